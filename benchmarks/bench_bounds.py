@@ -1,0 +1,77 @@
+"""Time the acceleration bounds: one arm at a time, as a control loop asks, and in batches.
+
+Run ``python benchmarks/bench_bounds.py``. Prints, for 7 joints, microseconds per call (median
+and best of the blocks, because other programs share the machine) and joint-states per second of
+a batch; where condition (11) holds and where it does not.
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "src" / "viability_bounds_pkg"))
+
+from viability_bounds_pkg.joint_limits import JointLimits
+from viability_bounds_pkg.viability import BoundsSolver
+
+JOINTS = 7
+BLOCKS = 60
+CALLS = 400
+BATCH = 100_000
+
+
+def seven_joints() -> JointLimits:
+    """Return limits like those of a collaborative arm, asymmetric."""
+    ones = np.ones(JOINTS)
+    names = [f"joint_{j}" for j in range(JOINTS)]
+    return JointLimits(names, -2.0 * ones, 2.0 * ones, 2.0 * ones, -12.0 * ones, 10.0 * ones)
+
+
+def time_calls(solver: BoundsSolver, q: np.ndarray, v: np.ndarray) -> list[float]:
+    """Return the mean time of one call in each block, s."""
+    times = []
+    for block in range(BLOCKS):
+        states = [(q[i], v[i]) for i in range(block * CALLS, (block + 1) * CALLS)]
+        start = time.perf_counter()
+        for x, speed in states:
+            solver.bounds(x, speed)
+        times.append((time.perf_counter() - start) / CALLS)
+    return times
+
+
+def time_batches(solver: BoundsSolver, q: np.ndarray, v: np.ndarray) -> list[float]:
+    """Return joint-states per second, for a few repetitions."""
+    rates = []
+    for _ in range(8):
+        start = time.perf_counter()
+        solver.bounds(q, v)
+        rates.append(q.size / (time.perf_counter() - start))
+    return rates
+
+
+def main() -> None:
+    """Measure and print."""
+    limits = seven_joints()
+    rng = np.random.default_rng(0)
+    q = rng.uniform(limits.q_min, limits.q_max, (BATCH, JOINTS))
+    v = rng.uniform(-limits.v_max, limits.v_max, (BATCH, JOINTS))
+    for dt, what in ((0.001, "(11) holds"), (0.3, "(11) fails")):
+        start = time.perf_counter()
+        solver = BoundsSolver(limits, dt)
+        construction = time.perf_counter() - start
+        calls = [1e6 * t for t in time_calls(solver, q, v)]
+        rates = [r / 1e6 for r in time_batches(solver, q, v)]
+        print(
+            f"dt {dt:g} s, {what}: {statistics.median(calls):.1f} us per call of {JOINTS} joints "
+            f"(best block {min(calls):.1f}); {statistics.median(rates):.1f} M joint-states/s "
+            f"in a batch (best {max(rates):.1f}); construction {1e3 * construction:.1f} ms"
+        )
+
+
+if __name__ == "__main__":
+    main()

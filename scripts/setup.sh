@@ -1,0 +1,105 @@
+#!/usr/bin/env bash
+# Makes the environment that everything here runs in, and enters it. Source it:
+#
+#     source scripts/setup.sh
+#
+# With ROS 2 Jazzy sourced, it makes .venv on top of that (system site packages) and adds what is
+# missing. Without, it installs the Jazzy wheels into .venv. Then it builds the three packages
+# with colcon. What is done already is not done again.
+
+_setup() {
+    local root python venv stamp wanted inputs
+    root="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
+    python="${PYTHON:-python3}"
+    venv="$root/.venv"
+
+    if ! "$python" -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null; then
+        echo "setup: Python 3.10 or newer is needed; '$python' is" \
+            "$("$python" --version 2>&1 || true). Set PYTHON to another one." >&2
+        return 1
+    fi
+
+    local ros=wheels
+    if [ "${ROS_DISTRO:-}" = jazzy ] && "$python" -c 'import rclpy' 2>/dev/null; then
+        ros=sourced
+    elif [ -n "${ROS_DISTRO:-}" ] && [ "$ROS_DISTRO" != jazzy ]; then
+        echo "setup: ROS 2 '$ROS_DISTRO' is sourced, but this is for Jazzy;" \
+            "open a shell without it." >&2
+        return 1
+    fi
+
+    # What an installation depends on; when any of it changes, it is made again.
+    stamp="$venv/.installed"
+    inputs="$(cat "$root/requirements/common.txt" "$root/requirements/$ros.txt" \
+        "$root/requirements/constraints.txt"; echo "$ros"; "$python" --version)"
+    wanted="$(printf '%s' "$inputs" | sha256sum | cut -d' ' -f1)"
+    if [ "$(cat "$stamp" 2>/dev/null)" != "$wanted" ]; then
+        _install || return 1
+        printf '%s' "$wanted" >"$stamp"
+    fi
+
+    # shellcheck disable=SC1091
+    source "$venv/bin/activate"
+    _build || return 1
+    # shellcheck disable=SC1091
+    source "$root/install/local_setup.bash"
+    export AMENT_PREFIX_PATH="$root/install/viability_bounds_pkg:$root/install/torque_safety_controller:$root/install/sim_bridge${_ros_prefix:+:$_ros_prefix}"
+}
+
+_install() {
+    local options=()
+    if [ "$ros" = sourced ]; then
+        echo "setup: ROS 2 Jazzy is sourced; making .venv on top of it" >&2
+        options+=(--system-site-packages)
+    else
+        echo "setup: no ROS 2 sourced; installing the Jazzy wheels into .venv" >&2
+    fi
+    if ! "$python" -m venv --clear "${options[@]}" "$venv"; then
+        echo "setup: '$python -m venv' failed; on Ubuntu: sudo apt install python3-venv" >&2
+        return 1
+    fi
+    local pip=("$venv/bin/python" -m pip install --quiet --disable-pip-version-check
+        --constraint "$root/requirements/constraints.txt")
+    if ! "${pip[@]}" -r "$root/requirements/common.txt" -r "$root/requirements/$ros.txt"; then
+        echo "setup: installing packages failed (is there a network?); run it again to retry" >&2
+        return 1
+    fi
+    _install_pybullet
+}
+
+_install_pybullet() {
+    if "$venv/bin/python" -c 'import pybullet' 2>/dev/null; then
+        return 0
+    fi
+    if ! "$venv/bin/python" -c 'import sys; sys.exit(sys.version_info >= (3, 12))'; then
+        echo "setup: PyBullet has no wheel for this Python; building it takes minutes and g++." \
+            "On Ubuntu 'sudo apt install python3-pybullet' is faster." >&2
+    fi
+    if ! "${pip[@]}" pybullet; then
+        echo "setup: installing PyBullet failed; install g++, or python3-pybullet" >&2
+        return 1
+    fi
+}
+
+_build() {
+    # Symlinks: only what colcon itself writes needs building again.
+    local built="$root/install/.built" now
+    now="$(cat "$root"/src/*/setup.py "$root"/src/*/setup.cfg "$root"/src/*/package.xml \
+        "$root/colcon.meta" "$stamp" | sha256sum | cut -d' ' -f1) $root"
+    if [ "$(cat "$built" 2>/dev/null)" = "$now" ]; then
+        return 0
+    fi
+    echo "setup: building the packages with colcon" >&2
+    if ! (cd "$root" && colcon --log-base "$root/log" build --symlink-install \
+        --event-handlers console_cohesion- console_start_end- summary- \
+        --metas "$root/colcon.meta" >"$root/.venv/build.log" 2>&1); then
+        cat "$root/.venv/build.log" >&2
+        return 1
+    fi
+    printf '%s' "$now" >"$built"
+}
+
+_setup
+_status=$?
+unset -f _setup _install _install_pybullet _build
+(exit $_status)

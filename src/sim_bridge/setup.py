@@ -1,0 +1,27 @@
+"""Build description of sim_bridge."""
+
+from setuptools import find_packages, setup
+
+PACKAGE = "sim_bridge"
+
+setup(
+    name=PACKAGE,
+    version="0.1.0",
+    packages=find_packages(exclude=["test"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=True,
+    maintainer="The viability bounds authors",
+    maintainer_email="maintainers@viability-bounds.example.org",
+    description="A torque-controlled robot played by PyBullet over ROS 2 topics.",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            "bullet_node = sim_bridge.bullet_node:main",
+            "scenario_node = sim_bridge.scenario_node:main",
+        ],
+    },
+)

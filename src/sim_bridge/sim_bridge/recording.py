@@ -1,0 +1,72 @@
+"""What a run left behind: states, bounds and commands, lined up by their stamps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Run:
+    """A recorded run; arrays of N control periods by n joints, NaN where a message was lost.
+
+    Attributes:
+        joints: names, n of them.
+        t: shape (N,), s of robot time from the first recorded state.
+        q, v: position and velocity, rad and rad/s.
+        a_lower, a_upper: acceleration limits, rad/s^2.
+        tau: commanded torque, N m.
+    """
+
+    joints: tuple[str, ...]
+    t: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    a_lower: np.ndarray
+    a_upper: np.ndarray
+    tau: np.ndarray
+
+    @property
+    def lost(self) -> int:
+        """Periods of which the recording lacks limits or command."""
+        return int(np.isnan(self.a_lower[:, 0] + self.tau[:, 0]).sum())
+
+
+class Recorder:
+    """Collects messages as they come and puts them in order at the end."""
+
+    def __init__(self, joints: Sequence[str]) -> None:
+        self._joints = tuple(joints)
+        self._states: dict[int, tuple] = {}
+        self._limits: dict[int, tuple] = {}
+        self._torques: dict[int, Sequence[float]] = {}
+
+    def add_state(self, stamp: int, q: Sequence[float], v: Sequence[float]) -> None:
+        """Keep a state, rad and rad/s, with its stamp in ns."""
+        self._states[stamp] = (q, v)
+
+    def add_limits(self, stamp: int, lower: Sequence[float], upper: Sequence[float]) -> None:
+        """Keep the acceleration limits, rad/s^2, for the state with `stamp`."""
+        self._limits[stamp] = (lower, upper)
+
+    def add_torque(self, stamp: int, tau: Sequence[float]) -> None:
+        """Keep the torques, N m, commanded for the state with `stamp`."""
+        self._torques.setdefault(stamp, tau)
+
+    def run(self, first: int) -> Run:
+        """Return the run from the state with stamp `first` on."""
+        stamps = sorted(stamp for stamp in self._states if stamp >= first)
+        nan = [np.nan] * len(self._joints)
+        states = np.array([self._states[s] for s in stamps])
+        limits = np.array([self._limits.get(s, (nan, nan)) for s in stamps])
+        return Run(
+            joints=self._joints,
+            t=(np.array(stamps) - first) * 1e-9,
+            q=states[:, 0],
+            v=states[:, 1],
+            a_lower=limits[:, 0],
+            a_upper=limits[:, 1],
+            tau=np.array([self._torques.get(s, nan) for s in stamps]),
+        )

@@ -1,0 +1,360 @@
+"""The scenario node: plays a scenario over the topics, shows it live, records and judges it."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum, auto
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool
+from trajectory_msgs.msg import JointTrajectory
+from viability_bounds_pkg.robot_description import RobotDescriptionError, read_urdf
+from viability_bounds_pkg.ros_parameters import (
+    NodeParameters,
+    Parameter,
+    ParameterError,
+    joint_names,
+    locked_joints,
+    per_joint,
+    positive,
+)
+from viability_bounds_pkg.ros_runtime import (
+    GOAL_QOS,
+    make_executor,
+    report_refusal,
+    set_stamp,
+    stamp_to_ns,
+)
+
+from sim_bridge.recording import Recorder, Run
+from sim_bridge.scenario import PoseGoal, PostureGoal, Push, Scenario, ScenarioError, load_scenario
+
+_RECORDING_QOS = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.BEST_EFFORT)
+_SHOW_PERIOD = 0.5
+_POLL_PERIOD = 0.02
+
+TABLE = (
+    Parameter("robot_name", str, "what the report calls the robot", default="robot"),
+    Parameter("robot_description", str, "URDF: path or package:// URI"),
+    Parameter("joints", list[str], "joints of the arm, in the order of all arrays"),
+    Parameter("locked_joints", list[str], "other joints that are not at zero", default=()),
+    Parameter("locked_positions", list[float], "where they are, rad", default=np.zeros(0)),
+    Parameter("base_frame", str, "frame of pose goals"),
+    Parameter("end_effector_frame", str, "frame that pose goals move"),
+    Parameter("position_min", list[float], "lower position limits, rad"),
+    Parameter("position_max", list[float], "upper position limits, rad"),
+    Parameter("velocity_max", list[float], "speed limits, rad/s"),
+    Parameter("torque_max", list[float], "torque limits, N m"),
+    Parameter("scenario", str, "YAML file that says what happens when"),
+    Parameter(
+        "ready_timeout", float, "how long the other nodes may take to be there, s", default=20.0
+    ),
+)
+
+
+@dataclass(frozen=True)
+class ScenarioConfiguration:
+    """Checked parameters of the scenario node."""
+
+    name: str
+    urdf: str
+    joints: tuple[str, ...]
+    locked: dict[str, float]
+    base_frame: str
+    end_effector_frame: str
+    q_min: np.ndarray
+    q_max: np.ndarray
+    v_max: np.ndarray
+    tau_max: np.ndarray
+    scenario: Scenario
+    ready_timeout: float
+
+
+def make_configuration(values: Mapping[str, Any]) -> ScenarioConfiguration:
+    """Check parameter values and read the scenario.
+
+    Raises:
+        ParameterError: a value cannot be used.
+    """
+    joints = joint_names(values)
+    try:
+        scenario = load_scenario(values["scenario"])
+    except ScenarioError as error:
+        raise ParameterError("scenario", values["scenario"], str(error)) from error
+    try:
+        urdf = read_urdf(values["robot_description"])
+    except RobotDescriptionError as error:
+        source = values["robot_description"]
+        raise ParameterError("robot_description", source, f"a URDF ({error})") from error
+    return ScenarioConfiguration(
+        name=values["robot_name"],
+        urdf=urdf,
+        joints=joints,
+        locked=locked_joints(values),
+        base_frame=values["base_frame"],
+        end_effector_frame=values["end_effector_frame"],
+        q_min=per_joint(values, "position_min", joints),
+        q_max=per_joint(values, "position_max", joints),
+        v_max=per_joint(values, "velocity_max", joints),
+        tau_max=per_joint(values, "torque_max", joints),
+        scenario=scenario,
+        ready_timeout=positive(values, "ready_timeout"),
+    )
+
+
+class Phase(Enum):
+    """How far the scenario has come."""
+
+    GETTING_READY = auto()
+    """The robot is paused; the chain does not answer yet."""
+    LOADING = auto()
+    """Goals are sent; the controller does not report them yet."""
+    PLAYING = auto()
+    STOPPING = auto()
+    """Over; the robot's last word is awaited."""
+    DONE = auto()
+
+
+class ScenarioNode(Node):
+    """Starts a paused robot with the goals of a scenario in place, and follows the run.
+
+    Goals are sent ahead with the stamps at which they take effect, so that a run in lockstep
+    is the same each time.
+
+    Attributes:
+        phase: how far it has come.
+        stamp: of the last state, ns.
+        robot: the robot's last diagnostics, by key.
+        controller: the controller's.
+        bounds: the bounds node's.
+    """
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("scenario_node", **node_arguments)
+        try:
+            config = NodeParameters(self, TABLE, make_configuration).configuration
+        except ParameterError:
+            self.destroy_node()
+            raise
+        self.config = config
+        self.phase = Phase.GETTING_READY
+        self.robot: dict[str, str] = {}
+        self.controller: dict[str, str] = {}
+        self.bounds: dict[str, str] = {}
+        self._recorder = Recorder(config.joints)
+        self._state: JointState | None = None
+        self.stamp = self._first = 0
+        self._last = math.inf
+        self._answered = False
+        self._pushes: list[tuple[float, Push | None]] = []
+        self._index: list[int] | None = None
+        self._poses = self.create_publisher(PoseStamped, "target_pose", GOAL_QOS)
+        self._postures = self.create_publisher(JointState, "target_posture", GOAL_QOS)
+        self._wrenches = self.create_publisher(WrenchStamped, "external_wrench", GOAL_QOS)
+        self._pause = self.create_client(SetBool, "bullet_node/pause")
+        self.create_subscription(JointState, "joint_states", self._on_state, _RECORDING_QOS)
+        self.create_subscription(
+            JointTrajectory, "acceleration_limits", self._on_limits, _RECORDING_QOS
+        )
+        self.create_subscription(JointState, "joint_commands", self._on_command, _RECORDING_QOS)
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(_POLL_PERIOD, self._proceed, clock=steady)
+
+    def recorded_run(self) -> Run:
+        """Return what was recorded since the robot began to move."""
+        return self._recorder.run(self._first)
+
+    # What comes in
+
+    def _on_state(self, message: JointState) -> None:
+        if self._index is None:
+            where = {name: i for i, name in enumerate(message.name)}
+            if any(joint not in where for joint in self.config.joints):
+                return
+            self._index = [where[joint] for joint in self.config.joints]
+        self._state = message
+        self.stamp = stamp_to_ns(message.header.stamp)
+        self._recorder.add_state(self.stamp, *self._arrays(message.position, message.velocity))
+        if self.phase is Phase.PLAYING and self.stamp >= self._last:
+            self.phase = Phase.STOPPING
+            self._pause.call_async(SetBool.Request(data=True))
+
+    def _arrays(self, *sequences) -> list[list[float]]:
+        return [[sequence[i] for i in self._index] for sequence in sequences]
+
+    def _on_limits(self, message: JointTrajectory) -> None:
+        lower, upper = (point.accelerations for point in message.points)
+        self._recorder.add_limits(stamp_to_ns(message.header.stamp), lower, upper)
+
+    def _on_command(self, message: JointState) -> None:
+        self._answered = True
+        self._recorder.add_torque(stamp_to_ns(message.header.stamp), message.effort)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = {value.key: value.value for value in status.values}
+            if status.name == "controller_node":
+                self.controller = values
+            elif status.name == "bullet_node":
+                self.robot = values
+            elif status.name == "bounds_node":
+                self.bounds = values
+
+    # What happens when
+
+    def _proceed(self) -> None:
+        if self.phase is Phase.GETTING_READY and self._chain_is_up():
+            self.phase = Phase.LOADING
+            self._send_goals()
+        elif self.phase is Phase.LOADING and self._goals_are_in():
+            self.phase = Phase.PLAYING
+            self._pause.call_async(SetBool.Request(data=False))
+        elif self.phase is Phase.PLAYING:
+            self._push()
+        elif self.phase is Phase.STOPPING and self.robot.get("paused") == "True":
+            # Statistics of the robot are final once it reports that it is paused.
+            if int(self.robot["stamp_ns"]) >= self._last:
+                self.phase = Phase.DONE
+
+    def _chain_is_up(self) -> bool:
+        return (
+            self._answered
+            and self.robot.get("paused") == "True"
+            and self._pause.service_is_ready()
+            and self._poses.get_subscription_count() > 0
+            and self._postures.get_subscription_count() > 0
+        )
+
+    def _goals_are_in(self) -> bool:
+        goals = [event for event in self.config.scenario.events if not isinstance(event, Push)]
+        return self.controller.get("goals_pending") == str(len(goals))
+
+    def _send_goals(self) -> None:
+        # Resuming begins a period of its own: the first state that moves is the next.
+        period = round(1e9 * float(self.robot["period_s"]))
+        self._first = self.stamp + period
+        self._last = self._first + round(1e9 * self.config.scenario.duration)
+        for event in self.config.scenario.events:
+            stamp = self._first + round(1e9 * event.time)
+            if isinstance(event, PoseGoal):
+                message = PoseStamped()
+                message.header.frame_id = self.config.base_frame
+                set_stamp(message.header.stamp, stamp)
+                p, o = message.pose.position, message.pose.orientation
+                p.x, p.y, p.z = event.position
+                o.x, o.y, o.z, o.w = event.orientation
+                self._poses.publish(message)
+            elif isinstance(event, PostureGoal):
+                message = JointState(
+                    name=list(event.positions), position=list(event.positions.values())
+                )
+                set_stamp(message.header.stamp, stamp)
+                self._postures.publish(message)
+            else:
+                self._pushes.append((stamp, event))
+                self._pushes.append((stamp + round(1e9 * event.duration), None))
+        self._pushes.sort(key=lambda entry: entry[0])
+
+    def _push(self) -> None:
+        while self._pushes and self.stamp >= self._pushes[0][0]:
+            event = self._pushes.pop(0)[1]
+            message = WrenchStamped()
+            if event is not None:
+                message.header.frame_id = event.link
+                f, t = message.wrench.force, message.wrench.torque
+                f.x, f.y, f.z = event.force
+                t.x, t.y, t.z = event.torque
+            self._wrenches.publish(message)
+
+    # What is shown
+
+    def live_line(self) -> str:
+        """Return the state of the run in one line."""
+        if self.phase is Phase.GETTING_READY or self._state is None:
+            return "waiting for the nodes"
+        q = np.array(self._arrays(self._state.position)[0])
+        distance = np.minimum(q - self.config.q_min, self.config.q_max - q)
+        nearest = int(np.argmin(distance))
+        error = float(self.controller.get("position_error_m", "nan"))
+        return (
+            f"{max(0.0, (self.stamp - self._first) * 1e-9):6.2f} s  "
+            f"{self.controller.get('mode', '?'):<8}  "
+            f"nearest limit {self.config.joints[nearest]} {distance[nearest]:+.4f} rad  "
+            f"pose error {1e3 * error:7.2f} mm  "
+            f"{float(self.robot.get('rate_hz', 'nan')):5.0f} Hz"
+        )
+
+
+def play(node: ScenarioNode) -> None:
+    """Run the scenario to its end, showing a live line.
+
+    Raises:
+        TimeoutError: the other nodes did not come up, or stopped answering.
+    """
+    executor = make_executor(node.context)
+    executor.add_node(node)
+    terminal = sys.stdout.isatty()
+    shown_at = -math.inf
+    stamp, moved_at = -1, time.monotonic()
+    while node.phase is not Phase.DONE and rclpy.ok(context=node.context):
+        executor.spin_once(timeout_sec=0.1)
+        now = time.monotonic()
+        if (node.stamp, node.phase) != stamp:
+            stamp, moved_at = (node.stamp, node.phase), now
+        elif now - moved_at > node.config.ready_timeout:
+            raise TimeoutError(f"nothing has moved for {node.config.ready_timeout:g} s "
+                               f"({node.phase.name.lower().replace('_', ' ')})")
+        if now - shown_at > _SHOW_PERIOD:
+            shown_at = now
+            print(node.live_line(), end="\r" if terminal else "\n", flush=True)
+    print(node.live_line(), flush=True)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Play a scenario; with ``--out DIRECTORY`` also record and judge it.
+
+    Returns:
+        0 when no limit was broken, 1 when one was, 2 when the scenario could not be played.
+    """
+    argv = rclpy.utilities.remove_ros_args(args=sys.argv if args is None else args)
+    out = Path(argv[argv.index("--out") + 1]) if "--out" in argv else None
+    try:
+        rclpy.init(args=args)
+        node = ScenarioNode()
+    except Exception as error:
+        rclpy.try_shutdown()
+        report_refusal(error)
+        return 2
+    try:
+        play(node)
+        if out is None:
+            return 0
+        from sim_bridge.report import write_report  # matplotlib takes a second to import
+
+        return 0 if write_report(out, node.config, node.recorded_run(), node.robot, node.bounds) else 1
+    except TimeoutError as error:
+        report_refusal(error)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,299 @@
+"""A URDF made ready for PyBullet, so that its dynamics equal Pinocchio's reduced model.
+
+PyBullet reads a URDF in ways that silently change the dynamics; nothing is left to that here:
+
+- a link without ``<inertial>`` would weigh 1 kg: every link made here has one;
+- inertia tensors would be diagonalised to a relative 1e-6 only, and one that breaks the
+  triangle inequality, if only by rounding as a flat link's may, would become zero: the text
+  has the principal axes and stand-ins for the moments, which the caller sets after loading;
+- joint damping and friction, and joint stops, would act: they are removed.
+
+Links that do not move against each other become one, with the sum of their inertias: PyBullet
+steps every link, fixed or not, and a humanoid becomes as fast as its arm.
+`PreparedUrdf.frames` remembers where each of the original links went.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field
+from typing import NamedTuple
+from xml.etree.ElementTree import Element, ParseError, SubElement, fromstring, tostring
+
+import numpy as np
+
+from viability_bounds_pkg.robot_description import RobotDescriptionError, resolve_uri
+
+_MOVABLE = ("revolute", "continuous", "prismatic")
+
+
+class FramePlacement(NamedTuple):
+    """Where a link of the original URDF sits: on which link left, and where on it.
+
+    Relative to the link's principal frame: centre of mass and principal axes. PyBullet reports
+    that in double precision, but URDF frames in single precision.
+    """
+
+    link: str
+    position: np.ndarray  # shape (3,), m
+    orientation: np.ndarray  # shape (4,), quaternion x, y, z, w
+
+
+@dataclass(frozen=True)
+class PreparedUrdf:
+    """A URDF for PyBullet, and what it takes to use it."""
+
+    text: str  # without any joints but those asked for
+    frames: Mapping[str, FramePlacement]  # of every link of the original URDF
+    principal_inertias: Mapping[str, np.ndarray]  # to set for each link left, shape (3,), kg m^2
+
+
+@dataclass
+class _Body:
+    """Links that move as one, gathered in the frame of the first of them."""
+
+    name: str
+    mass: float = 0.0
+    moment: np.ndarray = field(default_factory=lambda: np.zeros(3))  # mass times centre of mass
+    inertia: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))  # about the frame
+    shapes: list[Element] = field(default_factory=list)
+
+
+def prepare_urdf(
+    urdf: str,
+    joints: Sequence[str],
+    locked_positions: Mapping[str, float] | None = None,
+    *,
+    visuals: bool = False,
+    mechanical_stops: bool = False,
+) -> PreparedUrdf:
+    """Return `urdf` reduced to `joints` and rewritten for PyBullet.
+
+    Args:
+        urdf: text of the URDF.
+        joints: the joints that move, in any order: revolute, continuous or prismatic.
+        locked_positions: where other joints are locked, rad or m; joints left out are locked
+            at zero. Mimic joints are joints like any other here, as they are in Pinocchio.
+        visuals: keep the visual and collision shapes; the files they name are looked up.
+        mechanical_stops: keep the position limits as hard stops, which hide violations.
+
+    Raises:
+        RobotDescriptionError: not a URDF, a joint that is unknown, repeated, both moved and
+            locked, or of a type with other than one coordinate; a mesh that cannot be found.
+    """
+    try:
+        root = fromstring(urdf)
+    except ParseError as error:
+        raise RobotDescriptionError(f"URDF is not well-formed XML ({error})") from error
+    locked = dict(locked_positions or {})
+    _check_joints(root, joints, locked)
+
+    output = Element("robot", name=root.get("name", "robot"))
+    output.extend(deepcopy(root.findall("material")))
+    links = {link.get("name", ""): link for link in root.findall("link")}
+    outgoing: dict[str, list[Element]] = {}
+    children = []
+    for joint in root.findall("joint"):
+        outgoing.setdefault(_linked(joint, "parent", links), []).append(joint)
+        children.append(_linked(joint, "child", links))
+    roots = [name for name in links if name not in children]
+    if len(roots) != 1 or len(set(children)) != len(children):
+        raise RobotDescriptionError(f"the links do not form one tree; roots: {roots}")
+
+    bodies = [_Body(roots[0])]
+    placed: dict[str, tuple[_Body, np.ndarray]] = {}
+    pending = [(roots[0], bodies[0], np.eye(4))]
+    while pending:
+        name, body, placement = pending.pop()
+        placed[name] = body, placement
+        _add_link(body, links[name], placement, visuals)
+        for joint in outgoing.get(name, ()):
+            child = _linked(joint, "child", links)
+            origin = placement @ _transform(joint.find("origin"))
+            if joint.get("name") in joints:
+                output.append(_moving_joint(joint, body.name, child, origin, mechanical_stops))
+                bodies.append(_Body(child))
+                pending.append((child, bodies[-1], np.eye(4)))
+            else:
+                motion = _locked_motion(joint, locked.get(joint.get("name", ""), 0.0))
+                pending.append((child, body, origin @ motion))
+
+    # What stands on the ground takes no part in the dynamics; its frame stays where it is.
+    bodies[0] = _Body(roots[0], shapes=bodies[0].shapes)
+    principal = {body.name: _append_link(output, body) for body in bodies}
+    frames = {
+        name: _frame(body.name, np.linalg.solve(principal[body.name][0], placement))
+        for name, (body, placement) in placed.items()
+    }
+    inertias = {name: moments for name, (_, moments) in principal.items()}
+    return PreparedUrdf(tostring(output, encoding="unicode"), frames, inertias)
+
+
+def _check_joints(root: Element, joints: Sequence[str], locked: Mapping[str, float]) -> None:
+    """Raise `RobotDescriptionError` unless each joint named exists and can do its part."""
+    types = {joint.get("name"): joint.get("type") for joint in root.findall("joint")}
+    for name in (*joints, *locked):
+        if name not in types:
+            known = ", ".join(str(n) for n, kind in types.items() if kind != "fixed")
+            raise RobotDescriptionError(f"unknown joint {name!r}; the URDF has: {known}")
+        if types[name] not in _MOVABLE:
+            raise RobotDescriptionError(f"joint {name!r} is {types[name]}, none of {_MOVABLE}")
+    if not joints or len(set(joints)) != len(joints):
+        raise RobotDescriptionError(f"joints must be listed once each, not {list(joints)}")
+    for name, position in locked.items():
+        if name in joints:
+            raise RobotDescriptionError(f"joint {name!r} cannot be both moved and locked")
+        if not math.isfinite(position):
+            raise RobotDescriptionError(f"joint {name!r} cannot be locked at {position}")
+
+
+def _linked(joint: Element, end: str, links: Mapping[str, object]) -> str:
+    """Return the link at the 'parent' or 'child' `end` of `joint`."""
+    element = joint.find(end)
+    name = "" if element is None else element.get("link", "")
+    if name not in links:
+        raise RobotDescriptionError(f"joint {joint.get('name')!r}: no {end} link {name!r}")
+    return name
+
+
+def _add_link(body: _Body, link: Element, placement: np.ndarray, visuals: bool) -> None:
+    """Add the inertia, and the shapes if wanted, of `link` placed on `body`."""
+    for inertial in link.findall("inertial"):
+        frame = placement @ _transform(inertial.find("origin"))
+        rotation, centre = frame[:3, :3], frame[:3, 3]
+        mass = _numbers(inertial.find("mass"), "value", 1)[0]
+        xx, xy, xz, yy, yz, zz = (
+            _numbers(inertial.find("inertia"), name, 1)[0]
+            for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+        )
+        own = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        body.mass += mass
+        body.moment += mass * centre
+        body.inertia += rotation @ own @ rotation.T + _point_inertia(mass, centre)
+    for shape in (*link.findall("visual"), *link.findall("collision")) if visuals else ():
+        shape = deepcopy(shape)
+        origin = shape.find("origin")
+        if origin is None:
+            origin = SubElement(shape, "origin")
+        origin.attrib = _origin(placement @ _transform(origin))
+        for mesh in shape.iter("mesh"):
+            mesh.set("filename", str(resolve_uri(mesh.get("filename", "")).resolve()))
+        body.shapes.append(shape)
+
+
+def _append_link(output: Element, body: _Body) -> tuple[np.ndarray, np.ndarray]:
+    """Add `body` to the URDF; return its principal frame, shape (4, 4), and moments (3,)."""
+    frame = np.eye(4)
+    frame[:3, 3] = centre = body.moment / body.mass if body.mass else np.zeros(3)
+    moments, axes = np.linalg.eigh(body.inertia - _point_inertia(body.mass, centre))
+    axes[:, 2] *= np.sign(np.linalg.det(axes))  # eigenvectors may come left-handed
+    frame[:3, :3] = axes
+    link = SubElement(output, "link", name=body.name)
+    inertial = SubElement(link, "inertial")
+    SubElement(inertial, "origin", _origin(frame))
+    SubElement(inertial, "mass", value=_text([body.mass]))
+    SubElement(inertial, "inertia", ixx="1", ixy="0", ixz="0", iyy="1", iyz="0", izz="1")
+    link.extend(body.shapes)
+    return frame, moments
+
+
+def _frame(link: str, transform: np.ndarray) -> FramePlacement:
+    """Return the frame that `transform`, shape (4, 4), places on `link`."""
+    half = 0.5 * np.array(_rpy(transform))
+    (sr, sp, sy), (cr, cp, cy) = np.sin(half), np.cos(half)
+    x, y, z = sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy
+    w = cr * cp * cy + sr * sp * sy
+    return FramePlacement(link, transform[:3, 3], np.array([x, y, z, w]))
+
+
+def _moving_joint(
+    joint: Element, parent: str, child: str, origin: np.ndarray, stops: bool
+) -> Element:
+    """Return `joint` placed at `origin` on `parent`, without friction, damping or mimicry."""
+    kind = "prismatic" if joint.get("type") == "prismatic" else "revolute"
+    moved = Element("joint", name=joint.get("name", ""), type=kind)
+    SubElement(moved, "origin", _origin(origin))
+    SubElement(moved, "parent", link=parent)
+    SubElement(moved, "child", link=child)
+    SubElement(moved, "axis", xyz=_text(_axis(joint)))
+    limit = joint.find("limit")
+    if stops and limit is not None and joint.get("type") != "continuous":
+        moved.append(deepcopy(limit))
+    else:  # PyBullet makes no stop where lower > upper
+        SubElement(moved, "limit", lower="1", upper="-1", effort="0", velocity="0")
+    return moved
+
+
+def _locked_motion(joint: Element, position: float) -> np.ndarray:
+    """Return the transform, shape (4, 4), that `joint` makes at `position` (rad or m)."""
+    motion = np.eye(4)
+    if joint.get("type") == "prismatic":
+        motion[:3, 3] = position * _axis(joint)
+    elif position != 0.0:  # Rodrigues: R = I + sin(q) K + (1 - cos(q)) K^2
+        x, y, z = _axis(joint)
+        skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        motion[:3, :3] += math.sin(position) * skew + (1.0 - math.cos(position)) * skew @ skew
+    return motion
+
+
+def _point_inertia(mass: float, point: np.ndarray) -> np.ndarray:
+    """Return the inertia, shape (3, 3), about the origin of a point mass at `point`."""
+    return mass * (point @ point * np.eye(3) - np.outer(point, point))
+
+
+def _axis(joint: Element) -> np.ndarray:
+    """Return the unit axis of `joint`, shape (3,); URDF's default is x."""
+    element = joint.find("axis")
+    axis = np.array([1.0, 0.0, 0.0]) if element is None else _numbers(element, "xyz", 3)
+    length = np.linalg.norm(axis)
+    if length == 0.0:
+        raise RobotDescriptionError(f"joint {joint.get('name')!r}: axis without a direction")
+    return axis / length
+
+
+def _transform(origin: Element | None) -> np.ndarray:
+    """Return the transform, shape (4, 4), of a URDF origin; identity for None."""
+    (sr, sp, sy), (cr, cp, cy) = (f(_numbers(origin, "rpy", 3)) for f in (np.sin, np.cos))
+    transform = np.eye(4)
+    transform[:3, :3] = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    transform[:3, 3] = _numbers(origin, "xyz", 3)
+    return transform
+
+
+def _rpy(transform: np.ndarray) -> tuple[float, float, float]:
+    """Return roll, pitch and yaw of `transform`, exact to rounding, rad."""
+    r = transform[:3, :3]
+    yaw = math.atan2(r[1, 0], r[0, 0])
+    pitch = math.atan2(-r[2, 0], math.hypot(r[0, 0], r[1, 0]))
+    # Roll from what is left once yaw is undone: taken apart, they lose digits near pitch +-pi/2.
+    s, c = math.sin(yaw), math.cos(yaw)
+    roll = math.atan2(s * r[0, 2] - c * r[1, 2], c * r[1, 1] - s * r[0, 1])
+    return roll, pitch, yaw
+
+
+def _origin(transform: np.ndarray) -> dict[str, str]:
+    """Return the attributes of the URDF origin that places `transform`."""
+    return {"xyz": _text(transform[:3, 3]), "rpy": _text(_rpy(transform))}
+
+
+def _text(numbers: Iterable[float]) -> str:
+    """Return `numbers` for a URDF, with all their digits."""
+    return " ".join(repr(float(number)) for number in numbers)
+
+
+def _numbers(element: Element | None, name: str, count: int) -> np.ndarray:
+    """Return the `count` numbers of an attribute, shape (count,); zeros where it is missing."""
+    text = None if element is None else element.get(name)
+    try:
+        numbers = np.array([float(x) for x in text.split()]) if text else np.zeros(count)
+    except ValueError:
+        numbers = np.empty(0)
+    if numbers.shape != (count,) or not np.isfinite(numbers).all():
+        raise RobotDescriptionError(f"URDF: {name}={text!r} is not {count} finite number(s)")
+    return numbers

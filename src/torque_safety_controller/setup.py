@@ -1,0 +1,26 @@
+"""Build description of torque_safety_controller."""
+
+from setuptools import find_packages, setup
+
+PACKAGE = "torque_safety_controller"
+
+setup(
+    name=PACKAGE,
+    version="0.1.0",
+    packages=find_packages(exclude=["test"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=True,
+    maintainer="The viability bounds authors",
+    maintainer_email="maintainers@viability-bounds.example.org",
+    description="Inverse-dynamics QP torque control inside joint and torque limits.",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            "controller_node = torque_safety_controller.controller_node:main",
+        ],
+    },
+)

@@ -1,0 +1,1 @@
+"""Torque control inside joint, acceleration and torque limits, solved as a QP."""

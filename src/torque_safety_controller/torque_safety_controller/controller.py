@@ -1,0 +1,246 @@
+"""State, limits and goals in, torque out; no ROS."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from torque_safety_controller.inverse_dynamics_qp import InverseDynamicsQP, NoSolutionFound
+from torque_safety_controller.robot_model import RobotModel
+from torque_safety_controller.tasks import (
+    TaskTerm,
+    damping_task,
+    pose_error,
+    pose_task,
+    posture_task,
+)
+
+AdditionalTorque = Callable[[RobotModel, np.ndarray, np.ndarray], np.ndarray]
+"""(model, q, v) -> torque, shape (n,), N m, that is added to the model's: integral action."""
+
+
+@dataclass(frozen=True)
+class Gains:
+    """What may change while the controller runs.
+
+    Attributes:
+        pose_kp, pose_kd: of the pose task, 1/s^2 and 1/s.
+        pose_weight: of the pose task; 0 leaves the task out.
+        posture_kp, posture_kd: of the posture task, 1/s^2 and 1/s.
+        posture_weight: of the posture task, > 0.
+        posture_in_null_space: whether the posture leaves the pose alone.
+        hold_kd: damping in HOLD, 1/s.
+    """
+
+    pose_kp: float
+    pose_kd: float
+    pose_weight: float
+    posture_kp: float
+    posture_kd: float
+    posture_weight: float
+    posture_in_null_space: bool
+    hold_kd: float
+
+
+class Step(NamedTuple):
+    """One control step.
+
+    Attributes:
+        tau: torque, shape (n,), N m, finite and within the limits.
+        a: accelerations that it is to give, shape (n,), rad/s^2.
+        tracking: whether the tasks were served; False when the arm only holds still.
+        relaxation: by how much the acceleration bounds had to give way to the torque limits,
+            shape (n,), rad/s^2, or None.
+        failure: why the QP was not used though it could have been, or empty.
+    """
+
+    tau: np.ndarray
+    a: np.ndarray
+    tracking: bool
+    relaxation: np.ndarray | None = None
+    failure: str = ""
+
+
+class Controller:
+    """Torques that move an arm towards its goals inside every limit.
+
+    Args:
+        robot: model of the arm.
+        tau_max: torque limits, shape (n,), N m.
+        gains: initial gains.
+        torque_rate_max: greatest change of torque, shape (n,), N m/s; inf for none.
+        additional_torque: integral action; the torque limits hold with it counted in.
+
+    Attributes:
+        q_des: joint goal, shape (n,), rad; None until one is set.
+        pose_des: end-effector goal; None until one is set.
+        error: error of the pose goal in the last step, shape (6,), m and rad.
+        iterations: of the last QP.
+    """
+
+    def __init__(
+        self,
+        robot: RobotModel,
+        tau_max: np.ndarray,
+        gains: Gains,
+        torque_rate_max: np.ndarray | None = None,
+        additional_torque: AdditionalTorque | None = None,
+    ) -> None:
+        n = robot.n
+        self.robot = robot
+        self.tau_max = np.asarray(tau_max, dtype=float)
+        self.gains = gains
+        self.q_des: np.ndarray | None = None
+        self.pose_des: pin.SE3 | None = None
+        self.error = np.full(6, math.nan)
+        self.iterations = 0
+        rate = np.full(n, math.inf) if torque_rate_max is None else torque_rate_max
+        self._tau_step = np.where(np.isinf(rate), np.inf, rate * robot.dt)
+        self._additional_torque = additional_torque
+        self._qp = InverseDynamicsQP(n)
+        self._a_last = np.zeros(n)
+        self._tau_last: np.ndarray | None = None
+        self._posture = np.zeros(n)
+
+    @property
+    def has_goal(self) -> bool:
+        """Whether there is something to track."""
+        return self.pose_des is not None or self.q_des is not None
+
+    def start(self, q: np.ndarray) -> None:
+        """Forget the past; `q` becomes the posture that the null space is held at."""
+        self._a_last.fill(0.0)
+        self._tau_last = None
+        self._posture = q.copy()
+
+    def set_pose_goal(self, pose_des: pin.SE3) -> None:
+        """Move the end effector to `pose_des` in the URDF's root frame."""
+        self.pose_des = pose_des
+
+    def set_posture_goal(self, q_des: np.ndarray) -> None:
+        """Bring the joints, or what the pose task leaves free of them, to `q_des`, rad."""
+        self.q_des = q_des
+
+    @property
+    def acceleration(self) -> np.ndarray:
+        """Acceleration commanded last, shape (n,), rad/s^2."""
+        return self._a_last
+
+    def step(self, q: np.ndarray, v: np.ndarray, a_lower: np.ndarray, a_upper: np.ndarray) -> Step:
+        """Return the torque for one control step towards the goals.
+
+        Without a goal it is `rest`; when the QP fails, `hold`.
+
+        Args:
+            q: position, shape (n,), rad.
+            v: velocity, shape (n,), rad/s.
+            a_lower: acceleration bounds, shape (n,), rad/s^2.
+            a_upper: shape (n,), rad/s^2, not below `a_lower`.
+        """
+        if not self.has_goal:
+            return self.rest(q, v, a_lower, a_upper)
+        self.robot.update(q, v, self._a_last)
+        return self._solve(q, v, self._tasks(q, v), a_lower, a_upper, True)
+
+    def rest(self, q: np.ndarray, v: np.ndarray, a_lower: np.ndarray, a_upper: np.ndarray) -> Step:
+        """Return the torque that brings the arm to rest inside its bounds; see `step`."""
+        self.robot.update(q, v, self._a_last)
+        tasks = [damping_task(v, self.gains.hold_kd)]
+        return self._solve(q, v, tasks, a_lower, a_upper, False)
+
+    def _solve(self, q, v, tasks: list[TaskTerm], a_lower, a_upper, tracking: bool) -> Step:
+        robot = self.robot
+        additional = self._additional(q, v)
+        bias = robot.h if additional is None else robot.h + additional
+        lower, upper = self._torque_range()
+        try:
+            solution = self._qp.solve(
+                tasks, a_lower, a_upper, robot.M, lower - bias, upper - bias
+            )
+        except NoSolutionFound as error:
+            return self._hold(q, v, additional, str(error))
+        self.iterations = solution.iterations
+        tau = robot.torque(q, v, solution.a)
+        if additional is not None:
+            tau = tau + additional
+        return Step(
+            self._limited(tau), self._remember(solution.a), tracking, solution.relaxation
+        )
+
+    def hold(self, q: np.ndarray, v: np.ndarray) -> Step:
+        """Return a torque that needs no acceleration bounds: gravity and damping.
+
+        Each joint brakes with `hold_kd`, as hard as its motor allows.
+        """
+        self.robot.update(q, v, self._a_last)
+        return self._hold(q, v, self._additional(q, v), "")
+
+    def _hold(self, q, v, additional, failure: str) -> Step:
+        robot = self.robot
+        a = -self.gains.hold_kd * v
+        tau = robot.M @ a + robot.h
+        if additional is not None:
+            tau = tau + additional
+        return Step(self._limited(tau), self._remember(a), False, None, failure)
+
+    def _tasks(self, q: np.ndarray, v: np.ndarray) -> list[TaskTerm]:
+        gains = self.gains
+        q_des = self._posture if self.q_des is None else self.q_des
+        tasks = []
+        if self.pose_des is not None:
+            self.error = pose_error(self.robot.pose, self.pose_des)
+            if gains.pose_weight > 0.0:
+                tasks.append(
+                    pose_task(
+                        self.robot,
+                        v,
+                        self.error,
+                        gains.pose_kp,
+                        gains.pose_kd,
+                        gains.pose_weight,
+                    )
+                )
+        guarded = self.robot.J if tasks and gains.posture_in_null_space else None
+        tasks.append(
+            posture_task(
+                q_des,
+                q,
+                v,
+                gains.posture_kp,
+                gains.posture_kd,
+                gains.posture_weight,
+                guarded,
+            )
+        )
+        return tasks
+
+    def _additional(self, q: np.ndarray, v: np.ndarray) -> np.ndarray | None:
+        if self._additional_torque is None:
+            return None
+        return self._additional_torque(self.robot, q, v)
+
+    def _torque_range(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the torques that may follow the last one, shape (n,) each, N m."""
+        if self._tau_last is None:
+            return -self.tau_max, self.tau_max
+        return (
+            np.maximum(-self.tau_max, self._tau_last - self._tau_step),
+            np.minimum(self.tau_max, self._tau_last + self._tau_step),
+        )
+
+    def _limited(self, tau: np.ndarray) -> np.ndarray:
+        """Return `tau` as it may be sent: whatever came before, finite and within the limits."""
+        if not np.isfinite(tau).all():
+            tau = np.zeros(self.robot.n) if self._tau_last is None else self._tau_last
+        lower, upper = self._torque_range()
+        self._tau_last = np.minimum(np.maximum(tau, lower), upper)
+        return self._tau_last
+
+    def _remember(self, a: np.ndarray) -> np.ndarray:
+        self._a_last = a if np.isfinite(a).all() else np.zeros(self.robot.n)
+        return self._a_last

@@ -1,0 +1,196 @@
+"""The controller node's parameters: the table, and what the node is made of from it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from viability_bounds_pkg.robot_description import (
+    RobotDescriptionError,
+    build_model,
+    check_urdf,
+    read_urdf,
+)
+from viability_bounds_pkg.ros_parameters import (
+    Parameter,
+    ParameterError,
+    joint_names,
+    locked_joints,
+    per_joint,
+    positive,
+)
+
+from torque_safety_controller.controller import Gains
+from torque_safety_controller.robot_model import RobotModel
+from torque_safety_controller.tasks import critical_damping
+
+TABLE = (
+    Parameter("robot_description", str, "URDF: path or package:// URI"),
+    Parameter("joints", list[str], "controlled joints, base to tip, in the order of all arrays"),
+    Parameter("locked_joints", list[str], "other joints that are not at zero", default=()),
+    Parameter("locked_positions", list[float], "where they are, rad", default=np.zeros(0)),
+    Parameter("base_frame", str, "frame of pose goals; fixed to the URDF's root"),
+    Parameter("end_effector_frame", str, "frame that pose goals move"),
+    Parameter("position_min", list[float], "lower limits of posture goals, rad"),
+    Parameter("position_max", list[float], "upper limits of posture goals, rad"),
+    Parameter("torque_max", list[float], "torque limits, N m"),
+    Parameter(
+        "torque_rate_max",
+        list[float],
+        "limits of the rate of torque, N m/s; none if empty",
+        default=np.zeros(0),
+    ),
+    Parameter("rate_hz", float, "rate of the control loop, Hz"),
+    Parameter("pose_kp", float, "stiffness of the pose task, 1/s^2", live=True),
+    Parameter("pose_kd", float, "its damping, 1/s; -1: critical", default=-1.0, live=True),
+    Parameter("pose_weight", float, "its weight; 0: no pose task", default=1.0, live=True),
+    Parameter("posture_kp", float, "stiffness of the posture task, 1/s^2", live=True),
+    Parameter("posture_kd", float, "its damping, 1/s; -1: critical", default=-1.0, live=True),
+    Parameter("posture_weight", float, "its weight, > 0", default=1e-3, live=True),
+    Parameter(
+        "posture_in_null_space",
+        bool,
+        "whether the posture task leaves the pose alone; false: eq. (33) as printed",
+        default=True,
+        live=True,
+    ),
+    Parameter("hold_kd", float, "damping in HOLD, 1/s", default=20.0, live=True),
+    Parameter(
+        "bounds_timeout",
+        float,
+        "how long a state waits for its acceleration limits, or a usable state for another, "
+        "before HOLD, s",
+        default=0.05,
+    ),
+    Parameter(
+        "state_timeout",
+        float,
+        "how long without a usable joint state before STOPPED, s",
+        default=0.5,
+    ),
+    Parameter("goal_timeout", float, "age of a goal before HOLD, s; 0: never", default=0.0),
+    Parameter(
+        "ros2_control_topic",
+        str,
+        "where to publish efforts as std_msgs/Float64MultiArray too; empty: nowhere",
+        default="",
+    ),
+)
+
+
+@dataclass(frozen=True)
+class ControllerConfiguration:
+    """Checked parameters of the controller node; arrays of shape (n,) in `joints` order."""
+
+    joints: tuple[str, ...]
+    dt: float
+    q_min: np.ndarray
+    q_max: np.ndarray
+    tau_max: np.ndarray
+    tau_rate_max: np.ndarray
+    base_frame: str
+    gains: Gains
+    bounds_timeout: float
+    state_timeout: float
+    goal_timeout: float
+    ros2_control_topic: str
+
+
+def make_configuration(values: Mapping[str, Any]) -> ControllerConfiguration:
+    """Check everything but the URDF, which `load_robot` reads once.
+
+    Raises:
+        ParameterError: a value cannot be used.
+    """
+    joints = joint_names(values)
+    tau_max = per_joint(values, "torque_max", joints)
+    if not (np.isfinite(tau_max).all() and (tau_max > 0).all()):
+        raise ParameterError("torque_max", tau_max, "finite numbers > 0")
+    tau_rate_max = np.full(len(joints), np.inf)
+    if len(values["torque_rate_max"]):
+        tau_rate_max = per_joint(values, "torque_rate_max", joints)
+        if not (tau_rate_max > 0).all():
+            raise ParameterError("torque_rate_max", tau_rate_max, "numbers > 0")
+    q_min = per_joint(values, "position_min", joints)
+    q_max = per_joint(values, "position_max", joints)
+    if not (q_min < q_max).all():
+        raise ParameterError("position_max", q_max, "above position_min everywhere")
+    return ControllerConfiguration(
+        joints=joints,
+        dt=1.0 / positive(values, "rate_hz"),
+        q_min=q_min,
+        q_max=q_max,
+        tau_max=tau_max,
+        tau_rate_max=tau_rate_max,
+        base_frame=values["base_frame"],
+        gains=_gains(values),
+        bounds_timeout=positive(values, "bounds_timeout"),
+        state_timeout=positive(values, "state_timeout"),
+        goal_timeout=positive(values, "goal_timeout", zero=True),
+        ros2_control_topic=values["ros2_control_topic"],
+    )
+
+
+def _gains(values: Mapping[str, Any]) -> Gains:
+    gains = {
+        name: positive(values, name, zero=name != "posture_weight")
+        for name in ("pose_kp", "pose_weight", "posture_kp", "posture_weight", "hold_kd")
+    }
+    for task in ("pose", "posture"):
+        name = f"{task}_kd"
+        kd = values[name]
+        gains[name] = (
+            critical_damping(gains[f"{task}_kp"]) if kd == -1.0 else positive(values, name)
+        )
+    return Gains(**gains, posture_in_null_space=values["posture_in_null_space"])
+
+
+def load_robot(
+    values: Mapping[str, Any], description: str | None = None
+) -> tuple[RobotModel, pin.SE3]:
+    """Read the URDF and return the robot's model and the placement of the base frame.
+
+    Args:
+        values: parameter values by name.
+        description: text of the URDF; None reads what ``robot_description`` names.
+
+    Raises:
+        ParameterError: a joint or frame that the URDF does not have.
+        RobotDescriptionError: a URDF that does not load.
+    """
+    source = values["robot_description"]
+    joints = joint_names(values)
+    try:
+        urdf = read_urdf(source) if description is None else description
+        check_urdf(urdf, source)
+    except RobotDescriptionError as error:
+        raise ParameterError("robot_description", source, f"a URDF ({error})") from error
+    try:
+        model = build_model(urdf, joints, locked_joints(values))
+    except RobotDescriptionError as error:
+        raise ParameterError("joints", list(joints), str(error)) from error
+    return (
+        _with_frame(model, values, "end_effector_frame"),
+        _base_placement(model, values["base_frame"]),
+    )
+
+
+def _with_frame(model: pin.Model, values: Mapping[str, Any], name: str) -> RobotModel:
+    frame = values[name]
+    try:
+        return RobotModel(model, frame, 1.0 / values["rate_hz"])
+    except RobotDescriptionError as error:
+        raise ParameterError(name, frame, f"a frame of the URDF ({error})") from error
+
+
+def _base_placement(model: pin.Model, frame: str) -> pin.SE3:
+    if not model.existFrame(frame):
+        known = ", ".join(f.name for f in model.frames if f.parentJoint == 0)
+        raise ParameterError("base_frame", frame, f"a frame fixed to the root: {known}")
+    found = model.frames[model.getFrameId(frame)]
+    if found.parentJoint != 0:
+        raise ParameterError("base_frame", frame, "a frame fixed to the root, not a moving one")
+    return found.placement

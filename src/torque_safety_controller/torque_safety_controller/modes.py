@@ -1,0 +1,33 @@
+"""Which mode the controller is in, and why."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+
+class Mode(Enum):
+    """What the controller does."""
+
+    TRACKING = "TRACKING"
+    """Serves its goals inside all limits."""
+    HOLD = "HOLD"
+    """Brings the arm to rest: gravity compensation and damping inside the torque limits."""
+    STOPPED = "STOPPED"
+    """Publishes nothing, so that the robot's own watchdog brakes it."""
+
+
+class ModeKeeper:
+    """Keeps the mode, its reason and how often it changed."""
+
+    def __init__(self) -> None:
+        self.mode = Mode.STOPPED
+        self.reason = "no joint state yet"
+        self.changes = 0
+
+    def set(self, mode: Mode, reason: str) -> bool:
+        """Enter `mode`; return whether mode or reason changed."""
+        if (mode, reason) == (self.mode, self.reason):
+            return False
+        self.mode, self.reason = mode, reason
+        self.changes += 1
+        return True

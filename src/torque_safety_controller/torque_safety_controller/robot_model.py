@@ -1,0 +1,87 @@
+"""One Pinocchio model of the arm; every quantity of a control step computed once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+from viability_bounds_pkg.robot_description import RobotDescriptionError
+
+
+class RobotModel:
+    """Kinematics of the end effector and dynamics of the arm at the current state.
+
+    The dynamics are those in the middle of the control step that the torque will be held for,
+
+        q_mid = q + v dt / 2 + a dt^2 / 8,    v_mid = v + a dt / 2,
+
+    because the acceleration under a constant torque drifts: a torque right for the middle of
+    the step gives the wanted change of velocity with an error of second order in dt, one for
+    its beginning with an error of first order. `docs/torque_margin.md` measures both. The
+    acceleration a of the step is not known before the QP is solved; the last one stands in for
+    it in `update`, and `torque` takes the one that was found.
+
+    Args:
+        model: n joints with one coordinate each.
+        frame: name of the end-effector frame.
+        dt: control period that torques are held for, s; 0 evaluates at the current state.
+
+    Attributes:
+        pose: placement of the end effector in the base frame.
+        J: its Jacobian in its own axes, shape (6, n), linear rows first.
+        drift: its acceleration at zero joint acceleration, J' v, shape (6,).
+        M: mass matrix, shape (n, n), kg m^2.
+        h: Coriolis, centrifugal and gravity torques, shape (n,), N m.
+
+    Raises:
+        RobotDescriptionError: no such frame.
+    """
+
+    def __init__(self, model: pin.Model, frame: str, dt: float) -> None:
+        if not model.existFrame(frame):
+            known = ", ".join(f.name for f in model.frames)
+            raise RobotDescriptionError(f"unknown frame {frame!r}; the URDF has: {known}")
+        self.model = model
+        self.frame = frame
+        self.dt = dt
+        self.n = model.nv
+        self._frame_id = model.getFrameId(frame)
+        self._data = model.createData()
+        self._zero = np.zeros(self.n)
+        self.pose = pin.SE3.Identity()
+        self.J = np.zeros((6, self.n))
+        self.drift = np.zeros(6)
+        self.M = np.eye(self.n)
+        self.h = np.zeros(self.n)
+
+    def update(self, q: np.ndarray, v: np.ndarray, a_last: np.ndarray) -> None:
+        """Compute everything for one control step.
+
+        Args:
+            q: position, shape (n,), rad.
+            v: velocity, shape (n,), rad/s.
+            a_last: acceleration commanded last, shape (n,), rad/s^2.
+        """
+        model, data = self.model, self._data
+        q_mid, v_mid = self._middle(q, v, a_last)
+        self.M = pin.crba(model, data, q_mid)
+        self.h = pin.nonLinearEffects(model, data, q_mid, v_mid)
+        # Last, because the kinematics in `data` are to be those of the current state.
+        pin.computeJointJacobians(model, data, q)
+        pin.forwardKinematics(model, data, q, v, self._zero)
+        self.pose = pin.updateFramePlacement(model, data, self._frame_id)
+        self.J = pin.getFrameJacobian(model, data, self._frame_id, pin.ReferenceFrame.LOCAL)
+        self.drift = pin.getFrameAcceleration(
+            model, data, self._frame_id, pin.ReferenceFrame.LOCAL
+        ).vector
+
+    def torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Return the torque that, held for dt, gives mean acceleration `a`, shape (n,), N m."""
+        q_mid, v_mid = self._middle(q, v, a)
+        return pin.rnea(self.model, self._data, q_mid, v_mid, a)
+
+    def _middle(
+        self, q: np.ndarray, v: np.ndarray, a: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        half = 0.5 * self.dt
+        v_mid = v + half * a
+        return q + half * (v + 0.5 * half * a), v_mid

@@ -1,0 +1,88 @@
+"""Goals from messages: checked, and kept until their time has come."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pinocchio as pin
+from geometry_msgs.msg import PoseStamped
+from sensor_msgs.msg import JointState
+from viability_bounds_pkg.ros_runtime import stamp_to_ns
+
+_QUATERNION_TOLERANCE = 1e-3
+
+
+class GoalRefused(ValueError):
+    """A goal message that cannot be followed."""
+
+
+def pose_from_message(message: PoseStamped, base_frame: str) -> pin.SE3:
+    """Return the placement that a message asks for, in the base frame.
+
+    Raises:
+        GoalRefused: another frame, a number that is not finite, a quaternion that is not unit.
+    """
+    frame = message.header.frame_id
+    if frame not in ("", base_frame):
+        raise GoalRefused(f"frame_id is '{frame}'; allowed: '{base_frame}' or empty")
+    p, o = message.pose.position, message.pose.orientation
+    values = (p.x, p.y, p.z, o.x, o.y, o.z, o.w)
+    if not all(map(math.isfinite, values)):
+        raise GoalRefused("pose is not finite")
+    norm = math.hypot(o.x, o.y, o.z, o.w)
+    if abs(norm - 1.0) > _QUATERNION_TOLERANCE:
+        raise GoalRefused(f"orientation has norm {norm:.4g}; allowed: 1 within 0.001")
+    quaternion = pin.Quaternion(o.w / norm, o.x / norm, o.y / norm, o.z / norm)
+    return pin.SE3(quaternion.toRotationMatrix(), np.array([p.x, p.y, p.z]))
+
+
+def posture_from_message(
+    message: JointState, joints: Sequence[str], q_min: np.ndarray, q_max: np.ndarray
+) -> np.ndarray:
+    """Return the positions that a message asks for, shape (n,), rad, matched by name.
+
+    Raises:
+        GoalRefused: a joint is missing, a number is not finite or outside the limits.
+    """
+    if len(message.name) != len(message.position):
+        raise GoalRefused(f"{len(message.name)} names but {len(message.position)} positions")
+    where = dict(zip(message.name, message.position, strict=True))
+    missing = [joint for joint in joints if joint not in where]
+    if missing:
+        raise GoalRefused(f"no position for {', '.join(missing)}")
+    q_des = np.array([where[joint] for joint in joints])
+    for joint, value, low, high in zip(joints, q_des, q_min, q_max, strict=True):
+        if not low <= value <= high:
+            raise GoalRefused(f"{joint} is {value:g} rad; allowed: {low:g} to {high:g}")
+    return q_des
+
+
+class GoalQueue:
+    """Goals whose stamps lie ahead of the robot's time, until they are due.
+
+    A stamp of zero, or one that has passed, takes effect with the next control step; one ahead
+    takes effect with the first state at or after it, which makes a plan of goals repeatable.
+    """
+
+    def __init__(self) -> None:
+        self._pending: list[tuple[int, Callable[[], None]]] = []
+        self.refused: Counter[str] = Counter()
+
+    def __len__(self) -> int:
+        return len(self._pending)
+
+    def add(self, message: PoseStamped | JointState, apply: Callable[[], None]) -> None:
+        """Call `apply` when the time in the header of `message` has come."""
+        self._pending.append((stamp_to_ns(message.header.stamp), apply))
+        self._pending.sort(key=lambda entry: entry[0])
+
+    def apply_due(self, stamp: int) -> bool:
+        """Apply the goals that are due at `stamp`, ns; return whether there were any."""
+        due = False
+        while self._pending and self._pending[0][0] <= stamp:
+            self._pending.pop(0)[1]()
+            due = True
+        return due

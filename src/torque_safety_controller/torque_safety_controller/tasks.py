@@ -1,0 +1,101 @@
+"""Tasks: what the accelerations should do, as weighted least squares.
+
+Each task asks for ``A a = b`` with a weight, eq. (5) and (9) of [Benallegue2021]; `A` is None
+where it is the identity, which spares the product.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from torque_safety_controller.robot_model import RobotModel
+
+
+_RANK_REGULARISATION = 1e-9
+
+
+class TaskTerm(NamedTuple):
+    """The term ``weight * |A a - b|^2`` of the QP's cost."""
+
+    A: np.ndarray | None
+    """Shape (m, n), or None for the identity."""
+    b: np.ndarray
+    """Shape (m,)."""
+    weight: float
+
+
+def critical_damping(kp: float) -> float:
+    """Return ``2 sqrt(kp)``, the gain that brings an error to zero fastest without overshoot."""
+    return 2.0 * math.sqrt(kp)
+
+
+def posture_task(
+    q_des: np.ndarray,
+    q: np.ndarray,
+    v: np.ndarray,
+    kp: float,
+    kd: float,
+    weight: float,
+    J: np.ndarray | None = None,
+) -> TaskTerm:
+    """Bring the joints to `q_des` and to rest: eq. (34) of [DelPrete2018].
+
+    As the paper has it, posture and pose pull against each other with their weights, and the
+    pose rests off its goal by about the ratio of the weights in m per rad. With `J` the
+    posture pulls only where the pose does not feel it, so that the pose is reached; damping
+    acts everywhere either way.
+
+    Args:
+        q_des: desired positions, shape (n,), rad.
+        q: positions, shape (n,), rad.
+        v: velocities, shape (n,), rad/s.
+        kp: stiffness, 1/s^2.
+        kd: damping, 1/s.
+        weight: of the squared error of acceleration.
+        J: Jacobian of the task not to be disturbed, shape (m, n), or None.
+    """
+    error = q_des - q
+    if J is not None:
+        error = null_space_part(J, error)
+    return TaskTerm(None, kp * error - kd * v, weight)
+
+
+def null_space_part(J: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return the part of joint vector `x`, shape (n,), that does not move the task.
+
+    ``x - J^T (J J^T + eps I)^-1 J x``; eps keeps it defined where J, shape (m, n), has lost
+    rank, and there leaves in the directions that the task cannot move anyway.
+    """
+    JJt = J @ J.T
+    JJt.flat[:: len(JJt) + 1] += _RANK_REGULARISATION
+    return x - J.T @ np.linalg.solve(JJt, J @ x)
+
+
+def damping_task(v: np.ndarray, kd: float) -> TaskTerm:
+    """Bring the joints to rest wherever they are."""
+    return TaskTerm(None, -kd * v, 1.0)
+
+
+def pose_error(pose: pin.SE3, pose_des: pin.SE3) -> np.ndarray:
+    """Return ``log(H^-1 H_des)``, shape (6,): m, then rad, in the end effector's axes."""
+    return pin.log6(pose.actInv(pose_des)).vector
+
+
+def pose_task(
+    robot: RobotModel, v: np.ndarray, error: np.ndarray, kp: float, kd: float, weight: float
+) -> TaskTerm:
+    """Bring the end effector to a pose: eq. (34) of [DelPrete2018].
+
+    Args:
+        robot: updated to the current state.
+        v: joint velocities, shape (n,), rad/s.
+        error: `pose_error`, shape (6,).
+        kp: stiffness, 1/s^2.
+        kd: damping, 1/s.
+        weight: of the squared error of acceleration.
+    """
+    return TaskTerm(robot.J, kp * error - kd * (robot.J @ v) - robot.drift, weight)

@@ -1,0 +1,28 @@
+"""Build description of viability_bounds_pkg."""
+
+from setuptools import find_packages, setup
+
+PACKAGE = "viability_bounds_pkg"
+
+setup(
+    name=PACKAGE,
+    version="0.1.0",
+    packages=find_packages(exclude=["test"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=True,
+    maintainer="The viability bounds authors",
+    maintainer_email="maintainers@viability-bounds.example.org",
+    description="Exact joint acceleration bounds as a library and a ROS 2 node.",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            "bounds_node = viability_bounds_pkg.bounds_node:main",
+            "estimate_acceleration_limits = "
+            "viability_bounds_pkg.estimate_acceleration_limits:main",
+        ],
+    },
+)

@@ -1,0 +1,1 @@
+"""Exact joint acceleration bounds that keep position and velocity limits for ever."""

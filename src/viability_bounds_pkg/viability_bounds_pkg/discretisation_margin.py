@@ -1,0 +1,262 @@
+"""How far a joint acceleration drifts while the torque is held for one control period.
+
+A torque-controlled robot receives a torque that is constant for a period `dt`, so that its
+acceleration is not: the inertia and the bias forces of eq. (30) of [DelPrete2018] change on the
+way. The paper neglects it ("time steps are typically short"); this module measures it, so that
+the acceleration bounds can keep it back as a margin.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from viability_bounds_pkg.state_space import (
+    LimitEstimateError,
+    StateSpace,
+    forward_dynamics,
+    inverse_dynamics,
+)
+
+Array = NDArray[np.float64]
+
+SUBSTEPS = 2
+"""Runge-Kutta steps a period: its error, of order (dt / SUBSTEPS)^5, is far below the defects."""
+
+
+@dataclass(frozen=True)
+class HoldDefects:
+    """What holding the torque for a period changes, worst case over the states searched.
+
+    Attributes:
+        acceleration: sup over t in [0, dt] of abs(a(t) - a), shape (n,), rad/s^2.
+        mean_acceleration: sup of abs((v(dt) - v) / dt - a), shape (n,), rad/s^2.
+        position: sup of abs(q(dt) - q - v dt - a dt^2 / 2), shape (n,), rad.
+        q: the state at which joint j's `acceleration` was found is row j, shape (n, n), rad.
+        v: its velocity, shape (n, n), rad/s.
+        a: the acceleration asked for there, shape (n, n), rad/s^2.
+    """
+
+    acceleration: Array
+    mean_acceleration: Array
+    position: Array
+    q: Array
+    v: Array
+    a: Array
+
+
+@dataclass(frozen=True)
+class DiscretisationMargin:
+    """Defects of the two ways to turn an acceleration into the torque held for a period.
+
+    Attributes:
+        dt: the control period, s.
+        mid_step: with the torque computed at the predicted middle of the period,
+            ``rnea(q + v dt/2 + a dt^2/8, v + a dt/2, a)``.
+        start_of_step: with the torque computed at the start, ``rnea(q, v, a)``.
+        samples: how many random states were drawn.
+        accepted: how many of them asked for a torque within the limits (mid-step law).
+    """
+
+    dt: float
+    mid_step: HoldDefects
+    start_of_step: HoldDefects
+    samples: int
+    accepted: int
+
+    @property
+    def margin(self) -> Array:
+        """What to keep back from the acceleration limits, shape (n,), rad/s^2."""
+        return self.mid_step.acceleration
+
+
+def mid_step_torque(model: pin.Model, q: Array, v: Array, a: Array, dt: float) -> Array:
+    """Return the torque for `a` at the middle of a period in which `a` is constant.
+
+    Holding it, the acceleration is too small by about half a period's drift at the start and too
+    large by as much at the end, and right on average to second order in `dt`.
+
+    Args:
+        model: the robot.
+        q: positions, shape (batch, n), rad.
+        v: velocities, shape (batch, n), rad/s.
+        a: accelerations wanted, shape (batch, n), rad/s^2.
+        dt: period, s; zero gives the plain inverse dynamics of the state.
+
+    Returns:
+        Torques, shape (batch, n), N m.
+    """
+    q_mid = q + 0.5 * dt * v + 0.125 * dt**2 * a
+    return inverse_dynamics(model, q_mid, v + 0.5 * dt * a, a)
+
+
+def hold_defects(
+    model: pin.Model, q: Array, v: Array, a: Array, tau: Array, dt: float, substeps: int = SUBSTEPS
+) -> Array:
+    """Integrate ``M a + h = tau`` with `tau` held and return the three defects of `HoldDefects`.
+
+    Classical Runge-Kutta; a(t) is looked at where the integrator's steps begin and end, which
+    includes both ends of the period, where the drift, linear in time to first order, is largest.
+
+    Args:
+        model: the robot.
+        q: positions at the start, shape (batch, n), rad.
+        v: velocities at the start, shape (batch, n), rad/s.
+        a: accelerations wanted, shape (batch, n), rad/s^2.
+        tau: torques held, shape (batch, n), N m.
+        dt: period, s.
+        substeps: integration steps.
+
+    Returns:
+        Defects of acceleration, mean acceleration and position, shape (batch, 3, n).
+    """
+    step = dt / substeps
+    q_now, v_now = q, v
+    drift = np.zeros_like(q)
+    for _ in range(substeps):
+        a_1 = forward_dynamics(model, q_now, v_now, tau)
+        v_2 = v_now + 0.5 * step * a_1
+        a_2 = forward_dynamics(model, q_now + 0.5 * step * v_now, v_2, tau)
+        v_3 = v_now + 0.5 * step * a_2
+        a_3 = forward_dynamics(model, q_now + 0.5 * step * v_2, v_3, tau)
+        v_4 = v_now + step * a_3
+        a_4 = forward_dynamics(model, q_now + step * v_3, v_4, tau)
+        drift = np.maximum(drift, np.abs(a_1 - a))
+        q_now = q_now + step / 6 * (v_now + 2 * v_2 + 2 * v_3 + v_4)
+        v_now = v_now + step / 6 * (a_1 + 2 * a_2 + 2 * a_3 + a_4)
+    drift = np.maximum(drift, np.abs(forward_dynamics(model, q_now, v_now, tau) - a))
+    mean = np.abs((v_now - v) / dt - a)
+    position = np.abs(q_now - q - dt * v - 0.5 * dt**2 * a)
+    return np.stack([drift, mean, position], axis=1)
+
+
+def discretisation_margin(
+    model: pin.Model,
+    q_min: ArrayLike,
+    q_max: ArrayLike,
+    v_max: ArrayLike,
+    a_min: ArrayLike,
+    a_max: ArrayLike,
+    tau_max: ArrayLike,
+    dt: float,
+    samples: int = 20_000,
+    seed: int = 0,
+    *,
+    starts: int = 8,
+    rounds: int = 40,
+) -> DiscretisationMargin:
+    """Return the worst acceleration drift of a torque held for `dt`, for both torque laws.
+
+    States and accelerations are drawn within their limits; those that ask for a torque beyond
+    `tau_max` are skipped, as the controller does not command them. From the worst ones a local
+    random search goes on, for each joint and defect: random sampling in 3 n dimensions alone
+    stays well below the supremum. The result is a lower bound of the true supremum all the same.
+
+    Args:
+        model: the robot, one degree of freedom a joint, n of them.
+        q_min: lower position limits, shape (n,), rad; infinite for continuous joints.
+        q_max: upper position limits, shape (n,), rad.
+        v_max: velocity limits, shape (n,), rad/s.
+        a_min: lower acceleration limits, shape (n,), rad/s^2.
+        a_max: upper acceleration limits, shape (n,), rad/s^2.
+        tau_max: torque limits, shape (n,), N m.
+        dt: control period, s.
+        samples: random states.
+        seed: of the random generator.
+        starts: worst states, per joint and defect, to search on from.
+        rounds: steps of the local search; zero for sampling alone.
+
+    Raises:
+        LimitEstimateError: limits of the wrong shape, sign or order, a `dt` that is not
+            positive, no samples, or no sampled state within the torque limits.
+    """
+    space = StateSpace.of(model, q_min, q_max, v_max, tau_max)
+    n = space.n
+    a_min, a_max = (np.asarray(limit, dtype=float) for limit in (a_min, a_max))
+    if a_min.shape != (n,) or a_max.shape != (n,) or not np.all(a_min < a_max):
+        raise LimitEstimateError(f"a_min and a_max must have {n} values each, a_min < a_max")
+    if not (math.isfinite(dt) and dt > 0):
+        raise LimitEstimateError(f"dt must be positive, is {dt}")
+    if samples < 1:
+        raise LimitEstimateError(f"samples must be at least 1, is {samples}")
+    lower = np.concatenate([space.q_min, -space.v_max, a_min])
+    upper = np.concatenate([space.q_max, space.v_max, a_max])
+    rng = np.random.default_rng(seed)
+    points = lower + rng.random((samples, 3 * n)) * (upper - lower)
+    laws = []
+    for lead in (dt, 0.0):  # how far ahead the torque looks
+
+        def defects_of(points: Array, lead: float = lead) -> Array:
+            q, v, a = np.split(points, 3, axis=1)
+            tau = mid_step_torque(model, q, v, a, lead)
+            allowed = np.all(np.abs(tau) <= space.tau_max, axis=1)
+            defects = np.full((len(points), 3 * n), -np.inf)
+            defects[allowed] = hold_defects(
+                model, q[allowed], v[allowed], a[allowed], tau[allowed], dt
+            ).reshape(-1, 3 * n)
+            return defects
+
+        values = defects_of(points)
+        accepted = int(np.count_nonzero(np.isfinite(values[:, 0])))
+        if not accepted:
+            raise LimitEstimateError(
+                f"none of {samples} sampled states and accelerations is within the torque "
+                "limits; narrow a_min and a_max"
+            )
+        best, worst = _climb(
+            defects_of, points, values, lower, upper, starts, rounds, np.random.default_rng(seed)
+        )
+        drift, mean, position = worst.reshape(3, n)
+        q, v, a = np.split(best[:n], 3, axis=1)
+        laws.append((HoldDefects(drift, mean, position, q, v, a), accepted))
+    (mid_step, accepted), (start_of_step, _) = laws
+    return DiscretisationMargin(dt, mid_step, start_of_step, samples, accepted)
+
+
+def _climb(
+    evaluate: Callable[[Array], Array],
+    points: Array,
+    values: Array,
+    lower: Array,
+    upper: Array,
+    starts: int,
+    rounds: int,
+    rng: np.random.Generator,
+) -> tuple[Array, Array]:
+    """Maximise every objective over a box by a random search that narrows round by round.
+
+    Args:
+        evaluate: maps points, shape (batch, d), to objectives, shape (batch, m), with minus
+            infinity where a point is not allowed.
+        points: where to begin, shape (batch, d).
+        values: their objectives, shape (batch, m).
+        lower: of the box, shape (d,).
+        upper: of the box, shape (d,).
+        starts: how many of the best points of each objective are followed.
+        rounds: how often each of them is perturbed.
+        rng: source of the perturbations.
+
+    Returns:
+        The best points, shape (m, d), and their objectives, shape (m,).
+    """
+    order = np.argsort(-values, axis=0)[:starts]  # shape (followed, m)
+    objective = np.tile(np.arange(values.shape[1]), len(order))
+    best = points[order.reshape(-1)]
+    best_values = values[order.reshape(-1), objective]
+    rows = np.arange(len(best))
+    for k in range(rounds):
+        reach = 0.3 * 0.01 ** (k / rounds)
+        moved = rng.random(best.shape) < 0.4
+        step = moved * rng.normal(scale=reach, size=best.shape) * (upper - lower)
+        proposal = np.clip(best + step, lower, upper)
+        scores = evaluate(proposal)[rows, objective]
+        better = scores > best_values
+        best[better], best_values[better] = proposal[better], scores[better]
+    champion = np.argmax(best_values.reshape(order.shape), axis=0)
+    chosen = champion * values.shape[1] + np.arange(values.shape[1])
+    return best[chosen], best_values[chosen]

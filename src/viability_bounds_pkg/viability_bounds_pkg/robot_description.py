@@ -1,0 +1,155 @@
+"""Where a robot description comes from, and the Pinocchio model made of it.
+
+A URDF is named by a file path or by a ``package://`` URI. Packages are looked up where ROS 2
+looks (``AMENT_PREFIX_PATH``, ``ROS_PACKAGE_PATH``) and where the ``example-robot-data`` wheel
+puts its robots, so that one parameter file works with both.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pinocchio as pin
+
+
+class RobotDescriptionError(ValueError):
+    """A URDF that cannot be found or loaded, or that lacks a joint or frame asked for."""
+
+
+def package_directories() -> Iterator[Path]:
+    """Yield the directories whose children are packages, in order of precedence."""
+    for prefix in filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)):
+        yield Path(prefix) / "share"
+    for root in filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)):
+        yield Path(root)
+    for entry in sys.path:
+        yield Path(entry) / "cmeel.prefix" / "share"
+
+
+def resolve_uri(uri: str) -> Path:
+    """Return the file that a path, ``file://`` or ``package://`` URI names.
+
+    Args:
+        uri: what to look up; a package name is the first component of a ``package://`` URI.
+
+    Raises:
+        RobotDescriptionError: no such file.
+    """
+    if uri.startswith("package://"):
+        relative = uri.removeprefix("package://")
+        for directory in package_directories():
+            path = directory / relative
+            if path.is_file():
+                return path
+        package = relative.split("/", 1)[0]
+        raise RobotDescriptionError(f"{uri}: no package {package!r} holds this file")
+    path = Path(uri.removeprefix("file://")).expanduser()
+    if not path.is_file():
+        raise RobotDescriptionError(f"{uri}: no such file")
+    return path
+
+
+def read_urdf(uri: str) -> str:
+    """Return the text of the URDF that `uri` names, checked to be well-formed XML.
+
+    Raises:
+        RobotDescriptionError: the file is missing, unreadable or is not a URDF.
+    """
+    path = resolve_uri(uri)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise RobotDescriptionError(f"{uri}: {error}") from error
+    check_urdf(text, uri)
+    return text
+
+
+def check_urdf(text: str, source: str) -> None:
+    """Raise `RobotDescriptionError`, naming `source`, unless `text` is a URDF."""
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise RobotDescriptionError(f"{source}: not well-formed XML ({error})") from error
+    if root.tag != "robot":
+        raise RobotDescriptionError(f"{source}: root element is <{root.tag}>, not <robot>")
+
+
+def build_model(
+    urdf: str, joints: Sequence[str], locked_positions: Mapping[str, float] | None = None
+) -> pin.Model:
+    """Return the Pinocchio model of `joints`, every other joint locked.
+
+    Args:
+        urdf: text of the URDF.
+        joints: the joints to keep, each with one degree of freedom, in the order that the
+            caller's arrays use; Pinocchio must number them in this order.
+        locked_positions: where other joints are locked, rad; joints left out are locked at
+            Pinocchio's neutral configuration (zero).
+
+    Returns:
+        A model with ``nq == nv == len(joints)``. Continuous joints are angles too, with
+        infinite position limits.
+
+    Raises:
+        RobotDescriptionError: an unknown joint, a planar or floating joint, or an order that
+            differs from the kinematic one.
+    """
+    urdf, continuous = _continuous_as_revolute(urdf)
+    try:
+        full = pin.buildModelFromXML(urdf)
+    except (ValueError, RuntimeError) as error:
+        raise RobotDescriptionError(f"URDF does not load: {error}") from error
+    configuration = pin.neutral(full)
+    names = list(full.names)
+    for name in (*joints, *(locked_positions or ())):
+        if name not in names:
+            known = ", ".join(names[1:])
+            raise RobotDescriptionError(f"unknown joint {name!r}; the URDF has: {known}")
+    for name, position in (locked_positions or {}).items():
+        joint = full.joints[full.getJointId(name)]
+        if joint.nq != 1:
+            raise RobotDescriptionError(f"joint {name!r} cannot be locked at one coordinate")
+        configuration[joint.idx_q] = position
+    locked = [i for i in range(1, full.njoints) if names[i] not in joints]
+    model = pin.buildReducedModel(full, locked, configuration)
+    for index in range(1, model.njoints):
+        if model.joints[index].nq != 1 or model.joints[index].nv != 1:
+            raise RobotDescriptionError(
+                f"joint {model.names[index]!r} is planar or floating; "
+                "joints must be revolute, continuous or prismatic"
+            )
+    kept = list(model.names)[1:]
+    if kept != list(joints):
+        raise RobotDescriptionError(
+            f"joints must be listed once each, from base to tip: {', '.join(kept)}"
+        )
+    for index in [i for i, name in enumerate(joints) if name in continuous]:
+        model.lowerPositionLimit[index] = -math.inf
+        model.upperPositionLimit[index] = math.inf
+    return model
+
+
+def _continuous_as_revolute(urdf: str) -> tuple[str, set[str]]:
+    """Return the URDF with continuous joints made revolute, and their names.
+
+    Pinocchio keeps a continuous joint as (cos, sin), two coordinates for one velocity; the
+    nodes exchange angles, so that one coordinate a joint is what everything here wants.
+    """
+    root = ElementTree.fromstring(urdf)
+    names = set()
+    for joint in root.iter("joint"):
+        if joint.get("type") != "continuous":
+            continue
+        names.add(joint.get("name", ""))
+        joint.set("type", "revolute")
+        limit = joint.find("limit")
+        if limit is None:
+            limit = ElementTree.SubElement(joint, "limit", effort="0", velocity="0")
+        limit.set("lower", "-1e9")
+        limit.set("upper", "1e9")
+    return (ElementTree.tostring(root, encoding="unicode") if names else urdf), names
