@@ -47,7 +47,7 @@ set -u
 export ROS_DOMAIN_ID="${ROS_DOMAIN_ID:-$((1 + $$ % 100))}"
 export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
 
-overrides=(-p "clock:=$clock" -p "method:=$bounds" -p start_paused:=true)
+overrides=(-p "clock:=$clock" -p "bounds_node:method:=$bounds" -p start_paused:=true)
 [ -z "$rate" ] || overrides+=(-p "rate_hz:=$rate")
 if [ "$clock" = lockstep ]; then
     # The robot waits: a busy machine must not look like a dead node.

@@ -53,7 +53,8 @@ class BulletNode(Node):
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("bullet_node", **node_arguments)
         try:
-            config = NodeParameters(self, TABLE, make_configuration).configuration
+            self._node_parameters = NodeParameters(self, TABLE, make_configuration)
+            config = self._node_parameters.configuration
             self._robot = _make_robot(config)
         except ParameterError:
             self.destroy_node()
@@ -102,11 +103,18 @@ class BulletNode(Node):
         self._robot.reset(config.q_start, np.zeros(n))
         self._monitor.reset()
         self._tau: np.ndarray | None = None
-        self._missed_in_row = self._missed = self._periods = self._braked = 0
+        self._missed_in_row = self._missed = self._braked = 0
+        self._periods = self._pause_at = 0
+        self._plan_pause()
         self._torque_ratio = 0.0
         self._refused: Counter[str] = Counter()
         self._latencies: deque[float] = deque(maxlen=_LATENCIES_KEPT)
         self._started_at = time.monotonic()
+
+    def _plan_pause(self) -> None:
+        """Find the period at which to pause, as `pause_after` says; counted from now."""
+        periods = round(self._node_parameters.configuration.pause_after / self._config.dt)
+        self._pause_at = self._periods + periods if periods else math.inf
 
     # The course of time
 
@@ -138,6 +146,9 @@ class BulletNode(Node):
             self._robot.step(self._tau, config.substeps)
         self._periods += 1
         self._advanced = True
+        if self._periods >= self._pause_at:
+            self._pause_at = math.inf
+            self._pause()
 
     def _tick(self) -> None:
         """End a period of the wall clock and begin the next."""
@@ -154,6 +165,10 @@ class BulletNode(Node):
                     )
             self._advance()
         self._next_state()
+
+    def _pause(self) -> None:
+        self._paused = True
+        self._diagnostics.publish()
 
     def _retry(self) -> None:
         """Send the state again if the chain lost it, or does not listen yet."""
@@ -231,11 +246,11 @@ class BulletNode(Node):
         if self._paused and not request.data:
             self._paused = False
             self._started_at = time.monotonic()
+            self._plan_pause()
             # A new stamp: what was answered during the pause answered old goals.
             self._next_state()
-        else:
-            self._paused = request.data
-        self._diagnostics.publish()
+        elif request.data:
+            self._pause()
         response.success = True
         response.message = "paused" if self._paused else "running"
         return response

@@ -40,6 +40,13 @@ TABLE = (
         default=5,
     ),
     Parameter("start_paused", bool, "wait for the pause service before moving", default=False),
+    Parameter(
+        "pause_after",
+        float,
+        "robot time after which it pauses by itself, s since it began to move; 0: never",
+        default=0.0,
+        live=True,
+    ),
     Parameter("publish_clock", bool, "publish /clock", default=False),
     Parameter(
         "external_wrench_timeout", float, "how long a push lasts, s of robot time", default=0.5
@@ -64,6 +71,7 @@ class BulletConfiguration:
     lockstep: bool
     command_timeout: int
     start_paused: bool
+    pause_after: float
     publish_clock: bool
     external_wrench_timeout: float
 
@@ -107,6 +115,7 @@ def make_configuration(values: Mapping[str, Any]) -> BulletConfiguration:
         lockstep=values["clock"] == "lockstep",
         command_timeout=values["command_timeout"],
         start_paused=values["start_paused"],
+        pause_after=positive(values, "pause_after", zero=True),
         publish_clock=values["publish_clock"],
         external_wrench_timeout=positive(values, "external_wrench_timeout"),
     )

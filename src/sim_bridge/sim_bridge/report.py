@@ -77,9 +77,7 @@ def _metrics(
     position = _floats(robot, "position_violation_rad")
     velocity = _floats(robot, "velocity_violation_rad_s")
     ratio = max(float(robot["commanded_torque_ratio_max"]), _floats(robot, "torque_ratio").max())
-    kept = (
-        position.max() <= TOLERANCE and velocity.max() <= TOLERANCE and ratio <= 1.0 + TOLERANCE
-    )
+    kept = position.max() <= TOLERANCE and velocity.max() <= TOLERANCE and ratio <= 1.0 + TOLERANCE
     return {
         "robot": config.name,
         "bounds_method": bounds.get("method", "unknown"),
@@ -164,7 +162,7 @@ def _draw(path: Path, config, run: Run, errors: np.ndarray, metrics: dict) -> No
     clearance = np.minimum(run.q - config.q_min, config.q_max - run.q).min(axis=0)
     j = int(np.argmin(clearance))
     t = run.t
-    figure, axes = plt.subplots(4, 2, figsize=(12, 11), sharex=True, layout="constrained")
+    figure, axes = plt.subplots(4, 2, figsize=(12, 10), sharex=True, layout="constrained")
     verdict = "no limit broken" if metrics["limits_kept"] else "LIMITS BROKEN"
     figure.suptitle(
         f"{config.name}: {metrics['bounds_method']} bounds, {metrics['rate_hz']:g} Hz, "
@@ -198,7 +196,7 @@ def _draw(path: Path, config, run: Run, errors: np.ndarray, metrics: dict) -> No
         every[1].plot(t, run.v[:, i] / config.v_max[i])
         every[2].plot(t, run.tau[:, i] / config.tau_max[i])
     every[0].set(title="all joints, limits at -1 and 1", ylabel="position / limit")
-    every[0].legend(loc="center right", fontsize="small")
+    every[0].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize="small")
     every[1].set(ylabel="velocity / limit")
     every[2].set(ylabel="torque / limit")
     every[3].semilogy(t, np.maximum(1e3 * errors[:, 0], 1e-3), label="position [mm]")

@@ -15,12 +15,17 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, WrenchStamped
+from rcl_interfaces.srv import SetParameters
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
+
+from sim_bridge.recording import Recorder, Run
+from sim_bridge.scenario import PoseGoal, PostureGoal, Push, Scenario, ScenarioError, load_scenario
 from viability_bounds_pkg.robot_description import RobotDescriptionError, read_urdf
 from viability_bounds_pkg.ros_parameters import (
     NodeParameters,
@@ -38,9 +43,6 @@ from viability_bounds_pkg.ros_runtime import (
     set_stamp,
     stamp_to_ns,
 )
-
-from sim_bridge.recording import Recorder, Run
-from sim_bridge.scenario import PoseGoal, PostureGoal, Push, Scenario, ScenarioError, load_scenario
 
 _RECORDING_QOS = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.BEST_EFFORT)
 _SHOW_PERIOD = 0.5
@@ -123,8 +125,6 @@ class Phase(Enum):
     LOADING = auto()
     """Goals are sent; the controller does not report them yet."""
     PLAYING = auto()
-    STOPPING = auto()
-    """Over; the robot's last word is awaited."""
     DONE = auto()
 
 
@@ -158,6 +158,7 @@ class ScenarioNode(Node):
         self._state: JointState | None = None
         self.stamp = self._first = 0
         self._last = math.inf
+        self._plan = None
         self._answered = False
         self._pushes: list[tuple[float, Push | None]] = []
         self._index: list[int] | None = None
@@ -165,6 +166,7 @@ class ScenarioNode(Node):
         self._postures = self.create_publisher(JointState, "target_posture", GOAL_QOS)
         self._wrenches = self.create_publisher(WrenchStamped, "external_wrench", GOAL_QOS)
         self._pause = self.create_client(SetBool, "bullet_node/pause")
+        self._settings = self.create_client(SetParameters, "bullet_node/set_parameters")
         self.create_subscription(JointState, "joint_states", self._on_state, _RECORDING_QOS)
         self.create_subscription(
             JointTrajectory, "acceleration_limits", self._on_limits, _RECORDING_QOS
@@ -189,9 +191,6 @@ class ScenarioNode(Node):
         self._state = message
         self.stamp = stamp_to_ns(message.header.stamp)
         self._recorder.add_state(self.stamp, *self._arrays(message.position, message.velocity))
-        if self.phase is Phase.PLAYING and self.stamp >= self._last:
-            self.phase = Phase.STOPPING
-            self._pause.call_async(SetBool.Request(data=True))
 
     def _arrays(self, *sequences) -> list[list[float]]:
         return [[sequence[i] for i in self._index] for sequence in sequences]
@@ -225,9 +224,9 @@ class ScenarioNode(Node):
             self._pause.call_async(SetBool.Request(data=False))
         elif self.phase is Phase.PLAYING:
             self._push()
-        elif self.phase is Phase.STOPPING and self.robot.get("paused") == "True":
-            # Statistics of the robot are final once it reports that it is paused.
-            if int(self.robot["stamp_ns"]) >= self._last:
+            # It pauses by itself, and what it reports then is final.
+            over = int(self.robot["stamp_ns"]) >= self._last
+            if over and self.robot["paused"] == "True":
                 self.phase = Phase.DONE
 
     def _chain_is_up(self) -> bool:
@@ -235,19 +234,24 @@ class ScenarioNode(Node):
             self._answered
             and self.robot.get("paused") == "True"
             and self._pause.service_is_ready()
+            and self._settings.service_is_ready()
             and self._poses.get_subscription_count() > 0
             and self._postures.get_subscription_count() > 0
         )
 
     def _goals_are_in(self) -> bool:
         goals = [event for event in self.config.scenario.events if not isinstance(event, Push)]
-        return self.controller.get("goals_pending") == str(len(goals))
+        planned = self._plan is not None and self._plan.done()
+        return planned and self.controller.get("goals_pending") == str(len(goals))
 
     def _send_goals(self) -> None:
         # Resuming begins a period of its own: the first state that moves is the next.
         period = round(1e9 * float(self.robot["period_s"]))
         self._first = self.stamp + period
-        self._last = self._first + round(1e9 * self.config.scenario.duration)
+        duration = self.config.scenario.duration
+        self._last = self._first + round(duration * 1e9 / period) * period - period
+        end = RosParameter("pause_after", value=duration).to_parameter_msg()
+        self._plan = self._settings.call_async(SetParameters.Request(parameters=[end]))
         for event in self.config.scenario.events:
             stamp = self._first + round(1e9 * event.time)
             if isinstance(event, PoseGoal):
@@ -316,8 +320,10 @@ def play(node: ScenarioNode) -> None:
         if (node.stamp, node.phase) != stamp:
             stamp, moved_at = (node.stamp, node.phase), now
         elif now - moved_at > node.config.ready_timeout:
-            raise TimeoutError(f"nothing has moved for {node.config.ready_timeout:g} s "
-                               f"({node.phase.name.lower().replace('_', ' ')})")
+            raise TimeoutError(
+                f"nothing has moved for {node.config.ready_timeout:g} s "
+                f"({node.phase.name.lower().replace('_', ' ')})"
+            )
         if now - shown_at > _SHOW_PERIOD:
             shown_at = now
             print(node.live_line(), end="\r" if terminal else "\n", flush=True)
@@ -345,7 +351,11 @@ def main(args: list[str] | None = None) -> int:
             return 0
         from sim_bridge.report import write_report  # matplotlib takes a second to import
 
-        return 0 if write_report(out, node.config, node.recorded_run(), node.robot, node.bounds) else 1
+        return (
+            0
+            if write_report(out, node.config, node.recorded_run(), node.robot, node.bounds)
+            else 1
+        )
     except TimeoutError as error:
         report_refusal(error)
         return 2

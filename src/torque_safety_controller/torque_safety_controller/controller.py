@@ -159,18 +159,14 @@ class Controller:
         bias = robot.h if additional is None else robot.h + additional
         lower, upper = self._torque_range()
         try:
-            solution = self._qp.solve(
-                tasks, a_lower, a_upper, robot.M, lower - bias, upper - bias
-            )
+            solution = self._qp.solve(tasks, a_lower, a_upper, robot.M, lower - bias, upper - bias)
         except NoSolutionFound as error:
             return self._hold(q, v, additional, str(error))
         self.iterations = solution.iterations
         tau = robot.torque(q, v, solution.a)
         if additional is not None:
             tau = tau + additional
-        return Step(
-            self._limited(tau), self._remember(solution.a), tracking, solution.relaxation
-        )
+        return Step(self._limited(tau), self._remember(solution.a), tracking, solution.relaxation)
 
     def hold(self, q: np.ndarray, v: np.ndarray) -> Step:
         """Return a torque that needs no acceleration bounds: gravity and damping.

@@ -16,9 +16,6 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
-from viability_bounds_pkg.ros_messages import Diagnostics, JointStateReader, Verdict
-from viability_bounds_pkg.ros_parameters import NodeParameters, ParameterError
-from viability_bounds_pkg.ros_runtime import CONTROL_QOS, GOAL_QOS, run, stamp_to_ns
 
 from torque_safety_controller.controller import Controller, Step
 from torque_safety_controller.controller_parameters import (
@@ -35,6 +32,9 @@ from torque_safety_controller.ros_goals import (
     posture_from_message,
 )
 from torque_safety_controller.ros_limits import LimitsReader
+from viability_bounds_pkg.ros_messages import Diagnostics, JointStateReader, Verdict
+from viability_bounds_pkg.ros_parameters import NodeParameters, ParameterError
+from viability_bounds_pkg.ros_runtime import CONTROL_QOS, GOAL_QOS, run, stamp_to_ns
 
 _LATENCIES_KEPT = 4096
 
@@ -49,12 +49,12 @@ class ControllerNode(Node):
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("controller_node", **node_arguments)
         try:
-            self._parameters = NodeParameters(self, TABLE, make_configuration, self._configure)
-            robot, self._base = load_robot(self._parameters.values)
+            self._node_parameters = NodeParameters(self, TABLE, make_configuration, self._configure)
+            robot, self._base = load_robot(self._node_parameters.values)
         except ParameterError:
             self.destroy_node()
             raise
-        config = self._config = self._parameters.configuration
+        config = self._config = self._node_parameters.configuration
         self._controller = Controller(robot, config.tau_max, config.gains, config.tau_rate_max)
         self._states = JointStateReader(config.joints, config.state_timeout)
         self._limits = LimitsReader(config.joints)
@@ -101,6 +101,7 @@ class ControllerNode(Node):
         self._message_at, self._message_stamp = now, message.header.stamp
         verdict = self._states.read(message, now)
         if verdict is Verdict.REPEAT:
+            self._state_at = now
             if self._answered_stamp == self._states.stamp:
                 self._send(message.header.stamp)
             return
@@ -153,7 +154,7 @@ class ControllerNode(Node):
         self._send(stamp)
         self._answered_stamp = stamp_to_ns(stamp)
         self._answered_at = now
-        self._latencies.append(now - self._state_at)
+        self._latencies.append(now - self._message_at)
         if step.failure:
             self._failures += 1
         if step.tracking:

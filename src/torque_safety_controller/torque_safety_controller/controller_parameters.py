@@ -8,6 +8,10 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+
+from torque_safety_controller.controller import Gains
+from torque_safety_controller.robot_model import RobotModel
+from torque_safety_controller.tasks import critical_damping
 from viability_bounds_pkg.robot_description import (
     RobotDescriptionError,
     build_model,
@@ -22,10 +26,6 @@ from viability_bounds_pkg.ros_parameters import (
     per_joint,
     positive,
 )
-
-from torque_safety_controller.controller import Gains
-from torque_safety_controller.robot_model import RobotModel
-from torque_safety_controller.tasks import critical_damping
 
 TABLE = (
     Parameter("robot_description", str, "URDF: path or package:// URI"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
+
 from viability_bounds_pkg.robot_description import RobotDescriptionError
 
 

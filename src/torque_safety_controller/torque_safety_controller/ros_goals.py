@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import JointState
+
 from viability_bounds_pkg.ros_runtime import stamp_to_ns
 
 _QUATERNION_TOLERANCE = 1e-3

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from trajectory_msgs.msg import JointTrajectory
+
 from viability_bounds_pkg.ros_runtime import stamp_to_ns
 
 

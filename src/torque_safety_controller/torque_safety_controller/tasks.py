@@ -14,7 +14,6 @@ import pinocchio as pin
 
 from torque_safety_controller.robot_model import RobotModel
 
-
 _RANK_REGULARISATION = 1e-9
 
 

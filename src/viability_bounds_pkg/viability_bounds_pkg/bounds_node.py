@@ -45,6 +45,13 @@ TABLE = (
         "rad/s^3; the bounds keep back this times the control period",
         default=np.zeros(0),
     ),
+    Parameter(
+        "position_margin",
+        float,
+        "how far inside the position limits the bounds keep the joints, rad: what the robot or "
+        "its sensors may be off",
+        default=0.0,
+    ),
     Parameter("rate_hz", float, "rate of the control loop, Hz"),
     Parameter(
         "bounds_dt_factor",
@@ -100,15 +107,22 @@ def make_configuration(values: Mapping[str, Any]) -> BoundsConfiguration:
     factor = positive(values, "bounds_dt_factor")
     if factor < 1.0:
         raise ParameterError("bounds_dt_factor", factor, ">= 1")
+    inset = positive(values, "position_margin", zero=True)
+    q_min = per_joint(values, "position_min", joints)
+    q_max = per_joint(values, "position_max", joints)
+    if (q_max - q_min <= 2.0 * inset).any() and (q_min < q_max).all():
+        raise ParameterError("position_margin", inset, "less than half of every joint's range")
     margin = np.zeros(len(joints))
     if len(values["acceleration_drift"]):
         margin = per_joint(values, "acceleration_drift", joints) * dt
     try:
         limits = JointLimits(
             joints,
+            q_min + inset,
+            q_max - inset,
             *(
                 per_joint(values, PARAMETER_OF[field], joints)
-                for field in ("q_min", "q_max", "v_max", "a_min", "a_max")
+                for field in ("v_max", "a_min", "a_max")
             ),
         )
         if values["method"] == "exact":
@@ -141,11 +155,11 @@ class BoundsNode(Node):
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("bounds_node", **node_arguments)
         try:
-            self._parameters = NodeParameters(self, TABLE, make_configuration, self._configure)
+            self._node_parameters = NodeParameters(self, TABLE, make_configuration, self._configure)
         except ParameterError:
             self.destroy_node()
             raise
-        config = self._parameters.configuration
+        config = self._node_parameters.configuration
         joints = config.limits.names
         self._solve = config.solve
         self._reader = JointStateReader(joints, config.state_timeout)
@@ -195,7 +209,7 @@ class BoundsNode(Node):
         self._publisher.publish(self._answer)
 
     def _report(self) -> tuple[bytes, str, dict[str, Any]]:
-        config = self._parameters.configuration
+        config = self._node_parameters.configuration
         silent = self._reader.stamp < 0
         values = {
             "method": config.method,

@@ -150,7 +150,7 @@ def bound_towards(room: float, v: float, side: Side) -> tuple[float, bool]:
         return a, room >= 0.0
     viable = v * v <= twice_braking * room
     if viable and landing is not None:
-        budget = room + half_dt * v
+        budget = min(room + half_dt * v, far)
         c = twice_braking * budget
         reachable = landing_speed(budget, c / (k + sqrt(k2 + c)), landing)
         viable = v <= reachable * (1.0 + ROUNDING)
@@ -210,7 +210,7 @@ def are_viable_towards(room: Array, v: Array, side: Side) -> NDArray[np.bool_]:
     viable = towards * towards <= side.twice_braking * room
     if side.landing is not None:
         (at,) = np.nonzero(viable & (v > 0.0))
-        budget = room[at] + side.half_dt * v[at]
+        budget = np.minimum(room[at] + side.half_dt * v[at], side.far)
         c = side.twice_braking * budget
         w = c / (side.k + np.sqrt(side.k2 + c))
         landing_speeds(budget, w, side.landing)

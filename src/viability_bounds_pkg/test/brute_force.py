@@ -1,0 +1,197 @@
+"""Problem (4) of [DelPrete2018] solved as it is stated, to check the closed forms against.
+
+Nothing here comes from Algorithms 1 to 3 or from `docs/bounds.md`: no stopping distance, no
+kernel, no case distinction. A motion is N steps of constant acceleration, eq. (5). Everything is
+linear in the accelerations, so that "maximise a_0 subject to the limits" is a linear program
+with a constraint for each of infinitely many times. It is solved by exchange: keep the limits at
+some times, find where the resulting parabolas leave the range (their extrema), add those times,
+repeat. The horizon is bracketed: a motion that need not be continued after N steps gives at
+least the true bound (outer), one that must end at rest, where it can stay, at most (inner).
+
+Lengths are made dimensionless with the step and a typical acceleration; the solver's feasibility
+tolerance is 1e-10 of that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linprog
+from scipy.sparse import coo_matrix
+
+TOLERANCE = 1e-10
+VIABLE = 1e-8
+"""A state counts as viable if limits that are wider by this much can be kept."""
+
+ROUNDS = 400
+FIRST_PHASES = np.array([0.25, 0.5, 0.75, 1.0])
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Limits of one joint and the step, SI units."""
+
+    q_min: float
+    q_max: float
+    v_max: float
+    a_min: float
+    a_max: float
+    dt: float
+
+
+@dataclass(frozen=True)
+class Extremes:
+    """Smallest and largest first acceleration, shape (m,), rad/s^2; nan where not viable."""
+
+    lower: np.ndarray
+    upper: np.ndarray
+    viable: np.ndarray
+
+
+def extreme_accelerations(
+    joint: Joint, q: np.ndarray, v: np.ndarray, steps: int, end_at_rest: bool
+) -> Extremes:
+    """Solve problem (4) on a finite horizon for m states, in one linear program.
+
+    Args:
+        joint: its limits.
+        q: shape (m,), rad.
+        v: shape (m,), rad/s.
+        steps: horizon N.
+        end_at_rest: True for the inner bracket, False for the outer one.
+    """
+    viable = _violation(joint, q, v, steps, end_at_rest) <= VIABLE
+    lower, upper = np.full(len(q), np.nan), np.full(len(q), np.nan)
+    for out, sign in ((upper, 1.0), (lower, -1.0)):
+        program = _Program(joint, q[viable], v[viable], steps, end_at_rest, elastic=False)
+        out[viable] = program.first_acceleration(sign)
+    return Extremes(lower, upper, viable)
+
+
+def _violation(joint, q, v, steps, end_at_rest) -> np.ndarray:
+    """Return by how much all position limits must be widened for a motion to exist."""
+    return _Program(joint, q, v, steps, end_at_rest, elastic=True).least_slack()
+
+
+class _Program:
+    """m independent motions side by side; variables per motion: N accelerations, one slack.
+
+    A position at step k and phase s in [0, 1] is a row over the accelerations of its motion.
+    """
+
+    def __init__(self, joint, q, v, steps, end_at_rest, elastic):
+        self.unit = max(-joint.a_min, joint.a_max)
+        scale = self.unit * joint.dt**2
+        self.m, self.steps, self.elastic = len(q), steps, elastic
+        self.end_at_rest = end_at_rest
+        self.low, self.high = joint.q_min / scale, joint.q_max / scale
+        self.v_max = joint.v_max * joint.dt / scale
+        self.bounds = (joint.a_min / self.unit, joint.a_max / self.unit)
+        self.q, self.v = np.asarray(q) / scale, np.asarray(v) * joint.dt / scale
+        grid = np.meshgrid(np.arange(self.m), np.arange(steps), FIRST_PHASES, indexing="ij")
+        self.cuts = [part.ravel() for part in grid]
+
+    def first_acceleration(self, sign: float) -> np.ndarray:
+        cost = np.zeros((self.m, self.steps + 1))
+        cost[:, 0] = -sign
+        return self._solve(cost)[:, 0] * self.unit
+
+    def least_slack(self) -> np.ndarray:
+        cost = np.zeros((self.m, self.steps + 1))
+        cost[:, -1] = 1.0
+        # The speed the state starts with is not the program's to keep.
+        slack = self._solve(cost)[:, -1]
+        return np.maximum(slack, np.abs(self.v) - self.v_max)
+
+    def _solve(self, cost: np.ndarray) -> np.ndarray:
+        """Exchange; a motion that keeps the limits at all times is finished and left out."""
+        solution = np.full((self.m, self.steps + 1), np.nan)
+        active = np.arange(self.m)
+        slack = (0.0, None) if self.elastic else (0.0, 0.0)
+        for _ in range(ROUNDS):
+            if active.size == 0:
+                return solution
+            matrix, rhs = self._rows(active)
+            equality = self._rest(active) if self.end_at_rest else (None, None)
+            result = linprog(
+                cost[active].ravel(),
+                A_ub=matrix,
+                b_ub=rhs,
+                A_eq=equality[0],
+                b_eq=equality[1],
+                bounds=([self.bounds] * self.steps + [slack]) * active.size,
+                method="highs",
+                options={
+                    "primal_feasibility_tolerance": TOLERANCE,
+                    "dual_feasibility_tolerance": TOLERANCE,
+                },
+            )
+            if result.status != 0:
+                raise RuntimeError(f"the linear program was not solved: {result.message}")
+            x = result.x.reshape(active.size, self.steps + 1)
+            finished = self._add_cuts(x, active)
+            solution[active[finished]] = x[finished]
+            active = active[~finished]
+        raise RuntimeError("the exchange did not come to an end")
+
+    def _add_cuts(self, x: np.ndarray, active: np.ndarray) -> np.ndarray:
+        """Add the times at which motions leave the range; return which of them do not."""
+        a, slack = x[:, :-1], x[:, -1:]
+        v_start = self.v[active, None] + np.cumsum(a, axis=1) - a
+        q_end = self.q[active, None] + np.cumsum(v_start + 0.5 * a, axis=1)
+        q_start = q_end - v_start - 0.5 * a
+        with np.errstate(divide="ignore", invalid="ignore"):
+            phase = np.where(a != 0.0, -v_start / a, -1.0)
+        inside = (phase > 0.0) & (phase < 1.0)
+        phase = np.where(inside, phase, 1.0)
+        peak = q_start + phase * v_start + 0.5 * phase**2 * a
+        over = np.maximum(peak - self.high, self.low - peak) - slack
+        motion, step = np.nonzero(inside & (over > 3.0 * TOLERANCE))
+        self.cuts = [
+            np.concatenate(pair)
+            for pair in zip(
+                self.cuts, (active[motion], step, phase[motion, step]), strict=True
+            )
+        ]
+        finished = np.ones(active.size, dtype=bool)
+        finished[motion] = False
+        # What some of the times already rule out, all of them rule out.
+        return finished | (slack[:, 0] > VIABLE)
+
+    def _rows(self, active: np.ndarray):
+        """Return position limits at the cuts, and speed limits, of motions as ``A x <= b``."""
+        kept = np.isin(self.cuts[0], active)
+        motion, step, phase = (part[kept] for part in self.cuts)
+        # q(k + s) = q + (k + s) v + sum over j < k of (k + s - j - 1/2) a_j + s^2 / 2 a_k.
+        j = np.arange(self.steps)
+        time = (step + phase)[:, None]
+        weight = np.where(j < step[:, None], time - j - 0.5, 0.0)
+        weight[np.arange(len(step)), step] = 0.5 * phase**2
+        free = self.q[motion] + time[:, 0] * self.v[motion]
+        blocks = [
+            (sign * weight, limit - sign * free, motion)
+            for sign, limit in ((1.0, self.high), (-1.0, -self.low))
+            if np.isfinite(limit)
+        ]
+        owner = np.repeat(active, self.steps)
+        sums = np.tile(np.tri(self.steps), (active.size, 1))
+        blocks += [
+            (sign * sums, self.v_max - sign * self.v[owner], owner) for sign in (1.0, -1.0)
+        ]
+        weights, rhs, owners = (np.concatenate(part) for part in zip(*blocks, strict=True))
+        slack = np.full((len(rhs), 1), -1.0 if self.elastic else 0.0)
+        return self._sparse(np.hstack([weights, slack]), owners, active), rhs
+
+    def _rest(self, active: np.ndarray):
+        """Return "the speed after the last step is zero"."""
+        sums = np.ones((active.size, self.steps + 1))
+        sums[:, -1] = 0.0
+        return self._sparse(sums, active, active), -self.v[active]
+
+    def _sparse(self, weights: np.ndarray, owners: np.ndarray, active: np.ndarray):
+        row, column = np.nonzero(weights)
+        width = self.steps + 1
+        place = np.searchsorted(active, owners)[row] * width + column
+        shape = (len(weights), active.size * width)
+        return coo_matrix((weights[row, column], (row, place)), shape).tocsr()
