@@ -7,6 +7,7 @@ import sys
 import time
 from array import array
 from collections import Counter, deque
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -19,9 +20,10 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-from sim_bridge.bullet_parameters import TABLE, make_configuration
+from sim_bridge.bullet_parameters import TABLE, BulletConfiguration, make_configuration
 from sim_bridge.bullet_robot import BulletRobot
 from sim_bridge.limit_monitor import LimitMonitor
+from sim_bridge.urdf_preparation import prepare_urdf
 from viability_bounds_pkg.robot_description import RobotDescriptionError
 from viability_bounds_pkg.ros_messages import Diagnostics
 from viability_bounds_pkg.ros_parameters import NodeParameters, ParameterError
@@ -55,7 +57,7 @@ class BulletNode(Node):
         try:
             self._node_parameters = NodeParameters(self, TABLE, make_configuration)
             config = self._node_parameters.configuration
-            self._robot = _make_robot(config)
+            self._robot = _make_robot(config, self._node_parameters.values)
         except ParameterError:
             self.destroy_node()
             raise
@@ -247,8 +249,11 @@ class BulletNode(Node):
             self._paused = False
             self._started_at = time.monotonic()
             self._plan_pause()
-            # A new stamp: what was answered during the pause answered old goals.
-            self._next_state()
+            # A new stamp: what was answered during the pause answered old goals. In real time
+            # it comes with the next tick, so that the first period is a whole one.
+            self._advanced = True
+            if self._config.lockstep:
+                self._next_state()
         elif request.data:
             self._pause()
         response.success = True
@@ -297,7 +302,7 @@ class BulletNode(Node):
         super().destroy_node()
 
 
-def _make_robot(config) -> BulletRobot:
+def _make_robot(config: BulletConfiguration, values: Mapping[str, Any]) -> BulletRobot:
     try:
         robot = BulletRobot(
             config.urdf,
@@ -306,8 +311,23 @@ def _make_robot(config) -> BulletRobot:
             physics_dt=config.dt / config.substeps,
         )
     except RobotDescriptionError as error:
-        raise ParameterError("joints", list(config.joints), str(error)) from error
+        name, allowed = _culprit(config)
+        raise ParameterError(name, values[name], f"{allowed} ({error})") from error
     return robot
+
+
+def _culprit(config: BulletConfiguration) -> tuple[str, str]:
+    """Return which parameter keeps the robot from being made, and what it may be."""
+    for name, allowed, arguments in (
+        ("robot_description", "a URDF", ((), None)),
+        ("joints", "joints of the URDF", (config.joints, None)),
+        ("locked_joints", "other joints of the URDF", (config.joints, config.locked)),
+    ):
+        try:
+            prepare_urdf(config.urdf, *arguments)
+        except RobotDescriptionError:
+            return name, allowed
+    return "robot_description", "a URDF that PyBullet can load"
 
 
 def main(args: list[str] | None = None) -> int:

@@ -71,6 +71,11 @@ def _floats(robot: dict[str, str], key: str) -> np.ndarray:
     return np.array([float(item) for item in robot[key].split()])
 
 
+def _or_none(value: float) -> float | None:
+    """Return what JSON has a word for: without a pose goal there is no error."""
+    return float(value) if np.isfinite(value) else None
+
+
 def _metrics(
     config, run: Run, robot: dict[str, str], errors: np.ndarray, bounds: dict[str, str]
 ) -> dict:
@@ -93,8 +98,8 @@ def _metrics(
         ),
         "max_velocity_violation_rad_s": float(velocity.max()),
         "max_torque_ratio": float(ratio),
-        "final_position_error_m": float(errors[-1, 0]),
-        "final_orientation_error_rad": float(errors[-1, 1]),
+        "final_position_error_m": _or_none(errors[-1, 0]),
+        "final_orientation_error_rad": _or_none(errors[-1, 1]),
         "deadline_misses": int(robot["deadline_misses"]),
         "latency_p50_us": float(robot["latency_p50_us"]),
         "latency_p99_us": float(robot["latency_p99_us"]),
@@ -130,10 +135,11 @@ def _print_table(config, metrics: dict) -> None:
             f"{row['max_torque_ratio']:10.1%}"
         )
     print()
-    print(
-        f"pose error at the end: {1e3 * metrics['final_position_error_m']:.3f} mm, "
-        f"{1e3 * metrics['final_orientation_error_rad']:.3f} mrad"
-    )
+    if metrics["final_position_error_m"] is not None:
+        print(
+            f"pose error at the end: {1e3 * metrics['final_position_error_m']:.3f} mm, "
+            f"{1e3 * metrics['final_orientation_error_rad']:.3f} mrad"
+        )
     print(
         f"{metrics['steps']} control periods, {metrics['deadline_misses']} deadlines missed, "
         f"command latency {metrics['latency_p50_us']:.0f} us (median), "

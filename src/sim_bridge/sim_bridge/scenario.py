@@ -80,8 +80,10 @@ def load_scenario(path: str | Path) -> Scenario:
     if not isinstance(content, dict) or set(content) - {"duration", "events"}:
         raise ScenarioError(f"scenario {path}: has keys other than 'duration' and 'events'")
     try:
-        duration = _number(content.get("duration"), "duration", positive=True)
+        duration = _number(content.get("duration"), "duration")
         entries = content.get("events") or []
+        if not isinstance(entries, list):
+            raise ScenarioError(f"events is {entries!r}; allowed: a list")
         events = [_event(entry, f"events[{i}]") for i, entry in enumerate(entries)]
     except ScenarioError as error:
         raise ScenarioError(f"scenario {path}: {error}") from None
@@ -95,7 +97,7 @@ def _event(entry: Any, where: str) -> PoseGoal | PostureGoal | Push:
     kind = next(key for key in entry if key != "time")
     if kind not in kinds or not isinstance(entry[kind], dict):
         raise ScenarioError(f"{where} must have 'time' and one of {', '.join(kinds)}")
-    time = _number(entry["time"], f"{where}.time")
+    time = _number(entry["time"], f"{where}.time", zero=True)
     return kinds[kind](time, entry[kind], f"{where}.{kind}")
 
 
@@ -109,16 +111,21 @@ def _pose(time: float, fields: dict, where: str) -> PoseGoal:
 
 
 def _posture(time: float, fields: dict, where: str) -> PostureGoal:
-    return PostureGoal(time, {str(k): _number(v, f"{where}.{k}") for k, v in fields.items()})
+    return PostureGoal(
+        time, {str(k): _number(v, f"{where}.{k}", negative=True) for k, v in fields.items()}
+    )
 
 
 def _push(time: float, fields: dict, where: str) -> Push:
     _only(fields, {"link", "duration", "force", "torque"}, where)
+    link = fields.get("link")
+    if not isinstance(link, str) or not link:
+        raise ScenarioError(f"{where}.link is {link!r}; allowed: the name of a link")
     zero = [0.0, 0.0, 0.0]
     return Push(
         time,
-        _number(fields.get("duration"), f"{where}.duration", positive=True),
-        str(fields.get("link", "")),
+        _number(fields.get("duration"), f"{where}.duration"),
+        link,
         _vector(fields.get("force", zero), 3, f"{where}.force"),
         _vector(fields.get("torque", zero), 3, f"{where}.torque"),
     )
@@ -131,12 +138,16 @@ def _only(fields: dict, allowed: set[str], where: str) -> None:
         raise ScenarioError(f"{where} has {', '.join(sorted(unknown))}; allowed: {allowed_names}")
 
 
-def _number(value: Any, where: str, *, positive: bool = False) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ScenarioError(f"{where} is {value!r}; allowed: a finite number")
-    if value < 0 or (positive and value == 0):
-        if positive or where.endswith("time"):
-            raise ScenarioError(f"{where} is {value!r}; must not be negative or zero")
+def _number(value: Any, where: str, *, zero: bool = False, negative: bool = False) -> float:
+    sign = "" if negative else " >= 0" if zero else " > 0"
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int | float)
+        or not math.isfinite(value)
+        or (value < 0 and not negative)
+        or (value == 0 and not (zero or negative))
+    ):
+        raise ScenarioError(f"{where} is {value!r}; allowed: a finite number{sign}")
     return float(value)
 
 

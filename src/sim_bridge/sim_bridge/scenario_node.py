@@ -17,6 +17,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rcl_interfaces.srv import SetParameters
 from rclpy.clock import Clock, ClockType
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -96,6 +97,11 @@ def make_configuration(values: Mapping[str, Any]) -> ScenarioConfiguration:
         scenario = load_scenario(values["scenario"])
     except ScenarioError as error:
         raise ParameterError("scenario", values["scenario"], str(error)) from error
+    for event in scenario.events:
+        if isinstance(event, PostureGoal) and set(joints) - set(event.positions):
+            missing = ", ".join(joint for joint in joints if joint not in event.positions)
+            allowed = f"postures of all 'joints'; at {event.time:g} s there is none of {missing}"
+            raise ParameterError("scenario", values["scenario"], allowed)
     try:
         urdf = read_urdf(values["robot_description"])
     except RobotDescriptionError as error:
@@ -160,7 +166,9 @@ class ScenarioNode(Node):
         self._last = math.inf
         self._plan = None
         self._answered = False
-        self._pushes: list[tuple[float, Push | None]] = []
+        # Stamp from which on, ns; link; force; torque.
+        self._pushes: list[tuple[int, str, tuple[float, ...], tuple[float, ...]]] = []
+        self._wrench: WrenchStamped | None = None
         self._index: list[int] | None = None
         self._poses = self.create_publisher(PoseStamped, "target_pose", GOAL_QOS)
         self._postures = self.create_publisher(JointState, "target_posture", GOAL_QOS)
@@ -269,20 +277,22 @@ class ScenarioNode(Node):
                 set_stamp(message.header.stamp, stamp)
                 self._postures.publish(message)
             else:
-                self._pushes.append((stamp, event))
-                self._pushes.append((stamp + round(1e9 * event.duration), None))
+                release = stamp + round(1e9 * event.duration)
+                self._pushes.append((stamp, event.link, event.force, event.torque))
+                self._pushes.append((release, event.link, (0.0,) * 3, (0.0,) * 3))
         self._pushes.sort(key=lambda entry: entry[0])
 
     def _push(self) -> None:
         while self._pushes and self.stamp >= self._pushes[0][0]:
-            event = self._pushes.pop(0)[1]
-            message = WrenchStamped()
-            if event is not None:
-                message.header.frame_id = event.link
-                f, t = message.wrench.force, message.wrench.torque
-                f.x, f.y, f.z = event.force
-                t.x, t.y, t.z = event.torque
-            self._wrenches.publish(message)
+            _, link, force, torque = self._pushes.pop(0)
+            self._wrench = message = WrenchStamped()
+            message.header.frame_id = link
+            f, t = message.wrench.force, message.wrench.torque
+            f.x, f.y, f.z = force
+            t.x, t.y, t.z = torque
+        # Again and again: the robot lets go of a push that it hears no more of.
+        if self._wrench is not None:
+            self._wrenches.publish(self._wrench)
 
     # What is shown
 
@@ -308,6 +318,7 @@ def play(node: ScenarioNode) -> None:
 
     Raises:
         TimeoutError: the other nodes did not come up, or stopped answering.
+        ExternalShutdownException: told to stop before the end.
     """
     executor = make_executor(node.context)
     executor.add_node(node)
@@ -327,6 +338,8 @@ def play(node: ScenarioNode) -> None:
         if now - shown_at > _SHOW_PERIOD:
             shown_at = now
             print(node.live_line(), end="\r" if terminal else "\n", flush=True)
+    if node.phase is not Phase.DONE:
+        raise ExternalShutdownException
     print(node.live_line(), flush=True)
 
 
@@ -337,8 +350,8 @@ def main(args: list[str] | None = None) -> int:
         0 when no limit was broken, 1 when one was, 2 when the scenario could not be played.
     """
     argv = rclpy.utilities.remove_ros_args(args=sys.argv if args is None else args)
-    out = Path(argv[argv.index("--out") + 1]) if "--out" in argv else None
     try:
+        out = _output_directory(argv)
         rclpy.init(args=args)
         node = ScenarioNode()
     except Exception as error:
@@ -359,11 +372,21 @@ def main(args: list[str] | None = None) -> int:
     except TimeoutError as error:
         report_refusal(error)
         return 2
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, ExternalShutdownException):
         return 130
     finally:
         node.destroy_node()
         rclpy.try_shutdown()
+
+
+def _output_directory(argv: list[str]) -> Path | None:
+    """Return the value of ``--out``, or None without it."""
+    if "--out" not in argv:
+        return None
+    value = argv[argv.index("--out") + 1 :][:1]
+    if not value:
+        raise ValueError("--out needs a directory")
+    return Path(value[0])
 
 
 if __name__ == "__main__":

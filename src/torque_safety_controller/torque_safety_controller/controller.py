@@ -101,6 +101,8 @@ class Controller:
         self.iterations = 0
         rate = np.full(n, math.inf) if torque_rate_max is None else torque_rate_max
         self._tau_step = np.where(np.isinf(rate), np.inf, rate * robot.dt)
+        self._rate_limited = bool(np.isfinite(rate).any())
+        self._tau_min = -self.tau_max
         self._additional_torque = additional_torque
         self._qp = InverseDynamicsQP(n)
         self._a_last = np.zeros(n)
@@ -180,7 +182,7 @@ class Controller:
         robot = self.robot
         a = -self.gains.hold_kd * v
         tau = robot.M @ a + robot.h
-        if additional is not None:
+        if additional is not None and np.isfinite(additional).all():
             tau = tau + additional
         return Step(self._limited(tau), self._remember(a), False, None, failure)
 
@@ -222,21 +224,21 @@ class Controller:
 
     def _torque_range(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the torques that may follow the last one, shape (n,) each, N m."""
-        if self._tau_last is None:
-            return -self.tau_max, self.tau_max
+        if self._tau_last is None or not self._rate_limited:
+            return self._tau_min, self.tau_max
         return (
-            np.maximum(-self.tau_max, self._tau_last - self._tau_step),
+            np.maximum(self._tau_min, self._tau_last - self._tau_step),
             np.minimum(self.tau_max, self._tau_last + self._tau_step),
         )
 
     def _limited(self, tau: np.ndarray) -> np.ndarray:
         """Return `tau` as it may be sent: whatever came before, finite and within the limits."""
-        if not np.isfinite(tau).all():
+        if not math.isfinite(tau.dot(tau)):
             tau = np.zeros(self.robot.n) if self._tau_last is None else self._tau_last
         lower, upper = self._torque_range()
         self._tau_last = np.minimum(np.maximum(tau, lower), upper)
         return self._tau_last
 
     def _remember(self, a: np.ndarray) -> np.ndarray:
-        self._a_last = a if np.isfinite(a).all() else np.zeros(self.robot.n)
+        self._a_last = a if math.isfinite(a.dot(a)) else np.zeros(self.robot.n)
         return self._a_last

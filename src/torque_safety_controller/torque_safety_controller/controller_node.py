@@ -34,7 +34,7 @@ from torque_safety_controller.ros_goals import (
 from torque_safety_controller.ros_limits import LimitsReader
 from viability_bounds_pkg.ros_messages import Diagnostics, JointStateReader, Verdict
 from viability_bounds_pkg.ros_parameters import NodeParameters, ParameterError
-from viability_bounds_pkg.ros_runtime import CONTROL_QOS, GOAL_QOS, run, stamp_to_ns
+from viability_bounds_pkg.ros_runtime import CONTROL_QOS, GOAL_QOS, run
 
 _LATENCIES_KEPT = 4096
 
@@ -49,7 +49,9 @@ class ControllerNode(Node):
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("controller_node", **node_arguments)
         try:
-            self._node_parameters = NodeParameters(self, TABLE, make_configuration, self._configure)
+            self._node_parameters = NodeParameters(
+                self, TABLE, make_configuration, self._configure
+            )
             robot, self._base = load_robot(self._node_parameters.values)
         except ParameterError:
             self.destroy_node()
@@ -61,7 +63,7 @@ class ControllerNode(Node):
         self._goals = GoalQueue()
         self._modes = ModeKeeper()
         self._goal_at = time.monotonic()
-        self._message_at = self._state_at = self._answered_at = -np.inf
+        self._message_at = self._state_at = self._waiting_since = -np.inf
         self._message_stamp = None
         self._answered_stamp = -1
         self._bounds_lost = False
@@ -99,24 +101,34 @@ class ControllerNode(Node):
     def _on_state(self, message: JointState) -> None:
         now = time.monotonic()
         self._message_at, self._message_stamp = now, message.header.stamp
+        last = self._states.stamp
         verdict = self._states.read(message, now)
-        if verdict is Verdict.REPEAT:
-            self._state_at = now
-            if self._answered_stamp == self._states.stamp:
-                self._send(message.header.stamp)
-            return
         if verdict is Verdict.REFUSED:
             return
-        if now - self._state_at > self._config.state_timeout:
-            self._controller.start(self._states.q)
-            self._answered_at = now
+        silent = now - self._state_at > self._config.state_timeout
         self._state_at = now
+        if silent or (verdict is Verdict.NEW and self._states.stamp <= last):
+            self._begin(verdict)
+        elif verdict is Verdict.REPEAT:
+            if self._answered_stamp == last:
+                self._send(message.header.stamp)
+            return
+        elif self._answered_stamp == last:
+            self._waiting_since = now
         if self._limits.stamp == self._states.stamp:
             self._track(message.header.stamp)
         elif self._bounds_lost:
             self._answer(
                 self._controller.hold(self._states.q, self._states.v), message.header.stamp
             )
+
+    def _begin(self, verdict: Verdict) -> None:
+        """Forget the past: the robot was silent, or started over."""
+        if verdict is Verdict.NEW and self._limits.stamp == self._answered_stamp:
+            self._limits.stamp = -1  # of another run, in which stamps may have been the same
+        self._answered_stamp = -1
+        self._waiting_since = self._state_at
+        self._controller.start(self._states.q)
 
     def _on_limits(self, message: JointTrajectory) -> None:
         if not self._limits.read(message):
@@ -152,8 +164,7 @@ class ControllerNode(Node):
         now = time.monotonic()
         self._command.effort = array("d", step.tau.tobytes())
         self._send(stamp)
-        self._answered_stamp = stamp_to_ns(stamp)
-        self._answered_at = now
+        self._answered_stamp = self._states.stamp
         self._latencies.append(now - self._message_at)
         if step.failure:
             self._failures += 1
@@ -188,7 +199,7 @@ class ControllerNode(Node):
                 self._enter(Mode.STOPPED, "no joint state" if quiet else self._why_refused())
             return
         waiting = self._states.stamp != self._answered_stamp
-        if waiting and now - self._answered_at > config.bounds_timeout:
+        if waiting and now - self._waiting_since > config.bounds_timeout:
             self._bounds_lost = True
             self._answer(
                 self._controller.hold(self._states.q, self._states.v), self._message_stamp
@@ -209,8 +220,12 @@ class ControllerNode(Node):
     def _enter(self, mode: Mode, reason: str) -> None:
         if not self._modes.set(mode, reason):
             return
-        log = self.get_logger()
-        (log.info if mode is Mode.TRACKING else log.warning)(f"{mode.value}: {reason}")
+        text = f"{mode.value}: {reason}"
+        # One call site per severity: rclpy ties the two together.
+        if mode is Mode.TRACKING:
+            self.get_logger().info(text)
+        else:
+            self.get_logger().warning(text)
         self._diagnostics.publish()
 
     # Goals

@@ -171,11 +171,25 @@ def load_robot(
     try:
         model = build_model(urdf, joints, locked_joints(values))
     except RobotDescriptionError as error:
-        raise ParameterError("joints", list(joints), str(error)) from error
+        name, allowed = _culprit(urdf, joints)
+        raise ParameterError(name, values[name], f"{allowed} ({error})") from error
     return (
         _with_frame(model, values, "end_effector_frame"),
         _base_placement(model, values["base_frame"]),
     )
+
+
+def _culprit(urdf: str, joints: tuple[str, ...]) -> tuple[str, str]:
+    """Return which parameter keeps a model from being built, and what it may be."""
+    for name, allowed, chosen in (
+        ("robot_description", "a URDF", ()),
+        ("joints", "joints of the URDF, base to tip", joints),
+    ):
+        try:
+            build_model(urdf, chosen)
+        except RobotDescriptionError:
+            return name, allowed
+    return "locked_joints", "other joints of the URDF"
 
 
 def _with_frame(model: pin.Model, values: Mapping[str, Any], name: str) -> RobotModel:

@@ -56,7 +56,7 @@ def posture_from_message(
         raise GoalRefused(f"no position for {', '.join(missing)}")
     q_des = np.array([where[joint] for joint in joints])
     for joint, value, low, high in zip(joints, q_des, q_min, q_max, strict=True):
-        if not low <= value <= high:
+        if not (math.isfinite(value) and low <= value <= high):
             raise GoalRefused(f"{joint} is {value:g} rad; allowed: {low:g} to {high:g}")
     return q_des
 

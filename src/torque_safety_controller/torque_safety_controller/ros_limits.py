@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
 from trajectory_msgs.msg import JointTrajectory
 
+from viability_bounds_pkg.ros_messages import all_finite
 from viability_bounds_pkg.ros_runtime import stamp_to_ns
 
 
@@ -41,7 +41,7 @@ class LimitsReader:
                 return self._refuse("missing joint")
             index = [where[joint] for joint in self._joints]
             lower, upper = lower[index], upper[index]
-        if not math.isfinite(lower.sum() + upper.sum()):
+        if not all_finite(lower, upper):
             return self._refuse("not finite")
         if (lower > upper).any():
             return self._refuse("lower above upper")

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
+from torque_safety_controller.dense_kernels import null_space_part
 from torque_safety_controller.robot_model import RobotModel
 
 _RANK_REGULARISATION = 1e-9
@@ -59,19 +60,9 @@ def posture_task(
     """
     error = q_des - q
     if J is not None:
-        error = null_space_part(J, error)
+        # Regularised where J has lost rank; there it leaves in what the task cannot move anyway.
+        error = null_space_part(J, error, _RANK_REGULARISATION)
     return TaskTerm(None, kp * error - kd * v, weight)
-
-
-def null_space_part(J: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return the part of joint vector `x`, shape (n,), that does not move the task.
-
-    ``x - J^T (J J^T + eps I)^-1 J x``; eps keeps it defined where J, shape (m, n), has lost
-    rank, and there leaves in the directions that the task cannot move anyway.
-    """
-    JJt = J @ J.T
-    JJt.flat[:: len(JJt) + 1] += _RANK_REGULARISATION
-    return x - J.T @ np.linalg.solve(JJt, J @ x)
 
 
 def damping_task(v: np.ndarray, kd: float) -> TaskTerm:

@@ -28,6 +28,7 @@ from viability_bounds_pkg.ros_parameters import (
     positive,
 )
 from viability_bounds_pkg.ros_runtime import CONTROL_QOS, run
+from viability_bounds_pkg.torque_margin import TorqueMargins, torque_margins
 
 METHODS = ("exact", "naive")
 
@@ -41,14 +42,14 @@ TABLE = (
     Parameter(
         "acceleration_drift",
         list[float],
-        "how fast the acceleration strays from the commanded one while a torque is held, "
-        "rad/s^3; the bounds keep back this times the control period",
+        "how fast the acceleration changes while a torque is held, rad/s^3; the bounds keep "
+        "back what follows from it at this rate",
         default=np.zeros(0),
     ),
     Parameter(
         "position_margin",
         float,
-        "how far inside the position limits the bounds keep the joints, rad: what the robot or "
+        "how much further inside the position limits to keep the joints, rad: what the robot or "
         "its sensors may be off",
         default=0.0,
     ),
@@ -84,8 +85,8 @@ class BoundsConfiguration:
     """Checked parameters of the bounds node."""
 
     limits: JointLimits
-    margin: np.ndarray
-    """Acceleration margin at this control rate, shape (n,), rad/s^2."""
+    margins: TorqueMargins
+    """What the exact bounds keep back."""
     control_dt: float
     bounds_dt: float
     method: str
@@ -107,26 +108,19 @@ def make_configuration(values: Mapping[str, Any]) -> BoundsConfiguration:
     factor = positive(values, "bounds_dt_factor")
     if factor < 1.0:
         raise ParameterError("bounds_dt_factor", factor, ">= 1")
-    inset = positive(values, "position_margin", zero=True)
-    q_min = per_joint(values, "position_min", joints)
-    q_max = per_joint(values, "position_max", joints)
-    if (q_max - q_min <= 2.0 * inset).any() and (q_min < q_max).all():
-        raise ParameterError("position_margin", inset, "less than half of every joint's range")
-    margin = np.zeros(len(joints))
-    if len(values["acceleration_drift"]):
-        margin = per_joint(values, "acceleration_drift", joints) * dt
     try:
         limits = JointLimits(
             joints,
-            q_min + inset,
-            q_max - inset,
             *(
                 per_joint(values, PARAMETER_OF[field], joints)
-                for field in ("v_max", "a_min", "a_max")
+                for field in ("q_min", "q_max", "v_max", "a_min", "a_max")
             ),
         )
+        margins = _margins(values, limits, dt)
         if values["method"] == "exact":
-            solve = viability.BoundsSolver(limits, factor * dt, margin, period=dt).bounds
+            inner = _inside(limits, margins)
+            solver = viability.BoundsSolver(inner, factor * dt, margins.acceleration, period=dt)
+            solve = solver.bounds
         else:
             solve = partial(baselines.naive_bounds, limits=limits, dt=factor * dt)
     except JointLimitsError as error:
@@ -135,12 +129,46 @@ def make_configuration(values: Mapping[str, Any]) -> BoundsConfiguration:
         raise ParameterError(name, shown, error.allowed) from error
     return BoundsConfiguration(
         limits=limits,
-        margin=margin,
+        margins=margins,
         control_dt=dt,
         bounds_dt=factor * dt,
         method=values["method"],
         state_timeout=positive(values, "state_timeout"),
         solve=solve,
+    )
+
+
+def _margins(values: Mapping[str, Any], limits: JointLimits, dt: float) -> TorqueMargins:
+    """Return what to keep back for the drift of acceleration and for the robot itself."""
+    drift = np.zeros(len(limits))
+    if len(values["acceleration_drift"]):
+        drift = per_joint(values, "acceleration_drift", limits.names)
+        if not (np.isfinite(drift).all() and (drift >= 0.0).all()):
+            raise ParameterError("acceleration_drift", drift, "finite numbers >= 0")
+    margins = torque_margins(drift, dt)
+    margins.position[:] += positive(values, "position_margin", zero=True)
+    for name, margin, room in (
+        ("velocity_max", margins.velocity, limits.v_max),
+        ("position_max", margins.position, 0.5 * (limits.q_max - limits.q_min)),
+    ):
+        if not (margin < room).all():
+            raise ParameterError(
+                name,
+                values[name],
+                f"more than the margins for acceleration_drift at this rate take: {margin}",
+            )
+    return margins
+
+
+def _inside(limits: JointLimits, margins: TorqueMargins) -> JointLimits:
+    """Return the limits with margins of position and velocity taken off."""
+    return JointLimits(
+        limits.names,
+        limits.q_min + margins.position,
+        limits.q_max - margins.position,
+        limits.v_max - margins.velocity,
+        limits.a_min,
+        limits.a_max,
     )
 
 
@@ -155,7 +183,9 @@ class BoundsNode(Node):
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("bounds_node", **node_arguments)
         try:
-            self._node_parameters = NodeParameters(self, TABLE, make_configuration, self._configure)
+            self._node_parameters = NodeParameters(
+                self, TABLE, make_configuration, self._configure
+            )
         except ParameterError:
             self.destroy_node()
             raise
@@ -215,6 +245,9 @@ class BoundsNode(Node):
             "method": config.method,
             "control_period_s": config.control_dt,
             "bounds_period_s": config.bounds_dt,
+            "position_margin_rad": config.margins.position,
+            "velocity_margin_rad_s": config.margins.velocity,
+            "acceleration_margin_rad_s2": config.margins.acceleration,
             "states_answered": self._answered,
             "states_refused": self._reader.refused,
             "states_outside_kernel_by_joint": self._outside,

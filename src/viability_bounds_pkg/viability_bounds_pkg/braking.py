@@ -86,7 +86,7 @@ def make_side(
     landing = None
     if curve is not None and len(curve.speed) > 1:
         landing = _make_landing(curve, v_max * dt, length, dt)
-        stopping_room = float(curve(np.array([v_max * dt]))[0])
+        stopping_room = curve.room_at(v_max * dt)
     far = 0.5 * dt * v_max + stopping_room
     # Not zero even if dt is tiny, so that no room at all does not make 0 / 0.
     k2 = max(k * k, float_info.min)
@@ -100,7 +100,7 @@ def _make_landing(curve: StoppingCurve, v_max: float, length: float, dt: float) 
     speeds: list[float] = []
     budgets: list[float] = []
     start = 0.0
-    while start <= v_max and (start == 0.0 or float(curve(np.array([start]))[0]) <= length):
+    while start <= v_max and (start == 0.0 or curve.room_at(start) <= length):
         speed = start + curve.speed
         whole = round(start / curve.braking)
         room = whole * curve.speed + 0.5 * whole * start + curve.room

@@ -14,19 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from viability_bounds_pkg.state_space import (
-    LimitEstimateError,
-    StateSpace,
-    forward_dynamics,
-    inverse_dynamics,
-)
-
-Array = NDArray[np.float64]
-
-SUBSTEPS = 2
-"""Runge-Kutta steps a period: its error, of order (dt / SUBSTEPS)^5, is far below the defects."""
+from viability_bounds_pkg.state_space import Array, LimitEstimateError, StateSpace
+from viability_bounds_pkg.torque_hold import acceleration_rate, hold_defects, mid_step_torque
 
 
 @dataclass(frozen=True)
@@ -59,13 +50,16 @@ class DiscretisationMargin:
         mid_step: with the torque computed at the predicted middle of the period,
             ``rnea(q + v dt/2 + a dt^2/8, v + a dt/2, a)``.
         start_of_step: with the torque computed at the start, ``rnea(q, v, a)``.
+        rate: sup of abs(da/dt) while a torque is held, shape (n,), rad/s^3: for a short period
+            the drift is this times `dt` for the plain law, half of it for the mid-step law.
         samples: how many random states were drawn.
-        accepted: how many of them asked for a torque within the limits (mid-step law).
+        accepted: how many of them asked for a torque within the limits at once.
     """
 
     dt: float
     mid_step: HoldDefects
     start_of_step: HoldDefects
+    rate: Array
     samples: int
     accepted: int
 
@@ -73,91 +67,6 @@ class DiscretisationMargin:
     def margin(self) -> Array:
         """What to keep back from the acceleration limits, shape (n,), rad/s^2."""
         return self.mid_step.acceleration
-
-
-def mid_step_torque(model: pin.Model, q: Array, v: Array, a: Array, dt: float) -> Array:
-    """Return the torque for `a` at the middle of a period in which `a` is constant.
-
-    Holding it, the acceleration is too small by about half a period's drift at the start and too
-    large by as much at the end, and right on average to second order in `dt`.
-
-    Args:
-        model: the robot.
-        q: positions, shape (batch, n), rad.
-        v: velocities, shape (batch, n), rad/s.
-        a: accelerations wanted, shape (batch, n), rad/s^2.
-        dt: period, s; zero gives the plain inverse dynamics of the state.
-
-    Returns:
-        Torques, shape (batch, n), N m.
-    """
-    q_mid = q + 0.5 * dt * v + 0.125 * dt**2 * a
-    return inverse_dynamics(model, q_mid, v + 0.5 * dt * a, a)
-
-
-def acceleration_rate(model: pin.Model, q: Array, v: Array, a: Array) -> tuple[Array, Array]:
-    """Return the torque for `a` and how fast the acceleration changes while it is held.
-
-    The time derivative of ``M a + h = tau`` at constant tau: ``M da/dt = -(dtau/dq v + dtau/dv a)``
-    with the partial derivatives of the inverse dynamics.
-
-    Args:
-        model: the robot.
-        q: positions, shape (batch, n), rad.
-        v: velocities, shape (batch, n), rad/s.
-        a: accelerations, shape (batch, n), rad/s^2.
-
-    Returns:
-        Torques, shape (batch, n), N m, and rates, shape (batch, n), rad/s^3.
-    """
-    data = model.createData()
-    tau, drive = np.empty_like(q), np.empty_like(q)
-    inertia = np.empty((*q.shape, q.shape[1]))
-    for i, (q_i, v_i, a_i) in enumerate(zip(q, v, a, strict=True)):
-        by_q, by_v, inertia[i] = pin.computeRNEADerivatives(model, data, q_i, v_i, a_i)
-        tau[i] = data.tau
-        drive[i] = by_q @ v_i + by_v @ a_i
-    return tau, -np.linalg.solve(inertia, drive[..., None])[..., 0]
-
-
-def hold_defects(
-    model: pin.Model, q: Array, v: Array, a: Array, tau: Array, dt: float, substeps: int = SUBSTEPS
-) -> Array:
-    """Integrate ``M a + h = tau`` with `tau` held and return the three defects of `HoldDefects`.
-
-    Classical Runge-Kutta; a(t) is looked at where the integrator's steps begin and end, which
-    includes both ends of the period, where the drift, linear in time to first order, is largest.
-
-    Args:
-        model: the robot.
-        q: positions at the start, shape (batch, n), rad.
-        v: velocities at the start, shape (batch, n), rad/s.
-        a: accelerations wanted, shape (batch, n), rad/s^2.
-        tau: torques held, shape (batch, n), N m.
-        dt: period, s.
-        substeps: integration steps.
-
-    Returns:
-        Defects of acceleration, mean acceleration and position, shape (batch, 3, n).
-    """
-    step = dt / substeps
-    q_now, v_now = q, v
-    drift = np.zeros_like(q)
-    for _ in range(substeps):
-        a_1 = forward_dynamics(model, q_now, v_now, tau)
-        v_2 = v_now + 0.5 * step * a_1
-        a_2 = forward_dynamics(model, q_now + 0.5 * step * v_now, v_2, tau)
-        v_3 = v_now + 0.5 * step * a_2
-        a_3 = forward_dynamics(model, q_now + 0.5 * step * v_2, v_3, tau)
-        v_4 = v_now + step * a_3
-        a_4 = forward_dynamics(model, q_now + step * v_3, v_4, tau)
-        drift = np.maximum(drift, np.abs(a_1 - a))
-        q_now = q_now + step / 6 * (v_now + 2 * v_2 + 2 * v_3 + v_4)
-        v_now = v_now + step / 6 * (a_1 + 2 * a_2 + 2 * a_3 + a_4)
-    drift = np.maximum(drift, np.abs(forward_dynamics(model, q_now, v_now, tau) - a))
-    mean = np.abs((v_now - v) / dt - a)
-    position = np.abs(q_now - q - dt * v - 0.5 * dt**2 * a)
-    return np.stack([drift, mean, position], axis=1)
 
 
 def discretisation_margin(
@@ -172,8 +81,8 @@ def discretisation_margin(
     samples: int = 20_000,
     seed: int = 0,
     *,
-    starts: int = 12,
-    rounds: int = 8,
+    starts: int = 32,
+    rounds: int = 12,
 ) -> DiscretisationMargin:
     """Return the worst acceleration drift of a torque held for `dt`, for both torque laws.
 
@@ -231,7 +140,7 @@ def discretisation_margin(
             f"none of {samples} sampled states and accelerations is within the torque limits; "
             "narrow a_min and a_max"
         )
-    followed, _ = climb(allowed_rate, points, rates, lower, upper, starts, rounds, rng)
+    followed, fastest = climb(allowed_rate, points, rates, lower, upper, starts, rounds, rng)
     laws = []
     for lead in (dt, 0.0):  # how far ahead the torque looks
 
@@ -253,7 +162,8 @@ def discretisation_margin(
         drift, mean, position = worst.reshape(3, n)
         q, v, a = np.split(best[:n], 3, axis=1)
         laws.append(HoldDefects(drift, mean, position, q, v, a))
-    return DiscretisationMargin(dt, laws[0], laws[1], samples, accepted)
+    rate = fastest.reshape(-1, n).max(axis=0)
+    return DiscretisationMargin(dt, laws[0], laws[1], rate, samples, accepted)
 
 
 def climb(

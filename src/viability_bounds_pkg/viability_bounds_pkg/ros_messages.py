@@ -9,6 +9,7 @@ from enum import Enum
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
@@ -24,6 +25,15 @@ class Verdict(Enum):
     """The stamp of the last accepted message again: a robot that asks once more."""
     REFUSED = 3
     """Dropped and counted; the arrays hold what they held."""
+
+
+def all_finite(*arrays: np.ndarray) -> bool:
+    """Return whether no number in any of the arrays is infinite or NaN.
+
+    Squares summed are the cheapest test there is; numbers above 1e150, whose squares overflow,
+    are as useless here and fail it too.
+    """
+    return all(math.isfinite(array.dot(array)) for array in arrays)
 
 
 class StampGuard:
@@ -43,9 +53,13 @@ class StampGuard:
         """Judge a stamp in ns that arrived at `now`, in s on the steady clock."""
         if stamp == self.last:
             return Verdict.REPEAT
-        if stamp < self.last and now - self._accepted_at < self._reset_after:
+        if stamp < self.last and not self.may_start_over(now):
             return Verdict.REFUSED
         return Verdict.NEW
+
+    def may_start_over(self, now: float) -> bool:
+        """Return whether the source has been silent for so long that any stamp will do."""
+        return now - self._accepted_at >= self._reset_after
 
     def accept(self, stamp: int, now: float) -> None:
         """Note that the message with this stamp was taken."""
@@ -72,26 +86,32 @@ class JointStateReader:
         self.refused: Counter[str] = Counter()
         self._joints = tuple(joints)
         self._guard = StampGuard(reset_after)
-        self._names: list[str] = []
+        self._names: list[str] | None = None
         self._index: np.ndarray | None = None
 
     def read(self, message: JointState, now: float) -> Verdict:
         """Take a message that arrived at `now`, in s on the steady clock."""
         stamp = stamp_to_ns(message.header.stamp)
+        if stamp == 0:
+            # All of them would have this one, and the first answer would serve for ever.
+            return self._refuse("no stamp")
         verdict = self._guard.check(stamp, now)
-        if verdict is not Verdict.NEW:
-            if verdict is Verdict.REFUSED:
-                self.refused["old stamp"] += 1
-            return verdict
+        if verdict is Verdict.REFUSED:
+            return self._refuse("old stamp")
         if message.name != self._names and not self._match(message.name):
             return self._refuse("missing joint")
         if not len(message.position) == len(message.velocity) == len(self._names):
             return self._refuse("wrong size")
-        q = np.asarray(message.position)[self._index]
-        v = np.asarray(message.velocity)[self._index]
-        # One NaN or infinity makes the sum NaN or infinite, and a sum is the cheapest test.
-        if not math.isfinite(q.sum() + v.sum()):
+        q, v = np.array(message.position), np.array(message.velocity)
+        if self._index is not None:
+            q, v = q[self._index], v[self._index]
+        if not all_finite(q, v):
             return self._refuse("not finite")
+        if verdict is Verdict.REPEAT:
+            if np.array_equal(q, self.q) and np.array_equal(v, self.v):
+                return verdict
+            if not self._guard.may_start_over(now):
+                return self._refuse("other values under the same stamp")
         self.q, self.v, self.stamp = q, v, stamp
         self._guard.accept(stamp, now)
         return Verdict.NEW
@@ -101,7 +121,9 @@ class JointStateReader:
         if any(joint not in where for joint in self._joints):
             return False
         self._names = list(names)
-        self._index = np.array([where[joint] for joint in self._joints])
+        index = [where[joint] for joint in self._joints]
+        same_order = index == list(range(len(names)))
+        self._index = None if same_order else np.array(index)
         return True
 
     def _refuse(self, reason: str) -> Verdict:
@@ -122,7 +144,9 @@ class Diagnostics:
         self._report = report
         self._node = node
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._timer = node.create_timer(period, self.publish)
+        # Also while time, as the clock topic tells it, stands still.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = node.create_timer(period, self.publish, clock=steady)
 
     def publish(self) -> None:
         """Send the status now."""

@@ -28,7 +28,7 @@ class ParameterError(ValueError):
 
     Args:
         name: the parameter.
-        value: what it was set to.
+        value: what it was set to; None if it was not.
         allowed: what it may be.
     """
 
@@ -38,6 +38,8 @@ class ParameterError(ValueError):
 
 
 def _show(value: Any) -> str:
+    if value is None:
+        return "not set"
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if isinstance(value, str):
@@ -74,7 +76,7 @@ class Parameter:
         """
         if value is None:
             if self.default is REQUIRED:
-                raise ParameterError(self.name, "not set", self._kind_name())
+                raise ParameterError(self.name, None, self._kind_name())
             return self.default
         if self.kind == list[float] and _is_sequence(value) and all(map(_is_number, value)):
             return np.array(value, dtype=float)

@@ -1,4 +1,4 @@
-"""The robot states a worst case is searched over, and the dynamics evaluated in batches of them.
+"""The robot states a worst case is searched over.
 
 Shared by `acceleration_limits` (Algorithm 4 of [DelPrete2018]) and `discretisation_margin`.
 """
@@ -13,9 +13,6 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
-
-NO_INERTIA = 1e-10
-"""Below this diagonal entry of M (kg m^2 or kg) a joint is taken to move nothing."""
 
 
 class LimitEstimateError(ValueError):
@@ -107,43 +104,3 @@ class StateSpace:
         q = self.q_min + unit[:, : self.n] * (self.q_max - self.q_min)
         v = (2.0 * unit[:, self.n :] - 1.0) * self.v_max
         return q, v
-
-
-def torque_terms(model: pin.Model, q: Array, v: Array) -> tuple[Array, Array]:
-    """Return the bias forces h(q, v) and the diagonal of M(q) of a batch of states.
-
-    Args:
-        model: the robot.
-        q: positions, shape (batch, n), rad.
-        v: velocities, shape (batch, n), rad/s.
-
-    Returns:
-        h, shape (batch, n), N m, and the diagonal of M, shape (batch, n), kg m^2.
-    """
-    data = model.createData()
-    diagonal = data.M.diagonal()  # a view, refreshed by every crba
-    h, inertia = np.empty_like(q), np.empty_like(q)
-    crba, bias = pin.crba, pin.nonLinearEffects
-    for q_i, v_i, h_i, inertia_i in zip(q, v, h, inertia, strict=True):
-        crba(model, data, q_i)
-        inertia_i[:] = diagonal
-        h_i[:] = bias(model, data, q_i, v_i)
-    return h, inertia
-
-
-def inverse_dynamics(model: pin.Model, q: Array, v: Array, a: Array) -> Array:
-    """Return ``M(q) a + h(q, v)`` of a batch, every array of shape (batch, n)."""
-    data = model.createData()
-    tau = np.empty_like(q)
-    for tau_i, q_i, v_i, a_i in zip(tau, q, v, a, strict=True):
-        tau_i[:] = pin.rnea(model, data, q_i, v_i, a_i)
-    return tau
-
-
-def forward_dynamics(model: pin.Model, q: Array, v: Array, tau: Array) -> Array:
-    """Return the accelerations that `tau` causes, every array of shape (batch, n)."""
-    data = model.createData()
-    a = np.empty_like(q)
-    for a_i, q_i, v_i, tau_i in zip(a, q, v, tau, strict=True):
-        a_i[:] = pin.aba(model, data, q_i, v_i, tau_i)
-    return a

@@ -1,0 +1,198 @@
+"""State -> limits -> command in one process: the real nodes against nodes that only relay.
+
+Both chains live in one process on one executor, and are driven in turns by the same probe, so
+that what differs is the work of the nodes. Each chain has its own simulated arm, moved outside the
+measured time: the real chain's by its commands, through the demo's goals and into the limits;
+the relays' by gravity compensation.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from array import array
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import rclpy
+import yaml
+from geometry_msgs.msg import PoseStamped
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from sim_bridge.bullet_robot import BulletRobot
+from sim_bridge.scenario import PoseGoal, load_scenario
+from torque_safety_controller.controller_node import ControllerNode
+from viability_bounds_pkg.bounds_node import BoundsNode
+from viability_bounds_pkg.robot_description import build_model, read_urdf
+from viability_bounds_pkg.ros_runtime import CONTROL_QOS, GOAL_QOS, make_executor, set_stamp
+
+ROOT = Path(__file__).resolve().parent.parent
+DT_NS = 1_000_000
+
+
+class RelayLimits(Node):
+    """Answers a state with limits of the right size, and does nothing else."""
+
+    def __init__(self, joints: list[str], **arguments) -> None:
+        super().__init__("relay_limits", **arguments)
+        wide = array("d", [1.0] * len(joints))
+        self._answer = JointTrajectory(
+            joint_names=joints,
+            points=[JointTrajectoryPoint(accelerations=wide) for _ in range(2)],
+        )
+        self._publisher = self.create_publisher(
+            JointTrajectory, "acceleration_limits", CONTROL_QOS
+        )
+        self.create_subscription(JointState, "joint_states", self._on_state, CONTROL_QOS)
+
+    def _on_state(self, message: JointState) -> None:
+        self._answer.header.stamp = message.header.stamp
+        self._publisher.publish(self._answer)
+
+
+class RelayCommand(Node):
+    """Takes states and limits, answers limits with a command of the right size."""
+
+    def __init__(self, joints: list[str], **arguments) -> None:
+        super().__init__("relay_command", **arguments)
+        self._command = JointState(name=joints, effort=array("d", [0.0] * len(joints)))
+        self._publisher = self.create_publisher(JointState, "joint_commands", CONTROL_QOS)
+        self.create_subscription(JointState, "joint_states", lambda _: None, CONTROL_QOS)
+        self.create_subscription(
+            JointTrajectory, "acceleration_limits", self._on_limits, CONTROL_QOS
+        )
+
+    def _on_limits(self, message: JointTrajectory) -> None:
+        self._command.header.stamp = message.header.stamp
+        self._publisher.publish(self._command)
+
+
+class Probe(Node):
+    """Plays the robot: publishes states, notes when the command comes."""
+
+    def __init__(self, joints: list[str], robot: BulletRobot, **arguments) -> None:
+        super().__init__("probe", **arguments)
+        self._state = JointState(name=joints, effort=array("d", [0.0] * len(joints)))
+        self.robot = robot
+        self._stamp = 0
+        self.command: array | None = None
+        self._publisher = self.create_publisher(JointState, "joint_states", CONTROL_QOS)
+        self._goal = self.create_publisher(PoseStamped, "target_pose", GOAL_QOS)
+        self.create_subscription(JointState, "joint_commands", self._on_command, CONTROL_QOS)
+
+    def set_goal(self, goal: PoseGoal) -> None:
+        """Give the controller something to track."""
+        message = PoseStamped()
+        p, o = message.pose.position, message.pose.orientation
+        p.x, p.y, p.z = goal.position
+        o.x, o.y, o.z, o.w = goal.orientation
+        self._goal.publish(message)
+
+    def cycle(self, executor, timeout: float = 1.0) -> float:
+        """Send a state, wait for its command, return how long it took, s; NaN if it is lost."""
+        self._stamp += DT_NS
+        q, v, _ = self.robot.state()
+        self.command = None
+        start = time.perf_counter()
+        self._state.position = array("d", q.tobytes())
+        self._state.velocity = array("d", v.tobytes())
+        set_stamp(self._state.header.stamp, self._stamp)
+        self._publisher.publish(self._state)
+        while self.command is None:
+            executor.spin_once(timeout_sec=0.01)
+            if time.perf_counter() - start > timeout:
+                return float("nan")
+        return time.perf_counter() - start
+
+    def _on_command(self, message: JointState) -> None:
+        self.command = message.effort
+
+
+def parameters(robot: str) -> dict:
+    """Return the parameters of all nodes in a robot's file, by name."""
+    content = yaml.safe_load((ROOT / "config" / f"{robot}.yaml").read_text())
+    return {
+        name: value for part in content.values() for name, value in part["ros__parameters"].items()
+    }
+
+
+def drive(executor, probe: Probe, model, cycles: int) -> list[float]:
+    """Return the times of some cycles, s, moving the probe's arm in between."""
+    data = model.createData()
+    times = []
+    for _ in range(cycles):
+        times.append(probe.cycle(executor))
+        gravity = pin.computeGeneralizedGravity(model, data, probe.robot.state().q)
+        commanded = probe.command is not None and any(probe.command)
+        probe.robot.step(np.array(probe.command) if commanded else gravity)
+    return times
+
+
+def main() -> None:
+    """Run the benchmark and print both medians and their ratio."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--robot", default="baxter_left_arm")
+    parser.add_argument("--cycles", type=int, default=8000, help="of each chain")
+    parser.add_argument("--block", type=int, default=100, help="cycles before the other's turn")
+    options = parser.parse_args()
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    rclpy.init()
+    values = parameters(options.robot)
+    joints = values["joints"]
+    overrides = [Parameter(name, value=value) for name, value in values.items()]
+    overrides.append(Parameter("bounds_timeout", value=1.0))
+    overrides.append(Parameter("rate_hz", value=1e9 / DT_NS))
+    urdf = read_urdf(values["robot_description"])
+    model = build_model(urdf, joints)
+    scenario = load_scenario(ROOT / "config" / "scenarios" / f"{options.robot}_demo.yaml")
+    goals = [event for event in scenario.events if isinstance(event, PoseGoal)]
+
+    def make_robot() -> BulletRobot:
+        robot = BulletRobot(urdf, joints, physics_dt=DT_NS * 1e-9)
+        robot.reset(values["start_positions"], np.zeros(len(joints)))
+        return robot
+
+    real = {"namespace": "real", "parameter_overrides": overrides}
+    relay = {"namespace": "relay"}
+    nodes = [
+        BoundsNode(**real),
+        ControllerNode(**real),
+        RelayLimits(joints, **relay),
+        RelayCommand(joints, **relay),
+    ]
+    probes = {
+        "real": Probe(joints, make_robot(), namespace="real"),
+        "relay": Probe(joints, make_robot(), namespace="relay"),
+    }
+    executor = make_executor()
+    for node in (*nodes, *probes.values()):
+        executor.add_node(node)
+    for name, probe in probes.items():
+        deadline = time.monotonic() + 20.0
+        while np.isnan(probe.cycle(executor)):
+            if time.monotonic() > deadline:
+                raise SystemExit(f"the {name} chain does not answer")
+    times: dict[str, list[float]] = {name: [] for name in probes}
+    blocks = options.cycles // options.block
+    for block in range(blocks):
+        probes["real"].set_goal(goals[block * len(goals) // blocks])
+        for name, probe in probes.items():
+            times[name] += drive(executor, probe, model, options.block)
+    medians = {name: np.nanmedian(samples) * 1e6 for name, samples in times.items()}
+    for name, samples in times.items():
+        slow = np.nanpercentile(samples, 99) * 1e6
+        lost = int(np.isnan(samples).sum())
+        print(f"{name:>5}: median {medians[name]:7.1f} us, 99% {slow:7.1f} us, lost {lost}")
+    print(f"ratio real / relay: {medians['real'] / medians['relay']:.2f}")
+    for node in (*nodes, *probes.values()):
+        node.destroy_node()
+    rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main()

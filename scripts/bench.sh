@@ -1,0 +1,22 @@
+#!/usr/bin/env bash
+# Measures, and prints what it measured. Ratios compare what ran in turns in one process.
+#
+#     bash scripts/bench.sh chain     state -> limits -> command against empty relays
+#     bash scripts/bench.sh step      one controller step, part by part
+#     bash scripts/bench.sh bounds    acceleration bounds: one arm, and batches
+set -eu
+root="$(cd "$(dirname "$0")/.." && pwd)"
+name="${1:-}"
+if [ -z "$name" ] || [ ! -f "$root/benchmarks/bench_$name.py" ]; then
+    known="$(cd "$root/benchmarks" && ls bench_*.py | sed 's/bench_//; s/.py//' | tr '\n' ' ')"
+    echo "usage: bash scripts/bench.sh NAME [options]; there are: $known" >&2
+    exit 2
+fi
+shift
+set +u
+# shellcheck disable=SC1091
+source "$root/scripts/setup.sh"
+set -u
+export ROS_DOMAIN_ID="${ROS_DOMAIN_ID:-$((1 + $$ % 100))}"
+export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
+exec python "$root/benchmarks/bench_$name.py" "$@"

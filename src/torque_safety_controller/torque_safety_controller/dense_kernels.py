@@ -1,0 +1,164 @@
+"""Small dense linear algebra, compiled: for matrices of 7 columns NumPy is mostly overhead.
+
+A step of the controller calls these a few times; each saves ten or so array operations, of
+which every one costs more than the arithmetic in it. The compiled code is cached beside this
+file, so that only the first start on a machine pays for compiling.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True)
+def _solve_positive_definite(A: np.ndarray, x: np.ndarray) -> bool:
+    """Replace `x`, shape (n,), by ``A^-1 x``; A, shape (n, n), is overwritten.
+
+    Returns:
+        False, with `x` undefined, when A is not numerically positive definite.
+    """
+    n = len(x)
+    for j in range(n):
+        d = A[j, j]
+        for k in range(j):
+            d -= A[j, k] * A[j, k]
+        if not d > 0.0:
+            return False
+        d = math.sqrt(d)
+        A[j, j] = d
+        for i in range(j + 1, n):
+            s = A[i, j]
+            for k in range(j):
+                s -= A[i, k] * A[j, k]
+            A[i, j] = s / d
+    for i in range(n):
+        s = x[i]
+        for k in range(i):
+            s -= A[i, k] * x[k]
+        x[i] = s / A[i, i]
+    for i in range(n - 1, -1, -1):
+        s = x[i]
+        for k in range(i + 1, n):
+            s -= A[k, i] * x[k]
+        x[i] = s / A[i, i]
+    return True
+
+
+@njit(cache=True)
+def add_rows(H: np.ndarray, g: np.ndarray, A: np.ndarray, b: np.ndarray, weight: float) -> None:
+    """Add ``weight * |A a - b|^2 / 2`` to the cost ``a' H a / 2 + g' a``, in place."""
+    m, n = A.shape
+    for i in range(n):
+        for j in range(i + 1):
+            s = 0.0
+            for k in range(m):
+                s += A[k, i] * A[k, j]
+            s *= weight
+            H[i, j] += s
+            if i != j:
+                H[j, i] += s
+        s = 0.0
+        for k in range(m):
+            s += A[k, i] * b[k]
+        g[i] -= weight * s
+
+
+@njit(cache=True)
+def add_identity(H: np.ndarray, g: np.ndarray, b: np.ndarray, weight: float) -> None:
+    """Add ``weight * |a - b|^2 / 2`` to the cost ``a' H a / 2 + g' a``, in place."""
+    for i in range(len(b)):
+        H[i, i] += weight
+        g[i] -= weight * b[i]
+
+
+@njit(cache=True)
+def null_space_part(J: np.ndarray, x: np.ndarray, regularisation: float) -> np.ndarray:
+    """Return ``x - J^T (J J^T + regularisation I)^-1 J x``, shape (n,), J of shape (m, n)."""
+    m, n = J.shape
+    G = np.empty((m, m))
+    y = np.empty(m)
+    for i in range(m):
+        s = 0.0
+        for k in range(n):
+            s += J[i, k] * x[k]
+        y[i] = s
+        for j in range(i + 1):
+            s = 0.0
+            for k in range(n):
+                s += J[i, k] * J[j, k]
+            G[i, j] = s
+        G[i, i] += regularisation
+    result = x.copy()
+    if _solve_positive_definite(G, y):
+        for k in range(n):
+            s = 0.0
+            for i in range(m):
+                s += J[i, k] * y[i]
+            result[k] -= s
+    return result
+
+
+@njit(cache=True)
+def minimum_with_bounds_active(
+    H: np.ndarray,
+    g: np.ndarray,
+    side: np.ndarray,
+    a_lower: np.ndarray,
+    a_upper: np.ndarray,
+    M: np.ndarray,
+    tau_lower: np.ndarray,
+    tau_upper: np.ndarray,
+    a: np.ndarray,
+) -> bool:
+    """Minimise ``a' H a / 2 + g' a`` with some bounds active; tell whether that is optimal.
+
+    Args:
+        H: shape (n, n), positive definite.
+        g: shape (n,).
+        side: which bound is active, shape (n,): 1 the lower, -1 the upper, 0 none.
+        a_lower: lower bounds of a, shape (n,).
+        a_upper: upper bounds of a, shape (n,).
+        M: shape (n, n).
+        tau_lower: lower bounds of M a, shape (n,).
+        tau_upper: upper bounds of M a, shape (n,).
+        a: shape (n,), receives the minimum.
+
+    Returns:
+        Whether all bounds are kept and no active one pulls inward: the Karush-Kuhn-Tucker
+        conditions, so that `a` is the constrained minimum. A NaN anywhere makes it False.
+    """
+    n = len(g)
+    K = np.empty((n, n))
+    for i in range(n):
+        if side[i] == 0:
+            s = -g[i]
+            for j in range(n):
+                if side[j] == 0:
+                    K[i, j] = H[i, j]
+                else:
+                    K[i, j] = 0.0
+                    s -= H[i, j] * (a_lower[j] if side[j] > 0 else a_upper[j])
+            a[i] = s
+        else:
+            for j in range(n):
+                K[i, j] = 0.0
+            K[i, i] = 1.0
+            a[i] = a_lower[i] if side[i] > 0 else a_upper[i]
+    if not _solve_positive_definite(K, a):
+        return False
+    for i in range(n):
+        tau = 0.0
+        for j in range(n):
+            tau += M[i, j] * a[j]
+        if not (a_lower[i] <= a[i] <= a_upper[i] and tau_lower[i] <= tau <= tau_upper[i]):
+            return False
+        if side[i] != 0:
+            slope = g[i]
+            for j in range(n):
+                slope += H[i, j] * a[j]
+            if not slope * side[i] >= 0.0:
+                return False
+    return True

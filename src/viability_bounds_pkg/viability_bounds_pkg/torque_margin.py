@@ -1,0 +1,61 @@
+"""What holding a torque for a control step costs, and the margins that pay for it.
+
+The bounds assume constant acceleration within a step; a robot under a constant torque has
+only nearly that. `docs/torque_margin.md` derives the margins below and shows that they keep
+the limits.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+class TorqueMargins(NamedTuple):
+    """What the bounds must keep back, each of shape (n,).
+
+    Attributes:
+        acceleration: off the braking and the bounds, rad/s^2.
+        velocity: off the speed limits, rad/s.
+        position: off the position limits, rad.
+    """
+
+    acceleration: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    position: NDArray[np.float64]
+
+
+def step_deviations(drift: ArrayLike, dt: float) -> tuple[NDArray, NDArray]:
+    """Return how far velocity and position stray from constant acceleration within a step.
+
+    The torque is right for the middle of the step, so that with drift J the acceleration is
+    off by J (t - dt/2): the velocity by at most J dt^2 / 8, the position by J dt^3 / 12.
+
+    Args:
+        drift: greatest rate of change of acceleration under constant torque, shape (n,),
+            rad/s^3.
+        dt: control period, s.
+
+    Returns:
+        Velocity, rad/s, and position, rad, each of shape (n,).
+    """
+    drift = np.asarray(drift, dtype=float)
+    return drift * dt**2 / 8.0, drift * dt**3 / 12.0
+
+
+def torque_margins(drift: ArrayLike, dt: float) -> TorqueMargins:
+    """Return the margins that make up for `step_deviations`.
+
+    One half of the acceleration margin, J dt / 36, covers what is left of the error of the mean
+    acceleration, which is of second order in dt; the other half is a reserve of braking that
+    makes up for the position error D = J dt^3 / 12 of each step as long as the joint is faster
+    than the last three steps of braking. In these the error adds up to at most 5 D.
+
+    Args:
+        drift: shape (n,), rad/s^3.
+        dt: control period, s.
+    """
+    velocity, position = step_deviations(drift, dt)
+    return TorqueMargins(np.asarray(drift, dtype=float) * dt / 18.0, velocity, 5.0 * position)
