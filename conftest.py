@@ -1,3 +1,3 @@
 """Fixtures for the tests of all packages."""
 
-pytest_plugins = ["ros_harness"]
+pytest_plugins = ["ros_harness", "arms"]

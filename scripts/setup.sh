@@ -43,7 +43,6 @@ _setup() {
     _build || return 1
     # shellcheck disable=SC1091
     source "$root/install/local_setup.bash"
-    export AMENT_PREFIX_PATH="$root/install/viability_bounds_pkg:$root/install/torque_safety_controller:$root/install/sim_bridge${_ros_prefix:+:$_ros_prefix}"
 }
 
 _install() {
@@ -99,7 +98,12 @@ _build() {
     printf '%s' "$now" >"$built"
 }
 
+# One at a time: two shells may source this at once.
+exec {_lock}>"$(dirname "${BASH_SOURCE[0]}")/../.setup.lock"
+flock "$_lock"
 _setup
 _status=$?
+exec {_lock}>&-
 unset -f _setup _install _install_pybullet _build
+unset _lock
 (exit $_status)

