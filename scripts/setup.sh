@@ -57,8 +57,15 @@ _install() {
         echo "setup: '$python -m venv' failed; on Ubuntu: sudo apt install python3-venv" >&2
         return 1
     fi
+    cp "$root/requirements/constraints.txt" "$venv/constraints.txt"
+    if [ "$ros" = sourced ]; then
+        # ROS' message packages are compiled for the NumPy of the system: keep to that one.
+        local numpy
+        numpy="$("$python" -c 'import numpy; print(numpy.__version__)')" || return 1
+        sed -i "s/^numpy==.*/numpy==$numpy/" "$venv/constraints.txt"
+    fi
     local pip=("$venv/bin/python" -m pip install --quiet --disable-pip-version-check
-        --constraint "$root/requirements/constraints.txt")
+        --constraint "$venv/constraints.txt")
     if ! "${pip[@]}" -r "$root/requirements/common.txt" -r "$root/requirements/$ros.txt"; then
         echo "setup: installing packages failed (is there a network?); run it again to retry" >&2
         return 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
 from pathlib import Path
@@ -313,34 +313,36 @@ class ScenarioNode(Node):
         )
 
 
-def play(node: ScenarioNode) -> None:
+def play(node: ScenarioNode, others: Sequence[Node] = (), *, quiet: bool = False) -> None:
     """Run the scenario to its end, showing a live line.
+
+    Args:
+        node: the scenario.
+        others: nodes to run in the same process.
+        quiet: show nothing.
 
     Raises:
         TimeoutError: the other nodes did not come up, or stopped answering.
-        ExternalShutdownException: told to stop before the end.
     """
     executor = make_executor(node.context)
-    executor.add_node(node)
+    for each in (node, *others):
+        executor.add_node(each)
     terminal = sys.stdout.isatty()
     shown_at = -math.inf
-    stamp, moved_at = -1, time.monotonic()
+    progress, moved_at = None, time.monotonic()
     while node.phase is not Phase.DONE and rclpy.ok(context=node.context):
         executor.spin_once(timeout_sec=0.1)
         now = time.monotonic()
-        if (node.stamp, node.phase) != stamp:
-            stamp, moved_at = (node.stamp, node.phase), now
+        if (node.stamp, node.phase) != progress:
+            progress, moved_at = (node.stamp, node.phase), now
         elif now - moved_at > node.config.ready_timeout:
-            raise TimeoutError(
-                f"nothing has moved for {node.config.ready_timeout:g} s "
-                f"({node.phase.name.lower().replace('_', ' ')})"
-            )
-        if now - shown_at > _SHOW_PERIOD:
+            phase = node.phase.name.lower().replace("_", " ")
+            raise TimeoutError(f"nothing has moved for {node.config.ready_timeout:g} s ({phase})")
+        if not quiet and now - shown_at > _SHOW_PERIOD:
             shown_at = now
             print(node.live_line(), end="\r" if terminal else "\n", flush=True)
-    if node.phase is not Phase.DONE:
-        raise ExternalShutdownException
-    print(node.live_line(), flush=True)
+    if not quiet:
+        print(node.live_line(), flush=True)
 
 
 def main(args: list[str] | None = None) -> int:

@@ -25,20 +25,20 @@ from torque_safety_controller.dense_kernels import (
 )
 from torque_safety_controller.tasks import TaskTerm
 
-# rad/s^2 and N m at most. With 1e-6, one warm start in a hundred ends off the minimum, by up to
-# 2 % of the cost.
-_TOLERANCE = 1e-8
+_TOLERANCE = 1e-8  # rad/s^2 and N m at most
 # Solvable problems take up to 11 outer and 50 inner iterations. ProxQP's own limits let one
 # without a solution go on for 15 s.
-_ITERATIONS = 50
+_OUTER_ITERATIONS = 25
+_INNER_ITERATIONS = 50
 # What giving way costs, relative to the tasks' gradient: the bounds give way by up to 5e-5
 # rad/s^2 more than they must, and the solver still tells good accelerations from bad ones.
 _PENALTY = 1e5
 _RELAXED_TOLERANCE = 1e-10
 # How near to a bound a solution of the solver counts as being at it, rad/s^2.
 _AT_BOUND = 1e-4
-# A problem that was hard to solve but has a solution: nothing gave way.
-_NEGLIGIBLE = 1e-6
+# Less relaxation than this, rad/s^2, is none: one problem in a thousand that has a solution is
+# taken for one that has not.
+_NEGLIGIBLE = 1e-4
 
 
 class Solution(NamedTuple):
@@ -106,16 +106,10 @@ class InverseDynamicsQP:
             raise NoSolutionFound("not finite, or lower limits above upper ones")
         a, iterations = self._solve_main(M, tau_lower, tau_upper, a_lower, a_upper)
         if a is not None:
-            return Solution(a, None, iterations)
-        # Started from the last solution, ProxQP takes one problem in a thousand for infeasible.
-        self._qp = None
-        a, more = self._solve_main(M, tau_lower, tau_upper, a_lower, a_upper)
-        iterations += more
-        if a is not None:
             np.clip(a, a_lower, a_upper, out=a)  # off by the solver's tolerance at most
             self._note_active_bounds(a, a_lower, a_upper)
             return Solution(a, None, iterations)
-        self._qp = None  # its multipliers have grown: nothing to start from
+        self._qp = None  # what it scales problems by was found for one with a solution
         a, more = self._solve_relaxed(M, tau_lower, tau_upper, a_lower, a_upper)
         relaxation = np.maximum(a_lower - a, a - a_upper).clip(0.0)
         if relaxation.max() < _NEGLIGIBLE:
@@ -192,8 +186,8 @@ class InverseDynamicsQP:
 def _configure(qp: proxqp.dense.QP, tolerance: float) -> None:
     qp.settings.eps_abs = tolerance
     qp.settings.eps_rel = 0.0
-    qp.settings.max_iter = _ITERATIONS
-    qp.settings.max_iter_in = _ITERATIONS
+    qp.settings.max_iter = _OUTER_ITERATIONS
+    qp.settings.max_iter_in = _INNER_ITERATIONS
     # Started from the last solution, ProxQP 0.8 now and then returns one whose multipliers have
     # the wrong sign, 2% above the least cost; what is easy has been solved before it is asked.
     qp.settings.initial_guess = proxqp.InitialGuess.NO_INITIAL_GUESS

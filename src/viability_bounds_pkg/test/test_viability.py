@@ -1,5 +1,6 @@
-"""Bounds against the paper's algorithms, against problem (4), and in motion."""
+"""Bounds against the paper's algorithms and problem (4), and what they do with odd input."""
 
+import math
 import os
 
 import brute_force
@@ -7,8 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from joint_cases import CASES, FAILING, HOLDING, column, one_joint, states_of
 
 from viability_bounds_pkg import paper_algorithms
+from viability_bounds_pkg.discrete_kernel import stopping_curves
 from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
 from viability_bounds_pkg.viability import (
     BoundsSolver,
@@ -22,54 +25,6 @@ EXACT = 1e-6
 
 EDGE = 1e-6
 """Distance from the edge of the kernel within which states are not told apart, see `Extremes`."""
-
-VIOLATION = 1e-9
-"""Largest violation in motion, rad and rad/s."""
-
-
-def one_joint(q_min, q_max, v_max, a_min, a_max):
-    return JointLimits(["joint"], [q_min], [q_max], [v_max], [a_min], [a_max])
-
-
-def column(values):
-    return np.asarray(values, dtype=float).reshape(-1, 1)
-
-
-# Joints and steps: (q_min, q_max, v_max, a_min, a_max, dt).
-HOLDING = {
-    "figure 3": (-0.5, 0.5, 2.0, -10.0, 10.0, 0.1),
-    "asymmetric": (-0.4, 0.8, 2.0, -6.0, 14.0, 0.1),
-    "asymmetric, mirrored": (-0.8, 0.4, 2.0, -14.0, 6.0, 0.1),
-    "condition (11) just holds": (-0.05, 0.05, 1.0, -10.0, 10.0, 0.1),
-    "no lower limit": (-np.inf, 0.5, 2.0, -10.0, 7.0, 0.1),
-    "continuous": (-np.inf, np.inf, 2.0, -10.0, 7.0, 0.5),
-}
-FAILING = {
-    "too fast": (-0.5, 0.5, 0.6, -10.0, 6.0, 0.1),
-    "too fast, one limit": (-np.inf, 0.5, 0.4, -10.0, 6.0, 0.1),
-    "narrow": (-0.03, 0.03, 2.0, -10.0, 10.0, 0.1),
-    "narrow and asymmetric": (-0.06, 0.06, 2.0, -10.0, 4.0, 0.1),
-    "weak one way": (-0.2, 0.3, 3.0, -10.0, 1.0, 0.1),
-    "narrow and too fast": (-0.02, 0.02, 0.6, -10.0, 10.0, 0.1),
-    "far too narrow": (-0.002, 0.002, 2.0, -10.0, 8.0, 0.1),
-}
-CASES = {**HOLDING, **FAILING}
-
-
-def states_of(case, count, seed):
-    """Return random states, more than enough of them viable, some on the limits."""
-    q_min, q_max, v_max, a_min, a_max, dt = case
-    rng = np.random.default_rng(seed)
-    low = q_min if np.isfinite(q_min) else -1.0
-    high = q_max if np.isfinite(q_max) else 1.0
-    # No speed that crosses the range within a quarter of a step is viable.
-    fastest = min(v_max, 4.0 * (q_max - q_min) / dt)
-    q, v = rng.uniform(low, high, count), rng.uniform(-fastest, fastest, count)
-    kind = rng.integers(0, 20, count)
-    q[kind == 0], q[kind == 1] = low, high
-    v[kind == 2], v[kind == 3] = fastest, -fastest
-    v[kind == 4] = 0.0
-    return q, v
 
 
 @pytest.mark.parametrize("name", HOLDING)
@@ -173,3 +128,200 @@ def test_agrees_with_brute_force_everywhere():
         found += number
         failing += 0 if holds else number
     print(f"{found} viable states, {failing} of them where condition (11) fails")
+
+
+def test_kernel_when_only_the_speed_is_short():
+    # A step that stops at the limit may end at -v_max: U(v) = v^2 / (2 (v + v_max)).
+    curve, _ = stopping_curves(np.inf, 1.5, (4.0, 4.0))
+    v = np.linspace(0.0, 1.5, 200)
+    expected = np.maximum(v**2 / 8.0, v**2 / (2.0 * (v + 1.5)))
+    assert np.abs(curve.room_and_slope(v)[0] - expected).max() < 1e-6
+
+
+def test_kernel_when_only_the_range_is_short():
+    # At speed 2 L, braking with 4 L, the joint swings from limit to limit for ever.
+    for curve in stopping_curves(0.7, 100.0, (50.0, 60.0)):
+        assert curve.room_at(1.4) == pytest.approx(0.35, abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("length", "v_max", "braking"),
+    [
+        (1.0, 9.0, (3.0, 3.0)),
+        (1.0, 9.0, (30.0, 20.0)),
+        (1.0, 1.5, (3.0, 2.0)),
+        (1.0, 0.5, (3.0, 2.0)),
+        (1.0, 9.0, (3.0, 0.1)),
+        (0.366, 1.63, (1.185, 0.5525)),
+        (np.inf, 1.5, (3.0, 3.0)),
+    ],
+)
+def test_interpolated_kernel_is_invariant(length, v_max, braking):
+    """From its edge, one step leads back into it: what makes the bounds safe, not just close."""
+    curves = stopping_curves(length, v_max, braking)
+    for curve, opposite, b in zip(curves, curves[::-1], braking, strict=True):
+        v = np.linspace(1e-6, min(b, 4.0 * length, v_max), 20_001)
+        room = curve.room_and_slope(v)[0]
+        v, room = v[room <= length], room[room <= length]
+        # Stop on the limit, with as little braking as the room allows; then thrown back.
+        needed = v**2 / (2.0 * room)
+        back = needed - v
+        left = length - back**2 / (2.0 * needed)
+        assert (needed <= b * (1.0 + 1e-12)).all()
+        assert (back >= -1e-12).all()
+        assert (back <= v_max * (1.0 + 1e-12)).all()
+        excess = opposite.room_and_slope(np.maximum(back, 0.0))[0] - left
+        assert excess.max() <= 1e-12 * min(1.0, v_max)
+
+
+def test_velocity_range_is_the_paper_s_kernel():
+    limits = one_joint(-0.5, 0.5, 2.0, -10.0, 5.0)
+    q = column(np.linspace(-0.5, 0.5, 101))
+    lower, upper = viable_velocity_range(q, limits)
+    assert upper == pytest.approx(np.minimum(2.0, np.sqrt(20.0 * (0.5 - q))))
+    assert lower == pytest.approx(-np.minimum(2.0, np.sqrt(10.0 * (q + 0.5))))
+    assert np.isnan(viable_velocity_range([0.6], limits)).all()
+    with_margin = viable_velocity_range(q, limits, margin=[2.0])[1]
+    assert with_margin == pytest.approx(np.minimum(2.0, np.sqrt(16.0 * (0.5 - q))))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_velocity_range_is_where_states_are_viable(name):
+    case = CASES[name]
+    limits = one_joint(*case[:5])
+    solver = BoundsSolver(limits, case[5])
+    q, _ = states_of(case, 500, seed=4)
+    q = column(q)
+    lower, upper = solver.velocity_range(q)
+    step = 1e-6 * case[2]
+    assert solver.bounds(q, np.maximum(upper - step, 0.0)).viable.all()
+    assert solver.bounds(q, np.minimum(lower + step, 0.0)).viable.all()
+    assert not solver.bounds(q, upper + step).viable.any()
+    assert not solver.bounds(q, lower - step).viable.any()
+    assert solver.velocity_range(q[0]) == (lower[0], upper[0])
+    outer = viable_velocity_range(q, limits)
+    assert (outer[0] <= lower + 1e-12).all()
+    assert (outer[1] >= upper - 1e-12).all()
+
+
+SIZES = st.floats(1e-3, 1e3)
+ANY = st.floats(allow_nan=False, allow_infinity=False)
+NEAR = st.one_of(st.floats(-3.0, 3.0), st.sampled_from([0.0, 1.0, -1.0, 1e-300, 5e-324]), ANY)
+
+
+@st.composite
+def joints(draw):
+    q_min = draw(st.one_of(st.floats(-3.0, 3.0), st.just(-math.inf)))
+    start = q_min if math.isfinite(q_min) else 0.0
+    length = draw(st.one_of(st.floats(1e-9, 10.0), st.just(math.inf)))
+    q_max = max(start + length, np.nextafter(start, 9.0))
+    return one_joint(q_min, q_max, draw(SIZES), -draw(SIZES), draw(SIZES))
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(
+    limits=joints(),
+    dt=st.one_of(st.floats(1e-4, 1.0), st.sampled_from([5e-324, 1e-300, 1e-12, 1e3, 1e300])),
+    q=NEAR,
+    v=NEAR,
+    on_limit=st.sampled_from([None, "q_min", "q_max"]),
+)
+def test_any_state_of_any_joint(limits, dt, q, v, on_limit):
+    if on_limit is not None and math.isfinite(getattr(limits, on_limit)[0]):
+        q = float(getattr(limits, on_limit)[0])
+    solver = BoundsSolver(limits, dt)
+    lower, upper, viable = (float(part[0]) for part in solver.bounds([q], [v]))
+    assert limits.a_min[0] <= lower <= upper <= limits.a_max[0]
+
+    reflected = one_joint(
+        -limits.q_max[0], -limits.q_min[0], limits.v_max[0], -limits.a_max[0], -limits.a_min[0]
+    )
+    mirror = BoundsSolver(reflected, dt).bounds([-q], [-v])
+    assert (-mirror.upper[0], -mirror.lower[0], mirror.viable[0]) == (lower, upper, viable)
+
+    batch = solver.bounds(np.full((100, 1), q), np.full((100, 1), v))
+    scale = limits.a_max[0] - limits.a_min[0]
+    assert np.abs(batch.lower - lower).max() <= 1e-12 * scale
+    assert np.abs(batch.upper - upper).max() <= 1e-12 * scale
+    assert (batch.viable == viable).all()
+
+
+@pytest.mark.parametrize("rows", [0, 1, 5, 24, 25, 5000])
+def test_batches_of_any_size_are_states_one_by_one(rows):
+    limits = JointLimits(
+        ["a", "b", "c"],
+        [-0.5, -math.inf, -0.02],
+        [0.5, 1.0, 0.02],
+        [2.0, 2.0, 0.6],
+        [-10.0, -5.0, -10.0],
+        [8.0, 9.0, 10.0],
+    )
+    rng = np.random.default_rng(0)
+    q, v = rng.uniform(-0.7, 0.7, (rows, 3)), rng.uniform(-2.2, 2.2, (rows, 3))
+    batch = acceleration_bounds(q, v, limits, 0.1)
+    assert all(part.shape == (rows, 3) for part in batch)
+    for i in range(0, rows, 7):
+        for one, many in zip(acceleration_bounds(q[i], v[i], limits, 0.1), batch, strict=True):
+            assert one == pytest.approx(many[i], rel=1e-12, abs=1e-12)
+
+
+def test_states_that_are_not_finite_do_no_harm():
+    limits = one_joint(-1.0, 1.0, 2.0, -10.0, 8.0)
+    for q, v in ((np.nan, 0.0), (0.0, np.nan), (np.nan, 1.0), (np.inf, 0.0), (0.0, -np.inf)):
+        for rows in (1, 100):
+            bounds = acceleration_bounds(np.full((rows, 1), q), np.full((rows, 1), v), limits, 0.1)
+            assert not bounds.viable.any()
+            assert (bounds.lower >= -10.0).all()
+            assert (bounds.upper <= 8.0).all()
+            assert (bounds.lower <= bounds.upper).all()
+
+
+@pytest.mark.parametrize(
+    ("q", "v"),
+    [
+        ([0.0], [0.0, 0.0]),
+        ([0.0, 0.0], [0.0, 0.0]),
+        (0.0, 0.0),
+        (np.zeros((2, 2)), np.zeros((2, 2))),
+    ],
+)
+def test_refuses_states_of_the_wrong_shape(q, v):
+    with pytest.raises(ValueError, match="shape"):
+        acceleration_bounds(q, v, one_joint(-1.0, 1.0, 2.0, -10.0, 8.0), 0.1)
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.1, math.nan, math.inf, "soon"])
+def test_refuses_steps(dt):
+    with pytest.raises(JointLimitsError, match="dt"):
+        BoundsSolver(one_joint(-1.0, 1.0, 2.0, -10.0, 8.0), dt)
+
+
+def test_refuses_a_period_above_the_step():
+    with pytest.raises(JointLimitsError, match="period"):
+        BoundsSolver(one_joint(-1.0, 1.0, 2.0, -10.0, 8.0), 0.1, period=0.2)
+
+
+@pytest.mark.parametrize(
+    ("margin", "dt"),
+    [
+        ([-1.0], 0.01),
+        ([8.0], 0.01),
+        ([math.nan], 0.01),
+        ([math.inf], 0.01),
+        ([1.0, 1.0], 0.01),
+        # Within one step the disturbance alone crosses the range.
+        ([3.0], 1.0),
+    ],
+)
+def test_refuses_margins(margin, dt):
+    with pytest.raises(JointLimitsError, match="margin") as caught:
+        BoundsSolver(one_joint(-1.0, 1.0, 2.0, -10.0, 8.0), dt, margin)
+    assert caught.value.field == "margin"
+
+
+def test_a_margin_keeps_the_acceleration_limits():
+    limits = one_joint(-1.0, 1.0, 2.0, -10.0, 8.0)
+    lower, upper, viable = acceleration_bounds([0.0], [0.0], limits, 0.01, margin=[2.0])
+    assert (lower[0], upper[0], viable[0]) == (-10.0, 8.0, True)
+    lower, upper, _ = acceleration_bounds([0.0], [2.0], limits, 0.01, margin=[2.0])
+    assert upper[0] == pytest.approx(-2.0)

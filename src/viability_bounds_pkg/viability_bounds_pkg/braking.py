@@ -226,6 +226,8 @@ def highest_speeds(room: Array, side: Side) -> Array:
         rooms = np.array(side.landing.budget) - side.half_dt * nodes
         curved = np.fmod(speed, side.landing.period) < side.landing.peak
         speed = np.where(curved, np.interp(room, rooms, nodes), speed)
+        fast = room + side.half_dt * side.v_max >= side.far
+        speed = np.where(fast, side.v_max, speed)
     return np.minimum(speed, side.v_max)
 
 
@@ -252,3 +254,32 @@ def landing_speeds(budget: Array, parabola: Array, landing: Landing) -> None:
     """Do as `landing_speed` for arrays of shape (k,), in place of `parabola`."""
     (at,) = np.nonzero(np.fmod(parabola, landing.period) < landing.peak)
     parabola[at] = np.interp(budget[at], landing.budget, landing.speed)
+
+
+def settle(above: float, below: float, v: float, lower: float, upper: float) -> float:
+    """Return the one acceleration left where the two limits of a joint contradict each other.
+
+    That happens outside the kernel, or by rounding on its edge. The limit that is still kept
+    is not given up for the one that is broken: a joint on its way back keeps its speed limit,
+    and one that cannot stop in time stops as soon as it can without being thrown against the
+    other limit. The broken one is told by the position or, inside, by the direction of motion.
+
+    Args:
+        above: room to the upper limit, rad.
+        below: room to the lower limit, rad.
+        v: velocity, rad/s.
+        lower: bound that the lower limit asks for, rad/s^2.
+        upper: bound that the upper limit asks for, rad/s^2; below `lower`.
+    """
+    if above < 0.0 or (below >= 0.0 and v > 0.0):
+        return lower
+    if below < 0.0 or v < 0.0:
+        return upper
+    return 0.5 * (lower + upper)
+
+
+def settle_all(above: Array, below: Array, v: Array, lower: Array, upper: Array) -> Array:
+    """Do as `settle` for arrays of shape (k,)."""
+    up_is_broken = (above < 0.0) | ((below >= 0.0) & (v > 0.0))
+    lo_is_broken = (below < 0.0) | (v < 0.0)
+    return np.where(up_is_broken, lower, np.where(lo_is_broken, upper, 0.5 * (lower + upper)))

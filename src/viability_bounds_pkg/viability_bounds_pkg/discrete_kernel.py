@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-PIECES = (256, 1024)
-"""Chords of a curve, coarse to find its kinks, then fine: see `_spread` for what they cost."""
+PIECES = (256, 256, 1024)
+"""Chords of a curve: coarse twice, to find its kinks, then fine; see `_spread` for their cost."""
 
 CONVERGED = 1e-13
 """Largest change of a curve, relative to its size, at which the iteration ends. One more step
@@ -60,7 +60,8 @@ class StoppingCurve(NamedTuple):
         """Return the needed room at speeds `v`, shape (k,), and its derivative."""
         whole = np.zeros_like(v) if self.peak == math.inf else np.floor(v / self.braking)
         rest = v - whole * self.braking
-        room, slope = rest * (rest / (2.0 * self.braking)), rest / self.braking
+        with np.errstate(over="ignore"):  # Beyond the last node, if that is also the last speed.
+            room, slope = rest * (rest / (2.0 * self.braking)), rest / self.braking
         (curved,) = np.nonzero(rest < self.peak)
         if curved.size:
             at = rest[curved]
@@ -96,13 +97,15 @@ def stopping_curves(
     first, second = (min(b, most) for b in braking)
     joint = _Joint(length, v_max, (first, second))
     grids = [joint.coarse_grid(i) for i in (0, 1)]
-    for pieces in PIECES[1:] * 2:
+    for pieces in PIECES[1:]:
         curves = joint.iterate(grids)
         grids = [joint.grid(i, curves, pieces) for i in (0, 1)]
     return joint.iterate(grids)
 
 
 class _Joint(NamedTuple):
+    """Arguments of `stopping_curves`; its limits are numbered 0 and 1."""
+
     length: float
     v_max: float
     braking: tuple[float, float]
@@ -141,6 +144,7 @@ class _Joint(NamedTuple):
         return u
 
     def curve(self, i: int, grid: Array, back: Array, room: Array) -> StoppingCurve:
+        """Return the curve through given nodes, up to where full braking is free."""
         free = back >= self.braking[i] - grid
         if not free.any():
             return StoppingCurve(grid, room, self.braking[i], math.inf)
@@ -169,7 +173,11 @@ class _Joint(NamedTuple):
         """
         tops = [self.top(i, curves[1 - i]) for i in (0, 1)]
         found: list[list[float]] = [[top] for top in tops]
-        fresh = [[self.v_max, *self.repeat(1 - i, [tops[1 - i]])] for i in (0, 1)]
+        # A top that is zero but for rounding is no corner.
+        corners = [
+            [top] if top > 1e-12 * b else [] for top, b in zip(tops, self.braking, strict=True)
+        ]
+        fresh = [[self.v_max, *self.repeat(1 - i, corners[1 - i])] for i in (0, 1)]
         for _ in range(MAX_STEPS):
             new = [
                 [v for u in fresh[i] if 0.0 < (v := self.thrown_from(u, curves[1 - i])) < tops[i]]
@@ -184,7 +192,7 @@ class _Joint(NamedTuple):
 
     def repeat(self, i: int, speeds: list[float]) -> list[float]:
         """Return the speeds at which curve i repeats the corners at `speeds`."""
-        top = min(self.v_max, self.braking[1 - i])
+        top = min(self.v_max, self.braking[1 - i], 4.0 * self.length)
         count = int(top / self.braking[i]) + 1
         return [v + n * self.braking[i] for v in speeds for n in range(count)]
 

@@ -182,8 +182,8 @@ def _margin(
     robot: Robot, space: StateSpace, limits: AccelerationLimits, options: argparse.Namespace
 ) -> tuple[DiscretisationMargin | None, bool]:
     """Return the margin, None if interrupted, and whether it was interrupted."""
-    print("searching for the worst drift of a held torque ...", flush=True)
     try:
+        print("searching for the worst drift of a held torque ...", flush=True)
         margin = discretisation_margin(
             robot.model,
             robot.q_min,

@@ -102,5 +102,6 @@ class StateSpace:
             q and v, each of shape (batch, n).
         """
         q = self.q_min + unit[:, : self.n] * (self.q_max - self.q_min)
+        np.minimum(q, self.q_max, out=q)  # 1.0 must not end up a rounding error outside
         v = (2.0 * unit[:, self.n :] - 1.0) * self.v_max
         return q, v

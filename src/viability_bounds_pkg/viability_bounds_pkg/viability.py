@@ -29,6 +29,8 @@ from viability_bounds_pkg.braking import (
     bounds_towards,
     highest_speeds,
     make_side,
+    settle,
+    settle_all,
 )
 from viability_bounds_pkg.condition_11 import (
     KernelBraking,
@@ -142,13 +144,8 @@ class BoundsSolver:
             return AccelerationBounds(np.array(lower), np.array(upper), np.array(viable))
         if len(q) <= SCALAR_ROWS:
             rows = [self._one(x, speed) for x, speed in zip(q.tolist(), v.tolist(), strict=True)]
-            lower, upper, viable = zip(*rows, strict=True) if rows else ((), (), ())
-            shape = q.shape
-            return AccelerationBounds(
-                np.array(lower).reshape(shape),
-                np.array(upper).reshape(shape),
-                np.array(viable, dtype=bool).reshape(shape),
-            )
+            lower, upper, viable = np.array(rows, dtype=float).reshape(len(q), 3, n).swapaxes(0, 1)
+            return AccelerationBounds(lower, upper, viable.astype(bool))
         return self._batch(q, v)
 
     def _one(self, q: list[float], v: list[float]) -> tuple[list[float], list[float], list[bool]]:
@@ -159,7 +156,7 @@ class BoundsSolver:
             lower, inside_lo = bound_towards(below, -speed, lo)
             lower = -lower
             if lower > upper:
-                lower = upper = _settle(above, below, speed, lower, upper)
+                lower = upper = settle(above, below, speed, lower, upper)
             lowers.append(lower)
             uppers.append(upper)
             viables.append(inside_up and inside_lo and -v_most <= speed <= v_most)
@@ -176,8 +173,10 @@ class BoundsSolver:
                     above, below, back = q_max - x, x - q_min, -speed
                     high = bounds_towards(above, speed, up)
                     low = -bounds_towards(below, back, lo)
-                    for i in np.flatnonzero(low > high):
-                        low[i] = high[i] = _settle(above[i], below[i], speed[i], low[i], high[i])
+                    (at,) = np.nonzero(low > high)
+                    if at.size:
+                        one = settle_all(above[at], below[at], speed[at], low[at], high[at])
+                        low[at] = high[at] = one
                     lower[rows, j], upper[rows, j] = low, high
                     inside = np.abs(speed) <= v_most
                     inside &= are_viable_towards(above, speed, up)
@@ -263,21 +262,6 @@ def viable_velocity_range(
         lower = -np.minimum(np.sqrt(2.0 * (limits.a_max - margins) * below), limits.v_max)
     outside = (above < 0.0) | (below < 0.0)
     return np.where(outside, np.nan, lower), np.where(outside, np.nan, upper)
-
-
-def _settle(above: float, below: float, v: float, lower: float, upper: float) -> float:
-    """Return the one acceleration left where the two limits contradict each other.
-
-    That happens outside the kernel, or by rounding on its edge. The limit that is still kept
-    is not given up for the one that is broken: a joint on its way back keeps its speed limit,
-    and one that cannot stop in time stops as soon as it can without being thrown against the
-    other limit. The broken one is told by the position or, inside, by the direction of motion.
-    """
-    if above < 0.0 or (below >= 0.0 and v > 0.0):
-        return lower
-    if below < 0.0 or v < 0.0:
-        return upper
-    return 0.5 * (lower + upper)
 
 
 def _joint_sides(

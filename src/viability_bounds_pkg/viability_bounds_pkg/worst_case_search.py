@@ -1,35 +1,38 @@
 """Search for the states that leave a joint the least acceleration in each direction.
 
-Two searches, both iterators over what has been found so far, so that a caller can show progress,
-stop, and keep the last result: `search_by_sampling` is Algorithm 4 of [DelPrete2018],
-`search_refined` spends its evaluations on the neighbourhoods of the worst states.
+Two searches that yield what has been found so far, so that a caller can show progress, stop and
+keep it: `search_by_sampling` is Algorithm 4 of [DelPrete2018], `search_refined` looks closer
+around the worst states.
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from scipy.optimize import minimize
-from scipy.stats import qmc
 
 from viability_bounds_pkg.batch_dynamics import BatchDynamics
+from viability_bounds_pkg.bounded_descent import descend
 from viability_bounds_pkg.state_space import Array, LimitEstimateError, StateSpace
 
 CHUNK = 2**13
-"""States evaluated at once: a power of two, so that the history falls on powers of two."""
+"""States evaluated at once; a power of two, as are the entries of the history."""
 
 NO_INERTIA = 1e-10
 """Below this diagonal entry of M (kg m^2 or kg) a joint is taken to move nothing."""
 
 SAMPLED_SHARE = 0.25
-"""Share of the refined search's evaluations spent on low-discrepancy samples."""
+"""Share of the refined search's evaluations spent on random samples."""
 
-SEARCH_STEPS = 20
-"""Quasi-Newton steps of one local search; most of them end on a corner of the box before."""
+SEARCH_STEPS = 30
+"""Steps of one local search; most end on a corner of the box before."""
+
+ENOUGH = 1e-3
+"""A step that tightens a limit by less than this part ends a local search; others begin."""
 
 PATIENCE = 25
 """Rounds of local searches without any gain after which the refined search ends."""
@@ -121,8 +124,8 @@ class _Tracker:
     def record(self) -> None:
         """Add the present estimate to the history."""
         if not self.history or self.evaluations > self.history[-1].evaluations:
-            entry = HistoryEntry(self.evaluations, -self.room[1], self.room[0].copy())
-            self.history.append(entry)
+            now = self.snapshot()
+            self.history.append(HistoryEntry(now.evaluations, now.a_min, now.a_max))
 
     def snapshot(self) -> WorstCases:
         """Return what was found so far; later updates do not change it."""
@@ -182,13 +185,14 @@ def search_by_sampling(
 def search_refined(
     model: pin.Model, space: StateSpace, evaluations: int, seed: int
 ) -> Iterator[WorstCases]:
-    """Sample evenly, then descend to a local minimum from the worst states of each limit.
+    """Sample, then descend to a local minimum from the worst states of each limit.
 
-    A randomly shifted Sobol sequence spreads the samples better than chance; every other one has
-    all velocities at their limits, because h is quadratic in v and its extremes lie mostly
-    there. Then, joint by joint and side by side, bounded quasi-Newton searches (L-BFGS-B, with
-    the analytic derivatives of the inverse dynamics) start from the worst samples, the very
-    worst of each limit first, until the evaluations are spent or `PATIENCE` rounds bring nothing.
+    Every other sample has all velocities at their limits, because h is quadratic in v and its
+    extremes lie mostly there. (A Sobol sequence in place of independent samples made no
+    difference: 14 dimensions are too many for a few thousand points to fill.) Searches with the
+    analytic derivatives of the inverse dynamics (`descend`) then start from the worst samples,
+    the very worst of each joint and side first, until the evaluations are spent or `PATIENCE`
+    rounds over all limits bring nothing.
 
     Args:
         model: the robot.
@@ -208,11 +212,10 @@ def search_refined(
     dynamics = BatchDynamics(model)
     tracker = _Tracker(n)
     count = 2 ** max(int(evaluations * SAMPLED_SHARE).bit_length() - 1, 0)
-    shift = np.random.default_rng(seed).random(2 * n)
-    sequence = qmc.Sobol(2 * n, scramble=False)
+    rng = np.random.default_rng(seed)
     points, rooms = [], []
     for size in _chunks(count):
-        unit = (sequence.random(size) + shift) % 1.0
+        unit = rng.random((size, 2 * n))
         corner = (tracker.evaluations + np.arange(size)) % 2 == 1
         unit[corner, n:] = np.round(unit[corner, n:])
         q, v = space.states(unit)
@@ -228,8 +231,6 @@ def search_refined(
     for ranks in order:
         before = tracker.room.copy()
         for limit, start in enumerate(ranks):
-            if tracker.evaluations >= evaluations:
-                break
             _descend(dynamics, space, tracker, unit[start], *divmod(limit, n), evaluations)
             yield tracker.snapshot()
         if tracker.evaluations >= 1.2 * tracker.history[-1].evaluations:
@@ -266,35 +267,33 @@ def _descend(
         evaluations: the count of the tracker at which to stop.
     """
     n = space.n
-    model = dynamics.model
-    data = model.createData()
+    data = dynamics.model.createData()
     sign = 1.0 - 2.0 * side
     width = np.concatenate([space.q_max - space.q_min, 2.0 * space.v_max])
+    last_room = np.inf
 
-    def room_and_gradient(unit: Array) -> tuple[float, Array]:
-        if tracker.evaluations + 2 > evaluations:
+    def room(unit: Array) -> float:
+        nonlocal last_room
+        if tracker.evaluations >= evaluations:
             raise _Spent
         q, v = space.states(unit[None])
-        room = acceleration_room(dynamics, space, q, v)
-        tracker.update(room, q, v)
-        tracker.evaluations += 1
-        least = float(room[0, side, joint])
+        rooms = acceleration_room(dynamics, space, q, v)
+        tracker.update(rooms, q, v)
+        last_room = float(rooms[0, side, joint])
+        return last_room
+
+    def slope(unit: Array) -> Array:
+        if tracker.evaluations >= evaluations:
+            raise _Spent
         # With a = sign * room, row j of M a + h stays at sign * tau_max as the state moves:
         # M[j, j] d(room) = -sign * d(M a + h)_j at constant a.
+        tracker.evaluations += 1
+        q, v = space.states(unit[None])
         a = np.zeros(n)
-        a[joint] = sign * least
-        by_q, by_v, inertia = pin.computeRNEADerivatives(model, data, q[0], v[0], a)
-        slope = np.concatenate([by_q[joint], by_v[joint]]) * width
-        return least, -sign * slope / inertia[joint, joint]
+        a[joint] = sign * last_room
+        by_q, by_v, inertia = pin.computeRNEADerivatives(dynamics.model, data, q[0], v[0], a)
+        change = np.concatenate([by_q[joint], by_v[joint]]) * width
+        return -sign * change / inertia[joint, joint]
 
-    try:
-        minimize(
-            room_and_gradient,
-            start,
-            jac=True,
-            method="L-BFGS-B",
-            bounds=[(0.0, 1.0)] * (2 * n),
-            options={"maxiter": SEARCH_STEPS},
-        )
-    except _Spent:
-        return
+    with contextlib.suppress(_Spent):
+        descend(room, slope, start, SEARCH_STEPS, ENOUGH)

@@ -1,0 +1,94 @@
+"""The real nodes in one process, in lockstep, from a scenario to a recording."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+import yaml
+from rclpy.parameter import Parameter
+
+from sim_bridge.bullet_node import BulletNode
+from sim_bridge.recording import Run
+from sim_bridge.scenario_node import ScenarioNode, play
+from torque_safety_controller.controller_node import ControllerNode
+from viability_bounds_pkg.bounds_node import BoundsNode
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@dataclass(frozen=True)
+class ChainResult:
+    """A finished run.
+
+    Attributes:
+        run: states, bounds and torques by control period.
+        robot: the robot's last diagnostics, by key: it saw every physics step.
+    """
+
+    run: Run
+    robot: dict[str, str]
+
+    def vector(self, key: str) -> np.ndarray:
+        """Return a per-joint value of the robot's diagnostics."""
+        return np.array([float(item) for item in self.robot[key].split()])
+
+
+def load_values(robot: str) -> dict[str, Any]:
+    """Return the parameters of all nodes in a robot's file, by name."""
+    content = yaml.safe_load((ROOT / "config" / f"{robot}.yaml").read_text())
+    return {k: v for part in content.values() for k, v in part["ros__parameters"].items()}
+
+
+@contextmanager
+def _context():
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    rclpy.init(args=["--ros-args", "--log-level", "error"])
+    try:
+        yield
+    finally:
+        rclpy.try_shutdown()
+
+
+def run_chain(
+    values: dict[str, Any], scenario: dict[str, Any], per_node: dict[str, dict[str, Any]]
+) -> ChainResult:
+    """Play a scenario through bounds, controller and robot node, in lockstep.
+
+    Args:
+        values: parameters of all nodes, by name.
+        scenario: content of a scenario file.
+        per_node: parameters that differ for one node, by node name.
+    """
+    lockstep = {
+        "clock": "lockstep",
+        "start_paused": True,
+        "bounds_timeout": 5.0,
+        "state_timeout": 10.0,
+    }
+    kinds = {
+        "bounds_node": BoundsNode,
+        "controller_node": ControllerNode,
+        "bullet_node": BulletNode,
+        "scenario_node": ScenarioNode,
+    }
+    with tempfile.TemporaryDirectory() as directory, _context():
+        path = Path(directory) / "scenario.yaml"
+        path.write_text(yaml.safe_dump(scenario))
+        nodes = []
+        for name, kind in kinds.items():
+            own = values | lockstep | {"scenario": str(path)} | per_node.get(name, {})
+            overrides = [Parameter(key, value=value) for key, value in own.items() if value != []]
+            nodes.append(kind(parameter_overrides=overrides))
+        try:
+            play(nodes[-1], others=nodes[:-1], quiet=True)
+            return ChainResult(nodes[-1].recorded_run(), nodes[-1].robot)
+        finally:
+            for node in nodes:
+                node.destroy_node()

@@ -1,0 +1,21 @@
+#!/usr/bin/env bash
+# Reproduces what a paper shows, into results/, and prints a table beside the paper's numbers.
+#
+#     bash scripts/reproduce.sh paper0         all figures, and docs/reproduction.md
+#     bash scripts/reproduce.sh paper0 fig5    one of them
+set -eu
+root="$(cd "$(dirname "$0")/.." && pwd)"
+what="${1:-all}"
+[ $# -eq 0 ] || shift
+[ "$what" != all ] || what=paper0
+if [ ! -f "$root/reproduction/$what.py" ]; then
+    echo "usage: bash scripts/reproduce.sh all|paper0 [figure]" >&2
+    exit 2
+fi
+set +u
+# shellcheck disable=SC1091
+source "$root/scripts/setup.sh"
+set -u
+export ROS_DOMAIN_ID="${ROS_DOMAIN_ID:-$((1 + $$ % 100))}"
+export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
+exec python "$root/reproduction/$what.py" "$@"

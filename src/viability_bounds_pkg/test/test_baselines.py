@@ -1,0 +1,161 @@
+"""What the other methods promise, and where they fail."""
+
+import numpy as np
+import pytest
+from joint_cases import column, one_joint
+
+from viability_bounds_pkg.baselines import (
+    damper_bounds,
+    damper_velocity_range,
+    decre_bounds,
+    decre_velocity_range,
+    naive_bounds,
+    rubrecht_bounds,
+    rubrecht_velocity_range,
+)
+from viability_bounds_pkg.joint_limits import JointLimits
+from viability_bounds_pkg.viability import acceleration_bounds, viable_velocity_range
+
+FIGURE_1 = one_joint(-1.0, 1.0, 5.0, -15.0, 15.0)
+ASYMMETRIC = one_joint(-1.0, 2.0, 5.0, -15.0, 6.0)
+FIGURE_4 = one_joint(-1.7, 2.0, 2.0, -12.0, 12.0)
+METHODS = [naive_bounds, damper_bounds, decre_bounds, rubrecht_bounds]
+
+
+def states(limits, count=5000):
+    rng = np.random.default_rng(0)
+    q = rng.uniform(limits.q_min - 0.1, limits.q_max + 0.1, (count, 1))
+    v = rng.uniform(-1.2 * limits.v_max, 1.2 * limits.v_max, (count, 1))
+    return q, v
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("limits", [FIGURE_1, ASYMMETRIC])
+def test_bounds_are_ordered_and_within_the_acceleration_limits(method, limits):
+    q, v = states(limits)
+    lower, upper, viable = method(q, v, limits, 0.01)
+    assert (limits.a_min <= lower).all()
+    assert (lower <= upper).all()
+    assert (upper <= limits.a_max).all()
+    assert viable.any()
+    assert not viable.all()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_is_mirror_symmetric(method):
+    q, v = states(ASYMMETRIC)
+    mirrored = one_joint(-2.0, 1.0, 5.0, -6.0, 15.0)
+    bounds, mirror = method(q, v, ASYMMETRIC, 0.01), method(-q, -v, mirrored, 0.01)
+    assert np.array_equal(mirror.upper, -bounds.lower)
+    assert np.array_equal(mirror.lower, -bounds.upper)
+    assert np.array_equal(mirror.viable, bounds.viable)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_takes_one_state_of_several_joints_some_of_them_continuous(method):
+    inf = np.inf
+    limits = JointLimits(["a", "b"], [-1.0, -inf], [1.0, inf], [2.0, 2.0], [-9.0] * 2, [8.0] * 2)
+    bounds = method([0.0, 70.0], [0.0, 1.0], limits, 0.01)
+    assert all(part.shape == (2,) for part in bounds)
+    assert bounds.viable.all()
+    assert (bounds.lower[1], bounds.upper[1]) == (-9.0, 8.0)
+
+
+def test_naive_bounds_are_equation_2():
+    # Far from all limits, at the speed limit, at a position limit.
+    lower, upper, _ = naive_bounds(
+        column([0.0, 0.0, 0.999]), column([0.0, 4.9, 0.1]), FIGURE_1, 0.1
+    )
+    assert upper[:, 0] == pytest.approx([15.0, 1.0, 2.0 / 0.01 * (0.001 - 0.01)])
+    assert lower[:, 0] == pytest.approx([-15.0, -15.0, -15.0])
+
+
+def test_damper_is_linear_within_its_influence():
+    lower, upper = damper_velocity_range(
+        column([0.0, 0.8, 0.9, 0.95]), FIGURE_1, influence=0.2, security=0.05, gain=3.0
+    )
+    assert upper[:, 0] == pytest.approx([5.0, 3.0, 1.0, 0.0])
+    assert lower[:, 0] == pytest.approx([-5.0] * 4)
+
+
+@pytest.mark.parametrize("limits", [FIGURE_1, ASYMMETRIC])
+def test_velocity_ranges_are_inside_the_kernel(limits):
+    """Fig. 1: [5] inside [6] inside the kernel; and [5] and [6] approach it as dt does zero."""
+    q = column(np.linspace(limits.q_min[0], limits.q_max[0], 1001))
+    kernel = viable_velocity_range(q, limits)
+    for dt in (0.1, 0.01):
+        decre = decre_velocity_range(q, limits, dt)
+        rubrecht = rubrecht_velocity_range(q, limits, dt)
+        for outer, inner in ((kernel, decre), (decre, rubrecht)):
+            assert (inner[1] <= outer[1] + 1e-12).all()
+            assert (inner[0] >= outer[0] - 1e-12).all()
+        assert rubrecht[1].max() == pytest.approx(5.0, abs=0.6)
+    for velocity_range in (decre_velocity_range, rubrecht_velocity_range):
+        assert velocity_range(q, limits, 1e-9)[1] == pytest.approx(kernel[1], abs=1e-6)
+
+
+def velocity_controlled(velocity_range, limits, dt, v=0.0, q=0.0):
+    """Go as fast as allowed under velocity control; return the hardest deceleration asked for."""
+    hardest = 0.0
+    for _ in range(2000):
+        allowed = float(velocity_range([q], limits, dt)[1][0])
+        hardest = max(hardest, (v - allowed) / dt)
+        v = min(allowed, v + limits.a_max[0] * dt)
+        q += dt * v
+        assert q <= limits.q_max[0] + 1e-9
+    return hardest
+
+
+def test_decre_contradicts_itself_near_the_limit_and_rubrecht_does_not():
+    assert velocity_controlled(decre_velocity_range, FIGURE_1, 0.01) > 1.1 * 15.0
+    assert velocity_controlled(rubrecht_velocity_range, FIGURE_1, 0.01) <= 15.0 + 1e-6
+
+
+def pull_to_the_limit(bounds, dt_bounds=0.01, dt=0.01, seconds=2.0):
+    """The test of Fig. 4: a PD controller whose goal is 0.1 rad beyond the upper limit.
+
+    Returns the largest position and the speed at which the joint passed its limit.
+    """
+    q, v, highest, impact = 1.0, 0.0, -np.inf, 0.0
+    kp = 1000.0
+    for _ in range(round(seconds / dt)):
+        desired = kp * (2.1 - q) - 2.0 * np.sqrt(kp) * v
+        lower, upper, _ = bounds([q], [v], FIGURE_4, dt_bounds)
+        a = float(np.clip(desired, lower[0], upper[0]))
+        before = q
+        q, v = q + dt * v + 0.5 * dt**2 * a, v + dt * a
+        if before <= 2.0 < q:
+            impact = max(impact, v)
+        highest = max(highest, q)
+    return highest, impact
+
+
+def test_naive_bounds_break_the_limit_and_larger_steps_only_soften_it():
+    """Fig. 4a and 4b; 4c and 4d for the exact bounds."""
+    highest, impact = pull_to_the_limit(naive_bounds)
+    assert highest > 2.0 + 0.05
+    softer, softer_impact = pull_to_the_limit(naive_bounds, dt_bounds=0.03)
+    assert 2.0 + 1e-3 < softer < highest
+    assert softer_impact < impact
+    for factor in (1, 2, 3):
+        exact, _ = pull_to_the_limit(acceleration_bounds, dt_bounds=0.01 * factor)
+        assert 2.0 - 1e-2 < exact <= 2.0 + 1e-9
+
+
+def test_velocity_methods_under_constant_acceleration():
+    """They count on velocities that change in steps, so that even a consistent one misses."""
+    # On the way from speed v to w < v the joint goes dt (v - w) / 2 further than dt w.
+    step_error = 0.5 * 12.0 * 0.01**2
+    assert 2.0 < pull_to_the_limit(rubrecht_bounds)[0] <= 2.0 + step_error
+    assert pull_to_the_limit(decre_bounds)[0] > 2.0 + 10.0 * step_error
+
+
+def test_a_damper_needs_tuning():
+    def gentle(q, v, limits, dt):
+        return damper_bounds(q, v, limits, dt, influence=0.4, gain=2.0)
+
+    def steep(q, v, limits, dt):
+        return damper_bounds(q, v, limits, dt, influence=0.05, gain=2.0)
+
+    assert pull_to_the_limit(gentle)[0] <= 2.0 + 1e-3
+    assert pull_to_the_limit(steep)[0] > 2.0 + 0.05
