@@ -403,7 +403,7 @@ def test_joint_that_moves_nothing_is_named(count):
 
 
 def test_descent_ends_on_the_bounds_and_uses_curvature():
-    """A quadratic a hundred times steeper in one direction, its minimum partly outside the cube."""
+    """A quadratic a hundred times steeper in one direction, its minimum outside the cube."""
     turn = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
     hessian = turn @ np.diag([1.0, 100.0, 1.0]) @ turn.T
     centre = np.array([0.3, 0.6, 1.7])

@@ -22,6 +22,7 @@ COMMAND = [sys.executable, "-m", "viability_bounds_pkg.estimate_acceleration_lim
 TIME_LIMIT = 60.0
 
 LIMITS = 'lower="-1" upper="2" effort="30" velocity="4"'
+LIMIT = f"<limit {LIMITS}/>"
 URDF = """
 <robot name="arm"><link name="base"/>
 <joint name="shoulder" type="{type}"><parent link="base"/><child link="arm"/>
@@ -51,7 +52,7 @@ def robot(tmp_path):
     """Writes a robot's URDF and parameter file; returns the latter's path."""
 
     def write(
-        limit=f"<limit {LIMITS}/>",
+        limit=LIMIT,
         type="revolute",
         mass=2.0,
         hand_mass=0.5,
@@ -231,6 +232,12 @@ def test_gravity_beyond_the_torque(robot, tmp_path):
             },
             "joint shoulder has no limit in the URDF to use: parameter 'torque_max' is missing",
         ),
+        ({"limit": ""}, "arm.urdf: joint shoulder has no effort limit"),
+        (
+            {"limit": '<limit lower="-1" upper="1" effort="30"/>'},
+            "arm.urdf: joint shoulder has no velocity limit",
+        ),
+        ({"limit": LIMIT.replace("30", "0")}, "parameter 'torque_max' is missing"),
         ({"hand_mass": 0.0}, "joint wrist moves no inertia"),
         ({"parameters": "    velocity_max: [1.0]"}, "'velocity_max' must be a list of 2 numbers"),
         ({"parameters": "    velocity_max: [1, fast]"}, "must be a list of 2 numbers"),

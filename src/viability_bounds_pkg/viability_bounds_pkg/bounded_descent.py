@@ -1,8 +1,8 @@
 """Descent to a local minimum in the unit cube.
 
-In place of SciPy's L-BFGS-B, whose small matrix factorisations wake the threads of OpenBLAS: on
-busy cores that made the searches here ten times slower. It also asks for a gradient only where a
-step was accepted, and a gradient costs as much as a value here.
+In place of SciPy's L-BFGS-B, which on busy cores made the searches here several times slower
+through the threads of OpenBLAS. It also asks for a gradient only where a step was accepted, and a
+gradient costs as much as a value here.
 """
 
 from __future__ import annotations

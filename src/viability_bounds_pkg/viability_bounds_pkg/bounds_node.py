@@ -30,7 +30,14 @@ from viability_bounds_pkg.ros_parameters import (
 from viability_bounds_pkg.ros_runtime import CONTROL_QOS, run
 from viability_bounds_pkg.torque_margin import TorqueMargins, torque_margins
 
-METHODS = ("exact", "naive")
+RIVALS = {
+    "naive": baselines.naive_bounds,
+    "decre": baselines.decre_bounds,
+    "rubrecht": baselines.rubrecht_bounds,
+}
+"""Methods to compare with that need no settings of their own."""
+
+METHODS = ("exact", *RIVALS, "damper")
 
 TABLE = (
     Parameter("joints", list[str], "names of the joints, in the order of all arrays"),
@@ -62,6 +69,13 @@ TABLE = (
         live=True,
     ),
     Parameter("method", str, f"one of: {', '.join(METHODS)}", default="exact", live=True),
+    Parameter(
+        "damper_influence",
+        float,
+        "for method damper: distance to a limit from which on it acts, rad",
+        default=0.2,
+    ),
+    Parameter("damper_gain", float, "for method damper: speed allowed there, rad/s", default=1.0),
     Parameter(
         "state_timeout", float, "silence after which older stamps are taken again, s", default=0.5
     ),
@@ -117,12 +131,21 @@ def make_configuration(values: Mapping[str, Any]) -> BoundsConfiguration:
             ),
         )
         margins = _margins(values, limits, dt)
-        if values["method"] == "exact":
+        method = values["method"]
+        if method == "exact":
             inner = _inside(limits, margins)
             solver = viability.BoundsSolver(inner, factor * dt, margins.acceleration, period=dt)
             solve = solver.bounds
+        elif method == "damper":
+            solve = partial(
+                baselines.damper_bounds,
+                limits=limits,
+                dt=factor * dt,
+                influence=positive(values, "damper_influence"),
+                gain=positive(values, "damper_gain"),
+            )
         else:
-            solve = partial(baselines.naive_bounds, limits=limits, dt=factor * dt)
+            solve = partial(RIVALS[method], limits=limits, dt=factor * dt)
     except JointLimitsError as error:
         name = PARAMETER_OF[error.field]
         shown = error.value if error.joint is None else f"{error.value} for {error.joint}"

@@ -7,13 +7,9 @@ the refined search), reports what it found, and writes a parameter file with the
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-
-# Of no use for matrices this small, and slow when the cores are busy; read when NumPy loads.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from tqdm import tqdm

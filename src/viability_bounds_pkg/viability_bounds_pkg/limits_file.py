@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
@@ -71,7 +72,9 @@ def read_robot(path: Path) -> Robot:
     locked = _texts(parameters, "locked_joints", path)
     positions = _numbers(parameters, "locked_positions", len(locked), path)
     locked_positions = dict(zip(locked, positions, strict=True)) if positions is not None else {}
-    model = build_model(read_urdf(parameters["robot_description"]), joints, locked_positions)
+    urdf = read_urdf(parameters["robot_description"])
+    _check_limits(urdf, parameters["robot_description"])
+    model = build_model(urdf, joints, locked_positions)
     limits = {}
     for key, from_urdf in (
         ("position_min", model.lowerPositionLimit),
@@ -92,6 +95,17 @@ def read_robot(path: Path) -> Robot:
                     f"parameter '{key}' is missing"
                 )
     return Robot(model, *limits.values())
+
+
+def _check_limits(urdf: str, source: str) -> None:
+    """Raise where a limit that every URDF must give is missing: the parser names it less well."""
+    for joint in ElementTree.fromstring(urdf).iter("joint"):
+        if joint.get("type") not in ("revolute", "prismatic"):
+            continue
+        limit = joint.find("limit")
+        for key in ("effort", "velocity"):
+            if limit is None or limit.get(key) is None:
+                raise ParameterFileError(f"{source}: joint {joint.get('name')} has no {key} limit")
 
 
 def _parameters(path: Path) -> dict[str, Any]:

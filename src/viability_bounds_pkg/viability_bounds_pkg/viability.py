@@ -22,16 +22,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from viability_bounds_pkg.braking import (
-    Side,
-    are_viable_towards,
-    bound_towards,
-    bounds_towards,
-    highest_speeds,
-    make_side,
-    settle,
-    settle_all,
-)
+from viability_bounds_pkg.bounds_kernel import make_table, solve
+from viability_bounds_pkg.braking import Side, highest_speeds, make_side
 from viability_bounds_pkg.condition_11 import (
     KernelBraking,
     checked_margin,
@@ -49,12 +41,6 @@ __all__ = [
     "condition_11",
     "viable_velocity_range",
 ]
-
-SCALAR_ROWS = 24
-"""Batches up to this many states are faster one by one than through NumPy."""
-
-CHUNK = 4096
-"""States per pass over a batch: the buffers of one pass stay in a core's own cache."""
 
 
 class AccelerationBounds(NamedTuple):
@@ -118,6 +104,7 @@ class BoundsSolver:
             _joint_sides(limits, j, self.dt, w, braking[j], bool(self.exact[j]))
             for j, w in enumerate(margins.tolist())
         ]
+        self._table = make_table(self._joints)
 
     def bounds(self, q: ArrayLike, v: ArrayLike) -> AccelerationBounds:
         """Return the acceleration bounds at one state or a batch of states.
@@ -139,49 +126,17 @@ class BoundsSolver:
             raise ValueError(
                 f"q {q.shape} and v {v.shape} must both have shape ({n},) or (batch, {n})"
             )
-        if q.ndim == 1:
-            lower, upper, viable = self._one(q.tolist(), v.tolist())
-            return AccelerationBounds(np.array(lower), np.array(upper), np.array(viable))
-        if len(q) <= SCALAR_ROWS:
-            rows = [self._one(x, speed) for x, speed in zip(q.tolist(), v.tolist(), strict=True)]
-            lower, upper, viable = np.array(rows, dtype=float).reshape(len(q), 3, n).swapaxes(0, 1)
-            return AccelerationBounds(lower, upper, viable.astype(bool))
-        return self._batch(q, v)
-
-    def _one(self, q: list[float], v: list[float]) -> tuple[list[float], list[float], list[bool]]:
-        lowers, uppers, viables = [], [], []
-        for x, speed, (q_min, q_max, v_most, up, lo) in zip(q, v, self._joints, strict=True):
-            above, below = q_max - x, x - q_min
-            upper, inside_up = bound_towards(above, speed, up)
-            lower, inside_lo = bound_towards(below, -speed, lo)
-            lower = -lower
-            if lower > upper:
-                lower = upper = settle(above, below, speed, lower, upper)
-            lowers.append(lower)
-            uppers.append(upper)
-            viables.append(inside_up and inside_lo and -v_most <= speed <= v_most)
-        return lowers, uppers, viables
-
-    def _batch(self, q: NDArray[np.float64], v: NDArray[np.float64]) -> AccelerationBounds:
-        lower, upper = np.empty_like(q), np.empty_like(q)
-        viable = np.empty(q.shape, dtype=bool)
-        with np.errstate(all="ignore"):
-            for first in range(0, len(q), CHUNK):
-                rows = slice(first, first + CHUNK)
-                for j, (q_min, q_max, v_most, up, lo) in enumerate(self._joints):
-                    x, speed = q[rows, j].copy(), v[rows, j].copy()
-                    above, below, back = q_max - x, x - q_min, -speed
-                    high = bounds_towards(above, speed, up)
-                    low = -bounds_towards(below, back, lo)
-                    (at,) = np.nonzero(low > high)
-                    if at.size:
-                        one = settle_all(above[at], below[at], speed[at], low[at], high[at])
-                        low[at] = high[at] = one
-                    lower[rows, j], upper[rows, j] = low, high
-                    inside = np.abs(speed) <= v_most
-                    inside &= are_viable_towards(above, speed, up)
-                    inside &= are_viable_towards(below, back, lo)
-                    viable[rows, j] = inside
+        states = (q.size // n, n)
+        lower, upper = np.empty(q.shape), np.empty(q.shape)
+        viable = np.empty(q.shape, dtype=np.bool_)
+        solve(
+            q.reshape(states),
+            v.reshape(states),
+            *self._table,
+            lower.reshape(states),
+            upper.reshape(states),
+            viable.reshape(states),
+        )
         return AccelerationBounds(lower, upper, viable)
 
     def velocity_range(self, q: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
