@@ -75,6 +75,36 @@ def add_identity(H: np.ndarray, g: np.ndarray, b: np.ndarray, weight: float) -> 
 
 
 @njit(cache=True)
+def middle_of_step(
+    q: np.ndarray, v: np.ndarray, a: np.ndarray, dt: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return position and velocity after dt / 2 at acceleration `a`, shape (n,) each."""
+    half = 0.5 * dt
+    return q + half * (v + 0.5 * half * a), v + half * a
+
+
+@njit(cache=True)
+def spring_damper_rows(
+    J: np.ndarray, v: np.ndarray, error: np.ndarray, drift: np.ndarray, kp: float, kd: float
+) -> np.ndarray:
+    """Return ``kp error - kd J v - drift``, shape (m,), J of shape (m, n)."""
+    m, n = J.shape
+    b = np.empty(m)
+    for i in range(m):
+        s = 0.0
+        for k in range(n):
+            s += J[i, k] * v[k]
+        b[i] = kp * error[i] - kd * s - drift[i]
+    return b
+
+
+@njit(cache=True)
+def spring_damper(error: np.ndarray, v: np.ndarray, kp: float, kd: float) -> np.ndarray:
+    """Return ``kp error - kd v``, shape (n,)."""
+    return kp * error - kd * v
+
+
+@njit(cache=True)
 def null_space_part(J: np.ndarray, x: np.ndarray, regularisation: float) -> np.ndarray:
     """Return ``x - J^T (J J^T + regularisation I)^-1 J x``, shape (n,), J of shape (m, n)."""
     m, n = J.shape

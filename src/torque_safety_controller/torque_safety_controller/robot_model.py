@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 
+from torque_safety_controller.dense_kernels import middle_of_step
 from viability_bounds_pkg.robot_description import RobotDescriptionError
 
 
@@ -63,7 +64,7 @@ class RobotModel:
             a_last: acceleration commanded last, shape (n,), rad/s^2.
         """
         model, data = self.model, self._data
-        q_mid, v_mid = self._middle(q, v, a_last)
+        q_mid, v_mid = middle_of_step(q, v, a_last, self.dt)
         self.M = pin.crba(model, data, q_mid)
         self.h = pin.nonLinearEffects(model, data, q_mid, v_mid)
         # Last, because the kinematics in `data` are to be those of the current state.
@@ -77,12 +78,5 @@ class RobotModel:
 
     def torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the torque that, held for dt, gives mean acceleration `a`, shape (n,), N m."""
-        q_mid, v_mid = self._middle(q, v, a)
+        q_mid, v_mid = middle_of_step(q, v, a, self.dt)
         return pin.rnea(self.model, self._data, q_mid, v_mid, a)
-
-    def _middle(
-        self, q: np.ndarray, v: np.ndarray, a: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        half = 0.5 * self.dt
-        v_mid = v + half * a
-        return q + half * (v + 0.5 * half * a), v_mid

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from trajectory_msgs.msg import JointTrajectory
 
-from viability_bounds_pkg.ros_messages import all_finite
+from viability_bounds_pkg.array_checks import both_finite, in_order
 from viability_bounds_pkg.ros_runtime import stamp_to_ns
 
 
@@ -32,7 +32,8 @@ class LimitsReader:
         """Take a message; return whether it was accepted."""
         if len(message.points) != 2:
             return self._refuse("wrong number of points")
-        lower, upper = (np.array(point.accelerations) for point in message.points)
+        first, second = message.points
+        lower, upper = np.array(first.accelerations), np.array(second.accelerations)
         if not len(lower) == len(upper) == len(message.joint_names):
             return self._refuse("wrong size")
         if message.joint_names != self._joints:
@@ -41,9 +42,9 @@ class LimitsReader:
                 return self._refuse("missing joint")
             index = [where[joint] for joint in self._joints]
             lower, upper = lower[index], upper[index]
-        if not all_finite(lower, upper):
+        if not both_finite(lower, upper):
             return self._refuse("not finite")
-        if (lower > upper).any():
+        if not in_order(lower, upper):
             return self._refuse("lower above upper")
         self.lower, self.upper = lower, upper
         self.stamp = stamp_to_ns(message.header.stamp)

@@ -12,7 +12,11 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from torque_safety_controller.dense_kernels import null_space_part
+from torque_safety_controller.dense_kernels import (
+    null_space_part,
+    spring_damper,
+    spring_damper_rows,
+)
 from torque_safety_controller.robot_model import RobotModel
 
 _RANK_REGULARISATION = 1e-9
@@ -62,7 +66,7 @@ def posture_task(
     if J is not None:
         # Regularised where J has lost rank; there it leaves in what the task cannot move anyway.
         error = null_space_part(J, error, _RANK_REGULARISATION)
-    return TaskTerm(None, kp * error - kd * v, weight)
+    return TaskTerm(None, spring_damper(error, v, kp, kd), weight)
 
 
 def damping_task(v: np.ndarray, kd: float) -> TaskTerm:
@@ -88,4 +92,4 @@ def pose_task(
         kd: damping, 1/s.
         weight: of the squared error of acceleration.
     """
-    return TaskTerm(robot.J, kp * error - kd * (robot.J @ v) - robot.drift, weight)
+    return TaskTerm(robot.J, spring_damper_rows(robot.J, v, error, robot.drift, kp, kd), weight)

@@ -9,12 +9,12 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from ros_harness import joint_state
 
+from viability_bounds_pkg.array_checks import both_finite
 from viability_bounds_pkg.ros_messages import (
     Diagnostics,
     JointStateReader,
     StampGuard,
     Verdict,
-    all_finite,
 )
 from viability_bounds_pkg.ros_runtime import set_stamp, stamp_to_ns
 
@@ -159,9 +159,9 @@ def test_what_is_not_taken_does_not_count_as_heard():
 @pytest.mark.parametrize("where", range(3))
 def test_one_bad_number_is_enough(bad, where):
     array = np.ones(3)
-    assert all_finite(array, array)
+    assert both_finite(array, array)
     array[where] = bad
-    assert not all_finite(np.ones(3), array)
+    assert not both_finite(np.ones(3), array)
 
 
 @pytest.mark.parametrize("nanoseconds", [0, 999_999_999, SECOND, 1_795_235_306_814_914_975])

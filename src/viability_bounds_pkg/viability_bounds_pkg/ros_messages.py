@@ -13,6 +13,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
+from viability_bounds_pkg.array_checks import both_finite
 from viability_bounds_pkg.ros_runtime import stamp_to_ns
 
 
@@ -25,15 +26,6 @@ class Verdict(Enum):
     """The stamp of the last accepted message again: a robot that asks once more."""
     REFUSED = 3
     """Dropped and counted; the arrays hold what they held."""
-
-
-def all_finite(*arrays: np.ndarray) -> bool:
-    """Return whether no number in any of the arrays is infinite or NaN.
-
-    Squares summed are the cheapest test there is; numbers above 1e150, whose squares overflow,
-    are as useless here and fail it too.
-    """
-    return all(math.isfinite(array.dot(array)) for array in arrays)
 
 
 class StampGuard:
@@ -105,7 +97,7 @@ class JointStateReader:
         q, v = np.array(message.position), np.array(message.velocity)
         if self._index is not None:
             q, v = q[self._index], v[self._index]
-        if not all_finite(q, v):
+        if not both_finite(q, v):
             return self._refuse("not finite")
         if verdict is Verdict.REPEAT:
             if np.array_equal(q, self.q) and np.array_equal(v, self.v):
