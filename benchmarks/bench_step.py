@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+
 from torque_safety_controller.controller import Controller, Gains
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.robot_description import build_model, read_urdf

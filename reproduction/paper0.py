@@ -68,7 +68,7 @@ def one_joint(q: float, v: float, a: float) -> JointLimits:
 def figure_1() -> Figure:
     """State-space plot of the viability constraints of this paper, [5] and [6]."""
     figure = Figure("paper0-fig1", "Fig. 1: viability constraints in the state space")
-    limits, dt = one_joint(1.0, 5.0, 15.0), 0.01
+    limits, dt = one_joint(1.0, 5.0, 15.0), 0.1
     q = np.linspace(-1.0, 1.0, 2001)
     column = q[:, None]
     curves = {
@@ -80,8 +80,9 @@ def figure_1() -> Figure:
     picture, axis = plt.subplots(figsize=(8, 5), layout="constrained")
     styles = ("tab:blue", "tab:orange", "tab:green")
     for (name, (low, high)), color in zip(curves.items(), styles, strict=True):
-        axis.plot(q, high[:, 0], color=color, label=name)
-        axis.plot(q, low[:, 0], color=color)
+        width = 4.0 if color == styles[0] else 1.5
+        axis.plot(q, high[:, 0], color=color, linewidth=width, label=name)
+        axis.plot(q, low[:, 0], color=color, linewidth=width)
         figure.data[name] = np.column_stack([q, low[:, 0], high[:, 0]])
     for sign in (-1.0, 1.0):
         axis.axhline(sign * 5.0, color="tab:red", linestyle="--", label=None)
@@ -93,7 +94,7 @@ def figure_1() -> Figure:
         ylabel="velocity [rad/s]",
         xlim=(-1.05, 1.05),
         ylim=(-6, 6),
-        title="q limits ±1 rad, velocity 5 rad/s, acceleration 15 rad/s²; dt of [5], [6]: 10 ms",
+        title="q limits ±1 rad, velocity 5 rad/s, acceleration 15 rad/s²; dt of [5], [6]: 0.1 s",
     )
     axis.legend(loc="lower left", fontsize="small")
     exact, rubrecht = (curves[name][1][:, 0] for name in list(curves)[::2])

@@ -51,7 +51,10 @@ _install() {
         echo "setup: ROS 2 Jazzy is sourced; making .venv on top of it" >&2
         options+=(--system-site-packages)
     else
-        echo "setup: no ROS 2 sourced; installing the Jazzy wheels into .venv" >&2
+        if [ "${ROS_DISTRO:-}" = jazzy ]; then
+            echo "setup: ROS 2 Jazzy is sourced, but '$python' cannot import its rclpy" >&2
+        fi
+        echo "setup: no usable ROS 2; installing the Jazzy wheels into .venv" >&2
     fi
     if ! "$python" -m venv --clear "${options[@]}" "$venv"; then
         echo "setup: '$python -m venv' failed; on Ubuntu: sudo apt install python3-venv" >&2

@@ -9,6 +9,7 @@ from array import array
 from collections import Counter, deque
 from collections.abc import Mapping
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -23,7 +24,6 @@ from std_srvs.srv import SetBool, Trigger
 from sim_bridge.bullet_parameters import TABLE, BulletConfiguration, make_configuration
 from sim_bridge.bullet_robot import BulletRobot
 from sim_bridge.limit_monitor import LimitMonitor
-from sim_bridge.urdf_preparation import prepare_urdf
 from viability_bounds_pkg.robot_description import RobotDescriptionError
 from viability_bounds_pkg.ros_messages import Diagnostics
 from viability_bounds_pkg.ros_parameters import NodeParameters, ParameterError
@@ -318,15 +318,11 @@ def _make_robot(config: BulletConfiguration, values: Mapping[str, Any]) -> Bulle
 
 def _culprit(config: BulletConfiguration) -> tuple[str, str]:
     """Return which parameter keeps the robot from being made, and what it may be."""
-    for name, allowed, arguments in (
-        ("robot_description", "a URDF", ((), None)),
-        ("joints", "joints of the URDF", (config.joints, None)),
-        ("locked_joints", "other joints of the URDF", (config.joints, config.locked)),
-    ):
-        try:
-            prepare_urdf(config.urdf, *arguments)
-        except RobotDescriptionError:
-            return name, allowed
+    known = {joint.get("name") for joint in ElementTree.fromstring(config.urdf).iter("joint")}
+    if not known >= set(config.joints):
+        return "joints", "joints of the URDF"
+    if not known - set(config.joints) >= set(config.locked):
+        return "locked_joints", "other joints of the URDF"
     return "robot_description", "a URDF that PyBullet can load"
 
 

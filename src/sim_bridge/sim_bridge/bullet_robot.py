@@ -32,10 +32,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pybullet
 from numpy.typing import ArrayLike
 
 from sim_bridge.limit_monitor import LimitMonitor
+from sim_bridge.quiet_pybullet import pybullet
 from sim_bridge.urdf_preparation import FramePlacement, PreparedUrdf, prepare_urdf
 from viability_bounds_pkg.robot_description import RobotDescriptionError
 

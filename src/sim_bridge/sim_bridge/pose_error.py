@@ -6,9 +6,9 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import pybullet
 
 from sim_bridge.bullet_robot import BulletRobot
+from sim_bridge.quiet_pybullet import pybullet
 from sim_bridge.recording import Run
 from sim_bridge.scenario import PoseGoal
 

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.torque_margin import step_deviations, torque_margins
 from viability_bounds_pkg.viability import BoundsSolver

@@ -88,6 +88,10 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
     except (ParameterError, RobotDescriptionError) as error:
         report_refusal(error)
         return 1
+    except Exception:
+        # A signal shuts the context down in the middle of a callback, which then cannot publish.
+        if rclpy.ok():
+            raise
     finally:
         if node is not None:
             node.destroy_node()

@@ -1,0 +1,153 @@
+"""The installed executables: what stops them at start, and how they end."""
+
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parent.parent
+DEADLINE = 30.0  # s
+
+BOUNDS = ("viability_bounds_pkg", "bounds_node")
+CONTROLLER = ("torque_safety_controller", "controller_node")
+ROBOT = ("sim_bridge", "bullet_node")
+
+
+def command(node, *arguments):
+    package, executable = node
+    path = ROOT / "install" / package / "lib" / package / executable
+    return [path, "--ros-args", "--log-level", "warn", *map(str, arguments)]
+
+
+def parameter_file(directory, robot="panda", **changes):
+    """Write a robot's file with some parameters changed, wherever in it they are."""
+    content = yaml.safe_load((ROOT / "config" / f"{robot}.yaml").read_text())
+    for name, value in changes.items():
+        sections = [part["ros__parameters"] for part in content.values()]
+        holders = [section for section in sections if name in section] or sections[:1]
+        for section in holders:
+            section[name] = value
+    path = directory / "robot.yaml"
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+def start(node, *arguments):
+    return subprocess.run(
+        command(node, *arguments), capture_output=True, text=True, timeout=DEADLINE, check=False
+    )
+
+
+def panda(name):
+    content = yaml.safe_load((ROOT / "config" / "panda.yaml").read_text())
+    return next(
+        p["ros__parameters"][name] for p in content.values() if name in p["ros__parameters"]
+    )
+
+
+def changed(name, index, value):
+    """A per-joint list with one number replaced."""
+    values = list(panda(name))
+    values[index] = value
+    return {name: values}
+
+
+@pytest.mark.parametrize(
+    ("node", "changes", "names"),
+    [
+        (BOUNDS, {"velocity_max": [1.0, 2.0]}, "velocity_max"),
+        (BOUNDS, changed("position_min", 1, 9.0), "position_m"),
+        (BOUNDS, changed("acceleration_min", 2, 0.5), "acceleration_min"),
+        (BOUNDS, changed("acceleration_max", 2, float("nan")), "acceleration_max"),
+        (BOUNDS, {"joints": "panda_joint1"}, "joints"),
+        (BOUNDS, {"method": "guessed"}, "method"),
+        (BOUNDS, {"rate_hz": 0.0}, "rate_hz"),
+        (BOUNDS, {"bounds_dt_factor": 0.5}, "bounds_dt_factor"),
+        (CONTROLLER, {"joints": ["panda_joint1", "no_such_joint"]}, "torque_max"),
+        (CONTROLLER, {"joints": [*panda("joints")[:-1], "no_such_joint"]}, "joints"),
+        (CONTROLLER, {"end_effector_frame": "no_such_frame"}, "end_effector_frame"),
+        (CONTROLLER, {"base_frame": "panda_hand"}, "base_frame"),
+        (CONTROLLER, {"robot_description": "package://nothing/no.urdf"}, "robot_description"),
+        (CONTROLLER, changed("torque_max", 0, -1.0), "torque_max"),
+        (CONTROLLER, {"pose_kp": -1.0}, "pose_kp"),
+        (ROBOT, {"joints": [*panda("joints")[:-1], "no_such_joint"]}, "joints"),
+        (ROBOT, {"robot_description": "/no/such.urdf"}, "robot_description"),
+        (ROBOT, {"clock": "sundial"}, "clock"),
+        (ROBOT, changed("start_positions", 0, float("inf")), "start_positions"),
+        (ROBOT, {"physics_step_max": 0.0}, "physics_step_max"),
+    ],
+)
+def test_a_bad_parameter_ends_a_node_with_one_line(tmp_path, node, changes, names):
+    result = start(node, "--params-file", parameter_file(tmp_path, **changes))
+    assert result.returncode == 1
+    lines = result.stderr.strip().splitlines()
+    assert len(lines) == 1, result.stderr
+    assert lines[0].startswith("error: parameter '")
+    assert names in lines[0]
+    assert "allowed" in lines[0]
+
+
+@pytest.mark.parametrize("node", [BOUNDS, CONTROLLER, ROBOT])
+def test_a_missing_parameter_is_named(node):
+    result = start(node)
+    assert result.returncode == 1
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert "not set" in result.stderr
+
+
+@pytest.mark.parametrize("text", ["a: [", "/**:\n  ros__parameters:\n    rate_hz: [1.0, 2]\n"])
+def test_a_file_that_is_not_parameters_is_refused_in_one_line(tmp_path, text):
+    path = tmp_path / "broken.yaml"
+    path.write_text(text)
+    result = start(BOUNDS, "--params-file", path)
+    assert result.returncode == 1
+    lines = [line for line in result.stderr.strip().splitlines() if line.startswith("error:")]
+    assert len(lines) == 1
+    assert "broken.yaml" in lines[0]
+
+
+def test_a_missing_file_is_refused_in_one_line(tmp_path):
+    result = start(BOUNDS, "--params-file", tmp_path / "none.yaml")
+    assert result.returncode == 1
+    assert "none.yaml" in result.stderr
+
+
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("node", [BOUNDS, CONTROLLER, ROBOT])
+def test_nodes_end_when_told_to(node, sent):
+    process = subprocess.Popen(
+        command(node, "--params-file", ROOT / "config" / "panda.yaml"),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # Started from a job in the background, SIGINT is ignored by inheritance.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    try:
+        wait_until_it_spins(process)
+        process.send_signal(sent)
+        _, errors = process.communicate(timeout=DEADLINE)
+    finally:
+        process.kill()
+    assert process.returncode == 0, errors
+    assert "Traceback" not in errors
+
+
+def wait_until_it_spins(process):
+    """Wait until a process has loaded everything: then it hardly uses its processor."""
+    ticks = os.sysconf("SC_CLK_TCK")
+    deadline = time.monotonic() + DEADLINE
+    used = -1.0
+    while time.monotonic() < deadline:
+        assert process.poll() is None, process.communicate()[1]
+        fields = Path(f"/proc/{process.pid}/stat").read_text().rsplit(")", 1)[1].split()
+        now = (int(fields[11]) + int(fields[12])) / ticks
+        if now > 0.3 and now - used < 0.1:
+            return
+        used = now
+        time.sleep(0.5)
+    raise AssertionError("it never came to rest")
