@@ -118,7 +118,7 @@ def test_random_states_outside_all_limits(arm):
     saturated = relaxed = 0
     for _ in range(300):
         q = rng.uniform(1.5 * arm.q_min, 1.5 * arm.q_max)
-        v = rng.uniform(-3.0, 3.0, arm.n) * arm.v_max
+        v = rng.uniform(-4.0, 4.0, arm.n) * arm.v_max
         lower = rng.uniform(-30.0, 30.0, arm.n)
         step = controller.step(q, v, lower, lower + rng.uniform(0.0, 10.0, arm.n))
         assert_may_be_sent(step, arm)

@@ -128,6 +128,21 @@ class Controller:
         """Bring the joints, or what the pose task leaves free of them, to `q_des`, rad."""
         self.q_des = q_des
 
+    def warm_up(self) -> None:
+        """Run every part of a step once: what is compiled at first use is compiled now.
+
+        Call it before anything else; it leaves no trace.
+        """
+        q = v = np.zeros(self.robot.n)
+        wide = np.full(self.robot.n, 1e3)
+        for bounds in (wide, 0.0 * wide):  # zero bounds take the solver proper
+            self.robot.update(q, v, v)
+            self.set_pose_goal(self.robot.pose.copy())
+            self.step(q, v, -bounds, bounds)
+        self.pose_des = None
+        self.error.fill(math.nan)
+        self.start(q)
+
     @property
     def acceleration(self) -> np.ndarray:
         """Acceleration commanded last, shape (n,), rad/s^2."""

@@ -58,6 +58,7 @@ class ControllerNode(Node):
             raise
         config = self._config = self._node_parameters.configuration
         self._controller = Controller(robot, config.tau_max, config.gains, config.tau_rate_max)
+        self._controller.warm_up()
         self._states = JointStateReader(config.joints, config.state_timeout)
         self._limits = LimitsReader(config.joints)
         self._goals = GoalQueue()

@@ -27,6 +27,7 @@ class LimitsReader:
         self.stamp = -1
         self.refused: Counter[str] = Counter()
         self._joints = list(joints)
+        in_order(self.lower, self.upper)  # compiled now, not when the first message comes
 
     def read(self, message: JointTrajectory) -> bool:
         """Take a message; return whether it was accepted."""

@@ -77,6 +77,7 @@ class JointStateReader:
         self.stamp = -1
         self.refused: Counter[str] = Counter()
         self._joints = tuple(joints)
+        both_finite(self.q, self.v)  # compiled now, not when the first message comes
         self._guard = StampGuard(reset_after)
         self._names: list[str] | None = None
         self._index: np.ndarray | None = None

@@ -105,6 +105,8 @@ class BoundsSolver:
             for j, w in enumerate(margins.tolist())
         ]
         self._table = make_table(self._joints)
+        # The first call compiles; let it be this one and not one in a control loop.
+        self.bounds(np.zeros(len(limits)), np.zeros(len(limits)))
 
     def bounds(self, q: ArrayLike, v: ArrayLike) -> AccelerationBounds:
         """Return the acceleration bounds at one state or a batch of states.
