@@ -1,0 +1,239 @@
+import math
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from arms import load_arm
+from geometry_msgs.msg import WrenchStamped
+from ros_harness import joint_state, read_config
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+
+from sim_bridge.bullet_node import BulletNode
+from viability_bounds_pkg.ros_runtime import GOAL_QOS, LATCHED_QOS, stamp_to_ns
+
+ARM = load_arm("panda")
+VALUES = read_config("panda", "bullet_node")
+JOINTS = VALUES["joints"]
+Q = np.array(VALUES["start_positions"])
+PERIOD = 2_000_000  # ns, of the configured 500 Hz
+
+
+class Robot:
+    """The node, and what a controller sees and sends."""
+
+    def __init__(self, ros, **changes):
+        self.ros = ros
+        self.states = ros.listen(JointState, "joint_states")
+        self.node = ros.start(BulletNode, VALUES | {"clock": "lockstep"} | changes)
+        self.commands = ros.talk(JointState, "joint_commands")
+        ros.wait_until(lambda: self.states, "a state")
+
+    @property
+    def stamp(self):
+        return stamp_to_ns(self.states[-1].header.stamp)
+
+    @property
+    def q(self):
+        return np.array(self.states[-1].position)
+
+    @property
+    def v(self):
+        return np.array(self.states[-1].velocity)
+
+    def gravity(self):
+        return pin.computeGeneralizedGravity(ARM.model, ARM.model.createData(), self.q)
+
+    def step(self, tau=None, times=1):
+        """Answer states, by default with gravity compensation, and await the next ones."""
+        for _ in range(times):
+            stamp = self.stamp
+            self.send(stamp, self.gravity() if tau is None else tau)
+            self.ros.wait_until(lambda s=stamp: self.stamp > s, "the next state")
+
+    def send(self, stamp, tau, joints=JOINTS):
+        self.commands.publish(joint_state(joints, stamp, tau=tau))
+
+    def reported(self, key):
+        return self.ros.reported("bullet_node", key)
+
+    def await_reported(self, key, value):
+        self.ros.wait_until(lambda: self.reported(key) == value, f"{key} {value}")
+
+
+def test_each_command_with_the_right_stamp_moves_time_by_one_period(ros):
+    robot = Robot(ros)
+    first = robot.stamp
+    assert first == PERIOD
+    robot.step(times=5)
+    assert robot.stamp == first + 5 * PERIOD
+    assert robot.states[-1].name == JOINTS
+    np.testing.assert_allclose(robot.q, Q, atol=1e-6)
+
+
+def test_an_unanswered_state_is_sent_again_and_nothing_moves(ros):
+    robot = Robot(ros)
+    ros.wait_until(lambda: len(robot.states) >= 3, "repeats")
+    assert set(robot.states.stamps) == {PERIOD}
+
+
+@pytest.mark.parametrize(
+    ("reason", "send"),
+    [
+        ("not finite", lambda r: r.send(r.stamp, [math.nan] * 7)),
+        ("not finite", lambda r: r.send(r.stamp, [math.inf] + [0.0] * 6)),
+        ("wrong size", lambda r: r.send(r.stamp, [1.0] * 3)),
+        ("missing joint", lambda r: r.send(r.stamp, [1.0] * 6, JOINTS[1:])),
+        ("not for this period", lambda r: r.send(r.stamp - PERIOD, [1.0] * 7)),
+        ("not for this period", lambda r: r.send(r.stamp + PERIOD, [1.0] * 7)),
+    ],
+)
+def test_commands_that_cannot_be_obeyed_are_dropped_and_counted(ros, reason, send):
+    robot = Robot(ros)
+    robot.step(times=3)
+    stamp = robot.stamp
+    send(robot)
+    ros.wait_until(lambda: f"{reason}: 1;" in robot.reported("commands_refused"))
+    assert robot.stamp == stamp
+    robot.step()  # and it goes on
+
+
+def test_names_may_come_in_any_order(ros):
+    robot = Robot(ros)
+    order = [3, 1, 6, 0, 2, 5, 4]
+    for _ in range(20):
+        stamp, tau = robot.stamp, robot.gravity()
+        robot.send(stamp, tau[order], [JOINTS[i] for i in order])
+        ros.wait_until(lambda s=stamp: robot.stamp > s)
+    np.testing.assert_allclose(robot.q, Q, atol=1e-6)
+
+
+def test_torque_beyond_the_limits_is_clipped_and_reported(ros):
+    robot = Robot(ros)
+    robot.step(3.0 * np.array(VALUES["torque_max"]))
+    robot.step()
+    ros.wait_until(lambda: float(robot.reported("commanded_torque_ratio_max") or 0.0) > 2.9)
+    applied = np.array([float(x) for x in robot.reported("torque_ratio").split()])
+    assert applied.max() <= 1.0 + 1e-9
+
+
+def test_effort_is_the_torque_that_the_motors_gave(ros):
+    robot = Robot(ros)
+    tau = robot.gravity() + 0.5
+    robot.step(tau)
+    np.testing.assert_allclose(robot.states[-1].effort, tau, rtol=1e-12)
+
+
+def test_reset_brings_it_back_to_the_start_at_rest(ros):
+    robot = Robot(ros)
+    robot.step(robot.gravity() + 1.0, times=30)
+    assert np.abs(robot.q - Q).max() > 1e-4
+    before = robot.stamp
+    assert ros.call(Trigger, "bullet_node/reset", Trigger.Request()).success
+    ros.wait_until(lambda: robot.stamp > before)
+    np.testing.assert_array_equal(robot.q, Q)
+    np.testing.assert_array_equal(robot.v, np.zeros(7))
+    robot.step()
+
+
+def test_pause_stops_time_and_resuming_asks_anew(ros):
+    robot = Robot(ros)
+    robot.step(times=2)
+    ros.call(SetBool, "bullet_node/pause", SetBool.Request(data=True))
+    robot.await_reported("paused", "True")
+    stamp = robot.stamp
+    robot.send(stamp, robot.gravity())
+    ros.run_for(0.1)
+    assert robot.stamp == stamp
+    ros.call(SetBool, "bullet_node/pause", SetBool.Request(data=False))
+    ros.wait_until(lambda: robot.stamp == stamp + PERIOD, "a state with a new stamp")
+    robot.step()
+
+
+def test_it_pauses_itself_after_the_time_asked_for(ros):
+    robot = Robot(ros, start_paused=True)
+    ros.accepts("bullet_node", pause_after=0.02)
+    ros.call(SetBool, "bullet_node/pause", SetBool.Request(data=False))
+    for _ in range(10):
+        stamp = robot.stamp
+        ros.wait_until(
+            lambda s=stamp: robot.stamp > s or robot.reported("paused") == "True",
+            each=lambda: robot.send(robot.stamp, robot.gravity()),
+        )
+    robot.await_reported("paused", "True")
+    assert robot.reported("periods") == "10"
+
+
+def test_a_push_moves_it_until_it_times_out(ros):
+    robot = Robot(ros, external_wrench_timeout=0.05)
+    pushes = ros.talk(WrenchStamped, "external_wrench", GOAL_QOS)
+    push = WrenchStamped()
+    push.header.frame_id = "panda_link4"
+    push.wrench.force.y = 30.0
+    pushes.publish(push)
+    ros.wait_until(lambda: robot.node._push_until < math.inf, "the push")
+    robot.step(times=24)
+    assert np.abs(robot.v).max() > 1e-3
+    robot.step(times=10)
+    assert robot.node._push_until == math.inf
+    speeds = [np.abs(np.array(s.velocity)).max() for s in robot.states[-5:]]
+    assert max(speeds) - min(speeds) < 1e-3  # nothing pushes any more
+
+
+@pytest.mark.parametrize(("link", "force"), [("no_such_link", 1.0), ("panda_link4", math.nan)])
+def test_a_push_that_cannot_be_is_refused(ros, link, force):
+    robot = Robot(ros)
+    pushes = ros.talk(WrenchStamped, "external_wrench", GOAL_QOS)
+    push = WrenchStamped()
+    push.header.frame_id = link
+    push.wrench.force.x = force
+    pushes.publish(push)
+    ros.wait_until(lambda: "external_wrench: 1;" in robot.reported("commands_refused"))
+    robot.step(times=3)
+    np.testing.assert_allclose(robot.q, Q, atol=1e-6)
+
+
+def test_robot_description_and_clock_are_published(ros):
+    clocks = ros.listen(Clock, "/clock")
+    robot = Robot(ros, publish_clock=True)
+    late = ros.listen(String, "robot_description", LATCHED_QOS)
+    ros.wait_until(lambda: late)
+    assert "<robot" in late[0].data
+    robot.step()
+    ros.wait_until(lambda: clocks and stamp_to_ns(clocks[-1].clock) == robot.stamp)
+
+
+def test_in_real_time_it_keeps_its_rate_and_brakes_without_commands(ros):
+    robot = Robot(ros, clock="real_time", rate_hz=100.0, command_timeout=3)
+    # Not one command yet: the brakes hold it, and no deadline has been missed.
+    ros.wait_until(lambda: int(robot.reported("braked_periods") or 0) > 10)
+    assert robot.reported("deadline_misses") == "0"
+    np.testing.assert_allclose(robot.q, Q, atol=1e-6)
+    assert 50.0 < float(robot.reported("rate_hz")) < 120.0
+
+    def answer():
+        robot.send(robot.stamp, robot.gravity() + 0.3)
+
+    ros.wait_until(
+        lambda: np.abs(robot.v).max() > 1e-3, "motion under commands", each=answer, period=0.001
+    )
+    braked = int(robot.reported("braked_periods"))
+    # Silence: held for three periods, then braked to rest.
+    ros.wait_until(lambda: np.abs(robot.v).max() < 1e-6, "rest under the brakes")
+    ros.wait_until(lambda: int(robot.reported("braked_periods")) > braked)
+    ros.wait_until(lambda: int(robot.reported("deadline_misses")) >= 3)
+    assert "braking" in robot.reported("message")
+
+
+def test_a_broken_limit_is_an_error_in_diagnostics(ros):
+    robot = Robot(ros)
+    for _ in range(400):
+        robot.step(robot.gravity() + np.array([0.0] * 6 + [6.0]))
+        if np.abs(robot.v[6]) > VALUES["velocity_max"][6] + 0.1:
+            break
+    ros.wait_until(lambda: robot.reported("message") == "a limit was broken")
+    violation = [float(x) for x in robot.reported("velocity_violation_rad_s").split()]
+    assert violation[6] > 0.1
+    assert max(violation[:5]) < 0.1
