@@ -67,7 +67,7 @@ def changed(name, index, value):
         (BOUNDS, {"method": "guessed"}, "method"),
         (BOUNDS, {"rate_hz": 0.0}, "rate_hz"),
         (BOUNDS, {"bounds_dt_factor": 0.5}, "bounds_dt_factor"),
-        (CONTROLLER, {"joints": ["panda_joint1", "no_such_joint"]}, "torque_max"),
+        (CONTROLLER, {"joints": ["panda_joint1", "no_such_joint"]}, "position_min"),
         (CONTROLLER, {"joints": [*panda("joints")[:-1], "no_such_joint"]}, "joints"),
         (CONTROLLER, {"end_effector_frame": "no_such_frame"}, "end_effector_frame"),
         (CONTROLLER, {"base_frame": "panda_hand"}, "base_frame"),

@@ -8,27 +8,26 @@ from typing import Any
 
 import numpy as np
 
-from viability_bounds_pkg.robot_description import RobotDescriptionError, read_urdf
 from viability_bounds_pkg.ros_parameters import (
     Parameter,
     ParameterError,
     joint_names,
-    locked_joints,
     per_joint,
     positive,
+)
+from viability_bounds_pkg.ros_robot_parameters import (
+    ROBOT_TABLE,
+    all_positive,
+    locked_joints,
+    position_limits,
+    robot_urdf,
 )
 
 CLOCKS = ("real_time", "lockstep")
 
 TABLE = (
-    Parameter("robot_description", str, "URDF: path or package:// URI"),
-    Parameter("joints", list[str], "joints that move, in the order of all arrays"),
-    Parameter("locked_joints", list[str], "other joints that are not at zero", default=()),
-    Parameter("locked_positions", list[float], "where they are, rad", default=np.zeros(0)),
-    Parameter("position_min", list[float], "lower position limits that are watched, rad"),
-    Parameter("position_max", list[float], "upper position limits that are watched, rad"),
+    *ROBOT_TABLE,
     Parameter("velocity_max", list[float], "speed limits that are watched, rad/s"),
-    Parameter("torque_max", list[float], "torque limits of the motors and brakes, N m"),
     Parameter("start_positions", list[float], "positions at start and after reset, rad"),
     Parameter("rate_hz", float, "rate of the control loop, Hz"),
     Parameter("physics_step_max", float, "longest physics step, s", default=0.001),
@@ -83,20 +82,13 @@ def make_configuration(values: Mapping[str, Any]) -> BulletConfiguration:
         ParameterError: a value cannot be used.
     """
     joints = joint_names(values)
-    source = values["robot_description"]
-    try:
-        urdf = read_urdf(source)
-    except RobotDescriptionError as error:
-        raise ParameterError("robot_description", source, f"a URDF ({error})") from error
+    urdf = robot_urdf(values)
     if values["clock"] not in CLOCKS:
         raise ParameterError("clock", values["clock"], f"one of {', '.join(CLOCKS)}")
     if values["command_timeout"] < 1:
         raise ParameterError("command_timeout", values["command_timeout"], "at least 1")
     dt = 1.0 / positive(values, "rate_hz")
-    q_min = per_joint(values, "position_min", joints)
-    q_max = per_joint(values, "position_max", joints)
-    if not (q_min < q_max).all():
-        raise ParameterError("position_max", q_max, "above position_min everywhere")
+    q_min, q_max = position_limits(values, joints)
     q_start = per_joint(values, "start_positions", joints)
     if not np.isfinite(q_start).all():
         raise ParameterError("start_positions", q_start, "finite numbers")
@@ -106,8 +98,8 @@ def make_configuration(values: Mapping[str, Any]) -> BulletConfiguration:
         locked=locked_joints(values),
         q_min=q_min,
         q_max=q_max,
-        v_max=_all_positive(values, "velocity_max", joints),
-        tau_max=_all_positive(values, "torque_max", joints),
+        v_max=all_positive(values, "velocity_max", joints),
+        tau_max=all_positive(values, "torque_max", joints),
         q_start=q_start,
         dt=dt,
         # The rounding keeps 1 kHz with steps of 1 ms from becoming two steps of 0.5 ms.
@@ -119,10 +111,3 @@ def make_configuration(values: Mapping[str, Any]) -> BulletConfiguration:
         publish_clock=values["publish_clock"],
         external_wrench_timeout=positive(values, "external_wrench_timeout"),
     )
-
-
-def _all_positive(values: Mapping[str, Any], name: str, joints: tuple[str, ...]) -> np.ndarray:
-    value = per_joint(values, name, joints)
-    if not (np.isfinite(value).all() and (value > 0).all()):
-        raise ParameterError(name, value, "finite numbers > 0")
-    return value

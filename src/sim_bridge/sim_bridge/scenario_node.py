@@ -27,15 +27,19 @@ from trajectory_msgs.msg import JointTrajectory
 
 from sim_bridge.recording import Recorder, Run
 from sim_bridge.scenario import PoseGoal, PostureGoal, Push, Scenario, ScenarioError, load_scenario
-from viability_bounds_pkg.robot_description import RobotDescriptionError, read_urdf
 from viability_bounds_pkg.ros_parameters import (
     NodeParameters,
     Parameter,
     ParameterError,
     joint_names,
-    locked_joints,
-    per_joint,
     positive,
+)
+from viability_bounds_pkg.ros_robot_parameters import (
+    ROBOT_TABLE,
+    all_positive,
+    locked_joints,
+    position_limits,
+    robot_urdf,
 )
 from viability_bounds_pkg.ros_runtime import (
     GOAL_QOS,
@@ -51,16 +55,10 @@ _POLL_PERIOD = 0.02
 
 TABLE = (
     Parameter("robot_name", str, "what the report calls the robot", default="robot"),
-    Parameter("robot_description", str, "URDF: path or package:// URI"),
-    Parameter("joints", list[str], "joints of the arm, in the order of all arrays"),
-    Parameter("locked_joints", list[str], "other joints that are not at zero", default=()),
-    Parameter("locked_positions", list[float], "where they are, rad", default=np.zeros(0)),
+    *ROBOT_TABLE,
     Parameter("base_frame", str, "frame of pose goals"),
     Parameter("end_effector_frame", str, "frame that pose goals move"),
-    Parameter("position_min", list[float], "lower position limits, rad"),
-    Parameter("position_max", list[float], "upper position limits, rad"),
     Parameter("velocity_max", list[float], "speed limits, rad/s"),
-    Parameter("torque_max", list[float], "torque limits, N m"),
     Parameter("scenario", str, "YAML file that says what happens when"),
     Parameter(
         "ready_timeout", float, "how long the other nodes may take to be there, s", default=20.0
@@ -102,22 +100,18 @@ def make_configuration(values: Mapping[str, Any]) -> ScenarioConfiguration:
             missing = ", ".join(joint for joint in joints if joint not in event.positions)
             allowed = f"postures of all 'joints'; at {event.time:g} s there is none of {missing}"
             raise ParameterError("scenario", values["scenario"], allowed)
-    try:
-        urdf = read_urdf(values["robot_description"])
-    except RobotDescriptionError as error:
-        source = values["robot_description"]
-        raise ParameterError("robot_description", source, f"a URDF ({error})") from error
+    q_min, q_max = position_limits(values, joints)
     return ScenarioConfiguration(
         name=values["robot_name"],
-        urdf=urdf,
+        urdf=robot_urdf(values),
         joints=joints,
         locked=locked_joints(values),
         base_frame=values["base_frame"],
         end_effector_frame=values["end_effector_frame"],
-        q_min=per_joint(values, "position_min", joints),
-        q_max=per_joint(values, "position_max", joints),
-        v_max=per_joint(values, "velocity_max", joints),
-        tau_max=per_joint(values, "torque_max", joints),
+        q_min=q_min,
+        q_max=q_max,
+        v_max=all_positive(values, "velocity_max", joints),
+        tau_max=all_positive(values, "torque_max", joints),
         scenario=scenario,
         ready_timeout=positive(values, "ready_timeout"),
     )

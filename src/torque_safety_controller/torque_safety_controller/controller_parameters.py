@@ -15,28 +15,26 @@ from torque_safety_controller.tasks import critical_damping
 from viability_bounds_pkg.robot_description import (
     RobotDescriptionError,
     build_model,
-    check_urdf,
-    read_urdf,
 )
 from viability_bounds_pkg.ros_parameters import (
     Parameter,
     ParameterError,
     joint_names,
-    locked_joints,
     per_joint,
     positive,
 )
+from viability_bounds_pkg.ros_robot_parameters import (
+    ROBOT_TABLE,
+    all_positive,
+    locked_joints,
+    position_limits,
+    robot_urdf,
+)
 
 TABLE = (
-    Parameter("robot_description", str, "URDF: path or package:// URI"),
-    Parameter("joints", list[str], "controlled joints, base to tip, in the order of all arrays"),
-    Parameter("locked_joints", list[str], "other joints that are not at zero", default=()),
-    Parameter("locked_positions", list[float], "where they are, rad", default=np.zeros(0)),
+    *ROBOT_TABLE,
     Parameter("base_frame", str, "frame of pose goals; fixed to the URDF's root"),
     Parameter("end_effector_frame", str, "frame that pose goals move"),
-    Parameter("position_min", list[float], "lower limits of posture goals, rad"),
-    Parameter("position_max", list[float], "upper limits of posture goals, rad"),
-    Parameter("torque_max", list[float], "torque limits, N m"),
     Parameter(
         "torque_rate_max",
         list[float],
@@ -106,24 +104,18 @@ def make_configuration(values: Mapping[str, Any]) -> ControllerConfiguration:
         ParameterError: a value cannot be used.
     """
     joints = joint_names(values)
-    tau_max = per_joint(values, "torque_max", joints)
-    if not (np.isfinite(tau_max).all() and (tau_max > 0).all()):
-        raise ParameterError("torque_max", tau_max, "finite numbers > 0")
     tau_rate_max = np.full(len(joints), np.inf)
     if len(values["torque_rate_max"]):
         tau_rate_max = per_joint(values, "torque_rate_max", joints)
         if not (tau_rate_max > 0).all():
             raise ParameterError("torque_rate_max", tau_rate_max, "numbers > 0")
-    q_min = per_joint(values, "position_min", joints)
-    q_max = per_joint(values, "position_max", joints)
-    if not (q_min < q_max).all():
-        raise ParameterError("position_max", q_max, "above position_min everywhere")
+    q_min, q_max = position_limits(values, joints)
     return ControllerConfiguration(
         joints=joints,
         dt=1.0 / positive(values, "rate_hz"),
         q_min=q_min,
         q_max=q_max,
-        tau_max=tau_max,
+        tau_max=all_positive(values, "torque_max", joints),
         tau_rate_max=tau_rate_max,
         base_frame=values["base_frame"],
         gains=_gains(values),
@@ -148,26 +140,17 @@ def _gains(values: Mapping[str, Any]) -> Gains:
     return Gains(**gains, posture_in_null_space=values["posture_in_null_space"])
 
 
-def load_robot(
-    values: Mapping[str, Any], description: str | None = None
-) -> tuple[RobotModel, pin.SE3]:
+def load_robot(values: Mapping[str, Any]) -> tuple[RobotModel, pin.SE3]:
     """Read the URDF and return the robot's model and the placement of the base frame.
 
     Args:
         values: parameter values by name.
-        description: text of the URDF; None reads what ``robot_description`` names.
 
     Raises:
-        ParameterError: a joint or frame that the URDF does not have.
-        RobotDescriptionError: a URDF that does not load.
+        ParameterError: a URDF that does not load, or a joint or frame that it does not have.
     """
-    source = values["robot_description"]
     joints = joint_names(values)
-    try:
-        urdf = read_urdf(source) if description is None else description
-        check_urdf(urdf, source)
-    except RobotDescriptionError as error:
-        raise ParameterError("robot_description", source, f"a URDF ({error})") from error
+    urdf = robot_urdf(values)
     try:
         model = build_model(urdf, joints, locked_joints(values))
     except RobotDescriptionError as error:

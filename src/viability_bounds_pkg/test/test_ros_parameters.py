@@ -12,10 +12,10 @@ from viability_bounds_pkg.ros_parameters import (
     Parameter,
     ParameterError,
     joint_names,
-    locked_joints,
     per_joint,
     positive,
 )
+from viability_bounds_pkg.ros_robot_parameters import locked_joints
 
 TABLE = (
     Parameter("joints", list[str], "names"),

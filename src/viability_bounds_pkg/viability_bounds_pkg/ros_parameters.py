@@ -215,18 +215,3 @@ def joint_names(values: Mapping[str, Any]) -> tuple[str, ...]:
     if not joints or len(set(joints)) != len(joints) or "" in joints:
         raise ParameterError("joints", list(joints), "at least one joint name, each once")
     return joints
-
-
-def locked_joints(values: Mapping[str, Any]) -> dict[str, float]:
-    """Return where joints are locked that are not at zero, rad by name.
-
-    Raises:
-        ParameterError: as many positions as joints are not given, or one is not finite.
-    """
-    names, positions = values["locked_joints"], values["locked_positions"]
-    if len(names) != len(positions):
-        allowed = f"{len(names)} numbers, one for each of 'locked_joints'"
-        raise ParameterError("locked_positions", positions, allowed)
-    if not np.isfinite(positions).all():
-        raise ParameterError("locked_positions", positions, "finite numbers")
-    return dict(zip(names, map(float, positions), strict=True))
