@@ -10,14 +10,15 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from ros_harness import ROOT, acceleration_limits, joint_state, read_config
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
+from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory
 
 from torque_safety_controller.controller import Controller, Gains
 from torque_safety_controller.controller_node import ControllerNode
 from torque_safety_controller.tasks import critical_damping
+from viability_bounds_pkg.robot_description import read_urdf
 from viability_bounds_pkg.ros_parameters import ParameterError
-from viability_bounds_pkg.ros_runtime import GOAL_QOS, set_stamp, stamp_to_ns
+from viability_bounds_pkg.ros_runtime import GOAL_QOS, LATCHED_QOS, set_stamp, stamp_to_ns
 
 NODE = "controller_node"
 MS = 1_000_000
@@ -717,3 +718,25 @@ def test_a_urdf_that_does_not_load_is_named(ros, tmp_path):
     with pytest.raises(ParameterError) as refusal:
         ros.start(ControllerNode, VALUES | {"robot_description": str(path)})
     assert refusal.value.name == "robot_description"
+
+
+# The robot's description
+
+
+def test_the_description_may_come_from_its_topic(ros):
+    publisher = ros.probe.create_publisher(String, "robot_description", LATCHED_QOS)
+    publisher.publish(String(data=read_urdf(read_config("panda", "x")["robot_description"])))
+    node = ros.start(
+        ControllerNode, read_config("panda", "controller_node") | {"robot_description": "topic"}
+    )
+    assert node._controller.robot.n == ARM.n
+
+
+def test_a_description_that_is_none_stops_it(ros):
+    publisher = ros.probe.create_publisher(String, "robot_description", LATCHED_QOS)
+    publisher.publish(String(data="no robot"))
+    with pytest.raises(ParameterError, match="'robot_description' is 'topic'.*not well-formed"):
+        ros.start(
+            ControllerNode,
+            read_config("panda", "controller_node") | {"robot_description": "topic"},
+        )

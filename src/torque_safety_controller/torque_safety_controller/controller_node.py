@@ -52,7 +52,7 @@ class ControllerNode(Node):
             self._node_parameters = NodeParameters(
                 self, TABLE, make_configuration, self._configure
             )
-            robot, self._base = load_robot(self._node_parameters.values)
+            robot, self._base = load_robot(self._node_parameters.values, self)
         except ParameterError:
             self.destroy_node()
             raise

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
@@ -30,6 +30,9 @@ from viability_bounds_pkg.ros_robot_parameters import (
     position_limits,
     robot_urdf,
 )
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
 
 TABLE = (
     *ROBOT_TABLE,
@@ -140,17 +143,18 @@ def _gains(values: Mapping[str, Any]) -> Gains:
     return Gains(**gains, posture_in_null_space=values["posture_in_null_space"])
 
 
-def load_robot(values: Mapping[str, Any]) -> tuple[RobotModel, pin.SE3]:
+def load_robot(values: Mapping[str, Any], node: Node) -> tuple[RobotModel, pin.SE3]:
     """Read the URDF and return the robot's model and the placement of the base frame.
 
     Args:
         values: parameter values by name.
+        node: listens for the URDF if it comes from a topic.
 
     Raises:
         ParameterError: a URDF that does not load, or a joint or frame that it does not have.
     """
     joints = joint_names(values)
-    urdf = robot_urdf(values)
+    urdf = robot_urdf(values, node)
     try:
         model = build_model(urdf, joints, locked_joints(values))
     except RobotDescriptionError as error:

@@ -6,12 +6,20 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from rclpy.node import Node
+from rclpy.task import Future
+from std_msgs.msg import String
 
-from viability_bounds_pkg.robot_description import RobotDescriptionError, read_urdf
+from viability_bounds_pkg.robot_description import (
+    RobotDescriptionError,
+    check_urdf,
+    read_urdf,
+)
 from viability_bounds_pkg.ros_parameters import Parameter, ParameterError, per_joint
+from viability_bounds_pkg.ros_runtime import LATCHED_QOS, make_executor
 
 ROBOT_TABLE = (
-    Parameter("robot_description", str, "URDF: path or package:// URI"),
+    Parameter("robot_description", str, "URDF: path, package:// URI, or 'topic': from that topic"),
     Parameter("joints", list[str], "joints that move, base to tip, in the order of all arrays"),
     Parameter("locked_joints", list[str], "other joints that are not at zero", default=()),
     Parameter("locked_positions", list[float], "where they are, rad", default=np.zeros(0)),
@@ -21,17 +29,50 @@ ROBOT_TABLE = (
 )
 
 
-def robot_urdf(values: Mapping[str, Any]) -> str:
+TOPIC = "topic"
+"""Value of ``robot_description`` that asks for what the topic of that name carries."""
+
+_TOPIC_TIMEOUT = 10.0
+
+
+def robot_urdf(values: Mapping[str, Any], node: Node | None = None) -> str:
     """Return the text of the URDF that ``robot_description`` names.
+
+    Args:
+        values: parameter values by name.
+        node: not in an executor yet; listens if the URDF is to come from the topic. None for
+            the robot itself, which publishes it.
 
     Raises:
         ParameterError: there is none.
     """
     source = values["robot_description"]
     try:
-        return read_urdf(source)
+        if source != TOPIC or node is None:
+            return read_urdf(source)
+        text = _urdf_from_topic(node)
+        check_urdf(text, "robot_description")
+        return text
     except RobotDescriptionError as error:
         raise ParameterError("robot_description", source, f"a URDF ({error})") from error
+
+
+def _urdf_from_topic(node: Node) -> str:
+    received: Future = Future()
+
+    def take(message: String) -> None:
+        if not received.done():
+            received.set_result(message.data)
+
+    subscription = node.create_subscription(String, "robot_description", take, LATCHED_QOS)
+    executor = make_executor(node.context)
+    executor.add_node(node)
+    executor.spin_until_future_complete(received, timeout_sec=_TOPIC_TIMEOUT)
+    executor.remove_node(node)
+    node.destroy_subscription(subscription)
+    if not received.done():
+        raise RobotDescriptionError(f"nothing on the topic for {_TOPIC_TIMEOUT:g} s")
+    return received.result()
 
 
 def locked_joints(values: Mapping[str, Any]) -> dict[str, float]:
