@@ -37,14 +37,12 @@ class Figure:
 
     Attributes:
         name: folder under results/.
-        title: what it shows.
         data: arrays for ``data.npz``.
         metrics: numbers for ``metrics.json``.
         rows: (what, the paper, here, agreement or why not) for the table.
     """
 
     name: str
-    title: str
     data: dict[str, np.ndarray] = field(default_factory=dict)
     metrics: dict[str, float] = field(default_factory=dict)
     rows: list[tuple[str, str, str, str]] = field(default_factory=list)
@@ -67,7 +65,7 @@ def one_joint(q: float, v: float, a: float) -> JointLimits:
 
 def figure_1() -> Figure:
     """State-space plot of the viability constraints of this paper, [5] and [6]."""
-    figure = Figure("paper0-fig1", "Fig. 1: viability constraints in the state space")
+    figure = Figure("paper0-fig1")
     limits, dt = one_joint(1.0, 5.0, 15.0), 0.1
     q = np.linspace(-1.0, 1.0, 2001)
     column = q[:, None]
@@ -118,7 +116,7 @@ def figure_1() -> Figure:
 
 def figure_3() -> Figure:
     """Regions of the state space by active acceleration bound."""
-    figure = Figure("paper0-fig3", "Fig. 3: state space by active upper bound")
+    figure = Figure("paper0-fig3")
     limits, dt = one_joint(0.5, 2.0, 10.0), 0.1
     q, v = np.meshgrid(np.linspace(-0.5, 0.5, 401), np.linspace(-2.0, 2.0, 401))
     states = q.reshape(-1, 1), v.reshape(-1, 1)
@@ -192,7 +190,7 @@ def joint_space_run(method: str, factor: float) -> ChainResult:
 
 def figure_4() -> Figure:
     """Trajectories of the first joint under four ways to bound accelerations."""
-    figure = Figure("paper0-fig4", "Fig. 4: joint-space acceleration control")
+    figure = Figure("paper0-fig4")
     cases = {
         "a: naive, dt": ("naive", 1.0),
         "b: naive, 2 dt": ("naive", 2.0),
@@ -288,7 +286,7 @@ def _figure_4_rows(m: dict[str, float]) -> list[tuple[str, str, str, str]]:
 
 def figure_5() -> Figure:
     """Trajectory of the elbow in Cartesian torque control, naive and exact."""
-    figure = Figure("paper0-fig5", "Fig. 5: Cartesian torque control of Baxter's arm")
+    figure = Figure("paper0-fig5")
     cases = {
         "a: naive, 2 dt": ("naive", 2.0),
         "naive, 20 dt": ("naive", 20.0),
@@ -364,7 +362,7 @@ def figure_5() -> Figure:
 
 def algorithm_4() -> Figure:
     """Time Algorithm 4 with the paper's number of samples."""
-    figure = Figure("paper0-alg4", "Algorithm 4: acceleration limits from torque limits")
+    figure = Figure("paper0-alg4")
     values = load_values("baxter_left_arm")
     model = build_model(read_urdf(values["robot_description"]), values["joints"])
     start = time.perf_counter()

@@ -59,12 +59,6 @@ class Scenario:
     duration: float
     events: tuple[PoseGoal | PostureGoal | Push, ...]
 
-    @property
-    def last_pose(self) -> PoseGoal | None:
-        """The pose goal that holds at the end."""
-        poses = [event for event in self.events if isinstance(event, PoseGoal)]
-        return poses[-1] if poses else None
-
 
 def load_scenario(path: str | Path) -> Scenario:
     """Read a scenario.

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from viability_bounds_pkg.joint_limits import JointLimits
-from viability_bounds_pkg.torque_margin import step_deviations, torque_margins
+from viability_bounds_pkg.torque_margin import step_deviations, tightened, torque_margins
 from viability_bounds_pkg.viability import BoundsSolver
 
 JOINTS = 200
@@ -24,17 +24,6 @@ def random_case(rng):
         a_max,
     )
     return limits, dt, drift
-
-
-def tightened(limits, margins):
-    return JointLimits(
-        limits.names,
-        limits.q_min + margins.position,
-        limits.q_max - margins.position,
-        limits.v_max - margins.velocity,
-        limits.a_min,
-        limits.a_max,
-    )
 
 
 def excess_in_units_of_d(rng, limits, dt, drift, margins, factor):

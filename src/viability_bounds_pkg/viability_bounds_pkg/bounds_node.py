@@ -28,7 +28,7 @@ from viability_bounds_pkg.ros_parameters import (
     positive,
 )
 from viability_bounds_pkg.ros_runtime import CONTROL_QOS, run
-from viability_bounds_pkg.torque_margin import TorqueMargins, torque_margins
+from viability_bounds_pkg.torque_margin import TorqueMargins, tightened, torque_margins
 
 RIVALS = {
     "naive": baselines.naive_bounds,
@@ -133,7 +133,7 @@ def make_configuration(values: Mapping[str, Any]) -> BoundsConfiguration:
         margins = _margins(values, limits, dt)
         method = values["method"]
         if method == "exact":
-            inner = _inside(limits, margins)
+            inner = tightened(limits, margins)
             solver = viability.BoundsSolver(inner, factor * dt, margins.acceleration, period=dt)
             solve = solver.bounds
         elif method == "damper":
@@ -181,18 +181,6 @@ def _margins(values: Mapping[str, Any], limits: JointLimits, dt: float) -> Torqu
                 f"more than the margins for acceleration_drift at this rate take: {margin}",
             )
     return margins
-
-
-def _inside(limits: JointLimits, margins: TorqueMargins) -> JointLimits:
-    """Return the limits with margins of position and velocity taken off."""
-    return JointLimits(
-        limits.names,
-        limits.q_min + margins.position,
-        limits.q_max - margins.position,
-        limits.v_max - margins.velocity,
-        limits.a_min,
-        limits.a_max,
-    )
 
 
 class BoundsNode(Node):

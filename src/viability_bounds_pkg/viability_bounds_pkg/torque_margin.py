@@ -12,6 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from viability_bounds_pkg.joint_limits import JointLimits
+
 
 class TorqueMargins(NamedTuple):
     """What the bounds must keep back, each of shape (n,).
@@ -59,3 +61,18 @@ def torque_margins(drift: ArrayLike, dt: float) -> TorqueMargins:
     """
     velocity, position = step_deviations(drift, dt)
     return TorqueMargins(np.asarray(drift, dtype=float) * dt / 18.0, velocity, 5.0 * position)
+
+
+def tightened(limits: JointLimits, margins: TorqueMargins) -> JointLimits:
+    """Return the limits with the margins of position and velocity taken off.
+
+    The margin of acceleration is `viability.BoundsSolver`'s to take.
+    """
+    return JointLimits(
+        limits.names,
+        limits.q_min + margins.position,
+        limits.q_max - margins.position,
+        limits.v_max - margins.velocity,
+        limits.a_min,
+        limits.a_max,
+    )
