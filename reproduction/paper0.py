@@ -383,7 +383,7 @@ def algorithm_4() -> Figure:
             "Algorithm 4, N = 1e6",
             "about 5 minutes",
             f"{seconds:.1f} s",
-            "agrees, on a machine ten years younger; left_s1 has no interval: see the README",
+            "faster, batched; left_s1 has no interval: see config/baxter_left_arm.yaml",
         )
     )
     figure.save(None)
