@@ -261,6 +261,14 @@ def acceleration_limits(joints, stamp: int, lower, upper) -> JointTrajectory:
     return message
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _graph_of_its_own() -> Iterator[None]:
+    """Keep what tests start with the default context, or as processes, to themselves."""
+    with private_domain() as domain, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_DOMAIN_ID", str(domain))
+        yield
+
+
 @pytest.fixture
 def ros() -> Iterator[RosHarness]:
     """A harness without nodes other than the probe."""

@@ -135,9 +135,7 @@ def _only(fields: dict, allowed: set[str], where: str) -> None:
 def _number(value: Any, where: str, *, zero: bool = False, negative: bool = False) -> float:
     sign = "" if negative else " >= 0" if zero else " > 0"
     if (
-        isinstance(value, bool)
-        or not isinstance(value, int | float)
-        or not math.isfinite(value)
+        not _is_finite(value)
         or (value < 0 and not negative)
         or (value == 0 and not (zero or negative))
     ):
@@ -148,7 +146,16 @@ def _number(value: Any, where: str, *, zero: bool = False, negative: bool = Fals
 def _vector(value: Any, size: int, where: str) -> tuple[float, ...]:
     if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != size:
         raise ScenarioError(f"{where} is {value!r}; allowed: {size} numbers")
-    for item in value:
-        if isinstance(item, bool) or not isinstance(item, int | float) or not math.isfinite(item):
-            raise ScenarioError(f"{where} is {value!r}; allowed: {size} finite numbers")
+    if not all(map(_is_finite, value)):
+        raise ScenarioError(f"{where} is {value!r}; allowed: {size} finite numbers")
     return tuple(map(float, value))
+
+
+def _is_finite(value: Any) -> bool:
+    """Return whether `value` is a number that a float can hold."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:
+        return False

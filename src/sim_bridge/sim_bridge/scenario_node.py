@@ -244,6 +244,7 @@ def play(node: ScenarioNode, others: Sequence[Node] = (), *, quiet: bool = False
 
     Raises:
         TimeoutError: the other nodes did not come up, or stopped answering.
+        ExternalShutdownException: told to stop before the end.
     """
     executor = make_executor(node.context)
     for each in (node, *others):
@@ -262,6 +263,8 @@ def play(node: ScenarioNode, others: Sequence[Node] = (), *, quiet: bool = False
         if not quiet and now - shown_at > _SHOW_PERIOD:
             shown_at = now
             print(node.live_line(), end="\r" if terminal else "\n", flush=True)
+    if node.phase is not Phase.DONE:
+        raise ExternalShutdownException
     if not quiet:
         print(node.live_line(), flush=True)
 

@@ -1,17 +1,19 @@
 import math
+import re
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from arms import load_arm
 from geometry_msgs.msg import WrenchStamped
-from ros_harness import joint_state, read_config
+from ros_harness import ROOT, joint_state, read_config
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from sim_bridge.bullet_node import BulletNode
+from viability_bounds_pkg.ros_parameters import ParameterError
 from viability_bounds_pkg.ros_runtime import GOAL_QOS, LATCHED_QOS, stamp_to_ns
 
 ARM = load_arm("panda")
@@ -55,6 +57,17 @@ class Robot:
 
     def send(self, stamp, tau, joints=JOINTS):
         self.commands.publish(joint_state(joints, stamp, tau=tau))
+
+    def push(self, link, force):
+        """Push along y and wait until it is felt."""
+        pushes = self.ros.talk(WrenchStamped, "external_wrench", GOAL_QOS)
+        message = WrenchStamped()
+        message.header.frame_id = link
+        message.wrench.force.y = force
+        before = self.node._push_until
+        pushes.publish(message)
+        self.ros.wait_until(lambda: self.node._push_until != before, "the push")
+        self.ros.probe.destroy_publisher(pushes)
 
     def reported(self, key):
         return self.ros.reported("bullet_node", key)
@@ -126,16 +139,31 @@ def test_effort_is_the_torque_that_the_motors_gave(ros):
     np.testing.assert_allclose(robot.states[-1].effort, tau, rtol=1e-12)
 
 
+def test_other_joints_in_a_command_are_ignored(ros):
+    robot = Robot(ros)
+    stamp, tau = robot.stamp, robot.gravity()
+    robot.send(stamp, [math.nan, *tau], ["other", *JOINTS])
+    ros.wait_until(lambda: robot.stamp > stamp, "the next state")
+    np.testing.assert_allclose(robot.states[-1].effort, tau, rtol=1e-12)
+
+
 def test_reset_brings_it_back_to_the_start_at_rest(ros):
     robot = Robot(ros)
+    robot.push("panda_link4", 50.0)
     robot.step(robot.gravity() + 1.0, times=30)
     assert np.abs(robot.q - Q).max() > 1e-4
+    robot.send(0, [1.0] * 7)
+    ros.wait_until(lambda: "not for this period" in robot.reported("commands_refused"))
     before = robot.stamp
     assert ros.call(Trigger, "bullet_node/reset", Trigger.Request()).success
     ros.wait_until(lambda: robot.stamp > before)
     np.testing.assert_array_equal(robot.q, Q)
     np.testing.assert_array_equal(robot.v, np.zeros(7))
-    robot.step()
+    # The push is gone, and all counts are at zero.
+    robot.step(times=5)
+    np.testing.assert_allclose(robot.q, Q, atol=1e-6)
+    ros.wait_until(lambda: robot.reported("periods") == "5")
+    assert robot.reported("commands_refused") == "none"
 
 
 def test_pause_stops_time_and_resuming_asks_anew(ros):
@@ -168,18 +196,27 @@ def test_it_pauses_itself_after_the_time_asked_for(ros):
 
 def test_a_push_moves_it_until_it_times_out(ros):
     robot = Robot(ros, external_wrench_timeout=0.05)
-    pushes = ros.talk(WrenchStamped, "external_wrench", GOAL_QOS)
-    push = WrenchStamped()
-    push.header.frame_id = "panda_link4"
-    push.wrench.force.y = 30.0
-    pushes.publish(push)
-    ros.wait_until(lambda: robot.node._push_until < math.inf, "the push")
+    robot.push("panda_link4", 30.0)
     robot.step(times=24)
     assert np.abs(robot.v).max() > 1e-3
     robot.step(times=10)
     assert robot.node._push_until == math.inf
     speeds = [np.abs(np.array(s.velocity)).max() for s in robot.states[-5:]]
     assert max(speeds) - min(speeds) < 1e-3  # nothing pushes any more
+
+
+def test_a_new_push_takes_the_place_of_the_old(ros):
+    robot = Robot(ros, external_wrench_timeout=5.0)
+    robot.push("panda_link4", 30.0)
+    robot.step(times=10)
+    speed = np.abs(robot.v).max()
+    assert speed > 1e-3
+    robot.push("panda_link6", 0.0)  # a push of nothing ends it, whatever the link
+    robot.step(times=10)
+    assert np.abs(robot.v).max() < 1.1 * speed
+    steady = robot.v
+    robot.step(times=10)
+    np.testing.assert_allclose(robot.v, steady, atol=0.1 * speed)
 
 
 @pytest.mark.parametrize(("link", "force"), [("no_such_link", 1.0), ("panda_link4", math.nan)])
@@ -225,6 +262,78 @@ def test_in_real_time_it_keeps_its_rate_and_brakes_without_commands(ros):
     ros.wait_until(lambda: int(robot.reported("braked_periods")) > braked)
     ros.wait_until(lambda: int(robot.reported("deadline_misses")) >= 3)
     assert "braking" in robot.reported("message")
+
+
+def test_the_first_period_after_a_pause_is_a_whole_one(ros):
+    """Resumed anywhere between two ticks, a robot leaves time to answer before the next."""
+    robot = Robot(ros, clock="real_time", rate_hz=5.0)
+    known = {"stamp": 0}
+
+    def answer():
+        if robot.stamp != known["stamp"]:
+            known["stamp"] = robot.stamp
+            robot.send(robot.stamp, robot.gravity())
+
+    ros.wait_until(lambda: robot.reported("message") == "running", each=answer, period=0.0)
+    for wait in (0.05, 0.1, 0.15):
+        ros.call(SetBool, "bullet_node/pause", SetBool.Request(data=True))
+        ros.run_for(wait)
+        paused_at = robot.stamp
+        ros.call(SetBool, "bullet_node/pause", SetBool.Request(data=False))
+        ros.wait_until(lambda s=paused_at: robot.stamp > s + 200_000_000, each=answer, period=0.0)
+    ros.diagnostics.clear()
+    ros.wait_until(lambda: robot.reported("deadline_misses"), each=answer, period=0.0)
+    assert robot.reported("deadline_misses") == "0"
+
+
+@pytest.mark.parametrize(
+    ("changed", "name", "shown"),
+    [
+        ({"joints": [*JOINTS[:6], "elbow"]}, "joints", "elbow"),
+        ({"joints": [*JOINTS[:6], JOINTS[0]]}, "joints", "each once"),
+        ({"joints": None}, "joints", "not set"),
+        ({"locked_joints": ["wing"], "locked_positions": [0.1]}, "locked_joints", "wing"),
+        (
+            {"locked_joints": [JOINTS[0]], "locked_positions": [0.1]},
+            "locked_joints",
+            JOINTS[0],
+        ),
+        ({"locked_joints": ["panda_finger_joint1"]}, "locked_positions", "1 numbers"),
+        ({"robot_description": "/no/such.urdf"}, "robot_description", "no such file"),
+        ({"robot_description": str(ROOT / "README.md")}, "robot_description", "not well-formed"),
+        ({"robot_description": "topic"}, "robot_description", "topic"),
+        ({"position_min": VALUES["position_max"]}, "position_max", "above position_min"),
+        ({"position_max": [1.0]}, "position_max", "7 numbers"),
+        ({"velocity_max": [0.0] * 7}, "velocity_max", "> 0"),
+        ({"velocity_max": [math.nan] * 7}, "velocity_max", "nan"),
+        ({"torque_max": [-1.0] * 7}, "torque_max", "> 0"),
+        ({"start_positions": [0.0] * 6}, "start_positions", "7 numbers"),
+        ({"start_positions": [math.inf] * 7}, "start_positions", "inf"),
+        ({"start_positions": None}, "start_positions", "not set"),
+        ({"rate_hz": -1.0}, "rate_hz", "> 0"),
+        ({"physics_step_max": math.nan}, "physics_step_max", "nan"),
+        ({"clock": "cuckoo"}, "clock", "real_time, lockstep"),
+        ({"command_timeout": 0}, "command_timeout", "at least 1"),
+        ({"command_timeout": 1.5}, "command_timeout", "a whole number"),
+        ({"pause_after": -1.0}, "pause_after", ">= 0"),
+        ({"external_wrench_timeout": 0.0}, "external_wrench_timeout", "> 0"),
+        ({"start_paused": "yes"}, "start_paused", "true or false"),
+    ],
+)
+def test_it_does_not_start_with_bad_parameters(ros, changed, name, shown):
+    with pytest.raises(ParameterError) as refusal:
+        ros.start(BulletNode, VALUES | changed)
+    text = str(refusal.value)
+    assert refusal.value.name == name
+    assert re.fullmatch(rf"parameter '{name}' is (.+); allowed: (.+)", text), text
+    assert shown in text
+
+
+def test_a_bad_time_to_pause_is_refused_while_it_runs(ros):
+    robot = Robot(ros)
+    assert ros.refuses("bullet_node", pause_after=-1.0).startswith("parameter 'pause_after' is -1")
+    assert "read-only" in ros.refuses("bullet_node", rate_hz=100.0)
+    robot.step(times=3)
 
 
 def test_a_broken_limit_is_an_error_in_diagnostics(ros):

@@ -1,6 +1,7 @@
 import math
 import re
 import time
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -119,12 +120,6 @@ class Chain:
 
     def reported(self, key) -> str:
         return self.ros.reported(NODE, key)
-
-    def set_pose(self, message, pending="0") -> None:
-        """Send a goal and wait until it is there."""
-        before = self.node._goals.received if hasattr(self.node._goals, "received") else None
-        assert before is None
-        self.poses.publish(message)
 
 
 def give_goal(chain, message=None, first=1) -> int:
@@ -599,11 +594,7 @@ def test_gains_change_while_it_runs(ros, changed, gains):
     before = chain.answer(10, lower=-wide, upper=wide)
     np.testing.assert_allclose(before, core.step(Q, V, -wide, wide).tau, atol=1e-4)
     ros.accepts(NODE, **changed)
-    core.gains = (
-        core.gains._replace(**gains)
-        if hasattr(core.gains, "_replace")
-        else Gains(**{**vars(core.gains), **gains})
-    )
+    core.gains = replace(core.gains, **gains)
     after = chain.answer(20, lower=-wide, upper=wide)
     np.testing.assert_allclose(after, core.step(Q, V, -wide, wide).tau, atol=1e-4)
     assert np.abs(after - before).max() > 1e-3
