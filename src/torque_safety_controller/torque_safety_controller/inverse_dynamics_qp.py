@@ -30,12 +30,15 @@ _TOLERANCE = 1e-8  # rad/s^2 and N m at most
 # without a solution go on for 15 s.
 _OUTER_ITERATIONS = 25
 _INNER_ITERATIONS = 50
+# With ProxQP's own 1e-4, problems with little room are taken for ones without a solution.
+_INFEASIBILITY_TOLERANCE = 1e-8
 # What giving way costs, relative to the tasks' gradient: the bounds give way by up to 5e-5
 # rad/s^2 more than they must, and the solver still tells good accelerations from bad ones.
 _PENALTY = 1e5
 _RELAXED_TOLERANCE = 1e-10
 # How near to a bound a solution of the solver counts as being at it, rad/s^2.
 _AT_BOUND = 1e-4
+_KEPT = 1e-6  # rad/s^2 and N m
 # Less relaxation than this, rad/s^2, is none: one problem in a thousand that has a solution is
 # taken for one that has not.
 _NEGLIGIBLE = 1e-4
@@ -177,10 +180,12 @@ class InverseDynamicsQP:
         qp = proxqp.dense.QP(2 * n, 0, 2 * n)
         _configure(qp, _RELAXED_TOLERANCE)
         qp.init(H, np.r_[self._g / penalty, np.zeros(n)], None, None, C, lower, upper)
-        a, iterations = _result(qp, n)
-        if a is None:
+        qp.solve()
+        a = np.array(qp.results.x[:n])
+        # What keeps the rows will do, converged or not: all else is a matter of the tasks.
+        if not (np.isfinite(a).all() and qp.results.info.pri_res < _KEPT):
             raise NoSolutionFound("no accelerations within the torque limits were found")
-        return a, iterations
+        return a, qp.results.info.iter
 
 
 def _configure(qp: proxqp.dense.QP, tolerance: float) -> None:
@@ -188,6 +193,7 @@ def _configure(qp: proxqp.dense.QP, tolerance: float) -> None:
     qp.settings.eps_rel = 0.0
     qp.settings.max_iter = _OUTER_ITERATIONS
     qp.settings.max_iter_in = _INNER_ITERATIONS
+    qp.settings.eps_primal_inf = _INFEASIBILITY_TOLERANCE
     # Started from the last solution, ProxQP 0.8 now and then returns one whose multipliers have
     # the wrong sign, 2% above the least cost; what is easy has been solved before it is asked.
     qp.settings.initial_guess = proxqp.InitialGuess.NO_INITIAL_GUESS

@@ -51,6 +51,19 @@ def test_condition_11_of_the_paper():
     assert not holds(0.1, 0.9999999)
 
 
+def test_condition_11_with_a_margin():
+    # Thrown back at up to (A + W) dt; then only A - W is there to stop with.
+    def holds(length, v_max, margin):
+        limits = one_joint(0.0, length, v_max, -10.0, 10.0)
+        return bool(condition_11(limits, 0.1, [margin])[0])
+
+    room = 0.5 * 0.1**2 * 12.0 * (1.0 + 12.0 / 8.0)
+    assert holds(1.001 * room, 1.201, 2.0)
+    assert not holds(0.999 * room, 1.201, 2.0)
+    assert not holds(1.001 * room, 1.199, 2.0)
+    assert holds(0.999 * room, 1.199, 1.9)
+
+
 @pytest.mark.parametrize("name", HOLDING)
 @pytest.mark.parametrize("steps_per_second", [10, 100, 1000])
 def test_agrees_with_algorithm_3(name, steps_per_second):
@@ -144,18 +157,35 @@ def test_kernel_when_only_the_range_is_short():
         assert curve.room_at(1.4) == pytest.approx(0.35, abs=1e-7)
 
 
-@pytest.mark.parametrize(
-    ("length", "v_max", "braking"),
-    [
-        (1.0, 9.0, (3.0, 3.0)),
-        (1.0, 9.0, (30.0, 20.0)),
-        (1.0, 1.5, (3.0, 2.0)),
-        (1.0, 0.5, (3.0, 2.0)),
-        (1.0, 9.0, (3.0, 0.1)),
-        (0.366, 1.63, (1.185, 0.5525)),
-        (np.inf, 1.5, (3.0, 3.0)),
-    ],
-)
+SHORT = [
+    (1.0, 9.0, (3.0, 3.0)),
+    (1.0, 9.0, (30.0, 20.0)),
+    (1.0, 1.5, (3.0, 2.0)),
+    (1.0, 0.5, (3.0, 2.0)),
+    (1.0, 9.0, (3.0, 0.1)),
+    (0.366, 1.63, (1.185, 0.5525)),
+    (np.inf, 1.5, (3.0, 3.0)),
+]
+"""Range, speed limit and braking in units of the step, where condition (11) fails."""
+
+
+@pytest.mark.parametrize(("length", "v_max", "braking"), SHORT)
+def test_interpolation_costs_less_than_the_accuracy_claimed(length, v_max, braking, monkeypatch):
+    """Also at the kinks, which random states hardly meet."""
+    curves = stopping_curves(length, v_max, braking)
+    monkeypatch.setattr("viability_bounds_pkg.discrete_kernel.PIECES", (256, 1024, 8192))
+    for curve, finer in zip(curves, stopping_curves(length, v_max, braking), strict=True):
+        # Evenly, and as closely as it gets around where the parabola begins.
+        v = np.linspace(0.0, min(finer.braking, 4.0 * length, v_max), 10_001)
+        peak = finer.peak if np.isfinite(finer.peak) else v[-1]
+        v = np.concatenate([v, peak * np.linspace(0.99, 1.01, 2001)])
+        v = v[v <= v[10_000]]
+        excess = curve.room_and_slope(v)[0] - finer.room_and_slope(v)[0]
+        # An end-of-step speed is off by at most twice the room.
+        assert 2.0 * np.abs(excess).max() <= 0.5 * EXACT * sum(braking)
+
+
+@pytest.mark.parametrize(("length", "v_max", "braking"), SHORT)
 def test_interpolated_kernel_is_invariant(length, v_max, braking):
     """From its edge, one step leads back into it: what makes the bounds safe, not just close."""
     curves = stopping_curves(length, v_max, braking)

@@ -81,7 +81,7 @@ def kernel_braking(
     result = []
     for j, w in enumerate(margins.tolist()):
         joint = _joint(limits, j)
-        up, lo = -float(limits.a_min[j]), float(limits.a_max[j])
+        up, lo = joint.braking
         if _holds(joint, dt, w):
             result.append(KernelBraking(up - w, lo - w, True))
         elif exact and w == 0.0:
@@ -91,7 +91,7 @@ def kernel_braking(
             if reduced is None:
                 allowed = f"must be smaller, or the step of {dt:g} s shorter, to leave any kernel"
                 raise JointLimitsError("margin", limits.names[j], w, allowed)
-            result.append(KernelBraking(reduced, reduced, False))
+            result.append(KernelBraking(*reduced, False))
     return result
 
 
@@ -133,9 +133,10 @@ def checked_margin(margin: ArrayLike | None, limits: JointLimits) -> NDArray[np.
 class _Joint(NamedTuple):
     length: float
     v_max: float
+    braking: tuple[float, float]
+    """Towards the upper and the lower limit."""
     ends: tuple[tuple[float, float], ...]
     """Towards each limit that exists: braking, and braking towards the opposite one."""
-    least: float
 
 
 def _joint(limits: JointLimits, j: int) -> _Joint:
@@ -146,7 +147,7 @@ def _joint(limits: JointLimits, j: int) -> _Joint:
     if limits.q_min[j] > -math.inf:
         ends.append((lo, up))
     length = float(limits.q_max[j] - limits.q_min[j])
-    return _Joint(length, float(limits.v_max[j]), tuple(ends), min(up, lo))
+    return _Joint(length, float(limits.v_max[j]), (up, lo), tuple(ends))
 
 
 def _holds(joint: _Joint, dt: float, w: float) -> bool:
@@ -163,15 +164,19 @@ def _holds(joint: _Joint, dt: float, w: float) -> bool:
     return True
 
 
-def _reduced_braking(joint: _Joint, dt: float, w: float) -> float | None:
-    """Return the largest B_up = B_lo = B for which (11) holds, or None.
+def _reduced_braking(joint: _Joint, dt: float, w: float) -> tuple[float, float] | None:
+    """Return braking towards the upper and lower limit with which (11) holds, or None.
 
-    The position part is B^2 + (3 W - L / dt^2) B + 2 W^2 <= 0.
+    First the largest B for both: the position part is B^2 + (3 W - L / dt^2) B + 2 W^2 <= 0.
+    Where the weaker side cannot use more, the stronger is then given what (11) leaves it, which
+    only makes (11) easier for the weaker one.
     """
     if not joint.ends:
         return None
-    b = min(joint.least - w, joint.v_max / dt - 2.0 * w)
-    spare = joint.length / dt / dt - 3.0 * w
+    fastest = joint.v_max / dt - 2.0 * w
+    b = min(*joint.braking, fastest + w) - w
+    steps = joint.length / dt / dt
+    spare = steps - 3.0 * w
     if spare < math.inf:
         root = spare * spare - 8.0 * w * w
         if spare <= 0.0 or root < 0.0:
@@ -180,4 +185,11 @@ def _reduced_braking(joint: _Joint, dt: float, w: float) -> float | None:
         if b < 2.0 * w * w / largest:
             return None
         b = min(b, largest)
-    return b if b > 0.0 else None
+    if b <= 0.0:
+        return None
+    # (B + 2 W)^2 / b + (B + 2 W) <= 2 L / dt^2 for the stronger side, without a difference.
+    stronger = (
+        4.0 * steps / (1.0 + math.sqrt(1.0 + 8.0 * steps / b)) if steps < math.inf else steps
+    )
+    stronger = max(b, min(stronger - 2.0 * w, fastest, max(joint.braking) - w))
+    return (stronger, b) if joint.braking[0] > joint.braking[1] else (b, stronger)
