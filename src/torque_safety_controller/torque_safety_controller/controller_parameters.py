@@ -12,10 +12,7 @@ import pinocchio as pin
 from torque_safety_controller.controller import Gains
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks import critical_damping
-from viability_bounds_pkg.robot_description import (
-    RobotDescriptionError,
-    build_model,
-)
+from viability_bounds_pkg.robot_description import RobotDescriptionError
 from viability_bounds_pkg.ros_parameters import (
     Parameter,
     ParameterError,
@@ -26,9 +23,8 @@ from viability_bounds_pkg.ros_parameters import (
 from viability_bounds_pkg.ros_robot_parameters import (
     ROBOT_TABLE,
     all_positive,
-    locked_joints,
+    load_model,
     position_limits,
-    robot_urdf,
 )
 
 if TYPE_CHECKING:
@@ -153,30 +149,11 @@ def load_robot(values: Mapping[str, Any], node: Node) -> tuple[RobotModel, pin.S
     Raises:
         ParameterError: a URDF that does not load, or a joint or frame that it does not have.
     """
-    joints = joint_names(values)
-    urdf = robot_urdf(values, node)
-    try:
-        model = build_model(urdf, joints, locked_joints(values))
-    except RobotDescriptionError as error:
-        name, allowed = _culprit(urdf, joints)
-        raise ParameterError(name, values[name], f"{allowed} ({error})") from error
+    model = load_model(values, node)
     return (
         _with_frame(model, values, "end_effector_frame"),
         _base_placement(model, values["base_frame"]),
     )
-
-
-def _culprit(urdf: str, joints: tuple[str, ...]) -> tuple[str, str]:
-    """Return which parameter keeps a model from being built, and what it may be."""
-    for name, allowed, chosen in (
-        ("robot_description", "a URDF", ()),
-        ("joints", "joints of the URDF, base to tip", joints),
-    ):
-        try:
-            build_model(urdf, chosen)
-        except RobotDescriptionError:
-            return name, allowed
-    return "locked_joints", "other joints of the URDF"
 
 
 def _with_frame(model: pin.Model, values: Mapping[str, Any], name: str) -> RobotModel:

@@ -6,16 +6,23 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 from rclpy.node import Node
 from rclpy.task import Future
 from std_msgs.msg import String
 
 from viability_bounds_pkg.robot_description import (
     RobotDescriptionError,
+    build_model,
     check_urdf,
     read_urdf,
 )
-from viability_bounds_pkg.ros_parameters import Parameter, ParameterError, per_joint
+from viability_bounds_pkg.ros_parameters import (
+    Parameter,
+    ParameterError,
+    joint_names,
+    per_joint,
+)
 from viability_bounds_pkg.ros_runtime import LATCHED_QOS, make_executor
 
 ROBOT_TABLE = (
@@ -73,6 +80,38 @@ def _urdf_from_topic(node: Node) -> str:
     if not received.done():
         raise RobotDescriptionError(f"nothing on the topic for {_TOPIC_TIMEOUT:g} s")
     return received.result()
+
+
+def load_model(values: Mapping[str, Any], node: Node) -> pin.Model:
+    """Return the model of the arm that the parameters of `ROBOT_TABLE` describe.
+
+    Args:
+        values: parameter values by name.
+        node: listens for the URDF if it comes from a topic.
+
+    Raises:
+        ParameterError: a URDF that does not load, or a joint that it does not have.
+    """
+    joints = joint_names(values)
+    urdf = robot_urdf(values, node)
+    try:
+        return build_model(urdf, joints, locked_joints(values))
+    except RobotDescriptionError as error:
+        name, allowed = _culprit(urdf, joints)
+        raise ParameterError(name, values[name], f"{allowed} ({error})") from error
+
+
+def _culprit(urdf: str, joints: tuple[str, ...]) -> tuple[str, str]:
+    """Return which parameter keeps a model from being built, and what it may be."""
+    for name, allowed, chosen in (
+        ("robot_description", "a URDF", ()),
+        ("joints", "joints of the URDF, base to tip", joints),
+    ):
+        try:
+            build_model(urdf, chosen)
+        except RobotDescriptionError:
+            return name, allowed
+    return "locked_joints", "other joints of the URDF"
 
 
 def locked_joints(values: Mapping[str, Any]) -> dict[str, float]:
