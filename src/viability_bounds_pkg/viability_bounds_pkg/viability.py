@@ -77,6 +77,7 @@ class BoundsSolver:
         dt: as given, s.
         exact: shape (n,), bool; False where the kernel is an inner approximation, because
             (11) fails and either a margin or a shorter period is asked for.
+        table: the constants that `bounds_kernel.solve` takes.
 
     Raises:
         JointLimitsError: `dt`, `margin` or `period` is unusable; the message names the joint.
@@ -104,7 +105,7 @@ class BoundsSolver:
             _joint_sides(limits, j, self.dt, w, braking[j], bool(self.exact[j]))
             for j, w in enumerate(margins.tolist())
         ]
-        self._table = make_table(self._joints)
+        self.table = make_table(self._joints)
         # The first call compiles; let it be this one and not one in a control loop.
         self.bounds(np.zeros(len(limits)), np.zeros(len(limits)))
 
@@ -134,7 +135,7 @@ class BoundsSolver:
         solve(
             q.reshape(states),
             v.reshape(states),
-            *self._table,
+            *self.table,
             lower.reshape(states),
             upper.reshape(states),
             viable.reshape(states),
