@@ -4,6 +4,7 @@
 #     bash scripts/bench.sh chain     state -> limits -> command against empty relays
 #     bash scripts/bench.sh step      one controller step, part by part
 #     bash scripts/bench.sh bounds    acceleration bounds: one arm, and batches
+#     bash scripts/bench.sh antiwindup  limits on the integral torque, and the solver's way
 set -eu
 root="$(cd "$(dirname "$0")/.." && pwd)"
 name="${1:-}"
