@@ -6,181 +6,26 @@ import sys
 import time
 from array import array
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from viability_bounds_pkg import baselines, viability
-from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
+from viability_bounds_pkg import viability
+from viability_bounds_pkg.bounds_parameters import (
+    TABLE,
+    BoundsConfiguration,
+    make_configuration,
+)
 from viability_bounds_pkg.ros_messages import Diagnostics, JointStateReader, Verdict
-from viability_bounds_pkg.ros_parameters import (
-    NodeParameters,
-    Parameter,
-    ParameterError,
-    joint_names,
-    per_joint,
-    positive,
-)
+from viability_bounds_pkg.ros_parameters import NodeParameters, ParameterError
+from viability_bounds_pkg.ros_robot_parameters import load_model
 from viability_bounds_pkg.ros_runtime import CONTROL_QOS, run
-from viability_bounds_pkg.torque_margin import TorqueMargins, tightened, torque_margins
-
-RIVALS = {
-    "naive": baselines.naive_bounds,
-    "decre": baselines.decre_bounds,
-    "rubrecht": baselines.rubrecht_bounds,
-}
-"""Methods to compare with that need no settings of their own."""
-
-METHODS = ("exact", *RIVALS, "damper")
-
-TABLE = (
-    Parameter("joints", list[str], "names of the joints, in the order of all arrays"),
-    Parameter("position_min", list[float], "lower position limits, rad; -.inf if continuous"),
-    Parameter("position_max", list[float], "upper position limits, rad; .inf if continuous"),
-    Parameter("velocity_max", list[float], "speed limits, rad/s"),
-    Parameter("acceleration_min", list[float], "lower acceleration limits, rad/s^2, < 0"),
-    Parameter("acceleration_max", list[float], "upper acceleration limits, rad/s^2, > 0"),
-    Parameter(
-        "acceleration_drift",
-        list[float],
-        "how fast the acceleration changes while a torque is held, rad/s^3; the bounds keep "
-        "back what follows from it at this rate",
-        default=np.zeros(0),
-    ),
-    Parameter(
-        "position_margin",
-        float,
-        "how much further inside the position limits to keep the joints, rad: what the robot or "
-        "its sensors may be off",
-        default=0.0,
-    ),
-    Parameter("rate_hz", float, "rate of the control loop, Hz"),
-    Parameter(
-        "bounds_dt_factor",
-        float,
-        "horizon of the bounds in control periods; 2 takes the chatter out",
-        default=2.0,
-        live=True,
-    ),
-    Parameter("method", str, f"one of: {', '.join(METHODS)}", default="exact", live=True),
-    Parameter(
-        "damper_influence",
-        float,
-        "for method damper: distance to a limit from which on it acts, rad",
-        default=0.2,
-    ),
-    Parameter("damper_gain", float, "for method damper: speed allowed there, rad/s", default=1.0),
-    Parameter(
-        "state_timeout", float, "silence after which older stamps are taken again, s", default=0.5
-    ),
-)
-
-PARAMETER_OF = {
-    "names": "joints",
-    "q_min": "position_min",
-    "q_max": "position_max",
-    "v_max": "velocity_max",
-    "a_min": "acceleration_min",
-    "a_max": "acceleration_max",
-    "margin": "acceleration_drift",
-    "dt": "bounds_dt_factor",
-    "period": "rate_hz",
-}
-
-
-@dataclass(frozen=True)
-class BoundsConfiguration:
-    """Checked parameters of the bounds node."""
-
-    limits: JointLimits
-    margins: TorqueMargins
-    """What the exact bounds keep back."""
-    control_dt: float
-    bounds_dt: float
-    method: str
-    state_timeout: float
-    solve: Any
-    """(q, v) -> AccelerationBounds."""
-
-
-def make_configuration(values: Mapping[str, Any]) -> BoundsConfiguration:
-    """Check parameter values and make what the node runs on of them.
-
-    Raises:
-        ParameterError: one of them cannot be used.
-    """
-    joints = joint_names(values)
-    if values["method"] not in METHODS:
-        raise ParameterError("method", values["method"], f"one of {', '.join(METHODS)}")
-    dt = 1.0 / positive(values, "rate_hz")
-    factor = positive(values, "bounds_dt_factor")
-    if factor < 1.0:
-        raise ParameterError("bounds_dt_factor", factor, ">= 1")
-    try:
-        limits = JointLimits(
-            joints,
-            *(
-                per_joint(values, PARAMETER_OF[field], joints)
-                for field in ("q_min", "q_max", "v_max", "a_min", "a_max")
-            ),
-        )
-        margins = _margins(values, limits, dt)
-        method = values["method"]
-        if method == "exact":
-            inner = tightened(limits, margins)
-            solver = viability.BoundsSolver(inner, factor * dt, margins.acceleration, period=dt)
-            solve = solver.bounds
-        elif method == "damper":
-            solve = partial(
-                baselines.damper_bounds,
-                limits=limits,
-                dt=factor * dt,
-                influence=positive(values, "damper_influence"),
-                gain=positive(values, "damper_gain"),
-            )
-        else:
-            solve = partial(RIVALS[method], limits=limits, dt=factor * dt)
-    except JointLimitsError as error:
-        name = PARAMETER_OF[error.field]
-        shown = error.value if error.joint is None else f"{error.value} for {error.joint}"
-        raise ParameterError(name, shown, error.allowed) from error
-    return BoundsConfiguration(
-        limits=limits,
-        margins=margins,
-        control_dt=dt,
-        bounds_dt=factor * dt,
-        method=values["method"],
-        state_timeout=positive(values, "state_timeout"),
-        solve=solve,
-    )
-
-
-def _margins(values: Mapping[str, Any], limits: JointLimits, dt: float) -> TorqueMargins:
-    """Return what to keep back for the drift of acceleration and for the robot itself."""
-    drift = np.zeros(len(limits))
-    if len(values["acceleration_drift"]):
-        drift = per_joint(values, "acceleration_drift", limits.names)
-        if not (np.isfinite(drift).all() and (drift >= 0.0).all()):
-            raise ParameterError("acceleration_drift", drift, "finite numbers >= 0")
-    margins = torque_margins(drift, dt)
-    margins.position[:] += positive(values, "position_margin", zero=True)
-    for name, margin, room in (
-        ("velocity_max", margins.velocity, limits.v_max),
-        ("position_max", margins.position, 0.5 * (limits.q_max - limits.q_min)),
-    ):
-        if not (margin < room).all():
-            raise ParameterError(
-                name,
-                values[name],
-                f"more than the margins for acceleration_drift at this rate take: {margin}",
-            )
-    return margins
 
 
 class BoundsNode(Node):
@@ -193,9 +38,13 @@ class BoundsNode(Node):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("bounds_node", **node_arguments)
+        self._model: pin.Model | None = None
         try:
             self._node_parameters = NodeParameters(
-                self, TABLE, make_configuration, self._configure
+                self,
+                TABLE,
+                partial(make_configuration, load_model=self._load_model),
+                self._configure,
             )
         except ParameterError:
             self.destroy_node()
@@ -203,6 +52,8 @@ class BoundsNode(Node):
         config = self._node_parameters.configuration
         joints = config.limits.names
         self._solve = config.solve
+        self._state_dependent = config.state_dependent
+        self._longest_ns = round(1.5e9 * config.control_dt)
         self._reader = JointStateReader(joints, config.state_timeout)
         self._answered = 0
         self._outside = np.zeros(len(joints), dtype=int)
@@ -216,8 +67,15 @@ class BoundsNode(Node):
         self._diagnostics = Diagnostics(self, self._report)
         self._warn_of_affected_joints(config)
 
+    def _load_model(self, values: Mapping[str, Any]) -> pin.Model:
+        """Return the model, loaded once: parameters that change it are read-only."""
+        if self._model is None:
+            self._model = load_model(values, self)
+        return self._model
+
     def _configure(self, config: BoundsConfiguration) -> None:
         self._solve = config.solve
+        self._state_dependent = config.state_dependent
         self._warn_of_affected_joints(config)
 
     def _warn_of_affected_joints(self, config: BoundsConfiguration) -> None:
@@ -235,10 +93,15 @@ class BoundsNode(Node):
                 )
 
     def _on_state(self, message: JointState) -> None:
+        last = self._reader.stamp
         verdict = self._reader.read(message, time.monotonic())
         if verdict is Verdict.REFUSED:
             return
         if verdict is Verdict.NEW:
+            if self._state_dependent is not None:
+                elapsed = self._reader.stamp - last
+                if not 0 < elapsed <= self._longest_ns:
+                    self._state_dependent.start()
             bounds = self._solve(self._reader.q, self._reader.v)
             points = self._answer.points
             points[0].accelerations = array("d", bounds.lower.tobytes())
@@ -263,6 +126,8 @@ class BoundsNode(Node):
             "states_refused": self._reader.refused,
             "states_outside_kernel_by_joint": self._outside,
         }
+        if self._state_dependent is not None:
+            values["steps_by_limits"] = self._state_dependent.outcomes
         if silent:
             return DiagnosticStatus.WARN, "no joint state yet", values
         if self._reader.refused:
