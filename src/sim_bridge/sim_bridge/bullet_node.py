@@ -1,4 +1,4 @@
-"""The robot node: plays a torque-controlled arm in PyBullet over topics."""
+"""The robot node: plays an arm with torque- and position-controlled motors over topics."""
 
 from __future__ import annotations
 
@@ -7,9 +7,7 @@ import sys
 import time
 from array import array
 from collections import Counter, deque
-from collections.abc import Mapping
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -21,9 +19,9 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-from sim_bridge.bullet_parameters import TABLE, BulletConfiguration, make_configuration
-from sim_bridge.bullet_robot import BulletRobot
+from sim_bridge.bullet_parameters import TABLE, make_configuration, make_robot
 from sim_bridge.limit_monitor import LimitMonitor
+from sim_bridge.ros_joint_command import CommandError, JointCommand, TorqueCommand, read_command
 from viability_bounds_pkg.robot_description import RobotDescriptionError
 from viability_bounds_pkg.ros_messages import Diagnostics
 from viability_bounds_pkg.ros_parameters import NodeParameters, ParameterError
@@ -41,7 +39,11 @@ _LATENCIES_KEPT = 100_000
 
 
 class BulletNode(Node):
-    """A torque-controlled arm: publishes ``joint_states``, obeys ``joint_commands``.
+    """An arm: publishes ``joint_states``, obeys ``joint_commands``.
+
+    A command with efforts sets the torques of the motors. One with positions, and perhaps
+    velocities, but no efforts leaves it to the motors' own drives to bring the joints there and
+    hold them. It may change from one to the next.
 
     With ``clock: real_time`` each control period lasts its time on the wall clock. A command
     that comes within the period of the state it answers acts during that period; when none
@@ -57,7 +59,7 @@ class BulletNode(Node):
         try:
             self._node_parameters = NodeParameters(self, TABLE, make_configuration)
             config = self._node_parameters.configuration
-            self._robot = _make_robot(config, self._node_parameters.values)
+            self._robot = make_robot(config, self._node_parameters.values)
         except ParameterError:
             self.destroy_node()
             raise
@@ -104,7 +106,7 @@ class BulletNode(Node):
         self._robot.clear_wrenches()
         self._robot.reset(config.q_start, np.zeros(n))
         self._monitor.reset()
-        self._tau: np.ndarray | None = None
+        self._command: JointCommand | None = None
         self._missed_in_row = self._missed = self._braked = 0
         self._periods = self._pause_at = 0
         self._plan_pause()
@@ -141,11 +143,13 @@ class BulletNode(Node):
         if self._stamp >= self._push_until:
             self._robot.clear_wrenches()
             self._push_until = math.inf
-        if self._tau is None:
+        if self._command is None:
             self._braked += 1
             self._robot.brake(config.substeps, config.tau_max)
+        elif isinstance(self._command, TorqueCommand):
+            self._robot.step(self._command.tau, config.substeps)
         else:
-            self._robot.step(self._tau, config.substeps)
+            self._robot.move(*self._command, config.tau_max, config.v_max, config.substeps)
         self._periods += 1
         self._advanced = True
         if self._periods >= self._pause_at:
@@ -157,11 +161,11 @@ class BulletNode(Node):
         if self._paused:
             return
         if not self._advanced:
-            if self._tau is not None:
+            if self._command is not None:
                 self._missed += 1
                 self._missed_in_row += 1
                 if self._missed_in_row > self._config.command_timeout:
-                    self._tau = None
+                    self._command = None
                     self.get_logger().warning(
                         f"no command for {self._missed_in_row} periods: braking"
                     )
@@ -187,38 +191,22 @@ class BulletNode(Node):
             return
         if self._paused:
             return
-        tau = self._torque_of(message)
-        if tau is None:
+        try:
+            command = read_command(message, self._state.name)
+        except CommandError as error:
+            self._refused[str(error)] += 1
             return
         self._latencies.append(time.monotonic() - self._published_at)
         self._missed_in_row = 0
-        self._torque_ratio = max(
-            self._torque_ratio, float(np.max(np.abs(tau) / self._config.tau_max))
-        )
-        # The drives do not exceed their limits, whatever they are told.
-        self._tau = np.clip(tau, -self._config.tau_max, self._config.tau_max)
+        if isinstance(command, TorqueCommand):
+            tau, tau_max = command.tau, self._config.tau_max
+            self._torque_ratio = max(self._torque_ratio, float(np.max(np.abs(tau) / tau_max)))
+            # The drives do not exceed their limits, whatever they are told.
+            command = TorqueCommand(np.clip(tau, -tau_max, tau_max))
+        self._command = command
         self._advance()
         if self._config.lockstep:
             self._next_state()
-
-    def _torque_of(self, message: JointState) -> np.ndarray | None:
-        """Return the torque that a command asks for, shape (n,), N m, or None to drop it."""
-        joints = self._config.joints
-        efforts = message.effort
-        if len(efforts) != len(message.name):
-            self._refused["wrong size"] += 1
-            return None
-        if message.name != self._state.name:
-            where = dict(zip(message.name, efforts, strict=True))
-            if any(joint not in where for joint in joints):
-                self._refused["missing joint"] += 1
-                return None
-            efforts = [where[joint] for joint in joints]
-        tau = np.array(efforts)
-        if not np.isfinite(tau).all():
-            self._refused["not finite"] += 1
-            return None
-        return tau
 
     def _on_wrench(self, message: WrenchStamped) -> None:
         force, torque = message.wrench.force, message.wrench.torque
@@ -270,6 +258,7 @@ class BulletNode(Node):
         values = {
             "clock": "lockstep" if self._config.lockstep else "real_time",
             "paused": self._paused,
+            "control": "brakes" if self._command is None else self._command.control,
             "stamp_ns": self._stamp,
             "period_s": self._config.dt,
             "periods": self._periods,
@@ -291,7 +280,7 @@ class BulletNode(Node):
             return DiagnosticStatus.ERROR, "a limit was broken", values
         if self._paused:
             return DiagnosticStatus.OK, "paused", values
-        if self._tau is None:
+        if self._command is None:
             return DiagnosticStatus.WARN, "braking: no commands", values
         return DiagnosticStatus.OK, "running", values
 
@@ -300,30 +289,6 @@ class BulletNode(Node):
         if hasattr(self, "_robot"):
             self._robot.close()
         super().destroy_node()
-
-
-def _make_robot(config: BulletConfiguration, values: Mapping[str, Any]) -> BulletRobot:
-    try:
-        robot = BulletRobot(
-            config.urdf,
-            config.joints,
-            locked_positions=config.locked,
-            physics_dt=config.dt / config.substeps,
-        )
-    except RobotDescriptionError as error:
-        name, allowed = _culprit(config)
-        raise ParameterError(name, values[name], f"{allowed} ({error})") from error
-    return robot
-
-
-def _culprit(config: BulletConfiguration) -> tuple[str, str]:
-    """Return which parameter keeps the robot from being made, and what it may be."""
-    known = {joint.get("name") for joint in ElementTree.fromstring(config.urdf).iter("joint")}
-    if not known >= set(config.joints):
-        return "joints", "joints of the URDF"
-    if not known - set(config.joints) >= set(config.locked):
-        return "locked_joints", "other joints of the URDF"
-    return "robot_description", "a URDF that PyBullet can load"
 
 
 def main(args: list[str] | None = None) -> int:

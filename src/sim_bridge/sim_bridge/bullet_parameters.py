@@ -1,13 +1,17 @@
-"""The robot node's parameters: the table, and their checks."""
+"""The robot node's parameters: the table, their checks, and the robot made of them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
+from sim_bridge.bullet_robot import BulletRobot
+from sim_bridge.gears import DEFAULT_STRIBECK_VELOCITY, Gears
+from viability_bounds_pkg.robot_description import RobotDescriptionError
 from viability_bounds_pkg.ros_parameters import (
     Parameter,
     ParameterError,
@@ -19,6 +23,7 @@ from viability_bounds_pkg.ros_robot_parameters import (
     ROBOT_TABLE,
     all_positive,
     locked_joints,
+    not_negative,
     position_limits,
     robot_urdf,
 )
@@ -48,6 +53,46 @@ TABLE = (
     ),
     Parameter("publish_clock", bool, "publish /clock", default=False),
     Parameter(
+        "friction_coulomb",
+        list[float],
+        "dry friction of moving joints, N m; none if empty",
+        default=np.zeros(0),
+    ),
+    Parameter(
+        "friction_static",
+        list[float],
+        "dry friction of joints at rest, N m; that of moving ones if empty",
+        default=np.zeros(0),
+    ),
+    Parameter(
+        "friction_viscous",
+        list[float],
+        "friction that grows with speed, N m s/rad; none if empty",
+        default=np.zeros(0),
+    ),
+    Parameter(
+        "stribeck_velocity",
+        list[float],
+        "speed at which static has become Coulomb friction but for 1/e of the difference, rad/s; "
+        f"{DEFAULT_STRIBECK_VELOCITY} if empty",
+        default=np.zeros(0),
+    ),
+    Parameter(
+        "torque_bias",
+        list[float],
+        "torque that the motors give beyond what they are told and report, N m; none if empty",
+        default=np.zeros(0),
+    ),
+    Parameter(
+        "mass_scale_links", list[str], "links that weigh other than the URDF says", default=()
+    ),
+    Parameter(
+        "mass_scales",
+        list[float],
+        "factors for their masses and inertias",
+        default=np.zeros(0),
+    ),
+    Parameter(
         "external_wrench_timeout", float, "how long a push lasts, s of robot time", default=0.5
     ),
 )
@@ -64,6 +109,8 @@ class BulletConfiguration:
     q_max: np.ndarray
     v_max: np.ndarray
     tau_max: np.ndarray
+    gears: Gears
+    mass_scales: dict[str, float]
     q_start: np.ndarray
     dt: float
     substeps: int
@@ -100,6 +147,8 @@ def make_configuration(values: Mapping[str, Any]) -> BulletConfiguration:
         q_max=q_max,
         v_max=all_positive(values, "velocity_max", joints),
         tau_max=all_positive(values, "torque_max", joints),
+        gears=_gears(values, joints),
+        mass_scales=_mass_scales(values),
         q_start=q_start,
         dt=dt,
         # The rounding keeps 1 kHz with steps of 1 ms from becoming two steps of 0.5 ms.
@@ -111,3 +160,74 @@ def make_configuration(values: Mapping[str, Any]) -> BulletConfiguration:
         publish_clock=values["publish_clock"],
         external_wrench_timeout=positive(values, "external_wrench_timeout"),
     )
+
+
+def _gears(values: Mapping[str, Any], joints: tuple[str, ...]) -> Gears:
+    coulomb = not_negative(values, "friction_coulomb", joints)
+    static = coulomb
+    if len(values["friction_static"]):
+        static = not_negative(values, "friction_static", joints)
+        if not (static >= coulomb).all():
+            raise ParameterError("friction_static", static, "at least friction_coulomb everywhere")
+    stribeck = DEFAULT_STRIBECK_VELOCITY
+    if len(values["stribeck_velocity"]):
+        stribeck = all_positive(values, "stribeck_velocity", joints)
+    bias = values["torque_bias"]
+    if len(bias):
+        bias = per_joint(values, "torque_bias", joints)
+        if not np.isfinite(bias).all():
+            raise ParameterError("torque_bias", bias, "finite numbers")
+    return Gears(
+        len(joints),
+        friction_coulomb=coulomb,
+        friction_static=static,
+        friction_viscous=not_negative(values, "friction_viscous", joints),
+        stribeck_velocity=stribeck,
+        torque_bias=bias if len(bias) else 0.0,
+        rotor_inertia=not_negative(values, "rotor_inertia", joints),
+    )
+
+
+def _mass_scales(values: Mapping[str, Any]) -> dict[str, float]:
+    links, scales = values["mass_scale_links"], values["mass_scales"]
+    if len(set(links)) != len(links):
+        raise ParameterError("mass_scale_links", links, "links of the URDF, each once")
+    if len(links) != len(scales):
+        allowed = f"{len(links)} numbers, one for each of 'mass_scale_links'"
+        raise ParameterError("mass_scales", scales, allowed)
+    if not (np.isfinite(scales).all() and (scales > 0).all()):
+        raise ParameterError("mass_scales", scales, "finite numbers > 0")
+    return dict(zip(links, map(float, scales), strict=True))
+
+
+def make_robot(config: BulletConfiguration, values: Mapping[str, Any]) -> BulletRobot:
+    """Return the robot that the parameters describe.
+
+    Raises:
+        ParameterError: a URDF that does not load, or a joint or link that it does not have.
+    """
+    try:
+        return BulletRobot(
+            config.urdf,
+            config.joints,
+            locked_positions=config.locked,
+            physics_dt=config.dt / config.substeps,
+            gears=config.gears,
+            mass_scales=config.mass_scales,
+        )
+    except RobotDescriptionError as error:
+        name, allowed = _culprit(config)
+        raise ParameterError(name, values[name], f"{allowed} ({error})") from error
+
+
+def _culprit(config: BulletConfiguration) -> tuple[str, str]:
+    """Return which parameter keeps the robot from being made, and what it may be."""
+    root = ElementTree.fromstring(config.urdf)
+    joints = {joint.get("name") for joint in root.iter("joint")}
+    if not joints >= set(config.joints):
+        return "joints", "joints of the URDF"
+    if not joints - set(config.joints) >= set(config.locked):
+        return "locked_joints", "other joints of the URDF"
+    if not {link.get("name") for link in root.iter("link")} >= set(config.mass_scales):
+        return "mass_scale_links", "links of the URDF"
+    return "robot_description", "a URDF that PyBullet can load"

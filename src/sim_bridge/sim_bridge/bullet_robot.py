@@ -25,27 +25,20 @@ the maximum being at r = a h^2 / 8: 2 microrad for 15 rad/s^2 at 1 kHz.
 from __future__ import annotations
 
 import math
-import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sim_bridge.bullet_world import BulletWorld
+from sim_bridge.gears import Gears
 from sim_bridge.limit_monitor import LimitMonitor
-from sim_bridge.quiet_pybullet import pybullet
-from sim_bridge.urdf_preparation import FramePlacement, PreparedUrdf, prepare_urdf
+from sim_bridge.position_drive import PositionDrive, make_drive
+from sim_bridge.urdf_preparation import FramePlacement, prepare_urdf
+from sim_bridge.vectors import finite_vector, not_negative_vector
 from viability_bounds_pkg.robot_description import RobotDescriptionError
-
-# What PyBullet adds to rigid-body dynamics: 4 % of damping and a clip of joint velocities at 100.
-_RIGID_BODY = {"linearDamping": 0.0, "angularDamping": 0.0, "maxJointVelocity": 1e9}
-# Brakes are solved one after another, again and again. With PyBullet's defaults (50 rounds,
-# 1e-7) a held Baxter arm creeps at 1.6e-3 rad/s, with these at 1.6e-7 rad/s. Without brakes or
-# contacts there is nothing to solve, and no cost.
-_SOLVER_ITERATIONS = 500
-_SOLVER_RESIDUAL = 1e-14
 
 
 class RobotState(NamedTuple):
@@ -53,26 +46,15 @@ class RobotState(NamedTuple):
 
     q: np.ndarray  # position at the same instant as v, rad
     v: np.ndarray  # velocity, rad/s
-    motor_torque: np.ndarray  # what the motors or brakes applied in the last physics step, N m
-
-
-class _Client:
-    """PyBullet's functions, bound to a private physics client without a window."""
-
-    def __init__(self) -> None:
-        self.id = pybullet.connect(pybullet.DIRECT)
-
-    def __getattr__(self, name: str) -> Callable[..., Any]:
-        bound = partial(getattr(pybullet, name), physicsClientId=self.id)
-        setattr(self, name, bound)  # found directly from now on
-        return bound
+    motor_torque: np.ndarray  # of the motors or brakes in the last physics step, N m
 
 
 class BulletRobot:
-    """One torque-controlled arm, fixed to the ground, alone in a world of its own.
+    """One arm with motors and brakes, fixed to the ground, alone in a world of its own.
 
     Its dynamics equal those of the Pinocchio model that
-    `viability_bounds_pkg.robot_description.build_model` makes of the same arguments. Call
+    `viability_bounds_pkg.robot_description.build_model` makes of the same arguments, save for
+    what it is told to add: gears, and masses that the URDF does not know of. Call
     `close` after use; `contextlib.closing` does. Methods raise `ValueError` for an array of
     another shape or with numbers that are not finite, `RobotDescriptionError` for a link that
     the URDF does not have.
@@ -85,6 +67,8 @@ class BulletRobot:
         gravity: acceleration of gravity in the base frame, m/s^2.
         visuals: load the visual and collision shapes, for cameras and contacts.
         mechanical_stops: stop joints hard at their position limits.
+        gears: friction, rotors and torque biases of the joints; none by default.
+        mass_scales: factors for mass and inertia of links, by name.
 
     Attributes:
         monitor: told of every physics step, unless None.
@@ -93,7 +77,8 @@ class BulletRobot:
 
     Raises:
         RobotDescriptionError: the URDF does not load, or as `prepare_urdf` does.
-        ValueError: `physics_dt` or `gravity` is out of range.
+        ValueError: `physics_dt` or `gravity` is out of range, or `gears` are those of another
+            number of joints.
     """
 
     def __init__(
@@ -106,54 +91,44 @@ class BulletRobot:
         gravity: Sequence[float] = (0.0, 0.0, -9.81),
         visuals: bool = False,
         mechanical_stops: bool = False,
+        gears: Gears | None = None,
+        mass_scales: Mapping[str, float] | None = None,
     ) -> None:
         if not (math.isfinite(physics_dt) and physics_dt > 0.0):
             raise ValueError(f"physics_dt must be positive and finite, not {physics_dt}")
-        self.joints, self.physics_dt = tuple(joints), float(physics_dt)
+        self.joints, self.physics_dt = tuple(joints), physics_dt
         self.monitor: LimitMonitor | None = None
-        gravity = _checked("gravity", gravity, 3)
+        gravity = finite_vector("gravity", gravity, 3)
+        n = len(self.joints)
+        gears = gears or Gears(n)
+        if gears.rotor_inertia.shape != (n,):
+            raise ValueError(f"there are {n} joints, but {gears.rotor_inertia.size} gears")
+        self._gears = None if gears.ideal else gears
+        inertias = zip(self.joints, gears.simulated_inertia(self.physics_dt).tolist(), strict=True)
         prepared = prepare_urdf(
-            urdf_text, joints, locked_positions, visuals=visuals, mechanical_stops=mechanical_stops
+            urdf_text,
+            joints,
+            locked_positions,
+            visuals=visuals,
+            mechanical_stops=mechanical_stops,
+            mass_scales=mass_scales,
+            rotor_inertias={joint: inertia for joint, inertia in inertias if inertia > 0.0},
         )
         self._frames = prepared.frames
         # PyBullet's position, half a step ahead of the velocity; see the module.
-        self._q, self._v, self._motor_torque = np.zeros((3, len(self.joints)))
+        self._q, self._v, self._motor_torque = np.zeros((3, n))
+        self._brakes = np.zeros(n)
         self._wrenches: dict[str, tuple[FramePlacement, list[float], list[float]]] = {}
-        self._bullet = _Client()
-        self.client_id = self._bullet.id
-        self._load(prepared, gravity.tolist())
-
-    def _load(self, prepared: PreparedUrdf, gravity: list[float]) -> None:
-        """Load the robot and take out what PyBullet adds to rigid-body dynamics."""
-        bullet = self._bullet
-        bullet.setGravity(*gravity)
-        bullet.setPhysicsEngineParameter(
-            fixedTimeStep=self.physics_dt,
-            numSolverIterations=_SOLVER_ITERATIONS,
-            solverResidualThreshold=_SOLVER_RESIDUAL,
-            deterministicOverlappingPairs=1,
+        direct = self._gears is not None
+        self._world = BulletWorld(prepared, self.joints, physics_dt, gravity.tolist(), direct)
+        self.client_id, self.body_id = self._world.client_id, self._world.body_id
+        # Made when first needed, because it takes a model.
+        self._make_drive = partial(
+            make_drive, urdf_text, self.joints, locked_positions, gears, physics_dt
         )
-        with tempfile.TemporaryDirectory() as directory:
-            path = Path(directory) / "robot.urdf"  # PyBullet reads files only
-            path.write_text(prepared.text, encoding="utf-8")
-            try:
-                self.body_id = body = bullet.loadURDF(
-                    str(path), useFixedBase=True, flags=pybullet.URDF_USE_INERTIA_FROM_FILE
-                )
-            except pybullet.error as error:
-                self.close()
-                raise RobotDescriptionError(f"URDF does not load: {error}") from error
-        infos = [bullet.getJointInfo(body, i) for i in range(bullet.getNumJoints(body))]
-        indices = {info[1].decode(): info[0] for info in infos}
-        self._joint_indices = [indices[name] for name in self.joints]
-        self._link_indices = dict.fromkeys(prepared.principal_inertias, -1)  # -1 is the base
-        self._link_indices.update({info[12].decode(): info[0] for info in infos})
-        # Apart: PyBullet forgets about the link as soon as anything of the whole body is set.
-        bullet.changeDynamics(body, -1, **_RIGID_BODY)
-        for link, index in self._link_indices.items():
-            inertia = prepared.principal_inertias[link].tolist()
-            bullet.changeDynamics(body, index, localInertiaDiagonal=inertia)
-        self._set_brakes([0.0] * len(self.joints))
+        self._drive: PositionDrive | None = None
+        self._driving = False
+        self._stepped = False  # since the last reset
 
     def reset(self, q: ArrayLike, v: ArrayLike) -> None:
         """Put the joints into a state, motors off; wrenches and the monitor stay as they are.
@@ -162,25 +137,59 @@ class BulletRobot:
             q: positions, shape (n,), rad.
             v: velocities, shape (n,), rad/s.
         """
-        v = _checked("v", v, len(self.joints))
-        raw = _checked("q", q, len(self.joints)) + 0.5 * self.physics_dt * v
-        for index, *state in zip(self._joint_indices, raw.tolist(), v.tolist(), strict=True):
-            self._bullet.resetJointState(self.body_id, index, *state)
+        v = finite_vector("v", v, len(self.joints))
+        raw = finite_vector("q", q, len(self.joints)) + 0.5 * self.physics_dt * v
+        self._world.set_state(raw, v)
         self._q[:], self._v[:] = raw, v
         self._motor_torque.fill(0.0)
+        self._driving = self._stepped = False
 
     def step(self, tau: ArrayLike, substeps: int = 1) -> None:
         """Apply joint torques for some physics steps.
 
         Args:
-            tau: torques of the motors, shape (n,), N m; applied as they are, unclipped.
+            tau: torques that the motors are told, shape (n,), N m; applied as they are, unclipped.
             substeps: how many physics steps, at least 1.
         """
-        tau = _checked("tau", tau, len(self.joints))
-        if self._brakes.any():
-            self._set_brakes([0.0] * len(self.joints))
+        tau = finite_vector("tau", tau, len(self.joints))
+        self._driving = False
+        self._release_brakes()
         self._motor_torque[:] = tau
-        self._advance(substeps, tau.tolist())
+        self._advance(substeps)
+
+    def move(
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        torque_limits: ArrayLike,
+        speed_limits: ArrayLike,
+        substeps: int = 1,
+    ) -> None:
+        """Let the motors' drives control the position for some physics steps.
+
+        They take over from torque control and from the brakes without a jump in torque.
+
+        Args:
+            q: where to be at the end, shape (n,), rad.
+            v: how fast to pass there, shape (n,), rad/s.
+            torque_limits: greatest torque of each motor, shape (n,), N m, not negative.
+            speed_limits: greatest speed that a drive asks for, shape (n,), rad/s, not negative.
+            substeps: how many physics steps, at least 1.
+        """
+        n = len(self.joints)
+        target = (
+            finite_vector("q", q, n),
+            finite_vector("v", v, n),
+            not_negative_vector("speed_limits", speed_limits, n),
+            not_negative_vector("torque_limits", torque_limits, n),
+        )
+        self._release_brakes()
+        if not self._driving:
+            self._drive = self._drive or self._make_drive()
+            last = self._motor_torque if self._stepped else None
+            self._drive.start(*self.state()[:2], target[-1], last)
+            self._driving = True
+        self._advance(substeps, target)
 
     def brake(self, substeps: int, torque_limits: ArrayLike) -> None:
         """Brake for some physics steps, as a drive does by itself, and hold what has stopped.
@@ -192,11 +201,12 @@ class BulletRobot:
             substeps: how many physics steps, at least 1.
             torque_limits: greatest torque of each brake, shape (n,), N m, not negative.
         """
-        limits = _checked("torque_limits", torque_limits, len(self.joints))
-        if np.any(limits < 0.0):
-            raise ValueError(f"torque_limits must not be negative: {limits}")
-        self._set_brakes(limits.tolist())
-        self._advance(substeps, None)
+        limits = not_negative_vector("torque_limits", torque_limits, len(self.joints))
+        self._driving = False
+        self._brakes[:] = limits
+        if self._gears is None:
+            self._world.set_brakes(limits)
+        self._advance(substeps, braking=True)
 
     def state(self) -> RobotState:
         """Return the joint state, in arrays of the caller's own."""
@@ -215,7 +225,7 @@ class BulletRobot:
             torque: shape (3,), N m, in world-aligned axes.
         """
         frame = self._frame(link)
-        force, torque = _checked("force", force, 3), _checked("torque", torque, 3)
+        force, torque = finite_vector("force", force, 3), finite_vector("torque", torque, 3)
         self._wrenches[link] = frame, force.tolist(), torque.tolist()
 
     def clear_wrenches(self) -> None:
@@ -229,58 +239,57 @@ class BulletRobot:
             Position, shape (3,), m, and orientation, shape (4,), a quaternion x, y, z, w, of
             any link of the URDF in the frame of its root link.
         """
-        return self._pose(self._frame(link))
+        return self._world.pose(self._frame(link))
 
     def close(self) -> None:
         """Leave the physics world; after that the robot is of no more use."""
-        if self.client_id >= 0:
-            self._bullet.disconnect()
-            self.client_id = -1
+        self._world.close()
 
-    def _advance(self, substeps: int, tau: list[float] | None) -> None:
-        """Make physics steps under torques or, with None, under the brakes."""
+    def _advance(
+        self,
+        substeps: int,
+        target: tuple[np.ndarray, ...] | None = None,
+        braking: bool = False,
+    ) -> None:
+        """Make physics steps under `_motor_torque`, or the drives' given a target, or brakes."""
         if substeps < 1:
             raise ValueError(f"substeps must be at least 1, not {substeps}")
-        bullet, body, joints = self._bullet, self.body_id, self._joint_indices
+        world = self._world
+        state_matters = target is not None or self._gears is not None
         for remaining in range(substeps, 0, -1):
-            # PyBullet forgets torques and wrenches at the end of each step.
-            if tau is not None:
-                bullet.setJointMotorControlArray(body, joints, pybullet.TORQUE_CONTROL, forces=tau)
-            for frame, force, torque in self._wrenches.values():
-                index = self._link_indices[frame.link]
-                point = self._pose(frame)[0].tolist()
-                bullet.applyExternalForce(body, index, force, point, pybullet.WORLD_FRAME)
-                bullet.applyExternalTorque(body, index, torque, pybullet.WORLD_FRAME)
-            bullet.stepSimulation()
-            if self.monitor is None and remaining > 1:
+            if target is not None:
+                self._motor_torque[:] = self._drive.torque(*self.state()[:2], *target)
+            if self._gears is not None:
+                self._load_gears(braking)
+            elif not braking:
+                world.set_torques(self._motor_torque)
+            for wrench in self._wrenches.values():
+                world.push(*wrench)
+            world.step()
+            self._stepped = True
+            if self.monitor is None and remaining > 1 and not state_matters:
                 continue
-            states = bullet.getJointStates(body, joints)
+            states = world.joint_states()
             self._q[:] = [state[0] for state in states]
             self._v[:] = [state[1] for state in states]
-            if tau is None:  # PyBullet reports what its motors apply, not commanded torques,
-                self._motor_torque[:] = [state[3] for state in states]
-                self._motor_torque[self._brakes == 0.0] = 0.0  # and the last of a motor now off
+            if braking:  # PyBullet counts friction in, and the last of a brake now off
+                applied = [state[3] for state in states]
+                self._motor_torque[:] = np.clip(applied, -self._brakes, self._brakes)
             if self.monitor is not None:
                 self.monitor.update(self._q, self._v, self._motor_torque)
 
-    def _set_brakes(self, torque_limits: list[float]) -> None:
-        """Let zero-velocity motors apply up to `torque_limits`; PyBullet starts with them on."""
-        self._bullet.setJointMotorControlArray(
-            self.body_id, self._joint_indices, pybullet.VELOCITY_CONTROL, forces=torque_limits
-        )
-        self._brakes = np.array(torque_limits)
+    def _load_gears(self, braking: bool) -> None:
+        """Apply what the motors deliver, and friction together with the brakes."""
+        # A motor that is off has no bias either.
+        tau = -self._gears.torque_bias if braking else self._motor_torque
+        delivered, friction = self._gears.loads(self._v, tau)
+        self._world.set_torques(delivered)
+        self._world.set_brakes(friction + self._brakes)
 
-    def _pose(self, frame: FramePlacement) -> tuple[np.ndarray, np.ndarray]:
-        """Return position and quaternion of a frame, from the joints' present positions."""
-        index = self._link_indices[frame.link]
-        if index < 0:
-            return frame.position.copy(), frame.orientation.copy()
-        link = self._bullet.getLinkState(self.body_id, index, computeForwardKinematics=1)
-        centre, (x, y, z, w) = link[:2]
-        # Products with a quaternion from the left, and with its conjugate from the right.
-        left = np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]])
-        right = np.array([[w, -z, y, -x], [z, w, -x, -y], [-y, x, w, -z], [x, y, z, w]])
-        return centre + (left @ right)[:3, :3] @ frame.position, left @ frame.orientation
+    def _release_brakes(self) -> None:
+        if self._brakes.any():
+            self._brakes.fill(0.0)
+            self._world.set_brakes(self._brakes)
 
     def _frame(self, link: str) -> FramePlacement:
         """Return the placement of `link`, or raise `RobotDescriptionError`."""
@@ -288,11 +297,3 @@ class BulletRobot:
             known = ", ".join(self._frames)
             raise RobotDescriptionError(f"unknown link {link!r}; the URDF has: {known}")
         return self._frames[link]
-
-
-def _checked(name: str, value: ArrayLike, size: int) -> np.ndarray:
-    """Return `value` as an array of `size` finite numbers, or raise `ValueError`."""
-    array = np.asarray(value, dtype=float)
-    if array.shape != (size,) or not np.isfinite(array).all():
-        raise ValueError(f"{name} must be {size} finite numbers, not {value}")
-    return array

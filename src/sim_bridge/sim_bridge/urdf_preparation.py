@@ -11,12 +11,15 @@ PyBullet reads a URDF in ways that silently change the dynamics; nothing is left
 Links that do not move against each other become one, with the sum of their inertias: PyBullet
 steps every link, fixed or not, and a humanoid becomes as fast as its arm.
 `PreparedUrdf.frames` remembers where each of the original links went.
+
+What a URDF cannot say is added on request: rotors that gears will couple to the joints
+(`sim_bridge.gears` has the reasons), and links that weigh other than the URDF believes.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -24,9 +27,20 @@ from xml.etree.ElementTree import Element, ParseError, SubElement, fromstring, t
 
 import numpy as np
 
+from sim_bridge.urdf_geometry import (
+    joint_axis,
+    number_text,
+    origin_attributes,
+    point_inertia,
+    read_numbers,
+    roll_pitch_yaw,
+    transform_of,
+)
 from viability_bounds_pkg.robot_description import RobotDescriptionError, resolve_uri
 
 _MOVABLE = ("revolute", "continuous", "prismatic")
+# PyBullet makes no stop where lower > upper.
+_NO_STOP = {"lower": "1", "upper": "-1", "effort": "0", "velocity": "0"}
 
 
 class FramePlacement(NamedTuple):
@@ -48,6 +62,7 @@ class PreparedUrdf:
     text: str  # without any joints but those asked for
     frames: Mapping[str, FramePlacement]  # of every link of the original URDF
     principal_inertias: Mapping[str, np.ndarray]  # to set for each link left, shape (3,), kg m^2
+    rotors: Mapping[str, str]  # the joint of the rotor that belongs to a joint, where there is one
 
 
 @dataclass
@@ -68,6 +83,8 @@ def prepare_urdf(
     *,
     visuals: bool = False,
     mechanical_stops: bool = False,
+    mass_scales: Mapping[str, float] | None = None,
+    rotor_inertias: Mapping[str, float] | None = None,
 ) -> PreparedUrdf:
     """Return `urdf` reduced to `joints` and rewritten for PyBullet.
 
@@ -78,10 +95,15 @@ def prepare_urdf(
             at zero. Mimic joints are joints like any other here, as they are in Pinocchio.
         visuals: keep the visual and collision shapes; the files they name are looked up.
         mechanical_stops: keep the position limits as hard stops, which hide violations.
+        mass_scales: factors for mass and inertia of links, by name.
+        rotor_inertias: for each of `joints` that gets a rotor, its inertia, kg m^2 (kg for a
+            prismatic joint). The rotors turn about axes fixed to the ground, through their
+            centres: neither gravity nor the arm's motion acts on them.
 
     Raises:
         RobotDescriptionError: not a URDF, a joint that is unknown, repeated, both moved and
-            locked, or of a type with other than one coordinate; a mesh that cannot be found.
+            locked, or of a type with other than one coordinate; an unknown link, or one scaled
+            by other than a finite positive number; a mesh that cannot be found.
     """
     try:
         root = fromstring(urdf)
@@ -93,6 +115,8 @@ def prepare_urdf(
     output = Element("robot", name=root.get("name", "robot"))
     output.extend(deepcopy(root.findall("material")))
     links = {link.get("name", ""): link for link in root.findall("link")}
+    scales = dict(mass_scales or {})
+    _check_mass_scales(links, scales)
     outgoing: dict[str, list[Element]] = {}
     children = []
     for joint in root.findall("joint"):
@@ -108,10 +132,10 @@ def prepare_urdf(
     while pending:
         name, body, placement = pending.pop()
         placed[name] = body, placement
-        _add_link(body, links[name], placement, visuals)
+        _add_link(body, links[name], placement, visuals, scales.get(name, 1.0))
         for joint in outgoing.get(name, ()):
             child = _linked(joint, "child", links)
-            origin = placement @ _transform(joint.find("origin"))
+            origin = placement @ transform_of(joint.find("origin"))
             if joint.get("name") in joints:
                 output.append(_moving_joint(joint, body.name, child, origin, mechanical_stops))
                 bodies.append(_Body(child))
@@ -128,7 +152,11 @@ def prepare_urdf(
         for name, (body, placement) in placed.items()
     }
     inertias = {name: moments for name, (_, moments) in principal.items()}
-    return PreparedUrdf(tostring(output, encoding="unicode"), frames, inertias)
+    rotors = {joint: f"{joint} rotor" for joint in rotor_inertias or {}}
+    for joint, rotor in rotors.items():
+        _append_rotor(output, bodies[0].name, rotor)
+        inertias[rotor] = np.full(3, rotor_inertias[joint])
+    return PreparedUrdf(tostring(output, encoding="unicode"), frames, inertias, rotors)
 
 
 def _check_joints(root: Element, joints: Sequence[str], locked: Mapping[str, float]) -> None:
@@ -149,6 +177,15 @@ def _check_joints(root: Element, joints: Sequence[str], locked: Mapping[str, flo
             raise RobotDescriptionError(f"joint {name!r} cannot be locked at {position}")
 
 
+def _check_mass_scales(links: Mapping[str, Element], scales: Mapping[str, float]) -> None:
+    """Raise `RobotDescriptionError` unless each link named exists and has a sensible factor."""
+    for name, scale in scales.items():
+        if name not in links:
+            raise RobotDescriptionError(f"unknown link {name!r}; the URDF has: {', '.join(links)}")
+        if not (math.isfinite(scale) and scale > 0.0):
+            raise RobotDescriptionError(f"the mass of link {name!r} cannot be scaled by {scale}")
+
+
 def _linked(joint: Element, end: str, links: Mapping[str, object]) -> str:
     """Return the link at the 'parent' or 'child' `end` of `joint`."""
     element = joint.find(end)
@@ -158,26 +195,28 @@ def _linked(joint: Element, end: str, links: Mapping[str, object]) -> str:
     return name
 
 
-def _add_link(body: _Body, link: Element, placement: np.ndarray, visuals: bool) -> None:
-    """Add the inertia, and the shapes if wanted, of `link` placed on `body`."""
+def _add_link(
+    body: _Body, link: Element, placement: np.ndarray, visuals: bool, scale: float
+) -> None:
+    """Add the inertia times `scale`, and the shapes if wanted, of `link` placed on `body`."""
     for inertial in link.findall("inertial"):
-        frame = placement @ _transform(inertial.find("origin"))
+        frame = placement @ transform_of(inertial.find("origin"))
         rotation, centre = frame[:3, :3], frame[:3, 3]
-        mass = _numbers(inertial.find("mass"), "value", 1)[0]
+        mass = scale * read_numbers(inertial.find("mass"), "value", 1)[0]
         xx, xy, xz, yy, yz, zz = (
-            _numbers(inertial.find("inertia"), name, 1)[0]
+            read_numbers(inertial.find("inertia"), name, 1)[0]
             for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
         )
-        own = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        own = scale * np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         body.mass += mass
         body.moment += mass * centre
-        body.inertia += rotation @ own @ rotation.T + _point_inertia(mass, centre)
+        body.inertia += rotation @ own @ rotation.T + point_inertia(mass, centre)
     for shape in (*link.findall("visual"), *link.findall("collision")) if visuals else ():
         shape = deepcopy(shape)
         origin = shape.find("origin")
         if origin is None:
             origin = SubElement(shape, "origin")
-        origin.attrib = _origin(placement @ _transform(origin))
+        origin.attrib = origin_attributes(placement @ transform_of(origin))
         for mesh in shape.iter("mesh"):
             mesh.set("filename", str(resolve_uri(mesh.get("filename", "")).resolve()))
         body.shapes.append(shape)
@@ -187,21 +226,33 @@ def _append_link(output: Element, body: _Body) -> tuple[np.ndarray, np.ndarray]:
     """Add `body` to the URDF; return its principal frame, shape (4, 4), and moments (3,)."""
     frame = np.eye(4)
     frame[:3, 3] = centre = body.moment / body.mass if body.mass else np.zeros(3)
-    moments, axes = np.linalg.eigh(body.inertia - _point_inertia(body.mass, centre))
+    moments, axes = np.linalg.eigh(body.inertia - point_inertia(body.mass, centre))
     axes[:, 2] *= np.sign(np.linalg.det(axes))  # eigenvectors may come left-handed
     frame[:3, :3] = axes
     link = SubElement(output, "link", name=body.name)
     inertial = SubElement(link, "inertial")
-    SubElement(inertial, "origin", _origin(frame))
-    SubElement(inertial, "mass", value=_text([body.mass]))
+    SubElement(inertial, "origin", origin_attributes(frame))
+    SubElement(inertial, "mass", value=number_text([body.mass]))
     SubElement(inertial, "inertia", ixx="1", ixy="0", ixz="0", iyy="1", iyz="0", izz="1")
     link.extend(body.shapes)
     return frame, moments
 
 
+def _append_rotor(output: Element, base: str, name: str) -> None:
+    """Add a rotor that turns against `base`; the caller sets its inertia, as for all links."""
+    inertial = SubElement(SubElement(output, "link", name=name), "inertial")
+    SubElement(inertial, "mass", value="1")
+    SubElement(inertial, "inertia", ixx="1", ixy="0", ixz="0", iyy="1", iyz="0", izz="1")
+    joint = SubElement(output, "joint", name=name, type="revolute")
+    SubElement(joint, "parent", link=base)
+    SubElement(joint, "child", link=name)
+    SubElement(joint, "axis", xyz="0 0 1")
+    SubElement(joint, "limit", _NO_STOP)
+
+
 def _frame(link: str, transform: np.ndarray) -> FramePlacement:
     """Return the frame that `transform`, shape (4, 4), places on `link`."""
-    half = 0.5 * np.array(_rpy(transform))
+    half = 0.5 * np.array(roll_pitch_yaw(transform))
     (sr, sp, sy), (cr, cp, cy) = np.sin(half), np.cos(half)
     x, y, z = sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy
     w = cr * cp * cy + sr * sp * sy
@@ -214,15 +265,15 @@ def _moving_joint(
     """Return `joint` placed at `origin` on `parent`, without friction, damping or mimicry."""
     kind = "prismatic" if joint.get("type") == "prismatic" else "revolute"
     moved = Element("joint", name=joint.get("name", ""), type=kind)
-    SubElement(moved, "origin", _origin(origin))
+    SubElement(moved, "origin", origin_attributes(origin))
     SubElement(moved, "parent", link=parent)
     SubElement(moved, "child", link=child)
-    SubElement(moved, "axis", xyz=_text(_axis(joint)))
+    SubElement(moved, "axis", xyz=number_text(joint_axis(joint)))
     limit = joint.find("limit")
     if stops and limit is not None and joint.get("type") != "continuous":
         moved.append(deepcopy(limit))
-    else:  # PyBullet makes no stop where lower > upper
-        SubElement(moved, "limit", lower="1", upper="-1", effort="0", velocity="0")
+    else:
+        SubElement(moved, "limit", _NO_STOP)
     return moved
 
 
@@ -230,70 +281,9 @@ def _locked_motion(joint: Element, position: float) -> np.ndarray:
     """Return the transform, shape (4, 4), that `joint` makes at `position` (rad or m)."""
     motion = np.eye(4)
     if joint.get("type") == "prismatic":
-        motion[:3, 3] = position * _axis(joint)
+        motion[:3, 3] = position * joint_axis(joint)
     elif position != 0.0:  # Rodrigues: R = I + sin(q) K + (1 - cos(q)) K^2
-        x, y, z = _axis(joint)
+        x, y, z = joint_axis(joint)
         skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         motion[:3, :3] += math.sin(position) * skew + (1.0 - math.cos(position)) * skew @ skew
     return motion
-
-
-def _point_inertia(mass: float, point: np.ndarray) -> np.ndarray:
-    """Return the inertia, shape (3, 3), about the origin of a point mass at `point`."""
-    return mass * (point @ point * np.eye(3) - np.outer(point, point))
-
-
-def _axis(joint: Element) -> np.ndarray:
-    """Return the unit axis of `joint`, shape (3,); URDF's default is x."""
-    element = joint.find("axis")
-    axis = np.array([1.0, 0.0, 0.0]) if element is None else _numbers(element, "xyz", 3)
-    length = np.linalg.norm(axis)
-    if length == 0.0:
-        raise RobotDescriptionError(f"joint {joint.get('name')!r}: axis without a direction")
-    return axis / length
-
-
-def _transform(origin: Element | None) -> np.ndarray:
-    """Return the transform, shape (4, 4), of a URDF origin; identity for None."""
-    (sr, sp, sy), (cr, cp, cy) = (f(_numbers(origin, "rpy", 3)) for f in (np.sin, np.cos))
-    transform = np.eye(4)
-    transform[:3, :3] = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    transform[:3, 3] = _numbers(origin, "xyz", 3)
-    return transform
-
-
-def _rpy(transform: np.ndarray) -> tuple[float, float, float]:
-    """Return roll, pitch and yaw of `transform`, exact to rounding, rad."""
-    r = transform[:3, :3]
-    yaw = math.atan2(r[1, 0], r[0, 0])
-    pitch = math.atan2(-r[2, 0], math.hypot(r[0, 0], r[1, 0]))
-    # Roll from what is left once yaw is undone: taken apart, they lose digits near pitch +-pi/2.
-    s, c = math.sin(yaw), math.cos(yaw)
-    roll = math.atan2(s * r[0, 2] - c * r[1, 2], c * r[1, 1] - s * r[0, 1])
-    return roll, pitch, yaw
-
-
-def _origin(transform: np.ndarray) -> dict[str, str]:
-    """Return the attributes of the URDF origin that places `transform`."""
-    return {"xyz": _text(transform[:3, 3]), "rpy": _text(_rpy(transform))}
-
-
-def _text(numbers: Iterable[float]) -> str:
-    """Return `numbers` for a URDF, with all their digits."""
-    return " ".join(repr(float(number)) for number in numbers)
-
-
-def _numbers(element: Element | None, name: str, count: int) -> np.ndarray:
-    """Return the `count` numbers of an attribute, shape (count,); zeros where it is missing."""
-    text = None if element is None else element.get(name)
-    try:
-        numbers = np.array([float(x) for x in text.split()]) if text else np.zeros(count)
-    except ValueError:
-        numbers = np.empty(0)
-    if numbers.shape != (count,) or not np.isfinite(numbers).all():
-        raise RobotDescriptionError(f"URDF: {name}={text!r} is not {count} finite number(s)")
-    return numbers

@@ -55,8 +55,18 @@ class Robot:
             self.send(stamp, self.gravity() if tau is None else tau)
             self.ros.wait_until(lambda s=stamp: self.stamp > s, "the next state")
 
-    def send(self, stamp, tau, joints=JOINTS):
-        self.commands.publish(joint_state(joints, stamp, tau=tau))
+    def send(self, stamp, tau=None, joints=JOINTS, *, q=None, v=None):
+        message = joint_state(joints, stamp, tau=[] if tau is None else tau)
+        message.position = [] if q is None else list(map(float, q))
+        message.velocity = [] if v is None else list(map(float, v))
+        self.commands.publish(message)
+
+    def move(self, q, v=None, times=1):
+        """Answer states with positions, and await the next ones."""
+        for _ in range(times):
+            stamp = self.stamp
+            self.send(stamp, q=q, v=v)
+            self.ros.wait_until(lambda s=stamp: self.stamp > s, "the next state")
 
     def push(self, link, force):
         """Push along y and wait until it is felt."""
@@ -99,6 +109,15 @@ def test_an_unanswered_state_is_sent_again_and_nothing_moves(ros):
         ("not finite", lambda r: r.send(r.stamp, [math.inf] + [0.0] * 6)),
         ("wrong size", lambda r: r.send(r.stamp, [1.0] * 3)),
         ("missing joint", lambda r: r.send(r.stamp, [1.0] * 6, JOINTS[1:])),
+        ("wrong size", lambda r: r.send(r.stamp)),
+        ("wrong size", lambda r: r.send(r.stamp, q=Q[:3])),
+        ("wrong size", lambda r: r.send(r.stamp, q=Q, v=[0.0])),
+        ("wrong size", lambda r: r.send(r.stamp, [1.0] * 3, q=Q)),
+        ("not finite", lambda r: r.send(r.stamp, q=[math.nan] * 7)),
+        ("not finite", lambda r: r.send(r.stamp, q=Q, v=[0.0] * 6 + [math.inf])),
+        ("not finite", lambda r: r.send(r.stamp, [math.nan] * 7, q=Q)),
+        ("missing joint", lambda r: r.send(r.stamp, q=Q[1:], joints=JOINTS[1:])),
+        ("not for this period", lambda r: r.send(r.stamp - PERIOD, q=Q)),
         ("not for this period", lambda r: r.send(r.stamp - PERIOD, [1.0] * 7)),
         ("not for this period", lambda r: r.send(r.stamp + PERIOD, [1.0] * 7)),
     ],
@@ -145,6 +164,91 @@ def test_other_joints_in_a_command_are_ignored(ros):
     robot.send(stamp, [math.nan, *tau], ["other", *JOINTS])
     ros.wait_until(lambda: robot.stamp > stamp, "the next state")
     np.testing.assert_allclose(robot.states[-1].effort, tau, rtol=1e-12)
+
+
+def test_positions_are_held_by_the_drives(ros):
+    robot = Robot(ros)
+    robot.move(Q, times=30)
+    np.testing.assert_allclose(robot.q, Q, rtol=0.0, atol=1e-3)
+    np.testing.assert_allclose(robot.states[-1].effort, robot.gravity(), atol=0.05)
+    robot.await_reported("control", "position")
+    goal = Q + np.linspace(-0.1, 0.1, 7)
+    robot.move(goal, times=400)
+    np.testing.assert_allclose(robot.q, goal, rtol=0.0, atol=1e-3)
+    assert robot.reported("commands_refused") == "none"
+    assert max(float(x) for x in robot.reported("torque_ratio").split()) <= 1.0
+
+
+def test_positions_may_come_in_any_order_and_with_velocities(ros):
+    robot = Robot(ros)
+    order = [3, 1, 6, 0, 2, 5, 4]
+    speed = np.linspace(0.05, 0.1, 7)
+    for k in range(100):
+        stamp, path = robot.stamp, Q + speed * (k + 1) * PERIOD * 1e-9
+        names = [*(JOINTS[i] for i in order), "other"]
+        robot.send(stamp, joints=names, q=[*path[order], 9.0], v=[*speed[order], 9.0])
+        ros.wait_until(lambda s=stamp: robot.stamp > s)
+    np.testing.assert_allclose(robot.q, path, rtol=0.0, atol=1e-3)
+    np.testing.assert_allclose(robot.v, speed, atol=0.01)
+
+
+def test_control_changes_at_any_time_without_a_jump(ros):
+    robot = Robot(ros)
+    robot.step(times=5)
+    tau = np.array(robot.states[-1].effort)
+    q, v = robot.q, robot.v
+    robot.move(q + v * PERIOD * 1e-9, v)
+    assert (np.abs(np.array(robot.states[-1].effort) - tau) < 1e-3 * np.abs(tau).max()).all()
+    robot.move(q, times=20)
+    robot.send(robot.stamp, robot.gravity(), q=Q + 1.0)  # efforts win
+    robot.await_reported("control", "torque")
+    robot.step(times=20)
+    np.testing.assert_allclose(robot.q, Q, atol=1e-3)
+
+
+def test_positions_are_held_for_the_time_out_and_then_braked(ros):
+    robot = Robot(ros, clock="real_time", rate_hz=100.0, command_timeout=3)
+    ros.wait_until(
+        lambda: robot.reported("control") == "position",
+        each=lambda: robot.send(robot.stamp, q=Q),
+        period=0.001,
+    )
+    robot.await_reported("control", "brakes")
+    assert int(robot.reported("deadline_misses")) >= 3
+    np.testing.assert_allclose(robot.q, Q, rtol=0.0, atol=1e-3)
+
+
+def test_gears_and_masses_reach_the_robot(ros):
+    friction = [1.0, 1.0, 1.0, 1.0, 0.5, 0.5, 0.5]
+    robot = Robot(
+        ros,
+        friction_coulomb=friction,
+        friction_static=[2.0 * f for f in friction],
+        friction_viscous=[0.1] * 7,
+        stribeck_velocity=[0.02] * 7,
+        torque_bias=[0.1, 0.0, 0.0, 0.0, 0.0, 0.0, -0.1],
+        rotor_inertia=[0.1] * 7,
+        mass_scale_links=["panda_link4"],
+        mass_scales=[1.2],
+    )
+    gears = robot.node._config.gears
+    np.testing.assert_array_equal(gears.friction_coulomb, friction)
+    np.testing.assert_array_equal(gears.friction_static, 2.0 * np.array(friction))
+    np.testing.assert_array_equal(gears.friction_viscous, 0.1)
+    np.testing.assert_array_equal(gears.stribeck_velocity, 0.02)
+    np.testing.assert_array_equal(gears.torque_bias, [0.1, 0.0, 0.0, 0.0, 0.0, 0.0, -0.1])
+    np.testing.assert_array_equal(gears.rotor_inertia, 0.1)
+    assert robot.node._config.mass_scales == {"panda_link4": 1.2}
+    # Less than the stiction, though wrong by the mass error and more: it stays where it is.
+    robot.step(times=50)
+    np.testing.assert_allclose(robot.q, Q, rtol=0.0, atol=1e-12)
+    robot.step(robot.gravity() + 5.0, times=20)
+    assert np.abs(robot.v).max() > 0.1
+
+
+def test_without_stiction_of_its_own_a_joint_has_that_of_coulomb(ros):
+    robot = Robot(ros, friction_coulomb=[1.0] * 7)
+    np.testing.assert_array_equal(robot.node._config.gears.friction_static, 1.0)
 
 
 def test_reset_brings_it_back_to_the_start_at_rest(ros):
@@ -318,6 +422,33 @@ def test_the_first_period_after_a_pause_is_a_whole_one(ros):
         ({"pause_after": -1.0}, "pause_after", ">= 0"),
         ({"external_wrench_timeout": 0.0}, "external_wrench_timeout", "> 0"),
         ({"start_paused": "yes"}, "start_paused", "true or false"),
+        ({"friction_coulomb": [1.0] * 6}, "friction_coulomb", "7 numbers"),
+        ({"friction_coulomb": [-1.0] * 7}, "friction_coulomb", ">= 0"),
+        ({"friction_static": [math.inf] * 7}, "friction_static", "inf"),
+        (
+            {"friction_coulomb": [1.0] * 7, "friction_static": [0.5] * 7},
+            "friction_static",
+            "at least friction_coulomb",
+        ),
+        ({"friction_viscous": [math.nan] * 7}, "friction_viscous", "nan"),
+        ({"stribeck_velocity": [0.0] * 7}, "stribeck_velocity", "> 0"),
+        ({"torque_bias": [math.inf] * 7}, "torque_bias", "finite"),
+        ({"torque_bias": [1.0]}, "torque_bias", "7 numbers"),
+        ({"rotor_inertia": [-0.1] * 7}, "rotor_inertia", ">= 0"),
+        ({"rotor_inertia": [0.1] * 3}, "rotor_inertia", "7 numbers"),
+        ({"mass_scale_links": ["panda_link4"]}, "mass_scales", "1 numbers"),
+        ({"mass_scales": [1.1]}, "mass_scales", "0 numbers"),
+        (
+            {"mass_scale_links": ["panda_link4"], "mass_scales": [0.0]},
+            "mass_scales",
+            "> 0",
+        ),
+        ({"mass_scale_links": ["wing"], "mass_scales": [1.1]}, "mass_scale_links", "wing"),
+        (
+            {"mass_scale_links": ["panda_link4"] * 2, "mass_scales": [1.1, 1.1]},
+            "mass_scale_links",
+            "each once",
+        ),
     ],
 )
 def test_it_does_not_start_with_bad_parameters(ros, changed, name, shown):

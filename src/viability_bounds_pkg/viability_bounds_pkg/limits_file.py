@@ -60,7 +60,8 @@ def read_robot(path: Path) -> Robot:
     Raises:
         ParameterFileError: the file cannot be read, is no parameter file, or a parameter is
             missing or of the wrong type or length.
-        RobotDescriptionError: the URDF cannot be found or loaded, or lacks a joint.
+        RobotDescriptionError: the URDF cannot be found or loaded, or lacks a joint; a rotor
+            inertia is negative.
     """
     parameters = _parameters(path)
     for key in ("robot_description", "joints"):
@@ -74,7 +75,8 @@ def read_robot(path: Path) -> Robot:
     locked_positions = dict(zip(locked, positions, strict=True)) if positions is not None else {}
     urdf = read_urdf(parameters["robot_description"])
     _check_limits(urdf, parameters["robot_description"])
-    model = build_model(urdf, joints, locked_positions)
+    rotor_inertia = _numbers(parameters, "rotor_inertia", len(joints), path)
+    model = build_model(urdf, joints, locked_positions, rotor_inertia)
     limits = {}
     for key, from_urdf in (
         ("position_min", model.lowerPositionLimit),

@@ -14,11 +14,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
+import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 
 
 class RobotDescriptionError(ValueError):
-    """A URDF that cannot be found or loaded, or that lacks a joint or frame asked for."""
+    """A URDF that cannot be found or loaded, or that does not fit what is asked of it."""
 
 
 def package_directories() -> Iterator[Path]:
@@ -41,7 +43,7 @@ def resolve_uri(uri: str) -> Path:
         RobotDescriptionError: no such file.
     """
     if uri.startswith("package://"):
-        relative = uri.removeprefix("package://")
+        relative = uri.removeprefix("package://").lstrip("/")  # some write three
         for directory in package_directories():
             path = directory / relative
             if path.is_file():
@@ -80,7 +82,10 @@ def check_urdf(text: str, source: str) -> None:
 
 
 def build_model(
-    urdf: str, joints: Sequence[str], locked_positions: Mapping[str, float] | None = None
+    urdf: str,
+    joints: Sequence[str],
+    locked_positions: Mapping[str, float] | None = None,
+    rotor_inertia: ArrayLike | None = None,
 ) -> pin.Model:
     """Return the Pinocchio model of `joints`, every other joint locked.
 
@@ -90,14 +95,16 @@ def build_model(
             caller's arrays use; Pinocchio must number them in this order.
         locked_positions: where other joints are locked, rad; joints left out are locked at
             Pinocchio's neutral configuration (zero).
+        rotor_inertia: of the motors as seen from the joints, N^2 times a rotor's own behind a
+            gear of ratio N, shape (n,), kg m^2; none if not given. On the diagonal of M.
 
     Returns:
         A model with ``nq == nv == len(joints)``. Continuous joints are angles too, with
         infinite position limits.
 
     Raises:
-        RobotDescriptionError: an unknown joint, a planar or floating joint, or an order that
-            differs from the kinematic one.
+        RobotDescriptionError: an unknown joint, a planar or floating joint, an order that
+            differs from the kinematic one, or rotor inertias that cannot be.
     """
     urdf, continuous = _continuous_as_revolute(urdf)
     try:
@@ -131,7 +138,24 @@ def build_model(
     for index in [i for i, name in enumerate(joints) if name in continuous]:
         model.lowerPositionLimit[index] = -math.inf
         model.upperPositionLimit[index] = math.inf
+    if rotor_inertia is not None:
+        armature = np.asarray(rotor_inertia, dtype=float)
+        if armature.shape != (model.nv,) or not (np.isfinite(armature) & (armature >= 0)).all():
+            raise RobotDescriptionError(
+                f"rotor_inertia must be {model.nv} finite numbers >= 0, not {armature}"
+            )
+        model.armature = armature
     return model
+
+
+def kinematic_order(urdf: str, joints: Sequence[str]) -> tuple[str, ...]:
+    """Return `joints` in the order in which `build_model` wants them, base to tip.
+
+    Args:
+        urdf: text of a URDF that loads.
+        joints: joints that it has, in any order.
+    """
+    return tuple(name for name in pin.buildModelFromXML(urdf).names if name in joints)
 
 
 def _continuous_as_revolute(urdf: str) -> tuple[str, set[str]]:

@@ -33,6 +33,12 @@ ROBOT_TABLE = (
     Parameter("position_min", list[float], "lower position limits, rad"),
     Parameter("position_max", list[float], "upper position limits, rad"),
     Parameter("torque_max", list[float], "torque limits of the motors, N m"),
+    Parameter(
+        "rotor_inertia",
+        list[float],
+        "inertia of the rotors as seen from the joints, kg m^2; none if empty",
+        default=np.zeros(0),
+    ),
 )
 
 
@@ -90,12 +96,14 @@ def load_model(values: Mapping[str, Any], node: Node) -> pin.Model:
         node: listens for the URDF if it comes from a topic.
 
     Raises:
-        ParameterError: a URDF that does not load, or a joint that it does not have.
+        ParameterError: a URDF that does not load, a joint that it does not have, or rotor
+            inertias that cannot be.
     """
     joints = joint_names(values)
+    rotors = not_negative(values, "rotor_inertia", joints)
     urdf = robot_urdf(values, node)
     try:
-        return build_model(urdf, joints, locked_joints(values))
+        return build_model(urdf, joints, locked_joints(values), rotors)
     except RobotDescriptionError as error:
         name, allowed = _culprit(urdf, joints)
         raise ParameterError(name, values[name], f"{allowed} ({error})") from error
@@ -153,4 +161,18 @@ def all_positive(values: Mapping[str, Any], name: str, joints: Sequence[str]) ->
     value = per_joint(values, name, joints)
     if not (np.isfinite(value).all() and (value > 0).all()):
         raise ParameterError(name, value, "finite numbers > 0")
+    return value
+
+
+def not_negative(values: Mapping[str, Any], name: str, joints: Sequence[str]) -> np.ndarray:
+    """Return a parameter of one finite number >= 0 a joint, shape (n,); zeros if it is empty.
+
+    Raises:
+        ParameterError: it is something else.
+    """
+    if not len(values[name]):
+        return np.zeros(len(joints))
+    value = per_joint(values, name, joints)
+    if not (np.isfinite(value).all() and (value >= 0).all()):
+        raise ParameterError(name, value, "finite numbers >= 0")
     return value
