@@ -2,11 +2,10 @@
 
 `state_dependent_limits` lets joints be faster than the worst-case braking allows. That is safe as
 long as there is a way out: a braking path, each joint slowing down at a constant rate from the
-end of the step until those that need more than the worst case stand still, on which every motor
-stays within its torque limit. The path is known, so that torque along it can be computed; only
-where the step ends is open, because the controller chooses any acceleration in the interval it is
-given. To first order, with ``rnea`` and its derivatives along the path from the middle of what
-can be reached,
+end of the step until it stands still, on which every motor stays within its torque limit. The
+path is known, so that torque along it can be computed; only where the step ends is open, because
+the controller chooses any acceleration in the interval that it is given. To first order, with
+``rnea`` and its derivatives along the path from the middle of what can be reached,
 
     |tau_i| + sum_j |d tau_i / d q_j| dq_j + |d tau_i / d v_j| dv_j + |M_ij| da_j <= tau_max_i
 
@@ -25,7 +24,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-PIECE = 0.02
+PIECE = 0.04
 """Longest piece of a braking path, s; torques are computed in the middle of each, and cover it to
 first order in time."""
 MOST_PIECES = 25
@@ -40,7 +39,7 @@ class Reach(NamedTuple):
         dq: largest deviation from `q`, shape (n,), rad.
         dv: largest deviation from `v`, shape (n,), rad/s.
         braking: deceleration of each joint, shape (n,), rad/s^2, positive.
-        horizon: until when torque has to be shown to suffice, s.
+        horizon: when all joints stand still, s.
     """
 
     q: Array
@@ -103,15 +102,15 @@ def _fill_path(q, v, dq, dv, braking, half_gap, path):
             path[m, 0, j] = q[j] + direction * (speed - 0.5 * b * moving) * moving
             path[m, 1, j] = direction * (speed - b * moving)
             path[m, 2, j] = -direction * b if t < stop else 0.0
+            path[m, 5, j] = 0.0
             path[m, 3, j] = dq[j] + dv[j] * min(t, stop + dv[j] / b)
             path[m, 4, j] = dv[j] if t < stop + slack else 0.0
-            path[m, 5, j] = 0.0
             if t < stop + slack:
                 if speed <= dv[j]:
                     # The direction is open: from braking one way to braking the other.
-                    path[m, 5, j] = b + abs(path[m, 2, j])
+                    path[m, 2, j], path[m, 5, j] = 0.0, b
                 elif t > stop - slack:
-                    path[m, 5, j] = b
+                    path[m, 2, j], path[m, 5, j] = -0.5 * direction * b, 0.5 * b
 
 
 @njit(cache=True)

@@ -121,7 +121,7 @@ def set_sides(sides, braking, v_max, low, high, dt):
 
 
 @njit(cache=True)
-def reach_of_step(q, v, lower, upper, dt, margin, ranges, least, tolerance, reach):
+def reach_of_step(q, v, lower, upper, dt, margin, ranges, braking, reach):
     """Fill in where a step may end and how the joints brake from there.
 
     Args:
@@ -132,35 +132,25 @@ def reach_of_step(q, v, lower, upper, dt, margin, ranges, least, tolerance, reac
         dt: control period, s.
         margin: acceleration kept back, shape (n,), rad/s^2.
         ranges: of `bounds_kernel.Table`.
-        least: braking of the worst case, shape (n, 2), rad/s^2.
-        tolerance: shape (n,), rad.
+        braking: of the kernel in which the bounds keep the joints, shape (n, 2), rad/s^2.
         reach: shape (5, n), receives middle and deviation of q and v, and the braking, as in
             `braking_certificate.Reach`.
 
     Returns:
-        Time until all joints that may need more than the worst case stand still, s; zero
-        if there are none.
+        Time until all joints stand still, s.
     """
     horizon = 0.0
     for j in range(q.size):
         v_low, v_high = v[j] + lower[j] * dt, v[j] + upper[j] * dt
         q_low, q_high = q[j] + 0.5 * (v[j] + v_low) * dt, q[j] + 0.5 * (v[j] + v_high) * dt
-        up = needed_towards(ranges[j, 1] - q_high, v_high, least[j, 0], tolerance[j])
-        down = needed_towards(q_low - ranges[j, 0], -v_low, least[j, 1], tolerance[j])
-        braking = least[j, 0] if v_low + v_high > 0.0 else least[j, 1]
-        if up > least[j, 0]:
-            braking = max(braking, up)
-        if down > least[j, 1]:
-            braking = max(braking, down)
-        braking += margin[j]
         reach[0, j], reach[1, j] = 0.5 * (q_low + q_high), 0.5 * (v_low + v_high)
-        reach[2, j] = 0.5 * (q_high - q_low) + tolerance[j]
+        reach[2, j] = 0.5 * (q_high - q_low)
         reach[3, j] = 0.5 * (v_high - v_low) + margin[j] * dt
-        reach[4, j] = braking
-        if up > least[j, 0]:
-            horizon = max(horizon, (v_high + margin[j] * dt) / braking)
-        if down > least[j, 1]:
-            horizon = max(horizon, (-v_low + margin[j] * dt) / braking)
+        reach[4, j] = margin[j] + braking[j, 0 if v_low + v_high > 0.0 else 1]
+        if v_low < 0.0 < v_high:
+            # Either way is possible: what both limits need is enough for the one that counts.
+            reach[4, j] = margin[j] + min(braking[j, 0], braking[j, 1])
+        horizon = max(horizon, (abs(reach[1, j]) + reach[3, j]) / reach[4, j])
     return horizon
 
 

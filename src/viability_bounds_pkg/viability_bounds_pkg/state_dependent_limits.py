@@ -4,9 +4,9 @@ The limits a_min and a_max of [DelPrete2018] are what the motors can do in the w
 paper calls them conservative and leaves the rest to future work. They play two parts. As *input
 limits* they are not needed: any acceleration that leads into a viable state is safe, and the
 controller keeps its torque limits anyway. As the *braking* that the viability kernel counts on
-they can be exceeded as long as a braking path is known on which torque suffices, from every state
-to which the step may lead; see `braking_certificate`. Where none can be shown, the bounds are
-those of the worst case. `docs/state_dependent_limits.md` has the derivation.
+they can be exceeded. Both are done as long as a braking path is known on which torque suffices,
+from every state to which the step may lead; see `braking_certificate`. Where none can be shown,
+the bounds are those of the worst case. `docs/state_dependent_limits.md` has the derivation.
 """
 
 from __future__ import annotations
@@ -49,9 +49,8 @@ class StateDependentBounds:
             number, rad; nearer than this to the kernel of the worst case counts as inside.
 
     Attributes:
-        outcomes: how many steps were answered with bounds of each kind: "worst case", when
-            they cannot lead out of its kernel, "certified", "braking", when only the braking
-            path of the last step is known to be safe, and "outside".
+        outcomes: how many steps were answered with bounds of each kind: "certified", "worst
+            case", "braking", when only the braking path of the last step is safe, and "outside".
 
     Raises:
         JointLimitsError: an argument is unusable.
@@ -93,21 +92,21 @@ class StateDependentBounds:
 
     def start(self) -> None:
         """Forget the braking path of the last step: the robot was moved, or time has passed."""
-        self._path = None
+        self._path, self._share = None, 1.0
 
     def bounds(self, q: ArrayLike, v: ArrayLike) -> AccelerationBounds:
         """Return the acceleration bounds for the next control step.
 
-        Every acceleration in them that the torque limits allow leads to a state from which the
-        position and velocity limits can still be kept within the torque limits. Where `viable`
-        is False this is lost, and the interval brings the joint back.
+        Where they were shown to be safe, or follow a path that was, every acceleration in them
+        that the torque limits allow leads to a state from which position and velocity limits can
+        still be kept within the torque limits. Otherwise they are those of the worst case.
 
         Args:
             q: shape (n,), rad.
             v: shape (n,), rad/s.
         """
         q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
-        limits, least, needed = self._limits, self._least, self._needed
+        limits, needed = self._limits, self._needed
         low, high, available = braking_reach.available(
             pin.crba(self._model, self._data, q),
             pin.nonLinearEffects(self._model, self._data, q, v),
@@ -117,33 +116,38 @@ class StateDependentBounds:
             self._peak,
         )
         urgent = braking_reach.needed_braking(
-            q, v, self._table.ranges, least, self._tolerance, needed
+            q, v, self._table.ranges, self._least, self._tolerance, needed
         )
         if urgent and (needed > self._most).any():
-            return self._outside(q, v, low, high)
+            return self._worst_case(q, v, low, high)
         available = np.minimum(available - self._margin[:, None], self._most)
-        most = min(self._share + _SHARE_STEP, 1.0)
-        for share in (most, self._share, 0.5 * self._share, 0.0):
-            braking = needed + share * np.maximum(available - needed, 0.0)
-            bounds = self._solve(q, v, braking, low, high)
-            horizon = self._fill_reach(q, v, bounds)
-            if horizon == 0.0:
-                self._path, self._share = None, most
-                return self._counted("worst case", bounds)
-            if self._certified(horizon):
+        worst = limits.a_min, limits.a_max
+        wide = low, high
+        known = self._share
+        for share, inputs in (
+            (min(known + _SHARE_STEP, 1.0), wide),
+            (known, wide),
+            (0.5 * known, wide),
+            (0.0, wide),
+            (0.0, worst),
+        ):
+            braking = np.maximum(needed, share * available)
+            bounds = self._solve(q, v, braking, *inputs)
+            if self._certified(q, v, bounds, braking):
                 self._path, self._share = self._reach[4].copy(), share
                 return self._counted("certified", bounds)
-        if self._path is None:
-            # A state that no step of ours led to: a shove, a start.
-            return self._outside(q, v, low, high)
+        self._share = 0.0
+        if self._path is None or not urgent:
+            return self._worst_case(q, v, *worst)
         a = braking_reach.stopping_acceleration(
             v, self._path, self._period, bounds.lower, bounds.upper
         )
         return self._counted("braking", AccelerationBounds(a, a.copy(), bounds.viable))
 
-    def _outside(self, q: Array, v: Array, low: Array, high: Array) -> AccelerationBounds:
+    def _worst_case(self, q: Array, v: Array, low: Array, high: Array) -> AccelerationBounds:
         self._path = None
-        return self._counted("outside", self._solve(q, v, self._least, low, high))
+        bounds = self._solve(q, v, self._least, low, high)
+        return self._counted("worst case" if bounds.viable.all() else "outside", bounds)
 
     def _solve(self, q, v, braking, low, high) -> AccelerationBounds:
         table, n = self._table, q.size
@@ -160,8 +164,8 @@ class StateDependentBounds:
         )
         return AccelerationBounds(lower, upper, viable)
 
-    def _fill_reach(self, q: Array, v: Array, bounds: AccelerationBounds) -> float:
-        return braking_reach.reach_of_step(
+    def _certified(self, q, v, bounds, braking) -> bool:
+        horizon = braking_reach.reach_of_step(
             q,
             v,
             bounds.lower,
@@ -169,16 +173,10 @@ class StateDependentBounds:
             self._period,
             self._margin,
             self._table.ranges,
-            self._least,
-            self._tolerance,
+            braking,
             self._reach,
         )
-
-    def _certified(self, horizon: float) -> bool:
-        reach = self._reach
-        return bool((reach[4] <= self._peak).all()) and self._certificate.holds(
-            Reach(*reach, horizon)
-        )
+        return self._certificate.holds(Reach(*self._reach, horizon))
 
     def _counted(self, outcome: str, bounds: AccelerationBounds) -> AccelerationBounds:
         self.outcomes[outcome] += 1
@@ -188,7 +186,8 @@ class StateDependentBounds:
         """Compile everything now and not in a control loop."""
         rest = np.zeros(len(self._limits))
         bounds = self.bounds(rest, rest)
-        self._certified(max(self._fill_reach(rest, rest, bounds), self._dt))
+        self._certified(rest, rest, bounds, self._least)
+        self._worst_case(rest, rest, self._limits.a_min, self._limits.a_max)
         braking_reach.stopping_acceleration(rest, rest, self._period, bounds.lower, bounds.upper)
         self.start()
         self.outcomes.clear()
