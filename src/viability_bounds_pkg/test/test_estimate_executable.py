@@ -220,6 +220,44 @@ def test_gravity_beyond_the_torque(robot, tmp_path):
     assert parameters_in(output.read_text())["acceleration_max"][0] == 1.0
 
 
+def test_too_much_speed_for_the_torque(robot, call, tmp_path):
+    """Joint, state, lower velocities and the override: all that is offered helps."""
+    output = tmp_path / "limits.yaml"
+    fast = "    velocity_max: [40.0, 40.0]\n    torque_max: [30.0, 10.0]"
+    line = one_line(call(robot(parameters=fast), "--samples", 3000, "-o", output))
+    assert re.search(r"joint (shoulder|wrist): its torque of .* at q = \[.*\], v = \[.*\]", line)
+    assert not output.exists()
+    scale = float(re.search(r"scaled by ([\d.]+)", line)[1])
+    lower = [float(x) for x in re.search(r"to \[([^]]*)\] rad/s", line)[1].split(",")]
+    assert lower == pytest.approx([40.0 * scale, 40.0 * scale], rel=0.01)
+    slower = fast.replace("[40.0, 40.0]", str(lower))
+    ended = call(robot(parameters=slower), "--samples", 3000, "-o", output)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    found = parameters_in(output.read_text())
+    smallest = min(*found["acceleration_max"], *(-a for a in found["acceleration_min"]))
+    assert 0.5 < smallest < 1.5
+    joint = re.search(r"--override (\w+)=MIN,MAX", line)[1]
+    both = [word for name in ("shoulder", "wrist") for word in ("--override", f"{name}=-1,1")]
+    assert joint in ("shoulder", "wrist")
+    assert call(robot(parameters=fast), "--samples", 100, *both).returncode == 0
+
+
+def test_continuous_joint_with_limits_of_the_urdf(robot, call):
+    path = robot(limit='<limit effort="30" velocity="4"/>', type="continuous")
+    ended = call(path, "--samples", 2000)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    inertia, weight = 2.0 * 0.25 + 0.5 * 0.36, 9.81 * (2.0 * 0.5 + 0.5 * 0.6)
+    # All the way round, it meets gravity at its worst on both sides.
+    limits = printed(ended)
+    assert limits["acceleration_max"][0] <= 1.01 * (30.0 - weight) / inertia
+    assert limits["acceleration_min"][0] == pytest.approx(-limits["acceleration_max"][0], rel=0.05)
+
+
+def test_a_link_without_mass_that_carries_others_is_fine(robot, call):
+    ended = call(robot(mass=0.0), "--samples", 300)
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
 @pytest.mark.parametrize(
     ("case", "message"),
     [
@@ -239,6 +277,7 @@ def test_gravity_beyond_the_torque(robot, tmp_path):
         ),
         ({"limit": LIMIT.replace("30", "0")}, "parameter 'torque_max' is missing"),
         ({"hand_mass": 0.0}, "joint wrist moves no inertia"),
+        ({"hand_mass": 0.0, "mass": 0.0}, "joint shoulder moves no inertia"),
         ({"parameters": "    velocity_max: [1.0]"}, "'velocity_max' must be a list of 2 numbers"),
         ({"parameters": "    velocity_max: [1, fast]"}, "must be a list of 2 numbers"),
         ({"parameters": "    velocity_max: [1, 0]"}, "joint wrist: v_max must be positive"),
@@ -286,6 +325,8 @@ def test_bad_usage_is_told_in_one_line(robot, call, arguments, message):
         (["-o", "{tmp}"], "is a directory"),
         (["-o", "{tmp}/none/limits.yaml"], "no directory"),
         (["-o", "{tmp}/robot.yaml"], "is the robot's parameter file"),
+        # Where nobody may create a file, root included.
+        (["-o", "/proc/limits.yaml"], "/proc cannot be written to"),
     ],
 )
 def test_options_that_do_not_fit_the_robot(robot, call, tmp_path, arguments, message):
@@ -413,6 +454,38 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path, monkeypatch, broken, e
         limits_file.write_whole(path, "new")
     assert path.read_text() == "old"
     assert os.listdir(tmp_path) == ["limits.yaml"]
+
+
+def test_a_write_protected_file_is_left_alone(tmp_path, monkeypatch):
+    path = tmp_path / "limits.yaml"
+    path.write_text("old")
+    access = os.access
+    # The permissions themselves do not stop root, who may be running this.
+    monkeypatch.setattr(
+        limits_file.os, "access", lambda p, mode: mode != os.W_OK and access(p, mode)
+    )
+    with pytest.raises(PermissionError, match="write-protected"):
+        limits_file.check_writable(path)
+    assert os.listdir(tmp_path) == ["limits.yaml"]
+
+
+def test_checking_leaves_nothing_behind(tmp_path):
+    limits_file.check_writable(tmp_path / "limits.yaml")
+    assert os.listdir(tmp_path) == []
+
+
+def test_what_was_found_is_printed_when_it_cannot_be_written(robot, call, tmp_path, monkeypatch):
+    output = tmp_path / "limits.yaml"
+    output.write_text("old")
+
+    def full(*arguments):
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(limits_file.os, "fsync", full)
+    ended = call(robot(), "--samples", 300, "-o", output)
+    assert "no space left" in one_line(ended)
+    assert set(printed(ended)) == {"acceleration_min", "acceleration_max"}
+    assert output.read_text() == "old"
 
 
 def test_a_link_keeps_pointing_to_the_file_written(tmp_path):

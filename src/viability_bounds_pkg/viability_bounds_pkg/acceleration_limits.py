@@ -76,6 +76,7 @@ class EmptyIntervalError(LimitEstimateError):
         torque_max: the torque available, N m.
         suggestion: the velocity scale that gives every such joint an interval, or the posture
             whose weight alone is too much.
+        velocity_max: the velocity limits so scaled, shape (n,), rad/s.
     """
 
     def __init__(
@@ -87,6 +88,7 @@ class EmptyIntervalError(LimitEstimateError):
         v: Array,
         torque_max: float,
         suggestion: VelocityScale,
+        velocity_max: Array,
     ):
         self.joint = joint
         self.a_min = a_min
@@ -95,20 +97,22 @@ class EmptyIntervalError(LimitEstimateError):
         self.v = v
         self.torque_max = torque_max
         self.suggestion = suggestion
+        self.velocity_max = velocity_max
         side = f"a_max = {a_max:.3g}" if a_max <= 0 else f"a_min = {a_min:.3g}"
         if suggestion.scale == 0.0:
             remedy = (
                 f"lower velocities do not help: joint {suggestion.joint} takes "
                 f"{abs(suggestion.static_torque):.3g} N m just to hold still at "
                 f"q = {_text(suggestion.q)}, which leaves less than {USEFUL_ACCELERATION:g} "
-                "rad/s^2; narrow the position limits or override the joint's acceleration limits"
+                "rad/s^2; narrow the position limits or override "
             )
         else:
             remedy = (
-                f"velocity limits scaled by {suggestion.scale:.3f} leave every joint "
-                f"{USEFUL_ACCELERATION:g} rad/s^2 either way; else narrow the position limits or "
-                "override the joint's acceleration limits"
+                f"velocity limits scaled by {suggestion.scale:.3f}, to {_text(velocity_max)} "
+                f"rad/s, leave every joint {USEFUL_ACCELERATION:g} rad/s^2 either way; else "
+                "narrow the position limits or override "
             )
+        remedy += f"the joint's acceleration limits (--override {joint}=MIN,MAX)"
         super().__init__(
             f"joint {joint}: its torque of {torque_max:.4g} N m leaves no acceleration interval: "
             f"{side} rad/s^2 at q = {_text(q)}, v = {_text(v)}; {remedy}"
@@ -239,6 +243,7 @@ def limits_from_worst_cases(
         if joint in overrides or worst.a_min[j] < 0 < worst.a_max[j]:
             continue
         upper = worst.a_max[j] <= 0
+        suggestion = largest_velocity_scale(model, space, ignore=overrides)
         raise EmptyIntervalError(
             joint,
             float(worst.a_min[j]),
@@ -246,7 +251,8 @@ def limits_from_worst_cases(
             (worst.q_at_a_max if upper else worst.q_at_a_min)[j],
             (worst.v_at_a_max if upper else worst.v_at_a_min)[j],
             float(space.tau_max[j]),
-            largest_velocity_scale(model, space, ignore=overrides),
+            suggestion,
+            suggestion.scale * space.v_max,
         )
     bound = np.broadcast_to(np.inf if cap is None else np.asarray(cap, dtype=float), len(names))
     a_min, a_max = np.maximum(worst.a_min, -bound), np.minimum(worst.a_max, bound)

@@ -236,7 +236,12 @@ def _run(options: argparse.Namespace) -> int:
     if options.output is None:
         print("\n" + text, end="")
     else:
-        write_whole(options.output, text)
+        try:
+            write_whole(options.output, text)
+        except OSError:
+            # The search may have taken long: what it found must not be lost.
+            print("\n" + text, end="", flush=True)
+            raise
         print(f"\nwritten to {options.output}")
     return INTERRUPTED if interrupted else 0
 

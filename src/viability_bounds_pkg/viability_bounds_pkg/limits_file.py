@@ -196,8 +196,14 @@ def check_writable(path: Path) -> None:
         raise IsADirectoryError(f"{path} is a directory")
     if not target.parent.is_dir():
         raise FileNotFoundError(f"{path}: no directory {target.parent}")
-    if not os.access(target.parent, os.W_OK):
-        raise PermissionError(f"{path}: directory {target.parent} cannot be written to")
+    if target.exists() and not os.access(target, os.W_OK):
+        raise PermissionError(f"{path} is write-protected")
+    try:
+        # Permissions do not tell everything: the file system may be read-only.
+        tempfile.NamedTemporaryFile(prefix=f".{target.name}.", dir=target.parent).close()
+    except OSError as error:
+        reason = f"directory {target.parent} cannot be written to ({error.strerror})"
+        raise OSError(f"{path}: {reason}") from error
 
 
 def write_whole(path: Path, text: str) -> None:
