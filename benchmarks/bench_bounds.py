@@ -1,20 +1,17 @@
 """Time the acceleration bounds: one arm at a time, as a control loop asks, and in batches.
 
-Run ``python benchmarks/bench_bounds.py``. Prints, for 7 joints, microseconds per call (median
-and best of the blocks, because other programs share the machine) and joint-states per second of
-a batch; where condition (11) holds and where it does not.
+Run ``bash scripts/bench.sh bounds``. Prints, for 7 joints, microseconds per call (median and best
+of the blocks, because other programs share the machine) and joint-states per second of a batch;
+where condition (11) holds and where it does not. With ``--tsid``, compares with TSID's task too.
 """
 
 from __future__ import annotations
 
+import argparse
 import statistics
-import sys
 import time
-from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "src" / "viability_bounds_pkg"))
 
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.viability import BoundsSolver
@@ -56,6 +53,13 @@ def time_batches(solver: BoundsSolver, q: np.ndarray, v: np.ndarray) -> list[flo
 
 def main() -> None:
     """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument(
+        "--tsid",
+        action="store_true",
+        help="compare values and time with TSID 1.7.1, installed into .venv-tsid when missing",
+    )
+    options = parser.parse_args()
     limits = seven_joints()
     rng = np.random.default_rng(0)
     q = rng.uniform(limits.q_min, limits.q_max, (BATCH, JOINTS))
@@ -71,6 +75,10 @@ def main() -> None:
             f"(best block {min(calls):.1f}); {statistics.median(rates):.1f} M joint-states/s "
             f"in a batch (best {max(rates):.1f}); construction {1e3 * construction:.1f} ms"
         )
+    if options.tsid:
+        import tsid_comparison
+
+        tsid_comparison.main()
 
 
 if __name__ == "__main__":
