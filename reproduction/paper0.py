@@ -7,55 +7,21 @@ bash scripts/reproduce.sh paper0 fig5    one figure
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
-
-import matplotlib
-
-matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 import numpy as np
 import yaml
 from chain import ROOT, ChainResult, load_values, run_chain
+from figure import Figure, table
 from matplotlib.colors import BoundaryNorm, ListedColormap
 
 from viability_bounds_pkg import baselines, paper_algorithms, viability
 from viability_bounds_pkg.acceleration_limits import estimate_acceleration_limits
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.robot_description import build_model, read_urdf
-
-RESULTS = ROOT / "results"
-
-
-@dataclass
-class Figure:
-    """What one figure of the paper came to.
-
-    Attributes:
-        name: folder under results/.
-        data: arrays for ``data.npz``.
-        metrics: numbers for ``metrics.json``.
-        rows: (what, the paper, here, agreement or why not) for the table.
-    """
-
-    name: str
-    data: dict[str, np.ndarray] = field(default_factory=dict)
-    metrics: dict[str, float] = field(default_factory=dict)
-    rows: list[tuple[str, str, str, str]] = field(default_factory=list)
-
-    def save(self, picture: plt.Figure | None) -> None:
-        """Write picture, data and metrics."""
-        directory = RESULTS / self.name
-        directory.mkdir(parents=True, exist_ok=True)
-        if picture is not None:
-            picture.savefig(directory / "figure.png", dpi=130)
-            plt.close(picture)
-        np.savez_compressed(directory / "data.npz", **self.data)
-        (directory / "metrics.json").write_text(json.dumps(self.metrics, indent=2) + "\n")
 
 
 def one_joint(q: float, v: float, a: float) -> JointLimits:
@@ -423,14 +389,6 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "fig5": figure_5,
     "alg4": algorithm_4,
 }
-
-
-def table(figures: list[Figure]) -> str:
-    """Return the rows of all figures as a Markdown table."""
-    lines = ["| figure | the paper | here | |", "|---|---|---|---|"]
-    for figure in figures:
-        lines += ["| " + " | ".join(row) + " |" for row in figure.rows]
-    return "\n".join(lines)
 
 
 def write_document(figures: list[Figure], path: Path) -> None:
