@@ -6,7 +6,8 @@ usage() {
 usage: bash scripts/demo.sh [robot] [--bounds exact|naive] [--rate HZ] [--lockstep]
                             [--out DIRECTORY]
 
-  robot        a parameter file in config/ that has a scenario: baxter_left_arm (default), panda
+  robot        a parameter file in config/ that has a scenario: baxter_left_arm (default), panda,
+               talos_left_arm
   --bounds     how acceleration limits are computed; naive breaks the limits (default: exact)
   --rate       control rate in Hz (default: the robot's own)
   --lockstep   each step waits for its command, as fast as the machine can; repeatable

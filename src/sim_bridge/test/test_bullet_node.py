@@ -13,6 +13,7 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from sim_bridge.bullet_node import BulletNode
+from viability_bounds_pkg.robot_description import build_model, read_urdf
 from viability_bounds_pkg.ros_parameters import ParameterError
 from viability_bounds_pkg.ros_runtime import GOAL_QOS, LATCHED_QOS, stamp_to_ns
 
@@ -244,6 +245,33 @@ def test_gears_and_masses_reach_the_robot(ros):
     np.testing.assert_allclose(robot.q, Q, rtol=0.0, atol=1e-12)
     robot.step(robot.gravity() + 5.0, times=20)
     assert np.abs(robot.v).max() > 0.1
+
+
+def test_talos_stands_still_by_its_friction_alone(ros):
+    """Of its own file: 10% of the torque is friction, and the controller's model is 10% light."""
+    values = read_config("talos_left_arm", "bullet_node")
+    states = ros.listen(JointState, "joint_states")
+    node = ros.start(BulletNode, values | {"clock": "lockstep"})
+    commands = ros.talk(JointState, "joint_commands")
+    ros.wait_until(lambda: states, "a state")
+    locked = dict(zip(values["locked_joints"], values["locked_positions"], strict=True))
+    model = build_model(
+        read_urdf(values["robot_description"]), values["joints"], locked, values["rotor_inertia"]
+    )
+    q, tau_max = np.array(values["start_positions"]), np.array(values["torque_max"])
+    gears, masses = node._config.gears, node._config.mass_scales
+    np.testing.assert_allclose(gears.friction_coulomb, 0.1 * tau_max)
+    np.testing.assert_array_less(gears.friction_coulomb, gears.friction_static)
+    np.testing.assert_array_equal(gears.rotor_inertia, model.armature)
+    assert set(masses.values()) == {1.1}
+    room = np.minimum(q - values["position_min"], np.array(values["position_max"]) - q)
+    assert room.min() > 0.3
+    tau = pin.computeGeneralizedGravity(model, model.createData(), q)
+    for _ in range(100):
+        stamp = stamp_to_ns(states[-1].header.stamp)
+        commands.publish(joint_state(values["joints"], stamp, tau=tau))
+        ros.wait_until(lambda s=stamp: stamp_to_ns(states[-1].header.stamp) > s)
+    np.testing.assert_allclose(states[-1].position, q, rtol=0.0, atol=1e-12)
 
 
 def test_without_stiction_of_its_own_a_joint_has_that_of_coulomb(ros):
