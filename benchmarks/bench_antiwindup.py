@@ -1,4 +1,4 @@
-"""Anti-windup: the closed form of eq. (11) against ProxQP, and the methods side by side.
+"""Anti-windup: the closed form of eq. (11) against ProxQP, and a step of the integral action.
 
 Run ``python benchmarks/bench_antiwindup.py``. Problems of 9 joints whose clipped torque would not
 dissipate enough, so that (11) is a QP in earnest. ProxQP is timed from scratch and started from
@@ -11,6 +11,7 @@ from __future__ import annotations
 import statistics
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,11 @@ from torque_safety_controller.anti_windup import (
     project_to_limits,
     scale_factor,
     scale_to_limits,
+)
+from torque_safety_controller.integral_feedback import (
+    IntegralFeedback,
+    IntegralSettings,
+    paper_settings,
 )
 
 JOINTS = 9
@@ -79,37 +85,56 @@ class GeneralSolver:
         return self._qp.results.x
 
 
+def integral_steps(rng: np.random.Generator, law: IntegralSettings) -> Callable[..., np.ndarray]:
+    """Return a step of the integral action, of a joint velocity and an acceleration."""
+    A = rng.normal(size=(JOINTS, JOINTS))
+    M, C = A @ A.T + np.eye(JOINTS), rng.normal(size=(JOINTS, JOINTS))
+    feedback = IntegralFeedback(law)
+    feedback.start(np.zeros(JOINTS))
+    return lambda v, a_ref: feedback.torque(M, C, v, a_ref, 1e-3)
+
+
+def measure(name: str, function, u, s, flush, off: float | None = None) -> None:
+    """Time a function of two vectors, many calls on end and one with cold caches, and print."""
+    times, alone = [], []
+    for _ in range(ROUNDS):
+        start = time.perf_counter()
+        for x, y in zip(u, s, strict=True):
+            function(x, y)
+        times.append((time.perf_counter() - start) / PROBLEMS)
+        flush += 1.0
+        start = time.perf_counter()
+        function(u[0], s[0])
+        alone.append(time.perf_counter() - start)
+    print(
+        f"{name:<40} {1e6 * statistics.median(times):6.1f} us per call "
+        f"(best {1e6 * min(times):.1f}), {1e6 * statistics.median(alone):.1f} us with "
+        f"cold caches" + ("" if off is None else f", off by {off:.0e}")
+    )
+
+
 def main() -> None:
     """Measure and print."""
-    u, s, u_max = problems(np.random.default_rng(0))
-    cold, warm = GeneralSolver(u_max, warm=False), GeneralSolver(u_max, warm=True)
-    functions = {
-        "(11) in closed form": lambda x, y: project_to_limits(x, y, u_max),
-        "(11) by ProxQP, from the last solution": warm,
-        "(11) by ProxQP, from scratch": cold,
-        "(10)": lambda x, _: scale_to_limits(x, u_max),
-        "clip": lambda x, _: clip_to_limits(x, u_max),
-    }
-    exact = [project_to_limits(x, y, u_max) for x, y in zip(u, s, strict=True)]
+    rng = np.random.default_rng(0)
+    u, s, u_max = problems(rng)
     flush = np.zeros(CACHE)
-    for name, function in functions.items():
+    exact = [project_to_limits(x, y, u_max) for x, y in zip(u, s, strict=True)]
+    for name, function in {
+        "(11) in closed form": lambda x, y: project_to_limits(x, y, u_max),
+        "(11) by ProxQP, from the last solution": GeneralSolver(u_max, warm=True),
+        "(11) by ProxQP, from scratch": GeneralSolver(u_max, warm=False),
+    }.items():
         results = [np.array(function(x, y)) for x, y in zip(u, s, strict=True)]
-        off = np.abs(np.array(results) - exact).max() if "(11)" in name else None
-        times, alone = [], []
-        for _ in range(ROUNDS):
-            start = time.perf_counter()
-            for x, y in zip(u, s, strict=True):
-                function(x, y)
-            times.append((time.perf_counter() - start) / PROBLEMS)
-            flush += 1.0
-            start = time.perf_counter()
-            function(u[0], s[0])
-            alone.append(time.perf_counter() - start)
-        print(
-            f"{name:<40} {1e6 * statistics.median(times):6.1f} us per call "
-            f"(best {1e6 * min(times):.1f}), {1e6 * statistics.median(alone):.1f} us with "
-            f"cold caches" + ("" if off is None else f", off by {off:.0e}")
-        )
+        measure(name, function, u, s, flush, np.abs(np.array(results) - exact).max())
+    measure("(10)", lambda x, _: scale_to_limits(x, u_max), u, s, flush)
+    measure("clip", lambda x, _: clip_to_limits(x, u_max), u, s, flush)
+    measure("nothing, for comparison", lambda x, _: x, u, s, flush)
+    for name, law in {
+        "integral step, not limited": IntegralSettings(np.full(JOINTS, 1e6)),
+        "integral step, all joints limited": IntegralSettings(np.full(JOINTS, 1e-3)),
+        "integral step, all limited, as the paper": paper_settings(np.full(JOINTS, 1e-3)),
+    }.items():
+        measure(name, integral_steps(rng, law), 1e-3 * u, 10.0 + s, flush)
 
 
 if __name__ == "__main__":
