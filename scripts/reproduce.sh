@@ -3,13 +3,15 @@
 #
 #     bash scripts/reproduce.sh paper0         all figures, and docs/reproduction.md
 #     bash scripts/reproduce.sh paper0 fig5    one of them
+#     bash scripts/reproduce.sh state_dependent  Baxter reaches faster, with limits by state
+#     bash scripts/reproduce.sh exactness      the bounds against brute force and in motion (long)
 set -eu
 root="$(cd "$(dirname "$0")/.." && pwd)"
 what="${1:-all}"
 [ $# -eq 0 ] || shift
 [ "$what" != all ] || what=paper0
 if [ ! -f "$root/reproduction/$what.py" ]; then
-    echo "usage: bash scripts/reproduce.sh all|paper0 [figure]" >&2
+    echo "usage: bash scripts/reproduce.sh all|paper0 [figure]|state_dependent|exactness [options]" >&2
     exit 2
 fi
 set +u

@@ -3,8 +3,11 @@
 import numpy as np
 
 from viability_bounds_pkg.joint_limits import JointLimits
+from viability_bounds_pkg.viability import condition_11
 
-# (q_min, q_max, v_max, a_min, a_max, dt)
+Case = tuple[float, float, float, float, float, float]
+"""q_min, q_max, v_max, a_min, a_max, dt."""
+
 HOLDING = {
     "figure 3": (-0.5, 0.5, 2.0, -10.0, 10.0, 0.1),
     "asymmetric": (-0.4, 0.8, 2.0, -6.0, 14.0, 0.1),
@@ -27,6 +30,11 @@ CASES = {**HOLDING, **FAILING}
 FAST_LOOP = {"1 kHz": (-0.5, 0.5, 2.0, -12.0, 9.0, 0.001)}
 """Too many steps to a stop for a brute-force solution."""
 
+ODD_STEPS = {
+    "tiny step": (-0.5, 0.5, 2.0, -12.0, 9.0, 1e-5),
+    "huge step": (-0.5, 0.5, 2.0, -12.0, 9.0, 10.0),
+}
+
 
 def one_joint(q_min, q_max, v_max, a_min, a_max):
     return JointLimits(["joint"], [q_min], [q_max], [v_max], [a_min], [a_max])
@@ -36,14 +44,52 @@ def column(values):
     return np.asarray(values, dtype=float).reshape(-1, 1)
 
 
+def random_joint(rng, holds):
+    """Return limits and step of a random joint for which condition (11) holds, or fails.
+
+    One in four lacks a limit or both, and speed, braking and range are such that it stops within
+    some dozen steps.
+    """
+    while True:
+        dt = 10.0 ** rng.uniform(-3.0, 0.0)
+        a_min, a_max = -rng.uniform(2.0, 20.0), rng.uniform(2.0, 20.0)
+        unit = max(-a_min, a_max) * dt
+        v_max = unit * rng.uniform(0.3, 3.0)
+        length = unit * dt * 10.0 ** rng.uniform(-1.5, 1.5)
+        q_min = rng.uniform(-1.0, 1.0) * length
+        q_max = q_min + length
+        missing = rng.integers(0, 20)
+        if missing in (0, 1, 2):
+            q_min = -np.inf
+        if missing in (2, 3, 4):
+            q_max = np.inf
+        case = (q_min, q_max, v_max, a_min, a_max, dt)
+        if bool(condition_11(one_joint(*case[:5]), dt)[0]) == holds:
+            return case
+
+
+def horizon(case):
+    """Return the number of steps within which a motion of a joint is decided."""
+    _, _, v_max, a_min, a_max, dt = case
+    return 8 + int(np.ceil(v_max / (min(-a_min, a_max) * dt)))
+
+
+def position_window(case):
+    """Return the positions worth looking at: the range, or what lies before its only limit."""
+    q_min, q_max, v_max, a_min, a_max, dt = case
+    reach = v_max * v_max / min(-a_min, a_max) + 2.0 * v_max * dt
+    if not np.isfinite(q_min):
+        q_min = (q_max if np.isfinite(q_max) else 0.5 * reach) - reach
+    return q_min, q_max if np.isfinite(q_max) else q_min + reach
+
+
 def states_of(case, count, seed):
     """Return random positions and velocities, some on the limits, many of them viable."""
-    q_min, q_max, v_max, _, _, dt = case
+    _, _, v_max, _, _, dt = case
     rng = np.random.default_rng(seed)
-    low = q_min if np.isfinite(q_min) else -1.0
-    high = q_max if np.isfinite(q_max) else 1.0
+    low, high = position_window(case)
     # No speed that crosses the range within a quarter of a step is viable.
-    fastest = min(v_max, 4.0 * (q_max - q_min) / dt)
+    fastest = min(v_max, 4.0 * (case[1] - case[0]) / dt)
     q, v = rng.uniform(low, high, count), rng.uniform(-fastest, fastest, count)
     kind = rng.integers(0, 20, count)
     q[kind == 0], q[kind == 1] = low, high

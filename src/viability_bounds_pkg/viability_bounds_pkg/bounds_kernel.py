@@ -7,7 +7,7 @@ this file, so that only the first start on a machine pays for compiling.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import sqrt
+from math import floor, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -58,11 +58,12 @@ def make_table(joints: Sequence[tuple[float, float, float, Side, Side]]) -> Tabl
 
 
 @njit(cache=True)
-def _landing_speed(budget, parabola, first, count, period, peak, budgets, speeds):
+def _landing_speed(budget, parabola, side, budgets, speeds):
     """Return the largest end-of-step speed w with ``dt w / 2 + U(w) <= budget``.
 
     `parabola` is the answer if the stopping curve U were the parabola.
     """
+    first, count, period, peak = int(side[11]), int(side[12]), side[13], side[14]
     if count == 0 or parabola % period >= peak:
         return parabola
     low, high = first, first + count
@@ -73,8 +74,12 @@ def _landing_speed(budget, parabola, first, count, period, peak, budgets, speeds
         else:
             low = middle + 1
     if low == first + count:
-        # Only from outside: so fast a joint would need more room than there is in the range.
-        return speeds[low - 1]
+        # Only from outside: so fast a joint would need more room than there is in the range. To
+        # come to rest as a step ends it needs chords of the parabola, one for each step.
+        length, per_step = budget / side[0], 2.0 * side[3]
+        steps = floor(0.5 * (sqrt(1.0 + 8.0 * length / per_step) - 1.0))
+        rest = length - 0.5 * per_step * steps * (steps + 1.0)
+        return max(speeds[low - 1], per_step * steps + rest / (steps + 1.0))
     share = (budget - budgets[low - 1]) / (budgets[low] - budgets[low - 1])
     return speeds[low - 1] + (speeds[low] - speeds[low - 1]) * share
 
@@ -96,8 +101,7 @@ def _bound_towards(room, v, side, budgets, speeds):
     """
     dt, half_dt, twice_braking, k, k2 = side[0], side[1], side[2], side[3], side[4]
     far, v_max, low, high = side[5], side[6], side[7], side[8]
-    margin, tolerance = side[9], side[10]
-    first, count, period, peak = int(side[11]), int(side[12]), side[13], side[14]
+    margin, tolerance, count = side[9], side[10], side[12]
     # Room that is left if the step ends at rest.
     budget = room - half_dt * v
     if budget >= far:
@@ -105,8 +109,8 @@ def _bound_towards(room, v, side, budgets, speeds):
     elif budget >= 0.0:
         c = twice_braking * budget
         w = c / (k + sqrt(k2 + c))
-        w = _landing_speed(budget, w, first, count, period, peak, budgets, speeds)
-        a = (w - v) / dt
+        w = _landing_speed(budget, w, side, budgets, speeds)
+        a = (min(w, v_max) - v) / dt
     elif v > 0.0:
         # Stop within the step: eq. (19). Outside, and still leaving: brake.
         a = -v * (v / (2.0 * room)) if room > 0.0 else low
@@ -123,29 +127,33 @@ def _bound_towards(room, v, side, budgets, speeds):
     if v <= 0.0:
         return a, room >= 0.0
     viable = v * v <= twice_braking * room
-    if viable and count > 0:
+    if viable and count > 0.0:
         budget = min(room + half_dt * v, far)
         c = twice_braking * budget
         parabola = c / (k + sqrt(k2 + c))
-        reachable = _landing_speed(budget, parabola, first, count, period, peak, budgets, speeds)
-        viable = v <= reachable * _WITHIN
+        viable = v <= _landing_speed(budget, parabola, side, budgets, speeds) * _WITHIN
     return a, viable
 
 
 @njit(cache=True)
-def _settle(above, below, v, lower, upper):
+def _settle(above, below, v, lower, upper, side):
     """Return the one acceleration left where the two limits contradict each other.
 
     That happens outside the kernel, or by rounding on its edge. The limit that is still kept
     is not given up for the one that is broken: a joint on its way back keeps its speed limit,
     and one that cannot stop in time stops as soon as it can without being thrown against the
     other limit. The broken one is told by the position or, inside, by the direction of motion.
+    Neither is worth a speed beyond its limit; `side` is the row of the upper one.
     """
     if above < 0.0 or (below >= 0.0 and v > 0.0):
-        return lower
-    if below < 0.0 or v < 0.0:
-        return upper
-    return 0.5 * (lower + upper)
+        a = lower
+    elif below < 0.0 or v < 0.0:
+        a = upper
+    else:
+        a = 0.5 * (lower + upper)
+    dt, v_max, a_min, a_max, margin = side[0], side[6], side[7], side[8], side[9]
+    a = max(min(a, (v_max - v) / dt - margin), (-v_max - v) / dt + margin)
+    return max(min(a, a_max), a_min)
 
 
 @njit(cache=True, error_model="numpy")
@@ -172,7 +180,7 @@ def solve(q, v, ranges, sides, budgets, speeds, lower, upper, viable):
             low, keeps_low = _bound_towards(below, -speed, sides[j, 1], budgets, speeds)
             low = -low
             if low > high:
-                low = high = _settle(above, below, speed, low, high)
+                low = high = _settle(above, below, speed, low, high, sides[j, 0])
             lower[i, j] = low
             upper[i, j] = high
             viable[i, j] = keeps_high and keeps_low and abs(speed) <= ranges[j, 2]

@@ -6,6 +6,7 @@ upper one in a mirror: position and velocity change sign, `a_min` and `-a_max` c
 
 from __future__ import annotations
 
+import math
 from sys import float_info
 from typing import NamedTuple
 
@@ -83,7 +84,13 @@ def make_side(
     landing = None
     if curve is not None and len(curve.speed) > 1:
         landing = _make_landing(curve, v_max * dt, length, dt)
-        stopping_room = curve.room_at(v_max * dt)
+        if v_max <= landing.speed[-1] or v_max % landing.period >= landing.peak:
+            stopping_room = curve.room_at(v_max * dt)
+        else:
+            # Rest as a step ends; v_max is for joints that come back from far outside.
+            steps = math.floor(v_max / (braking * dt))
+            rest = v_max - steps * braking * dt
+            stopping_room = 0.5 * dt * (steps * steps * braking * dt + rest * (2 * steps + 1))
     far = 0.5 * dt * v_max + stopping_room
     # Not zero even if dt is tiny, so that no room at all does not make 0 / 0.
     k2 = max(k * k, float_info.min)

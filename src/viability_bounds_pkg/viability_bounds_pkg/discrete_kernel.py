@@ -59,7 +59,7 @@ class StoppingCurve(NamedTuple):
     def room_and_slope(self, v: Array) -> tuple[Array, Array]:
         """Return the needed room at speeds `v`, shape (k,), and its derivative."""
         whole = np.zeros_like(v) if self.peak == math.inf else np.floor(v / self.braking)
-        rest = v - whole * self.braking
+        rest = np.maximum(v - whole * self.braking, 0.0)  # not below, by rounding
         with np.errstate(over="ignore"):  # Beyond the last node, if that is also the last speed.
             room, slope = rest * (rest / (2.0 * self.braking)), rest / self.braking
         (curved,) = np.nonzero(rest < self.peak)

@@ -1,0 +1,173 @@
+"""Motions that do their worst within the bounds, watched in continuous time.
+
+States have shape (m, n): m motions of each of n joints, all with the same step.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from joint_cases import column, position_window
+
+from viability_bounds_pkg.viability import BoundsSolver
+
+VIOLATION = 1e-9
+"""Largest violation of a limit in continuous time, rad and rad/s."""
+
+
+def advance(q, v, a, dt):
+    """Return the state after dt, and the lowest and highest position on the way."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        turn = np.where(a != 0.0, -v / a, -1.0)
+    turn = np.where((turn > 0.0) & (turn < dt), turn, dt)
+    at_turn = q + turn * v + 0.5 * turn**2 * a
+    q_next = q + dt * v + 0.5 * dt**2 * a
+    low = np.minimum(np.minimum(q, q_next), at_turn)
+    high = np.maximum(np.maximum(q, q_next), at_turn)
+    return q_next, v + dt * a, low, high
+
+
+def towards_nearest(q, v, lower, upper, limits, rng):
+    """Rush at the limit that is closer: the greedy adversary."""
+    return np.where(limits.q_max - q < q - limits.q_min, upper, lower)
+
+
+POLICIES = {
+    "upper": lambda q, v, lower, upper, limits, rng: upper,
+    "lower": lambda q, v, lower, upper, limits, rng: lower,
+    "random": lambda q, v, lower, upper, limits, rng: rng.uniform(lower, upper),
+    "either": lambda q, v, lower, upper, limits, rng: np.where(
+        rng.random(q.shape) < 0.5, lower, upper
+    ),
+    "faster": lambda q, v, lower, upper, limits, rng: np.where(v > 0.0, upper, lower),
+    "nearest": towards_nearest,
+}
+
+
+class Violations:
+    """Largest violations of the position and speed limits seen, rad and rad/s."""
+
+    def __init__(self, limits):
+        self.limits = limits
+        self.position = self.speed = -np.inf
+
+    def see(self, low, high, v):
+        position = np.maximum(high - self.limits.q_max, self.limits.q_min - low)
+        self.position = max(self.position, position.max())
+        self.speed = max(self.speed, (np.abs(v) - self.limits.v_max).max())
+
+    @property
+    def worst(self):
+        return max(self.position, self.speed)
+
+
+def states_in_kernel(solver, case, count, rng):
+    """Return viable states of one joint, half of them on the kernel's edge or at rest.
+
+    One in ten positions is a limit.
+    """
+    low, high = position_window(case)
+    q = rng.uniform(low, high, count)
+    place = rng.integers(0, 20, count)
+    q[place == 0], q[place == 1] = low, high
+    slowest, fastest = (speed[:, 0] for speed in solver.velocity_range(column(q)))
+    v = rng.uniform(slowest, fastest)
+    kind = rng.integers(0, 6, count)
+    v[kind == 0], v[kind == 1], v[kind == 2] = slowest[kind == 0], fastest[kind == 1], 0.0
+    return column(q), column(v)
+
+
+def states_outside(solver, case, count, rng):
+    """Return states beyond the position limits, too fast, or too fast to stop in time.
+
+    They are so far outside that some hundred steps bring them back.
+    """
+    _, _, v_max, a_min, a_max, dt = case
+    low, high = position_window(case)
+    span = 300.0 * dt
+    reach = min(0.3 * (high - low), 0.5 * min(-a_min, a_max) * span**2)
+    excess = min(v_max, min(-a_min, a_max) * span)
+    fastest = min(v_max, (high - low) / dt)
+    q = rng.uniform(low - reach, high + reach, 4 * count)
+    v = rng.uniform(-fastest - excess, fastest + excess, 4 * count)
+    outside = ~solver.bounds(column(q), column(v)).viable[:, 0]
+    return column(q[outside][:count]), column(v[outside][:count])
+
+
+class Kept(NamedTuple):
+    """How motions from within the kernel went.
+
+    Attributes:
+        joint_steps: their number.
+        lost: states that were not in the kernel any more.
+        position: largest violation of a position limit in continuous time, rad; negative if none.
+        speed: largest violation of a speed limit, rad/s.
+    """
+
+    joint_steps: int
+    lost: int
+    position: float
+    speed: float
+
+
+def drive(solver: BoundsSolver, q, v, policy: str, steps: int, rng) -> Kept:
+    """Let joints that are in the kernel choose among the bounds for a number of steps."""
+    limits, seen, lost = solver.limits, Violations(solver.limits), 0
+    for _ in range(steps):
+        lower, upper, viable = solver.bounds(q, v)
+        lost += int((~viable).sum())
+        a = POLICIES[policy](q, v, lower, upper, limits, rng)
+        q, v, low, high = advance(q, v, a, solver.dt)
+        seen.see(low, high, v)
+    return Kept(steps * q.size, lost, float(seen.position), float(seen.speed))
+
+
+class Returned(NamedTuple):
+    """How motions from outside the kernel went.
+
+    Attributes:
+        joint_steps: their number.
+        stray: joints that did not get back.
+        again: largest violation of a limit by a joint that had been back, rad and rad/s.
+        position: the furthest that any went beyond where braking at its limit takes it, rad.
+        speed: the most that any was faster than at the start or than its limit, rad/s.
+        highest: the furthest position of each motion, shape (m, n), rad.
+    """
+
+    joint_steps: int
+    stray: int
+    again: float
+    position: float
+    speed: float
+    highest: np.ndarray
+
+
+def bring_back(solver: BoundsSolver, q, v, policy: str, most_steps: int, rng) -> Returned:
+    """Let joints that are outside the kernel choose among the bounds until all are in it."""
+    limits = solver.limits
+    # The way that braking at its limit takes, from each state.
+    stop_above = q + np.where(v > 0.0, v * v / (2.0 * -limits.a_min), 0.0)
+    stop_below = q - np.where(v < 0.0, v * v / (2.0 * limits.a_max), 0.0)
+    stop_above = np.maximum(limits.q_max, stop_above)
+    stop_below = np.minimum(limits.q_min, stop_below)
+    fastest = np.maximum(limits.v_max, np.abs(v))
+    highest = q.copy()
+    back = np.zeros(q.shape, dtype=bool)
+    position = speed = again = -np.inf
+    steps = 0
+    while True:
+        lower, upper, viable = solver.bounds(q, v)
+        back |= viable
+        if back.all() or steps == most_steps:
+            break
+        a = POLICIES[policy](q, v, lower, upper, limits, rng)
+        q, v, low, high = advance(q, v, a, solver.dt)
+        highest = np.maximum(highest, high)
+        position = max(position, float(np.maximum(high - stop_above, stop_below - low).max()))
+        speed = max(speed, float((np.abs(v) - fastest).max()))
+        outside = np.maximum(high - limits.q_max, limits.q_min - low)
+        outside = np.maximum(outside, np.abs(v) - limits.v_max)
+        again = max(again, float(outside.max(where=back, initial=-np.inf)))
+        steps += 1
+    return Returned(steps * q.size, int((~back).sum()), again, position, speed, highest)
