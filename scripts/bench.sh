@@ -5,6 +5,7 @@
 #     bash scripts/bench.sh step      one controller step, part by part
 #     bash scripts/bench.sh bounds    acceleration bounds: one arm, and batches; with --tsid
 #                                     also beside TSID's, which is installed into .venv-tsid
+#     bash scripts/bench.sh robot     physics steps of the simulated robot, and their accuracy
 #     bash scripts/bench.sh antiwindup  limits on the integral torque, and the solver's way
 set -eu
 root="$(cd "$(dirname "$0")/.." && pwd)"

@@ -60,6 +60,8 @@ class BulletWorld:
         client_id: PyBullet's physics client; -1 when closed.
         body_id: the robot in that client.
         step: makes a physics step.
+        joint_states: returns a tuple for each joint: position, velocity, reaction, and what its
+            brake applied.
 
     Raises:
         RobotDescriptionError: PyBullet does not load the robot.
@@ -100,6 +102,10 @@ class BulletWorld:
         for link, index in self._links.items():
             inertia = prepared.principal_inertias[link].tolist()
             bullet.changeDynamics(body, index, localInertiaDiagonal=inertia)
+        control = partial(bullet.setJointMotorControlArray, body, self._joints)
+        self._push_joints = partial(control, pybullet.TORQUE_CONTROL)
+        self._stop_joints = partial(control, pybullet.VELOCITY_CONTROL)
+        self.joint_states = partial(bullet.getJointStates, body, self._joints)
         for motor in indices.values():  # PyBullet starts with them on
             bullet.setJointMotorControl2(body, motor, pybullet.VELOCITY_CONTROL, force=0.0)
         for joint, rotor in self._rotors.items():
@@ -140,15 +146,11 @@ class BulletWorld:
 
     def set_torques(self, torques: np.ndarray) -> None:
         """Apply joint torques, shape (n,), N m."""
-        self._bullet.setJointMotorControlArray(
-            self.body_id, self._joints, pybullet.TORQUE_CONTROL, forces=torques.tolist()
-        )
+        self._push_joints(forces=torques.tolist())
 
     def set_brakes(self, torque_limits: np.ndarray) -> None:
         """Let zero-velocity motors apply up to `torque_limits`, shape (n,), N m."""
-        self._bullet.setJointMotorControlArray(
-            self.body_id, self._joints, pybullet.VELOCITY_CONTROL, forces=torque_limits.tolist()
-        )
+        self._stop_joints(forces=torque_limits.tolist())
 
     def push(self, frame: FramePlacement, force: list[float], torque: list[float]) -> None:
         """Apply a force, N, and a torque, N m, in world axes at the origin of `frame`."""
@@ -156,10 +158,6 @@ class BulletWorld:
         point = self.pose(frame)[0].tolist()
         bullet.applyExternalForce(body, index, force, point, pybullet.WORLD_FRAME)
         bullet.applyExternalTorque(body, index, torque, pybullet.WORLD_FRAME)
-
-    def joint_states(self) -> tuple[tuple[Any, ...], ...]:
-        """Return for each joint: position, velocity, reaction, and what its brake applied."""
-        return self._bullet.getJointStates(self.body_id, self._joints)
 
     def pose(self, frame: FramePlacement) -> tuple[np.ndarray, np.ndarray]:
         """Return position and quaternion of a frame, from the joints' present positions."""
