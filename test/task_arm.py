@@ -81,10 +81,14 @@ class TaskArm:
         kp=400.0,
         kd=40.0,
         damping=5.0,
+        stiffness=0.0,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return accelerations that hold the hand at a place and damp the rest, and its error."""
+        """Return accelerations that hold the hand at a place and the arm near its posture.
+
+        And the error of the hand, shape (m,), m and rad.
+        """
         error = pin.log6(self.hand(q).actInv(hand)).vector[: self.rows]
-        rest = -damping * v
+        rest = stiffness * (self.posture - q) - damping * v
         task = kp * error - kd * terms.J @ v - terms.J_dot @ v
         return rest + np.linalg.pinv(terms.J) @ (task - terms.J @ rest), error
 
