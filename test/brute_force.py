@@ -142,18 +142,20 @@ class _Motions:
         extreme = np.full(self.m, np.nan)
         active = np.arange(self.m)
         for _ in range(ROUNDS):
-            if active.size == 0:
-                break
             first = self._solve(active, "first", sign)[:, 0]
             active, first = active[np.isfinite(first)], first[np.isfinite(first)]
             x = self._solve(active, "margin", sign, first)
             finished = self._add_cuts(x, active)
             extreme[active] = np.where(finished & np.isfinite(x[:, 0]), first, np.nan)
             active = active[~finished]
+            if active.size == 0:
+                break
         return extreme * self.unit
 
     def _solve(self, active, goal, sign=1.0, first=None) -> np.ndarray:
         """Return the best variables of the active motions, shape (k, 2 N + 1)."""
+        if active.size == 0:
+            return np.empty((0, 2 * self.steps + 1))
         cost = np.zeros((active.size, 2 * self.steps + 1))
         bounds = np.zeros((*cost.shape, 2))
         bounds[:, : self.steps] = self.bounds
