@@ -61,6 +61,21 @@ def assert_may_be_sent(step, arm) -> None:
     assert (np.abs(step.tau) <= arm.tau_max).all()
 
 
+class Fixed:
+    """An additional torque that is always the same."""
+
+    idle = False
+
+    def __init__(self, torque) -> None:
+        self._torque = torque
+
+    def start(self, robot, v) -> None:
+        """Nothing to forget."""
+
+    def torque(self, robot, v, a_last, elapsed):
+        return self._torque
+
+
 # The output, whatever comes
 
 
@@ -87,8 +102,8 @@ def test_torques_are_finite_and_within_their_limits_whatever_comes(
     q, v, a, width, additional, goals, after
 ):
     arm = load_arm("baxter_left_arm")
-    torque = None if additional is None else (lambda *_: additional)
-    controller = make(arm, additional_torque=torque)
+    torque = None if additional is None else Fixed(additional)
+    controller = make(arm, additional=torque)
     if goals in ("pose", "both"):
         controller.set_pose_goal(pose_at(arm, arm.q_start + 0.2))
     if goals in ("posture", "both"):
@@ -148,7 +163,7 @@ def test_a_state_that_is_not_finite_is_survived(arm):
 
 
 def test_an_additional_torque_that_is_not_finite_leaves_the_arm_held(arm):
-    controller = make(arm, additional_torque=lambda *_: np.full(arm.n, math.nan))
+    controller = make(arm, additional=Fixed(np.full(arm.n, math.nan)))
     controller.set_pose_goal(pose_at(arm, arm.q_start))
     q, v = arm.q_start, np.zeros(arm.n)
     for step in (controller.step(q, v, *wide(arm)), controller.hold(q, v)):
@@ -160,7 +175,7 @@ def test_an_additional_torque_that_is_not_finite_leaves_the_arm_held(arm):
 def test_the_torque_limits_hold_with_the_additional_torque_in_them(arm):
     push = 0.8 * arm.tau_max
     rng = np.random.default_rng(2)
-    controller = make(arm, additional_torque=lambda *_: push)
+    controller = make(arm, additional=Fixed(push))
     controller.set_posture_goal(arm.q_max)
     exact = limited = 0
     for _ in range(60):

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
+from torque_safety_controller.additional_torque import AdditionalTorque
 from torque_safety_controller.inverse_dynamics_qp import InverseDynamicsQP, NoSolutionFound
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks import (
@@ -19,9 +19,6 @@ from torque_safety_controller.tasks import (
     pose_task,
     posture_task,
 )
-
-AdditionalTorque = Callable[[RobotModel, np.ndarray, np.ndarray], np.ndarray]
-"""(model, q, v) -> torque, shape (n,), N m, that is added to the model's: integral action."""
 
 
 @dataclass(frozen=True)
@@ -74,12 +71,13 @@ class Controller:
         tau_max: torque limits, shape (n,), N m.
         gains: initial gains.
         torque_rate_max: greatest change of torque, shape (n,), N m/s; inf for none.
-        additional_torque: integral action; the torque limits hold with it counted in.
+        additional: integral action; the torque limits hold with it counted in.
 
     Attributes:
         q_des: joint goal, shape (n,), rad; None until one is set.
         pose_des: end-effector goal; None until one is set.
         error: error of the pose goal in the last step, shape (6,), m and rad.
+        additional: as given.
         iterations: of the last QP.
     """
 
@@ -89,7 +87,7 @@ class Controller:
         tau_max: np.ndarray,
         gains: Gains,
         torque_rate_max: np.ndarray | None = None,
-        additional_torque: AdditionalTorque | None = None,
+        additional: AdditionalTorque | None = None,
     ) -> None:
         n = robot.n
         self.robot = robot
@@ -103,7 +101,8 @@ class Controller:
         self._tau_step = np.where(np.isinf(rate), np.inf, rate * robot.dt)
         self._rate_limited = bool(np.isfinite(rate).any())
         self._tau_min = -self.tau_max
-        self._additional_torque = additional_torque
+        self.additional = additional
+        self._begun = False
         self._qp = InverseDynamicsQP(n)
         self._a_last = np.zeros(n)
         self._tau_last: np.ndarray | None = None
@@ -116,8 +115,9 @@ class Controller:
 
     def start(self, q: np.ndarray) -> None:
         """Forget the past; `q` becomes the posture that the null space is held at."""
-        self._a_last.fill(0.0)
+        self._a_last = np.zeros(self.robot.n)
         self._tau_last = None
+        self._begun = False
         self._posture = q.copy()
 
     def set_pose_goal(self, pose_des: pin.SE3) -> None:
@@ -142,13 +142,24 @@ class Controller:
         self.pose_des = None
         self.error.fill(math.nan)
         self.start(q)
+        if self.additional is not None:
+            self.robot.rates = True
+            self.robot.update(q, v, v)
+            self.additional.start(self.robot, v)
 
     @property
     def acceleration(self) -> np.ndarray:
         """Acceleration commanded last, shape (n,), rad/s^2."""
         return self._a_last
 
-    def step(self, q: np.ndarray, v: np.ndarray, a_lower: np.ndarray, a_upper: np.ndarray) -> Step:
+    def step(
+        self,
+        q: np.ndarray,
+        v: np.ndarray,
+        a_lower: np.ndarray,
+        a_upper: np.ndarray,
+        elapsed: float | None = None,
+    ) -> Step:
         """Return the torque for one control step towards the goals.
 
         Without a goal it is `rest`; when the QP fails, `hold`.
@@ -158,21 +169,75 @@ class Controller:
             v: velocity, shape (n,), rad/s.
             a_lower: acceleration bounds, shape (n,), rad/s^2.
             a_upper: shape (n,), rad/s^2, not below `a_lower`.
+            elapsed: time since the last step, s; None for a control period.
         """
         if not self.has_goal:
-            return self.rest(q, v, a_lower, a_upper)
-        self.robot.update(q, v, self._a_last)
-        return self._solve(q, v, self._tasks(q, v), a_lower, a_upper, True)
+            return self.rest(q, v, a_lower, a_upper, elapsed)
+        additional = self._begin(q, v, elapsed)
+        return self._solve(q, v, self._tasks(q, v), a_lower, a_upper, additional, True)
 
-    def rest(self, q: np.ndarray, v: np.ndarray, a_lower: np.ndarray, a_upper: np.ndarray) -> Step:
+    def rest(
+        self,
+        q: np.ndarray,
+        v: np.ndarray,
+        a_lower: np.ndarray,
+        a_upper: np.ndarray,
+        elapsed: float | None = None,
+    ) -> Step:
         """Return the torque that brings the arm to rest inside its bounds; see `step`."""
-        self.robot.update(q, v, self._a_last)
+        additional = self._begin(q, v, elapsed)
         tasks = [damping_task(v, self.gains.hold_kd)]
-        return self._solve(q, v, tasks, a_lower, a_upper, False)
+        return self._solve(q, v, tasks, a_lower, a_upper, additional, False)
 
-    def _solve(self, q, v, tasks: list[TaskTerm], a_lower, a_upper, tracking: bool) -> Step:
+    def take_over(
+        self,
+        q: np.ndarray,
+        v: np.ndarray,
+        a_lower: np.ndarray,
+        a_upper: np.ndarray,
+        tau: np.ndarray,
+    ) -> Step:
+        """Prepare to go on from torque that something else applies: [Benallegue2021], IV-A.
+
+        The arm's pose and posture become the goals. What is asked for then is given by the QP;
+        the additional torque begins with the difference, so that the next step continues `tau`.
+
+        Args:
+            q: position, shape (n,), rad.
+            v: velocity, shape (n,), rad/s.
+            a_lower: acceleration bounds, shape (n,), rad/s^2.
+            a_upper: shape (n,), rad/s^2, not below `a_lower`.
+            tau: torque of the motors now, shape (n,), N m.
+        """
+        self.start(q)
+        self.robot.rates = self.additional is not None
+        self.robot.update(q, v, self._a_last)
+        self.set_posture_goal(q.copy())
+        self.set_pose_goal(self.robot.pose.copy())
+        step = self._solve(q, v, self._tasks(q, v), a_lower, a_upper, None, True)
+        tau = np.clip(tau, self._tau_min, self.tau_max)
+        if self.additional is not None and not step.failure:
+            self.additional.seed(self.robot, v, tau - step.tau)
+            self._begun = True
+        self._tau_last = tau
+        return step
+
+    def _begin(self, q: np.ndarray, v: np.ndarray, elapsed: float | None) -> np.ndarray | None:
+        """Update the model and return the additional torque of a step, or None."""
+        robot, additional = self.robot, self.additional
+        robot.rates = additional is not None and not additional.idle
+        robot.update(q, v, self._a_last)
+        if not robot.rates:
+            return None
+        if not self._begun:
+            additional.start(robot, v)
+            self._begun = True
+        return additional.torque(robot, v, self._a_last, robot.dt if elapsed is None else elapsed)
+
+    def _solve(
+        self, q, v, tasks: list[TaskTerm], a_lower, a_upper, additional, tracking: bool
+    ) -> Step:
         robot = self.robot
-        additional = self._additional(q, v)
         bias = robot.h if additional is None else robot.h + additional
         lower, upper = self._torque_range()
         try:
@@ -185,13 +250,12 @@ class Controller:
             tau = tau + additional
         return Step(self._limited(tau), self._remember(solution.a), tracking, solution.relaxation)
 
-    def hold(self, q: np.ndarray, v: np.ndarray) -> Step:
+    def hold(self, q: np.ndarray, v: np.ndarray, elapsed: float | None = None) -> Step:
         """Return a torque that needs no acceleration bounds: gravity and damping.
 
         Each joint brakes with `hold_kd`, as hard as its motor allows.
         """
-        self.robot.update(q, v, self._a_last)
-        return self._hold(q, v, self._additional(q, v), "")
+        return self._hold(q, v, self._begin(q, v, elapsed), "")
 
     def _hold(self, q, v, additional, failure: str) -> Step:
         robot = self.robot
@@ -231,11 +295,6 @@ class Controller:
             )
         )
         return tasks
-
-    def _additional(self, q: np.ndarray, v: np.ndarray) -> np.ndarray | None:
-        if self._additional_torque is None:
-            return None
-        return self._additional_torque(self.robot, q, v)
 
     def _torque_range(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the torques that may follow the last one, shape (n,) each, N m."""

@@ -5,18 +5,18 @@ from __future__ import annotations
 import sys
 import time
 from array import array
-from collections import deque
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
+from torque_safety_controller.additional_torque import AdditionalTorque
 from torque_safety_controller.controller import Controller, Step
 from torque_safety_controller.controller_parameters import (
     TABLE,
@@ -24,7 +24,9 @@ from torque_safety_controller.controller_parameters import (
     load_robot,
     make_configuration,
 )
+from torque_safety_controller.handover import Control, Handover, HandoverRefused
 from torque_safety_controller.modes import Mode, ModeKeeper
+from torque_safety_controller.ros_controller_report import LEVELS, StepRecord
 from torque_safety_controller.ros_goals import (
     GoalQueue,
     GoalRefused,
@@ -36,14 +38,13 @@ from viability_bounds_pkg.ros_messages import Diagnostics, JointStateReader, Ver
 from viability_bounds_pkg.ros_parameters import NodeParameters, ParameterError
 from viability_bounds_pkg.ros_runtime import CONTROL_QOS, GOAL_QOS, run
 
-_LATENCIES_KEPT = 4096
-
 
 class ControllerNode(Node):
     """Answers each joint state, once its acceleration limits are there, with torques.
 
     Subscribes to ``joint_states``, ``acceleration_limits``, ``target_pose`` and
-    ``target_posture``; publishes ``joint_commands`` with the stamp of the state answered.
+    ``target_posture``; publishes ``joint_commands`` with the stamp of the state answered. The
+    service ``~/enable_torque`` hands over between the robot's position control and torque.
     """
 
     def __init__(self, **node_arguments: Any) -> None:
@@ -57,8 +58,12 @@ class ControllerNode(Node):
             self.destroy_node()
             raise
         config = self._config = self._node_parameters.configuration
-        self._controller = Controller(robot, config.tau_max, config.gains, config.tau_rate_max)
+        self._additional = AdditionalTorque(config.additional, config.task_rows)
+        self._controller = Controller(
+            robot, config.tau_max, config.gains, config.tau_rate_max, self._additional
+        )
         self._controller.warm_up()
+        self._handover = Handover(config.start_control, config.joints, config.q_min, config.q_max)
         self._states = JointStateReader(config.joints, config.state_timeout)
         self._limits = LimitsReader(config.joints)
         self._goals = GoalQueue()
@@ -68,11 +73,12 @@ class ControllerNode(Node):
         self._message_stamp = None
         self._answered_stamp = -1
         self._bounds_lost = False
-        self._steps = self._relaxed_steps = self._failures = 0
-        self._latencies: deque[float] = deque(maxlen=_LATENCIES_KEPT)
-        self._last_relaxation = np.zeros(len(config.joints))
+        self._record = StepRecord(len(config.joints))
 
         self._command = JointState(name=list(config.joints))
+        self._positions = JointState(
+            name=list(config.joints), velocity=np.zeros(len(config.joints)).tolist()
+        )
         self._publisher = self.create_publisher(JointState, "joint_commands", CONTROL_QOS)
         self._efforts = None
         if config.ros2_control_topic:
@@ -85,6 +91,7 @@ class ControllerNode(Node):
         )
         self.create_subscription(PoseStamped, "target_pose", self._on_pose, GOAL_QOS)
         self.create_subscription(JointState, "target_posture", self._on_posture, GOAL_QOS)
+        self.create_service(SetBool, "~/enable_torque", self._on_enable_torque)
         # Watchdogs must bark when time itself, as the clock topic tells it, stands still.
         self._watchdog = self.create_timer(
             min(config.bounds_timeout, config.state_timeout) / 4,
@@ -96,6 +103,7 @@ class ControllerNode(Node):
     def _configure(self, config: ControllerConfiguration) -> None:
         self._config = config
         self._controller.gains = config.gains
+        self._additional.settings = config.additional
 
     # Streams
 
@@ -116,12 +124,12 @@ class ControllerNode(Node):
             return
         elif self._answered_stamp == last:
             self._waiting_since = now
-        if self._limits.stamp == self._states.stamp:
+        if self._handover.control is Control.POSITION:
+            self._hold_position(message.header.stamp)
+        elif self._limits.stamp == self._states.stamp:
             self._track(message.header.stamp)
         elif self._bounds_lost:
-            self._answer(
-                self._controller.hold(self._states.q, self._states.v), message.header.stamp
-            )
+            self._hold(message.header.stamp)
 
     def _begin(self, verdict: Verdict) -> None:
         """Forget the past: the robot was silent, or started over."""
@@ -130,6 +138,7 @@ class ControllerNode(Node):
         self._answered_stamp = -1
         self._waiting_since = self._state_at
         self._controller.start(self._states.q)
+        self._handover.forget()
 
     def _on_limits(self, message: JointTrajectory) -> None:
         if not self._limits.read(message):
@@ -146,15 +155,21 @@ class ControllerNode(Node):
         if self._goals.apply_due(self._states.stamp):
             self._goal_at = time.monotonic()
         states, limits = self._states, self._limits
+        now = states.q, states.v, limits.lower, limits.upper
+        if self._handover.by_drives:
+            self._take_over(stamp)
+            return
         if self._goal_lost():
-            step = self._controller.rest(states.q, states.v, limits.lower, limits.upper)
+            step = self._controller.rest(*now, self._elapsed())
         else:
-            step = self._controller.step(states.q, states.v, limits.lower, limits.upper)
-        self._steps += 1
-        if step.relaxation is not None:
-            self._relaxed_steps += 1
-            self._last_relaxation = step.relaxation
+            step = self._controller.step(*now, self._elapsed())
         self._answer(step, stamp)
+
+    def _elapsed(self) -> float | None:
+        """Return the time since the state answered last, s; None if there is none."""
+        if self._answered_stamp < 0:
+            return None
+        return 1e-9 * (self._states.stamp - self._answered_stamp)
 
     def _goal_lost(self) -> bool:
         timeout = self._config.goal_timeout
@@ -166,9 +181,7 @@ class ControllerNode(Node):
         self._command.effort = array("d", step.tau.tobytes())
         self._send(stamp)
         self._answered_stamp = self._states.stamp
-        self._latencies.append(now - self._message_at)
-        if step.failure:
-            self._failures += 1
+        self._record.note(step, now - self._message_at)
         if step.tracking:
             self._enter(Mode.TRACKING, "goal")
         else:
@@ -184,10 +197,70 @@ class ControllerNode(Node):
         return "no goal"
 
     def _send(self, stamp: Any) -> None:
+        if self._handover.by_drives:
+            self._positions.header.stamp = stamp
+            self._publisher.publish(self._positions)
+            return
         self._command.header.stamp = stamp
         self._publisher.publish(self._command)
         if self._efforts is not None:
             self._efforts.publish(Float64MultiArray(data=self._command.effort))
+
+    def _hold(self, stamp: Any) -> None:
+        """Answer the newest state without acceleration limits."""
+        states = self._states
+        self._answer(self._controller.hold(states.q, states.v, self._elapsed()), stamp)
+
+    # Position control
+
+    def _hold_position(self, stamp: Any) -> None:
+        """Answer the newest state with the position that the drives hold."""
+        q = self._handover.hold(self._states.q)
+        self._positions.position = array("d", q.tobytes())
+        self._send(stamp)
+        self._answered_stamp = self._states.stamp
+        self._enter(Mode.POSITION, self._handover.control.value)
+
+    def _take_over(self, stamp: Any) -> None:
+        """Prepare to go on with torque from the next state; this one is still the drives'."""
+        states, limits = self._states, self._limits
+        tau = states.effort()
+        failure = "joint_states carry no motor torque (effort)"
+        if tau is not None:
+            step = self._controller.take_over(states.q, states.v, limits.lower, limits.upper, tau)
+            failure = step.failure
+        self._hold_position(stamp)
+        if failure:
+            self._handover.forget()
+            self.get_logger().error(f"handover to torque control failed: {failure}")
+        else:
+            self._goal_at = time.monotonic()
+            self._handover.taken_over()
+
+    def _on_enable_torque(
+        self, request: SetBool.Request, response: SetBool.Response
+    ) -> SetBool.Response:
+        states, now = self._states, time.monotonic()
+        fresh = now - self._state_at < self._config.state_timeout
+        try:
+            if request.data:
+                self._handover.to_torque(
+                    states.q, states.effort(), fresh, self._limits_follow(states.stamp)
+                )
+                response.message = "torque control begins with the next state"
+            else:
+                self._handover.to_position(states.q, fresh)
+                response.message = "position control begins with the next state"
+            response.success = True
+        except HandoverRefused as error:
+            response.message = str(error)
+            self.get_logger().warning(f"enable_torque refused: {error}")
+        return response
+
+    def _limits_follow(self, stamp: int) -> bool:
+        """Return whether acceleration limits keep up with the state with this stamp, ns."""
+        late = 1e-9 * (stamp - self._limits.stamp)
+        return self._limits.stamp >= 0 and late <= self._config.bounds_timeout
 
     # Watchdogs
 
@@ -202,14 +275,20 @@ class ControllerNode(Node):
         waiting = self._states.stamp != self._answered_stamp
         if waiting and now - self._waiting_since > config.bounds_timeout:
             self._bounds_lost = True
-            self._answer(
-                self._controller.hold(self._states.q, self._states.v), self._message_stamp
-            )
+            if self._handover.by_drives:
+                self._handover.forget()
+                self.get_logger().error("handover failed: acceleration limits are stale")
+                self._hold_position(self._message_stamp)
+            else:
+                self._hold(self._message_stamp)
         elif (
             now - self._state_at > config.bounds_timeout
             and now - self._message_at < config.bounds_timeout
         ):
             # States come but cannot be used: keep gravity off the arm until STOPPED.
+            if self._handover.by_drives:
+                self._hold_position(self._message_stamp)
+                return
             step = self._controller.hold(self._states.q, np.zeros_like(self._states.v))
             self._command.effort = array("d", step.tau.tobytes())
             self._send(self._message_stamp)
@@ -223,7 +302,7 @@ class ControllerNode(Node):
             return
         text = f"{mode.value}: {reason}"
         # One call site per severity: rclpy ties the two together.
-        if mode is Mode.TRACKING:
+        if mode in (Mode.TRACKING, Mode.POSITION):
             self.get_logger().info(text)
         else:
             self.get_logger().warning(text)
@@ -253,40 +332,21 @@ class ControllerNode(Node):
     # Diagnostics
 
     def _report(self) -> tuple[bytes, str, dict[str, Any]]:
-        controller, modes = self._controller, self._modes
-        latencies = np.array(self._latencies) if self._latencies else np.full(1, np.nan)
-        median, slow = np.percentile(latencies, (50, 99)) * 1e6
-        values = {
-            "mode": modes.mode.value,
-            "reason": modes.reason,
-            "mode_changes": modes.changes,
-            "steps": self._steps,
-            "position_error_m": float(np.linalg.norm(controller.error[:3])),
-            "orientation_error_rad": float(np.linalg.norm(controller.error[3:])),
+        values = self._record.values(
+            self._config.joints, self._controller, self._limits.lower, self._limits.upper
+        )
+        values |= {
+            "mode": self._modes.mode.value,
+            "reason": self._modes.reason,
+            "mode_changes": self._modes.changes,
+            "control": self._handover.control.value,
+            "integral_action": self._config.additional.mode,
             "goals_pending": len(self._goals),
             "goals_refused": self._goals.refused,
             "states_refused": self._states.refused,
             "limits_refused": self._limits.refused,
-            "qp_iterations": controller.iterations,
-            "qp_failures": self._failures,
-            "bounds_relaxed_steps": self._relaxed_steps,
-            "bounds_last_relaxation_rad_s2": self._last_relaxation,
-            "joints_at_acceleration_limit": ", ".join(self._joints_at_limit()) or "none",
-            "latency_p50_us": float(median),
-            "latency_p99_us": float(slow),
         }
-        level = {
-            Mode.TRACKING: DiagnosticStatus.OK,
-            Mode.HOLD: DiagnosticStatus.WARN,
-            Mode.STOPPED: DiagnosticStatus.ERROR,
-        }[modes.mode]
-        return level, f"{modes.mode.value}: {modes.reason}", values
-
-    def _joints_at_limit(self) -> list[str]:
-        a, limits = self._controller.acceleration, self._limits
-        near = 1e-3 * (limits.upper - limits.lower) + 1e-6
-        at = (a <= limits.lower + near) | (a >= limits.upper - near)
-        return [name for name, flag in zip(self._config.joints, at, strict=True) if flag]
+        return LEVELS[self._modes.mode], f"{self._modes.mode.value}: {self._modes.reason}", values
 
 
 def main(args: list[str] | None = None) -> int:

@@ -9,7 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pinocchio as pin
 
+from torque_safety_controller import integral_parameters
+from torque_safety_controller.additional_torque import AdditionalSettings
 from torque_safety_controller.controller import Gains
+from torque_safety_controller.modes import CONTROLS
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks import critical_damping
 from viability_bounds_pkg.robot_description import RobotDescriptionError
@@ -55,6 +58,14 @@ TABLE = (
         live=True,
     ),
     Parameter("hold_kd", float, "damping in HOLD, 1/s", default=20.0, live=True),
+    *integral_parameters.TABLE,
+    Parameter(
+        "start_control",
+        str,
+        f"one of {', '.join(CONTROLS)}: what the robot is commanded by until enable_torque is "
+        "called",
+        default="torque",
+    ),
     Parameter(
         "bounds_timeout",
         float,
@@ -90,6 +101,9 @@ class ControllerConfiguration:
     tau_rate_max: np.ndarray
     base_frame: str
     gains: Gains
+    additional: AdditionalSettings
+    task_rows: slice
+    start_control: str
     bounds_timeout: float
     state_timeout: float
     goal_timeout: float
@@ -109,15 +123,22 @@ def make_configuration(values: Mapping[str, Any]) -> ControllerConfiguration:
         if not (tau_rate_max > 0).all():
             raise ParameterError("torque_rate_max", tau_rate_max, "numbers > 0")
     q_min, q_max = position_limits(values, joints)
+    tau_max = all_positive(values, "torque_max", joints)
+    if values["start_control"] not in CONTROLS:
+        allowed = f"one of {', '.join(CONTROLS)}"
+        raise ParameterError("start_control", values["start_control"], allowed)
     return ControllerConfiguration(
         joints=joints,
         dt=1.0 / positive(values, "rate_hz"),
         q_min=q_min,
         q_max=q_max,
-        tau_max=all_positive(values, "torque_max", joints),
+        tau_max=tau_max,
         tau_rate_max=tau_rate_max,
         base_frame=values["base_frame"],
         gains=_gains(values),
+        additional=integral_parameters.additional_settings(values, joints, tau_max),
+        task_rows=integral_parameters.task_rows(values),
+        start_control=values["start_control"],
         bounds_timeout=positive(values, "bounds_timeout"),
         state_timeout=positive(values, "state_timeout"),
         goal_timeout=positive(values, "goal_timeout", zero=True),

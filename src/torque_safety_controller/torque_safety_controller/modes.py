@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from enum import Enum
 
+CONTROLS = ("torque", "position")
+"""What the robot's drives are commanded by."""
+
 
 class Mode(Enum):
     """What the controller does."""
@@ -12,6 +15,8 @@ class Mode(Enum):
     """Serves its goals inside all limits."""
     HOLD = "HOLD"
     """Brings the arm to rest: gravity compensation and damping inside the torque limits."""
+    POSITION = "POSITION"
+    """The robot's own drives hold the position that they are sent."""
     STOPPED = "STOPPED"
     """Publishes nothing, so that the robot's own watchdog brakes it."""
 

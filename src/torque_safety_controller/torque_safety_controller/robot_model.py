@@ -33,6 +33,9 @@ class RobotModel:
         drift: its acceleration at zero joint acceleration, J' v, shape (6,).
         M: mass matrix, shape (n, n), kg m^2.
         h: Coriolis, centrifugal and gravity torques, shape (n,), N m.
+        C: Coriolis matrix with M' - 2 C skew-symmetric, shape (n, n), N m s; with `rates`.
+        J_dot: time derivative of J, shape (6, n); with `rates`.
+        rates: whether `update` computes C and J_dot.
 
     Raises:
         RobotDescriptionError: no such frame.
@@ -54,6 +57,9 @@ class RobotModel:
         self.drift = np.zeros(6)
         self.M = np.eye(self.n)
         self.h = np.zeros(self.n)
+        self.C = np.zeros((self.n, self.n))
+        self.J_dot = np.zeros((6, self.n))
+        self.rates = False
 
     def update(self, q: np.ndarray, v: np.ndarray, a_last: np.ndarray) -> None:
         """Compute everything for one control step.
@@ -67,8 +73,16 @@ class RobotModel:
         q_mid, v_mid = middle_of_step(q, v, a_last, self.dt)
         self.M = pin.crba(model, data, q_mid)
         self.h = pin.nonLinearEffects(model, data, q_mid, v_mid)
+        if self.rates:
+            self.C = pin.computeCoriolisMatrix(model, data, q_mid, v_mid)
         # Last, because the kinematics in `data` are to be those of the current state.
-        pin.computeJointJacobians(model, data, q)
+        if self.rates:
+            pin.computeJointJacobiansTimeVariation(model, data, q, v)
+            self.J_dot = pin.getFrameJacobianTimeVariation(
+                model, data, self._frame_id, pin.ReferenceFrame.LOCAL
+            )
+        else:
+            pin.computeJointJacobians(model, data, q)
         pin.forwardKinematics(model, data, q, v, self._zero)
         self.pose = pin.updateFramePlacement(model, data, self._frame_id)
         self.J = pin.getFrameJacobian(model, data, self._frame_id, pin.ReferenceFrame.LOCAL)

@@ -55,6 +55,13 @@ TABLE = (
         default=np.zeros(0),
     ),
     Parameter(
+        "acceleration_disturbance",
+        list[float],
+        "how much more than commanded the joints may accelerate by what no model knows, friction, "
+        "payloads, pushes, rad/s^2; kept back from the braking and from the bounds",
+        default=np.zeros(0),
+    ),
+    Parameter(
         "position_margin",
         float,
         "how much further inside the position limits to keep the joints, rad: what the robot or "
@@ -218,14 +225,26 @@ def _state_dependent(
     )
 
 
+def _not_negative(values: Mapping[str, Any], name: str, limits: JointLimits) -> np.ndarray:
+    """Return a parameter of one number a joint, shape (n,), zeros if it is empty."""
+    if not len(values[name]):
+        return np.zeros(len(limits))
+    value = per_joint(values, name, limits.names)
+    if not (np.isfinite(value).all() and (value >= 0.0).all()):
+        raise ParameterError(name, value, "finite numbers >= 0")
+    return value
+
+
 def _margins(values: Mapping[str, Any], limits: JointLimits, dt: float) -> TorqueMargins:
     """Return what to keep back for the drift of acceleration and for the robot itself."""
-    drift = np.zeros(len(limits))
-    if len(values["acceleration_drift"]):
-        drift = per_joint(values, "acceleration_drift", limits.names)
-        if not (np.isfinite(drift).all() and (drift >= 0.0).all()):
-            raise ParameterError("acceleration_drift", drift, "finite numbers >= 0")
-    margins = torque_margins(drift, dt)
+    margins = torque_margins(_not_negative(values, "acceleration_drift", limits), dt)
+    disturbance = _not_negative(values, "acceleration_disturbance", limits)
+    margins.acceleration[:] += disturbance
+    braking = np.minimum(-limits.a_min, limits.a_max)
+    if not (margins.acceleration < braking).all():
+        name = "acceleration_disturbance" if disturbance.any() else "acceleration_drift"
+        allowed = f"less than what there is to brake with, {braking}, by the margins for the rate"
+        raise ParameterError(name, values[name], allowed)
     margins.position[:] += positive(values, "position_margin", zero=True)
     for name, margin, room in (
         ("velocity_max", margins.velocity, limits.v_max),

@@ -81,6 +81,7 @@ class JointStateReader:
         self._guard = StampGuard(reset_after)
         self._names: list[str] | None = None
         self._index: np.ndarray | None = None
+        self._accepted: tuple[JointState, np.ndarray | None] | None = None
 
     def read(self, message: JointState, now: float) -> Verdict:
         """Take a message that arrived at `now`, in s on the steady clock."""
@@ -106,8 +107,24 @@ class JointStateReader:
             if not self._guard.may_start_over(now):
                 return self._refuse("other values under the same stamp")
         self.q, self.v, self.stamp = q, v, stamp
+        self._accepted = message, self._index
         self._guard.accept(stamp, now)
         return Verdict.NEW
+
+    def effort(self) -> np.ndarray | None:
+        """Return the torque of the motors in the last accepted message, shape (n,), N m.
+
+        None where it does not tell, for each joint, a finite number.
+        """
+        if self._accepted is None:
+            return None
+        message, index = self._accepted
+        if len(message.effort) != len(message.name):
+            return None
+        tau = np.array(message.effort)
+        if index is not None:
+            tau = tau[index]
+        return tau if np.isfinite(tau).all() else None
 
     def _match(self, names: Sequence[str]) -> bool:
         where = {name: i for i, name in enumerate(names)}

@@ -1,0 +1,174 @@
+"""Robot, bounds and controller of a parameter file in one loop, without messages between them.
+
+The same classes, made from the same parameters as in the nodes, step by step in lockstep; for
+runs in which something is to happen at an exact step, and for many of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+from chain import load_values
+
+from sim_bridge import bullet_parameters
+from sim_bridge.limit_monitor import LimitMonitor
+from torque_safety_controller import controller_parameters
+from torque_safety_controller.additional_torque import AdditionalTorque
+from torque_safety_controller.controller import Controller, Step
+from torque_safety_controller.robot_model import RobotModel
+from viability_bounds_pkg import bounds_parameters
+from viability_bounds_pkg.robot_description import build_model, read_urdf
+from viability_bounds_pkg.ros_parameters import Parameter
+
+
+class Sample(NamedTuple):
+    """One control step: state, torque, and what the controller thought."""
+
+    t: float
+    q: np.ndarray
+    v: np.ndarray
+    tau: np.ndarray
+    additional: np.ndarray
+    error: np.ndarray
+
+
+class DirectLoop:
+    """An arm under control, and the record of what it did.
+
+    Args:
+        robot: name of a file in ``config/``.
+        changed: parameters that differ from it, by name.
+
+    Attributes:
+        robot: in PyBullet.
+        controller: with its goals at the start pose.
+        samples: one a control step.
+    """
+
+    def __init__(self, robot: str, changed: Mapping[str, Any] | None = None) -> None:
+        self._given = load_values(robot) | dict(changed or {})
+        bullet = self._values(bullet_parameters.TABLE)
+        config = bullet_parameters.make_configuration(bullet)
+        self.robot = bullet_parameters.make_robot(config, bullet)
+        self.robot.monitor = LimitMonitor(
+            config.q_min,
+            config.q_max,
+            config.v_max,
+            config.tau_max,
+            torque_tolerance=1e-9 * float(config.tau_max.max()),
+        )
+        self.config = config
+        self.model = build_model(
+            read_urdf(bullet["robot_description"]),
+            config.joints,
+            config.locked,
+            bullet["rotor_inertia"] if len(bullet["rotor_inertia"]) else None,
+        )
+        bounds = bounds_parameters.make_configuration(
+            self._values(bounds_parameters.TABLE), lambda _: self.model
+        )
+        self.limits = bounds.limits
+        self._bounds = bounds.solve
+        values = self._values(controller_parameters.TABLE)
+        made = controller_parameters.make_configuration(values)
+        self._additional = AdditionalTorque(made.additional, made.task_rows)
+        self.controller = Controller(
+            RobotModel(self.model, values["end_effector_frame"], config.dt),
+            made.tau_max,
+            made.gains,
+            made.tau_rate_max,
+            self._additional,
+        )
+        self.controller.warm_up()
+        self.samples: list[Sample] = []
+        self.t = 0.0
+        self.robot.reset(config.q_start, np.zeros(len(config.joints)))
+        self.begin()
+
+    def _values(self, table: tuple[Parameter, ...]) -> dict[str, Any]:
+        return {row.name: row.coerce(self._given.get(row.name)) for row in table}
+
+    def change(self, **parameters: Any) -> None:
+        """Change live parameters of the controller, as a running node would."""
+        self._given |= parameters
+        made = controller_parameters.make_configuration(self._values(controller_parameters.TABLE))
+        self.controller.gains = made.gains
+        self._additional.settings = made.additional
+
+    @property
+    def dt(self) -> float:
+        """Control period, s."""
+        return self.config.dt
+
+    def begin(self) -> None:
+        """Make where the arm is its goal, and forget the past."""
+        q = self.robot.state().q
+        self.controller.start(q)
+        self.controller.set_posture_goal(q)
+        self.controller.set_pose_goal(self.pose())
+
+    def pose(self) -> pin.SE3:
+        """Return the true pose of the end effector, in the URDF's root frame."""
+        data = self.model.createData()
+        pin.framesForwardKinematics(self.model, data, self.robot.state().q)
+        return data.oMf[self.model.getFrameId(self.controller.robot.frame)].copy()
+
+    def run(
+        self, duration: float, each: Callable[[float], None] | None = None
+    ) -> tuple[Sample, ...]:
+        """Play on for some seconds; return the samples.
+
+        Args:
+            duration: s.
+            each: called with the time before each step.
+        """
+        first = len(self.samples)
+        for _ in range(round(duration / self.dt)):
+            if each is not None:
+                each(self.t)
+            self.step()
+        return tuple(self.samples[first:])
+
+    def step(self) -> Step:
+        """Play one control step under torque control."""
+        q, v, _ = self.robot.state()
+        bounds = self._bounds(q, v)
+        step = self.controller.step(q, v, bounds.lower, bounds.upper)
+        self._record(q, v, step.tau)
+        self.robot.step(step.tau, self.config.substeps)
+        return step
+
+    def move(self, q_des: np.ndarray) -> None:
+        """Play one control step under position control by the robot's drives."""
+        q, v, _ = self.robot.state()
+        config = self.config
+        self.robot.move(q_des, np.zeros(q.size), config.tau_max, config.v_max, config.substeps)
+        self._record(q, v, self.robot.state().motor_torque)
+
+    def take_over(self, q_des: np.ndarray) -> None:
+        """Prepare torque control in a step that is still the drives'."""
+        q, v, tau = self.robot.state()
+        bounds = self._bounds(q, v)
+        self.controller.take_over(q, v, bounds.lower, bounds.upper, tau)
+        self.move(q_des)
+
+    def _record(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> None:
+        self.samples.append(
+            Sample(
+                self.t,
+                q,
+                v,
+                tau.copy(),
+                self._additional.last.copy(),
+                self.controller.error.copy(),
+            )
+        )
+        self.t += self.dt
+
+
+def column(samples: tuple[Sample, ...], name: str) -> np.ndarray:
+    """Return one field of all samples as an array."""
+    return np.array([getattr(sample, name) for sample in samples])
