@@ -129,8 +129,6 @@ def step(
     total = 0.0
     for i in range(n):
         offset[i] = tau[i] - own[i] if entering else fading * memory.offset[i]
-        offset[i] = min(max(offset[i], -limit[i] - own[i]), limit[i] - own[i])
-        # Rounding must not carry the sum beyond the limit.
         tau[i] = min(max(own[i] + offset[i], -limit[i]), limit[i])
         total += tau[i] + s[i] + a[i] + x[i] + v[i]
     for i in range(m):
