@@ -69,7 +69,7 @@ class Fixed:
     def __init__(self, torque) -> None:
         self._torque = torque
 
-    def start(self, robot, v) -> None:
+    def start(self) -> None:
         """Nothing to forget."""
 
     def torque(self, robot, v, a_last, elapsed):

@@ -1,20 +1,20 @@
 """The torque that is added to the model's: integral action in one of its modes, without jumps.
 
-Modes are ``none``; ``joints``, every joint stiff, (3)-(14) of [Benallegue2021]; and ``task``, stiff
-in the task and free in its null space, (15)-(26). Whatever is changed while the arm moves, the
-torque goes on from where it was.
+Modes are ``none``; ``joints``, every joint stiff, (3)-(14) of [Benallegue2021]; and ``task``,
+stiff in the task and free in its null space, (15)-(26). Whatever is changed while the arm moves,
+and whatever comes instead of its next state, the torque goes on from where it was.
 """
 
 from __future__ import annotations
 
 import math
-from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from torque_safety_controller.integral_feedback import IntegralFeedback, SeedingError
+from torque_safety_controller.integral_feedback import IntegralFeedback
 from torque_safety_controller.integral_settings import IntegralSettings
 from torque_safety_controller.nullspace_compliance import NullspaceCompliance
 from torque_safety_controller.nullspace_settings import NullspaceSettings
@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 MODES = ("none", "joints", "task")
 
 LONGEST_GAP = 2.5
-"""Steps that a missed deadline or two may take; after a longer gap nothing is integrated."""
+"""Periods that a step may take, a missed deadline being 2; a longer gap is not integrated over."""
 
 _FADING_TIME = 0.2  # s; of what a mode cannot take over
 _NEGLIGIBLE = 1e-9  # N m
@@ -39,11 +39,14 @@ class AdditionalSettings:
         mode: one of `MODES`.
         joints: of mode ``joints``.
         task: of mode ``task``; None where the task leaves no null space.
+        disturbance_max: largest disturbance of each joint that is integrated, shape (n,), N m;
+            what friction and a wrong model never are, but a sensor's glitch or a blow may be.
     """
 
     mode: str
     joints: IntegralSettings
     task: NullspaceSettings | None
+    disturbance_max: Array
 
 
 class AdditionalTorque:
@@ -55,6 +58,7 @@ class AdditionalTorque:
 
     Attributes:
         last: what the last step added, shape (n,), N m.
+        skipped: steps that were not integrated over: time jumped, or the velocity did.
         joints: the integral action of mode ``joints``.
         task: that of mode ``task``, or None.
     """
@@ -65,12 +69,13 @@ class AdditionalTorque:
         self.task: NullspaceCompliance | None = None
         if settings.task is not None:
             self.task = NullspaceCompliance(settings.task, rows.stop - rows.start)
+        self.skipped = 0
         self._rows = rows
         self._settings = settings
-        self._mode = settings.mode
-        self.last = np.zeros(n)
-        self._fading = np.zeros(n)
-        self._faded = True
+        self._zero = np.zeros(n)
+        self.start()
+        # Compiled now, not in a control loop.
+        _beyond(np.eye(n), self._zero, self._zero, self._zero, self._zero)
 
     @property
     def settings(self) -> AdditionalSettings:
@@ -94,60 +99,72 @@ class AdditionalTorque:
         """Which joints are at their budget, shape (n,)."""
         if self._mode == "joints":
             return self.joints.saturated
-        return np.full(self.last.size, self._mode == "task" and self.task.limited)
+        if self._mode == "task" and self.task.limited:
+            budget = self.task.settings.budget
+            return np.abs(self.task.additional_torque) >= (1.0 - 1e-9) * budget
+        return np.zeros(self.last.size, dtype=bool)
 
-    def start(self, robot: RobotModel, v: Array) -> None:
-        """Forget the past.
-
-        Args:
-            robot: of the arm, updated.
-            v: velocity now, shape (n,), rad/s.
-        """
+    def start(self) -> None:
+        """Forget the past: the next step begins with nothing added."""
         self._mode = self._settings.mode
-        self.last = np.zeros(v.size)
-        self._fading.fill(0.0)
+        self._started = False
+        self._lost = self._resuming = False
+        self._v_last = self._zero
+        self.last = self._zero
+        self._fading = self._zero
         self._faded = True
-        if self._mode == "joints":
-            self.joints.start(v)
-        elif self._mode == "task":
-            self.task.start(v, robot.J[self._rows])
 
     def torque(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> Array:
-        """Return what to add in this step, shape (n,), N m.
+        """Return what to add in this step, shape (n,), N m; finite whatever comes.
+
+        After a jump in time, or of the velocity, the torque goes on from the last one, and the
+        difference to what the memory asks for fades.
 
         Args:
             robot: of the arm, updated with rates.
             v: velocity, shape (n,), rad/s.
             a_last: acceleration commanded in the last step, shape (n,), rad/s^2.
-            elapsed: time since the last step, s; a jump in time is not integrated over.
+            elapsed: time since the last step, s.
         """
         try:
-            torque = self._integrated(robot, v, a_last, elapsed)
-        except ValueError:
-            return self.last  # absurd numbers, over which nothing is integrated
-        if not self._faded:
-            gap = elapsed if 0.0 < elapsed < math.inf else 0.0
-            self._fading *= math.exp(-gap / _FADING_TIME)
-            self._faded = bool(np.abs(self._fading).max() < _NEGLIGIBLE)
-            torque = torque + self._fading
-        if self._mode != self._settings.mode:
-            torque = self.seed(robot, v, torque)
+            torque = self._next(robot, v, a_last, elapsed)
+        except ValueError:  # numbers beyond sense
+            self._lost = True
+            torque = None
+        if torque is None:
+            self._resuming = True
+            self.skipped += 1
+            return self.last
         self.last = torque
         return torque
 
-    def _integrated(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> Array:
-        """Return the torque of the present mode."""
-        if not 0.0 < elapsed <= LONGEST_GAP * robot.dt:
+    def _next(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> Array | None:
+        """Return the torque of this step; None where the velocity jumped."""
+        if not self._started:
+            self._begin(robot, v)
+        known = 0.0 < elapsed <= LONGEST_GAP * robot.dt and not self._lost
+        jumped = known and self._mode != "none" and self._jumped(robot.M, v, a_last, elapsed)
+        if not known or jumped:
             self._skip(robot, v, elapsed)
-            a_last, elapsed = np.zeros(v.size), 0.0
-        if self._mode == "joints":
-            return self.joints.torque(robot.M, robot.C, v, a_last, elapsed)
-        if self._mode == "task":
-            rows = self._rows
-            return self.task.torque(
-                robot.M, robot.C, robot.J[rows], robot.J_dot[rows], v, a_last, elapsed
-            )
-        return np.zeros(v.size)
+            self._lost = False
+        self._v_last = v.copy()
+        if jumped:
+            return None
+        if known:
+            torque = self._of_mode(robot, v, a_last, elapsed)
+        else:
+            self.skipped += 1
+            torque = self._of_mode(robot, v, self._zero, 0.0)
+        if self._resuming or not known:
+            self._resuming = False
+            self._fade(self.last - torque)
+        if not self._faded:
+            gap = min(elapsed, LONGEST_GAP * robot.dt) if elapsed > 0.0 else 0.0
+            self._fade(self._fading * math.exp(-gap / _FADING_TIME))
+            torque = torque + self._fading
+        if self._mode != self._settings.mode:
+            torque = self.seed(robot, v, torque)
+        return torque
 
     def seed(self, robot: RobotModel, v: Array, torque: Array) -> Array:
         """Enter the mode that is set so that it gives `torque` now; return that.
@@ -158,21 +175,45 @@ class AdditionalTorque:
         Args:
             robot: of the arm, updated with rates.
             v: velocity, shape (n,), rad/s.
-            torque: shape (n,), N m.
+            torque: shape (n,), N m, finite.
         """
         self._mode = self._settings.mode
-        taken = np.zeros(torque.size)
-        if self._mode == "joints":
-            self.joints.start(v)
-            with suppress(SeedingError):  # too fast: all of it fades
+        taken = self._zero
+        try:
+            self._begin(robot, v)
+            if self._mode == "joints":
                 taken = self.joints.seed(torque, robot.M, robot.C)
-        elif self._mode == "task":
-            rows = self._rows
-            taken = self.task.seed(torque, robot.M, robot.C, robot.J[rows], robot.J_dot[rows], v)
-        self._fading = torque - taken
-        self._faded = bool(np.abs(self._fading).max() < _NEGLIGIBLE)
+            elif self._mode == "task":
+                J, J_dot = robot.J[self._rows], robot.J_dot[self._rows]
+                taken = self.task.seed(torque, robot.M, robot.C, J, J_dot, v)
+        except ValueError:  # too fast, or numbers beyond sense: all of it fades
+            self._started = False
+        self._fade(torque - taken)
         self.last = torque
         return torque
+
+    def _begin(self, robot: RobotModel, v: Array) -> None:
+        """Let the memory of the mode begin, empty, at this velocity."""
+        if self._mode == "joints":
+            self.joints.start(v)
+        elif self._mode == "task":
+            self.task.start(v, robot.J[self._rows])
+        self._v_last = v.copy()
+        self._started, self._lost = True, False
+
+    def _jumped(self, M: Array, v: Array, a_last: Array, elapsed: float) -> bool:
+        """Return whether nothing that the integral is for can have changed the velocity so."""
+        impulse = self._settings.disturbance_max * elapsed
+        return _beyond(M, self._v_last, v, a_last * elapsed, impulse)
+
+    def _of_mode(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> Array:
+        """Return the torque of the present mode."""
+        if self._mode == "joints":
+            return self.joints.torque(robot.M, robot.C, v, a_last, elapsed)
+        if self._mode == "task":
+            J, J_dot = robot.J[self._rows], robot.J_dot[self._rows]
+            return self.task.torque(robot.M, robot.C, J, J_dot, v, a_last, elapsed)
+        return self._zero
 
     def _skip(self, robot: RobotModel, v: Array, elapsed: float) -> None:
         gap = elapsed if 0.0 <= elapsed < math.inf else 0.0
@@ -180,3 +221,25 @@ class AdditionalTorque:
             self.joints.skip(v, gap)
         elif self._mode == "task":
             self.task.skip(v, robot.J[self._rows], gap)
+
+    def _fade(self, torque: Array) -> None:
+        self._fading = torque
+        self._faded = bool(np.abs(torque).max() < _NEGLIGIBLE)
+
+
+@njit(cache=True)
+def _beyond(M: Array, v_last: Array, v: Array, expected: Array, largest: Array) -> bool:
+    """Return whether a joint's velocity is off by more than an impulse on its own inertia gives.
+
+    Args:
+        M: mass matrix, shape (n, n), kg m^2.
+        v_last: velocity, shape (n,), rad/s.
+        v: in the next step, shape (n,), rad/s.
+        expected: by how much it was to change, shape (n,), rad/s.
+        largest: impulse of the largest disturbance, shape (n,), N m s.
+    """
+    for i in range(len(v)):
+        # A NaN is not within it.
+        if not M[i, i] * abs(expected[i] - (v[i] - v_last[i])) <= largest[i]:
+            return True
+    return False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -102,7 +103,6 @@ class Controller:
         self._rate_limited = bool(np.isfinite(rate).any())
         self._tau_min = -self.tau_max
         self.additional = additional
-        self._begun = False
         self._qp = InverseDynamicsQP(n)
         self._a_last = np.zeros(n)
         self._tau_last: np.ndarray | None = None
@@ -117,8 +117,9 @@ class Controller:
         """Forget the past; `q` becomes the posture that the null space is held at."""
         self._a_last = np.zeros(self.robot.n)
         self._tau_last = None
-        self._begun = False
         self._posture = q.copy()
+        if self.additional is not None:
+            self.additional.start()
 
     def set_pose_goal(self, pose_des: pin.SE3) -> None:
         """Move the end effector to `pose_des` in the URDF's root frame."""
@@ -141,11 +142,9 @@ class Controller:
             self.step(q, v, -bounds, bounds)
         self.pose_des = None
         self.error.fill(math.nan)
+        self.robot.rates = self.additional is not None
+        self.robot.update(q, v, v)
         self.start(q)
-        if self.additional is not None:
-            self.robot.rates = True
-            self.robot.update(q, v, v)
-            self.additional.start(self.robot, v)
 
     @property
     def acceleration(self) -> np.ndarray:
@@ -218,7 +217,6 @@ class Controller:
         tau = np.clip(tau, self._tau_min, self.tau_max)
         if self.additional is not None and not step.failure:
             self.additional.seed(self.robot, v, tau - step.tau)
-            self._begun = True
         self._tau_last = tau
         return step
 
@@ -229,9 +227,6 @@ class Controller:
         robot.update(q, v, self._a_last)
         if not robot.rates:
             return None
-        if not self._begun:
-            additional.start(robot, v)
-            self._begun = True
         return additional.torque(robot, v, self._a_last, robot.dt if elapsed is None else elapsed)
 
     def _solve(
@@ -260,10 +255,16 @@ class Controller:
     def _hold(self, q, v, additional, failure: str) -> Step:
         robot = self.robot
         a = -self.gains.hold_kd * v
-        tau = robot.M @ a + robot.h
+        bias = robot.h
         if additional is not None and np.isfinite(additional).all():
-            tau = tau + additional
-        return Step(self._limited(tau), self._remember(a), False, None, failure)
+            bias = robot.h + additional
+        tau = robot.M @ a + bias
+        sent = self._limited(tau)
+        if not np.array_equal(sent, tau):
+            # What the motors cannot give is no error for the integral to grow on.
+            with suppress(np.linalg.LinAlgError):
+                a = np.linalg.solve(robot.M, sent - bias)
+        return Step(sent, self._remember(a), False, None, failure)
 
     def _tasks(self, q: np.ndarray, v: np.ndarray) -> list[TaskTerm]:
         gains = self.gains

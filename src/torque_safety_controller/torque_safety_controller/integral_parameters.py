@@ -19,6 +19,9 @@ from viability_bounds_pkg.ros_parameters import Parameter, ParameterError, per_j
 BUDGET = 0.1
 """Default budget in torque limits: the paper's tau_m."""
 
+DISTURBANCE_MAX = 2.0
+"""Disturbances beyond this many torque limits are not integrated."""
+
 TASKS = {"pose": slice(0, 6), "position": slice(0, 3)}
 """Rows of the pose's Jacobian that are a task of integral action ``task``."""
 
@@ -117,6 +120,7 @@ def additional_settings(
             NullspaceSettings(**common, keep_integral=as_printed)
             if rows.stop < len(joints)
             else None,
+            DISTURBANCE_MAX * tau_max,
         )
     except IntegralSettingsError as error:
         name = f"integral_{_NAME_OF.get(error.name, error.name)}"
