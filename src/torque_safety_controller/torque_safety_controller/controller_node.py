@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import sys
 import time
-from array import array
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
@@ -27,24 +24,20 @@ from torque_safety_controller.controller_parameters import (
 from torque_safety_controller.handover import Control, Handover, HandoverRefused
 from torque_safety_controller.modes import Mode, ModeKeeper
 from torque_safety_controller.ros_controller_report import LEVELS, StepRecord
-from torque_safety_controller.ros_goals import (
-    GoalQueue,
-    GoalRefused,
-    pose_from_message,
-    posture_from_message,
-)
+from torque_safety_controller.ros_goals import GoalInbox
+from torque_safety_controller.ros_joint_commands import JointCommands
 from torque_safety_controller.ros_limits import LimitsReader
 from viability_bounds_pkg.ros_messages import Diagnostics, JointStateReader, Verdict
 from viability_bounds_pkg.ros_parameters import NodeParameters, ParameterError
-from viability_bounds_pkg.ros_runtime import CONTROL_QOS, GOAL_QOS, run
+from viability_bounds_pkg.ros_runtime import CONTROL_QOS, run
 
 
 class ControllerNode(Node):
     """Answers each joint state, once its acceleration limits are there, with torques.
 
-    Subscribes to ``joint_states``, ``acceleration_limits``, ``target_pose`` and
-    ``target_posture``; publishes ``joint_commands`` with the stamp of the state answered. The
-    service ``~/enable_torque`` hands over between the robot's position control and torque.
+    Subscribes to ``joint_states``, ``acceleration_limits`` and goals; publishes
+    ``joint_commands`` with the stamp of the state answered. The service ``~/enable_torque``
+    hands over between the robot's position control and torque.
     """
 
     def __init__(self, **node_arguments: Any) -> None:
@@ -53,7 +46,7 @@ class ControllerNode(Node):
             self._node_parameters = NodeParameters(
                 self, TABLE, make_configuration, self._configure
             )
-            robot, self._base = load_robot(self._node_parameters.values, self)
+            robot, base = load_robot(self._node_parameters.values, self)
         except ParameterError:
             self.destroy_node()
             raise
@@ -63,10 +56,12 @@ class ControllerNode(Node):
             robot, config.tau_max, config.gains, config.tau_rate_max, self._additional
         )
         self._controller.warm_up()
-        self._handover = Handover(config.start_control, config.joints, config.q_min, config.q_max)
+        self._handover = Handover(
+            config.start_control, config.joints, config.q_min, config.q_max, config.tau_max
+        )
         self._states = JointStateReader(config.joints, config.state_timeout)
         self._limits = LimitsReader(config.joints)
-        self._goals = GoalQueue()
+        self._goals = GoalInbox(self, self._controller, config, base)
         self._modes = ModeKeeper()
         self._goal_at = time.monotonic()
         self._message_at = self._state_at = self._waiting_since = -np.inf
@@ -75,22 +70,11 @@ class ControllerNode(Node):
         self._bounds_lost = False
         self._record = StepRecord(len(config.joints))
 
-        self._command = JointState(name=list(config.joints))
-        self._positions = JointState(
-            name=list(config.joints), velocity=np.zeros(len(config.joints)).tolist()
-        )
-        self._publisher = self.create_publisher(JointState, "joint_commands", CONTROL_QOS)
-        self._efforts = None
-        if config.ros2_control_topic:
-            self._efforts = self.create_publisher(
-                Float64MultiArray, config.ros2_control_topic, CONTROL_QOS
-            )
+        self._commands = JointCommands(self, config.joints, config.ros2_control_topic)
         self.create_subscription(JointState, "joint_states", self._on_state, CONTROL_QOS)
         self.create_subscription(
             JointTrajectory, "acceleration_limits", self._on_limits, CONTROL_QOS
         )
-        self.create_subscription(PoseStamped, "target_pose", self._on_pose, GOAL_QOS)
-        self.create_subscription(JointState, "target_posture", self._on_posture, GOAL_QOS)
         self.create_service(SetBool, "~/enable_torque", self._on_enable_torque)
         # Watchdogs must bark when time itself, as the clock topic tells it, stands still.
         self._watchdog = self.create_timer(
@@ -120,7 +104,7 @@ class ControllerNode(Node):
             self._begin(verdict)
         elif verdict is Verdict.REPEAT:
             if self._answered_stamp == last:
-                self._send(message.header.stamp)
+                self._commands.again(message.header.stamp)
             return
         elif self._answered_stamp == last:
             self._waiting_since = now
@@ -138,7 +122,7 @@ class ControllerNode(Node):
         self._answered_stamp = -1
         self._waiting_since = self._state_at
         self._controller.start(self._states.q)
-        self._handover.forget()
+        self._handover.robot_was_away()
 
     def _on_limits(self, message: JointTrajectory) -> None:
         if not self._limits.read(message):
@@ -152,13 +136,13 @@ class ControllerNode(Node):
     def _track(self, stamp: Any) -> None:
         """Answer the newest state, whose acceleration limits are there."""
         self._bounds_lost = False
+        if self._handover.by_drives:
+            self._take_over(stamp)
+            return
         if self._goals.apply_due(self._states.stamp):
             self._goal_at = time.monotonic()
         states, limits = self._states, self._limits
         now = states.q, states.v, limits.lower, limits.upper
-        if self._handover.by_drives:
-            self._take_over(stamp)
-            return
         if self._goal_lost():
             step = self._controller.rest(*now, self._elapsed())
         else:
@@ -178,8 +162,7 @@ class ControllerNode(Node):
     def _answer(self, step: Step, stamp: Any) -> None:
         """Publish the torques of `step` for the state with `stamp`."""
         now = time.monotonic()
-        self._command.effort = array("d", step.tau.tobytes())
-        self._send(stamp)
+        self._commands.torque(step.tau, stamp)
         self._answered_stamp = self._states.stamp
         self._record.note(step, now - self._message_at)
         if step.tracking:
@@ -196,16 +179,6 @@ class ControllerNode(Node):
             return "goal lost"
         return "no goal"
 
-    def _send(self, stamp: Any) -> None:
-        if self._handover.by_drives:
-            self._positions.header.stamp = stamp
-            self._publisher.publish(self._positions)
-            return
-        self._command.header.stamp = stamp
-        self._publisher.publish(self._command)
-        if self._efforts is not None:
-            self._efforts.publish(Float64MultiArray(data=self._command.effort))
-
     def _hold(self, stamp: Any) -> None:
         """Answer the newest state without acceleration limits."""
         states = self._states
@@ -215,41 +188,47 @@ class ControllerNode(Node):
 
     def _hold_position(self, stamp: Any) -> None:
         """Answer the newest state with the position that the drives hold."""
-        q = self._handover.hold(self._states.q)
-        self._positions.position = array("d", q.tobytes())
-        self._send(stamp)
+        self._commands.position(self._handover.hold(self._states.q), stamp)
         self._answered_stamp = self._states.stamp
-        self._enter(Mode.POSITION, self._handover.control.value)
+        self._enter(Mode.POSITION, self._handover.reason)
 
     def _take_over(self, stamp: Any) -> None:
         """Prepare to go on with torque from the next state; this one is still the drives'."""
         states, limits = self._states, self._limits
-        tau = states.effort()
-        failure = "joint_states carry no motor torque (effort)"
-        if tau is not None:
-            step = self._controller.take_over(states.q, states.v, limits.lower, limits.upper, tau)
-            failure = step.failure
         self._hold_position(stamp)
-        if failure:
-            self._handover.forget()
-            self.get_logger().error(f"handover to torque control failed: {failure}")
-        else:
-            self._goal_at = time.monotonic()
-            self._handover.taken_over()
+        if self._goals.apply_due(states.stamp):
+            self.get_logger().warning("goals from before the handover are dropped")
+        try:
+            tau = self._handover.check(states.q, states.effort())
+        except HandoverRefused as error:
+            self._fail_handover(str(error))
+            return
+        step = self._controller.take_over(states.q, states.v, limits.lower, limits.upper, tau)
+        if step.failure:
+            self._fail_handover(f"solver failed: {step.failure}")
+            return
+        self._goal_at = time.monotonic()
+        self._handover.taken_over()
+
+    def _fail_handover(self, reason: str) -> None:
+        self._handover.failed(reason)
+        self.get_logger().error(self._handover.reason)
+        self._enter(Mode.POSITION, self._handover.reason)
 
     def _on_enable_torque(
         self, request: SetBool.Request, response: SetBool.Response
     ) -> SetBool.Response:
-        states, now = self._states, time.monotonic()
-        fresh = now - self._state_at < self._config.state_timeout
+        states, silence = self._states, time.monotonic() - self._state_at
+        config = self._config
         try:
             if request.data:
-                self._handover.to_torque(
-                    states.q, states.effort(), fresh, self._limits_follow(states.stamp)
-                )
+                fresh = silence < config.bounds_timeout
+                follow = self._limits_follow(states.stamp)
+                self._handover.to_torque(states.q, states.effort(), fresh, follow)
+                self._bounds_lost = False
                 response.message = "torque control begins with the next state"
             else:
-                self._handover.to_position(states.q, fresh)
+                self._handover.to_position(states.q, silence < config.state_timeout)
                 response.message = "position control begins with the next state"
             response.success = True
         except HandoverRefused as error:
@@ -259,8 +238,8 @@ class ControllerNode(Node):
 
     def _limits_follow(self, stamp: int) -> bool:
         """Return whether acceleration limits keep up with the state with this stamp, ns."""
-        late = 1e-9 * (stamp - self._limits.stamp)
-        return self._limits.stamp >= 0 and late <= self._config.bounds_timeout
+        apart = 1e-9 * abs(stamp - self._limits.stamp)  # those of another run may lie ahead
+        return self._limits.stamp >= 0 and apart <= self._config.bounds_timeout
 
     # Watchdogs
 
@@ -276,8 +255,7 @@ class ControllerNode(Node):
         if waiting and now - self._waiting_since > config.bounds_timeout:
             self._bounds_lost = True
             if self._handover.by_drives:
-                self._handover.forget()
-                self.get_logger().error("handover failed: acceleration limits are stale")
+                self._fail_handover("acceleration limits are stale")
                 self._hold_position(self._message_stamp)
             else:
                 self._hold(self._message_stamp)
@@ -289,9 +267,8 @@ class ControllerNode(Node):
             if self._handover.by_drives:
                 self._hold_position(self._message_stamp)
                 return
-            step = self._controller.hold(self._states.q, np.zeros_like(self._states.v))
-            self._command.effort = array("d", step.tau.tobytes())
-            self._send(self._message_stamp)
+            step = self._controller.hold(self._states.q, np.zeros_like(self._states.v), 0.0)
+            self._commands.torque(step.tau, self._message_stamp)
             self._enter(Mode.HOLD, self._why_refused())
 
     def _why_refused(self) -> str:
@@ -307,27 +284,6 @@ class ControllerNode(Node):
         else:
             self.get_logger().warning(text)
         self._diagnostics.publish()
-
-    # Goals
-
-    def _on_pose(self, message: PoseStamped) -> None:
-        try:
-            pose = pose_from_message(message, self._config.base_frame)
-        except GoalRefused as error:
-            return self._refuse_goal("target_pose", error)
-        self._goals.add(message, lambda: self._controller.set_pose_goal(self._base * pose))
-
-    def _on_posture(self, message: JointState) -> None:
-        config = self._config
-        try:
-            q_des = posture_from_message(message, config.joints, config.q_min, config.q_max)
-        except GoalRefused as error:
-            return self._refuse_goal("target_posture", error)
-        self._goals.add(message, lambda: self._controller.set_posture_goal(q_des))
-
-    def _refuse_goal(self, topic: str, error: GoalRefused) -> None:
-        self._goals.refused[topic] += 1
-        self.get_logger().warning(f"{topic} refused: {error}")
 
     # Diagnostics
 

@@ -11,6 +11,10 @@ from __future__ import annotations
 from enum import Enum
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+TORQUE_TOLERANCE = 0.01
+"""By how much of its limit a measured torque may exceed it: the step that is left is no larger."""
 
 
 class Control(Enum):
@@ -35,16 +39,27 @@ class Handover:
         joints: names of the n joints.
         q_min: lower position limits, shape (n,), rad.
         q_max: upper position limits, shape (n,), rad.
+        tau_max: torque limits, shape (n,), N m.
 
     Attributes:
         control: who is in command.
-        q_hold: where the drives are to hold the joints, shape (n,), rad.
+        reason: why it is they.
     """
 
-    def __init__(self, control: str, joints: tuple[str, ...], q_min, q_max) -> None:
-        self.control = Control(control)
-        self.q_hold: np.ndarray | None = None
-        self._joints, self._q_min, self._q_max = joints, q_min, q_max
+    def __init__(
+        self,
+        control: str,
+        joints: tuple[str, ...],
+        q_min: ArrayLike,
+        q_max: ArrayLike,
+        tau_max: ArrayLike,
+    ) -> None:
+        self.control = self._start = Control(control)
+        self.reason = "as at start"
+        self._q_hold: np.ndarray | None = None
+        self._joints = joints
+        self._q_min, self._q_max = np.asarray(q_min), np.asarray(q_max)
+        self._tau_max = np.asarray(tau_max)
 
     @property
     def by_drives(self) -> bool:
@@ -52,16 +67,20 @@ class Handover:
         return self.control is not Control.TORQUE
 
     def hold(self, q: np.ndarray) -> np.ndarray:
-        """Return where the drives are to hold the joints, captured at the first call."""
-        if self.q_hold is None:
-            self.q_hold = q.copy()
-        return self.q_hold
+        """Return where the drives are to hold the joints, captured at the first call.
 
-    def forget(self) -> None:
-        """Capture the position anew: the robot started over."""
-        self.q_hold = None
-        if self.control is Control.TAKING_OVER:
-            self.control = Control.POSITION
+        Args:
+            q: position now, shape (n,), rad.
+        """
+        if self._q_hold is None:
+            self._q_hold = q.copy()
+        return self._q_hold
+
+    def robot_was_away(self) -> None:
+        """Begin anew, the robot having been silent or started over: never with torque unasked."""
+        if self._start is Control.POSITION or self.control is Control.TAKING_OVER:
+            self._set(Control.POSITION, "the robot was silent or started over")
+        self._q_hold = None
 
     def to_torque(
         self, q: np.ndarray, tau: np.ndarray | None, fresh: bool, bounds_fresh: bool
@@ -83,20 +102,40 @@ class Handover:
             raise HandoverRefused("no joint state, or only old ones")
         if not bounds_fresh:
             raise HandoverRefused("no acceleration limits, or only old ones")
-        outside = np.flatnonzero((q < self._q_min) | (q > self._q_max))
-        if outside.size:
-            names = ", ".join(self._joints[j] for j in outside)
-            raise HandoverRefused(f"outside the position limits: {names}")
+        self.check(q, tau)
+        self._set(Control.TAKING_OVER, "enable_torque")
+
+    def check(self, q: np.ndarray, tau: np.ndarray | None) -> np.ndarray:
+        """Return `tau`, if torque control can begin in this state; see `to_torque`.
+
+        Raises:
+            HandoverRefused: it cannot.
+        """
+        outside = (q < self._q_min) | (q > self._q_max)
+        if outside.any():
+            raise HandoverRefused(f"outside the position limits: {self._names(outside)}")
         if tau is None:
             raise HandoverRefused("joint_states carry no motor torque (effort)")
-        self.control = Control.TAKING_OVER
+        beyond = np.abs(tau) > (1.0 + TORQUE_TOLERANCE) * self._tau_max
+        if beyond.any():
+            raise HandoverRefused(f"motor torque beyond torque_max: {self._names(beyond)}")
+        return tau
 
     def taken_over(self) -> None:
         """Note that torque is commanded from the next step on."""
-        self.control = Control.TORQUE
+        self._set(Control.TORQUE, "enable_torque")
+        self._q_hold = None
+
+    def failed(self, reason: str) -> None:
+        """Leave the arm to the drives, where they hold it."""
+        self._set(Control.POSITION, f"handover failed: {reason}")
 
     def to_position(self, q: np.ndarray, fresh: bool) -> None:
         """Let the drives hold the arm where it is.
+
+        Args:
+            q: position, shape (n,), rad.
+            fresh: whether joint states come.
 
         Raises:
             HandoverRefused: they do so already, or nobody knows where it is.
@@ -105,5 +144,12 @@ class Handover:
             raise HandoverRefused("position control is on already")
         if not fresh:
             raise HandoverRefused("no joint state, or only old ones")
-        self.control = Control.POSITION
-        self.q_hold = q.copy()
+        if self.control is Control.TORQUE:
+            self._q_hold = q.copy()
+        self._set(Control.POSITION, "enable_torque")
+
+    def _set(self, control: Control, reason: str) -> None:
+        self.control, self.reason = control, reason
+
+    def _names(self, flags: np.ndarray) -> str:
+        return ", ".join(name for name, flag in zip(self._joints, flags, strict=True) if flag)

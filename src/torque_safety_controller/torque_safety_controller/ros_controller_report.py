@@ -79,6 +79,7 @@ class StepRecord:
             values |= {
                 "additional_torque_nm": controller.additional.last,
                 "joints_at_integral_budget": _named(joints, controller.additional.saturated),
+                "integral_skipped_steps": controller.additional.skipped,
             }
         return values
 

@@ -9,9 +9,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pinocchio as pin
 from geometry_msgs.msg import PoseStamped
+from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
-from viability_bounds_pkg.ros_runtime import stamp_to_ns
+from torque_safety_controller.controller import Controller
+from torque_safety_controller.controller_parameters import ControllerConfiguration
+from viability_bounds_pkg.ros_runtime import GOAL_QOS, stamp_to_ns
 
 _QUATERNION_TOLERANCE = 1e-3
 
@@ -87,3 +90,42 @@ class GoalQueue:
             self._pending.pop(0)[1]()
             due = True
         return due
+
+
+class GoalInbox(GoalQueue):
+    """Takes goals for `controller` from ``target_pose`` and ``target_posture``.
+
+    Args:
+        node: listens and logs what is refused.
+        controller: is given the goals when they are due.
+        config: has the names and limits that they are checked by.
+        base: placement of the base frame in the URDF's root frame.
+    """
+
+    def __init__(
+        self, node: Node, controller: Controller, config: ControllerConfiguration, base: pin.SE3
+    ) -> None:
+        super().__init__()
+        self._controller, self._config, self._base = controller, config, base
+        self._logger = node.get_logger()
+        node.create_subscription(PoseStamped, "target_pose", self._on_pose, GOAL_QOS)
+        node.create_subscription(JointState, "target_posture", self._on_posture, GOAL_QOS)
+
+    def _on_pose(self, message: PoseStamped) -> None:
+        try:
+            pose = pose_from_message(message, self._config.base_frame)
+        except GoalRefused as error:
+            return self._refuse("target_pose", error)
+        self.add(message, lambda: self._controller.set_pose_goal(self._base * pose))
+
+    def _on_posture(self, message: JointState) -> None:
+        config = self._config
+        try:
+            q_des = posture_from_message(message, config.joints, config.q_min, config.q_max)
+        except GoalRefused as error:
+            return self._refuse("target_posture", error)
+        self.add(message, lambda: self._controller.set_posture_goal(q_des))
+
+    def _refuse(self, topic: str, error: GoalRefused) -> None:
+        self.refused[topic] += 1
+        self._logger.warning(f"{topic} refused: {error}")
