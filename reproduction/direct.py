@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from chain import load_values
+import yaml
+from chain import ROOT
 
 from sim_bridge import bullet_parameters
 from sim_bridge.limit_monitor import LimitMonitor
@@ -49,8 +50,9 @@ class DirectLoop:
     """
 
     def __init__(self, robot: str, changed: Mapping[str, Any] | None = None) -> None:
-        self._given = load_values(robot) | dict(changed or {})
-        bullet = self._values(bullet_parameters.TABLE)
+        self._file = yaml.safe_load((ROOT / "config" / f"{robot}.yaml").read_text())
+        self._changed = dict(changed or {})
+        bullet = self._values("bullet_node", bullet_parameters.TABLE)
         config = bullet_parameters.make_configuration(bullet)
         self.robot = bullet_parameters.make_robot(config, bullet)
         self.robot.monitor = LimitMonitor(
@@ -68,11 +70,11 @@ class DirectLoop:
             bullet["rotor_inertia"] if len(bullet["rotor_inertia"]) else None,
         )
         bounds = bounds_parameters.make_configuration(
-            self._values(bounds_parameters.TABLE), lambda _: self.model
+            self._values("bounds_node", bounds_parameters.TABLE), lambda _: self.model
         )
         self.limits = bounds.limits
         self._bounds = bounds.solve
-        values = self._values(controller_parameters.TABLE)
+        values = self._values("controller_node", controller_parameters.TABLE)
         made = controller_parameters.make_configuration(values)
         self._additional = AdditionalTorque(made.additional, made.task_rows)
         self.controller = Controller(
@@ -88,13 +90,19 @@ class DirectLoop:
         self.robot.reset(config.q_start, np.zeros(len(config.joints)))
         self.begin()
 
-    def _values(self, table: tuple[Parameter, ...]) -> dict[str, Any]:
-        return {row.name: row.coerce(self._given.get(row.name)) for row in table}
+    def _values(self, node: str, table: tuple[Parameter, ...]) -> dict[str, Any]:
+        """Return a node's parameters as it would get them from the file."""
+        given: dict[str, Any] = {}
+        for section in ("/**", f"/**/{node}"):
+            given |= self._file.get(section, {}).get("ros__parameters", {})
+        given |= self._changed
+        return {row.name: row.coerce(given.get(row.name)) for row in table}
 
     def change(self, **parameters: Any) -> None:
         """Change live parameters of the controller, as a running node would."""
-        self._given |= parameters
-        made = controller_parameters.make_configuration(self._values(controller_parameters.TABLE))
+        self._changed |= parameters
+        values = self._values("controller_node", controller_parameters.TABLE)
+        made = controller_parameters.make_configuration(values)
         self.controller.gains = made.gains
         self._additional.settings = made.additional
 

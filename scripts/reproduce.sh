@@ -10,6 +10,7 @@ root="$(cd "$(dirname "$0")/.." && pwd)"
 what="${1:-all}"
 [ $# -eq 0 ] || shift
 [ "$what" != all ] || what=paper0
+what="${what//-/_}"
 if [ ! -f "$root/reproduction/$what.py" ]; then
     echo "usage: bash scripts/reproduce.sh all|paper0 [figure]|state_dependent|exactness [options]" >&2
     exit 2

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from torque_safety_controller.additional_torque import AdditionalTorque
+from torque_safety_controller.additional_torque import LONGEST_GAP, AdditionalTorque
+from torque_safety_controller.disturbance_observer import DisturbanceObserver
 from torque_safety_controller.inverse_dynamics_qp import InverseDynamicsQP, NoSolutionFound
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks import (
@@ -33,6 +34,8 @@ class Gains:
         posture_weight: of the posture task, > 0.
         posture_in_null_space: whether the posture leaves the pose alone.
         hold_kd: damping in HOLD, 1/s.
+        disturbance_time: time constant with which what disturbs the accelerations is learned
+            and kept out of the bounds, s; None not to.
     """
 
     pose_kp: float
@@ -43,6 +46,7 @@ class Gains:
     posture_weight: float
     posture_in_null_space: bool
     hold_kd: float
+    disturbance_time: float | None = None
 
 
 class Step(NamedTuple):
@@ -104,6 +108,7 @@ class Controller:
         self._tau_min = -self.tau_max
         self.additional = additional
         self._qp = InverseDynamicsQP(n)
+        self._observer = DisturbanceObserver(n, gains.disturbance_time)
         self._a_last = np.zeros(n)
         self._tau_last: np.ndarray | None = None
         self._posture = np.zeros(n)
@@ -117,6 +122,7 @@ class Controller:
         """Forget the past; `q` becomes the posture that the null space is held at."""
         self._a_last = np.zeros(self.robot.n)
         self._tau_last = None
+        self._observer.start()
         self._posture = q.copy()
         if self.additional is not None:
             self.additional.start()
@@ -225,9 +231,14 @@ class Controller:
         robot, additional = self.robot, self.additional
         robot.rates = additional is not None and not additional.idle
         robot.update(q, v, self._a_last)
+        elapsed = robot.dt if elapsed is None else elapsed
+        observer = self._observer
+        observer.time_constant = self.gains.disturbance_time
+        known = elapsed if elapsed <= LONGEST_GAP * robot.dt else 0.0
+        observer.observe(v, self._a_last, known, self.tau_max, robot.M)
         if not robot.rates:
             return None
-        return additional.torque(robot, v, self._a_last, robot.dt if elapsed is None else elapsed)
+        return additional.torque(robot, v, self._a_last, elapsed)
 
     def _solve(
         self, q, v, tasks: list[TaskTerm], a_lower, a_upper, additional, tracking: bool
@@ -235,6 +246,7 @@ class Controller:
         robot = self.robot
         bias = robot.h if additional is None else robot.h + additional
         lower, upper = self._torque_range()
+        a_lower, a_upper = self._observer.shift(a_lower, a_upper)
         try:
             solution = self._qp.solve(tasks, a_lower, a_upper, robot.M, lower - bias, upper - bias)
         except NoSolutionFound as error:
@@ -254,6 +266,7 @@ class Controller:
 
     def _hold(self, q, v, additional, failure: str) -> Step:
         robot = self.robot
+        self._observer.start()  # what is asked for here may be more than the motors can give
         a = -self.gains.hold_kd * v
         bias = robot.h
         if additional is not None and np.isfinite(additional).all():

@@ -58,6 +58,14 @@ TABLE = (
         live=True,
     ),
     Parameter("hold_kd", float, "damping in HOLD, 1/s", default=20.0, live=True),
+    Parameter(
+        "disturbance_time",
+        float,
+        "time constant with which what disturbs the accelerations is learned and kept out of "
+        "the bounds, s; -1: not at all",
+        default=-1.0,
+        live=True,
+    ),
     *integral_parameters.TABLE,
     Parameter(
         "start_control",
@@ -157,6 +165,11 @@ def _gains(values: Mapping[str, Any]) -> Gains:
         gains[name] = (
             critical_damping(gains[f"{task}_kp"]) if kd == -1.0 else positive(values, name)
         )
+    time = values["disturbance_time"]
+    if time == -1.0:
+        gains["disturbance_time"] = None
+    else:
+        gains["disturbance_time"] = positive(values, "disturbance_time", zero=True)
     return Gains(**gains, posture_in_null_space=values["posture_in_null_space"])
 
 

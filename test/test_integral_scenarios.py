@@ -1,0 +1,78 @@
+"""TALOS' arm with friction, rotors and mass errors at 1 kHz: what the integral action is for.
+
+Shorter runs of what `scripts/reproduce.sh paper1-integral` plays.
+"""
+
+import numpy as np
+import pytest
+from direct import DirectLoop, column
+from paper1_integral import (
+    PAPER,
+    PUSHES,
+    ROBOT,
+    UNLIMITED,
+    Disturbed,
+    distance,
+    goal,
+    push,
+)
+
+
+def error_at_rest(changed):
+    loop = DirectLoop(ROBOT, changed)
+    start = loop.pose()
+    errors = []
+    for offset in ((0.05, 0.1, 0.15), (0.1, -0.1, -0.05)):
+        goal(loop, start, offset)
+        errors.append(distance(loop.run(5.0))[-1000:].mean())
+    return np.mean(errors)
+
+
+def test_steady_error_is_ten_times_smaller():
+    assert error_at_rest({}) < 0.1 * error_at_rest({"integral_action": "none"})
+
+
+@pytest.mark.parametrize("force", PUSHES)
+def test_push_and_release(force):
+    without, limited = push(UNLIMITED, force), push(PAPER, force)
+    assert limited["share"] <= 1.0 + 1e-9 < 2.0 < without["share"]
+    assert limited["overshoot"] <= without["overshoot"] / 3.0
+    assert limited["recovery"] <= 1.0
+
+
+def test_nothing_passes_a_limit_whatever_happens():
+    run = Disturbed({})
+    run.run(0.25)
+    assert run.steps == 15_000
+    assert run.not_finite == 0 and run.torque_ratio <= 1.0
+    assert run.deepest == 0.0 and run.fastest == 0.0
+
+
+def test_a_pause_of_the_robot_does_not_kick():
+    """It was shoved somewhere else in the meantime."""
+    loop = DirectLoop(ROBOT)
+    loop.run(0.5)
+    before = loop.samples[-1]
+    q, v, _ = loop.robot.state()
+    loop.robot.reset(q + 0.05, v + 0.2)
+    bounds = loop.limits
+    step = loop.controller.step(q + 0.05, v + 0.2, bounds.a_min, bounds.a_max, elapsed=3.0)
+    additional = loop.controller.additional.last
+    assert np.isfinite(step.tau).all()
+    jump = np.abs(additional - before.additional) / loop.config.tau_max
+    assert jump.max() < 1e-2
+
+
+def test_the_handover_does_not_jolt():
+    loop = DirectLoop(ROBOT)
+    q = loop.config.q_start.copy()
+    for k in range(1200):
+        q[5] = loop.config.q_start[5] + 0.1 * min(1.0, k / 1000)
+        loop.move(q)
+    loop.take_over(q)
+    loop.run(0.2)
+    samples = tuple(loop.samples[1000:])
+    jumps = np.abs(np.diff(column(samples, "tau"), axis=0)) / loop.config.tau_max
+    # The drives' last step is 1200, counted from the beginning.
+    assert jumps[200].max() < np.delete(jumps, 200, axis=0).max() + 0.01
+    assert np.ptp(column(samples, "q")[200:], axis=0).max() < 1e-3
