@@ -48,8 +48,24 @@ def _solve_positive_definite(A: np.ndarray, x: np.ndarray) -> bool:
 
 
 @njit(cache=True)
-def add_rows(H: np.ndarray, g: np.ndarray, A: np.ndarray, b: np.ndarray, weight: float) -> None:
-    """Add ``weight * |A a - b|^2 / 2`` to the cost ``a' H a / 2 + g' a``, in place."""
+def clear_cost(H: np.ndarray, g: np.ndarray, gamma: float) -> None:
+    """Make the cost ``x' H x / 2 + g' x`` into ``gamma |x|^2 / 2``, in place."""
+    n = len(g)
+    for i in range(n):
+        for j in range(n):
+            H[i, j] = 0.0
+        H[i, i] = gamma
+        g[i] = 0.0
+
+
+@njit(cache=True)
+def add_rows(
+    H: np.ndarray, g: np.ndarray, A: np.ndarray, b: np.ndarray, weight: float, first: int
+) -> None:
+    """Add ``weight * |A z - b|^2 / 2`` to the cost ``x' H x / 2 + g' x``, in place.
+
+    z are as many of x as A has columns, from index `first` on.
+    """
     m, n = A.shape
     for i in range(n):
         for j in range(i + 1):
@@ -57,18 +73,18 @@ def add_rows(H: np.ndarray, g: np.ndarray, A: np.ndarray, b: np.ndarray, weight:
             for k in range(m):
                 s += A[k, i] * A[k, j]
             s *= weight
-            H[i, j] += s
+            H[first + i, first + j] += s
             if i != j:
-                H[j, i] += s
+                H[first + j, first + i] += s
         s = 0.0
         for k in range(m):
             s += A[k, i] * b[k]
-        g[i] -= weight * s
+        g[first + i] -= weight * s
 
 
 @njit(cache=True)
 def add_identity(H: np.ndarray, g: np.ndarray, b: np.ndarray, weight: float) -> None:
-    """Add ``weight * |a - b|^2 / 2`` to the cost ``a' H a / 2 + g' a``, in place."""
+    """Add ``weight * |z - b|^2 / 2`` to the cost ``x' H x / 2 + g' x``, z the first of x."""
     for i in range(len(b)):
         H[i, i] += weight
         g[i] -= weight * b[i]
@@ -129,66 +145,3 @@ def null_space_part(J: np.ndarray, x: np.ndarray, regularisation: float) -> np.n
                 s += J[i, k] * y[i]
             result[k] -= s
     return result
-
-
-@njit(cache=True)
-def minimum_with_bounds_active(
-    H: np.ndarray,
-    g: np.ndarray,
-    side: np.ndarray,
-    a_lower: np.ndarray,
-    a_upper: np.ndarray,
-    M: np.ndarray,
-    tau_lower: np.ndarray,
-    tau_upper: np.ndarray,
-    a: np.ndarray,
-) -> bool:
-    """Minimise ``a' H a / 2 + g' a`` with some bounds active; tell whether that is optimal.
-
-    Args:
-        H: shape (n, n), positive definite.
-        g: shape (n,).
-        side: which bound is active, shape (n,): 1 the lower, -1 the upper, 0 none.
-        a_lower: lower bounds of a, shape (n,).
-        a_upper: upper bounds of a, shape (n,).
-        M: shape (n, n).
-        tau_lower: lower bounds of M a, shape (n,).
-        tau_upper: upper bounds of M a, shape (n,).
-        a: shape (n,), receives the minimum.
-
-    Returns:
-        Whether all bounds are kept and no active one pulls inward: the Karush-Kuhn-Tucker
-        conditions, so that `a` is the constrained minimum. A NaN anywhere makes it False.
-    """
-    n = len(g)
-    K = np.empty((n, n))
-    for i in range(n):
-        if side[i] == 0:
-            s = -g[i]
-            for j in range(n):
-                if side[j] == 0:
-                    K[i, j] = H[i, j]
-                else:
-                    K[i, j] = 0.0
-                    s -= H[i, j] * (a_lower[j] if side[j] > 0 else a_upper[j])
-            a[i] = s
-        else:
-            for j in range(n):
-                K[i, j] = 0.0
-            K[i, i] = 1.0
-            a[i] = a_lower[i] if side[i] > 0 else a_upper[i]
-    if not _solve_positive_definite(K, a):
-        return False
-    for i in range(n):
-        tau = 0.0
-        for j in range(n):
-            tau += M[i, j] * a[j]
-        if not (a_lower[i] <= a[i] <= a_upper[i] and tau_lower[i] <= tau <= tau_upper[i]):
-            return False
-        if side[i] != 0:
-            slope = g[i]
-            for j in range(n):
-                slope += H[i, j] * a[j]
-            if not slope * side[i] >= 0.0:
-                return False
-    return True

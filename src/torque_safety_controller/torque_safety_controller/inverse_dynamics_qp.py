@@ -1,47 +1,49 @@
-"""The QP for joint accelerations: eq. (33) of [DelPrete2018], eq. (5) of [Benallegue2021].
+"""The QP for joint accelerations and contact forces: eq. (5) of [Benallegue2021].
 
-    minimise    sum_t w_t |A_t a - b_t|^2 + gamma |a|^2
-    subject to  a_lower <= a <= a_upper,   tau_min <= M a + h <= tau_max.
+    minimise    sum_t w_t |A_t a - b_t|^2 + sum_c w_c |W_c rho - F_c|^2 + gamma (|a|^2 + |rho|^2)
+    subject to  a_lower <= a <= a_upper,   lower <= G a <= upper,   0 <= rho <= rho_max,
+                tau_min <= M a + h - B rho <= tau_max.
 
-Torques are eliminated by the dynamics, so that n accelerations are the only variables. The
-torque rows always have a solution, as M is regular; together with the acceleration bounds they
-may not. Then the torque rows win and the bounds give way as little as possible, in the sense
-of least squares.
+Without contacts it is eq. (33) of [DelPrete2018]. Torques are eliminated by the dynamics. The
+torque rows always have a solution, without force, as M is regular; together with the bounds of
+the accelerations and the rows G a they may not. Then the torque rows win, and bounds and rows
+give way as little as possible, in the sense of least squares.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from proxsuite import proxqp
 
-from torque_safety_controller.dense_kernels import (
-    add_identity,
-    add_rows,
-    minimum_with_bounds_active,
+from torque_safety_controller.active_set import (
+    FAILED,
+    INFEASIBLE,
+    minimise,
+    minimise_dynamics,
 )
-from torque_safety_controller.tasks import TaskTerm
+from torque_safety_controller.constraints import Rows
+from torque_safety_controller.dense_kernels import add_identity, add_rows, clear_cost
+from torque_safety_controller.tasks import TaskTerm, WrenchTerm
 
-_TOLERANCE = 1e-8  # rad/s^2 and N m at most
-# Solvable problems take up to 11 outer and 50 inner iterations. ProxQP's own limits let one
-# without a solution go on for 15 s.
-_OUTER_ITERATIONS = 25
-_INNER_ITERATIONS = 50
-# With ProxQP's own 1e-4, problems with little room are taken for ones without a solution.
-_INFEASIBILITY_TOLERANCE = 1e-8
-# What giving way costs, relative to the tasks' gradient: the bounds give way by up to 5e-5
-# rad/s^2 more than they must, and the solver still tells good accelerations from bad ones.
-_PENALTY = 1e5
-_RELAXED_TOLERANCE = 1e-10
-# How near to a bound a solution of the solver counts as being at it, rad/s^2.
-_AT_BOUND = 1e-4
-_KEPT = 1e-6  # rad/s^2 and N m
-# Less relaxation than this, rad/s^2, is none: one problem in a thousand that has a solution is
-# taken for one that has not.
-_NEGLIGIBLE = 1e-4
+# Weight of |x|^2 beside the squared relaxation: what it adds to the least is of this order.
+_RELAXED_REGULARISATION = 1e-10
+# Room that is left to the tasks beyond the least relaxation, relative to it where it is above 1.
+_ROOM = 1e-8
+_NEGLIGIBLE = 1e-6
+"""Less relaxation than this, rad/s^2, is none."""
+
+
+class ContactForces(NamedTuple):
+    """Forces of the environment on the arm, W rho with rho >= 0."""
+
+    B: np.ndarray
+    """What rho adds to the joint torques, the sum of J' W: shape (n, r)."""
+    rho_max: np.ndarray
+    """Shape (r,), N: inf, or 0 for contacts that are open."""
+    tasks: Sequence[WrenchTerm] = ()
+    """What the forces should be."""
 
 
 class Solution(NamedTuple):
@@ -50,30 +52,36 @@ class Solution(NamedTuple):
     a: np.ndarray
     """Accelerations, shape (n,), rad/s^2."""
     relaxation: np.ndarray | None
-    """By how much bounds gave way, shape (n,), rad/s^2; None when none had to."""
+    """By how much bounds gave way, shape (n,), rad/s^2; None when nothing had to."""
     iterations: int
+    """Changes of the active constraints, from those of the last solution."""
+    row_relaxation: np.ndarray | None = None
+    """By how much rows gave way, shape (k,), in their units; None when nothing had to."""
+    rho: np.ndarray | None = None
+    """Coefficients of the contact forces, shape (r,), N; None without contacts."""
+    contact_torque: np.ndarray | None = None
+    """B rho, shape (n,), N m: the motors give M a + h minus this; None without contacts."""
 
 
 class NoSolutionFound(RuntimeError):
-    """The solver did not converge, or was given values that are not finite."""
+    """The solver was given values that are not finite, crossed, or absurd."""
 
 
 class InverseDynamicsQP:
-    """Assembles and solves the QP; the bounds active in the last solution are tried first.
+    """Assembles and solves the QP; the limits active in the last solution are tried first.
 
     Args:
         n: number of joints.
-        gamma: weight of |a|^2, relative to the largest task weight; keeps the solution unique.
+        gamma: weight of |x|^2, relative to the largest task weight; keeps the solution unique.
     """
 
     def __init__(self, n: int, gamma: float = 1e-6) -> None:
         self._n = n
         self._gamma = gamma
-        self._H = np.zeros((n, n))
-        self._g = np.zeros(n)
-        self._diagonal = np.einsum("ii->i", self._H)
-        self._qp: proxqp.dense.QP | None = None
-        self._side = np.zeros(n)  # of the bound that is active: 1 lower, -1 upper, 0 none
+        self._no_rows = Rows(np.zeros((0, n)), np.zeros(0), np.zeros(0))
+        self._no_contacts = ContactForces(np.zeros((n, 0)), np.zeros(0))
+        self._side = np.zeros(0)
+        self._size = (-1, -1)
 
     def solve(
         self,
@@ -83,126 +91,166 @@ class InverseDynamicsQP:
         M: np.ndarray,
         tau_lower: np.ndarray,
         tau_upper: np.ndarray,
+        rows: Rows | None = None,
+        contacts: ContactForces | None = None,
     ) -> Solution:
-        """Return the accelerations that serve the tasks best within the limits.
+        """Return the accelerations and forces that serve the tasks best within the limits.
 
         Args:
             tasks: at least one.
             a_lower: shape (n,), rad/s^2.
             a_upper: shape (n,), rad/s^2, not below `a_lower`.
             M: mass matrix, shape (n, n).
-            tau_lower: lower limits of M a, bias torque subtracted, shape (n,), N m.
-            tau_upper: upper limits of M a, shape (n,), N m.
+            tau_lower: lower limits of M a - B rho, bias torque subtracted, shape (n,), N m.
+            tau_upper: upper limits of M a - B rho, shape (n,), N m.
+            rows: further constraints on the accelerations; their number may change.
+            contacts: what the environment can exert; the number of forces may change.
 
         Raises:
-            NoSolutionFound: no solution, or numbers that are not finite.
+            NoSolutionFound: numbers that are not finite, limits that are crossed, or no weight.
+            ValueError: rows or contacts of the wrong shape.
         """
-        self._assemble(tasks)
-        # Mostly the bounds that were active in the last step still are, and no others: then the
-        # solution takes a tenth of what the solver needs.
-        a = np.empty(self._n)
-        if minimum_with_bounds_active(
-            self._H, self._g, self._side, a_lower, a_upper, M, tau_lower, tau_upper, a
-        ):
-            return Solution(a, None, 0)
-        if not self._is_usable(M, tau_lower, tau_upper, a_lower, a_upper):
-            raise NoSolutionFound("not finite, or lower limits above upper ones")
-        a, iterations = self._solve_main(M, tau_lower, tau_upper, a_lower, a_upper)
-        if a is not None:
-            np.clip(a, a_lower, a_upper, out=a)  # off by the solver's tolerance at most
-            self._note_active_bounds(a, a_lower, a_upper)
-            return Solution(a, None, iterations)
-        self._qp = None  # what it scales problems by was found for one with a solution
-        a, more = self._solve_relaxed(M, tau_lower, tau_upper, a_lower, a_upper)
-        relaxation = np.maximum(a_lower - a, a - a_upper).clip(0.0)
-        if relaxation.max() < _NEGLIGIBLE:
-            relaxation = None
-        return Solution(a, relaxation, iterations + more)
-
-    def _is_usable(self, M, tau_lower, tau_upper, a_lower, a_upper) -> bool:
-        """Return whether the problem is finite; limits may be infinite, but not crossed.
-
-        ProxQP takes a NaN in the limits for no limit, and searches long for one elsewhere.
-        """
-        total = self._g.dot(self._g) + self._H.sum() + M.sum()
-        return math.isfinite(total) and bool(
-            ((tau_lower <= tau_upper) & (a_lower <= a_upper)).all()
+        rows = self._no_rows if rows is None else self._checked_rows(rows)
+        forces = self._no_contacts if contacts is None else self._checked_forces(contacts)
+        self._resize(len(forces.rho_max), len(rows.lower))
+        self._assemble(tasks, forces.tasks)
+        x = np.empty(self._n + len(forces.rho_max))
+        iterations = minimise_dynamics(
+            self._H,
+            self._g,
+            self._C,
+            self._lower,
+            self._upper,
+            self._side,
+            x,
+            a_lower,
+            a_upper,
+            forces.rho_max,
+            M,
+            forces.B,
+            tau_lower,
+            tau_upper,
+            *rows,
         )
+        relaxation = row_relaxation = None
+        if iterations == INFEASIBLE:
+            relaxation, row_relaxation, iterations = self._relax(x)
+        elif iterations == FAILED:
+            raise NoSolutionFound("not finite, or lower limits above upper ones")
+        if contacts is None:
+            return Solution(x, relaxation, iterations, row_relaxation)
+        a, rho = x[: self._n], x[self._n :]
+        return Solution(a, relaxation, iterations, row_relaxation, rho, forces.B @ rho)
 
-    def _assemble(self, tasks: Sequence[TaskTerm]) -> None:
-        """Fill H and g; the largest weight becomes 1, so that the tolerance keeps its sense."""
-        scale = 1.0 / max(task.weight for task in tasks)
+    def _checked_rows(self, rows: Rows) -> Rows:
+        """Return `rows` in the one layout that the kernels are compiled for."""
+        G, lower, upper = (np.ascontiguousarray(each, dtype=float) for each in rows)
+        if G.shape != (len(lower), self._n) or lower.shape != upper.shape or lower.ndim != 1:
+            raise ValueError(
+                f"rows of {self._n} joints with G {G.shape}, lower {lower.shape}, "
+                f"upper {upper.shape}"
+            )
+        return Rows(G, lower, upper)
+
+    def _checked_forces(self, contacts: ContactForces) -> ContactForces:
+        B = np.ascontiguousarray(contacts.B, dtype=float)
+        rho_max = np.ascontiguousarray(contacts.rho_max, dtype=float)
+        if rho_max.ndim != 1 or B.shape != (self._n, len(rho_max)):
+            raise ValueError(
+                f"forces on {self._n} joints with B {B.shape}, rho_max {rho_max.shape}"
+            )
+        for W, F_des, _, first in contacts.tasks:
+            m, r = W.shape
+            if F_des.shape != (m,) or not 0 <= first <= len(rho_max) - r:
+                raise ValueError(
+                    f"wrench task with W {W.shape} from force {first} of {len(rho_max)} on, "
+                    f"F_des {F_des.shape}"
+                )
+        return ContactForces(B, rho_max, contacts.tasks)
+
+    def _resize(self, r: int, k: int) -> None:
+        """Make room for r forces and k rows; what was active is kept where it still exists."""
+        if (r, k) == self._size:
+            return
+        n, size = self._n, self._n + r
+        side = np.zeros(size + n + k)
+        if self._size[0] == r:
+            common = min(len(side), len(self._side))
+            side[:common] = self._side[:common]
+        self._size = (r, k)
+        self._side = side
+        self._H, self._g = np.zeros((size, size)), np.zeros(size)
+        self._C = np.zeros((n + k, size))
+        self._lower, self._upper = np.zeros(len(side)), np.zeros(len(side))
+
+    def _assemble(self, tasks: Sequence[TaskTerm], wrench_tasks: Sequence[WrenchTerm]) -> None:
+        """Fill H and g; the largest weight becomes 1, so that gamma keeps its sense."""
+        greatest = 0.0
+        for _, _, weight in tasks:
+            if weight > greatest:
+                greatest = weight
+        for _, _, weight, _ in wrench_tasks:
+            if weight > greatest:
+                greatest = weight
+        if not greatest > 0.0:
+            raise NoSolutionFound("no task with a weight above 0")
+        scale = 1.0 / greatest
         H, g = self._H, self._g
-        H.fill(0.0)
-        g.fill(0.0)
-        self._diagonal += self._gamma
+        clear_cost(H, g, self._gamma)
         for A, b, weight in tasks:
             if A is None:
                 add_identity(H, g, b, weight * scale)
             else:
-                add_rows(H, g, A, b, weight * scale)
+                add_rows(H, g, A, b, weight * scale, 0)
+        for W, F_des, weight, first in wrench_tasks:
+            add_rows(H, g, W, F_des, weight * scale, self._n + first)
 
-    def _note_active_bounds(self, a: np.ndarray, a_lower: np.ndarray, a_upper: np.ndarray) -> None:
-        """Keep which accelerations of a solution are at a bound, and at which."""
-        gradient = self._H @ a + self._g
-        at_lower = (a <= a_lower + _AT_BOUND) & (gradient > 0.0)
-        at_upper = (a >= a_upper - _AT_BOUND) & (gradient < 0.0)
-        self._side = at_lower.astype(float) - at_upper
+    def _relax(self, x: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None, int]:
+        """Solve with bounds and rows moved by the least that leaves a solution.
 
-    def _solve_main(self, M, tau_lower, tau_upper, a_lower, a_upper):
-        problem = (self._H, self._g, None, None, M, tau_lower, tau_upper, a_lower, a_upper)
-        if self._qp is None:
-            self._qp = proxqp.dense.QP(self._n, 0, self._n, True)
-            _configure(self._qp, _TOLERANCE)
-            # Without it, ProxQP can stop up to 0.01 rad/s^2 short of a limit it should be at.
-            self._qp.settings.check_duality_gap = True
-            self._qp.settings.eps_duality_gap_abs = _TOLERANCE
-            self._qp.settings.eps_duality_gap_rel = _TOLERANCE
-            self._qp.init(*problem)
-        else:
-            self._qp.update(*problem, False)
-        return _result(self._qp, self._n)
+        First, in the variables (x, e), with S x what may give way, the bounded and G a:
 
-    def _solve_relaxed(self, M, tau_lower, tau_upper, a_lower, a_upper) -> tuple[np.ndarray, int]:
-        """Return accelerations within the torque rows, as near to the box as they can be.
+            minimise |e|^2 + epsilon |x|^2   subject to   S x - e, rho and the torques in limits;
 
-        In the variables (a, e), where e is by how much a is outside the box:
-
-            minimise |e|^2 + cost(a) / penalty   subject to   a - e in the box, M a in its rows.
+        then the QP itself, with the limits moved by e.
         """
-        n = self._n
-        penalty = _PENALTY * max(1.0, float(np.abs(self._g).max()))
-        H = np.zeros((2 * n, 2 * n))
-        H[:n, :n] = self._H / penalty
-        eye = H[n:, n:] = np.eye(n)
-        C = np.block([[M, np.zeros((n, n))], [eye, -eye]])
-        lower, upper = np.r_[tau_lower, a_lower], np.r_[tau_upper, a_upper]
-        qp = proxqp.dense.QP(2 * n, 0, 2 * n)
-        _configure(qp, _RELAXED_TOLERANCE)
-        qp.init(H, np.r_[self._g / penalty, np.zeros(n)], None, None, C, lower, upper)
-        qp.solve()
-        a = np.array(qp.results.x[:n])
-        # What keeps the rows will do, converged or not: all else is a matter of the tasks.
-        if not (np.isfinite(a).all() and qp.results.info.pri_res < _KEPT):
+        n, (r, k) = self._n, self._size
+        size, soft = n + r, n + k
+        S = np.zeros((soft, size))
+        S[:n, :n] = np.eye(n)
+        S[n:] = self._C[n:]
+        H = np.diag(np.r_[np.full(size, _RELAXED_REGULARISATION), np.ones(soft)])
+        C = np.zeros((n + soft, size + soft))
+        C[:n, :size] = self._C[:n]
+        C[n:, :size] = S
+        C[n:, size:] = -np.eye(soft)
+        given = np.r_[:n, size + n : size + n + k]  # where the limits of S x are
+        no = np.full(soft, np.inf)
+        tau = slice(size, size + n)
+        lower, upper = self._lower, self._upper
+        free = np.full(n, np.inf)
+        y = np.empty(size + soft)
+        first = minimise(
+            H,
+            np.zeros(size + soft),
+            C,
+            np.r_[-free, lower[n:size], -no, lower[tau], lower[given]],
+            np.r_[free, upper[n:size], no, upper[tau], upper[given]],
+            np.zeros(size + soft + n + soft),
+            y,
+        )
+        if first < 0:
             raise NoSolutionFound("no accelerations within the torque limits were found")
-        return a, qp.results.info.iter
-
-
-def _configure(qp: proxqp.dense.QP, tolerance: float) -> None:
-    qp.settings.eps_abs = tolerance
-    qp.settings.eps_rel = 0.0
-    qp.settings.max_iter = _OUTER_ITERATIONS
-    qp.settings.max_iter_in = _INNER_ITERATIONS
-    qp.settings.eps_primal_inf = _INFEASIBILITY_TOLERANCE
-    # Started from the last solution, ProxQP 0.8 now and then returns one whose multipliers have
-    # the wrong sign, 2% above the least cost; what is easy has been solved before it is asked.
-    qp.settings.initial_guess = proxqp.InitialGuess.NO_INITIAL_GUESS
-
-
-def _result(qp: proxqp.dense.QP, n: int) -> tuple[np.ndarray | None, int]:
-    qp.solve()
-    iterations = qp.results.info.iter
-    if qp.results.info.status != proxqp.QPSolverOutput.PROXQP_SOLVED:
-        return None, iterations
-    x = np.array(qp.results.x[:n])
-    return (x if np.isfinite(x).all() else None), iterations
+        e = y[size:]
+        room = _ROOM * max(1.0, float(np.abs(e).max()))
+        moved_lower, moved_upper = lower.copy(), upper.copy()
+        moved_lower[given] += np.minimum(e, 0.0) - room
+        moved_upper[given] += np.maximum(e, 0.0) + room
+        second = minimise(self._H, self._g, self._C, moved_lower, moved_upper, self._side, x)
+        if second < 0:
+            raise NoSolutionFound("no accelerations were found, even with bounds relaxed")
+        value = S @ x
+        relaxation = np.maximum(lower[given] - value, value - upper[given]).clip(0.0)
+        if relaxation.max() < _NEGLIGIBLE:
+            return None, None, first + second
+        return relaxation[:n], relaxation[n:], first + second

@@ -32,6 +32,18 @@ class TaskTerm(NamedTuple):
     weight: float
 
 
+class WrenchTerm(NamedTuple):
+    """The term ``weight * |W rho - F_des|^2`` of the QP's cost: [Benallegue2021], III-E (a)."""
+
+    W: np.ndarray
+    """Shape (m, r): what rho >= 0 means as a wrench, or as some components of it."""
+    F_des: np.ndarray
+    """Shape (m,), N and N m: what the environment should exert on the link."""
+    weight: float
+    first: int
+    """Where the r coefficients begin among those of all contacts."""
+
+
 def critical_damping(kp: float) -> float:
     """Return ``2 sqrt(kp)``, the gain that brings an error to zero fastest without overshoot."""
     return 2.0 * math.sqrt(kp)
