@@ -8,6 +8,7 @@ from torque_safety_controller.tasks import (
     critical_damping,
     damping_task,
     pose_error,
+    pose_feed_forward,
     pose_task,
     posture_task,
 )
@@ -191,3 +192,44 @@ def test_with_the_posture_in_the_null_space_the_pose_is_reached(arm):
 
 def test_as_the_paper_has_it_pose_and_posture_end_in_a_compromise(arm):
     assert 1e-4 < np.abs(settle(arm, in_null_space=False)).max() < 1e-2  # m, rad
+
+
+def test_a_moving_goal_is_followed_exactly(arm):
+    """Feed-forward: on the track, with the track's twist, the asked rate is the track's own."""
+    rng = np.random.default_rng(4)
+    q, v = arm.random_state(rng)
+    robot = arm.robot(0.0)
+    robot.update(q, v, np.zeros(arm.n))
+    twist, rate = robot.J @ v, rng.normal(size=6)
+    ahead = pose_feed_forward(robot, v, robot.pose, twist, rate, 7.0)
+    term = pose_task(robot, v, np.zeros(6), 30.0, 7.0, 1.0, ahead)
+    a = np.linalg.pinv(robot.J) @ term.b
+    np.testing.assert_allclose(robot.J @ a + robot.drift, rate, atol=1e-8)
+
+
+def test_the_error_of_a_moving_goal_dies_away_as_that_of_one_at_rest(arm):
+    """The second derivative of the error is -kp e - kd e', also away from the track."""
+    rng = np.random.default_rng(5)
+    q, v = arm.random_state(rng)
+    twist, rate = 0.3 * rng.normal(size=6), rng.normal(size=6)
+    kp, kd, h = 30.0, 7.0, 1e-4
+    robot = arm.robot(0.0)
+    robot.update(q, v, np.zeros(arm.n))
+    # A goal near by: the logarithm is linear to first order in the error, which is small.
+    goal = robot.pose * pin.exp6(1e-6 * rng.normal(size=6))
+    ahead = pose_feed_forward(robot, v, goal, twist, rate, kd)
+    error = pose_error(robot.pose, goal)
+    term = pose_task(robot, v, error, kp, kd, 1.0, ahead)
+    a = np.linalg.pinv(robot.J) @ term.b
+
+    def error_at(t):
+        other = arm.robot(0.0)
+        other.update(q + t * v + 0.5 * t * t * a, v, np.zeros(arm.n))
+        moved = goal * pin.exp6(t * twist + 0.5 * t * t * rate)
+        return pose_error(other.pose, moved)
+
+    first = (error_at(h) - error_at(-h)) / (2.0 * h)
+    second = (error_at(h) - 2.0 * error_at(0.0) + error_at(-h)) / (h * h)
+    np.testing.assert_allclose(first, twist - robot.J @ v, atol=1e-4)
+    expected = -kp * error - kd * (twist - robot.J @ v)
+    np.testing.assert_allclose(second, expected, atol=1e-3)

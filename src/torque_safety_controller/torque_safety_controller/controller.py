@@ -18,6 +18,7 @@ from torque_safety_controller.tasks import (
     TaskTerm,
     damping_task,
     pose_error,
+    pose_feed_forward,
     pose_task,
     posture_task,
 )
@@ -100,6 +101,8 @@ class Controller:
         self.gains = gains
         self.q_des: np.ndarray | None = None
         self.pose_des: pin.SE3 | None = None
+        self._pose_motion: tuple[np.ndarray, np.ndarray] | None = None
+        self._v_des: np.ndarray | None = None
         self.error = np.full(6, math.nan)
         self.iterations = 0
         rate = np.full(n, math.inf) if torque_rate_max is None else torque_rate_max
@@ -127,13 +130,32 @@ class Controller:
         if self.additional is not None:
             self.additional.start()
 
-    def set_pose_goal(self, pose_des: pin.SE3) -> None:
-        """Move the end effector to `pose_des` in the URDF's root frame."""
-        self.pose_des = pose_des
+    def set_pose_goal(
+        self,
+        pose_des: pin.SE3,
+        twist: np.ndarray | None = None,
+        twist_rate: np.ndarray | None = None,
+    ) -> None:
+        """Move the end effector to `pose_des` in the URDF's root frame.
 
-    def set_posture_goal(self, q_des: np.ndarray) -> None:
-        """Bring the joints, or what the pose task leaves free of them, to `q_des`, rad."""
+        Args:
+            pose_des: goal now.
+            twist: of a goal in motion, in the goal's axes, shape (6,), m/s and rad/s; None for
+                one at rest.
+            twist_rate: time derivative of `twist`, shape (6,); with `twist`.
+        """
+        self.pose_des = pose_des
+        self._pose_motion = None if twist is None else (twist, twist_rate)
+
+    def set_posture_goal(self, q_des: np.ndarray, v_des: np.ndarray | None = None) -> None:
+        """Bring the joints, or what the pose task leaves free of them, to `q_des`, rad.
+
+        Args:
+            q_des: goal now, shape (n,), rad.
+            v_des: its velocity, shape (n,), rad/s; None for a goal at rest.
+        """
         self.q_des = q_des
+        self._v_des = v_des
 
     def warm_up(self) -> None:
         """Run every part of a step once: what is compiled at first use is compiled now.
@@ -294,6 +316,7 @@ class Controller:
                         gains.pose_kp,
                         gains.pose_kd,
                         gains.pose_weight,
+                        self._pose_ahead(v),
                     )
                 )
         guarded = self.robot.J if tasks and gains.posture_in_null_space else None
@@ -306,9 +329,17 @@ class Controller:
                 gains.posture_kd,
                 gains.posture_weight,
                 guarded,
+                None if self._v_des is None else gains.posture_kd * self._v_des,
             )
         )
         return tasks
+
+    def _pose_ahead(self, v: np.ndarray) -> np.ndarray | None:
+        if self._pose_motion is None:
+            return None
+        return pose_feed_forward(
+            self.robot, v, self.pose_des, *self._pose_motion, self.gains.pose_kd
+        )
 
     def _torque_range(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the torques that may follow the last one, shape (n,) each, N m."""

@@ -57,8 +57,9 @@ def posture_task(
     kd: float,
     weight: float,
     J: np.ndarray | None = None,
+    ahead: np.ndarray | None = None,
 ) -> TaskTerm:
-    """Bring the joints to `q_des` and to rest: eq. (34) of [DelPrete2018].
+    """Bring the joints to `q_des`: eq. (34) of [DelPrete2018], eq. (6) of [Benallegue2021].
 
     As the paper has it, posture and pose pull against each other with their weights, and the
     pose rests off its goal by about the ratio of the weights in m per rad. With `J` the
@@ -73,12 +74,14 @@ def posture_task(
         kd: damping, 1/s.
         weight: of the squared error of acceleration.
         J: Jacobian of the task not to be disturbed, shape (m, n), or None.
+        ahead: feed-forward, ``kd v_des + a_des``, shape (n,), rad/s^2; None for a goal at rest.
     """
     error = q_des - q
     if J is not None:
         # Regularised where J has lost rank; there it leaves in what the task cannot move anyway.
         error = null_space_part(J, error, _RANK_REGULARISATION)
-    return TaskTerm(None, spring_damper(error, v, kp, kd), weight)
+    b = spring_damper(error, v, kp, kd)
+    return TaskTerm(None, b if ahead is None else b + ahead, weight)
 
 
 def damping_task(v: np.ndarray, kd: float) -> TaskTerm:
@@ -91,10 +94,45 @@ def pose_error(pose: pin.SE3, pose_des: pin.SE3) -> np.ndarray:
     return pin.log6(pose.actInv(pose_des)).vector
 
 
+def pose_feed_forward(
+    robot: RobotModel,
+    v: np.ndarray,
+    pose_des: pin.SE3,
+    twist: np.ndarray,
+    twist_rate: np.ndarray,
+    kd: float,
+) -> np.ndarray:
+    """Return what a goal in motion adds to `pose_task`, shape (6,), in the end effector's axes.
+
+    The goal's twist as seen at the end effector is X xi_des with X the action of the placement
+    H^-1 H_des between them; it changes with rate ``X xi_des' - xi x (X xi_des)``, because the axes
+    move with the twist xi of the end effector.
+
+    Args:
+        robot: updated to the current state.
+        v: joint velocities, shape (n,), rad/s.
+        pose_des: goal.
+        twist: its twist xi_des in its own axes, shape (6,), m/s and rad/s.
+        twist_rate: time derivative of `twist`, shape (6,).
+        kd: damping of the pose task, 1/s.
+    """
+    between = robot.pose.actInv(pose_des)
+    ahead = between.act(pin.Motion(twist))
+    own = pin.Motion(robot.J @ v)
+    rate = between.act(pin.Motion(twist_rate)) - own.cross(ahead)
+    return kd * ahead.vector + rate.vector
+
+
 def pose_task(
-    robot: RobotModel, v: np.ndarray, error: np.ndarray, kp: float, kd: float, weight: float
+    robot: RobotModel,
+    v: np.ndarray,
+    error: np.ndarray,
+    kp: float,
+    kd: float,
+    weight: float,
+    ahead: np.ndarray | None = None,
 ) -> TaskTerm:
-    """Bring the end effector to a pose: eq. (34) of [DelPrete2018].
+    """Bring the end effector to a pose: eq. (34) of [DelPrete2018], (7)-(8) of [Benallegue2021].
 
     Args:
         robot: updated to the current state.
@@ -103,5 +141,7 @@ def pose_task(
         kp: stiffness, 1/s^2.
         kd: damping, 1/s.
         weight: of the squared error of acceleration.
+        ahead: `pose_feed_forward`, or None for a goal at rest.
     """
-    return TaskTerm(robot.J, spring_damper_rows(robot.J, v, error, robot.drift, kp, kd), weight)
+    b = spring_damper_rows(robot.J, v, error, robot.drift, kp, kd)
+    return TaskTerm(robot.J, b if ahead is None else b + ahead, weight)
