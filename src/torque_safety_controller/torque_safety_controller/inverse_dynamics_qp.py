@@ -136,7 +136,7 @@ class InverseDynamicsQP:
         if iterations == INFEASIBLE:
             relaxation, row_relaxation, iterations = self._relax(x)
         elif iterations == FAILED:
-            raise NoSolutionFound("not finite, or lower limits above upper ones")
+            raise NoSolutionFound("not finite, absurd, or lower limits above upper ones")
         if contacts is None:
             return Solution(x, relaxation, iterations, row_relaxation)
         a, rho = x[: self._n], x[self._n :]
