@@ -78,7 +78,8 @@ class Handover:
 
     def robot_was_away(self) -> None:
         """Begin anew, the robot having been silent or started over: never with torque unasked."""
-        if self._start is Control.POSITION or self.control is Control.TAKING_OVER:
+        back = self._start is Control.POSITION or self.control is Control.TAKING_OVER
+        if back and self.control is not Control.POSITION:
             self._set(Control.POSITION, "the robot was silent or started over")
         self._q_hold = None
 

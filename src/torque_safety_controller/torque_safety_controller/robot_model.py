@@ -28,6 +28,7 @@ class RobotModel:
         dt: control period that torques are held for, s; 0 evaluates at the current state.
 
     Attributes:
+        q: position, shape (n,), rad.
         pose: placement of the end effector in the base frame.
         J: its Jacobian in its own axes, shape (6, n), linear rows first.
         drift: its acceleration at zero joint acceleration, J' v, shape (6,).
@@ -52,6 +53,7 @@ class RobotModel:
         self._frame_id = model.getFrameId(frame)
         self._data = model.createData()
         self._zero = np.zeros(self.n)
+        self.q = self._zero
         self.pose = pin.SE3.Identity()
         self.J = np.zeros((6, self.n))
         self.drift = np.zeros(6)
@@ -70,6 +72,7 @@ class RobotModel:
             a_last: acceleration commanded last, shape (n,), rad/s^2.
         """
         model, data = self.model, self._data
+        self.q = q
         q_mid, v_mid = middle_of_step(q, v, a_last, self.dt)
         self.M = pin.crba(model, data, q_mid)
         self.h = pin.nonLinearEffects(model, data, q_mid, v_mid)
