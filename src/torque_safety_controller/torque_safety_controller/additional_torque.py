@@ -1,8 +1,9 @@
-"""The torque that is added to the model's: integral action in one of its modes, without jumps.
+"""The torque added to the model's: integral action in one of its modes, and friction's.
 
 Modes are ``none``; ``joints``, every joint stiff, (3)-(14) of [Benallegue2021]; and ``task``,
 stiff in the task and free in its null space, (15)-(26). Whatever is changed while the arm moves,
-and whatever comes instead of its next state, the torque goes on from where it was.
+and whatever comes instead of its next state, the torque goes on from where it was. Friction is
+compensated beside it, with a budget of its own.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from torque_safety_controller.friction_compensation import FrictionCompensation
+from torque_safety_controller.friction_settings import FrictionSettings, no_friction
 from torque_safety_controller.integral_feedback import IntegralFeedback
 from torque_safety_controller.integral_settings import IntegralSettings
 from torque_safety_controller.nullspace_compliance import NullspaceCompliance
@@ -27,6 +30,7 @@ MODES = ("none", "joints", "task")
 LONGEST_GAP = 2.5
 """Periods that a step may take, a missed deadline being 2; a longer gap is not integrated over."""
 
+_POSITION_JUMP = 0.05  # rad or m; beyond what the velocities account for
 _FADING_TIME = 0.2  # s; of what a mode cannot take over
 _NEGLIGIBLE = 1e-9  # N m
 
@@ -41,12 +45,19 @@ class AdditionalSettings:
         task: of mode ``task``; None where the task leaves no null space.
         disturbance_max: largest disturbance of each joint that is integrated, shape (n,), N m;
             what friction and a wrong model never are, but a sensor's glitch or a blow may be.
+        friction: of the friction compensation; None for none.
     """
 
     mode: str
     joints: IntegralSettings
     task: NullspaceSettings | None
     disturbance_max: Array
+    friction: FrictionSettings | None = None
+
+    def __post_init__(self) -> None:
+        if self.friction is None:
+            n = len(self.joints.budget)
+            object.__setattr__(self, "friction", FrictionSettings(no_friction(n), np.zeros(n)))
 
 
 class AdditionalTorque:
@@ -58,9 +69,10 @@ class AdditionalTorque:
 
     Attributes:
         last: what the last step added, shape (n,), N m.
-        skipped: steps that were not integrated over: time jumped, or the velocity did.
+        skipped: steps that were not integrated over: time jumped, or the state did.
         joints: the integral action of mode ``joints``.
         task: that of mode ``task``, or None.
+        friction: the friction compensation.
     """
 
     def __init__(self, settings: AdditionalSettings, rows: slice = slice(0, 6)) -> None:
@@ -69,13 +81,15 @@ class AdditionalTorque:
         self.task: NullspaceCompliance | None = None
         if settings.task is not None:
             self.task = NullspaceCompliance(settings.task, rows.stop - rows.start)
+        self.friction = FrictionCompensation(settings.friction)
         self.skipped = 0
         self._rows = rows
         self._settings = settings
         self._zero = np.zeros(n)
         self.start()
         # Compiled now, not in a control loop.
-        _beyond(np.eye(n), self._zero, self._zero, self._zero, self._zero)
+        zero = self._zero
+        _jumped(np.eye(n), zero, zero, zero, zero, zero, 0.0, zero)
 
     @property
     def settings(self) -> AdditionalSettings:
@@ -88,11 +102,13 @@ class AdditionalTorque:
         self.joints.settings = settings.joints
         if self.task is not None and settings.task is not None:
             self.task.settings = settings.task
+        self.friction.settings = settings.friction
 
     @property
     def idle(self) -> bool:
         """Whether nothing is added, so that the model needs no rates of its matrices."""
-        return self._mode == self._settings.mode == "none" and self._faded
+        integrating = not (self._mode == self._settings.mode == "none" and self._faded)
+        return not integrating and self.friction.idle
 
     @property
     def saturated(self) -> NDArray[np.bool_]:
@@ -109,15 +125,16 @@ class AdditionalTorque:
         self._mode = self._settings.mode
         self._started = False
         self._lost = self._resuming = False
-        self._v_last = self._zero
-        self.last = self._zero
+        self._q_last = self._v_last = self._zero
+        self.last = self._integral = self._zero
         self._fading = self._zero
         self._faded = True
+        self.friction.start()
 
     def torque(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> Array:
         """Return what to add in this step, shape (n,), N m; finite whatever comes.
 
-        After a jump in time, or of the velocity, the torque goes on from the last one, and the
+        After a jump in time, or of the state, the torque goes on from the last one, and the
         difference to what the memory asks for fades.
 
         Args:
@@ -135,19 +152,21 @@ class AdditionalTorque:
             self._resuming = True
             self.skipped += 1
             return self.last
-        self.last = torque
-        return torque
+        self._integral = torque
+        time = elapsed if 0.0 < elapsed <= LONGEST_GAP * robot.dt else 0.0
+        self.last = torque + self.friction.torque(robot.M, v, a_last, time, robot.dt)
+        return self.last
 
     def _next(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> Array | None:
-        """Return the torque of this step; None where the velocity jumped."""
+        """Return the torque of this step; None where the state jumped."""
         if not self._started:
             self._begin(robot, v)
         known = 0.0 < elapsed <= LONGEST_GAP * robot.dt and not self._lost
-        jumped = known and self._mode != "none" and self._jumped(robot.M, v, a_last, elapsed)
+        jumped = known and self._mode != "none" and self._jumped(robot, v, a_last, elapsed)
         if not known or jumped:
             self._skip(robot, v, elapsed)
             self._lost = False
-        self._v_last = v.copy()
+        self._q_last, self._v_last = robot.q.copy(), v.copy()
         if jumped:
             return None
         if known:
@@ -157,26 +176,33 @@ class AdditionalTorque:
             torque = self._of_mode(robot, v, self._zero, 0.0)
         if self._resuming or not known:
             self._resuming = False
-            self._fade(self.last - torque)
+            self._fade(self._integral - torque)
         if not self._faded:
             gap = min(elapsed, LONGEST_GAP * robot.dt) if elapsed > 0.0 else 0.0
             self._fade(self._fading * math.exp(-gap / _FADING_TIME))
             torque = torque + self._fading
         if self._mode != self._settings.mode:
-            torque = self.seed(robot, v, torque)
+            self._enter(robot, v, torque)
         return torque
 
     def seed(self, robot: RobotModel, v: Array, torque: Array) -> Array:
-        """Enter the mode that is set so that it gives `torque` now; return that.
+        """Begin so that the torque is `torque` now; return that. Friction's fades in.
 
-        The mode takes over what it can, within budgets that are widened as far as they must be
-        and for some time; the rest fades.
+        The mode that is set takes over what it can, within budgets that are widened as far as
+        they must be and for some time; the rest fades.
 
         Args:
             robot: of the arm, updated with rates.
             v: velocity, shape (n,), rad/s.
             torque: shape (n,), N m, finite.
         """
+        self.friction.start()
+        self._enter(robot, v, torque)
+        self.last = self._integral = torque
+        return torque
+
+    def _enter(self, robot: RobotModel, v: Array, torque: Array) -> None:
+        """Enter the mode that is set so that it gives `torque` now; see `seed`."""
         self._mode = self._settings.mode
         taken = self._zero
         try:
@@ -189,22 +215,20 @@ class AdditionalTorque:
         except ValueError:  # too fast, or numbers beyond sense: all of it fades
             self._started = False
         self._fade(torque - taken)
-        self.last = torque
-        return torque
 
     def _begin(self, robot: RobotModel, v: Array) -> None:
-        """Let the memory of the mode begin, empty, at this velocity."""
+        """Let the memory of the mode begin, empty, at this state."""
         if self._mode == "joints":
             self.joints.start(v)
         elif self._mode == "task":
             self.task.start(v, robot.J[self._rows])
-        self._v_last = v.copy()
+        self._q_last, self._v_last = robot.q.copy(), v.copy()
         self._started, self._lost = True, False
 
-    def _jumped(self, M: Array, v: Array, a_last: Array, elapsed: float) -> bool:
-        """Return whether nothing that the integral is for can have changed the velocity so."""
-        impulse = self._settings.disturbance_max * elapsed
-        return _beyond(M, self._v_last, v, a_last * elapsed, impulse)
+    def _jumped(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> bool:
+        """Return whether nothing that the integral is for can have changed the state so."""
+        q_last, v_last, largest = self._q_last, self._v_last, self._settings.disturbance_max
+        return _jumped(robot.M, q_last, robot.q, v_last, v, a_last, elapsed, largest)
 
     def _of_mode(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> Array:
         """Return the torque of the present mode."""
@@ -228,18 +252,32 @@ class AdditionalTorque:
 
 
 @njit(cache=True)
-def _beyond(M: Array, v_last: Array, v: Array, expected: Array, largest: Array) -> bool:
-    """Return whether a joint's velocity is off by more than an impulse on its own inertia gives.
+def _jumped(
+    M: Array,
+    q_last: Array,
+    q: Array,
+    v_last: Array,
+    v: Array,
+    a_last: Array,
+    elapsed: float,
+    disturbance_max: Array,
+) -> bool:
+    """Return whether a joint's velocity or position changed by more than can be.
 
     Args:
         M: mass matrix, shape (n, n), kg m^2.
+        q_last: position, shape (n,), rad.
+        q: position in the next step, shape (n,), rad.
         v_last: velocity, shape (n,), rad/s.
-        v: in the next step, shape (n,), rad/s.
-        expected: by how much it was to change, shape (n,), rad/s.
-        largest: impulse of the largest disturbance, shape (n,), N m s.
+        v: velocity in the next step, shape (n,), rad/s.
+        a_last: acceleration asked for in between, shape (n,), rad/s^2.
+        elapsed: time in between, s.
+        disturbance_max: what acts on a joint's own inertia at most, shape (n,), N m.
     """
     for i in range(len(v)):
-        # A NaN is not within it.
-        if not M[i, i] * abs(expected[i] - (v[i] - v_last[i])) <= largest[i]:
+        impulse = M[i, i] * abs(a_last[i] * elapsed - (v[i] - v_last[i]))
+        way = abs(q[i] - q_last[i]) - elapsed * (abs(v[i]) + abs(v_last[i]))
+        # A NaN is not within its limits.
+        if not (impulse <= disturbance_max[i] * elapsed and way <= _POSITION_JUMP):
             return True
     return False

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pinocchio as pin
 
-from torque_safety_controller import integral_parameters
+from torque_safety_controller import friction_parameters, integral_parameters
 from torque_safety_controller.additional_torque import AdditionalSettings
 from torque_safety_controller.controller import Gains
 from torque_safety_controller.modes import CONTROLS
@@ -67,6 +67,7 @@ TABLE = (
         live=True,
     ),
     *integral_parameters.TABLE,
+    *friction_parameters.TABLE,
     Parameter(
         "start_control",
         str,

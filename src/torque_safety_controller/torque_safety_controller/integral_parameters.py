@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from torque_safety_controller.additional_torque import MODES, AdditionalSettings
+from torque_safety_controller.friction_parameters import friction_settings
 from torque_safety_controller.integral_settings import (
     METHODS,
     IntegralSettings,
@@ -121,6 +122,7 @@ def additional_settings(
             if rows.stop < len(joints)
             else None,
             DISTURBANCE_MAX * tau_max,
+            friction_settings(values, joints, tau_max),
         )
     except IntegralSettingsError as error:
         name = f"integral_{_NAME_OF.get(error.name, error.name)}"

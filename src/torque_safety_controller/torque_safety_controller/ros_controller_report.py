@@ -78,6 +78,7 @@ class StepRecord:
         if controller.additional is not None:
             values |= {
                 "additional_torque_nm": controller.additional.last,
+                "friction_torque_nm": controller.additional.friction.last,
                 "joints_at_integral_budget": _named(joints, controller.additional.saturated),
                 "integral_skipped_steps": controller.additional.skipped,
             }

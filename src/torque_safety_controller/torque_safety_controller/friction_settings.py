@@ -1,0 +1,118 @@
+"""What the friction compensation can be set to, checked in one place."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+DEFAULT_STRIBECK_VELOCITY = 0.01
+"""rad/s."""
+
+
+class FrictionSettingsError(ValueError):
+    """A setting of the friction compensation is unusable.
+
+    Attributes:
+        name: of the setting.
+        value: what was given.
+        allowed: what would have been accepted.
+    """
+
+    def __init__(self, name: str, value: object, allowed: str) -> None:
+        self.name = name
+        self.value = value
+        self.allowed = allowed
+        super().__init__(f"{name} = {value}: must be {allowed}")
+
+
+@dataclass(frozen=True, eq=False)
+class FrictionModel:
+    """Friction of n joints: f(v) = sign(v) F(v), and at rest whatever holds, up to F(0).
+
+        F(v) = F_c + (F_s - F_c) exp(-(v / v_s)^2) + d |v|
+
+    Attributes:
+        coulomb: F_c, dry friction of a moving joint, shape (n,), N m, >= 0.
+        static: F_s, that of a joint at rest, shape (n,), N m, >= coulomb.
+        viscous: d, shape (n,), N m s/rad, >= 0.
+        stribeck_velocity: v_s between the two, shape (n,), rad/s, > 0.
+
+    Raises:
+        FrictionSettingsError: a value is out of range, or the shapes differ.
+    """
+
+    coulomb: NDArray[np.float64]
+    static: NDArray[np.float64]
+    viscous: NDArray[np.float64]
+    stribeck_velocity: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        n = np.size(self.coulomb)
+        for name in ("coulomb", "static", "viscous", "stribeck_velocity"):
+            value = _finite_vector(name, getattr(self, name), n)
+            if not (value >= 0.0).all():
+                raise FrictionSettingsError(name, value, "numbers >= 0")
+            object.__setattr__(self, name, value)
+        if not (self.static >= self.coulomb).all():
+            raise FrictionSettingsError("static", self.static, "at least coulomb everywhere")
+        if not (self.stribeck_velocity > 0.0).all():
+            raise FrictionSettingsError("stribeck_velocity", self.stribeck_velocity, "numbers > 0")
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return self.coulomb.size
+
+    def level(self, v: ArrayLike) -> NDArray[np.float64]:
+        """Return F(v), N m, for velocities of shape (..., n), rad/s."""
+        v = np.asarray(v, dtype=np.float64)
+        dry = np.exp(-((v / self.stribeck_velocity) ** 2)) * (self.static - self.coulomb)
+        return self.coulomb + dry + self.viscous * np.abs(v)
+
+
+def no_friction(n: int) -> FrictionModel:
+    """Return the model of n joints without friction."""
+    zero = np.zeros(n)
+    return FrictionModel(zero, zero, zero, np.full(n, DEFAULT_STRIBECK_VELOCITY))
+
+
+@dataclass(frozen=True, eq=False)
+class FrictionSettings:
+    """Settings of `FrictionCompensation`.
+
+    Attributes:
+        model: of the joints' friction.
+        budget: most that is ever compensated, whatever the model says, shape (n,), N m, >= 0.
+        scale: share of the model that is compensated, 0 to 1; 0 is off.
+        theta: rate at which the reference velocity returns to the measured one, 1/s, >= 0.
+
+    Raises:
+        FrictionSettingsError: a value is out of range.
+    """
+
+    model: FrictionModel
+    budget: NDArray[np.float64]
+    scale: float = 0.0
+    theta: float = 3.0
+
+    def __post_init__(self) -> None:
+        budget = _finite_vector("budget", self.budget, self.model.n)
+        if not (budget >= 0.0).all():
+            raise FrictionSettingsError("budget", budget, "numbers >= 0")
+        object.__setattr__(self, "budget", budget)
+        if not 0.0 <= self.scale <= 1.0:
+            raise FrictionSettingsError("scale", self.scale, "a number from 0 to 1")
+        if not (math.isfinite(self.theta) and self.theta >= 0.0):
+            raise FrictionSettingsError("theta", self.theta, "a finite number >= 0")
+
+
+def _finite_vector(name: str, value: ArrayLike, n: int) -> NDArray[np.float64]:
+    """Return n finite numbers as a read-only copy."""
+    vector = np.array(value, dtype=np.float64)
+    if vector.shape != (n,) or n == 0 or not np.isfinite(vector).all():
+        raise FrictionSettingsError(name, value, f"{n} finite numbers, one for each joint")
+    vector.flags.writeable = False
+    return vector
