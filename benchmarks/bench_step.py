@@ -7,9 +7,13 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import yaml
 
+from torque_safety_controller.constraints import Rows
+from torque_safety_controller.contacts import Contact, Contacts
 from torque_safety_controller.controller import Controller, Gains
+from torque_safety_controller.inverse_dynamics_qp import InverseDynamicsQP
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 
@@ -25,6 +29,58 @@ def microseconds(function, repetitions: int = 2000, rounds: int = 7) -> float:
             function()
         best = min(best, (time.perf_counter() - start) / repetitions)
     return 1e6 * best
+
+
+def qp_alone(controller: Controller, q: np.ndarray, v: np.ndarray) -> dict:
+    """Return what times the QP alone: plain, with rows, with contact forces.
+
+    Each with the same limits active as before, and with others: bounds that change sides.
+    """
+    robot, n = controller.robot, controller.robot.n
+    rng = np.random.default_rng(1)
+    data = robot.model.createData()
+    pin.computeJointJacobians(robot.model, data, q)
+    pin.forwardKinematics(robot.model, data, q, v, np.zeros(n))
+    contacts = Contacts(robot.model, [Contact(robot.frame, np.zeros(3), [0.0, 0.0, -1.0], 0.5, 4)])
+    task = contacts.wrench_task(0, np.array([0.0, 0.0, -10.0, 0.0, 0.0, 0.0]), 1e-3)
+    robot.update(q, v, np.zeros(n))
+    limits = robot.M, -controller.tau_max - robot.h, controller.tau_max - robot.h
+    tasks = controller._tasks(q, v)
+    wide, tight = np.full(n, 5.0), np.full(n, 0.5)
+    # Like distances: limited below, so that the middle of the tight bounds is just allowed.
+    G = rng.normal(size=(10, n))
+    rows = Rows(G, -np.abs(G @ tight), np.full(10, np.inf))
+    too_much = rows._replace(lower=np.abs(G @ tight) + 0.2)
+
+    def with_contact() -> tuple:
+        contacts.update(data)
+        return None, contacts.forces([task])
+
+    timed = {}
+    for name, extra in {
+        "QP alone": lambda: (None, None),
+        "QP with 10 rows": lambda: (rows, None),
+        "QP with a contact of 4 facets": with_contact,
+        "QP with both": lambda: (rows, with_contact()[1]),
+    }.items():
+        same, other = InverseDynamicsQP(n), InverseDynamicsQP(n)
+        sign = [1.0]
+
+        def again(qp=same, extra=extra) -> None:
+            qp.solve(tasks, -wide, wide, *limits, *extra())
+
+        def off_and_on(qp=other, extra=extra, sign=sign) -> None:
+            sign[0] = -sign[0]
+            qp.solve(tasks, sign[0] * tight - 0.1, sign[0] * tight + 0.1, *limits, *extra())
+
+        timed[name] = again
+        timed[f"{name}, other bounds active"] = off_and_on
+    relaxed = InverseDynamicsQP(n)
+    timed["QP with 10 rows and bounds that give way"] = lambda: relaxed.solve(
+        tasks, -tight, tight, *limits, too_much
+    )
+    timed["  contact Jacobian and forces"] = with_contact
+    return timed
 
 
 def main() -> None:
@@ -59,8 +115,9 @@ def main() -> None:
         "  torque of the middle of the step": lambda: robot.torque(q, v, v),
         "  limits and rate of torque": lambda: controller._limited(tau_max),
     }
+    rows |= qp_alone(controller, q, v)
     for name, function in rows.items():
-        print(f"{name:<36} {microseconds(function):8.1f} us")
+        print(f"{name:<50} {microseconds(function):8.1f} us")
 
 
 if __name__ == "__main__":

@@ -356,3 +356,47 @@ def test_rows_are_stacked_in_order():
     np.testing.assert_array_equal(stacked.G, [[1, 1], [2, 2], [2, 2]])
     np.testing.assert_array_equal(stacked.lower, [0, 2, 2])
     np.testing.assert_array_equal(stacked.upper, [1, 3, 3])
+
+
+def test_the_force_on_a_springy_table_becomes_the_one_that_is_asked_for():
+    """The hand holds its place along the table and presses; what pushes back is a spring."""
+    arm, dt, steps = Arm(speed=0.0), 1e-3, 1500
+    model, frame = arm.model, arm.model.getFrameId(HAND)
+    up = np.array([0.0, 0.0, 1.0])
+    normal = arm.points(arm.q, 0)[1].T @ up
+    contacts = Contacts(model, [Contact(HAND, np.zeros(3), normal, 0.5)])
+    F_des = np.r_[10.0 * normal, 0.0, 0.0, 0.0]
+    across = np.eye(6)
+    across[:3, :3] -= np.outer(normal, normal)
+    data, q, v = arm.data, arm.q.copy(), np.zeros(7)
+    pin.updateFramePlacement(model, data, frame)
+    goal, wide, tau_max = data.oMf[frame].copy(), np.full(7, 50.0), np.full(7, 80.0)
+    qp, forces = InverseDynamicsQP(7), []
+    for _ in range(steps):
+        M, h = pin.crba(model, data, q), pin.nonLinearEffects(model, data, q, v)
+        pin.computeJointJacobians(model, data, q)
+        pin.forwardKinematics(model, data, q, v, np.zeros(7))
+        pose = pin.updateFramePlacement(model, data, frame)
+        contacts.update(data)
+        J = pin.getFrameJacobian(model, data, frame, pin.LOCAL)
+        drift = pin.getFrameAcceleration(model, data, frame, pin.LOCAL).vector
+        error = across @ pin.log6(pose.actInv(goal)).vector
+        hand = TaskTerm(J, 900.0 * error - 50.0 * J @ v - drift, 1e4)
+        solution = qp.solve(
+            [hand, TaskTerm(None, -5.0 * v, 10.0)],
+            -wide,
+            wide,
+            M,
+            -tau_max - h,
+            tau_max - h,
+            contacts=contacts.forces([contacts.wrench_task(0, F_des, 10.0)]),
+        )
+        tau = M @ solution.a + h - solution.contact_torque
+        speed = up @ (pose.rotation @ (J @ v)[:3])
+        pushed = max(0.0, 2000.0 * (goal.translation[2] - pose.translation[2]) - 20.0 * speed)
+        v = v + dt * np.linalg.solve(M, tau - h + J[:3].T @ pose.rotation.T @ (pushed * up))
+        q = q + dt * v
+        forces.append(pushed)
+    np.testing.assert_allclose(forces[-200:], 10.0, atol=0.1)
+    assert np.abs(v).max() < 1e-2
+    assert np.linalg.norm(error[:3]) < 1e-3

@@ -82,6 +82,9 @@ class InverseDynamicsQP:
         self._no_contacts = ContactForces(np.zeros((n, 0)), np.zeros(0))
         self._side = np.zeros(0)
         self._size = (-1, -1)
+        # Compiled now, not in the first step in which limits must give way.
+        one = np.ones(1)
+        minimise(np.eye(1), one, np.zeros((0, 1)), -one, one, np.zeros(1), np.zeros(1))
 
     def solve(
         self,
@@ -179,6 +182,7 @@ class InverseDynamicsQP:
             side[:common] = self._side[:common]
         self._size = (r, k)
         self._side = side
+        self._relaxed_side = np.zeros(size + 3 * n + 2 * k)
         self._H, self._g = np.zeros((size, size)), np.zeros(size)
         self._C = np.zeros((n + k, size))
         self._lower, self._upper = np.zeros(len(side)), np.zeros(len(side))
@@ -236,7 +240,7 @@ class InverseDynamicsQP:
             C,
             np.r_[-free, lower[n:size], -no, lower[tau], lower[given]],
             np.r_[free, upper[n:size], no, upper[tau], upper[given]],
-            np.zeros(size + soft + n + soft),
+            self._relaxed_side,
             y,
         )
         if first < 0:
