@@ -109,6 +109,7 @@ class ControllerConfiguration:
     tau_max: np.ndarray
     tau_rate_max: np.ndarray
     base_frame: str
+    end_effector_frame: str
     gains: Gains
     additional: AdditionalSettings
     task_rows: slice
@@ -144,6 +145,7 @@ def make_configuration(values: Mapping[str, Any]) -> ControllerConfiguration:
         tau_max=tau_max,
         tau_rate_max=tau_rate_max,
         base_frame=values["base_frame"],
+        end_effector_frame=values["end_effector_frame"],
         gains=_gains(values),
         additional=integral_parameters.additional_settings(values, joints, tau_max),
         task_rows=integral_parameters.task_rows(values),
