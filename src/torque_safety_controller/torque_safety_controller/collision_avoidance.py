@@ -1,0 +1,177 @@
+"""Collision avoidance as rows on joint accelerations: distances that can be kept for ever.
+
+`docs/collision_avoidance.md` derives the rows, and says what they promise and what not.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import astuple, dataclass, fields
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from torque_safety_controller.collision_kernels import ROWS_OF_KIND, collision_rows
+from torque_safety_controller.collision_kinematics import make_motion
+from torque_safety_controller.collision_model import CollisionModel
+from torque_safety_controller.collision_obstacles import CollisionError
+from torque_safety_controller.collision_row import Law, Step, make_rows
+from viability_bounds_pkg.bounds_kernel import make_table
+from viability_bounds_pkg.braking import make_side
+
+Array = NDArray[np.float64]
+
+# Of the virtual joint, whose braking is 1: more than anything has.
+_FAST, _HARD = 1e6, 1e12
+
+
+@dataclass(frozen=True)
+class CollisionSettings:
+    """What distances are kept, and how.
+
+    Attributes:
+        margin: distance to keep, m.
+        reserve: kept on top of it, m; what the linearisation within a step may take.
+        braking: deceleration that a distance counts on at most, m/s^2.
+        braking_share: share of what the joints can do along a distance that it counts on, up
+            to `braking`.
+        speed_max: greatest speed of approach, m/s.
+        recovery_speed: speed at which bodies inside the margin are parted, m/s.
+        influence: distance beyond which a pair is not looked at, m, unless it approaches fast.
+    """
+
+    margin: float = 0.02
+    reserve: float = 0.002
+    braking: float = 2.0
+    braking_share: float = 0.5
+    speed_max: float = 1.0
+    recovery_speed: float = 0.1
+    influence: float = 0.1
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if not (isinstance(value, int | float) and math.isfinite(value) and value >= 0.0):
+                raise CollisionError(f"{f.name} must be finite and not negative, not {value}")
+            if value == 0.0 and f.name not in ("margin", "reserve"):
+                raise CollisionError(f"{f.name} must be positive")
+        if self.braking_share > 1.0:
+            raise CollisionError(f"braking_share must be at most 1, not {self.braking_share}")
+        if self.influence <= self.margin + self.reserve:
+            raise CollisionError(
+                f"influence must be more than margin and reserve, not {self.influence}"
+            )
+
+
+class CollisionRows(NamedTuple):
+    """Rows ``G a >= lower``; arrays are views that the next step overwrites.
+
+    Attributes:
+        G: shape (k, n), m/rad.
+        lower: shape (k,), m/s^2; never more than some `a` within the bounds reaches.
+        names: of the bodies of each row, length k.
+        distance: shape (k,), m; negative where capsules overlap.
+        rate: rate of change of the distance, shape (k,), m/s.
+        bias: its acceleration at zero joint acceleration, shape (k,), m/s^2, so that its
+            acceleration is ``G a + bias``.
+        viable: shape (k,), bool; False where the margin is broken, or more braking is needed to
+            keep it than is counted on or than the bounds allow.
+    """
+
+    G: Array
+    lower: Array
+    names: list[str]
+    distance: Array
+    rate: Array
+    bias: Array
+    viable: NDArray[np.bool_]
+
+
+class CollisionAvoidance:
+    """Rows that keep the pairs of a collision model apart.
+
+    Args:
+        model: shapes and pairs.
+        a_min: acceleration limits of the joints, shape (n,), rad/s^2, negative.
+        a_max: shape (n,), rad/s^2, positive.
+        dt: how long an acceleration is held, s; more than the control period gives gentler
+            rows, as with the joints' bounds.
+        settings: distances and speeds.
+
+    Raises:
+        CollisionError: limits of the wrong size or sign, or a step that is not positive.
+    """
+
+    def __init__(
+        self,
+        model: CollisionModel,
+        a_min: ArrayLike,
+        a_max: ArrayLike,
+        dt: float,
+        settings: CollisionSettings | None = None,
+    ) -> None:
+        n = len(model.chain.parent) - 1
+        lower, upper = np.asarray(a_min, dtype=float), np.asarray(a_max, dtype=float)
+        for name, limit, sign in (("a_min", lower, -1.0), ("a_max", upper, 1.0)):
+            if limit.shape != (n,) or not (np.isfinite(limit) & (sign * limit > 0.0)).all():
+                kind = "negative" if sign < 0.0 else "positive"
+                raise CollisionError(f"{name} must be {n} finite {kind} numbers, not {limit}")
+        if not (math.isfinite(dt) and dt > 0.0):
+            raise CollisionError(f"dt must be positive, not {dt}")
+        self.settings = settings or CollisionSettings()
+        self.model = model
+        side = make_side(
+            dt=dt,
+            braking=1.0,
+            v_max=_FAST,
+            low=-_HARD,
+            high=_HARD,
+            margin=0.0,
+            tolerance=0.0,
+            length=math.inf,
+            curve=None,
+        )
+        most = int(ROWS_OF_KIND[model.pairs.kind].sum()) + 1
+        self._n = n
+        self._rows = make_rows(most, n, len(model.names), len(model.bodies.joint))
+        self._fixed = (
+            np.minimum(-lower, upper),
+            *make_table([(0.0, math.inf, _FAST, side, side)]),
+            Law(*astuple(self.settings), dt),
+        )
+        self._arm = (model.chain, make_motion(model.chain), self._rows)
+        # The first call compiles; let it be this one and not one in a control loop.
+        self.rows(np.zeros(n), np.zeros(n), lower, upper)
+
+    def rows(self, q: Array, v: Array, a_lower: Array, a_upper: Array) -> CollisionRows:
+        """Return the rows of one step; those that the bounds imply are left out.
+
+        Args:
+            q: shape (n,), rad.
+            v: shape (n,), rad/s.
+            a_lower: bounds of the accelerations, shape (n,), rad/s^2, finite.
+            a_upper: shape (n,), rad/s^2, not below `a_lower`.
+
+        Values that are not finite are the caller's to refuse.
+        """
+        step = Step(a_lower, a_upper, *self._fixed)
+        k = collision_rows(q, v, self.model.pairs, self.model.bodies, step, *self._arm)
+        rows, names = self._rows, self.model.names
+        return CollisionRows(
+            rows.G[:k],
+            rows.lower[:k],
+            [names[i] for i in rows.pair[:k].tolist()],
+            rows.distance[:k],
+            rows.rate[:k],
+            rows.bias[:k],
+            rows.viable[:k],
+        )
+
+    def closest(self) -> tuple[float, str]:
+        """Return the least distance in the last step, m, and between what; inf if all are far."""
+        if not self.model.names:
+            return math.inf, ""
+        index = int(np.argmin(self._rows.found))
+        distance = float(self._rows.found[index])
+        return distance, self.model.names[index] if distance < math.inf else ""
