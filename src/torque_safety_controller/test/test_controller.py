@@ -9,7 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from torque_safety_controller.additional_torque import (
+    MODES,
+    AdditionalSettings,
+    AdditionalTorque,
+)
 from torque_safety_controller.controller import Controller, Gains
+from torque_safety_controller.integral_settings import IntegralSettings
+from torque_safety_controller.nullspace_settings import NullspaceSettings
 from torque_safety_controller.tasks import pose_error
 
 GAINS = Gains(
@@ -24,6 +31,7 @@ GAINS = Gains(
 )
 EXACT = 1e-9  # N m; rounding
 SOLVED = 1e-4  # rad/s^2; how exactly the QP is solved
+KHZ = 1e-3  # s
 WIDE = 1e3  # rad/s^2; bounds that no one feels
 
 
@@ -74,6 +82,19 @@ class Fixed:
 
     def torque(self, robot, v, a_last, elapsed):
         return self._torque
+
+
+def integral(arm, mode, **changed) -> AdditionalSettings:
+    common = {"budget": 0.2 * arm.tau_max, "lambda_": 30.0} | changed
+    return AdditionalSettings(
+        mode, IntegralSettings(**common), NullspaceSettings(**common), 2.0 * arm.tau_max
+    )
+
+
+def with_integral(arm, mode="joints", gains=GAINS, rate=None, **changed) -> Controller:
+    """A controller at 1 kHz."""
+    additional = AdditionalTorque(integral(arm, mode, **changed), slice(0, 3))
+    return Controller(arm.robot(KHZ), arm.tau_max, gains, rate, additional)
 
 
 # The output, whatever comes
@@ -417,3 +438,174 @@ def test_start_keeps_a_copy_of_the_state(arm):
     q += 1.0  # a reader may use its array again
     step = controller.step(arm.q_start, np.zeros(arm.n), *wide(arm))
     np.testing.assert_allclose(step.a, 0.0, atol=1e-3)
+
+
+# With integral action
+
+
+DEEDS = st.lists(
+    st.tuples(
+        st.sampled_from(["step", "rest", "hold", "take_over", "start"]),
+        st.sampled_from([None, *MODES]),
+        st.one_of(st.none(), NUMBERS),
+        st.one_of(st.just(np.zeros(7)), VECTORS),
+        st.one_of(st.just(np.zeros(7)), VECTORS),
+        VECTORS,
+    ),
+    min_size=1,
+    max_size=10,
+)
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(
+    mode=st.sampled_from(MODES),
+    share=st.sampled_from([0.0, 0.1, 1.0]),
+    rate=st.sampled_from([math.inf, 1000.0]),
+    deeds=DEEDS,
+)
+def test_torque_limits_hold_whatever_the_integral_does(mode, share, rate, deeds):
+    arm = load_arm("panda")
+    budget = share * arm.tau_max
+    controller = with_integral(arm, mode, rate=np.full(arm.n, rate), budget=budget)
+    controller.set_posture_goal(arm.q_start + 0.3)
+    with np.errstate(all="ignore"):
+        for deed, other, elapsed, dq, v, x in deeds:
+            if other is not None:
+                controller.additional.settings = integral(arm, other, budget=budget)
+            q = arm.q_start + dq
+            bounds = -np.abs(x), np.abs(x)
+            if deed == "start":
+                controller.start(q)
+                continue
+            act = getattr(controller, deed)
+            last = {"hold": (elapsed,), "take_over": (*bounds, x)}
+            step = act(q, v, *last.get(deed, (*bounds, elapsed)))
+            assert_may_be_sent(step, arm)
+            assert np.isfinite(controller.additional.last).all()
+        # Once the world makes sense again, so does the controller.
+        controller.pose_des = None
+        controller.set_posture_goal(arm.q_start)
+        rest = arm.q_start, np.zeros(arm.n), *wide(arm)
+        for _ in range(3):
+            assert_may_be_sent(controller.step(*rest), arm)
+        assert not controller.step(*rest).failure
+
+
+STIFF = replace(GAINS, pose_kp=400.0, pose_kd=40.0, posture_kp=100.0, posture_kd=20.0)
+
+
+def pushed(arm, q, v, tau, push):
+    """Play a period with a torque on the joints that no one knows of."""
+    return arm.move(q, v, tau + push, KHZ, steps=1)
+
+
+def test_the_integral_carries_what_the_model_does_not_know():
+    arm = load_arm("panda")
+    push = 0.1 * arm.tau_max * np.array([1, -1, 1, 1, -1, 1, -1])
+    errors = {}
+    for mode in ("none", "joints", "task"):
+        controller = with_integral(arm, mode, STIFF)
+        goal = pose_at(arm, arm.q_start)
+        controller.start(arm.q_start)
+        controller.set_pose_goal(goal)
+        q, v = arm.q_start, np.zeros(arm.n)
+        for _ in range(round(0.6 / KHZ)):
+            q, v = pushed(arm, q, v, controller.step(q, v, *wide(arm)).tau, push)
+        errors[mode] = np.linalg.norm(pose_error(pose_at(arm, q), goal)[:3])
+    assert errors["joints"] < 0.1 * errors["none"]
+    assert errors["task"] < 0.1 * errors["none"]
+
+
+def test_the_limits_on_torque_leave_the_integral_its_share(arm):
+    """The QP keeps the sum within its limits: the accelerations it returns are those it gives."""
+    state = arm.q_start, np.zeros(arm.n)
+    saturated = 0
+    for sign in (1.0, -1.0):
+        controller = with_integral(arm, gains=replace(GAINS, posture_kp=1e4))
+        controller.take_over(*state, *wide(arm), sign * 0.5 * arm.tau_max)
+        controller.pose_des = None
+        controller.set_posture_goal(arm.q_max)
+        for _ in range(5):
+            step = controller.step(*state, *wide(arm))
+            assert_may_be_sent(step, arm)
+            assert not step.failure
+            added = controller.additional.last
+            assert (np.abs(added) > 0.01 * arm.tau_max).any()
+            # The limits are those in the middle of a step with the acceleration of the last one.
+            model = controller.robot.torque(*state, step.a)
+            np.testing.assert_allclose(step.tau, model + added, atol=0.01 * arm.tau_max.max())
+            saturated += (np.abs(step.tau) > 0.99 * arm.tau_max).any()
+    assert saturated == 10
+
+
+def test_in_hold_nothing_grows_on_what_the_motors_cannot_give(arm):
+    controller = with_integral(arm, gains=replace(GAINS, hold_kd=500.0))
+    q, v = arm.q_start, 0.5 * arm.v_max
+    saturated = 0
+    for _ in range(20):
+        step = controller.hold(q, v, KHZ)
+        saturated += (np.abs(step.tau) == arm.tau_max).any()
+        q, v = arm.move(q, v, step.tau, KHZ, steps=2)
+    assert saturated > 5
+    # With the accelerations that were wished for, budgets would be used up by now.
+    assert (np.abs(controller.additional.last) < 0.02 * arm.tau_max).all()
+
+
+# Handover
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_it_takes_over_the_torque_of_others(arm, mode):
+    rng = np.random.default_rng(6)
+    for _ in range(5):
+        controller = with_integral(arm, mode)
+        tau = gravity(arm, arm.q_start) + rng.uniform(-0.15, 0.15, arm.n) * arm.tau_max
+        tau = np.clip(tau, -arm.tau_max, arm.tau_max)
+        state = arm.q_start, np.zeros(arm.n)
+        controller.set_pose_goal(pose_at(arm, arm.q_start + 0.5))  # forgotten
+        step = controller.take_over(*state, *wide(arm), tau)
+        assert not step.failure
+        # The next step is at the same place, where friction holds the arm.
+        after = controller.step(*state, *wide(arm))
+        assert (np.abs(after.tau - tau) < 0.01 * arm.tau_max).all()
+        np.testing.assert_allclose(after.a, 0.0, atol=5e-3)
+        assert controller.pose_des.isApprox(pose_at(arm, arm.q_start))
+        np.testing.assert_array_equal(controller.q_des, arm.q_start)
+
+
+def test_torque_beyond_the_limits_is_taken_over_up_to_them(arm):
+    controller = with_integral(arm)
+    state = arm.q_start, np.zeros(arm.n)
+    controller.take_over(*state, *wide(arm), 1.5 * arm.tau_max)
+    step = controller.step(*state, *wide(arm))
+    assert_may_be_sent(step, arm)
+    assert (step.tau > 0.97 * arm.tau_max).all()
+
+
+def test_the_rate_of_torque_counts_from_what_was_measured(arm):
+    rate = np.full(arm.n, 1.0)
+    controller = with_integral(arm, "none", rate=rate)
+    state = arm.q_start, np.zeros(arm.n)
+    tau = gravity(arm, arm.q_start) + 0.2 * arm.tau_max
+    controller.take_over(*state, *wide(arm), tau)
+    assert (np.abs(controller.step(*state, *wide(arm)).tau - tau) <= rate * KHZ + EXACT).all()
+
+
+@pytest.mark.parametrize("bad", ["bounds", "torque", "position"])
+def test_a_handover_that_fails_leaves_everything_as_it_was(arm, bad):
+    controller = with_integral(arm)
+    goal = pose_at(arm, arm.q_start + 0.1)
+    controller.set_pose_goal(goal)
+    nan = np.full(arm.n, math.nan)
+    q = nan if bad == "position" else arm.q_start
+    bounds = (nan, nan) if bad == "bounds" else wide(arm)
+    tau = nan if bad == "torque" else 0.5 * arm.tau_max
+    step = controller.take_over(q, np.zeros(arm.n), *bounds, tau)
+    assert step.failure
+    assert not controller.additional.last.any()
+    assert controller.pose_des is goal
+    assert controller.q_des is None
+    step = controller.hold(arm.q_start, np.zeros(arm.n))
+    np.testing.assert_allclose(step.tau, gravity(arm, arm.q_start), atol=EXACT)
+    assert not controller.step(arm.q_start, np.zeros(arm.n), *wide(arm)).failure

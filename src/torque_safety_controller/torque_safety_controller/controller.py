@@ -228,6 +228,7 @@ class Controller:
 
         The arm's pose and posture become the goals. What is asked for then is given by the QP;
         the additional torque begins with the difference, so that the next step continues `tau`.
+        When the QP fails, or `tau` is not finite, the goals stay what they were.
 
         Args:
             q: position, shape (n,), rad.
@@ -236,16 +237,21 @@ class Controller:
             a_upper: shape (n,), rad/s^2, not below `a_lower`.
             tau: torque of the motors now, shape (n,), N m.
         """
+        goals = self.pose_des, self._pose_motion, self.q_des, self._v_des, self._posture
         self.start(q)
         self.robot.rates = self.additional is not None
         self.robot.update(q, v, self._a_last)
         self.set_posture_goal(q.copy())
         self.set_pose_goal(self.robot.pose.copy())
         step = self._solve(q, v, self._tasks(q, v), a_lower, a_upper, None, True)
-        tau = np.clip(tau, self._tau_min, self.tau_max)
-        if self.additional is not None and not step.failure:
-            self.additional.seed(self.robot, v, tau - step.tau)
-        self._tau_last = tau
+        if not step.failure and not np.isfinite(tau).all():
+            step = step._replace(failure="the torque of the motors is not finite")
+        if step.failure:
+            self.pose_des, self._pose_motion, self.q_des, self._v_des, self._posture = goals
+            return step
+        self._tau_last = np.clip(tau, self._tau_min, self.tau_max)
+        if self.additional is not None:
+            self.additional.seed(self.robot, v, self._tau_last - step.tau)
         return step
 
     def _begin(self, q: np.ndarray, v: np.ndarray, elapsed: float | None) -> np.ndarray | None:
