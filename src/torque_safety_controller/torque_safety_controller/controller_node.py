@@ -137,7 +137,9 @@ class ControllerNode(Node):
         """Answer the newest state, whose acceleration limits are there."""
         self._bounds_lost = False
         if self._handover.by_drives:
-            self._take_over(stamp)
+            self._hold_position(stamp)
+            if self._handover.control is Control.TAKING_OVER:
+                self._take_over()
             return
         if self._goals.apply_due(self._states.stamp):
             self._goal_at = time.monotonic()
@@ -192,10 +194,9 @@ class ControllerNode(Node):
         self._answered_stamp = self._states.stamp
         self._enter(Mode.POSITION, self._handover.reason)
 
-    def _take_over(self, stamp: Any) -> None:
+    def _take_over(self) -> None:
         """Prepare to go on with torque from the next state; this one is still the drives'."""
         states, limits = self._states, self._limits
-        self._hold_position(stamp)
         if self._goals.apply_due(states.stamp):
             self.get_logger().warning("goals from before the handover are dropped")
         try:
@@ -254,8 +255,9 @@ class ControllerNode(Node):
         waiting = self._states.stamp != self._answered_stamp
         if waiting and now - self._waiting_since > config.bounds_timeout:
             self._bounds_lost = True
-            if self._handover.by_drives:
+            if self._handover.control is Control.TAKING_OVER:
                 self._fail_handover("acceleration limits are stale")
+            if self._handover.by_drives:
                 self._hold_position(self._message_stamp)
             else:
                 self._hold(self._message_stamp)
