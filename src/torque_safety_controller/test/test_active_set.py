@@ -201,6 +201,24 @@ def test_rows_that_say_the_same_do_no_harm():
         np.testing.assert_allclose(x, solve(problem)[1], atol=1e-6)
 
 
+def test_rows_that_contradict_each_other_through_others_have_no_solution():
+    """One row is a combination of the others but for rounding, and its limit is not."""
+    rng = np.random.default_rng(9)
+    for _ in range(100):
+        n, m = 12, 4
+        problem = random_problem(rng, n, 0)
+        C, b = rng.normal(size=(m, n)), rng.normal(size=m)
+        share = rng.uniform(0.1, 1.0, m)
+        C, b = np.vstack([C, share @ C / 3.0]), np.r_[b, share @ b / 3.0 - 1e-3]
+        no = np.full(n, np.inf)
+        changes, *_ = solve(
+            problem._replace(
+                C=C, lower=np.r_[-no, b[:m], -np.inf], upper=np.r_[no, np.full(m, np.inf), b[m]]
+            )
+        )
+        assert changes == INFEASIBLE
+
+
 def test_a_row_of_zeros_that_excludes_zero_has_no_solution():
     problem = random_problem(np.random.default_rng(6), 4, 1)
     no = Problem(

@@ -222,6 +222,7 @@ def test_acceleration_of_the_points(index, normal_only):
     np.testing.assert_allclose(A @ a + drift, acceleration.reshape(-1), atol=1e-5)
     term = arm.contacts.rest_task(index, 20.0, 3.0, normal_only)
     np.testing.assert_allclose(term.b, -20.0 * v_c - drift)
+    assert term.weight == 3.0 / len(x)
     rows = arm.contacts.rest_rows(index, 20.0, normal_only)
     np.testing.assert_array_equal(rows.lower, rows.upper)
     np.testing.assert_allclose(rows.G, term.A)
