@@ -28,7 +28,7 @@ def everything(**changes) -> CollisionAvoidance:
     """Panda among all obstacles, near and far."""
     _, limits, collision, _ = panda()
     given = CollisionSettings(influence=5.0, **changes)
-    return CollisionAvoidance(collision, limits.a_min, limits.a_max, 2e-3, given)
+    return CollisionAvoidance(collision, limits.a_min, limits.a_max, 2e-3, given, rows_max=1000)
 
 
 def random_states(count, speed=1.0, seed=0):
@@ -221,6 +221,21 @@ def test_pairs_that_are_not_looked_at_have_twice_the_way_to_stop():
     assert compared > 20
 
 
+def test_of_too_many_rows_the_nearest_are_returned():
+    arm, limits, collision, _ = panda()
+    few = CollisionAvoidance(collision, limits.a_min, limits.a_max, 2e-3, rows_max=3)
+    every = CollisionAvoidance(collision, limits.a_min, limits.a_max, 2e-3, rows_max=1000)
+    cut = 0
+    for q, v in random_states(100, speed=2.0, seed=8):
+        rows = few.rows(q, v, limits.a_min, limits.a_max)
+        all_rows = every.rows(q, v, limits.a_min, limits.a_max)
+        nearest = np.sort(all_rows.distance)[: len(rows.names)]
+        np.testing.assert_array_equal(np.sort(rows.distance), nearest)
+        assert len(rows.names) == min(3, len(all_rows.names)) == len(rows.G) == len(rows.viable)
+        cut += len(all_rows.names) > 3
+    assert cut > 10
+
+
 def test_no_row_asks_for_what_the_bounds_do_not_allow():
     avoidance = everything()
     broken = 0
@@ -351,5 +366,7 @@ def test_limits_and_steps_that_cannot_be_are_refused():
         CollisionAvoidance(collision, limits.a_min, -limits.a_max, 1e-3)
     with pytest.raises(CollisionError, match="a_min"):
         CollisionAvoidance(collision, limits.a_min[:3], limits.a_max, 1e-3)
+    with pytest.raises(CollisionError, match="rows_max"):
+        CollisionAvoidance(collision, limits.a_min, limits.a_max, 1e-3, rows_max=0)
     with pytest.raises(CollisionError, match="dt"):
         CollisionAvoidance(collision, limits.a_min, limits.a_max, 0.0)

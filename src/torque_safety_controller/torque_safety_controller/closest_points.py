@@ -5,28 +5,27 @@ from __future__ import annotations
 from math import sqrt
 
 import numpy as np
-from numba import njit
 
-from torque_safety_controller.vectors3 import along, column, dot, sub
+from torque_safety_controller.vectors3 import along, column, compiled, dot, sub
 
 _SHORT = 1e-12  # m^2; a segment with less is a point
 _DEEP = 60  # bisections: to rounding
 
 
-@njit(cache=True)
+@compiled
 def clamp(x, low, high):
     """Return the number of [low, high] that is nearest to x."""
     return low if x < low else (high if x > high else x)
 
 
-@njit(cache=True)
+@compiled
 def on_segment(point, a, u):
     """Return t in [0, 1] so that a + t u is nearest to a point."""
     square = dot(u, u)
     return clamp(dot(sub(point, a), u) / square, 0.0, 1.0) if square > _SHORT else 0.0
 
 
-@njit(cache=True)
+@compiled
 def between_segments(a, u, b, w):
     """Return s and t in [0, 1] so that a + s u and b + t w are nearest to each other.
 
@@ -49,14 +48,14 @@ def between_segments(a, u, b, w):
     return s, t
 
 
-@njit(cache=True)
+@compiled
 def in_axes(point, R: np.ndarray, centre):
     """Return a point in the axes R, shape (3, 3), about `centre`."""
     r = sub(point, centre)
     return dot(r, column(R, 0)), dot(r, column(R, 1)), dot(r, column(R, 2))
 
 
-@njit(cache=True)
+@compiled
 def _slope(s, a, u, half):
     """Return half the derivative of the squared distance of a + s u from a box at zero."""
     slope = 0.0
@@ -66,13 +65,13 @@ def _slope(s, a, u, half):
     return slope
 
 
-@njit(cache=True)
+@compiled
 def _depth(x, half):
     """Return the signed distance of a point from the nearest face; negative inside a box."""
     return max(abs(x[0]) - half[0], abs(x[1]) - half[1], abs(x[2]) - half[2])
 
 
-@njit(cache=True)
+@compiled
 def segment_to_box(a, u, half):
     """Return s in [0, 1] so that a + s u is nearest to a box, or deepest in it.
 
@@ -113,7 +112,7 @@ def segment_to_box(a, u, half):
     return 0.5 * (low + high)
 
 
-@njit(cache=True)
+@compiled
 def point_to_box(x, half):
     """Return the signed distance of a point from a box, the normal and which axes are free.
 

@@ -98,6 +98,8 @@ class CollisionAvoidance:
         dt: how long an acceleration is held, s; more than the control period gives gentler
             rows, as with the joints' bounds.
         settings: distances and speeds.
+        rows_max: how many rows a step returns at most; of more, those of the least distances.
+            Only arms deep in obstacles have more, and a QP needs an end.
 
     Raises:
         CollisionError: limits of the wrong size or sign, or a step that is not positive.
@@ -110,6 +112,7 @@ class CollisionAvoidance:
         a_max: ArrayLike,
         dt: float,
         settings: CollisionSettings | None = None,
+        rows_max: int = 40,
     ) -> None:
         n = len(model.chain.parent) - 1
         lower, upper = np.asarray(a_min, dtype=float), np.asarray(a_max, dtype=float)
@@ -119,6 +122,9 @@ class CollisionAvoidance:
                 raise CollisionError(f"{name} must be {n} finite {kind} numbers, not {limit}")
         if not (math.isfinite(dt) and dt > 0.0):
             raise CollisionError(f"dt must be positive, not {dt}")
+        if rows_max < 1:
+            raise CollisionError(f"rows_max must be positive, not {rows_max}")
+        self._rows_max = rows_max
         self.settings = settings or CollisionSettings()
         self.model = model
         side = make_side(
@@ -157,16 +163,25 @@ class CollisionAvoidance:
         """
         step = Step(a_lower, a_upper, *self._fixed)
         k = collision_rows(q, v, self.model.pairs, self.model.bodies, step, *self._arm)
-        rows, names = self._rows, self.model.names
+        rows = self._rows
+        chosen: slice | NDArray = slice(k)
+        if k > self._rows_max:
+            chosen = np.sort(np.argpartition(rows.distance[:k], self._rows_max)[: self._rows_max])
+        names = self.model.names
         return CollisionRows(
-            rows.G[:k],
-            rows.lower[:k],
-            [names[i] for i in rows.pair[:k].tolist()],
-            rows.distance[:k],
-            rows.rate[:k],
-            rows.bias[:k],
-            rows.viable[:k],
+            rows.G[chosen],
+            rows.lower[chosen],
+            [names[i] for i in rows.pair[chosen].tolist()],
+            rows.distance[chosen],
+            rows.rate[chosen],
+            rows.bias[chosen],
+            rows.viable[chosen],
         )
+
+    @property
+    def distances(self) -> Array:
+        """Distances of all pairs in the last step, shape (p,), m; inf where one is far."""
+        return self._rows.found
 
     def closest(self) -> tuple[float, str]:
         """Return the least distance in the last step, m, and between what; inf if all are far."""

@@ -11,7 +11,6 @@ from math import inf, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from torque_safety_controller.closest_points import (
@@ -23,7 +22,7 @@ from torque_safety_controller.closest_points import (
 )
 from torque_safety_controller.collision_kinematics import move, place, point_motion
 from torque_safety_controller.collision_row import slides_along, write_row
-from torque_safety_controller.vectors3 import along, at, column, cross, dot, sub, turned
+from torque_safety_controller.vectors3 import along, at, column, compiled, cross, dot, sub, turned
 
 Array = NDArray[np.float64]
 
@@ -79,7 +78,7 @@ class Pairs(NamedTuple):
     second: NDArray[np.int64]
 
 
-@njit(cache=True)
+@compiled
 def place_capsules(motion, bodies, rows):
     """Put the segments of all capsules into the base frame."""
     for i in range(len(bodies.joint)):
@@ -91,7 +90,7 @@ def place_capsules(motion, bodies, rows):
             rows.segment[i, k] = u[k]
 
 
-@njit(cache=True)
+@compiled
 def distance_of(kind, i, j, bodies, rows):
     """Return the distance of a pair whose capsules are placed, negative if they overlap, m."""
     a, u = at(rows.start, i), at(rows.segment, i)
@@ -108,7 +107,7 @@ def distance_of(kind, i, j, bodies, rows):
     return min(dot(n, a), dot(n, along(a, 1.0, u))) - bodies.level[j] - bodies.radius[i]
 
 
-@njit(cache=True)
+@compiled
 def _ball(i, motion, bodies, rows):
     """Return a capsule's middle, its velocity, and what its ends add to distance and speed."""
     half = along(_STILL, 0.5, at(rows.segment, i))
@@ -119,7 +118,7 @@ def _ball(i, motion, bodies, rows):
     return middle, v, length + bodies.radius[i], sqrt(dot(turning, turning)) * length
 
 
-@njit(cache=True)
+@compiled
 def _gap_and_speed(kind, i, j, motion, bodies, rows):
     """Return less than the distance of a pair, and more than the speed of its approach."""
     middle, v, reach, swing = _ball(i, motion, bodies, rows)
@@ -136,7 +135,7 @@ def _gap_and_speed(kind, i, j, motion, bodies, rows):
     return gap - reach, sqrt(dot(v, v)) + swing
 
 
-@njit(cache=True)
+@compiled
 def _is_new(s, o, known, counts):
     """Return whether no row of the pair belongs to these points yet, and note that one does."""
     count = counts[1]
@@ -151,7 +150,7 @@ def _is_new(s, o, known, counts):
     return True
 
 
-@njit(cache=True)
+@compiled
 def _direction(c, u, w):
     """Return |c| and its direction; for axes that meet, one across both of them."""
     d = sqrt(dot(c, c))
@@ -166,7 +165,7 @@ def _direction(c, u, w):
     return d, (n[0] / size, n[1] / size, n[2] / size)
 
 
-@njit(cache=True)
+@compiled
 def _segment_rows(pair, i, b, w, other, radius, near, ends, bodies, step, chain, motion, rows):
     """Write the rows of capsule `i` and a segment from b to b + w, moved by joint `other`.
 
@@ -197,7 +196,7 @@ def _segment_rows(pair, i, b, w, other, radius, near, ends, bodies, step, chain,
         write_row(pair, d, radius, n, p, joint, o, other, sliding, step, chain, motion, rows)
 
 
-@njit(cache=True)
+@compiled
 def _box_rows(pair, i, j, near, bodies, step, chain, motion, rows):
     """Write the rows of capsule `i` and box `j`: closest points, ends, and the box's edges."""
     joint, radius = bodies.joint[i], bodies.radius[i]
@@ -231,7 +230,7 @@ def _box_rows(pair, i, j, near, bodies, step, chain, motion, rows):
                           chain, motion, rows)  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def collision_rows(q, v, pairs, bodies, step, chain, motion, rows):
     """Fill in `rows`, and return how many there are.
 

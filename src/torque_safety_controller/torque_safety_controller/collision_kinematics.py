@@ -11,10 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from numba import njit
 from numpy.typing import NDArray
 
-from torque_safety_controller.vectors3 import along, at, cross, dot, sub, turned
+from torque_safety_controller.vectors3 import along, at, compiled, cross, dot, sub, turned
 
 Array = NDArray[np.float64]
 
@@ -98,12 +97,12 @@ def make_motion(chain: Chain) -> Motion:
     return motion
 
 
-@njit(cache=True)
+@compiled
 def _set(A, i, x):
     A[i, 0], A[i, 1], A[i, 2] = x
 
 
-@njit(cache=True)
+@compiled
 def move(q, v, chain, motion):
     """Compute `motion` at a state, in place.
 
@@ -144,7 +143,7 @@ def move(q, v, chain, motion):
         _set(motion.bias, i, bias)
 
 
-@njit(cache=True)
+@compiled
 def _turn(R, axis, c, s):
     """Replace R by R times the rotation about `axis`, row by row: Rodrigues' formula."""
     for k in range(3):
@@ -155,13 +154,13 @@ def _turn(R, axis, c, s):
                           c * row[2] + s * side[2]), share, axis))  # fmt: skip
 
 
-@njit(cache=True)
+@compiled
 def place(motion, i, local):
     """Return a point of joint `i`, given in its axes, in the base frame."""
     return along(at(motion.origin, i), 1.0, turned(motion.rotation[i], local))
 
 
-@njit(cache=True)
+@compiled
 def point_motion(motion, i, point):
     """Return velocity and acceleration at zero joint acceleration of a point fixed to joint i."""
     lever = sub(point, at(motion.origin, i))

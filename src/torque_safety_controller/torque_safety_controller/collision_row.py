@@ -10,11 +10,10 @@ from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from torque_safety_controller.collision_kinematics import point_motion
-from torque_safety_controller.vectors3 import at, cross, dot, sub
+from torque_safety_controller.vectors3 import at, compiled, cross, dot, sub
 from viability_bounds_pkg.bounds_kernel import solve
 
 Array = NDArray[np.float64]
@@ -130,7 +129,7 @@ def make_rows(most: int, n: int, pairs: int, capsules: int) -> Rows:
     )
 
 
-@njit(cache=True)
+@compiled
 def write_row(pair, d, radius, n, p, joint, o, other, sliding, step, chain, motion, rows):
     """Write the next row, for one distance, unless the bounds imply it.
 
@@ -148,9 +147,6 @@ def write_row(pair, d, radius, n, p, joint, o, other, sliding, step, chain, moti
         chain: constants of the joints.
         motion: of the joints.
         rows: to write to.
-
-    Tuples of arrays are never nested: taking one out of another counts a reference to each
-    array in it, and that takes longer than the arithmetic here.
     """
     law = step.law
     v, gamma = point_motion(motion, joint, p)
@@ -201,13 +197,13 @@ def write_row(pair, d, radius, n, p, joint, o, other, sliding, step, chain, moti
     rows.count[0] = k + 1
 
 
-@njit(cache=True)
+@compiled
 def _lever(axis, origin, slides, p, n):
     """Return the speed along n that a unit velocity of a joint gives to a point that it moves."""
     return dot(axis, n) if slides else dot(axis, cross(sub(p, origin), n))
 
 
-@njit(cache=True)
+@compiled
 def _sliding_term(v, c, count, free, turning, L):
     """Return what sliding takes off the second derivative of |c|^2 / 2: w' H^-1 w.
 
@@ -239,7 +235,7 @@ def _sliding_term(v, c, count, free, turning, L):
     return total
 
 
-@njit(cache=True)
+@compiled
 def _lowest(room, rate, braking, step, x, kept):
     """Return the lowest acceleration of a distance that keeps it: that of a joint's lower limit.
 
@@ -255,7 +251,7 @@ def _lowest(room, rate, braking, step, x, kept):
     return lowest
 
 
-@njit(cache=True)
+@compiled
 def slides_along(count, direction, turning, free, turns):
     """Add a direction to those in which closest points may slide; return how many there are."""
     length = sqrt(dot(direction, direction))

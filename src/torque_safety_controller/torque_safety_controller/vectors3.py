@@ -5,20 +5,24 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+compiled = njit(cache=True, error_model="numpy", _nrt=False)
+"""Compiles what allocates no arrays. To count references to those it is given, as numba does for
+each one taken out of a tuple, takes several times longer than the arithmetic here."""
 
-@njit(cache=True)
+
+@compiled
 def at(A: np.ndarray, i: int):
     """Return row `i` of an array of shape (m, 3)."""
     return A[i, 0], A[i, 1], A[i, 2]
 
 
-@njit(cache=True)
+@compiled
 def dot(a, b):
     """Return a . b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(cache=True)
+@compiled
 def cross(a, b):
     """Return a x b."""
     return (
@@ -28,25 +32,25 @@ def cross(a, b):
     )
 
 
-@njit(cache=True)
+@compiled
 def sub(a, b):
     """Return a - b."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
-@njit(cache=True)
+@compiled
 def along(a, s, u):
     """Return a + s u."""
     return a[0] + s * u[0], a[1] + s * u[1], a[2] + s * u[2]
 
 
-@njit(cache=True)
+@compiled
 def column(R: np.ndarray, k: int):
     """Return column `k` of an array of shape (3, 3)."""
     return R[0, k], R[1, k], R[2, k]
 
 
-@njit(cache=True)
+@compiled
 def turned(R: np.ndarray, a):
     """Return R a."""
     return (

@@ -1,0 +1,262 @@
+"""Collision avoidance: what a pair and a step cost, and what the capsules add to the links.
+
+For Panda and for TALOS' torso and arm, pairs chosen automatically, among a table, a floor, a pole
+and a ball. States are random ones around the start posture, at up to 1 rad/s. With cold caches
+means that other data has been read since the last call, as in a control loop. Beside it coal,
+called through Pinocchio, for the same capsules and for the convex hulls of the links' meshes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import statistics
+import time
+from pathlib import Path
+
+import coal
+import numpy as np
+import pinocchio as pin
+import yaml
+
+from torque_safety_controller.collision_avoidance import CollisionAvoidance
+from torque_safety_controller.collision_geometry import link_shapes, load_geometry
+from torque_safety_controller.collision_kernels import BOX, CAPSULES, HALF_SPACE, Pairs
+from torque_safety_controller.collision_model import CollisionModel, build_collision_model
+from torque_safety_controller.collision_obstacles import box, capsule, half_space, sphere
+from viability_bounds_pkg.robot_description import build_model, read_urdf
+
+ROOT = Path(__file__).resolve().parent.parent
+STATES = 1000
+CACHE = 8_000_000  # numbers; more than the last-level cache holds
+KINDS = {CAPSULES: "two capsules", BOX: "capsule and box", HALF_SPACE: "capsule and half space"}
+SURROUNDINGS = {
+    "panda": (
+        box("table", [0.6, 0.0, 0.1], [0.4, 1.0, 0.05]),
+        half_space("floor", [0.0, 0.0, -0.1], [0.0, 0.0, 1.0]),
+        capsule("pole", [0.4, -0.4, 0.0], [0.4, -0.4, 1.0], 0.03),
+        sphere("ball", [0.5, 0.4, 0.6], 0.1),
+    ),
+    "talos_left_arm": (
+        box("table", [0.7, 0.3, -0.1], [0.4, 1.0, 0.05]),
+        half_space("floor", [0.0, 0.0, -1.0], [0.0, 0.0, 1.0]),
+        capsule("pole", [0.4, 0.6, -1.0], [0.4, 0.6, 1.0], 0.03),
+        sphere("ball", [0.6, 0.0, 0.3], 0.1),
+    ),
+}
+
+
+class Robot:
+    """One robot of ``config/`` with its collision model."""
+
+    def __init__(self, name: str) -> None:
+        content = yaml.safe_load((ROOT / "config" / f"{name}.yaml").read_text())
+        values = {k: v for part in content.values() for k, v in part["ros__parameters"].items()}
+        locked = dict(
+            zip(values.get("locked_joints", []), values.get("locked_positions", []), strict=True)
+        )
+        urdf = read_urdf(values["robot_description"])
+        self.name, self.dt = name, 2.0 / values["rate_hz"]
+        self.model = build_model(urdf, values["joints"], locked)
+        self.geometry = load_geometry(urdf, self.model, locked)
+        self.q = np.array(values["start_positions"])
+        self.a_min = np.array(values["acceleration_min"])
+        self.a_max = np.array(values["acceleration_max"])
+        build_collision_model(self.model, self.geometry, self.q)  # compiles
+        start = time.perf_counter()
+        self.collision = build_collision_model(
+            self.model, self.geometry, self.q, SURROUNDINGS[name]
+        )
+        self.seconds = time.perf_counter() - start
+
+    def states(self, speed: float = 1.0) -> list[tuple[np.ndarray, ...]]:
+        """Return arguments of `CollisionAvoidance.rows`."""
+        rng = np.random.default_rng(0)
+        n = len(self.q)
+        return [
+            (
+                self.q + rng.uniform(-0.3, 0.3, n),
+                speed * rng.uniform(-1.0, 1.0, n),
+                self.a_min,
+                self.a_max,
+            )
+            for _ in range(STATES)
+        ]
+
+    def avoidance(self, model: CollisionModel | None = None) -> CollisionAvoidance:
+        """Return the rows' source, with the default settings."""
+        return CollisionAvoidance(model or self.collision, self.a_min, self.a_max, self.dt)
+
+
+def only(model: CollisionModel, kind: int, repeat: int = 1) -> CollisionModel:
+    """Return the model with the pairs of one kind, or with none."""
+    mask = np.tile(model.pairs.kind == kind, repeat)
+    pairs = Pairs(*(np.tile(a, repeat)[mask].copy() for a in model.pairs))
+    names = tuple(n for n, kept in zip(model.names * repeat, mask, strict=True) if kept)
+    return dataclasses.replace(model, pairs=pairs, names=names)
+
+
+def median_time(function, arguments) -> float:
+    """Return the median time of a call, us."""
+    times = []
+    for each in arguments:
+        start = time.perf_counter()
+        function(*each)
+        times.append(time.perf_counter() - start)
+    return 1e6 * statistics.median(times)
+
+
+def steps(robot: Robot) -> None:
+    """Measure whole steps."""
+    flush = np.zeros(CACHE)
+    avoidance = robot.avoidance()
+    for speed in (0.0, 0.3, 1.0):
+        states = robot.states(speed)
+        near, rows = [], []
+        for state in states:
+            rows.append(len(avoidance.rows(*state).names))
+            near.append(np.count_nonzero(np.isfinite(avoidance.distances)))
+        cold = []
+        for state in states[:40]:
+            flush += 1.0
+            cold.append(median_time(avoidance.rows, [state]))
+        print(
+            f"  step at up to {speed:.1f} rad/s: {median_time(avoidance.rows, states):6.1f} us, "
+            f"{statistics.median(cold):6.1f} us with cold caches; pairs near {np.mean(near):.1f}, "
+            f"rows {np.mean(rows):.2f}, {max(rows)} at most"
+        )
+
+
+def pairs(robot: Robot) -> None:
+    """Measure pairs of each kind: far ones, and near ones with all their features."""
+    states = robot.states()
+    model = robot.collision
+    bare = median_time(robot.avoidance(only(model, -1)).rows, states)
+    print(f"  without pairs: {bare:.1f} us (kinematics, and what Python takes)")
+    for kind, name in KINDS.items():
+        part = only(model, kind)
+        count = len(part.names)
+        if not count:
+            continue
+        costs = {}
+        for label, influence in (("far", 1e-1), ("near", 50.0)):
+            avoidance = robot.avoidance(part)
+            avoidance = CollisionAvoidance(
+                part,
+                robot.a_min,
+                robot.a_max,
+                robot.dt,
+                dataclasses.replace(avoidance.settings, influence=influence),
+            )
+            still = [(q, 0.0 * v, low, high) for q, v, low, high in states]
+            time_ = median_time(avoidance.rows, still)
+            costs[label] = (time_ - bare) / count
+        print(
+            f"  {name:<22} {count:4d} pairs: {costs['near']:5.2f} us each with all its features, "
+            f"{costs['far']:5.2f} us with most of them far"
+        )
+
+
+def coal_pairs(robot: Robot) -> None:
+    """Measure coal on the same pairs of capsules, and on hulls of the same links."""
+    model, bodies = robot.collision, robot.collision.bodies
+    for label in ("capsules", "convex hulls"):
+        geometry = pin.GeometryModel()
+        if label == "capsules":
+            for i, (j, p, u, r) in enumerate(
+                zip(bodies.joint, bodies.start, bodies.segment, bodies.radius, strict=True)
+            ):
+                length = float(np.linalg.norm(u))
+                z = np.array([0.0, 0.0, 1.0])
+                turn = pin.Quaternion.FromTwoVectors(z, u if length > 0.0 else z)
+                place = pin.SE3(turn.toRotationMatrix(), p + 0.5 * u)
+                shape = coal.Capsule(float(r), length)
+                geometry.addGeometryObject(pin.GeometryObject(str(i), int(j), 0, place, shape))
+            chosen = model.pairs.kind == CAPSULES
+            for i, j in zip(model.pairs.first[chosen], model.pairs.second[chosen], strict=True):
+                geometry.addCollisionPair(pin.CollisionPair(int(i), int(j)))
+        else:
+            index = {}
+            for item in robot.geometry.geometryObjects:
+                if isinstance(item.geometry, coal.BVHModelBase):
+                    item.geometry.buildConvexRepresentation(False)
+                    hull = item.geometry.convex
+                    link = robot.model.frames[item.parentFrame].name
+                    index[link] = geometry.addGeometryObject(
+                        pin.GeometryObject(link, item.parentJoint, 0, item.placement, hull)
+                    )
+            for name in dict.fromkeys(model.names):
+                first, second = name.split(" - ")
+                if first in index and second in index:
+                    geometry.addCollisionPair(pin.CollisionPair(index[first], index[second]))
+        count = len(geometry.collisionPairs)
+        data, meshes = robot.model.createData(), geometry.createData()
+        states = [state[:1] for state in robot.states()]
+
+        def every(q, data=data, geometry=geometry, meshes=meshes):
+            pin.updateGeometryPlacements(robot.model, data, geometry, meshes, q)
+            pin.computeDistances(geometry, meshes)
+
+        def single(q, count=count, geometry=geometry, meshes=meshes):
+            for k in range(count):
+                pin.computeDistance(geometry, meshes, k).getNearestPoint1()
+
+        print(
+            f"  coal, {label:<13} {count:4d} pairs: {median_time(every, states) / count:5.2f} us "
+            f"each by computeDistances, {median_time(single, states[:200]) / count:5.2f} us one "
+            "by one with a witness point"
+        )
+
+
+def excess(robot: Robot) -> None:
+    """Print how far capsules stand out of their links."""
+    ball = coal.Sphere(1e-6)
+    rng = np.random.default_rng(0)
+    worst, means = ("", 0.0), []
+    for shape in link_shapes(robot.model, robot.geometry):
+        if not len(shape.triangles):
+            continue
+        mesh = coal.BVHModelOBBRSS()
+        mesh.beginModel(len(shape.triangles), len(shape.vertices))
+        mesh.addVertices(shape.vertices)
+        for triangle in shape.triangles:
+            mesh.addTriangle(*shape.vertices[triangle])
+        mesh.endModel()
+        gaps = []
+        for start, end, radius in robot.collision.capsules[shape.link]:
+            directions = rng.normal(size=(60, 3))
+            directions /= np.linalg.norm(directions, axis=1)[:, None]
+            points = start + rng.uniform(size=(60, 1)) * (end - start) + radius * directions
+            for point in points:
+                result = coal.DistanceResult()
+                place = coal.Transform3s(np.eye(3), point)
+                request = coal.DistanceRequest()
+                gaps.append(coal.distance(mesh, coal.Transform3s(), ball, place, request, result))
+        means.append(np.mean(gaps))
+        if max(gaps) > worst[1]:
+            worst = (shape.link, max(gaps))
+    print(
+        f"  capsules stand out of the meshes by {1e3 * np.mean(means):.0f} mm on average over the "
+        f"links, {1e3 * worst[1]:.0f} mm at most ({worst[0]})"
+    )
+
+
+def main() -> None:
+    """Measure and print."""
+    for name in SURROUNDINGS:
+        robot = Robot(name)
+        model = robot.collision
+        capsules = sum(len(c) for c in model.capsules.values())
+        out = ", ".join(f"{len(names)} {reason}" for reason, names in model.left_out.items())
+        print(
+            f"{name}: {len(model.capsules)} links, {capsules} capsules, {len(model.names)} pairs; "
+            f"left out: {out}; built in {robot.seconds:.1f} s"
+        )
+        print("  not guarded:", ", ".join(model.left_out.get("near at start", [])) or "none")
+        excess(robot)
+        steps(robot)
+        pairs(robot)
+        coal_pairs(robot)
+
+
+if __name__ == "__main__":
+    main()
