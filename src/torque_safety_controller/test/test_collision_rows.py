@@ -208,7 +208,7 @@ def test_rows_are_left_out_only_if_the_bounds_imply_them():
 def test_pairs_that_are_not_looked_at_have_twice_the_way_to_stop():
     _, limits, collision, _ = panda()
     avoidance = everything()
-    usual = CollisionAvoidance(collision, limits.a_min, limits.a_max, 2e-3)
+    usual = CollisionAvoidance(collision, limits.a_min, limits.a_max, 2e-3, rows_max=1000)
     compared = 0
     for q, v in random_states(150, speed=1.5, seed=5):
         near = set(usual.rows(q, v, limits.a_min, limits.a_max).names)

@@ -44,7 +44,7 @@ class CollisionSettings:
     margin: float = 0.02
     reserve: float = 0.002
     braking: float = 2.0
-    braking_share: float = 0.5
+    braking_share: float = 0.3
     speed_max: float = 1.0
     recovery_speed: float = 0.1
     influence: float = 0.1
