@@ -235,6 +235,17 @@ def test_a_dearer_row_gives_way_less():
     np.testing.assert_allclose(given[10.0], [100.0 / 101.0, 1.0 / 101.0], atol=1e-5)
 
 
+@pytest.mark.parametrize("factor", [1e-4, 1e4])
+def test_rows_of_any_usual_length_have_a_solution(factor):
+    rng = np.random.default_rng(10)
+    for _ in range(60):
+        problem = random_problem(rng, 8, 4, 0.3)
+        rows = problem.rows._replace(G=factor * problem.rows.G)
+        problem = problem._replace(rows=rows)
+        solution = InverseDynamicsQP(N, GAMMA).solve(*problem)
+        assert_hard_limits_kept(problem, solution)
+
+
 def test_sizes_may_change_from_step_to_step():
     rng = np.random.default_rng(4)
     qp = InverseDynamicsQP(N, GAMMA)

@@ -17,7 +17,7 @@ from torque_safety_controller.cholesky import factorise
 _FEASIBLE = 1e-9
 """What a constraint may be violated by, for a normal of length 1."""
 _ROUNDING = 1e-13  # of a limit
-_DEPENDENT = 1e-10
+_DEPENDENT = 1e-12
 """A normal of which less is independent of the active ones, in the metric of H^-1, depends."""
 _BLOCKING = 1e-14
 """Multipliers that fall slower than this, of the fastest, do not fall but for rounding."""

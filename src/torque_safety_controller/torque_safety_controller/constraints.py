@@ -13,7 +13,8 @@ class Rows(NamedTuple):
 
     Where the torque limits leave no solution, rows and acceleration bounds give way together,
     as little as possible in the sum of squares. A row may be scaled, with its limits, to say
-    how dear it is: a row times 10 gives way as one that costs 100 times as much.
+    how dear it is: a row times 10 gives way as one that costs 100 times as much. Lengths up to
+    1e4 are sensible.
     """
 
     G: np.ndarray
