@@ -265,6 +265,8 @@ def test_numbers_beyond_sense_keep_the_last_torque():
             np.testing.assert_array_equal(added, before)
             loop.run(0.02)
             assert loop.steps(21) < 1e-3
+            # Since when the velocity has changed is not known in the next step either.
+            assert loop.additional.skipped == (0 if mode == "none" else 2)
 
 
 @pytest.mark.parametrize("mode", MODES)
