@@ -21,6 +21,7 @@ setup(
     entry_points={
         "console_scripts": [
             "bullet_node = sim_bridge.bullet_node:main",
+            "record_excitation = sim_bridge.ros_record_excitation:main",
             "scenario_node = sim_bridge.scenario_node:main",
         ],
     },

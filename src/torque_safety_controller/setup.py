@@ -21,6 +21,7 @@ setup(
     entry_points={
         "console_scripts": [
             "controller_node = torque_safety_controller.controller_node:main",
+            "identify_friction = torque_safety_controller.identify_friction:main",
         ],
     },
 )

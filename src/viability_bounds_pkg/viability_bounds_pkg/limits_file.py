@@ -63,7 +63,7 @@ def read_robot(path: Path) -> Robot:
         RobotDescriptionError: the URDF cannot be found or loaded, or lacks a joint; a rotor
             inertia is negative.
     """
-    parameters = _parameters(path)
+    parameters = node_parameters(path)
     for key in ("robot_description", "joints"):
         if key not in parameters:
             raise ParameterFileError(f"{path}: parameter '{key}' is missing")
@@ -110,8 +110,16 @@ def _check_limits(urdf: str, source: str) -> None:
                 raise ParameterFileError(f"{source}: joint {joint.get('name')} has no {key} limit")
 
 
-def _parameters(path: Path) -> dict[str, Any]:
-    """Return the parameters of the bounds node, those for all nodes included."""
+def node_parameters(path: Path, node: str = NODE) -> dict[str, Any]:
+    """Return the parameters of one node, those for all nodes included.
+
+    Args:
+        path: the parameter file.
+        node: ``/**/name``; sections ``name`` and ``/name`` count as well.
+
+    Raises:
+        ParameterFileError: the file cannot be read, is no parameter file, or has none for `node`.
+    """
     try:
         document = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
@@ -120,16 +128,17 @@ def _parameters(path: Path) -> dict[str, Any]:
         reason = " ".join(str(error).split())
         raise ParameterFileError(f"{path}: not a YAML file ({reason})") from error
     parameters: dict[str, Any] = {}
-    for node in ("/**", "bounds_node", "/bounds_node", NODE):
-        section = document.get(node) if isinstance(document, Mapping) else None
+    name = node.rpartition("/")[2]
+    for key in ("/**", name, f"/{name}", node):
+        section = document.get(key) if isinstance(document, Mapping) else None
         if section is None:
             continue
         values = section.get("ros__parameters") if isinstance(section, Mapping) else None
         if not isinstance(values, Mapping):
-            raise ParameterFileError(f"{path}: '{node}' has no 'ros__parameters'")
+            raise ParameterFileError(f"{path}: '{key}' has no 'ros__parameters'")
         parameters.update(values)
     if not parameters:
-        raise ParameterFileError(f"{path}: no parameters under '/**' or '{NODE}'")
+        raise ParameterFileError(f"{path}: no parameters under '/**' or '{node}'")
     return parameters
 
 
@@ -153,8 +162,8 @@ def _numbers(parameters: Mapping[str, Any], key: str, count: int, path: Path) ->
     return np.array(values, dtype=float)
 
 
-def overlay(parameters: Mapping[str, Array], notes: Sequence[str]) -> str:
-    """Return a parameter file that sets `parameters` of the bounds node and nothing else.
+def overlay(parameters: Mapping[str, Array], notes: Sequence[str], node: str = NODE) -> str:
+    """Return a parameter file that sets `parameters` of one node and nothing else.
 
     It is meant as a second ``--params-file``, after the robot's: what a person wrote there, with
     the comments, stays as it is.
@@ -162,9 +171,10 @@ def overlay(parameters: Mapping[str, Array], notes: Sequence[str]) -> str:
     Args:
         parameters: values by name; they must have few enough digits to be written as they are.
         notes: comment lines for the head of the file.
+        node: whose parameters they are.
     """
     lines = [f"# {note}" for note in notes]
-    lines += [f"{NODE}:", "  ros__parameters:"]
+    lines += [f"{node}:", "  ros__parameters:"]
     for name, values in parameters.items():
         lines.append(f"    {name}: [{', '.join(repr(float(value)) for value in values)}]")
     return "\n".join(lines) + "\n"
@@ -206,8 +216,8 @@ def check_writable(path: Path) -> None:
         raise OSError(f"{path}: {reason}") from error
 
 
-def write_whole(path: Path, text: str) -> None:
-    """Write `text` to `path` so that at any time the old or the new file is there, complete.
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Write `content` to `path` so that at any time the old or the new file is there, complete.
 
     Raises:
         OSError: the file cannot be written; what was there before still is.
@@ -216,8 +226,8 @@ def write_whole(path: Path, text: str) -> None:
     mode = target.stat().st_mode & 0o777 if target.exists() else 0o666 & ~_umask()
     descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
     try:
-        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-            file.write(text)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(content.encode() if isinstance(content, str) else content)
             file.flush()
             os.fchmod(file.fileno(), mode)
             os.fsync(file.fileno())

@@ -1,0 +1,49 @@
+#!/usr/bin/env bash
+# The friction of a robot's joints, from a recording of its motion or, without one, from a motion
+# in simulation. Sets itself up.
+set -eu
+usage() {
+    cat <<'USAGE'
+usage: bash scripts/identify_friction.sh [robot] [-o FILE] [--recording FILE]
+
+  robot         a parameter file in config/ (default: talos_left_arm)
+  -o            parameter file to write (default: results/friction/<robot>.yaml)
+  --recording   of the robot (.npz: t, q, v, tau); by default one is made in simulation and kept
+                beside the parameter file
+USAGE
+}
+
+root="$(cd "$(dirname "$0")/.." && pwd)"
+robot=talos_left_arm output='' recording=''
+while [ $# -gt 0 ]; do
+    case "$1" in
+    -o | --output) output="$(realpath -m -- "${2:?$1 needs a value}")"; shift ;;
+    --recording) recording="$(realpath -m -- "${2:?--recording needs a value}")"; shift ;;
+    -h | --help) usage; exit 0 ;;
+    -*) echo "error: unknown option '$1'" >&2; usage >&2; exit 2 ;;
+    *) robot="$1" ;;
+    esac
+    shift
+done
+config="$root/config/$robot.yaml"
+if [ ! -f "$config" ]; then
+    known="$(cd "$root/config" && ls -- *.yaml | sed 's/\.yaml//' | tr '\n' ' ')"
+    echo "error: unknown robot '$robot'; there are: $known" >&2
+    exit 2
+fi
+if [ -z "$output" ]; then
+    output="$root/results/friction/$robot.yaml"
+    mkdir -p "$root/results/friction"
+fi
+
+set +u # ROS' own set-up scripts use unset variables
+# shellcheck disable=SC1091
+source "$root/scripts/setup.sh"
+set -u
+
+if [ -z "$recording" ]; then
+    recording="${output%.yaml}.npz"
+    "$root/install/sim_bridge/lib/sim_bridge/record_excitation" "$config" -o "$recording"
+fi
+exec "$root/install/torque_safety_controller/lib/torque_safety_controller/identify_friction" \
+    "$config" "$recording" -o "$output"

@@ -1,0 +1,166 @@
+"""A recording of joint states, and the averages over short blocks of it that models are fitted to.
+
+Averages over a block from sample s to sample e need no derivative of a noisy velocity: the mean
+acceleration is (v_e - v_s) / (t_e - t_s). The torque of sample k is the one that was applied until
+then, as in ``joint_states``, so that the mean torque is that of samples s + 1 to e.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+KEYS = ("t", "q", "v", "tau")
+
+
+class RecordingError(ValueError):
+    """A recording that cannot be read or used."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Joint states of N samples and n joints, as a robot reports them.
+
+    Attributes:
+        t: time, shape (N,), s, increasing.
+        q: position, shape (N, n), rad.
+        v: velocity, shape (N, n), rad/s.
+        tau: torque of the motors, shape (N, n), N m.
+
+    Raises:
+        RecordingError: shapes do not fit, a number is not finite, or time does not increase.
+    """
+
+    t: Array
+    q: Array
+    v: Array
+    tau: Array
+
+    def __post_init__(self) -> None:
+        for key in KEYS:
+            try:
+                value = np.asarray(getattr(self, key), dtype=np.float64)
+            except (TypeError, ValueError) as error:
+                raise RecordingError(f"'{key}' is not an array of numbers") from error
+            object.__setattr__(self, key, value)
+        if self.t.ndim != 1 or len(self.t) < 2:
+            raise RecordingError(f"'t' must have shape (N,) with N > 1, has {self.t.shape}")
+        for key in KEYS[1:]:
+            shape = getattr(self, key).shape
+            if shape != (len(self.t), self.n):
+                raise RecordingError(
+                    f"'{key}' must have shape ({len(self.t)}, {self.n}), has {shape}"
+                )
+        for key in KEYS:
+            if not np.isfinite(getattr(self, key)).all():
+                raise RecordingError(f"'{key}' has numbers that are not finite")
+        late = np.flatnonzero(np.diff(self.t) <= 0.0)
+        if late.size:
+            raise RecordingError(f"'t' does not increase after sample {late[0]}")
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return self.q.shape[1] if self.q.ndim == 2 else 0
+
+
+def load_recording(path: Path, joints: Sequence[str]) -> Recording:
+    """Return a recording from a NumPy file of `t`, `q`, `v`, `tau` and perhaps `joints`.
+
+    Args:
+        path: ``.npz``; the columns are in the order of its `joints`, or else of `joints`.
+        joints: names of the joints wanted, in the order wanted; the file may have more.
+
+    Raises:
+        RecordingError: the file cannot be read, lacks an array or a joint, or `Recording` refuses.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {key: file[key] for key in (*KEYS, "joints") if key in file}
+    except (OSError, ValueError, EOFError) as error:
+        raise RecordingError(f"{path}: no NumPy file of arrays ({error})") from error
+    except AttributeError as error:  # a single array, .npy
+        raise RecordingError(f"{path}: one array, where an .npz file is needed") from error
+    missing = [key for key in KEYS if key not in arrays]
+    if missing:
+        raise RecordingError(f"{path}: array {missing[0]!r} is missing")
+    names = [str(name) for name in np.atleast_1d(arrays.pop("joints", np.array(joints)))]
+    unknown = [joint for joint in joints if joint not in names]
+    if unknown:
+        raise RecordingError(f"{path}: joint {unknown[0]!r} is missing; it has {', '.join(names)}")
+    columns = [names.index(joint) for joint in joints]
+    for key in KEYS[1:]:
+        if arrays[key].ndim != 2 or arrays[key].shape[1] != len(names):
+            raise RecordingError(
+                f"{path}: {key!r} must have one column for each of {len(names)} joints, "
+                f"has shape {arrays[key].shape}"
+            )
+        arrays[key] = arrays[key][:, columns]
+    try:
+        return Recording(**arrays)
+    except RecordingError as error:
+        raise RecordingError(f"{path}: {error}") from error
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Averages over B blocks of a recording.
+
+    Attributes:
+        t: middle, shape (B,), s.
+        q, v, a, tau: means, shape (B, n).
+        samples: velocities between the samples, on the straight line nearest to them, shape
+            (B, m, n), rad/s: what is not linear in them is averaged after it has been evaluated.
+        bend: mean square of what the samples are off it, as a deviation, shape (B, n), rad/s.
+        noise: standard deviation of `v` that the sensors' noise makes, shape (n,), rad/s.
+    """
+
+    t: Array
+    q: Array
+    v: Array
+    a: Array
+    tau: Array
+    samples: Array
+    bend: Array
+    noise: Array
+
+
+def make_blocks(recording: Recording, duration: float) -> Blocks:
+    """Return the averages over blocks of about `duration`, s; those with a gap are left out.
+
+    Raises:
+        RecordingError: the recording is shorter than that.
+    """
+    t, q, v, tau = (getattr(recording, key) for key in KEYS)
+    period = float(np.median(np.diff(t)))
+    m = max(1, round(duration / period))
+    count = (len(t) - 1) // m
+    if count < 1:
+        raise RecordingError(f"it is too short: {t[-1] - t[0]:.3g} s")
+    s = m * np.arange(count)
+    span = t[s + m] - t[s]
+    s, span = s[span < 1.5 * m * period], span[span < 1.5 * m * period]
+    index = s[:, None] + np.arange(m + 1)
+    # Twice differenced, motion is gone and noise is sqrt(6) times larger.
+    rest = np.abs(np.diff(v, 2, axis=0)) if len(t) > 2 else np.zeros((1, recording.n))
+    mean = v[index].mean(axis=1)
+    ramp = np.arange(m + 1) - 0.5 * m
+    slope = np.einsum("k,bkj->bj", ramp, v[index]) / (ramp @ ramp)
+    middle = 0.5 * (ramp[1:] + ramp[:-1])
+    off = v[index] - mean[:, None] - ramp[:, None] * slope[:, None]
+    return Blocks(
+        t=0.5 * (t[s] + t[s + m]),
+        q=q[index].mean(axis=1),
+        v=mean,
+        a=(v[s + m] - v[s]) / span[:, None],
+        tau=tau[index[:, 1:]].mean(axis=1),
+        samples=mean[:, None] + middle[:, None] * slope[:, None],
+        bend=np.sqrt((off**2).mean(axis=1)),
+        noise=np.median(rest, axis=0) / (0.6745 * np.sqrt(6.0 * (m + 1))),
+    )
