@@ -83,6 +83,7 @@ class DirectLoop:
             made.gains,
             made.tau_rate_max,
             self._additional,
+            made.qp_solver,
         )
         self.controller.warm_up()
         self.samples: list[Sample] = []

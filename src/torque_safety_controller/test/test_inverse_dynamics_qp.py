@@ -6,6 +6,7 @@ import pytest
 from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import lsq_linear, nnls
 
+from torque_safety_controller.active_set import FAILED
 from torque_safety_controller.inverse_dynamics_qp import InverseDynamicsQP, NoSolutionFound
 from torque_safety_controller.tasks import TaskTerm
 
@@ -325,3 +326,31 @@ def test_absurd_numbers_cost_neither_time_nor_limits(scale):
             assert np.isfinite(a).all()
             assert_torques_kept(problem, a)
         assert time.monotonic() - begin < LONG
+
+
+def test_proxqp_gives_the_same_accelerations():
+    rng = np.random.default_rng(30)
+    mine, other = InverseDynamicsQP(N, GAMMA), InverseDynamicsQP(N, GAMMA, "proxqp")
+    for _ in range(60):
+        problem = random_problem(rng)
+        expected, found = mine.solve(*problem), other.solve(*problem)
+        assert (expected.relaxation is None) == (found.relaxation is None)
+        np.testing.assert_allclose(found.a, expected.a, atol=1e-4)
+    little = other.solve(*LITTLE_ROOM)
+    assert little.relaxation is None
+    np.testing.assert_allclose(little.a, mine.solve(*LITTLE_ROOM).a, atol=1e-4)
+
+
+def test_a_second_opinion_where_the_first_solver_gives_up(monkeypatch):
+    qp = InverseDynamicsQP(N, GAMMA)
+    problem = random_problem(np.random.default_rng(31))
+    expected = qp.solve(*problem)
+    monkeypatch.setattr(qp, "_minimise", lambda *_: FAILED)
+    np.testing.assert_allclose(qp.solve(*problem).a, expected.a, atol=1e-4)
+
+
+def test_proxqp_does_not_go_on_where_there_is_no_solution():
+    problem = random_problem(np.random.default_rng(32))
+    crossed = problem._replace(a_lower=problem.a_upper + 1.0)
+    with pytest.raises(NoSolutionFound):
+        InverseDynamicsQP(N, GAMMA, "proxqp").solve(*crossed)

@@ -115,14 +115,10 @@ def minimise(
 
 
 @njit(cache=True)
-def minimise_dynamics(
-    H: np.ndarray,
-    g: np.ndarray,
+def write_dynamics(
     C: np.ndarray,
     lower: np.ndarray,
     upper: np.ndarray,
-    side: np.ndarray,
-    x: np.ndarray,
     a_lower: np.ndarray,
     a_upper: np.ndarray,
     rho_max: np.ndarray,
@@ -133,17 +129,13 @@ def minimise_dynamics(
     G: np.ndarray,
     g_lower: np.ndarray,
     g_upper: np.ndarray,
-) -> int:
-    """Write the constraints on x = (a, rho) with C = (M, -B; G, 0), and `minimise`.
+) -> None:
+    """Write the constraints on x = (a, rho) with C = (M, -B; G, 0), as `minimise` takes them.
 
     Args:
-        H: shape (n + r, n + r), positive definite.
-        g: shape (n + r,).
         C: shape (n + k, n + r), written; what is zero in it has to be zero already.
         lower: shape (n + r + n + k,), written.
         upper: shape (n + r + n + k,), written.
-        side: shape (n + r + n + k,), see `minimise`.
-        x: shape (n + r,), receives the solution.
         a_lower: limits of a, shape (n,).
         a_upper: shape (n,).
         rho_max: upper limits of rho, shape (r,); the lower ones are zero.
@@ -154,9 +146,6 @@ def minimise_dynamics(
         G: shape (k, n).
         g_lower: limits of G a, shape (k,).
         g_upper: shape (k,).
-
-    Returns:
-        See `minimise`.
     """
     n, r = B.shape
     for i in range(n):
@@ -172,4 +161,3 @@ def minimise_dynamics(
         lower[n + r + n + i], upper[n + r + n + i] = g_lower[i], g_upper[i]
         for j in range(n):
             C[n + i, j] = G[i, j]
-    return minimise(H, g, C, lower, upper, side, x)

@@ -78,6 +78,7 @@ class Controller:
         gains: initial gains.
         torque_rate_max: greatest change of torque, shape (n,), N m/s; inf for none.
         additional: integral action; the torque limits hold with it counted in.
+        solver: of the QP, one of `inverse_dynamics_qp.SOLVERS`.
 
     Attributes:
         q_des: joint goal, shape (n,), rad; None until one is set.
@@ -94,6 +95,7 @@ class Controller:
         gains: Gains,
         torque_rate_max: np.ndarray | None = None,
         additional: AdditionalTorque | None = None,
+        solver: str = "active_set",
     ) -> None:
         n = robot.n
         self.robot = robot
@@ -110,7 +112,7 @@ class Controller:
         self._rate_limited = bool(np.isfinite(rate).any())
         self._tau_min = -self.tau_max
         self.additional = additional
-        self._qp = InverseDynamicsQP(n)
+        self._qp = InverseDynamicsQP(n, solver=solver)
         self._observer = DisturbanceObserver(n, gains.disturbance_time)
         self._a_last = np.zeros(n)
         self._tau_last: np.ndarray | None = None

@@ -53,7 +53,12 @@ class ControllerNode(Node):
         config = self._config = self._node_parameters.configuration
         self._additional = AdditionalTorque(config.additional, config.task_rows)
         self._controller = Controller(
-            robot, config.tau_max, config.gains, config.tau_rate_max, self._additional
+            robot,
+            config.tau_max,
+            config.gains,
+            config.tau_rate_max,
+            self._additional,
+            config.qp_solver,
         )
         self._controller.warm_up()
         self._handover = Handover(

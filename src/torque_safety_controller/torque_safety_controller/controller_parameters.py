@@ -12,6 +12,7 @@ import pinocchio as pin
 from torque_safety_controller import friction_parameters, integral_parameters
 from torque_safety_controller.additional_torque import AdditionalSettings
 from torque_safety_controller.controller import Gains
+from torque_safety_controller.inverse_dynamics_qp import SOLVERS
 from torque_safety_controller.modes import CONTROLS
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks import critical_damping
@@ -58,6 +59,12 @@ TABLE = (
         live=True,
     ),
     Parameter("hold_kd", float, "damping in HOLD, 1/s", default=20.0, live=True),
+    Parameter(
+        "qp_solver",
+        str,
+        f"one of {', '.join(SOLVERS)}; proxqp takes several times as long",
+        default="active_set",
+    ),
     Parameter(
         "disturbance_time",
         float,
@@ -111,6 +118,7 @@ class ControllerConfiguration:
     base_frame: str
     end_effector_frame: str
     gains: Gains
+    qp_solver: str
     additional: AdditionalSettings
     task_rows: slice
     start_control: str
@@ -134,6 +142,8 @@ def make_configuration(values: Mapping[str, Any]) -> ControllerConfiguration:
             raise ParameterError("torque_rate_max", tau_rate_max, "numbers > 0")
     q_min, q_max = position_limits(values, joints)
     tau_max = all_positive(values, "torque_max", joints)
+    if values["qp_solver"] not in SOLVERS:
+        raise ParameterError("qp_solver", values["qp_solver"], f"one of {', '.join(SOLVERS)}")
     if values["start_control"] not in CONTROLS:
         allowed = f"one of {', '.join(CONTROLS)}"
         raise ParameterError("start_control", values["start_control"], allowed)
@@ -147,6 +157,7 @@ def make_configuration(values: Mapping[str, Any]) -> ControllerConfiguration:
         base_frame=values["base_frame"],
         end_effector_frame=values["end_effector_frame"],
         gains=_gains(values),
+        qp_solver=values["qp_solver"],
         additional=integral_parameters.additional_settings(values, joints, tau_max),
         task_rows=integral_parameters.task_rows(values),
         start_control=values["start_control"],

@@ -17,12 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torque_safety_controller.active_set import (
-    FAILED,
-    INFEASIBLE,
-    minimise,
-    minimise_dynamics,
-)
+from torque_safety_controller import active_set, proxqp_solver
+from torque_safety_controller.active_set import FAILED, INFEASIBLE, write_dynamics
 from torque_safety_controller.constraints import Rows
 from torque_safety_controller.dense_kernels import add_identity, add_rows, clear_cost
 from torque_safety_controller.tasks import TaskTerm, WrenchTerm
@@ -33,6 +29,10 @@ _RELAXED_REGULARISATION = 1e-10
 _ROOM = 1e-8
 _NEGLIGIBLE = 1e-6
 """Less relaxation than this, rad/s^2, is none."""
+
+
+SOLVERS = {"active_set": active_set.minimise, "proxqp": proxqp_solver.minimise}
+"""By name: our own, which starts from the limits that were active last, and ProxQP."""
 
 
 class ContactForces(NamedTuple):
@@ -73,18 +73,21 @@ class InverseDynamicsQP:
     Args:
         n: number of joints.
         gamma: weight of |x|^2, relative to the largest task weight; keeps the solution unique.
+        solver: one of `SOLVERS`. Where ``active_set`` gives up, ProxQP is asked; by how much
+            limits must give way, ``active_set`` finds, because ProxQP cannot tell for certain.
     """
 
-    def __init__(self, n: int, gamma: float = 1e-6) -> None:
+    def __init__(self, n: int, gamma: float = 1e-6, solver: str = "active_set") -> None:
         self._n = n
         self._gamma = gamma
+        self._minimise = SOLVERS[solver]
         self._no_rows = Rows(np.zeros((0, n)), np.zeros(0), np.zeros(0))
         self._no_contacts = ContactForces(np.zeros((n, 0)), np.zeros(0))
         self._side = np.zeros(0)
         self._size = (-1, -1)
         # Compiled now, not in the first step in which limits must give way.
         one = np.ones(1)
-        minimise(np.eye(1), one, np.zeros((0, 1)), -one, one, np.zeros(1), np.zeros(1))
+        active_set.minimise(np.eye(1), one, np.zeros((0, 1)), -one, one, np.zeros(1), np.zeros(1))
 
     def solve(
         self,
@@ -118,14 +121,10 @@ class InverseDynamicsQP:
         self._resize(len(forces.rho_max), len(rows.lower))
         self._assemble(tasks, forces.tasks)
         x = np.empty(self._n + len(forces.rho_max))
-        iterations = minimise_dynamics(
-            self._H,
-            self._g,
+        write_dynamics(
             self._C,
             self._lower,
             self._upper,
-            self._side,
-            x,
             a_lower,
             a_upper,
             forces.rho_max,
@@ -135,6 +134,10 @@ class InverseDynamicsQP:
             tau_upper,
             *rows,
         )
+        problem = self._H, self._g, self._C, self._lower, self._upper, self._side, x
+        iterations = self._minimise(*problem)
+        if iterations == FAILED:
+            iterations = proxqp_solver.minimise(*problem)
         relaxation = row_relaxation = None
         if iterations == INFEASIBLE:
             relaxation, row_relaxation, iterations = self._relax(x)
@@ -234,7 +237,7 @@ class InverseDynamicsQP:
         lower, upper = self._lower, self._upper
         free = np.full(n, np.inf)
         y = np.empty(size + soft)
-        first = minimise(
+        first = active_set.minimise(
             H,
             np.zeros(size + soft),
             C,
@@ -250,7 +253,9 @@ class InverseDynamicsQP:
         moved_lower, moved_upper = lower.copy(), upper.copy()
         moved_lower[given] += np.minimum(e, 0.0) - room
         moved_upper[given] += np.maximum(e, 0.0) + room
-        second = minimise(self._H, self._g, self._C, moved_lower, moved_upper, self._side, x)
+        second = active_set.minimise(
+            self._H, self._g, self._C, moved_lower, moved_upper, self._side, x
+        )
         if second < 0:
             raise NoSolutionFound("no accelerations were found, even with bounds relaxed")
         value = S @ x
