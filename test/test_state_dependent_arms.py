@@ -71,7 +71,7 @@ class Race:
         )
 
     def run(self, solver, steps, seed):
-        """Return distances to the goal, shape (steps, n), the worst violations, and relaxations."""
+        """Return distances to the goal, shape (steps, n), worst violations, and relaxations."""
         arm, limits = self.arm, self.limits
         controller = Controller(arm.robot(DT), arm.tau_max, RACING)
         rng = np.random.default_rng(seed)
