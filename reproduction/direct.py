@@ -171,7 +171,7 @@ class DirectLoop:
                 q,
                 v,
                 tau.copy(),
-                self._additional.last.copy(),
+                self._additional.integral.copy(),
                 self.controller.error.copy(),
             )
         )

@@ -243,6 +243,7 @@ def ablation() -> Figure:
         "leaky, (11) as printed": PRINTED,
         "leaky, (11), whole torque": PAPER,
         "the same, the file's values": {},
+        "and friction compensation": {"friction_compensation": 1.0},
     }
     names = ("rest", "way", "share", "overshoot", "recovery")
     values = {}

@@ -69,6 +69,7 @@ class AdditionalTorque:
 
     Attributes:
         last: what the last step added, shape (n,), N m.
+        integral: what of it is the integral action's, shape (n,), N m.
         skipped: steps that were not integrated over: time jumped, or the state did.
         joints: the integral action of mode ``joints``.
         task: that of mode ``task``, or None.
@@ -126,7 +127,7 @@ class AdditionalTorque:
         self._started = False
         self._lost = self._resuming = False
         self._q_last = self._v_last = self._zero
-        self.last = self._integral = self._zero
+        self.last = self.integral = self._zero
         self._fading = self._zero
         self._faded = True
         self.friction.start()
@@ -152,7 +153,7 @@ class AdditionalTorque:
             self._resuming = True
             self.skipped += 1
             return self.last
-        self._integral = torque
+        self.integral = torque
         time = elapsed if 0.0 < elapsed <= LONGEST_GAP * robot.dt else 0.0
         self.last = torque + self.friction.torque(robot.M, v, a_last, time, robot.dt)
         return self.last
@@ -176,7 +177,7 @@ class AdditionalTorque:
             torque = self._of_mode(robot, v, self._zero, 0.0)
         if self._resuming or not known:
             self._resuming = False
-            self._fade(self._integral - torque)
+            self._fade(self.integral - torque)
         if not self._faded:
             gap = min(elapsed, LONGEST_GAP * robot.dt) if elapsed > 0.0 else 0.0
             self._fade(self._fading * math.exp(-gap / _FADING_TIME))
@@ -198,7 +199,7 @@ class AdditionalTorque:
         """
         self.friction.start()
         self._enter(robot, v, torque)
-        self.last = self._integral = torque
+        self.last = self.integral = torque
         return torque
 
     def _enter(self, robot: RobotModel, v: Array, torque: Array) -> None:
