@@ -15,7 +15,6 @@ next to each other are alike. `docs/friction.md` shows what comes out.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -23,6 +22,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from torque_safety_controller.friction_regression import JointRegression
 from torque_safety_controller.friction_settings import DEFAULT_STRIBECK_VELOCITY, FrictionModel
 from torque_safety_controller.joint_recording import (
     Blocks,
@@ -46,15 +46,11 @@ LEAST_LEFT = 0.05
 """Share of the friction that must not look like an error of the model."""
 
 _BEND = 0.2  # of its speed that a joint may be off steady acceleration: else it stuck or slipped
-_PIECE = 0.25  # s; residuals of one such piece count as one
 _FEWEST = 20  # blocks in each direction
 _FEWEST_SLOW = 8  # blocks below half of v_s, without which stiction is a guess
 _BLOCKS_PER_UNKNOWN = 1.5
-_RANK = 1e-7  # singular values of the model's error below this share are rounding
-_HUBER = 1.345  # standard deviations up to which a residual counts in full
 _ROUNDS = 3
 _CANDIDATES = np.geomspace(1.0, 300.0, 48)  # v_s in standing speeds
-_SUBSETS = [s for k in range(1, 4) for s in itertools.combinations(range(3), k)]
 
 
 @dataclass
@@ -148,7 +144,7 @@ def fit_joint(blocks: Blocks, joint: int, beyond: Array, errors: Array) -> Joint
     if one_way < _FEWEST:
         fit.notes.append("nothing found: it did not move both ways for long enough")
         return fit
-    data = _JointData(
+    data = JointRegression(
         blocks.samples[used][:, :, joint],
         direction[used],
         blocks.t[used],
@@ -171,98 +167,7 @@ def fit_joint(blocks: Blocks, joint: int, beyond: Array, errors: Array) -> Joint
     return fit
 
 
-class _JointData:
-    """One joint's blocks, and the least squares they are used in."""
-
-    def __init__(self, samples, direction, t, beyond, errors) -> None:
-        self.samples, self.direction, self.beyond = samples, direction, beyond
-        sizes = np.linalg.norm(errors, axis=0)
-        columns = errors[:, sizes > 0.0] / sizes[sizes > 0.0]
-        U, size, _ = np.linalg.svd(columns, full_matrices=False)
-        self._errors = U[:, size > _RANK * size[0]]
-        self.pieces = np.unique((t / _PIECE).astype(int), return_inverse=True)[1]
-        self._weigh(np.ones(len(beyond)))
-
-    def _weigh(self, weights: Array) -> None:
-        self.weights = weights
-        self._basis = np.linalg.qr(weights[:, None] * self._errors)[0]
-        self._y = self.reduce(self.beyond)
-
-    @property
-    def unknowns(self) -> int:
-        """How many numbers are fitted."""
-        return self._basis.shape[1] + 4
-
-    def reduce(self, columns: Array) -> Array:
-        """Return what the errors of the model leave of weighted columns, shape (B, ...)."""
-        columns = (self.weights * columns.T).T
-        return columns - self._basis @ (self._basis.T @ columns)
-
-    def left(self, column: Array) -> float:
-        """Return the share of a column's square that the errors of the model leave."""
-        size = np.linalg.norm(self.weights * column)
-        return float((np.linalg.norm(self.reduce(column)) / size) ** 2)
-
-    def slower(self, speed: float) -> int:
-        """Return how many blocks are slower than that, rad/s."""
-        return int((np.abs(self.samples.mean(axis=1)) < speed).sum())
-
-    def columns(self, v_s: float) -> Array:
-        """Return what F_c, F_s - F_c and d are multiplied by, block by block, shape (B, 3)."""
-        falling = np.exp(-((self.samples / v_s) ** 2)).mean(axis=1)
-        return np.column_stack(
-            [self.direction, self.direction * falling, self.samples.mean(axis=1)]
-        )
-
-    def solve(self, v_s: float, kept: Sequence[int] = (0, 1, 2)) -> tuple[float, Array]:
-        """Return the least sum of squares with coefficients >= 0, and them, shape (3,)."""
-        X = self.reduce(self.columns(v_s))
-        G, b = X.T @ X, X.T @ self._y
-        gain, found = 0.0, np.zeros(3)
-        for subset in _SUBSETS:  # of three, all may be tried
-            if not set(subset) <= set(kept):
-                continue
-            rows = list(subset)
-            x = np.linalg.lstsq(G[np.ix_(rows, rows)], b[rows], rcond=None)[0]
-            if (x >= 0.0).all() and x @ b[rows] > gain:
-                gain, found = float(x @ b[rows]), np.zeros(3)
-                found[rows] = x
-        return float(self._y @ self._y) - gain, found
-
-    def reweight(self, v_s: float, x: Array) -> None:
-        """Make what is far off count less: Huber's weights."""
-        columns = self.columns(v_s)
-        residual = (self._y - self.reduce(columns) @ x) / self.weights
-        size = 1.4826 * float(np.median(np.abs(residual))) + 1e-12
-        self._weigh(np.sqrt(np.minimum(1.0, _HUBER * size / (np.abs(residual) + 1e-300))))
-
-    def standard_errors(self, v_s: float, x: Array, kept: Sequence[int]) -> tuple[Array, float]:
-        """Return those of F_c, F_s - F_c, d, v_s and F_s, shape (5,), and the residual's size."""
-        X = self.columns(v_s)
-        residual = self._y - self.reduce(X) @ x
-        columns = [X[:, k] for k in kept]
-        if 1 in kept:
-            step = 1e-3 * v_s
-            change = (self.columns(v_s + step) - self.columns(v_s - step))[:, 1] / (2.0 * step)
-            columns.append(x[1] * change)
-        J = self.reduce(np.column_stack(columns))
-        inverse = np.linalg.pinv(J.T @ J)
-        scores = np.zeros((self.pieces.max() + 1, J.shape[1]))
-        np.add.at(scores, self.pieces, J * residual[:, None])
-        freedom = len(residual) / max(len(residual) - self.unknowns, 1)
-        covariance = freedom * inverse @ (scores.T @ scores) @ inverse
-        errors = np.full(5, np.nan)
-        places = [*kept, 3] if 1 in kept else list(kept)
-        errors[places] = np.sqrt(np.diag(covariance))
-        errors[4] = errors[0]
-        if 0 in kept and 1 in kept:
-            i, j = places.index(0), places.index(1)
-            errors[4] = np.sqrt(max(covariance[i, i] + covariance[j, j] + 2 * covariance[i, j], 0))
-        plain = residual / self.weights
-        return errors, float(np.sqrt(freedom * np.mean(plain**2)))
-
-
-def _fill(fit: JointFit, data: _JointData, standing: float) -> None:
+def _fill(fit: JointFit, data: JointRegression, standing: float) -> None:
     """Fit, and keep of it what is sure."""
     candidates = standing * _CANDIDATES
     candidates = candidates[candidates < max(fit.speeds[1], 2.0 * standing)]
@@ -272,7 +177,7 @@ def _fill(fit: JointFit, data: _JointData, standing: float) -> None:
         for _ in range(_ROUNDS):
             data.reweight(v_s, data.solve(v_s, kept)[1])
     names = ("Coulomb friction", "stiction beyond Coulomb friction", "viscous friction")
-    while True:
+    while kept:
         v_s = _best(data, candidates, kept)
         x = data.solve(v_s, kept)[1]
         errors, fit.residual = data.standard_errors(v_s, x, kept)
@@ -285,6 +190,8 @@ def _fill(fit: JointFit, data: _JointData, standing: float) -> None:
             f"{names[worst]} not told: {x[worst]:.2g} with a standard error of {errors[worst]:.2g}"
         )
         kept.remove(worst)
+    else:
+        return
     fit.coulomb, fit.static, fit.viscous = float(x[0]), float(x[0] + x[1]), float(x[2])
     fit.errors = errors[[0, 4, 2, 3]]
     if 1 in kept and data.slower(0.5 * v_s) >= _FEWEST_SLOW:
@@ -296,7 +203,7 @@ def _fill(fit: JointFit, data: _JointData, standing: float) -> None:
         fit.static, fit.errors[1], fit.errors[3] = fit.coulomb, fit.errors[0], np.nan
 
 
-def _best(data: _JointData, candidates: Array, kept: Sequence[int]) -> float:
+def _best(data: JointRegression, candidates: Array, kept: Sequence[int]) -> float:
     """Return the v_s that fits best: of the candidates, then between the best one's neighbours."""
     if 1 not in kept:
         return float(candidates[0])
