@@ -7,44 +7,10 @@ file, so that only the first start on a machine pays for compiling.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import njit
 
-
-@njit(cache=True)
-def _solve_positive_definite(A: np.ndarray, x: np.ndarray) -> bool:
-    """Replace `x`, shape (n,), by ``A^-1 x``; A, shape (n, n), is overwritten.
-
-    Returns:
-        False, with `x` undefined, when A is not numerically positive definite.
-    """
-    n = len(x)
-    for j in range(n):
-        d = A[j, j]
-        for k in range(j):
-            d -= A[j, k] * A[j, k]
-        if not d > 0.0:
-            return False
-        d = math.sqrt(d)
-        A[j, j] = d
-        for i in range(j + 1, n):
-            s = A[i, j]
-            for k in range(j):
-                s -= A[i, k] * A[j, k]
-            A[i, j] = s / d
-    for i in range(n):
-        s = x[i]
-        for k in range(i):
-            s -= A[i, k] * x[k]
-        x[i] = s / A[i, i]
-    for i in range(n - 1, -1, -1):
-        s = x[i]
-        for k in range(i + 1, n):
-            s -= A[k, i] * x[k]
-        x[i] = s / A[i, i]
-    return True
+from torque_safety_controller.cholesky import factorise, solve_vector
 
 
 @njit(cache=True)
@@ -138,7 +104,8 @@ def null_space_part(J: np.ndarray, x: np.ndarray, regularisation: float) -> np.n
             G[i, j] = s
         G[i, i] += regularisation
     result = x.copy()
-    if _solve_positive_definite(G, y):
+    if factorise(G):
+        solve_vector(G, y)
         for k in range(n):
             s = 0.0
             for i in range(m):
