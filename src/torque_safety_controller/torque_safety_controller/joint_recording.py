@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,9 +84,9 @@ def load_recording(path: Path, joints: Sequence[str]) -> Recording:
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {key: file[key] for key in (*KEYS, "joints") if key in file}
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, EOFError, BadZipFile) as error:
         raise RecordingError(f"{path}: no NumPy file of arrays ({error})") from error
-    except AttributeError as error:  # a single array, .npy
+    except TypeError as error:  # a single array, .npy
         raise RecordingError(f"{path}: one array, where an .npz file is needed") from error
     missing = [key for key in KEYS if key not in arrays]
     if missing:
