@@ -26,7 +26,10 @@ TABLE = (
     Parameter("velocity_max", list[float], "speed limits, rad/s"),
     Parameter("scenario", str, "YAML file that says what happens when"),
     Parameter(
-        "ready_timeout", float, "how long the other nodes may take to be there, s", default=20.0
+        "ready_timeout",
+        float,
+        "how long the other nodes may take to be there, s; at their first start they compile",
+        default=180.0,
     ),
 )
 

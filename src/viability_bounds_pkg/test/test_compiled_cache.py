@@ -38,5 +38,4 @@ def test_a_change_in_a_called_file_is_noticed(tmp_path):
     assert value(1.0) == (10.0, False)
     assert value(1.0) == (10.0, True)
     assert value(3.0) == (30.0, False)
-    caches = list((package / "__pycache__" / "compiled").iterdir())
-    assert len(caches) == 2 and all(list(cache.rglob("*.nbc")) for cache in caches)
+    assert list((package / "__pycache__").glob("outer*.nbc"))

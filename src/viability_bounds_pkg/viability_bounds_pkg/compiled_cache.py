@@ -1,43 +1,49 @@
 """Compiled code kept between runs, and never older than its source.
 
 Numba caches a compiled function until the file with its definition changes; that a function which
-it calls, in another file, has changed it does not notice. Here every state of the sources has a
-cache of its own.
+it calls, in another file, has changed it does not notice. So all that is cached goes when any of
+the sources has changed.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
-import shutil
-import time
 from contextlib import suppress
 from pathlib import Path
 
 import numba
 
-_KEPT = 7 * 86_400.0  # s; caches of other states of the sources
+_RECORD = "compiled.sha256"
 
 
 def keep_compiled(*packages: str) -> None:
-    """Let functions that are compiled from now on be cached for the sources as they are.
+    """Drop what was compiled from other sources, before anything of a package is compiled.
 
     Args:
-        packages: directories whose files such functions may call. The cache is in the last, or
-            in ``NUMBA_CACHE_DIR`` if that is set, or, if it cannot be written to, where Numba
-            puts it.
+        packages: directories whose files the last one's functions may call. The cache is beside
+            its sources, or in ``NUMBA_CACHE_DIR`` if that is set, or, if it cannot be written
+            there, in the user's cache directory.
     """
     digest = hashlib.sha256()
     for package in packages:
         for path in sorted(Path(package).glob("*.py")):
             digest.update(path.name.encode() + b"\0" + path.read_bytes())
-    given = os.environ.get("NUMBA_CACHE_DIR")
-    root = Path(given) if given else Path(packages[-1]) / "__pycache__" / "compiled"
-    chosen = root / digest.hexdigest()[:16]
-    with suppress(OSError):
-        chosen.mkdir(parents=True, exist_ok=True)
-        chosen.touch()
-        for other in () if given else root.iterdir():
-            if time.time() - other.stat().st_mtime > _KEPT:
-                shutil.rmtree(other, ignore_errors=True)
-        numba.config.CACHE_DIR = str(chosen)
+    state = digest.hexdigest()[:16]
+    elsewhere = os.environ.get("NUMBA_CACHE_DIR")
+    if elsewhere:
+        numba.config.CACHE_DIR = str(Path(elsewhere) / state)
+        return
+    cache = Path(packages[-1]) / "__pycache__"
+    record = cache / _RECORD
+    try:
+        if record.exists() and record.read_text() == state:
+            return
+        cache.mkdir(exist_ok=True)
+        for pattern in ("*.nbi", "*.nbc"):
+            for path in cache.glob(pattern):
+                with suppress(FileNotFoundError):  # another process does the same
+                    path.unlink()
+        record.write_text(state)
+    except OSError:
+        numba.config.CACHE_DIR = str(Path.home() / ".cache" / "viability_bounds" / state)
