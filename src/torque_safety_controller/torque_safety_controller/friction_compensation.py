@@ -4,13 +4,13 @@
 `friction_settings`, and a reference velocity w that integrates the acceleration asked for,
 
     w' = a_ref - theta (w - v),
-    tau_f = clip(gamma M_ii w, -k F(v), k F(v)),
+    tau_f = clip(gamma m w, -k F(v), k F(v)),    m = 1 / (M^-1)_ii,
 
-with k the share to compensate. A joint that moves as it should has w = v, and its friction is
-compensated; one at rest has w ~ a_ref / theta: the acceleration wanted decides the direction, and
-takes it out of its stiction. `docs/friction.md` derives the law, and what keeps it from driving
-the joint: of the friction itself it never takes more than there is, and of too large a model it
-makes a stiffer spring.
+with k the share to compensate, and m the inertia that the joint's motor feels. A joint that moves
+as it should has w = v, and its friction is compensated; one at rest has w ~ a_ref / theta: the
+acceleration wanted decides the direction, and takes it out of its stiction. `docs/friction.md`
+derives the law, and what keeps it from driving the joint: of the friction itself it never takes
+more than there is, and of too large a model it makes a stiffer spring.
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from torque_safety_controller.cholesky import factorise
 from torque_safety_controller.friction_settings import FrictionSettings
 
 Array = NDArray[np.float64]
 
-GAIN = 0.25
+GAIN = 0.1
 """gamma in control rates: how soon a reference velocity calls for all of the friction."""
 
 _FADING_TIME = 0.2  # s; in which new coefficients take the place of old ones
@@ -144,6 +145,7 @@ def _compensate(present, wanted, blend, M, v, a_last, dt, theta, gamma, w, tau):
     decay = math.exp(-theta * dt)
     held = -math.expm1(-theta * dt) / (theta * dt) if theta * dt > 0.0 else 1.0
     faded = True
+    inertia = _felt_inertia(M)
     for i in range(len(v)):
         for row in range(len(present)):
             present[row, i] += blend * (wanted[row, i] - present[row, i])
@@ -151,7 +153,7 @@ def _compensate(present, wanted, blend, M, v, a_last, dt, theta, gamma, w, tau):
         stiction = present[_EXCESS, i] * math.exp(-((speed / present[_STRIBECK, i]) ** 2))
         friction = present[_COULOMB, i] + stiction + present[_VISCOUS, i] * speed
         friction = min(friction, present[_BUDGET, i])
-        gain = gamma * M[i, i]
+        gain = gamma * inertia[i]
         # More than what calls for all of the friction is nothing to remember.
         enough = friction / gain
         w_new = decay * w[i] + (1.0 - decay) * v[i] + held * dt * a_last[i]
@@ -162,3 +164,24 @@ def _compensate(present, wanted, blend, M, v, a_last, dt, theta, gamma, w, tau):
         largest = present[_COULOMB, i] + present[_EXCESS, i] + present[_VISCOUS, i]
         faded = faded and largest < _NEGLIGIBLE
     return faded
+
+
+@njit(cache=True)
+def _felt_inertia(M):
+    """Return 1 / (M^-1)_ii, shape (n,): with others free to give way; NaN if there is no such."""
+    n = len(M)
+    inertia = np.full(n, np.nan)
+    L = M.copy()
+    if not factorise(L):
+        return inertia
+    x = np.empty(n)
+    for i in range(n):
+        total = 0.0
+        for j in range(i, n):
+            s = 1.0 if j == i else 0.0
+            for k in range(i, j):
+                s -= L[j, k] * x[k]
+            x[j] = s / L[j, j]
+            total += x[j] * x[j]
+        inertia[i] = 1.0 / total
+    return inertia
