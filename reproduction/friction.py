@@ -31,6 +31,11 @@ RADIUS, PERIOD = 0.08, 6.0  # m, s
 STILL = 1e-4  # rad/s
 THETAS = (3.0, 10.0, 30.0, 100.0)  # 1/s
 ELBOW, PUSH, PUSHED = "arm_left_4_link", (0.0, 60.0, 0.0), 1.5  # N, s
+PUSHES = (
+    ("off", {}, 0.0),
+    ("stiff", {}, 1.0),
+    ("yielding", {"friction_theta": 100.0, "friction_gain": 300.0}, 0.7),
+)
 
 
 def believed(loop: DirectLoop, share: float) -> dict[str, Any]:
@@ -120,11 +125,10 @@ def switched() -> tuple[float, float]:
     return float(at), float(before)
 
 
-def push_elbow(theta: float | None, share: float) -> tuple[float, float]:
+def push_elbow(changes: dict[str, float], share: float) -> tuple[float, float]:
     """Return how far the elbow went, m, pushed with the null space free, and the hand, m."""
     loop = start({"integral_action": "task"}, share)
-    if theta is not None:
-        loop.change(friction_theta=theta)
+    loop.change(**changes)
     loop.run(1.0)
     before = loop.robot.link_pose(ELBOW)[0]
     loop.robot.apply_wrench(ELBOW, PUSH, (0.0, 0.0, 0.0))
@@ -212,13 +216,12 @@ def more(figure: Figure) -> bool:
     rows.rows.append(
         ("torque step when switched", f"{switching:.2%} of tau_max, {before:.2%} just before")
     )
-    for theta, share in ((None, 0.0), (3.0, 1.0), (100.0, 0.7), (100.0, 1.0)):
-        elbow, hand = push_elbow(theta, share)
-        name = "off" if theta is None else f"{share:g} of friction, theta {theta:g} 1/s"
-        figure.metrics[f"push_{name.replace(' ', '_')}_m"] = elbow
+    for name, changes, share in PUSHES:
+        elbow, hand = push_elbow(changes, share)
+        figure.metrics[f"push_{name}_elbow_m"] = elbow
         rows.rows.append(
             (
-                f"elbow pushed, null space free; {name}",
+                f"elbow pushed, null space free; compensation {name}",
                 f"{1e3 * elbow:.1f} mm, the hand up to {1e3 * hand:.1f} mm",
             )
         )

@@ -153,10 +153,11 @@ def test_each_parameter_reaches_the_settings():
     given = values(
         friction_compensation=0.4,
         friction_theta=11.0,
+        friction_gain=70.0,
         **{key: value.tolist() for key, value in rows.items()},
     )
     made = friction_settings(given, "abcdefg", ARM.tau_max)
-    assert (made.scale, made.theta) == (0.4, 11.0)
+    assert (made.scale, made.theta, made.gain) == (0.4, 11.0, 70.0)
     found = (
         *(getattr(made.model, k) for k in ("coulomb", "static", "viscous", "stribeck_velocity")),
         made.budget,
@@ -185,6 +186,7 @@ REFUSED = [
     ("friction_budget", [1e3] * N, "at most torque_max"),
     ("friction_budget", [-1.0] * N, ">= 0"),
     ("friction_theta", -3.0, ">= 0"),
+    ("friction_gain", 0.0, "> 0"),
 ]
 GIVEN = {
     "friction_compensation": 0.5,

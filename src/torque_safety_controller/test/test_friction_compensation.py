@@ -357,6 +357,8 @@ def test_models_that_cannot_be_are_refused(changed, name):
         ({"scale": math.nan}, "scale"),
         ({"theta": -1.0}, "theta"),
         ({"theta": math.inf}, "theta"),
+        ({"gain": 0.0}, "gain"),
+        ({"gain": math.nan}, "gain"),
         ({"budget": [1.0]}, "budget"),
         ({"budget": [-1.0, 1.0]}, "budget"),
         ({"budget": [math.inf, 1.0]}, "budget"),

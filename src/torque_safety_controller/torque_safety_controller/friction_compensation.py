@@ -27,7 +27,7 @@ from torque_safety_controller.friction_settings import FrictionSettings
 Array = NDArray[np.float64]
 
 GAIN = 0.1
-"""gamma in control rates: how soon a reference velocity calls for all of the friction."""
+"""gamma in control rates, by default: how soon w calls for all of the friction."""
 
 _FADING_TIME = 0.2  # s; in which new coefficients take the place of old ones
 _NEGLIGIBLE = 1e-9  # N m
@@ -55,6 +55,7 @@ class FrictionCompensation:
         self._present = self._wanted.copy()
         self.start()
         # The first call compiles; let it be this one and not one in a control loop.
+        self._gain = 1.0
         self._step(np.eye(n), np.zeros(n), np.zeros(n), 0.0, 1.0)
 
     @property
@@ -101,12 +102,18 @@ class FrictionCompensation:
             return self.last
         if not self._started:
             self.reference_velocity[:] = v
+            self._gain = self._wanted_gain(period)
             self._started = True
         self._step(M, v, a_last, elapsed, period)
         return self.last
 
+    def _wanted_gain(self, period: float) -> float:
+        gain = self._settings.gain
+        return GAIN / period if gain is None else gain
+
     def _step(self, M: Array, v: Array, a_last: Array, elapsed: float, period: float) -> None:
         blend = -math.expm1(-elapsed / _FADING_TIME)
+        self._gain += blend * (self._wanted_gain(period) - self._gain)
         self._faded = _compensate(
             self._present,
             self._wanted,
@@ -116,7 +123,7 @@ class FrictionCompensation:
             a_last,
             elapsed,
             self._settings.theta,
-            GAIN / period,
+            self._gain,
             self.reference_velocity,
             self.last,
         )

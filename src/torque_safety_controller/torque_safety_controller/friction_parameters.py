@@ -53,6 +53,13 @@ TABLE = (
         default=3.0,
         live=True,
     ),
+    Parameter(
+        "friction_gain",
+        float,
+        "gain of the reference velocity, 1/s; -1: what the control rate allows",
+        default=-1.0,
+        live=True,
+    ),
 )
 
 _PARAMETER_OF = {"scale": "friction_compensation", "theta": "friction_theta"}
@@ -101,7 +108,8 @@ def friction_settings(
         name = f"friction_model_{error.name}"
         raise ParameterError(name, error.value, error.allowed) from error
     try:
-        return FrictionSettings(model, budget, scale, values["friction_theta"])
+        gain = None if values["friction_gain"] == -1.0 else values["friction_gain"]
+        return FrictionSettings(model, budget, scale, values["friction_theta"], gain)
     except FrictionSettingsError as error:
         name = _PARAMETER_OF.get(error.name, f"friction_{error.name}")
         raise ParameterError(name, error.value, error.allowed) from error

@@ -88,6 +88,8 @@ class FrictionSettings:
         budget: most that is ever compensated, whatever the model says, shape (n,), N m, >= 0.
         scale: share of the model that is compensated, 0 to 1; 0 is off.
         theta: rate at which the reference velocity returns to the measured one, 1/s, >= 0.
+        gain: of the reference velocity, in torques for the inertia felt, 1/s, > 0; None for what
+            the control rate allows.
 
     Raises:
         FrictionSettingsError: a value is out of range.
@@ -97,6 +99,7 @@ class FrictionSettings:
     budget: NDArray[np.float64]
     scale: float = 0.0
     theta: float = 3.0
+    gain: float | None = None
 
     def __post_init__(self) -> None:
         budget = _finite_vector("budget", self.budget, self.model.n)
@@ -107,6 +110,8 @@ class FrictionSettings:
             raise FrictionSettingsError("scale", self.scale, "a number from 0 to 1")
         if not (math.isfinite(self.theta) and self.theta >= 0.0):
             raise FrictionSettingsError("theta", self.theta, "a finite number >= 0")
+        if self.gain is not None and not (math.isfinite(self.gain) and self.gain > 0.0):
+            raise FrictionSettingsError("gain", self.gain, "a finite number > 0")
 
 
 def _finite_vector(name: str, value: ArrayLike, n: int) -> NDArray[np.float64]:
