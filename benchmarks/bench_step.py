@@ -45,7 +45,7 @@ def qp_alone(controller: Controller, q: np.ndarray, v: np.ndarray) -> dict:
     task = contacts.wrench_task(0, np.array([0.0, 0.0, -10.0, 0.0, 0.0, 0.0]), 1e-3)
     robot.update(q, v, np.zeros(n))
     limits = robot.M, -controller.tau_max - robot.h, controller.tau_max - robot.h
-    tasks = controller._tasks(q, v)
+    tasks = controller.goals.tasks(robot, q, v, controller.gains)
     wide, tight = np.full(n, 5.0), np.full(n, 0.5)
     # Like distances: limited below, so that the middle of the tight bounds is just allowed.
     G = rng.normal(size=(10, n))

@@ -172,7 +172,7 @@ class DirectLoop:
                 v,
                 tau.copy(),
                 self._additional.integral.copy(),
-                self.controller.error.copy(),
+                self.controller.goals.error.copy(),
             )
         )
         self.t += self.dt

@@ -108,7 +108,7 @@ def push(changed: dict[str, Any], force: tuple[float, ...], seconds: float = 5.0
     start = loop.pose()
     goal(loop, start, (0.05, 0.05, 0.1))
     loop.run(3.0)
-    target = loop.controller.pose_des.translation
+    target = loop.controller.goals.pose_des.translation
     loop.robot.apply_wrench(HAND, force, (0.0, 0.0, 0.0))
     pushed = loop.run(seconds)
     loop.robot.clear_wrenches()

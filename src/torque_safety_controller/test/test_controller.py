@@ -292,7 +292,7 @@ def test_bounds_that_the_motors_cannot_keep_are_relaxed_and_reported(arm):
 def test_without_a_goal_it_rests(arm):
     controller = strong(arm)
     controller.start(arm.q_start)
-    assert not controller.has_goal
+    assert not controller.goals.any
     v = 0.1 * arm.v_max
     step = controller.step(arm.q_start, v, *wide(arm))
     assert not step.tracking
@@ -359,7 +359,7 @@ def test_a_pose_goal_is_reached(arm):
         first = last if first is None else first
     assert np.linalg.norm(first) > 0.05
     assert np.linalg.norm(last) < 1e-4  # m, rad
-    np.testing.assert_allclose(controller.error, last, atol=1e-12)
+    np.testing.assert_allclose(controller.goals.error, last, atol=1e-12)
 
 
 # Each gain reaches the output
@@ -484,7 +484,7 @@ def test_torque_limits_hold_whatever_the_integral_does(mode, share, rate, deeds)
             assert_may_be_sent(step, arm)
             assert np.isfinite(controller.additional.last).all()
         # Once the world makes sense again, so does the controller.
-        controller.pose_des = None
+        controller.goals.pose_des = None
         controller.set_posture_goal(arm.q_start)
         rest = arm.q_start, np.zeros(arm.n), *wide(arm)
         for _ in range(3):
@@ -524,7 +524,7 @@ def test_the_limits_on_torque_leave_the_integral_its_share(arm):
     for sign in (1.0, -1.0):
         controller = with_integral(arm, gains=replace(GAINS, posture_kp=1e4))
         controller.take_over(*state, *wide(arm), sign * 0.5 * arm.tau_max)
-        controller.pose_des = None
+        controller.goals.pose_des = None
         controller.set_posture_goal(arm.q_max)
         for _ in range(5):
             step = controller.step(*state, *wide(arm))
@@ -575,8 +575,8 @@ def test_it_takes_over_the_torque_of_others(arm, mode):
         after = controller.step(*state, *wide(arm))
         assert (np.abs(after.tau - tau) < 0.01 * arm.tau_max).all()
         np.testing.assert_allclose(after.a, 0.0, atol=5e-3)
-        assert controller.pose_des.isApprox(pose_at(arm, arm.q_start))
-        np.testing.assert_array_equal(controller.q_des, arm.q_start)
+        assert controller.goals.pose_des.isApprox(pose_at(arm, arm.q_start))
+        np.testing.assert_array_equal(controller.goals.q_des, arm.q_start)
 
 
 def test_torque_beyond_the_limits_is_taken_over_up_to_them(arm):
@@ -609,8 +609,8 @@ def test_a_handover_that_fails_leaves_everything_as_it_was(arm, bad):
     step = controller.take_over(q, np.zeros(arm.n), *bounds, tau)
     assert step.failure
     assert not controller.additional.last.any()
-    assert controller.pose_des is goal
-    assert controller.q_des is None
+    assert controller.goals.pose_des is goal
+    assert controller.goals.q_des is None
     step = controller.hold(arm.q_start, np.zeros(arm.n))
     np.testing.assert_allclose(step.tau, gravity(arm, arm.q_start), atol=EXACT)
     assert not controller.step(arm.q_start, np.zeros(arm.n), *wide(arm)).failure

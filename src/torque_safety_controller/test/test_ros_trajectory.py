@@ -123,5 +123,7 @@ def test_it_is_followed_in_the_robots_time(ros):
         ros.wait_until(lambda s=stamp: s * MS in commands.stamps, "an answer", each=send)
         if stamp >= 20:
             pose, *_ = meant.sample(1e-3 * (stamp - 20))
-            assert np.abs(pin.log6(pose.actInv(node._controller.pose_des)).vector).max() < 1e-6
-    assert node._controller.pose_des.translation == pytest.approx(start.translation, abs=1e-9)
+            error = pin.log6(pose.actInv(node._controller.goals.pose_des)).vector
+            assert np.abs(error).max() < 1e-6
+    resting = node._controller.goals.pose_des.translation
+    assert resting == pytest.approx(start.translation, abs=1e-9)

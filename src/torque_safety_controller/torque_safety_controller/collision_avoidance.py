@@ -53,15 +53,13 @@ class CollisionSettings:
         for f in fields(self):
             value = getattr(self, f.name)
             if not (isinstance(value, int | float) and math.isfinite(value) and value >= 0.0):
-                raise CollisionError(f"{f.name} must be finite and not negative, not {value}")
+                raise CollisionError(f.name, value, "a finite number >= 0")
             if value == 0.0 and f.name not in ("margin", "reserve"):
-                raise CollisionError(f"{f.name} must be positive")
+                raise CollisionError(f.name, value, "a finite number > 0")
         if self.braking_share > 1.0:
-            raise CollisionError(f"braking_share must be at most 1, not {self.braking_share}")
+            raise CollisionError("braking_share", self.braking_share, "at most 1")
         if self.influence <= self.margin + self.reserve:
-            raise CollisionError(
-                f"influence must be more than margin and reserve, not {self.influence}"
-            )
+            raise CollisionError("influence", self.influence, "more than margin and reserve")
 
 
 class CollisionRows(NamedTuple):
@@ -119,11 +117,11 @@ class CollisionAvoidance:
         for name, limit, sign in (("a_min", lower, -1.0), ("a_max", upper, 1.0)):
             if limit.shape != (n,) or not (np.isfinite(limit) & (sign * limit > 0.0)).all():
                 kind = "negative" if sign < 0.0 else "positive"
-                raise CollisionError(f"{name} must be {n} finite {kind} numbers, not {limit}")
+                raise CollisionError(name, limit, f"{n} finite {kind} numbers")
         if not (math.isfinite(dt) and dt > 0.0):
-            raise CollisionError(f"dt must be positive, not {dt}")
+            raise CollisionError("dt", dt, "a finite number > 0")
         if rows_max < 1:
-            raise CollisionError(f"rows_max must be positive, not {rows_max}")
+            raise CollisionError("rows_max", rows_max, "positive")
         self._rows_max = rows_max
         self.settings = settings or CollisionSettings()
         self.model = model

@@ -99,7 +99,7 @@ def build_collision_model(
     pruning = pruning or Pruning()
     q_start = np.asarray(q_start, dtype=float)
     if q_start.shape != (model.nq,) or not np.isfinite(q_start).all():
-        raise CollisionError(f"q_start must be {model.nq} finite numbers, not {q_start}")
+        raise CollisionError("q_start", q_start, f"{model.nq} finite numbers")
     owners, joints, capsules = [], [], []
     for shape in link_shapes(model, geometry):
         around = list(shape.capsules)
@@ -164,17 +164,17 @@ def _check_names(links: set[str], obstacles: Sequence[Obstacle]) -> None:
     names = [obstacle.name for obstacle in obstacles]
     for name in names:
         if names.count(name) > 1 or name in links:
-            raise CollisionError(f"obstacle {name!r}: another obstacle or a link has this name")
+            raise CollisionError("name", name, "what no other obstacle and no link is called")
 
 
 def _base_placement(model: pin.Model, base_frame: str | None) -> pin.SE3:
     if base_frame is None:
         return pin.SE3.Identity()
     if not model.existFrame(base_frame):
-        raise CollisionError(f"unknown base frame {base_frame!r}")
+        raise CollisionError("base_frame", base_frame, "a frame of the URDF")
     frame = model.frames[model.getFrameId(base_frame)]
     if frame.parentJoint != 0:
-        raise CollisionError(f"base frame {base_frame!r} is moved by a joint")
+        raise CollisionError("base_frame", base_frame, "a frame that is not moved by a joint")
     return frame.placement
 
 
@@ -200,15 +200,13 @@ def _checked_pairs(pairs, owners, joints) -> set[frozenset[str]]:
     joint_of = dict(zip(owners, joints, strict=False))
     for pair in pairs:
         if len(pair) != 2:
-            raise CollisionError(f"a pair must name two links, not {pair}")
+            raise CollisionError("pairs", pair, "two links")
         for link in pair:
             if link not in joint_of:
                 known = ", ".join(sorted(joint_of))
-                raise CollisionError(
-                    f"no link {link!r} with collision geometry; there are: {known}"
-                )
+                raise CollisionError("pairs", link, f"links with collision geometry: {known}")
         if joint_of[pair[0]] == joint_of[pair[1]]:
-            raise CollisionError(f"links {pair[0]!r} and {pair[1]!r} do not move to each other")
+            raise CollisionError("pairs", pair, "links that move to each other")
     return {frozenset(pair) for pair in pairs}
 
 

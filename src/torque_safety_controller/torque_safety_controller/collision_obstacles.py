@@ -11,7 +11,20 @@ from numpy.typing import ArrayLike, NDArray
 
 
 class CollisionError(ValueError):
-    """An obstacle, a pair or a setting of the collision avoidance that cannot be used."""
+    """An obstacle, a pair or a setting of the collision avoidance that cannot be used.
+
+    Args:
+        field: which of them.
+        value: what was given.
+        allowed: what would have been accepted.
+        obstacle: its name, if it is about one.
+    """
+
+    def __init__(self, field: str, value: object, allowed: str, obstacle: str = "") -> None:
+        self.field = field
+        self.value = value
+        self.allowed = f"{allowed} (obstacle {obstacle!r})" if obstacle else allowed
+        super().__init__(f"{field} = {value}: must be {self.allowed}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +79,11 @@ def box(
     """
     half = 0.5 * _vector(name, "size", size)
     if not (half > 0.0).all():
-        raise CollisionError(f"obstacle {name!r}: size must be positive, is {list(2.0 * half)}")
+        raise CollisionError("size", size, "positive", name)
     quaternion = _vector(name, "orientation", orientation, 4)
     norm = float(np.linalg.norm(quaternion))
     if norm < 1e-6:
-        raise CollisionError(f"obstacle {name!r}: orientation must not be zero")
+        raise CollisionError("orientation", orientation, "a quaternion, not zero", name)
     rotation = pin.Quaternion(quaternion / norm).toRotationMatrix()
     placement = pin.SE3(rotation, _vector(name, "centre", centre))
     return Obstacle(_name(name), "box", placement, half)
@@ -90,7 +103,7 @@ def half_space(name: str, point: ArrayLike, normal: ArrayLike) -> Obstacle:
     direction = _vector(name, "normal", normal)
     length = float(np.linalg.norm(direction))
     if length < 1e-9:
-        raise CollisionError(f"obstacle {name!r}: normal must not be zero")
+        raise CollisionError("normal", normal, "a direction, not zero", name)
     placement = pin.SE3(_rotation_to(direction / length), _vector(name, "point", point))
     return Obstacle(_name(name), "half_space", placement, np.zeros(0))
 
@@ -105,7 +118,7 @@ def _rotation_to(axis: np.ndarray) -> np.ndarray:
 
 def _name(name: str) -> str:
     if not isinstance(name, str) or not name:
-        raise CollisionError(f"an obstacle's name must be a non-empty string, not {name!r}")
+        raise CollisionError("name", repr(name), "a non-empty string")
     return name
 
 
@@ -115,9 +128,7 @@ def _vector(name: str, field: str, values: ArrayLike, n: int = 3) -> np.ndarray:
     except (TypeError, ValueError):
         array = np.zeros(0)
     if array.shape != (n,) or not np.isfinite(array).all():
-        raise CollisionError(
-            f"obstacle {name!r}: {field} must be {n} finite numbers, not {values}"
-        )
+        raise CollisionError(field, values, f"{n} finite numbers", name)
     return array
 
 
@@ -127,5 +138,5 @@ def _positive(name: str, field: str, value: float) -> float:
     except (TypeError, ValueError):
         number = math.nan
     if not (math.isfinite(number) and number > 0.0):
-        raise CollisionError(f"obstacle {name!r}: {field} must be positive, not {value}")
+        raise CollisionError(field, value, "a finite number > 0", name)
     return number

@@ -3,51 +3,37 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import NamedTuple
+from copy import copy
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from torque_safety_controller.additional_torque import LONGEST_GAP, AdditionalTorque
+from torque_safety_controller.collision_avoidance import CollisionAvoidance
+from torque_safety_controller.constraints import Rows
 from torque_safety_controller.disturbance_observer import DisturbanceObserver
-from torque_safety_controller.inverse_dynamics_qp import InverseDynamicsQP, NoSolutionFound
-from torque_safety_controller.robot_model import RobotModel
-from torque_safety_controller.tasks import (
-    TaskTerm,
-    damping_task,
-    pose_error,
-    pose_feed_forward,
-    pose_task,
-    posture_task,
+from torque_safety_controller.gains import Gains
+from torque_safety_controller.goals import Goals
+from torque_safety_controller.inverse_dynamics_qp import (
+    ContactForces,
+    InverseDynamicsQP,
+    NoSolutionFound,
 )
+from torque_safety_controller.robot_model import RobotModel
+from torque_safety_controller.tasks import TaskTerm, damping_task
+from torque_safety_controller.torque_limiter import TorqueLimiter
 
+if TYPE_CHECKING:
+    from torque_safety_controller.interaction import Interaction
 
-@dataclass(frozen=True)
-class Gains:
-    """What may change while the controller runs.
+__all__ = ["Controller", "Gains", "Step"]
 
-    Attributes:
-        pose_kp, pose_kd: of the pose task, 1/s^2 and 1/s.
-        pose_weight: of the pose task; 0 leaves the task out.
-        posture_kp, posture_kd: of the posture task, 1/s^2 and 1/s.
-        posture_weight: of the posture task, > 0.
-        posture_in_null_space: whether the posture leaves the pose alone.
-        hold_kd: damping in HOLD, 1/s.
-        disturbance_time: time constant with which what disturbs the accelerations is learned
-            and kept out of the bounds, s; None not to.
-    """
-
-    pose_kp: float
-    pose_kd: float
-    pose_weight: float
-    posture_kp: float
-    posture_kd: float
-    posture_weight: float
-    posture_in_null_space: bool
-    hold_kd: float
-    disturbance_time: float | None = None
+_ROW_SCALE = 0.1
+"""Of the rows of collisions: where the torques cannot keep them and the joints' bounds, a distance
+gives way at a hundredth of what joints cost, so that the joints keep theirs."""
 
 
 class Step(NamedTuple):
@@ -60,6 +46,8 @@ class Step(NamedTuple):
         relaxation: by how much the acceleration bounds had to give way to the torque limits,
             shape (n,), rad/s^2, or None.
         failure: why the QP was not used though it could have been, or empty.
+        row_relaxation: by how much distances had to give way, one for each row of the collision
+            avoidance, scaled m/s^2, or None.
     """
 
     tau: np.ndarray
@@ -67,6 +55,7 @@ class Step(NamedTuple):
     tracking: bool
     relaxation: np.ndarray | None = None
     failure: str = ""
+    row_relaxation: np.ndarray | None = None
 
 
 class Controller:
@@ -79,12 +68,12 @@ class Controller:
         torque_rate_max: greatest change of torque, shape (n,), N m/s; inf for none.
         additional: integral action; the torque limits hold with it counted in.
         solver: of the QP, one of `inverse_dynamics_qp.SOLVERS`.
+        collision: keeps links apart and away from obstacles; None for nothing.
+        interaction: what is done about forces at the hand and other contacts; None for nothing.
 
     Attributes:
-        q_des: joint goal, shape (n,), rad; None until one is set.
-        pose_des: end-effector goal; None until one is set.
-        error: error of the pose goal in the last step, shape (6,), m and rad.
-        additional: as given.
+        goals: of the end effector and the joints.
+        additional, collision, interaction: as given.
         iterations: of the last QP.
     """
 
@@ -96,41 +85,45 @@ class Controller:
         torque_rate_max: np.ndarray | None = None,
         additional: AdditionalTorque | None = None,
         solver: str = "active_set",
+        collision: CollisionAvoidance | None = None,
+        interaction: Interaction | None = None,
     ) -> None:
         n = robot.n
         self.robot = robot
-        self.tau_max = np.asarray(tau_max, dtype=float)
         self.gains = gains
-        self.q_des: np.ndarray | None = None
-        self.pose_des: pin.SE3 | None = None
-        self._pose_motion: tuple[np.ndarray, np.ndarray] | None = None
-        self._v_des: np.ndarray | None = None
-        self.error = np.full(6, math.nan)
-        self.iterations = 0
-        rate = np.full(n, math.inf) if torque_rate_max is None else torque_rate_max
-        self._tau_step = np.where(np.isinf(rate), np.inf, rate * robot.dt)
-        self._rate_limited = bool(np.isfinite(rate).any())
-        self._tau_min = -self.tau_max
+        self.goals = Goals(n)
         self.additional = additional
+        self.collision = collision
+        self.interaction = interaction
+        self.iterations = 0
+        self._limiter = TorqueLimiter(tau_max, torque_rate_max, robot.dt)
         self._qp = InverseDynamicsQP(n, solver=solver)
         self._observer = DisturbanceObserver(n, gains.disturbance_time)
         self._a_last = np.zeros(n)
-        self._tau_last: np.ndarray | None = None
-        self._posture = np.zeros(n)
 
     @property
-    def has_goal(self) -> bool:
-        """Whether there is something to track."""
-        return self.pose_des is not None or self.q_des is not None
+    def tau_max(self) -> np.ndarray:
+        """Torque limits, shape (n,), N m."""
+        return self._limiter.tau_max
+
+    @property
+    def acceleration(self) -> np.ndarray:
+        """Acceleration commanded last, shape (n,), rad/s^2."""
+        return self._a_last
 
     def start(self, q: np.ndarray) -> None:
         """Forget the past; `q` becomes the posture that the null space is held at."""
+        self._forget()
+        self.goals.posture = q.copy()
+
+    def _forget(self) -> None:
         self._a_last = np.zeros(self.robot.n)
-        self._tau_last = None
+        self._limiter.start()
         self._observer.start()
-        self._posture = q.copy()
         if self.additional is not None:
             self.additional.start()
+        if self.interaction is not None:
+            self.interaction.start()
 
     def set_pose_goal(
         self,
@@ -138,26 +131,12 @@ class Controller:
         twist: np.ndarray | None = None,
         twist_rate: np.ndarray | None = None,
     ) -> None:
-        """Move the end effector to `pose_des` in the URDF's root frame.
-
-        Args:
-            pose_des: goal now.
-            twist: of a goal in motion, in the goal's axes, shape (6,), m/s and rad/s; None for
-                one at rest.
-            twist_rate: time derivative of `twist`, shape (6,); with `twist`.
-        """
-        self.pose_des = pose_des
-        self._pose_motion = None if twist is None else (twist, twist_rate)
+        """Move the end effector to `pose_des`; see `Goals.set_pose`."""
+        self.goals.set_pose(pose_des, twist, twist_rate)
 
     def set_posture_goal(self, q_des: np.ndarray, v_des: np.ndarray | None = None) -> None:
-        """Bring the joints, or what the pose task leaves free of them, to `q_des`, rad.
-
-        Args:
-            q_des: goal now, shape (n,), rad.
-            v_des: its velocity, shape (n,), rad/s; None for a goal at rest.
-        """
-        self.q_des = q_des
-        self._v_des = v_des
+        """Bring the joints to `q_des`; see `Goals.set_posture`."""
+        self.goals.set_posture(q_des, v_des)
 
     def warm_up(self) -> None:
         """Run every part of a step once: what is compiled at first use is compiled now.
@@ -170,16 +149,10 @@ class Controller:
             self.robot.update(q, v, v)
             self.set_pose_goal(self.robot.pose.copy())
             self.step(q, v, -bounds, bounds)
-        self.pose_des = None
-        self.error.fill(math.nan)
+        self.goals = Goals(self.robot.n)
         self.robot.rates = self.additional is not None
         self.robot.update(q, v, v)
         self.start(q)
-
-    @property
-    def acceleration(self) -> np.ndarray:
-        """Acceleration commanded last, shape (n,), rad/s^2."""
-        return self._a_last
 
     def step(
         self,
@@ -200,10 +173,11 @@ class Controller:
             a_upper: shape (n,), rad/s^2, not below `a_lower`.
             elapsed: time since the last step, s; None for a control period.
         """
-        if not self.has_goal:
+        if not self.goals.any:
             return self.rest(q, v, a_lower, a_upper, elapsed)
         additional = self._begin(q, v, elapsed)
-        return self._solve(q, v, self._tasks(q, v), a_lower, a_upper, additional, True)
+        tasks, contacts = self._tasks(self.goals, q, v)
+        return self._solve(q, v, tasks, a_lower, a_upper, additional, contacts)
 
     def rest(
         self,
@@ -216,7 +190,8 @@ class Controller:
         """Return the torque that brings the arm to rest inside its bounds; see `step`."""
         additional = self._begin(q, v, elapsed)
         tasks = [damping_task(v, self.gains.hold_kd)]
-        return self._solve(q, v, tasks, a_lower, a_upper, additional, False)
+        step = self._solve(q, v, tasks, a_lower, a_upper, additional)
+        return step._replace(tracking=False)
 
     def take_over(
         self,
@@ -239,22 +214,31 @@ class Controller:
             a_upper: shape (n,), rad/s^2, not below `a_lower`.
             tau: torque of the motors now, shape (n,), N m.
         """
-        goals = self.pose_des, self._pose_motion, self.q_des, self._v_des, self._posture
-        self.start(q)
+        self._forget()
         self.robot.rates = self.additional is not None
         self.robot.update(q, v, self._a_last)
-        self.set_posture_goal(q.copy())
-        self.set_pose_goal(self.robot.pose.copy())
-        step = self._solve(q, v, self._tasks(q, v), a_lower, a_upper, None, True)
+        here = copy(self.goals)
+        here.posture = q.copy()
+        here.set_posture(q.copy())
+        here.hold(self.robot.pose)
+        tasks = here.tasks(self.robot, q, v, self.gains)
+        step = self._solve(q, v, tasks, a_lower, a_upper, None)
         if not step.failure and not np.isfinite(tau).all():
             step = step._replace(failure="the torque of the motors is not finite")
         if step.failure:
-            self.pose_des, self._pose_motion, self.q_des, self._v_des, self._posture = goals
             return step
-        self._tau_last = np.clip(tau, self._tau_min, self.tau_max)
+        self.goals = here
+        self._limiter.go_on_from(tau)
         if self.additional is not None:
-            self.additional.seed(self.robot, v, self._tau_last - step.tau)
+            self.additional.seed(self.robot, v, self._limiter.last - step.tau)
         return step
+
+    def hold(self, q: np.ndarray, v: np.ndarray, elapsed: float | None = None) -> Step:
+        """Return a torque that needs no acceleration bounds: gravity and damping.
+
+        Each joint brakes with `hold_kd`, as hard as its motor allows.
+        """
+        return self._hold(q, v, self._begin(q, v, elapsed), "")
 
     def _begin(self, q: np.ndarray, v: np.ndarray, elapsed: float | None) -> np.ndarray | None:
         """Update the model and return the additional torque of a step, or None."""
@@ -266,35 +250,69 @@ class Controller:
         observer.time_constant = self.gains.disturbance_time
         known = elapsed if elapsed <= LONGEST_GAP * robot.dt else 0.0
         observer.observe(v, self._a_last, known, self.tau_max, robot.M)
+        if self.interaction is not None:
+            self.interaction.observe(robot, self.goals, elapsed)
         if not robot.rates:
             return None
         return additional.torque(robot, v, self._a_last, elapsed)
 
+    def _tasks(
+        self, goals: Goals, q: np.ndarray, v: np.ndarray
+    ) -> tuple[list[TaskTerm], ContactForces | None]:
+        """Return the tasks of a step, and the forces that contacts may exert."""
+        robot, gains, interaction = self.robot, self.gains, self.interaction
+        if interaction is None:
+            return goals.tasks(robot, q, v, gains), None
+        tasks = goals.tasks(robot, q, v, gains, interaction.stiffness)
+        tasks += interaction.tasks(robot, gains)
+        return tasks, interaction.forces(robot)
+
     def _solve(
-        self, q, v, tasks: list[TaskTerm], a_lower, a_upper, additional, tracking: bool
+        self,
+        q: np.ndarray,
+        v: np.ndarray,
+        tasks: Sequence[TaskTerm],
+        a_lower: np.ndarray,
+        a_upper: np.ndarray,
+        additional: np.ndarray | None,
+        contacts: ContactForces | None = None,
     ) -> Step:
         robot = self.robot
         bias = robot.h if additional is None else robot.h + additional
-        lower, upper = self._torque_range()
+        lower, upper = self._limiter.range()
         a_lower, a_upper = self._observer.shift(a_lower, a_upper)
+        rows = None
+        if self.collision is not None:
+            found = self.collision.rows(q, v, a_lower, a_upper)
+            rows = Rows(
+                _ROW_SCALE * found.G,
+                _ROW_SCALE * found.lower,
+                np.full(len(found.lower), np.inf),
+            )
         try:
-            solution = self._qp.solve(tasks, a_lower, a_upper, robot.M, lower - bias, upper - bias)
+            solution = self._qp.solve(
+                tasks, a_lower, a_upper, robot.M, lower - bias, upper - bias, rows, contacts
+            )
         except NoSolutionFound as error:
             return self._hold(q, v, additional, str(error))
         self.iterations = solution.iterations
         tau = robot.torque(q, v, solution.a)
         if additional is not None:
             tau = tau + additional
-        return Step(self._limited(tau), self._remember(solution.a), tracking, solution.relaxation)
+        if contacts is not None:
+            tau = tau - solution.contact_torque
+            self.interaction.note_forces(solution.rho)
+        return Step(
+            self._limiter.limited(tau),
+            self._remember(solution.a),
+            True,
+            solution.relaxation,
+            row_relaxation=solution.row_relaxation,
+        )
 
-    def hold(self, q: np.ndarray, v: np.ndarray, elapsed: float | None = None) -> Step:
-        """Return a torque that needs no acceleration bounds: gravity and damping.
-
-        Each joint brakes with `hold_kd`, as hard as its motor allows.
-        """
-        return self._hold(q, v, self._begin(q, v, elapsed), "")
-
-    def _hold(self, q, v, additional, failure: str) -> Step:
+    def _hold(
+        self, q: np.ndarray, v: np.ndarray, additional: np.ndarray | None, failure: str
+    ) -> Step:
         robot = self.robot
         self._observer.start()  # what is asked for here may be more than the motors can give
         a = -self.gains.hold_kd * v
@@ -302,69 +320,12 @@ class Controller:
         if additional is not None and np.isfinite(additional).all():
             bias = robot.h + additional
         tau = robot.M @ a + bias
-        sent = self._limited(tau)
+        sent = self._limiter.limited(tau)
         if not np.array_equal(sent, tau):
             # What the motors cannot give is no error for the integral to grow on.
             with suppress(np.linalg.LinAlgError):
                 a = np.linalg.solve(robot.M, sent - bias)
         return Step(sent, self._remember(a), False, None, failure)
-
-    def _tasks(self, q: np.ndarray, v: np.ndarray) -> list[TaskTerm]:
-        gains = self.gains
-        q_des = self._posture if self.q_des is None else self.q_des
-        tasks = []
-        if self.pose_des is not None:
-            self.error = pose_error(self.robot.pose, self.pose_des)
-            if gains.pose_weight > 0.0:
-                tasks.append(
-                    pose_task(
-                        self.robot,
-                        v,
-                        self.error,
-                        gains.pose_kp,
-                        gains.pose_kd,
-                        gains.pose_weight,
-                        self._pose_ahead(v),
-                    )
-                )
-        guarded = self.robot.J if tasks and gains.posture_in_null_space else None
-        tasks.append(
-            posture_task(
-                q_des,
-                q,
-                v,
-                gains.posture_kp,
-                gains.posture_kd,
-                gains.posture_weight,
-                guarded,
-                None if self._v_des is None else gains.posture_kd * self._v_des,
-            )
-        )
-        return tasks
-
-    def _pose_ahead(self, v: np.ndarray) -> np.ndarray | None:
-        if self._pose_motion is None:
-            return None
-        return pose_feed_forward(
-            self.robot, v, self.pose_des, *self._pose_motion, self.gains.pose_kd
-        )
-
-    def _torque_range(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the torques that may follow the last one, shape (n,) each, N m."""
-        if self._tau_last is None or not self._rate_limited:
-            return self._tau_min, self.tau_max
-        return (
-            np.maximum(self._tau_min, self._tau_last - self._tau_step),
-            np.minimum(self.tau_max, self._tau_last + self._tau_step),
-        )
-
-    def _limited(self, tau: np.ndarray) -> np.ndarray:
-        """Return `tau` as it may be sent: whatever came before, finite and within the limits."""
-        if not math.isfinite(tau.dot(tau)):
-            tau = np.zeros(self.robot.n) if self._tau_last is None else self._tau_last
-        lower, upper = self._torque_range()
-        self._tau_last = np.minimum(np.maximum(tau, lower), upper)
-        return self._tau_last
 
     def _remember(self, a: np.ndarray) -> np.ndarray:
         self._a_last = a if math.isfinite(a.dot(a)) else np.zeros(self.robot.n)

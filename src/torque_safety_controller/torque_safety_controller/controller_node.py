@@ -182,7 +182,7 @@ class ControllerNode(Node):
             return f"solver failed: {step.failure}"
         if self._bounds_lost:
             return "acceleration limits are stale"
-        if self._controller.has_goal:
+        if self._controller.goals.any:
             return "goal lost"
         return "no goal"
 

@@ -37,6 +37,8 @@ class RobotModel:
         C: Coriolis matrix with M' - 2 C skew-symmetric, shape (n, n), N m s; with `rates`.
         J_dot: time derivative of J, shape (6, n); with `rates`.
         rates: whether `update` computes C and J_dot.
+        data: Pinocchio's; after `update` with the kinematics and joint Jacobians of the current
+            state, at zero acceleration.
 
     Raises:
         RobotDescriptionError: no such frame.
@@ -51,7 +53,7 @@ class RobotModel:
         self.dt = dt
         self.n = model.nv
         self._frame_id = model.getFrameId(frame)
-        self._data = model.createData()
+        self.data = model.createData()
         self._zero = np.zeros(self.n)
         self.q = self._zero
         self.pose = pin.SE3.Identity()
@@ -71,7 +73,7 @@ class RobotModel:
             v: velocity, shape (n,), rad/s.
             a_last: acceleration commanded last, shape (n,), rad/s^2.
         """
-        model, data = self.model, self._data
+        model, data = self.model, self.data
         self.q = q
         q_mid, v_mid = middle_of_step(q, v, a_last, self.dt)
         self.M = pin.crba(model, data, q_mid)
@@ -96,4 +98,4 @@ class RobotModel:
     def torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the torque that, held for dt, gives mean acceleration `a`, shape (n,), N m."""
         q_mid, v_mid = middle_of_step(q, v, a, self.dt)
-        return pin.rnea(self.model, self._data, q_mid, v_mid, a)
+        return pin.rnea(self.model, self.data, q_mid, v_mid, a)

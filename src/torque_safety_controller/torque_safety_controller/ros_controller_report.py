@@ -65,8 +65,8 @@ class StepRecord:
         at_limit = (a <= a_lower + near) | (a >= a_upper - near)
         values = {
             "steps": self._steps,
-            "position_error_m": float(np.linalg.norm(controller.error[:3])),
-            "orientation_error_rad": float(np.linalg.norm(controller.error[3:])),
+            "position_error_m": float(np.linalg.norm(controller.goals.error[:3])),
+            "orientation_error_rad": float(np.linalg.norm(controller.goals.error[3:])),
             "qp_iterations": controller.iterations,
             "qp_failures": self._failures,
             "bounds_relaxed_steps": self._relaxed_steps,

@@ -177,9 +177,15 @@ class GoalInbox(GoalQueue):
         )
         self._trajectory: PoseTrajectory | None = None
         self._begin = 0
+        self._taken = controller.goals.taken
 
     def apply_due(self, stamp: int) -> bool:
-        """Apply the goals that are due at `stamp`, ns, and go on with a trajectory."""
+        """Apply the goals that are due at `stamp`, ns, and go on with a trajectory.
+
+        A trajectory ends where the arm has taken the pose where it was for its goal.
+        """
+        if self._taken != self._controller.goals.taken:
+            self._taken, self._trajectory = self._controller.goals.taken, None
         due = super().apply_due(stamp)
         if self._trajectory is None:
             return due
