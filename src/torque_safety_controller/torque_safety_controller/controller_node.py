@@ -46,7 +46,7 @@ class ControllerNode(Node):
             self._node_parameters = NodeParameters(
                 self, TABLE, make_configuration, self._configure
             )
-            robot, base = load_robot(self._node_parameters.values, self)
+            robot, base, _ = load_robot(self._node_parameters.values, self)
         except ParameterError:
             self.destroy_node()
             raise

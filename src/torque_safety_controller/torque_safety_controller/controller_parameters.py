@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from torque_safety_controller import friction_parameters, integral_parameters
 from torque_safety_controller.additional_torque import AdditionalSettings
-from torque_safety_controller.controller import Gains
+from torque_safety_controller.gains import Gains
 from torque_safety_controller.inverse_dynamics_qp import SOLVERS
 from torque_safety_controller.modes import CONTROLS
 from torque_safety_controller.robot_model import RobotModel
@@ -27,8 +27,9 @@ from viability_bounds_pkg.ros_parameters import (
 from viability_bounds_pkg.ros_robot_parameters import (
     ROBOT_TABLE,
     all_positive,
-    load_model,
+    model_from,
     position_limits,
+    robot_urdf,
 )
 
 if TYPE_CHECKING:
@@ -187,8 +188,22 @@ def _gains(values: Mapping[str, Any]) -> Gains:
     return Gains(**gains, posture_in_null_space=values["posture_in_null_space"])
 
 
-def load_robot(values: Mapping[str, Any], node: Node) -> tuple[RobotModel, pin.SE3]:
-    """Read the URDF and return the robot's model and the placement of the base frame.
+class LoadedRobot(NamedTuple):
+    """What the URDF says.
+
+    Attributes:
+        robot: model of the arm.
+        base: placement of the base frame in the URDF's root frame.
+        urdf: its text.
+    """
+
+    robot: RobotModel
+    base: pin.SE3
+    urdf: str
+
+
+def load_robot(values: Mapping[str, Any], node: Node | None) -> LoadedRobot:
+    """Read the URDF, once, and return what is made of it.
 
     Args:
         values: parameter values by name.
@@ -197,10 +212,12 @@ def load_robot(values: Mapping[str, Any], node: Node) -> tuple[RobotModel, pin.S
     Raises:
         ParameterError: a URDF that does not load, or a joint or frame that it does not have.
     """
-    model = load_model(values, node)
-    return (
+    urdf = robot_urdf(values, node)
+    model = model_from(values, urdf)
+    return LoadedRobot(
         _with_frame(model, values, "end_effector_frame"),
         _base_placement(model, values["base_frame"]),
+        urdf,
     )
 
 

@@ -99,9 +99,13 @@ def load_model(values: Mapping[str, Any], node: Node) -> pin.Model:
         ParameterError: a URDF that does not load, a joint that it does not have, or rotor
             inertias that cannot be.
     """
+    return model_from(values, robot_urdf(values, node))
+
+
+def model_from(values: Mapping[str, Any], urdf: str) -> pin.Model:
+    """Return the model of the arm from the text of its URDF; see `load_model`."""
     joints = joint_names(values)
     rotors = not_negative(values, "rotor_inertia", joints)
-    urdf = robot_urdf(values, node)
     try:
         return build_model(urdf, joints, locked_joints(values), rotors)
     except RobotDescriptionError as error:
