@@ -45,6 +45,46 @@ class Obstacle:
     size: NDArray[np.float64]
 
 
+SHAPES = ("box", "sphere", "cylinder", "half_space")
+"""Shapes of `make_obstacle`."""
+
+
+def make_obstacle(
+    name: str, shape: str, size: ArrayLike, position: ArrayLike, orientation: ArrayLike
+) -> Obstacle:
+    """Return an obstacle described as a `visualization_msgs/Marker` is.
+
+    Args:
+        name: of the obstacle.
+        shape: one of `SHAPES`. A cylinder is kept as the capsule around it, which is longer by
+            its radius at either end.
+        size: full lengths along the obstacle's axes, shape (3,), m: edges of a box, diameters
+            of a sphere, diameter, diameter and height of a cylinder; nothing of a half space.
+        position: of its centre, or of a point on the surface of a half space, shape (3,), m.
+        orientation: quaternion x, y, z, w of its axes, normalised here; a half space is where
+            z < 0.
+
+    Raises:
+        CollisionError: something of it cannot be.
+    """
+    if shape not in SHAPES:
+        raise CollisionError("shape", shape, f"one of {', '.join(SHAPES)}", name)
+    rotation = _rotation(name, orientation)
+    centre = _vector(name, "position", position)
+    if shape == "half_space":
+        return half_space(name, centre, rotation[:, 2])
+    if shape == "box":
+        return box(name, centre, size, orientation)
+    diameter, other, height = lengths = _vector(name, "size", size)
+    if diameter != other or (shape == "sphere" and diameter != height) or not (lengths > 0).all():
+        equal = "three times" if shape == "sphere" else "twice"
+        raise CollisionError("size", size, f"a positive diameter {equal}", name)
+    if shape == "sphere":
+        return sphere(name, centre, 0.5 * diameter)
+    half = 0.5 * height * rotation[:, 2]
+    return capsule(name, centre - half, centre + half, 0.5 * diameter)
+
+
 def sphere(name: str, centre: ArrayLike, radius: float) -> Obstacle:
     """Return a sphere; `centre` of shape (3,) and `radius` in m."""
     return capsule(name, centre, centre, radius)
@@ -80,12 +120,7 @@ def box(
     half = 0.5 * _vector(name, "size", size)
     if not (half > 0.0).all():
         raise CollisionError("size", size, "positive", name)
-    quaternion = _vector(name, "orientation", orientation, 4)
-    norm = float(np.linalg.norm(quaternion))
-    if norm < 1e-6:
-        raise CollisionError("orientation", orientation, "a quaternion, not zero", name)
-    rotation = pin.Quaternion(quaternion / norm).toRotationMatrix()
-    placement = pin.SE3(rotation, _vector(name, "centre", centre))
+    placement = pin.SE3(_rotation(name, orientation), _vector(name, "centre", centre))
     return Obstacle(_name(name), "box", placement, half)
 
 
@@ -106,6 +141,15 @@ def half_space(name: str, point: ArrayLike, normal: ArrayLike) -> Obstacle:
         raise CollisionError("normal", normal, "a direction, not zero", name)
     placement = pin.SE3(_rotation_to(direction / length), _vector(name, "point", point))
     return Obstacle(_name(name), "half_space", placement, np.zeros(0))
+
+
+def _rotation(name: str, orientation: ArrayLike) -> np.ndarray:
+    """Return the rotation of a quaternion x, y, z, w."""
+    quaternion = _vector(name, "orientation", orientation, 4)
+    norm = float(np.linalg.norm(quaternion))
+    if norm < 1e-6:
+        raise CollisionError("orientation", orientation, "a quaternion, not zero", name)
+    return pin.Quaternion(quaternion / norm).toRotationMatrix()
 
 
 def _rotation_to(axis: np.ndarray) -> np.ndarray:

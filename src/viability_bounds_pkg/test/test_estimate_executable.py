@@ -103,6 +103,8 @@ def test_limits_are_written_as_an_overlay(robot, tmp_path, method):
     assert path.read_bytes() == before
     written = parameters_in(output.read_text())
     assert set(written) == {"acceleration_min", "acceleration_max"}
+    controller = yaml.safe_load(output.read_text())["/**/controller_node"]
+    assert controller["ros__parameters"] == written
     # The shoulder with the arm stretched out to the side, at rest or nearly.
     inertia, weight = 2.0 * 0.25 + 0.5 * 0.36, 9.81 * (2.0 * 0.5 + 0.5 * 0.6)
     at_rest = (30.0 - weight) / inertia

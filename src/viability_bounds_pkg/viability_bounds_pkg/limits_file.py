@@ -21,6 +21,9 @@ from viability_bounds_pkg.state_space import Array
 NODE = "/**/bounds_node"
 """The node whose parameters the limits are."""
 
+CONTROLLER = "/**/controller_node"
+"""The node that must know them, too, to keep distances."""
+
 DIGITS = 4
 """Significant digits written."""
 

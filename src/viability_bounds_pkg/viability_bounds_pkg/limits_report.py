@@ -8,7 +8,12 @@ import numpy as np
 
 from viability_bounds_pkg.acceleration_limits import AccelerationLimits
 from viability_bounds_pkg.discretisation_margin import DiscretisationMargin
-from viability_bounds_pkg.limits_file import overlay, round_away_from_zero, round_towards_zero
+from viability_bounds_pkg.limits_file import (
+    CONTROLLER,
+    overlay,
+    round_away_from_zero,
+    round_towards_zero,
+)
 from viability_bounds_pkg.state_space import Array
 from viability_bounds_pkg.worst_case_search import WorstCases
 
@@ -81,13 +86,15 @@ def overlay_text(
     notes = [*origin, f"joints: {', '.join(limits.names)}; rad/s^2, drift in rad/s^3"]
     if limits.overridden:
         notes.append(f"set by hand: {', '.join(sorted(limits.overridden))}")
-    parameters = {
+    found = {
         "acceleration_min": round_towards_zero(limits.a_min),
         "acceleration_max": round_towards_zero(limits.a_max),
     }
+    drift = {}
     if margin is not None:
         notes.append(f"acceleration_drift with the torque held for {margin.dt:g} s")
         # The acceleration is right at the middle of the period: half of it is there to drift.
-        drift = np.maximum(margin.rate, 2.0 * margin.mid_step.acceleration / margin.dt)
-        parameters["acceleration_drift"] = round_away_from_zero(drift)
-    return overlay(parameters, notes)
+        rate = np.maximum(margin.rate, 2.0 * margin.mid_step.acceleration / margin.dt)
+        drift["acceleration_drift"] = round_away_from_zero(rate)
+    # Not for all nodes at once: a file that names the node would win over that.
+    return overlay(found | drift, notes) + "\n" + overlay(found, [], CONTROLLER)
