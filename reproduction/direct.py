@@ -18,6 +18,7 @@ from sim_bridge import bullet_parameters
 from sim_bridge.limit_monitor import LimitMonitor
 from torque_safety_controller import controller_parameters
 from torque_safety_controller.additional_torque import AdditionalTorque
+from torque_safety_controller.collision_parameters import load_collision
 from torque_safety_controller.controller import Controller, Step
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg import bounds_parameters
@@ -63,8 +64,9 @@ class DirectLoop:
             torque_tolerance=1e-9 * float(config.tau_max.max()),
         )
         self.config = config
+        urdf = read_urdf(bullet["robot_description"])
         self.model = build_model(
-            read_urdf(bullet["robot_description"]),
+            urdf,
             config.joints,
             config.locked,
             bullet["rotor_inertia"] if len(bullet["rotor_inertia"]) else None,
@@ -84,6 +86,7 @@ class DirectLoop:
             made.tau_rate_max,
             self._additional,
             made.qp_solver,
+            load_collision(values, made.collision, urdf, self.model),
         )
         self.controller.warm_up()
         self.samples: list[Sample] = []

@@ -137,7 +137,7 @@ class CollisionAvoidance:
             curve=None,
         )
         most = int(ROWS_OF_KIND[model.pairs.kind].sum()) + 1
-        self._n = n
+        self._count = 0
         self._rows = make_rows(most, n, len(model.names), len(model.bodies.joint))
         self._fixed = (
             np.minimum(-lower, upper),
@@ -161,6 +161,7 @@ class CollisionAvoidance:
         """
         step = Step(a_lower, a_upper, *self._fixed)
         k = collision_rows(q, v, self.model.pairs, self.model.bodies, step, *self._arm)
+        self._count = k
         rows = self._rows
         chosen: slice | NDArray = slice(k)
         if k > self._rows_max:
@@ -175,6 +176,16 @@ class CollisionAvoidance:
             rows.bias[chosen],
             rows.viable[chosen],
         )
+
+    @property
+    def count(self) -> int:
+        """How many rows the last step had, before those beyond `rows_max` were dropped."""
+        return self._count
+
+    @property
+    def viable(self) -> bool:
+        """Whether all rows of the last step were viable."""
+        return bool(self._rows.viable[: self._count].all())
 
     @property
     def distances(self) -> Array:

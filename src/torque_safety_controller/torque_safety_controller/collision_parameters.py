@@ -119,6 +119,8 @@ class CollisionConfiguration:
         pairs: of links to keep apart; None to choose them automatically.
         posture: free of collisions, rad.
         capsules_per_link: at most.
+        q_min: position limits, rad: within them links are looked for in each other's way.
+        q_max: rad.
         a_min: acceleration limits, rad/s^2.
         a_max: rad/s^2.
         obstacles: in the base frame.
@@ -128,6 +130,8 @@ class CollisionConfiguration:
     pairs: tuple[tuple[str, str], ...] | None
     posture: np.ndarray
     capsules_per_link: int
+    q_min: np.ndarray
+    q_max: np.ndarray
     a_min: np.ndarray
     a_max: np.ndarray
     obstacles: tuple[Obstacle, ...]
@@ -169,6 +173,8 @@ def collision_configuration(
         pairs=pairs or None,
         posture=posture,
         capsules_per_link=count,
+        q_min=q_min,
+        q_max=q_max,
         a_min=per_joint(values, "acceleration_min", joints),
         a_max=per_joint(values, "acceleration_max", joints),
         obstacles=obstacles,
@@ -180,8 +186,6 @@ def load_collision(
     config: CollisionConfiguration | None,
     urdf: str,
     model: pin.Model,
-    q_min: np.ndarray,
-    q_max: np.ndarray,
 ) -> CollisionAvoidance | None:
     """Return the collision avoidance of an arm, or None without one.
 
@@ -190,8 +194,6 @@ def load_collision(
         config: made of them.
         urdf: text of the URDF.
         model: made of it.
-        q_min: position limits, shape (n,), rad: where links are looked for in each other's way.
-        q_max: shape (n,), rad.
 
     Raises:
         ParameterError: collision geometry that does not load, or a link that there is not.
@@ -199,7 +201,7 @@ def load_collision(
     if config is None:
         return None
     limited = model.copy()
-    limited.lowerPositionLimit, limited.upperPositionLimit = q_min, q_max
+    limited.lowerPositionLimit, limited.upperPositionLimit = config.q_min, config.q_max
     settings = config.settings
     kept = settings.margin + settings.reserve
     try:

@@ -7,6 +7,7 @@ import time
 from typing import Any
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
@@ -14,6 +15,7 @@ from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
 from torque_safety_controller.additional_torque import AdditionalTorque
+from torque_safety_controller.collision_parameters import load_collision
 from torque_safety_controller.controller import Controller, Step
 from torque_safety_controller.controller_parameters import (
     TABLE,
@@ -23,6 +25,7 @@ from torque_safety_controller.controller_parameters import (
 )
 from torque_safety_controller.handover import Control, Handover, HandoverRefused
 from torque_safety_controller.modes import Mode, ModeKeeper
+from torque_safety_controller.ros_collision_report import CollisionReport
 from torque_safety_controller.ros_controller_report import LEVELS, StepRecord
 from torque_safety_controller.ros_goals import GoalInbox
 from torque_safety_controller.ros_joint_commands import JointCommands
@@ -46,11 +49,13 @@ class ControllerNode(Node):
             self._node_parameters = NodeParameters(
                 self, TABLE, make_configuration, self._configure
             )
-            robot, base, _ = load_robot(self._node_parameters.values, self)
+            values, config = self._node_parameters.values, self._node_parameters.configuration
+            robot, base, urdf = load_robot(values, self)
+            collision = load_collision(values, config.collision, urdf, robot.model)
         except ParameterError:
             self.destroy_node()
             raise
-        config = self._config = self._node_parameters.configuration
+        self._config = config
         self._additional = AdditionalTorque(config.additional, config.task_rows)
         self._controller = Controller(
             robot,
@@ -59,6 +64,7 @@ class ControllerNode(Node):
             config.tau_rate_max,
             self._additional,
             config.qp_solver,
+            collision,
         )
         self._controller.warm_up()
         self._handover = Handover(
@@ -74,6 +80,7 @@ class ControllerNode(Node):
         self._answered_stamp = -1
         self._bounds_lost = False
         self._record = StepRecord(len(config.joints))
+        self._collision = CollisionReport(self.get_logger(), collision)
 
         self._commands = JointCommands(self, config.joints, config.ros2_control_topic)
         self.create_subscription(JointState, "joint_states", self._on_state, CONTROL_QOS)
@@ -172,6 +179,7 @@ class ControllerNode(Node):
         self._commands.torque(step.tau, stamp)
         self._answered_stamp = self._states.stamp
         self._record.note(step, now - self._message_at)
+        self._collision.note(step)
         if step.tracking:
             self._enter(Mode.TRACKING, "goal")
         else:
@@ -298,7 +306,7 @@ class ControllerNode(Node):
         values = self._record.values(
             self._config.joints, self._controller, self._limits.lower, self._limits.upper
         )
-        values |= {
+        values |= self._collision.values() | {
             "mode": self._modes.mode.value,
             "reason": self._modes.reason,
             "mode_changes": self._modes.changes,
@@ -309,7 +317,10 @@ class ControllerNode(Node):
             "states_refused": self._states.refused,
             "limits_refused": self._limits.refused,
         }
-        return LEVELS[self._modes.mode], f"{self._modes.mode.value}: {self._modes.reason}", values
+        level, text = LEVELS[self._modes.mode], f"{self._modes.mode.value}: {self._modes.reason}"
+        if self._collision.too_near:
+            level, text = max(level, DiagnosticStatus.WARN), f"{text}; {self._collision.too_near}"
+        return level, text, values
 
 
 def main(args: list[str] | None = None) -> int:

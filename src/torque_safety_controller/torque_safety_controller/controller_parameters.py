@@ -9,7 +9,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from torque_safety_controller import friction_parameters, integral_parameters
+from torque_safety_controller import (
+    collision_parameters,
+    friction_parameters,
+    integral_parameters,
+)
 from torque_safety_controller.additional_torque import AdditionalSettings
 from torque_safety_controller.gains import Gains
 from torque_safety_controller.inverse_dynamics_qp import SOLVERS
@@ -76,6 +80,7 @@ TABLE = (
     ),
     *integral_parameters.TABLE,
     *friction_parameters.TABLE,
+    *collision_parameters.TABLE,
     Parameter(
         "start_control",
         str,
@@ -122,6 +127,7 @@ class ControllerConfiguration:
     qp_solver: str
     additional: AdditionalSettings
     task_rows: slice
+    collision: collision_parameters.CollisionConfiguration | None
     start_control: str
     bounds_timeout: float
     state_timeout: float
@@ -161,6 +167,7 @@ def make_configuration(values: Mapping[str, Any]) -> ControllerConfiguration:
         qp_solver=values["qp_solver"],
         additional=integral_parameters.additional_settings(values, joints, tau_max),
         task_rows=integral_parameters.task_rows(values),
+        collision=collision_parameters.collision_configuration(values, joints, q_min, q_max),
         start_control=values["start_control"],
         bounds_timeout=positive(values, "bounds_timeout"),
         state_timeout=positive(values, "state_timeout"),
