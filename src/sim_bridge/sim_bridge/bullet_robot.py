@@ -35,6 +35,7 @@ from numpy.typing import ArrayLike
 from sim_bridge.bullet_world import BulletWorld
 from sim_bridge.gears import Gears
 from sim_bridge.limit_monitor import LimitMonitor
+from sim_bridge.obstacles import Contact, ContactMaterial, Obstacle
 from sim_bridge.position_drive import PositionDrive, make_drive
 from sim_bridge.urdf_preparation import FramePlacement, prepare_urdf
 from sim_bridge.vectors import finite_vector, not_negative_vector
@@ -65,7 +66,9 @@ class BulletRobot:
         locked_positions: where other joints are locked, rad or m; those left out are at zero.
         physics_dt: the physics step h, s.
         gravity: acceleration of gravity in the base frame, m/s^2.
-        visuals: load the visual and collision shapes, for cameras and contacts.
+        visuals: load the visual shapes, for cameras.
+        collisions: load the collision shapes, meshes as their convex hulls, for contacts.
+        material: of obstacles; rigid, with a friction of 0.5, by default.
         mechanical_stops: stop joints hard at their position limits.
         gears: friction, rotors and torque biases of the joints; none by default.
         mass_scales: factors for mass and inertia of links, by name.
@@ -90,6 +93,8 @@ class BulletRobot:
         physics_dt: float,
         gravity: Sequence[float] = (0.0, 0.0, -9.81),
         visuals: bool = False,
+        collisions: bool = True,
+        material: ContactMaterial | None = None,
         mechanical_stops: bool = False,
         gears: Gears | None = None,
         mass_scales: Mapping[str, float] | None = None,
@@ -110,6 +115,7 @@ class BulletRobot:
             joints,
             locked_positions,
             visuals=visuals,
+            collisions=collisions,
             mechanical_stops=mechanical_stops,
             mass_scales=mass_scales,
             rotor_inertias={joint: inertia for joint, inertia in inertias if inertia > 0.0},
@@ -120,7 +126,15 @@ class BulletRobot:
         self._brakes = np.zeros(n)
         self._wrenches: dict[str, tuple[FramePlacement, list[float], list[float]]] = {}
         direct = self._gears is not None
-        self._world = BulletWorld(prepared, self.joints, physics_dt, gravity.tolist(), direct)
+        self._world = BulletWorld(
+            prepared,
+            self.joints,
+            physics_dt,
+            gravity.tolist(),
+            direct,
+            material or ContactMaterial(),
+        )
+        self._without_shape = prepared.missing if collisions else ("none was to be loaded",)
         self.client_id, self.body_id = self._world.client_id, self._world.body_id
         # Made when first needed, because it takes a model.
         self._make_drive = partial(
@@ -231,6 +245,29 @@ class BulletRobot:
     def clear_wrenches(self) -> None:
         """Take all wrenches off."""
         self._wrenches.clear()
+
+    def add_obstacle(self, obstacle: Obstacle) -> None:
+        """Put an obstacle into the world, in place of the one of its name if there is one.
+
+        Raises:
+            RobotDescriptionError: the robot's collision shapes are not all there.
+        """
+        if self._without_shape:
+            missing = "; ".join(self._without_shape)
+            raise RobotDescriptionError(f"collision shapes are missing: {missing}")
+        self._world.obstacles.add(obstacle)
+
+    def remove_obstacle(self, name: str) -> bool:
+        """Take an obstacle out of the world; return whether there was one of that name."""
+        return self._world.obstacles.remove(name)
+
+    def clear_obstacles(self) -> None:
+        """Take all obstacles out of the world."""
+        self._world.obstacles.clear()
+
+    def contacts(self) -> list[Contact]:
+        """Return where obstacles pushed on the robot in the last physics step."""
+        return self._world.obstacles.contacts()
 
     def link_pose(self, link: str) -> tuple[np.ndarray, np.ndarray]:
         """Return where a link is, by PyBullet's own joint positions.

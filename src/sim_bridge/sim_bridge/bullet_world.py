@@ -19,6 +19,8 @@ from typing import Any
 
 import numpy as np
 
+from sim_bridge.bullet_obstacles import BulletObstacles
+from sim_bridge.obstacles import ContactMaterial
 from sim_bridge.quiet_pybullet import pybullet, silenced
 from sim_bridge.urdf_preparation import FramePlacement, PreparedUrdf
 from viability_bounds_pkg.robot_description import RobotDescriptionError
@@ -55,8 +57,10 @@ class BulletWorld:
         physics_dt: the physics step, s.
         gravity: shape (3,), m/s^2.
         direct_solver: whether constraint impulses are solved for by Dantzig's algorithm.
+        material: of what the robot may touch.
 
     Attributes:
+        obstacles: what else is in the world.
         client_id: PyBullet's physics client; -1 when closed.
         body_id: the robot in that client.
         step: makes a physics step.
@@ -74,6 +78,7 @@ class BulletWorld:
         physics_dt: float,
         gravity: Sequence[float],
         direct_solver: bool,
+        material: ContactMaterial,
     ) -> None:
         self._bullet = bullet = _Client()
         self.client_id = bullet.id
@@ -101,15 +106,18 @@ class BulletWorld:
         bullet.changeDynamics(body, -1, **_RIGID_BODY)
         for link, index in self._links.items():
             inertia = prepared.principal_inertias[link].tolist()
-            bullet.changeDynamics(body, index, localInertiaDiagonal=inertia)
+            bullet.changeDynamics(body, index, localInertiaDiagonal=inertia, lateralFriction=1.0)
         control = partial(bullet.setJointMotorControlArray, body, self._joints)
         self._push_joints = partial(control, pybullet.TORQUE_CONTROL)
         self._stop_joints = partial(control, pybullet.VELOCITY_CONTROL)
         self.joint_states = partial(bullet.getJointStates, body, self._joints)
-        for motor in indices.values():  # PyBullet starts with them on
-            bullet.setJointMotorControl2(body, motor, pybullet.VELOCITY_CONTROL, force=0.0)
+        for info in infos:  # PyBullet starts with the motors on
+            if info[2] != pybullet.JOINT_FIXED:
+                bullet.setJointMotorControl2(body, info[0], pybullet.VELOCITY_CONTROL, force=0.0)
         for joint, rotor in self._rotors.items():
             self._couple(joint, rotor)
+        names = {index: link for link, index in self._links.items()}
+        self.obstacles = BulletObstacles(bullet, body, names, material)
 
     def _load(self, urdf: str) -> int:
         with tempfile.TemporaryDirectory() as directory:

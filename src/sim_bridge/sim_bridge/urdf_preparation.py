@@ -19,7 +19,7 @@ What a URDF cannot say is added on request: rotors that gears will couple to the
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -36,7 +36,8 @@ from sim_bridge.urdf_geometry import (
     roll_pitch_yaw,
     transform_of,
 )
-from viability_bounds_pkg.robot_description import RobotDescriptionError, resolve_uri
+from sim_bridge.urdf_links import placed_shapes, scale_masses
+from viability_bounds_pkg.robot_description import RobotDescriptionError
 
 _MOVABLE = ("revolute", "continuous", "prismatic")
 # PyBullet makes no stop where lower > upper.
@@ -63,6 +64,7 @@ class PreparedUrdf:
     frames: Mapping[str, FramePlacement]  # of every link of the original URDF
     principal_inertias: Mapping[str, np.ndarray]  # to set for each link left, shape (3,), kg m^2
     rotors: Mapping[str, str]  # the joint of the rotor that belongs to a joint, where there is one
+    missing: Sequence[str]  # meshes of collision shapes that cannot be found and are left out
 
 
 @dataclass
@@ -82,7 +84,9 @@ def prepare_urdf(
     locked_positions: Mapping[str, float] | None = None,
     *,
     visuals: bool = False,
+    collisions: bool = False,
     mechanical_stops: bool = False,
+    apart: Collection[str] = (),
     mass_scales: Mapping[str, float] | None = None,
     rotor_inertias: Mapping[str, float] | None = None,
 ) -> PreparedUrdf:
@@ -93,8 +97,10 @@ def prepare_urdf(
         joints: the joints that move, in any order: revolute, continuous or prismatic.
         locked_positions: where other joints are locked, rad or m; joints left out are locked
             at zero. Mimic joints are joints like any other here, as they are in Pinocchio.
-        visuals: keep the visual and collision shapes; the files they name are looked up.
+        visuals: keep the visual shapes; the files they name are looked up.
+        collisions: keep the collision shapes of what moves.
         mechanical_stops: keep the position limits as hard stops, which hide violations.
+        apart: links that do not become one with those that carry them, even if they are fixed.
         mass_scales: factors for mass and inertia of links, by name.
         rotor_inertias: for each of `joints` that gets a rotor, its inertia, kg m^2 (kg for a
             prismatic joint). The rotors turn about axes fixed to the ground, through their
@@ -111,12 +117,11 @@ def prepare_urdf(
         raise RobotDescriptionError(f"URDF is not well-formed XML ({error})") from error
     locked = dict(locked_positions or {})
     _check_joints(root, joints, locked)
+    scale_masses(root, mass_scales or {})
 
     output = Element("robot", name=root.get("name", "robot"))
     output.extend(deepcopy(root.findall("material")))
     links = {link.get("name", ""): link for link in root.findall("link")}
-    scales = dict(mass_scales or {})
-    _check_mass_scales(links, scales)
     outgoing: dict[str, list[Element]] = {}
     children = []
     for joint in root.findall("joint"):
@@ -126,23 +131,31 @@ def prepare_urdf(
     if len(roots) != 1 or len(set(children)) != len(children):
         raise RobotDescriptionError(f"the links do not form one tree; roots: {roots}")
 
+    missing: list[str] = []
     bodies = [_Body(roots[0])]
     placed: dict[str, tuple[_Body, np.ndarray]] = {}
     pending = [(roots[0], bodies[0], np.eye(4))]
     while pending:
         name, body, placement = pending.pop()
         placed[name] = body, placement
-        _add_link(body, links[name], placement, visuals, scales.get(name, 1.0))
+        _add_inertia(body, links[name], placement)
+        if visuals:
+            body.shapes += placed_shapes(links[name], "visual", placement)
+        if collisions and body is not bodies[0]:  # what stands still meets nothing
+            body.shapes += placed_shapes(links[name], "collision", placement, missing)
         for joint in outgoing.get(name, ()):
             child = _linked(joint, "child", links)
             origin = placement @ transform_of(joint.find("origin"))
-            if joint.get("name") in joints:
-                output.append(_moving_joint(joint, body.name, child, origin, mechanical_stops))
+            moves = joint.get("name") in joints
+            if not moves:
+                origin = origin @ _locked_motion(joint, locked.get(joint.get("name", ""), 0.0))
+            if moves or child in apart:
+                stops = mechanical_stops and moves
+                output.append(_joint_between(joint, moves, body.name, child, origin, stops))
                 bodies.append(_Body(child))
                 pending.append((child, bodies[-1], np.eye(4)))
             else:
-                motion = _locked_motion(joint, locked.get(joint.get("name", ""), 0.0))
-                pending.append((child, body, origin @ motion))
+                pending.append((child, body, origin))
 
     # What stands on the ground takes no part in the dynamics; its frame stays where it is.
     bodies[0] = _Body(roots[0], shapes=bodies[0].shapes)
@@ -156,7 +169,7 @@ def prepare_urdf(
     for joint, rotor in rotors.items():
         _append_rotor(output, bodies[0].name, rotor)
         inertias[rotor] = np.full(3, rotor_inertias[joint])
-    return PreparedUrdf(tostring(output, encoding="unicode"), frames, inertias, rotors)
+    return PreparedUrdf(tostring(output, encoding="unicode"), frames, inertias, rotors, missing)
 
 
 def _check_joints(root: Element, joints: Sequence[str], locked: Mapping[str, float]) -> None:
@@ -177,15 +190,6 @@ def _check_joints(root: Element, joints: Sequence[str], locked: Mapping[str, flo
             raise RobotDescriptionError(f"joint {name!r} cannot be locked at {position}")
 
 
-def _check_mass_scales(links: Mapping[str, Element], scales: Mapping[str, float]) -> None:
-    """Raise `RobotDescriptionError` unless each link named exists and has a sensible factor."""
-    for name, scale in scales.items():
-        if name not in links:
-            raise RobotDescriptionError(f"unknown link {name!r}; the URDF has: {', '.join(links)}")
-        if not (math.isfinite(scale) and scale > 0.0):
-            raise RobotDescriptionError(f"the mass of link {name!r} cannot be scaled by {scale}")
-
-
 def _linked(joint: Element, end: str, links: Mapping[str, object]) -> str:
     """Return the link at the 'parent' or 'child' `end` of `joint`."""
     element = joint.find(end)
@@ -195,31 +199,20 @@ def _linked(joint: Element, end: str, links: Mapping[str, object]) -> str:
     return name
 
 
-def _add_link(
-    body: _Body, link: Element, placement: np.ndarray, visuals: bool, scale: float
-) -> None:
-    """Add the inertia times `scale`, and the shapes if wanted, of `link` placed on `body`."""
+def _add_inertia(body: _Body, link: Element, placement: np.ndarray) -> None:
+    """Add the inertia of `link` placed on `body`."""
     for inertial in link.findall("inertial"):
         frame = placement @ transform_of(inertial.find("origin"))
         rotation, centre = frame[:3, :3], frame[:3, 3]
-        mass = scale * read_numbers(inertial.find("mass"), "value", 1)[0]
+        mass = read_numbers(inertial.find("mass"), "value", 1)[0]
         xx, xy, xz, yy, yz, zz = (
             read_numbers(inertial.find("inertia"), name, 1)[0]
             for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
         )
-        own = scale * np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        own = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         body.mass += mass
         body.moment += mass * centre
         body.inertia += rotation @ own @ rotation.T + point_inertia(mass, centre)
-    for shape in (*link.findall("visual"), *link.findall("collision")) if visuals else ():
-        shape = deepcopy(shape)
-        origin = shape.find("origin")
-        if origin is None:
-            origin = SubElement(shape, "origin")
-        origin.attrib = origin_attributes(placement @ transform_of(origin))
-        for mesh in shape.iter("mesh"):
-            mesh.set("filename", str(resolve_uri(mesh.get("filename", "")).resolve()))
-        body.shapes.append(shape)
 
 
 def _append_link(output: Element, body: _Body) -> tuple[np.ndarray, np.ndarray]:
@@ -259,22 +252,24 @@ def _frame(link: str, transform: np.ndarray) -> FramePlacement:
     return FramePlacement(link, transform[:3, 3], np.array([x, y, z, w]))
 
 
-def _moving_joint(
-    joint: Element, parent: str, child: str, origin: np.ndarray, stops: bool
+def _joint_between(
+    joint: Element, moves: bool, parent: str, child: str, origin: np.ndarray, stops: bool
 ) -> Element:
     """Return `joint` placed at `origin` on `parent`, without friction, damping or mimicry."""
     kind = "prismatic" if joint.get("type") == "prismatic" else "revolute"
-    moved = Element("joint", name=joint.get("name", ""), type=kind)
-    SubElement(moved, "origin", origin_attributes(origin))
-    SubElement(moved, "parent", link=parent)
-    SubElement(moved, "child", link=child)
-    SubElement(moved, "axis", xyz=number_text(joint_axis(joint)))
+    result = Element("joint", name=joint.get("name", ""), type=kind if moves else "fixed")
+    SubElement(result, "origin", origin_attributes(origin))
+    SubElement(result, "parent", link=parent)
+    SubElement(result, "child", link=child)
+    if not moves:
+        return result
+    SubElement(result, "axis", xyz=number_text(joint_axis(joint)))
     limit = joint.find("limit")
     if stops and limit is not None and joint.get("type") != "continuous":
-        moved.append(deepcopy(limit))
+        result.append(deepcopy(limit))
     else:
-        SubElement(moved, "limit", _NO_STOP)
-    return moved
+        SubElement(result, "limit", _NO_STOP)
+    return result
 
 
 def _locked_motion(joint: Element, position: float) -> np.ndarray:

@@ -37,14 +37,12 @@ def single_joint(gravity=(0.0, 0.0, 0.0), physics_dt=H, **options):
       </link>
       <joint name="joint" type="revolute"><parent link="base"/><child link="arm"/>
         <axis xyz="{options.pop("axis", "0 0 1")}"/></joint></robot>"""
-    visuals = options.pop("visuals", False)
     return closing(
         BulletRobot(
             urdf,
             ["joint"],
             physics_dt=physics_dt,
             gravity=gravity,
-            visuals=visuals,
             gears=Gears(1, **options),
         )
     )
@@ -358,7 +356,7 @@ def test_brakes_add_to_the_friction_and_hold(model):
 @pytest.mark.parametrize("reach", [0.09, 0.2])
 def test_an_impact_meets_the_rotor(reach):
     """Angular momentum about the axis, rotor included, is what ball and arm share."""
-    with single_joint(visuals=True, rotor_inertia=ROTOR) as robot:
+    with single_joint(rotor_inertia=ROTOR) as robot:
         world = {"physicsClientId": robot.client_id}
         shape = pybullet.createCollisionShape(pybullet.GEOM_SPHERE, radius=0.1, **world)
         place = [1.0, 0.19 + reach / 100.0, 0.0]
@@ -383,7 +381,6 @@ def test_stiction_bears_what_lies_on_the_arm():
         with single_joint(
             axis="0 1 0",
             gravity=(0.0, 0.0, -9.81),
-            visuals=True,
             friction_coulomb=stiction,
             rotor_inertia=ROTOR,
         ) as robot:
