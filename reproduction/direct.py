@@ -16,11 +16,8 @@ from chain import ROOT
 
 from sim_bridge import bullet_parameters
 from sim_bridge.limit_monitor import LimitMonitor
-from torque_safety_controller import controller_parameters
-from torque_safety_controller.additional_torque import AdditionalTorque
-from torque_safety_controller.collision_parameters import load_collision
-from torque_safety_controller.controller import Controller, Step
-from torque_safety_controller.robot_model import RobotModel
+from torque_safety_controller import controller_assembly, controller_parameters
+from torque_safety_controller.controller import Step
 from viability_bounds_pkg import bounds_parameters
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 from viability_bounds_pkg.ros_parameters import Parameter
@@ -64,9 +61,8 @@ class DirectLoop:
             torque_tolerance=1e-9 * float(config.tau_max.max()),
         )
         self.config = config
-        urdf = read_urdf(bullet["robot_description"])
         self.model = build_model(
-            urdf,
+            read_urdf(bullet["robot_description"]),
             config.joints,
             config.locked,
             bullet["rotor_inertia"] if len(bullet["rotor_inertia"]) else None,
@@ -78,17 +74,7 @@ class DirectLoop:
         self._bounds = bounds.solve
         values = self._values("controller_node", controller_parameters.TABLE)
         made = controller_parameters.make_configuration(values)
-        self._additional = AdditionalTorque(made.additional, made.task_rows)
-        self.controller = Controller(
-            RobotModel(self.model, values["end_effector_frame"], config.dt),
-            made.tau_max,
-            made.gains,
-            made.tau_rate_max,
-            self._additional,
-            made.qp_solver,
-            load_collision(values, made.collision, urdf, self.model),
-        )
-        self.controller.warm_up()
+        self.controller, _ = controller_assembly.make_controller(values, made)
         self.samples: list[Sample] = []
         self.t = 0.0
         self.robot.reset(config.q_start, np.zeros(len(config.joints)))
@@ -107,8 +93,7 @@ class DirectLoop:
         self._changed |= parameters
         values = self._values("controller_node", controller_parameters.TABLE)
         made = controller_parameters.make_configuration(values)
-        self.controller.gains = made.gains
-        self._additional.settings = made.additional
+        controller_assembly.configure(self.controller, made)
 
     @property
     def dt(self) -> float:
@@ -174,7 +159,7 @@ class DirectLoop:
                 q,
                 v,
                 tau.copy(),
-                self._additional.integral.copy(),
+                self.controller.additional.integral.copy(),
                 self.controller.goals.error.copy(),
             )
         )

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from contextlib import suppress
 from copy import copy
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -17,6 +17,7 @@ from torque_safety_controller.constraints import Rows
 from torque_safety_controller.disturbance_observer import DisturbanceObserver
 from torque_safety_controller.gains import Gains
 from torque_safety_controller.goals import Goals
+from torque_safety_controller.interaction import Interaction
 from torque_safety_controller.inverse_dynamics_qp import (
     ContactForces,
     InverseDynamicsQP,
@@ -25,9 +26,6 @@ from torque_safety_controller.inverse_dynamics_qp import (
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks import TaskTerm, damping_task
 from torque_safety_controller.torque_limiter import TorqueLimiter
-
-if TYPE_CHECKING:
-    from torque_safety_controller.interaction import Interaction
 
 __all__ = ["Controller", "Gains", "Step"]
 
@@ -149,6 +147,9 @@ class Controller:
             self.robot.update(q, v, v)
             self.set_pose_goal(self.robot.pose.copy())
             self.step(q, v, -bounds, bounds)
+        if self.interaction is not None:
+            tasks, contacts = self.interaction.rehearsal(self.robot, self.gains)
+            self._solve(q, v, tasks, -wide, wide, None, contacts)
         self.goals = Goals(self.robot.n)
         self.robot.rates = self.additional is not None
         self.robot.update(q, v, v)

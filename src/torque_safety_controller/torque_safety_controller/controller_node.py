@@ -14,13 +14,11 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
-from torque_safety_controller.additional_torque import AdditionalTorque
-from torque_safety_controller.collision_parameters import load_collision
-from torque_safety_controller.controller import Controller, Step
+from torque_safety_controller.controller import Step
+from torque_safety_controller.controller_assembly import configure, make_controller
 from torque_safety_controller.controller_parameters import (
     TABLE,
     ControllerConfiguration,
-    load_robot,
     make_configuration,
 )
 from torque_safety_controller.handover import Control, Handover, HandoverRefused
@@ -30,6 +28,7 @@ from torque_safety_controller.ros_controller_report import LEVELS, StepRecord
 from torque_safety_controller.ros_goals import GoalInbox
 from torque_safety_controller.ros_joint_commands import JointCommands
 from torque_safety_controller.ros_limits import LimitsReader
+from torque_safety_controller.ros_wrenches import WrenchInbox
 from viability_bounds_pkg.ros_messages import Diagnostics, JointStateReader, Verdict
 from viability_bounds_pkg.ros_parameters import NodeParameters, ParameterError
 from viability_bounds_pkg.ros_runtime import CONTROL_QOS, run
@@ -50,29 +49,18 @@ class ControllerNode(Node):
                 self, TABLE, make_configuration, self._configure
             )
             values, config = self._node_parameters.values, self._node_parameters.configuration
-            robot, base, urdf = load_robot(values, self)
-            collision = load_collision(values, config.collision, urdf, robot.model)
+            self._controller, base = make_controller(values, config, self)
         except ParameterError:
             self.destroy_node()
             raise
         self._config = config
-        self._additional = AdditionalTorque(config.additional, config.task_rows)
-        self._controller = Controller(
-            robot,
-            config.tau_max,
-            config.gains,
-            config.tau_rate_max,
-            self._additional,
-            config.qp_solver,
-            collision,
-        )
-        self._controller.warm_up()
         self._handover = Handover(
             config.start_control, config.joints, config.q_min, config.q_max, config.tau_max
         )
         self._states = JointStateReader(config.joints, config.state_timeout)
         self._limits = LimitsReader(config.joints)
         self._goals = GoalInbox(self, self._controller, config, base)
+        self._wrenches = WrenchInbox(self, self._controller.interaction, self._goals, config, base)
         self._modes = ModeKeeper()
         self._goal_at = time.monotonic()
         self._message_at = self._state_at = self._waiting_since = -np.inf
@@ -80,7 +68,7 @@ class ControllerNode(Node):
         self._answered_stamp = -1
         self._bounds_lost = False
         self._record = StepRecord(len(config.joints))
-        self._collision = CollisionReport(self.get_logger(), collision)
+        self._collision = CollisionReport(self.get_logger(), self._controller.collision)
 
         self._commands = JointCommands(self, config.joints, config.ros2_control_topic)
         self.create_subscription(JointState, "joint_states", self._on_state, CONTROL_QOS)
@@ -98,8 +86,7 @@ class ControllerNode(Node):
 
     def _configure(self, config: ControllerConfiguration) -> None:
         self._config = config
-        self._controller.gains = config.gains
-        self._additional.settings = config.additional
+        configure(self._controller, config)
 
     # Streams
 
@@ -179,6 +166,7 @@ class ControllerNode(Node):
         self._commands.torque(step.tau, stamp)
         self._answered_stamp = self._states.stamp
         self._record.note(step, now - self._message_at)
+        self._wrenches.note()
         self._collision.note(step)
         if step.tracking:
             self._enter(Mode.TRACKING, "goal")
@@ -306,17 +294,21 @@ class ControllerNode(Node):
         values = self._record.values(
             self._config.joints, self._controller, self._limits.lower, self._limits.upper
         )
-        values |= self._collision.values() | {
-            "mode": self._modes.mode.value,
-            "reason": self._modes.reason,
-            "mode_changes": self._modes.changes,
-            "control": self._handover.control.value,
-            "integral_action": self._config.additional.mode,
-            "goals_pending": len(self._goals),
-            "goals_refused": self._goals.refused,
-            "states_refused": self._states.refused,
-            "limits_refused": self._limits.refused,
-        }
+        values |= (
+            self._collision.values()
+            | self._wrenches.values()
+            | {
+                "mode": self._modes.mode.value,
+                "reason": self._modes.reason,
+                "mode_changes": self._modes.changes,
+                "control": self._handover.control.value,
+                "integral_action": self._config.additional.mode,
+                "goals_pending": len(self._goals),
+                "goals_refused": self._goals.refused,
+                "states_refused": self._states.refused,
+                "limits_refused": self._limits.refused,
+            }
+        )
         level, text = LEVELS[self._modes.mode], f"{self._modes.mode.value}: {self._modes.reason}"
         if self._collision.too_near:
             level, text = max(level, DiagnosticStatus.WARN), f"{text}; {self._collision.too_near}"

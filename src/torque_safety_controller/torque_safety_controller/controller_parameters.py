@@ -13,13 +13,16 @@ from torque_safety_controller import (
     collision_parameters,
     friction_parameters,
     integral_parameters,
+    interaction_parameters,
 )
 from torque_safety_controller.additional_torque import AdditionalSettings
 from torque_safety_controller.gains import Gains
+from torque_safety_controller.interaction import InteractionSettings
 from torque_safety_controller.inverse_dynamics_qp import SOLVERS
 from torque_safety_controller.modes import CONTROLS
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks import critical_damping
+from torque_safety_controller.wrench_sensor import SensorSettings
 from viability_bounds_pkg.robot_description import RobotDescriptionError
 from viability_bounds_pkg.ros_parameters import (
     Parameter,
@@ -80,6 +83,7 @@ TABLE = (
     ),
     *integral_parameters.TABLE,
     *friction_parameters.TABLE,
+    *interaction_parameters.TABLE,
     *collision_parameters.TABLE,
     Parameter(
         "start_control",
@@ -127,6 +131,9 @@ class ControllerConfiguration:
     qp_solver: str
     additional: AdditionalSettings
     task_rows: slice
+    ft_frame: str
+    sensor: SensorSettings
+    interaction: InteractionSettings
     collision: collision_parameters.CollisionConfiguration | None
     start_control: str
     bounds_timeout: float
@@ -167,6 +174,9 @@ def make_configuration(values: Mapping[str, Any]) -> ControllerConfiguration:
         qp_solver=values["qp_solver"],
         additional=integral_parameters.additional_settings(values, joints, tau_max),
         task_rows=integral_parameters.task_rows(values),
+        ft_frame=values["ft_frame"],
+        sensor=interaction_parameters.sensor_settings(values),
+        interaction=interaction_parameters.interaction_settings(values),
         collision=collision_parameters.collision_configuration(values, joints, q_min, q_max),
         start_control=values["start_control"],
         bounds_timeout=positive(values, "bounds_timeout"),

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import pinocchio as pin
-from geometry_msgs.msg import Point, PoseStamped, Quaternion, Vector3
+from geometry_msgs.msg import Point, PoseStamped, Quaternion, Vector3, WrenchStamped
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import MultiDOFJointTrajectory
@@ -138,7 +138,7 @@ class GoalQueue:
 
     def add(
         self,
-        message: PoseStamped | JointState | MultiDOFJointTrajectory,
+        message: PoseStamped | JointState | MultiDOFJointTrajectory | WrenchStamped,
         apply: Callable[[], None],
     ) -> None:
         """Call `apply` when the time in the header of `message` has come."""
@@ -200,7 +200,7 @@ class GoalInbox(GoalQueue):
         try:
             pose = pose_from_message(message, self._config.base_frame)
         except GoalRefused as error:
-            return self._refuse("target_pose", error)
+            return self.refuse("target_pose", error)
         self.add(message, lambda: self._rest_at(self._base * pose))
 
     def _rest_at(self, pose: pin.SE3) -> None:
@@ -214,7 +214,7 @@ class GoalInbox(GoalQueue):
                 message, config.base_frame, config.end_effector_frame, self._base
             )
         except GoalRefused as error:
-            return self._refuse("target_trajectory", error)
+            return self.refuse("target_trajectory", error)
         self.add(message, lambda: self._follow(trajectory, stamp_to_ns(message.header.stamp)))
 
     def _follow(self, trajectory: PoseTrajectory, begin: int) -> None:
@@ -226,9 +226,10 @@ class GoalInbox(GoalQueue):
         try:
             q_des = posture_from_message(message, config.joints, config.q_min, config.q_max)
         except GoalRefused as error:
-            return self._refuse("target_posture", error)
+            return self.refuse("target_posture", error)
         self.add(message, lambda: self._controller.set_posture_goal(q_des))
 
-    def _refuse(self, topic: str, error: GoalRefused) -> None:
+    def refuse(self, topic: str, error: GoalRefused) -> None:
+        """Count and log a goal that cannot be followed."""
         self.refused[topic] += 1
         self._logger.warning(f"{topic} refused: {error}")

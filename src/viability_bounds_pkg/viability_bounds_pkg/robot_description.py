@@ -148,6 +148,46 @@ def build_model(
     return model
 
 
+def inertia_beyond(
+    urdf: str, frame: str, locked_positions: Mapping[str, float] | None = None
+) -> pin.Inertia:
+    """Return the inertia of all that hangs on a link, other joints locked, in the link's axes.
+
+    The link's own inertia is not counted: a force/torque sensor does not feel its housing.
+
+    Args:
+        urdf: text of a URDF that loads.
+        frame: name of the link.
+        locked_positions: where joints beyond are locked, rad; at zero where left out.
+
+    Raises:
+        RobotDescriptionError: no such link.
+    """
+    model = pin.buildModelFromXML(_continuous_as_revolute(urdf)[0])
+    if not model.existFrame(frame, pin.FrameType.BODY):
+        raise RobotDescriptionError(f"unknown link {frame!r}")
+    q = pin.neutral(model)
+    for name, position in (locked_positions or {}).items():
+        q[model.joints[model.getJointId(name)].idx_q] = position
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    root = model.getFrameId(frame, pin.FrameType.BODY)
+    beyond = {root}
+    total = pin.Inertia.Zero()
+    for index, each in enumerate(model.frames):  # parents come first
+        if index == root or each.parentFrame not in beyond or index == 0:
+            continue
+        beyond.add(index)
+        inertia, place = each.inertia, data.oMf[index]
+        if each.type == pin.FrameType.JOINT:
+            # All that moves with the joint; frames fixed to it have their own again.
+            inertia, place = model.inertias[each.parentJoint], data.oMi[each.parentJoint]
+        elif each.parentJoint != model.frames[root].parentJoint:
+            continue
+        total = total + (data.oMf[root].inverse() * place).act(inertia)
+    return total
+
+
 def kinematic_order(urdf: str, joints: Sequence[str]) -> tuple[str, ...]:
     """Return `joints` in the order in which `build_model` wants them, base to tip.
 

@@ -1,0 +1,135 @@
+"""What a wrist force/torque sensor measures, made into the wrench of the environment on the hand.
+
+A sensor feels everything beyond it: what the environment does to the hand, and the weight of the
+hand, besides a bias of its own and noise. With R the orientation of the sensor and m, c mass and
+centre of mass of what is beyond it,
+
+    F = raw - (m R'g, c x m R'g) - bias,
+
+taken to the end effector's origin and axes, and filtered by one time constant; the derivative is
+that of the filtered wrench, the finite difference that [Benallegue2021] takes, without its noise.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike
+
+_TARE_TIME = 0.2  # s, of the mean that becomes the bias
+
+
+class WrenchError(ValueError):
+    """A measurement, or a property of the sensor or the tool, that cannot be used."""
+
+
+@dataclass(frozen=True)
+class SensorSettings:
+    """How measurements are taken.
+
+    Attributes:
+        filter_hz: cut-off frequency of the filter, Hz.
+        timeout: how long without a measurement before the sensor counts as silent, s.
+    """
+
+    filter_hz: float = 30.0
+    timeout: float = 0.05
+
+
+class WrenchSensor:
+    """Keeps the wrench of the environment on the hand.
+
+    Args:
+        placement: of the sensor's frame in the end effector's.
+        tool: inertia of what is beyond the sensor, in the sensor's axes.
+        gravity: in the URDF's root frame, shape (3,), m/s^2.
+        settings: may be replaced between steps.
+
+    Attributes:
+        settings: as given.
+        placement: as given.
+        bias: of the sensor, in its axes, shape (6,), N and N m; see `tare`.
+        wrench: of the environment on the arm, about the end effector's origin and in its axes,
+            shape (6,), N and N m; zero while the sensor is silent.
+        rate: its time derivative, shape (6,), N/s and N m/s.
+        silent: whether there was no measurement for too long, or none yet.
+    """
+
+    def __init__(
+        self,
+        placement: pin.SE3,
+        tool: pin.Inertia,
+        gravity: ArrayLike,
+        settings: SensorSettings | None = None,
+    ) -> None:
+        self.settings = settings or SensorSettings()
+        self.placement = placement
+        self.bias = np.zeros(6)
+        self._action = placement.toDualActionMatrix()
+        self._R = placement.rotation
+        self._weight = tool.mass * np.asarray(gravity, dtype=float)
+        self._com = tool.lever.copy()
+        self.start()
+
+    def start(self) -> None:
+        """Forget what was measured; the bias stays."""
+        self.wrench, self.rate = np.zeros(6), np.zeros(6)
+        self.silent = True
+        self._raw: np.ndarray | None = None
+        self._age = math.inf
+        self._filtered = self._mean = np.zeros(6)
+
+    def receive(self, raw: ArrayLike) -> None:
+        """Take a measurement, in the sensor's axes, shape (6,), N and N m, for the next `update`.
+
+        Raises:
+            WrenchError: it is something else; nothing has changed then.
+        """
+        raw = np.array(raw, dtype=float)
+        if raw.shape != (6,) or not np.isfinite(raw).all():
+            raise WrenchError("not six finite numbers")
+        self._raw = raw
+
+    def update(self, rotation: np.ndarray, elapsed: float) -> None:
+        """Make the wrench of this control step.
+
+        Args:
+            rotation: of the end effector in the root frame, shape (3, 3).
+            elapsed: time since the last step, s.
+        """
+        self._age += elapsed
+        if self._raw is None:
+            if self._age > self.settings.timeout and not self.silent:
+                self.start()
+            return
+        force = (rotation @ self._R).T @ self._weight
+        found = self._raw - np.concatenate([force, np.cross(self._com, force)])
+        time, self._age, self._raw = self._age, 0.0, None
+        if self.silent or not time > 0.0:
+            self._filtered, self._mean = found, found
+            self.rate = np.zeros(6)
+        else:
+            change = found - self._filtered
+            change *= -math.expm1(-2.0 * math.pi * self.settings.filter_hz * time)
+            self._filtered = self._filtered + change
+            self._mean = self._mean - math.expm1(-time / _TARE_TIME) * (found - self._mean)
+            self.rate = self._action @ (change / time)
+        self.silent = False
+        self.wrench = self._action @ (self._filtered - self.bias)
+
+    def tare(self) -> np.ndarray:
+        """Take what is measured now, the tool's weight subtracted, for the bias; return it.
+
+        The hand must touch nothing. It is the mean over some tenths of a second.
+
+        Raises:
+            WrenchError: the sensor is silent.
+        """
+        if self.silent:
+            raise WrenchError("the force/torque sensor is silent")
+        self.bias = self._mean.copy()
+        self.wrench = self._action @ (self._filtered - self.bias)
+        return self.bias
