@@ -24,6 +24,7 @@ ROS = {
     "std_msgs",
     "std_srvs",
     "trajectory_msgs",
+    "visualization_msgs",
 }
 
 

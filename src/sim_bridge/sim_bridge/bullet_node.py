@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import WrenchStamped
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
@@ -22,12 +21,11 @@ from std_srvs.srv import SetBool, Trigger
 from sim_bridge.bullet_parameters import TABLE, make_configuration, make_robot
 from sim_bridge.limit_monitor import LimitMonitor
 from sim_bridge.ros_joint_command import CommandError, JointCommand, TorqueCommand, read_command
-from viability_bounds_pkg.robot_description import RobotDescriptionError
+from sim_bridge.ros_world_inbox import WorldInbox
 from viability_bounds_pkg.ros_messages import Diagnostics
 from viability_bounds_pkg.ros_parameters import NodeParameters, ParameterError
 from viability_bounds_pkg.ros_runtime import (
     CONTROL_QOS,
-    GOAL_QOS,
     LATCHED_QOS,
     run,
     set_stamp,
@@ -77,8 +75,9 @@ class BulletNode(Node):
         self._paused = config.start_paused
         # In lockstep robot time is its own, from one period on: zero means "no stamp".
         self._stamp = 0 if config.lockstep else self.get_clock().now().nanoseconds
-        self._push_until = math.inf
         self._advanced = True
+        self._refused: Counter[str] = Counter()
+        self._world = WorldInbox(self, self._robot, config.external_wrench_timeout, self._refused)
         self._restart()
 
         self._state = JointState(name=list(config.joints))
@@ -89,7 +88,6 @@ class BulletNode(Node):
         description = self.create_publisher(String, "robot_description", LATCHED_QOS)
         description.publish(String(data=config.urdf))
         self.create_subscription(JointState, "joint_commands", self._on_command, CONTROL_QOS)
-        self.create_subscription(WrenchStamped, "external_wrench", self._on_wrench, GOAL_QOS)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -103,7 +101,7 @@ class BulletNode(Node):
         """Put the robot at its start and all counts to zero; robot time goes on."""
         config = self._config
         n = len(config.joints)
-        self._robot.clear_wrenches()
+        self._world.clear()
         self._robot.reset(config.q_start, np.zeros(n))
         self._monitor.reset()
         self._command: JointCommand | None = None
@@ -111,7 +109,7 @@ class BulletNode(Node):
         self._periods = self._pause_at = 0
         self._plan_pause()
         self._torque_ratio = 0.0
-        self._refused: Counter[str] = Counter()
+        self._refused.clear()
         self._latencies: deque[float] = deque(maxlen=_LATENCIES_KEPT)
         self._started_at = time.monotonic()
 
@@ -140,9 +138,7 @@ class BulletNode(Node):
     def _advance(self) -> None:
         """Play the current period to its end, under the last command or the brakes."""
         config = self._config
-        if self._stamp >= self._push_until:
-            self._robot.clear_wrenches()
-            self._push_until = math.inf
+        self._world.apply_due(self._stamp)
         if self._command is None:
             self._braked += 1
             self._robot.brake(config.substeps, config.tau_max)
@@ -205,23 +201,9 @@ class BulletNode(Node):
             command = TorqueCommand(np.clip(tau, -tau_max, tau_max))
         self._command = command
         self._advance()
-        if self._config.lockstep:
+        # When it pauses itself, the next state waits too: time stands still for all.
+        if self._config.lockstep and not self._paused:
             self._next_state()
-
-    def _on_wrench(self, message: WrenchStamped) -> None:
-        force, torque = message.wrench.force, message.wrench.torque
-        self._robot.clear_wrenches()
-        try:
-            self._robot.apply_wrench(
-                message.header.frame_id,
-                (force.x, force.y, force.z),
-                (torque.x, torque.y, torque.z),
-            )
-        except (RobotDescriptionError, ValueError) as error:
-            self._refused["external_wrench"] += 1
-            self.get_logger().warning(f"external_wrench refused: {error}")
-            return
-        self._push_until = self._stamp + 1e9 * self._config.external_wrench_timeout
 
     # Services
 
@@ -267,6 +249,7 @@ class BulletNode(Node):
             "deadline_misses": self._missed,
             "braked_periods": self._braked,
             "commands_refused": self._refused,
+            "world_changes_pending": len(self._world),
             "latency_p50_us": float(median),
             "latency_p99_us": float(slow),
             "commanded_torque_ratio_max": self._torque_ratio,

@@ -11,11 +11,12 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
+from visualization_msgs.msg import Marker, MarkerArray
 
 from sim_bridge.bullet_node import BulletNode
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 from viability_bounds_pkg.ros_parameters import ParameterError
-from viability_bounds_pkg.ros_runtime import GOAL_QOS, LATCHED_QOS, stamp_to_ns
+from viability_bounds_pkg.ros_runtime import GOAL_QOS, LATCHED_QOS, set_stamp, stamp_to_ns
 
 ARM = load_arm("panda")
 VALUES = read_config("panda", "bullet_node")
@@ -69,15 +70,16 @@ class Robot:
             self.send(stamp, q=q, v=v)
             self.ros.wait_until(lambda s=stamp: self.stamp > s, "the next state")
 
-    def push(self, link, force):
-        """Push along y and wait until it is felt."""
+    def push(self, link, force, stamp=0):
+        """Push along y and wait until the robot knows."""
         pushes = self.ros.talk(WrenchStamped, "external_wrench", GOAL_QOS)
         message = WrenchStamped()
         message.header.frame_id = link
         message.wrench.force.y = force
-        before = self.node._push_until
+        set_stamp(message.header.stamp, stamp)
+        before = len(self.node._world)
         pushes.publish(message)
-        self.ros.wait_until(lambda: self.node._push_until != before, "the push")
+        self.ros.wait_until(lambda: len(self.node._world) > before, "the push")
         self.ros.probe.destroy_publisher(pushes)
 
     def reported(self, key):
@@ -332,23 +334,78 @@ def test_a_push_moves_it_until_it_times_out(ros):
     robot.step(times=24)
     assert np.abs(robot.v).max() > 1e-3
     robot.step(times=10)
-    assert robot.node._push_until == math.inf
+    assert not robot.node._world.pushed
     speeds = [np.abs(np.array(s.velocity)).max() for s in robot.states[-5:]]
     assert max(speeds) - min(speeds) < 1e-3  # nothing pushes any more
 
 
-def test_a_new_push_takes_the_place_of_the_old(ros):
+def test_a_new_push_takes_the_place_of_the_old_on_its_link(ros):
     robot = Robot(ros, external_wrench_timeout=5.0)
     robot.push("panda_link4", 30.0)
+    robot.push("panda_link6", 1.0)
     robot.step(times=10)
     speed = np.abs(robot.v).max()
     assert speed > 1e-3
-    robot.push("panda_link6", 0.0)  # a push of nothing ends it, whatever the link
+    assert set(robot.node._world.pushed) == {"panda_link4", "panda_link6"}
+    robot.push("panda_link4", 0.0)
+    robot.push("panda_link6", -1.0)  # what the other has done
     robot.step(times=10)
     assert np.abs(robot.v).max() < 1.1 * speed
+    robot.push("panda_link6", 0.0)
+    robot.step()
     steady = robot.v
     robot.step(times=10)
     np.testing.assert_allclose(robot.v, steady, atol=0.1 * speed)
+
+
+def test_a_push_sent_ahead_begins_and_ends_with_its_stamps(ros):
+    robot = Robot(ros, external_wrench_timeout=3 * PERIOD * 1e-9)
+    begin, end = robot.stamp + 5 * PERIOD, robot.stamp + 15 * PERIOD
+    robot.push("panda_link4", 0.0, end)
+    robot.push("panda_link4", 30.0, begin)
+    still = ros.listen(JointState, "joint_states")
+    robot.step(times=25)
+    stamps = np.array(still.stamps)
+    v = np.array([message.velocity[0] for message in still])
+    assert np.abs(v[stamps <= begin]).max() < 1e-9
+    # Longer than the time-out, as its end is there already; then nothing changes any more.
+    growing, coasting = np.diff(v[(stamps >= begin) & (stamps <= end)]), v[stamps > end]
+    assert (np.abs(growing) > 0.5 * np.abs(growing).max()).all()
+    assert np.ptp(coasting) < 0.1 * np.abs(coasting).max()
+
+
+def test_obstacles_come_and_go_with_their_stamps(ros):
+    robot = Robot(ros)
+    obstacles = ros.talk(MarkerArray, "obstacles", GOAL_QOS)
+
+    def marker(name, stamp, action=Marker.ADD, kind=Marker.CUBE, frame="panda_link0"):
+        marker = Marker(ns=name, action=action, type=kind)
+        marker.header.frame_id = frame
+        marker.pose.position.x, marker.pose.orientation.w = 2.0, 1.0
+        marker.scale.x = marker.scale.y = marker.scale.z = 0.1
+        set_stamp(marker.header.stamp, stamp)
+        return marker
+
+    world = robot.node._robot._world.obstacles
+    later = robot.stamp + 3 * PERIOD
+    markers = [
+        marker("first", 0),
+        marker("second", later),
+        marker("first", later, Marker.DELETE),
+        marker("third", 0, kind=Marker.ARROW),
+        marker("fourth", 0, frame="nowhere"),
+    ]
+    obstacles.publish(MarkerArray(markers=markers))
+    ros.wait_until(lambda: len(robot.node._world) == 3, "the obstacles")
+    robot.step()
+    assert set(world._bodies) == {"first"}
+    robot.step(times=2)
+    assert set(world._bodies) == {"first"}
+    robot.step()
+    assert set(world._bodies) == {"second"}
+    ros.wait_until(lambda: "obstacles: 2;" in robot.reported("commands_refused"))
+    ros.call(Trigger, "bullet_node/reset", Trigger.Request())
+    assert not world._bodies
 
 
 @pytest.mark.parametrize(("link", "force"), [("no_such_link", 1.0), ("panda_link4", math.nan)])
