@@ -247,7 +247,10 @@ def _lowest(room, rate, braking, step, x, kept):
     law = step.law
     lowest = max(x[2, 0, 0] * braking, (-law.speed_max - rate) / law.dt)
     if room < 0.0:
-        lowest = min(lowest, (law.recovery_speed - rate) / law.dt)
+        # Beyond the limit, back within a step is enough: full braking would be a kick there,
+        # and rounding alone takes a distance at rest on its limit beyond it.
+        back = -2.0 * (room / law.dt + rate) / law.dt
+        lowest = min(lowest, back, (law.recovery_speed - rate) / law.dt)
     return lowest
 
 
