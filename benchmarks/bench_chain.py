@@ -25,7 +25,8 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from sim_bridge.bullet_robot import BulletRobot
-from sim_bridge.scenario import PoseGoal, load_scenario
+from sim_bridge.scenario import load_scenario
+from sim_bridge.scenario_events import PoseGoal
 from torque_safety_controller.controller_node import ControllerNode
 from viability_bounds_pkg.bounds_node import BoundsNode
 from viability_bounds_pkg.robot_description import build_model, read_urdf

@@ -17,7 +17,10 @@ class Run:
         t: shape (N,), s of robot time from the first recorded state.
         q, v: position and velocity, rad and rad/s.
         a_lower, a_upper: acceleration limits, rad/s^2.
-        tau: commanded torque, N m.
+        tau: commanded torque, N m; NaN under position control too.
+        ft_wrench: of the force/torque sensor, force and torque, N and N m, shape (N, 6); NaN where
+            there is none.
+        answered: whether there was a command, shape (N,).
     """
 
     joints: tuple[str, ...]
@@ -27,11 +30,13 @@ class Run:
     a_lower: np.ndarray
     a_upper: np.ndarray
     tau: np.ndarray
+    ft_wrench: np.ndarray
+    answered: np.ndarray
 
     @property
     def lost(self) -> int:
         """Periods of which the recording lacks limits or command."""
-        return int(np.isnan(self.a_lower[:, 0] + self.tau[:, 0]).sum())
+        return int((np.isnan(self.a_lower[:, 0]) | ~self.answered).sum())
 
 
 class Recorder:
@@ -42,6 +47,7 @@ class Recorder:
         self._states: dict[int, tuple] = {}
         self._limits: dict[int, tuple] = {}
         self._torques: dict[int, Sequence[float]] = {}
+        self._wrenches: dict[int, Sequence[float]] = {}
 
     def add_state(self, stamp: int, q: Sequence[float], v: Sequence[float]) -> None:
         """Keep a state, rad and rad/s, with its stamp in ns."""
@@ -52,8 +58,12 @@ class Recorder:
         self._limits[stamp] = (lower, upper)
 
     def add_torque(self, stamp: int, tau: Sequence[float]) -> None:
-        """Keep the torques, N m, commanded for the state with `stamp`."""
+        """Keep the torques, N m, commanded for the state with `stamp`; none: the drives hold."""
         self._torques.setdefault(stamp, tau)
+
+    def add_wrench(self, stamp: int, wrench: Sequence[float]) -> None:
+        """Keep what the force/torque sensor felt in the state with `stamp`, N and N m."""
+        self._wrenches[stamp] = wrench
 
     def run(self, first: int) -> Run:
         """Return the run from the state with stamp `first` on."""
@@ -68,5 +78,7 @@ class Recorder:
             v=states[:, 1],
             a_lower=limits[:, 0],
             a_upper=limits[:, 1],
-            tau=np.array([self._torques.get(s, nan) for s in stamps]),
+            tau=np.array([self._torques.get(s) or nan for s in stamps]),
+            ft_wrench=np.array([self._wrenches.get(s, [np.nan] * 6) for s in stamps]),
+            answered=np.array([s in self._torques for s in stamps]),
         )

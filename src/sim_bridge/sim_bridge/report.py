@@ -14,12 +14,14 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from sim_bridge.bullet_robot import BulletRobot
-from sim_bridge.pose_error import pose_errors
+from sim_bridge.pose_reference import pose_errors, pose_reference
 from sim_bridge.recording import Run
-from sim_bridge.scenario import PoseGoal
+from sim_bridge.scenario_events import TrajectoryGoal
 
 TOLERANCE = 1e-9
 """What counts as a violation, rad, rad/s and share of the torque limit: rounding does not."""
+
+_RECORDED = ("t", "q", "v", "a_lower", "a_upper", "tau", "ft_wrench")
 
 
 def write_report(
@@ -38,15 +40,16 @@ def write_report(
         Whether every limit was kept.
     """
     directory.mkdir(parents=True, exist_ok=True)
-    goals = [event for event in config.scenario.events if isinstance(event, PoseGoal)]
-    errors = _errors(config, run, goals)
+    reference = pose_reference(config.scenario.events, run.t)
+    errors = _errors(config, run, reference)
     metrics = _metrics(config, run, robot, errors, bounds)
     np.savez_compressed(
         directory / "data.npz",
         joints=np.array(run.joints),
         position_error=errors[:, 0],
         orientation_error=errors[:, 1],
-        **{name: getattr(run, name) for name in ("t", "q", "v", "a_lower", "a_upper", "tau")},
+        pose_reference=reference,
+        **{name: getattr(run, name) for name in _RECORDED},
     )
     (directory / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
     _draw(directory / "figure.png", config, run, errors, metrics)
@@ -55,8 +58,8 @@ def write_report(
     return metrics["limits_kept"]
 
 
-def _errors(config, run: Run, goals: list[PoseGoal]) -> np.ndarray:
-    """Return the pose error of each state, shape (N, 2), m and rad; NaN before a goal.
+def _errors(config, run: Run, reference: np.ndarray) -> np.ndarray:
+    """Return the pose error of each state, shape (N, 2), m and rad; NaN without a reference.
 
     The robot's own forward kinematics are PyBullet's, which share nothing with the
     controller's.
@@ -64,7 +67,7 @@ def _errors(config, run: Run, goals: list[PoseGoal]) -> np.ndarray:
     with closing(
         BulletRobot(config.urdf, config.joints, locked_positions=config.locked, physics_dt=1e-3)
     ) as robot:
-        return pose_errors(robot, config.base_frame, config.end_effector_frame, run, goals)
+        return pose_errors(robot, config.base_frame, config.end_effector_frame, run, reference)
 
 
 def _floats(robot: dict[str, str], key: str) -> np.ndarray:
@@ -74,6 +77,16 @@ def _floats(robot: dict[str, str], key: str) -> np.ndarray:
 def _or_none(value: float) -> float | None:
     """Return what JSON has a word for: without a pose goal there is no error."""
     return float(value) if np.isfinite(value) else None
+
+
+def _trajectory_error(config, run: Run, errors: np.ndarray) -> float:
+    """Return the largest distance to a trajectory while it lasted, m; NaN if there was none."""
+    worst = np.nan
+    for event in config.scenario.events:
+        if isinstance(event, TrajectoryGoal):
+            during = (run.t >= event.time) & (run.t <= event.time + event.points[-1].time)
+            worst = np.fmax(worst, np.fmax.reduce(errors[during, 0], initial=np.nan))
+    return worst
 
 
 def _metrics(
@@ -100,6 +113,8 @@ def _metrics(
         "max_torque_ratio": float(ratio),
         "final_position_error_m": _or_none(errors[-1, 0]),
         "final_orientation_error_rad": _or_none(errors[-1, 1]),
+        "max_trajectory_error_m": _or_none(_trajectory_error(config, run, errors)),
+        "max_contact_force_n": _or_none(float(robot.get("contact_force_max_n", "nan"))),
         "deadline_misses": int(robot["deadline_misses"]),
         "latency_p50_us": float(robot["latency_p50_us"]),
         "latency_p99_us": float(robot["latency_p99_us"]),
@@ -140,6 +155,10 @@ def _print_table(config, metrics: dict) -> None:
             f"pose error at the end: {1e3 * metrics['final_position_error_m']:.3f} mm, "
             f"{1e3 * metrics['final_orientation_error_rad']:.3f} mrad"
         )
+    if metrics["max_trajectory_error_m"] is not None:
+        print(f"off the trajectory: {1e3 * metrics['max_trajectory_error_m']:.3f} mm at most")
+    if metrics["max_contact_force_n"]:
+        print(f"obstacles pushed on the arm with {metrics['max_contact_force_n']:.1f} N at most")
     print(
         f"{metrics['steps']} control periods, {metrics['deadline_misses']} deadlines missed, "
         f"command latency {metrics['latency_p50_us']:.0f} us (median), "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
+from collections import deque
 from collections.abc import Sequence
 from enum import Enum, auto
 from pathlib import Path
@@ -13,35 +14,36 @@ from typing import Any
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped, WrenchStamped
-from rcl_interfaces.srv import SetParameters
+from geometry_msgs.msg import WrenchStamped
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
 from sim_bridge.recording import Recorder, Run
-from sim_bridge.scenario import PoseGoal, PostureGoal, Push
+from sim_bridge.ros_scenario_messages import (
+    Request,
+    change_parameters,
+    to_controller,
+    to_robot,
+    to_service,
+)
+from sim_bridge.ros_scenario_sender import Caller, Outbox, ScenarioRefused
+from sim_bridge.scenario_events import ServiceEvent
 from sim_bridge.scenario_parameters import TABLE, make_configuration
 from viability_bounds_pkg.ros_parameters import (
     NodeParameters,
     ParameterError,
 )
-from viability_bounds_pkg.ros_runtime import (
-    GOAL_QOS,
-    make_executor,
-    report_refusal,
-    set_stamp,
-    stamp_to_ns,
-)
+from viability_bounds_pkg.ros_runtime import make_executor, report_refusal, stamp_to_ns
 
 _RECORDING_QOS = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.BEST_EFFORT)
 _SHOW_PERIOD = 0.5
 _POLL_PERIOD = 0.02
+_RESUME = Request("bullet_node/pause", SetBool, SetBool.Request(data=False))
 
 
 class Phase(Enum):
@@ -50,7 +52,7 @@ class Phase(Enum):
     GETTING_READY = auto()
     """The robot is paused; the chain does not answer yet."""
     LOADING = auto()
-    """Goals are sent; the controller does not report them yet."""
+    """What is to happen is sent ahead; not all of it has been reported as received."""
     PLAYING = auto()
     DONE = auto()
 
@@ -58,11 +60,13 @@ class Phase(Enum):
 class ScenarioNode(Node):
     """Starts a paused robot with the goals of a scenario in place, and follows the run.
 
-    Goals are sent ahead with the stamps at which they take effect, so that a run in lockstep
-    is the same each time.
+    Goals, pushes and obstacles are sent ahead with the stamps at which they take effect. In
+    lockstep the robot is halted where a service is to be called, and goes on when it has
+    answered; so a run in lockstep is the same each time.
 
     Attributes:
         phase: how far it has come.
+        failure: why it cannot be played on; None while it can.
         stamp: of the last state, ns.
         robot: the robot's last diagnostics, by key.
         controller: the controller's.
@@ -78,29 +82,30 @@ class ScenarioNode(Node):
             raise
         self.config = config
         self.phase = Phase.GETTING_READY
+        self.failure: ScenarioRefused | None = None
         self.robot: dict[str, str] = {}
         self.controller: dict[str, str] = {}
         self.bounds: dict[str, str] = {}
         self._recorder = Recorder(config.joints)
         self._state: JointState | None = None
         self.stamp = self._first = 0
-        self._last = math.inf
-        self._plan = None
+        self._period = 1
         self._answered = False
-        # Stamp from which on, ns; link; force; torque.
-        self._pushes: list[tuple[int, str, tuple[float, ...], tuple[float, ...]]] = []
-        self._wrench: WrenchStamped | None = None
         self._index: list[int] | None = None
-        self._poses = self.create_publisher(PoseStamped, "target_pose", GOAL_QOS)
-        self._postures = self.create_publisher(JointState, "target_posture", GOAL_QOS)
-        self._wrenches = self.create_publisher(WrenchStamped, "external_wrench", GOAL_QOS)
-        self._pause = self.create_client(SetBool, "bullet_node/pause")
-        self._settings = self.create_client(SetParameters, "bullet_node/set_parameters")
+        self._refused: tuple[str, ...] = ()
+        self._halt = self._end = 0  # periods from the beginning
+        frames = config.base_frame, config.end_effector_frame
+        self._goals = Outbox(self, to_controller(config.scenario, *frames))
+        self._world = Outbox(self, to_robot(config.scenario, config.base_frame))
+        self._due = deque(e for e in config.scenario.events if isinstance(e, ServiceEvent))
+        own = _RESUME, change_parameters("bullet_node", {})
+        self._caller = Caller(self, [*own, *map(to_service, self._due)])
         self.create_subscription(JointState, "joint_states", self._on_state, _RECORDING_QOS)
         self.create_subscription(
             JointTrajectory, "acceleration_limits", self._on_limits, _RECORDING_QOS
         )
         self.create_subscription(JointState, "joint_commands", self._on_command, _RECORDING_QOS)
+        self.create_subscription(WrenchStamped, "ft_wrench", self._on_wrench, _RECORDING_QOS)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_POLL_PERIOD, self._proceed, clock=steady)
@@ -132,6 +137,11 @@ class ScenarioNode(Node):
         self._answered = True
         self._recorder.add_torque(stamp_to_ns(message.header.stamp), message.effort)
 
+    def _on_wrench(self, message: WrenchStamped) -> None:
+        f, t = message.wrench.force, message.wrench.torque
+        stamp = stamp_to_ns(message.header.stamp)
+        self._recorder.add_wrench(stamp, (f.x, f.y, f.z, t.x, t.y, t.z))
+
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             values = {value.key: value.value for value in status.values}
@@ -145,75 +155,87 @@ class ScenarioNode(Node):
     # What happens when
 
     def _proceed(self) -> None:
-        if self.phase is Phase.GETTING_READY and self._chain_is_up():
-            self.phase = Phase.LOADING
-            self._send_goals()
-        elif self.phase is Phase.LOADING and self._goals_are_in():
-            self.phase = Phase.PLAYING
-            self._pause.call_async(SetBool.Request(data=False))
-        elif self.phase is Phase.PLAYING:
-            self._push()
-            # It pauses by itself, and what it reports then is final.
-            over = int(self.robot["stamp_ns"]) >= self._last
-            if over and self.robot["paused"] == "True":
-                self.phase = Phase.DONE
+        try:
+            if self.phase is Phase.GETTING_READY and not self.awaited():
+                self.phase = Phase.LOADING
+                self._plan()
+            elif self.phase is Phase.LOADING and self._load():
+                self.phase = Phase.PLAYING
+                self._go_on()
+            elif self.phase is Phase.PLAYING and self._caller.proceed():
+                self._play()
+        except ScenarioRefused as error:
+            self.failure = error
 
-    def _chain_is_up(self) -> bool:
+    def awaited(self) -> list[str]:
+        """Return what other nodes have to do before this one can go on."""
+        if self.phase is not Phase.GETTING_READY:
+            return self._caller.awaited
+        paused = self.robot.get("paused") == "True"
+        topics = self._goals.unheard() + self._world.unheard()
         return (
-            self._answered
-            and self.robot.get("paused") == "True"
-            and self._pause.service_is_ready()
-            and self._settings.service_is_ready()
-            and self._poses.get_subscription_count() > 0
-            and self._postures.get_subscription_count() > 0
+            ([] if paused else ["a paused robot"])
+            + ([] if self._answered else ["joint commands"])
+            + [f"service {service}" for service in self._caller.missing()]
+            + [f"a subscriber of {topic}" for topic in topics]
         )
 
-    def _goals_are_in(self) -> bool:
-        goals = [event for event in self.config.scenario.events if not isinstance(event, Push)]
-        planned = self._plan is not None and self._plan.done()
-        return planned and self.controller.get("goals_pending") == str(len(goals))
-
-    def _send_goals(self) -> None:
+    def _plan(self) -> None:
         # Resuming begins a period of its own: the first state that moves is the next.
-        period = round(1e9 * float(self.robot["period_s"]))
-        self._first = self.stamp + period
-        duration = self.config.scenario.duration
-        self._last = self._first + round(duration * 1e9 / period) * period - period
-        end = RosParameter("pause_after", value=duration).to_parameter_msg()
-        self._plan = self._settings.call_async(SetParameters.Request(parameters=[end]))
-        for event in self.config.scenario.events:
-            stamp = self._first + round(1e9 * event.time)
-            if isinstance(event, PoseGoal):
-                message = PoseStamped()
-                message.header.frame_id = self.config.base_frame
-                set_stamp(message.header.stamp, stamp)
-                p, o = message.pose.position, message.pose.orientation
-                p.x, p.y, p.z = event.position
-                o.x, o.y, o.z, o.w = event.orientation
-                self._poses.publish(message)
-            elif isinstance(event, PostureGoal):
-                message = JointState(
-                    name=list(event.positions), position=list(event.positions.values())
-                )
-                set_stamp(message.header.stamp, stamp)
-                self._postures.publish(message)
-            else:
-                release = stamp + round(1e9 * event.duration)
-                self._pushes.append((stamp, event.link, event.force, event.torque))
-                self._pushes.append((release, event.link, (0.0,) * 3, (0.0,) * 3))
-        self._pushes.sort(key=lambda entry: entry[0])
+        self._period = round(1e9 * float(self.robot["period_s"]))
+        self._first = self.stamp + self._period
+        self._end = round(1e9 * self.config.scenario.duration / self._period)
+        self._refused = self._refusals()
 
-    def _push(self) -> None:
-        while self._pushes and self.stamp >= self._pushes[0][0]:
-            _, link, force, torque = self._pushes.pop(0)
-            self._wrench = message = WrenchStamped()
-            message.header.frame_id = link
-            f, t = message.wrench.force, message.wrench.torque
-            f.x, f.y, f.z = force
-            t.x, t.y, t.z = torque
-        # Again and again: the robot lets go of a push that it hears no more of.
-        if self._wrench is not None:
-            self._wrenches.publish(self._wrench)
+    def _load(self) -> bool:
+        """Send ahead what others have room for; return whether they have it all."""
+        refused = self._refusals()
+        if refused != self._refused:
+            raise ScenarioRefused(f"goals, pushes or obstacles refused: {' '.join(refused)}")
+        waiting = [
+            (self._goals, self.controller, "goals_pending"),
+            (self._world, self.robot, "world_changes_pending"),
+        ]
+        done = [out.proceed(self._first, int(of.get(key, 0))) for out, of, key in waiting]
+        return all(done)
+
+    def _refusals(self) -> tuple[str, ...]:
+        return self.controller.get("goals_refused", ""), self.robot["commands_refused"]
+
+    def _play(self) -> None:
+        # In lockstep it pauses where a service is to be called, and what it reports when it has
+        # paused at the end is final.
+        over = int(self.robot["stamp_ns"]) >= self._first + (self._halt - 1) * self._period
+        if not over or self.robot["paused"] != "True":
+            if self.robot["clock"] != "lockstep":
+                self._call((self.stamp - self._first) // self._period)
+        elif self._halt == self._end:
+            self.phase = Phase.DONE
+        else:
+            self._go_on()
+
+    def _go_on(self) -> None:
+        """Call what is due where the robot has halted, then let it go on to the next halt."""
+        now = self._halt
+        self._call(now)
+        lockstep = self.robot["clock"] == "lockstep"
+        self._halt = (
+            min(self._end, self._period_of(self._due[0])) if self._due and lockstep else self._end
+        )
+        left = 1e-9 * self._period * (self._halt - now)
+        self._caller.add("", change_parameters("bullet_node", {"pause_after": left}))
+        self._caller.add("", _RESUME)
+        self._caller.proceed()
+
+    def _call(self, period: int) -> None:
+        """Call the services that are due when a period, counted from the first, begins."""
+        while self._due and self._period_of(self._due[0]) <= period:
+            event = self._due.popleft()
+            self._caller.add(f"at {event.time:g} s: ", to_service(event))
+
+    def _period_of(self, event: ServiceEvent) -> int:
+        """Return the first period that begins when an event is due, or after."""
+        return math.ceil(1e9 * event.time / self._period - 1e-6)
 
     # What is shown
 
@@ -244,6 +266,7 @@ def play(node: ScenarioNode, others: Sequence[Node] = (), *, quiet: bool = False
 
     Raises:
         TimeoutError: the other nodes did not come up, or stopped answering.
+        ScenarioRefused: another node refused what the scenario asks of it.
         ExternalShutdownException: told to stop before the end.
     """
     executor = make_executor(node.context)
@@ -254,12 +277,17 @@ def play(node: ScenarioNode, others: Sequence[Node] = (), *, quiet: bool = False
     progress, moved_at = None, time.monotonic()
     while node.phase is not Phase.DONE and rclpy.ok(context=node.context):
         executor.spin_once(timeout_sec=0.1)
+        if node.failure is not None:
+            raise node.failure
         now = time.monotonic()
         if (node.stamp, node.phase) != progress:
             progress, moved_at = (node.stamp, node.phase), now
         elif now - moved_at > node.config.ready_timeout:
             phase = node.phase.name.lower().replace("_", " ")
-            raise TimeoutError(f"nothing has moved for {node.config.ready_timeout:g} s ({phase})")
+            awaited = ": there is no " + ", no ".join(node.awaited()) if node.awaited() else ""
+            raise TimeoutError(
+                f"nothing has moved for {node.config.ready_timeout:g} s ({phase}{awaited})"
+            )
         if not quiet and now - shown_at > _SHOW_PERIOD:
             shown_at = now
             print(node.live_line(), end="\r" if terminal else "\n", flush=True)
@@ -295,7 +323,7 @@ def main(args: list[str] | None = None) -> int:
             if write_report(out, node.config, node.recorded_run(), node.robot, node.bounds)
             else 1
         )
-    except TimeoutError as error:
+    except (TimeoutError, ScenarioRefused) as error:
         report_refusal(error)
         return 2
     except (KeyboardInterrupt, ExternalShutdownException):

@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from sim_bridge.scenario import PostureGoal, Scenario, ScenarioError, load_scenario
+from sim_bridge.scenario import Scenario, load_scenario
+from sim_bridge.scenario_events import PostureGoal, WrenchGoal
+from sim_bridge.scenario_fields import ScenarioError
 from viability_bounds_pkg.ros_parameters import Parameter, ParameterError, joint_names, positive
 from viability_bounds_pkg.ros_robot_parameters import (
     ROBOT_TABLE,
@@ -67,6 +69,14 @@ def make_configuration(values: Mapping[str, Any]) -> ScenarioConfiguration:
         if isinstance(event, PostureGoal) and set(joints) - set(event.positions):
             missing = ", ".join(joint for joint in joints if joint not in event.positions)
             allowed = f"postures of all 'joints'; at {event.time:g} s there is none of {missing}"
+            raise ParameterError("scenario", values["scenario"], allowed)
+    frames = "", values["end_effector_frame"], values["base_frame"]
+    for event in scenario.events:
+        if isinstance(event, WrenchGoal) and event.frame not in frames:
+            allowed = (
+                f"wrenches in the axes of {' or '.join(frames[1:])}; at {event.time:g} s there is "
+                f"one in those of {event.frame!r}"
+            )
             raise ParameterError("scenario", values["scenario"], allowed)
     q_min, q_max = position_limits(values, joints)
     return ScenarioConfiguration(
