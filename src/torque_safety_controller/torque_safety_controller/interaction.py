@@ -57,8 +57,9 @@ class InteractionSettings:
         weight: of the admittance task; None for that of the pose task.
         wrench_weight: of the wrench tasks.
         wrench_time: time constant with which a new target wrench is gone over to, s, > 0.
-        contact_force: N along a contact's normal from which on the hand counts as in contact;
-            half of it until it no longer does.
+        force_step: by how much the force that the QP counts on at the hand may exceed the
+            measured one along the contact's normal, N: the hand neither rushes at what it is to
+            touch, nor presses on what is not there.
         closed: indices of other contacts that there are at present.
         dual: when the hand yields; None never.
         yielding_gains: of the admittance task when it does.
@@ -70,7 +71,7 @@ class InteractionSettings:
     weight: float | None = None
     wrench_weight: float = 10.0
     wrench_time: float = 0.1
-    contact_force: float = 1.0
+    force_step: float = 0.5
     closed: tuple[int, ...] = ()
     dual: DualSettings | None = None
     yielding_gains: AdmittanceGains = AdmittanceGains(0.1, 0.0, 1.0, 0.0)
@@ -82,8 +83,7 @@ class Interaction:
     Args:
         sensor: at the hand; None for none: then nothing is done but what `contacts` want.
         contacts: that the QP may use forces of; None for none.
-        hand: index of the contact at the hand, which is closed by what is measured; None for
-            none.
+        hand: index of the contact at the hand, with which a wrench is exerted; None for none.
         placement: of that contact's frame in the end effector's.
         settings: may be replaced between steps.
 
@@ -135,9 +135,9 @@ class Interaction:
     def start(self) -> None:
         """Forget the past and the target."""
         self._target = None
-        self._goal = self.reference = np.zeros(6)
-        self._reference_rate = np.zeros(6)
-        self._realised: Array | None = None
+        self._goal = self._goal_rate = self.reference = np.zeros(6)
+        self._counted = np.zeros(6)  # on, at the contact of the hand, in its axes
+        self._missing = np.zeros(6)  # of that, in the QP, in the end effector's axes
         self._enter(Compliance.OFF, "at start")
         if self.sensor is not None:
             self.sensor.start()
@@ -211,25 +211,24 @@ class Interaction:
             if goals.pose_des is None:
                 goals.hold(robot.pose)  # its damping is needed
             self._goal = measured
-            self._realised = None
+            self._missing = np.zeros(6)
         before = self._goal
-        share = -math.expm1(-elapsed / self.settings.wrench_time) if elapsed > 0.0 else 0.0
+        share = -math.expm1(-elapsed / self._settings.wrench_time) if elapsed > 0.0 else 0.0
         self._goal = before + share * (wrench - before)
-        self._reference_rate = (self._goal - before) / elapsed if elapsed > 0.0 else np.zeros(6)
-        self._close_hand(measured)
-        # What the QP counts on is what is to be felt, one step late: [Benallegue2021], III-E (b).
-        self.reference = self._goal if self._realised is None else self._realised
+        self._goal_rate = (self._goal - before) / elapsed if elapsed > 0.0 else np.zeros(6)
+        # What the QP says that limits allow is what is to be felt: III-E (b), one step late.
+        self.reference = self._goal - self._missing
+        self._count_on(measured)
 
-    def _close_hand(self, measured: Array) -> None:
+    def _count_on(self, measured: Array) -> None:
+        """Find how much of the goal the QP may count on at the hand, given what is measured."""
         if self._hand is None:
             return
-        closed = self.contacts.closed
-        contact = self.contacts.contacts[self._hand]
-        normal = contact.normal @ (self._to_contact @ measured)[:3]
-        least = self._settings.contact_force * (0.5 if closed[self._hand] else 1.0)
-        closed[self._hand] = normal > least
-        if not closed[self._hand]:
-            self._realised = None
+        normal = self.contacts.contacts[self._hand].normal
+        goal = self._to_contact @ self._goal
+        wanted = normal @ goal[:3]
+        most = max(normal @ (self._to_contact @ measured)[:3], 0.0) + self._settings.force_step
+        self._counted = goal * (most / wanted) if wanted > most else goal
 
     @property
     def stiffness(self) -> Array | None:
@@ -252,7 +251,7 @@ class Interaction:
             return [
                 admittance_task(robot.J, robot.drift, -F, -rate, settings.yielding_gains, weight)
             ]
-        error, error_rate = self.reference - F, self._reference_rate - rate
+        error, error_rate = self.reference - F, self._goal_rate - rate
         return [
             admittance_task(
                 robot.J, robot.drift, error, error_rate, settings.gains, weight, self._rows
@@ -270,17 +269,16 @@ class Interaction:
             return None
         closed = contacts.closed
         for index in range(len(closed)):
-            if index != self._hand:
-                closed[index] = index in self._settings.closed
-        if self._hand is not None and self.state is not Compliance.FORCE:
-            closed[self._hand] = False
+            closed[index] = index in self._settings.closed
+        if self._hand is not None:
+            closed[self._hand] = self.state is Compliance.FORCE
         if not closed.any():
             return None
         contacts.update(robot.data)
         tasks = []
-        for index in np.flatnonzero(closed):
-            wanted = self._to_contact @ self._goal if index == self._hand else np.zeros(6)
-            tasks.append(contacts.wrench_task(int(index), wanted, self._settings.wrench_weight))
+        for index in np.flatnonzero(closed).tolist():
+            wanted = self._counted if index == self._hand else np.zeros(6)
+            tasks.append(contacts.wrench_task(index, wanted, self._settings.wrench_weight))
         return contacts.forces(tasks)
 
     def rehearsal(
@@ -300,8 +298,12 @@ class Interaction:
 
     def note_forces(self, rho: Array) -> None:
         """Take note of the forces that the QP counts on, shape (r,), N."""
-        if self._hand is not None and self.contacts.closed[self._hand]:
-            self._realised = self._to_hand @ self.contacts.wrench(self._hand, rho)
+        if self._hand is None or not self.contacts.closed[self._hand]:
+            return
+        missing = self._counted - self.contacts.wrench(self._hand, rho)
+        if len(self.contacts.contacts[self._hand].points) == 1:
+            missing[3:] = 0.0  # a point exerts no moment; none was asked of it
+        self._missing = self._to_hand @ missing
 
     def _enter(self, state: Compliance, reason: str) -> None:
         if state is not self.state:

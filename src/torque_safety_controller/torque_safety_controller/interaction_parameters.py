@@ -103,10 +103,10 @@ TABLE = (
     ),
     Parameter("contact_facets", int, "edges of a friction pyramid, at least 3", 4),
     Parameter(
-        "contact_force",
+        "contact_force_step",
         float,
-        "force along its normal from which on the hand counts as in contact, N",
-        1.0,
+        "by how much the force counted on at the hand may exceed the measured one, N",
+        0.5,
         live=True,
     ),
     Parameter(
@@ -163,7 +163,7 @@ def interaction_settings(values: Mapping[str, Any]) -> InteractionSettings:
         weight=None if weight == -1.0 else positive(values, "admittance_weight"),
         wrench_weight=positive(values, "wrench_weight"),
         wrench_time=positive(values, "wrench_time"),
-        contact_force=positive(values, "contact_force"),
+        force_step=positive(values, "contact_force_step"),
         closed=tuple(frames.index(frame) for frame in values["closed_contacts"]),
         dual=_dual(values),
         yielding_gains=AdmittanceGains(
