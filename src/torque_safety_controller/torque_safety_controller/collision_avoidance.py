@@ -17,10 +17,16 @@ from torque_safety_controller.collision_kinematics import make_motion
 from torque_safety_controller.collision_model import CollisionModel
 from torque_safety_controller.collision_obstacles import CollisionError
 from torque_safety_controller.collision_row import Law, Step, make_rows
+from torque_safety_controller.constraints import Rows
+from viability_bounds_pkg.array_checks import both_finite
 from viability_bounds_pkg.bounds_kernel import make_table
 from viability_bounds_pkg.braking import make_side
 
 Array = NDArray[np.float64]
+
+ROW_SCALE = 0.01
+"""Of rows in the QP: where they, the torques and the joints' bounds have no common solution, a
+distance gives way at a ten thousandth of what joints cost, so that the joints keep theirs."""
 
 # Of the virtual joint, whose braking is 1: more than anything has.
 _FAST, _HARD = 1e6, 1e12
@@ -138,6 +144,7 @@ class CollisionAvoidance:
         )
         most = int(ROWS_OF_KIND[model.pairs.kind].sum()) + 1
         self._count = 0
+        self._undisturbed = np.zeros(n)
         self._rows = make_rows(most, n, len(model.names), len(model.bodies.joint))
         self._fixed = (
             np.minimum(-lower, upper),
@@ -148,7 +155,14 @@ class CollisionAvoidance:
         # The first call compiles; let it be this one and not one in a control loop.
         self.rows(np.zeros(n), np.zeros(n), lower, upper)
 
-    def rows(self, q: Array, v: Array, a_lower: Array, a_upper: Array) -> CollisionRows:
+    def rows(
+        self,
+        q: Array,
+        v: Array,
+        a_lower: Array,
+        a_upper: Array,
+        disturbance: Array | None = None,
+    ) -> CollisionRows:
         """Return the rows of one step; those that the bounds imply are left out.
 
         Args:
@@ -156,10 +170,13 @@ class CollisionAvoidance:
             v: shape (n,), rad/s.
             a_lower: bounds of the accelerations, shape (n,), rad/s^2, finite.
             a_upper: shape (n,), rad/s^2, not below `a_lower`.
+            disturbance: what comes on top of the accelerations, shape (n,), rad/s^2. What of it
+                takes distance away is asked for in addition, as in `DisturbanceObserver.shift`.
 
         Values that are not finite are the caller's to refuse.
         """
-        step = Step(a_lower, a_upper, *self._fixed)
+        pushed = self._undisturbed if disturbance is None else disturbance
+        step = Step(a_lower, a_upper, pushed, *self._fixed)
         k = collision_rows(q, v, self.model.pairs, self.model.bodies, step, *self._arm)
         self._count = k
         rows = self._rows
@@ -176,6 +193,36 @@ class CollisionAvoidance:
             rows.bias[chosen],
             rows.viable[chosen],
         )
+
+    def constraint(
+        self,
+        q: Array,
+        v: Array,
+        a_lower: Array,
+        a_upper: Array,
+        disturbance: Array | None = None,
+    ) -> Rows | None:
+        """Return the rows of one step for the QP, in a scale in which bounds are dearer.
+
+        Args:
+            q: as in `rows`, like all others.
+            v: may be not finite, as `q`.
+            a_lower: may be infinite.
+            a_upper: may be infinite.
+            disturbance: finite.
+
+        Returns:
+            None in a state that is not finite, which the QP refuses.
+        """
+        if not both_finite(q, v):
+            return None
+        if not both_finite(a_lower, a_upper):  # infinite, or for the QP to refuse
+            a_lower, a_upper = (
+                np.nan_to_num(bound, posinf=_FAST, neginf=-_FAST) for bound in (a_lower, a_upper)
+            )
+        found = self.rows(q, v, a_lower, a_upper, disturbance)
+        upper = np.full(len(found.lower), np.inf)
+        return Rows(ROW_SCALE * found.G, ROW_SCALE * found.lower, upper)
 
     @property
     def count(self) -> int:

@@ -88,6 +88,7 @@ class Step(NamedTuple):
     Attributes:
         a_lower: shape (n,), rad/s^2.
         a_upper: shape (n,), rad/s^2.
+        disturbance: what comes on top of accelerations that are asked for, shape (n,), rad/s^2.
         a_brake: what each joint can brake with, shape (n,), rad/s^2.
         ranges: of the table of the virtual joint whose braking is 1, see `bounds_kernel.Table`.
         sides: of that table.
@@ -98,6 +99,7 @@ class Step(NamedTuple):
 
     a_lower: Array
     a_upper: Array
+    disturbance: Array
     a_brake: Array
     ranges: Array
     sides: Array
@@ -163,7 +165,7 @@ def write_row(pair, d, radius, n, p, joint, o, other, sliding, step, chain, moti
         ) / d
     k = rows.count[0]
     G = rows.G[k]
-    brake, most, least = 0.0, 0.0, 0.0
+    brake, most, least, pushed = 0.0, 0.0, 0.0, 0.0
     axes, origins, slides = motion.axis, motion.origin, chain.slides
     moves, moves_other = chain.moved_by[joint], chain.moved_by[other]
     a_lower, a_upper, a_brake = step.a_lower, step.a_upper, step.a_brake
@@ -175,6 +177,7 @@ def write_row(pair, d, radius, n, p, joint, o, other, sliding, step, chain, moti
             g -= _lever(at(axes, m + 1), at(origins, m + 1), slides[m + 1], o, n)
         G[m] = g
         brake += abs(g) * a_brake[m]
+        pushed += g * step.disturbance[m]
         low, high = g * a_lower[m], g * a_upper[m]
         most += max(low, high)
         least += min(low, high)
@@ -182,7 +185,7 @@ def write_row(pair, d, radius, n, p, joint, o, other, sliding, step, chain, moti
     braking = min(law.braking, law.share * brake)
     braking = max(min(braking, law.share * brake + bias), _LEAST_SHARE * braking, _LEAST_BRAKING)
     room = d - radius - law.margin - law.reserve
-    wanted = _lowest(room, rate, braking, step, rows.joint, rows.kept) - bias
+    wanted = _lowest(room, rate, braking, step, rows.joint, rows.kept) - bias - min(pushed, 0.0)
     if wanted <= least:
         return
     rounding = _ROUNDING * (1e-3 + abs(most) + abs(least))

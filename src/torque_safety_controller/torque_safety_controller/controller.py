@@ -13,7 +13,6 @@ import pinocchio as pin
 
 from torque_safety_controller.additional_torque import LONGEST_GAP, AdditionalTorque
 from torque_safety_controller.collision_avoidance import CollisionAvoidance
-from torque_safety_controller.constraints import Rows
 from torque_safety_controller.disturbance_observer import DisturbanceObserver
 from torque_safety_controller.gains import Gains
 from torque_safety_controller.goals import Goals
@@ -28,10 +27,6 @@ from torque_safety_controller.tasks import TaskTerm, damping_task
 from torque_safety_controller.torque_limiter import TorqueLimiter
 
 __all__ = ["Controller", "Gains", "Step"]
-
-_ROW_SCALE = 0.1
-"""Of the rows of collisions: where the torques cannot keep them and the joints' bounds, a distance
-gives way at a hundredth of what joints cost, so that the joints keep theirs."""
 
 
 class Step(NamedTuple):
@@ -284,12 +279,7 @@ class Controller:
         a_lower, a_upper = self._observer.shift(a_lower, a_upper)
         rows = None
         if self.collision is not None:
-            found = self.collision.rows(q, v, a_lower, a_upper)
-            rows = Rows(
-                _ROW_SCALE * found.G,
-                _ROW_SCALE * found.lower,
-                np.full(len(found.lower), np.inf),
-            )
+            rows = self.collision.constraint(q, v, a_lower, a_upper, self._observer.known)
         try:
             solution = self._qp.solve(
                 tasks, a_lower, a_upper, robot.M, lower - bias, upper - bias, rows, contacts

@@ -73,6 +73,11 @@ class DisturbanceObserver:
         self._v_last[:] = v
         self._begun = True
 
+    @property
+    def known(self) -> Array | None:
+        """The estimate; None while nothing is watched, or has been yet."""
+        return None if self.time_constant is None or not self._begun else self.estimate
+
     def shift(self, lower: Array, upper: Array) -> tuple[Array, Array]:
         """Return bounds for the accelerations to ask for.
 
@@ -80,9 +85,8 @@ class DisturbanceObserver:
             lower: bound of the accelerations to have, shape (n,), rad/s^2.
             upper: shape (n,), rad/s^2, not below `lower`.
         """
-        if self.time_constant is None or not self._begun:
-            return lower, upper
-        return _shift(self.estimate, lower, upper)
+        known = self.known
+        return (lower, upper) if known is None else _shift(known, lower, upper)
 
 
 @njit(cache=True)

@@ -19,6 +19,7 @@ LEVELS = {
 }
 
 _LATENCIES_KEPT = 4096
+_SLIGHT = 1e-3  # rad/s^2; by less than this bounds give way beside distances that do
 
 
 class StepRecord:
@@ -39,7 +40,7 @@ class StepRecord:
         self._steps += 1
         if step.failure:
             self._failures += 1
-        if step.relaxation is not None:
+        if step.relaxation is not None and step.relaxation.max() > _SLIGHT:
             self._relaxed_steps += 1
             self._last_relaxation = step.relaxation
 
