@@ -1,14 +1,55 @@
-"""Obstacles in a PyBullet world, and what they do to the robot in it."""
+"""Obstacles in a PyBullet world, and what they do to the robot in it.
+
+An obstacle is hard, but not rigid: rigid ones would leave open how hard a robot with friction in
+its joints presses on them, and the solver, for which one solution is as good as another, would
+jump about between them. Its surface has no mass and moves by x against a spring and a damper,
+
+    F = k x+ + d v+,    x+ = x + h v+,
+
+with F the force of the robot: it is implicit and thus stable however stiff it is. PyBullet
+moves a body of mass m by m (v+ - v) = h (F + f), which is the same for
+
+    m = h d + h^2 k,    f = -k x - (d + h k) v.
+
+Along the surface PyBullet lets the robot slide: its Dantzig solver replaces the cone of Coulomb's
+law by a box, whose size is that of the pressure without friction. `contact_friction` has that law.
+
+Four points under a flat hand are one more than it takes, and Dantzig's solver finds no solution.
+It does when there is some softness in all constraints; it is far too little to be noticed.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sim_bridge.obstacles import Contact, ContactMaterial, Obstacle
+from sim_bridge.contact_friction import Bristle
+from sim_bridge.obstacles import Contact, ContactMaterial, Obstacle, ObstacleError
 from sim_bridge.quiet_pybullet import pybullet
+
+_OVERLAP_MAX = 1e-3  # m, with the robot, of an obstacle that is new
+_RELEASED = 1e-9  # m; a surface that is nearer to its place is put there
+_OBSTACLES_MEET_ROBOTS = (64, 1)  # collision group of the former, that of the latter
+_INERTIA = 1e15  # kg m^2: surfaces do not turn
+_SOFTNESS = 1e-11  # m/s of all constraints for each N (rad/s, N m), while there are obstacles
+
+
+class LinkForce(NamedTuple):
+    """A force on a link of the robot."""
+
+    link: str
+    point: np.ndarray  # shape (3,), m
+    force: np.ndarray  # shape (3,), N
+
+
+class _Surface:
+    """An obstacle in the world."""
+
+    def __init__(self, name: str, body: int, place: Sequence[float]) -> None:
+        self.name, self.body, self.place = name, body, tuple(place)
+        self.moved = False
 
 
 class BulletObstacles:
@@ -19,24 +60,47 @@ class BulletObstacles:
         body: the robot in that client.
         links: names of its links, by PyBullet's indices.
         material: of the obstacles.
+        physics_dt: the physics step, s.
+        gravity: shape (3,), m/s^2.
     """
 
     def __init__(
-        self, bullet: Any, body: int, links: Mapping[int, str], material: ContactMaterial
+        self,
+        bullet: Any,
+        body: int,
+        links: Mapping[int, str],
+        material: ContactMaterial,
+        physics_dt: float,
+        gravity: Sequence[float],
     ) -> None:
         self._bullet, self._body, self._links = bullet, body, links
-        self._material = material
-        self._bodies: dict[str, int] = {}
-        self._names: dict[int, str] = {}
+        self._material, self._dt = material, physics_dt
+        self._mass = physics_dt * (material.damping + physics_dt * material.stiffness)
+        self._hold = [-self._mass * x for x in gravity]
+        self._surfaces: dict[str, _Surface] = {}
+        self._by_body: dict[int, _Surface] = {}
+        # By link and body of the obstacle, of those in touch.
+        self._bristles: dict[tuple[int, int], Bristle] = {}
+        self._points: dict[tuple[int, int], np.ndarray] = {}
+        self._friction: list[tuple[tuple[int, int], LinkForce]] = []
 
     def __len__(self) -> int:
-        return len(self._bodies)
+        return len(self._surfaces)
+
+    @property
+    def names(self) -> set[str]:
+        """Of all obstacles."""
+        return set(self._surfaces)
 
     def add(self, obstacle: Obstacle) -> None:
-        """Put an obstacle into the world, in place of the one of its name if there is one."""
+        """Put an obstacle into the world, in place of the one of its name if there is one.
+
+        Raises:
+            ObstacleError: the robot is there.
+        """
         bullet = self._bullet
         self.remove(obstacle.name)
-        x, _, z = obstacle.size
+        x, _, z = obstacle.size.tolist()
         if obstacle.shape == "box":
             extents = (0.5 * obstacle.size).tolist()
             shape = bullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=extents)
@@ -44,52 +108,133 @@ class BulletObstacles:
             shape = bullet.createCollisionShape(pybullet.GEOM_SPHERE, radius=0.5 * x)
         else:
             shape = bullet.createCollisionShape(pybullet.GEOM_CYLINDER, radius=0.5 * x, height=z)
+        place = obstacle.position.tolist()
         body = bullet.createMultiBody(
-            baseMass=0.0,
+            baseMass=self._mass,
             baseCollisionShapeIndex=shape,
-            basePosition=obstacle.position.tolist(),
+            basePosition=place,
             baseOrientation=obstacle.orientation.tolist(),
         )
-        # PyBullet multiplies the two coefficients; the robot's links have 1.
-        bullet.changeDynamics(body, -1, lateralFriction=self._material.friction)
-        self._bodies[obstacle.name] = body
-        self._names[body] = obstacle.name
+        bullet.changeDynamics(
+            body,
+            -1,
+            localInertiaDiagonal=[_INERTIA] * 3,
+            lateralFriction=0.0,
+            linearDamping=0.0,
+            angularDamping=0.0,
+        )
+        bullet.setCollisionFilterGroupMask(body, -1, *_OBSTACLES_MEET_ROBOTS)
+        bullet.setPhysicsEngineParameter(globalCFM=_SOFTNESS)
+        surface = _Surface(obstacle.name, body, place)
+        self._surfaces[obstacle.name] = self._by_body[body] = surface
+        near = bullet.getClosestPoints(self._body, body, 0.0)
+        overlap = -min((point[8] for point in near), default=0.0)
+        if overlap > _OVERLAP_MAX:
+            self.remove(obstacle.name)
+            raise ObstacleError(
+                f"obstacle {obstacle.name!r} overlaps the robot by {1e3 * overlap:.1f} mm"
+            )
 
     def remove(self, name: str) -> bool:
         """Take an obstacle out of the world; return whether there was one of that name."""
-        body = self._bodies.pop(name, None)
-        if body is None:
+        surface = self._surfaces.pop(name, None)
+        if surface is None:
             return False
-        del self._names[body]
-        self._bullet.removeBody(body)
+        del self._by_body[surface.body]
+        for key in [key for key in self._bristles if key[1] == surface.body]:
+            del self._bristles[key]
+            self._points.pop(key, None)
+        self._bullet.removeBody(surface.body)
+        if not self._surfaces:
+            self._bullet.setPhysicsEngineParameter(globalCFM=0.0)
         return True
 
     def clear(self) -> None:
         """Take all obstacles out of the world."""
-        for name in list(self._bodies):
+        for name in list(self._surfaces):
             self.remove(name)
 
-    def contacts(self) -> list[Contact]:
-        """Return where the robot was pushed in the last physics step."""
-        if not self._bodies:
-            return []
-        found = []
-        for point in self._bullet.getContactPoints(self._body):
-            _, _, other, link, _, position, _, normal, distance, pressure, *friction = point
-            if other not in self._names or pressure == 0.0:
-                continue
-            normal = np.array(normal)
-            force = pressure * normal
-            for size, direction in zip(friction[::2], friction[1::2], strict=True):
-                force += size * np.array(direction)
-            found.append(
-                Contact(
-                    self._links[link],
-                    self._names[other],
-                    np.array(position),
-                    normal,
-                    force,
-                    distance,
-                )
+    def before_step(self) -> None:
+        """Let springs, dampers and friction act in the step to come."""
+        bullet = self._bullet
+        k, c = (
+            self._material.stiffness,
+            self._material.damping + self._dt * self._material.stiffness,
+        )
+        touched = {body for _, body in self._bristles}
+        for surface in self._by_body.values():
+            body, place, force = surface.body, surface.place, self._hold
+            if surface.moved:
+                place, _ = bullet.getBasePositionAndOrientation(body)
+                v, _ = bullet.getBaseVelocity(body)
+                x = [a - b for a, b in zip(place, surface.place, strict=True)]
+                if body not in touched and max(map(abs, x)) < _RELEASED:
+                    self._put_back(surface)
+                    x = v = (0.0, 0.0, 0.0)
+                force = [f - k * s - c * w for f, s, w in zip(force, x, v, strict=True)]
+            bullet.applyExternalForce(body, -1, force, place, pybullet.WORLD_FRAME)
+        self._friction.clear()
+        for key, bristle in self._bristles.items():
+            link, _ = key
+            state = bullet.getLinkState(self._body, link, 1, 1)  # kinematics of now
+            motion = np.array((*state[0], *state[6], *state[7]))
+            bristle.update(self._points[key], motion, self._material.friction)
+            force, point = bristle.force.copy(), bristle.point.copy()
+            bullet.applyExternalForce(
+                self._body, link, force.tolist(), point.tolist(), pybullet.WORLD_FRAME
             )
+            self._friction.append((key, LinkForce(self._links[link], point, force)))
+
+    def reset(self) -> None:
+        """Let go of the robot."""
+        self._bristles.clear()
+        self._points.clear()
+        self._friction.clear()
+        for surface in self._by_body.values():
+            if surface.moved:
+                self._put_back(surface)
+
+    def _put_back(self, surface: _Surface) -> None:
+        none = (0.0, 0.0, 0.0)
+        _, orientation = self._bullet.getBasePositionAndOrientation(surface.body)
+        self._bullet.resetBasePositionAndOrientation(surface.body, surface.place, orientation)
+        self._bullet.resetBaseVelocity(surface.body, none, none)
+        surface.moved = False
+
+    def after_step(self) -> None:
+        """See where the robot was touched in the step."""
+        rows: dict[tuple[int, int], list[tuple[float, ...]]] = {}
+        for point in self._bullet.getContactPoints(self._body):
+            if point[9] > 0.0 and point[2] in self._by_body:
+                rows.setdefault((point[3], point[2]), []).append((*point[5], *point[7], point[9]))
+        self._points = {key: np.array(value) for key, value in rows.items()}
+        known = self._bristles
+        self._bristles = {
+            key: known.get(key) or Bristle(self._dt, self._material.stiffness) for key in rows
+        }
+        for _, body in rows:
+            self._by_body[body].moved = True
+
+    def forces(self) -> list[LinkForce]:
+        """Return all that acted on the robot in the last physics step."""
+        pressures = [
+            LinkForce(self._links[link], row[:3], row[6] * row[3:6])
+            for (link, _), rows in self._points.items()
+            for row in rows
+        ]
+        return pressures + [force for _, force in self._friction]
+
+    def contacts(self) -> list[Contact]:
+        """Return where the robot was touched in the last physics step."""
+        found = []
+        friction = dict(self._friction)
+        for key, rows in self._points.items():
+            link, body = key
+            along = friction[key].force if key in friction else np.zeros(3)
+            for row in rows:
+                position, normal, pressure = row[:3], row[3:6], row[6]
+                # The friction acts at the centre of pressure, as if it were shared out like this.
+                force = pressure * normal + pressure / rows[:, 6].sum() * along
+                name = self._by_body[body].name
+                found.append(Contact(self._links[link], name, position, normal, force))
         return found

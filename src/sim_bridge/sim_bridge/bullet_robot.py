@@ -24,22 +24,18 @@ the maximum being at r = a h^2 / 8: 2 microrad for 15 rad/s^2 at 1 kHz.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sim_bridge.bullet_world import BulletWorld
+from sim_bridge.bullet_body import BulletBody
 from sim_bridge.gears import Gears
 from sim_bridge.limit_monitor import LimitMonitor
-from sim_bridge.obstacles import Contact, ContactMaterial, Obstacle
 from sim_bridge.position_drive import PositionDrive, make_drive
-from sim_bridge.urdf_preparation import FramePlacement, prepare_urdf
 from sim_bridge.vectors import finite_vector, not_negative_vector
-from viability_bounds_pkg.robot_description import RobotDescriptionError
 
 
 class RobotState(NamedTuple):
@@ -50,7 +46,7 @@ class RobotState(NamedTuple):
     motor_torque: np.ndarray  # of the motors or brakes in the last physics step, N m
 
 
-class BulletRobot:
+class BulletRobot(BulletBody):
     """One arm with motors and brakes, fixed to the ground, alone in a world of its own.
 
     Its dynamics equal those of the Pinocchio model that
@@ -63,25 +59,17 @@ class BulletRobot:
     Args:
         urdf_text: the URDF.
         joints: names of the n joints that move; arrays are in this order.
-        locked_positions: where other joints are locked, rad or m; those left out are at zero.
         physics_dt: the physics step h, s.
-        gravity: acceleration of gravity in the base frame, m/s^2.
-        visuals: load the visual shapes, for cameras.
-        collisions: load the collision shapes, meshes as their convex hulls, for contacts.
-        material: of obstacles; rigid, with a friction of 0.5, by default.
-        mechanical_stops: stop joints hard at their position limits.
+        locked_positions: where other joints are locked, rad or m; those left out are at zero.
         gears: friction, rotors and torque biases of the joints; none by default.
-        mass_scales: factors for mass and inertia of links, by name.
+        body: further options of `BulletBody`: gravity, shapes, obstacles, masses, a sensor.
 
     Attributes:
         monitor: told of every physics step, unless None.
-        client_id: PyBullet's physics client, for cameras and obstacles.
-        body_id: the robot in that client.
 
     Raises:
-        RobotDescriptionError: the URDF does not load, or as `prepare_urdf` does.
-        ValueError: `physics_dt` or `gravity` is out of range, or `gears` are those of another
-            number of joints.
+        RobotDescriptionError: as `BulletBody` does.
+        ValueError: as `BulletBody` does, or `gears` are those of another number of joints.
     """
 
     def __init__(
@@ -89,53 +77,30 @@ class BulletRobot:
         urdf_text: str,
         joints: Sequence[str],
         *,
-        locked_positions: Mapping[str, float] | None = None,
         physics_dt: float,
-        gravity: Sequence[float] = (0.0, 0.0, -9.81),
-        visuals: bool = False,
-        collisions: bool = True,
-        material: ContactMaterial | None = None,
-        mechanical_stops: bool = False,
+        locked_positions: Mapping[str, float] | None = None,
         gears: Gears | None = None,
-        mass_scales: Mapping[str, float] | None = None,
+        **body: Any,
     ) -> None:
-        if not (math.isfinite(physics_dt) and physics_dt > 0.0):
-            raise ValueError(f"physics_dt must be positive and finite, not {physics_dt}")
-        self.joints, self.physics_dt = tuple(joints), physics_dt
-        self.monitor: LimitMonitor | None = None
-        gravity = finite_vector("gravity", gravity, 3)
-        n = len(self.joints)
+        n = len(joints)
         gears = gears or Gears(n)
         if gears.rotor_inertia.shape != (n,):
             raise ValueError(f"there are {n} joints, but {gears.rotor_inertia.size} gears")
-        self._gears = None if gears.ideal else gears
-        inertias = zip(self.joints, gears.simulated_inertia(self.physics_dt).tolist(), strict=True)
-        prepared = prepare_urdf(
+        inertias = zip(joints, gears.simulated_inertia(physics_dt).tolist(), strict=True)
+        super().__init__(
             urdf_text,
             joints,
-            locked_positions,
-            visuals=visuals,
-            collisions=collisions,
-            mechanical_stops=mechanical_stops,
-            mass_scales=mass_scales,
+            physics_dt=physics_dt,
+            locked_positions=locked_positions,
             rotor_inertias={joint: inertia for joint, inertia in inertias if inertia > 0.0},
+            direct_solver=not gears.ideal,
+            **body,
         )
-        self._frames = prepared.frames
+        self.monitor: LimitMonitor | None = None
+        self._gears = None if gears.ideal else gears
         # PyBullet's position, half a step ahead of the velocity; see the module.
         self._q, self._v, self._motor_torque = np.zeros((3, n))
         self._brakes = np.zeros(n)
-        self._wrenches: dict[str, tuple[FramePlacement, list[float], list[float]]] = {}
-        direct = self._gears is not None
-        self._world = BulletWorld(
-            prepared,
-            self.joints,
-            physics_dt,
-            gravity.tolist(),
-            direct,
-            material or ContactMaterial(),
-        )
-        self._without_shape = prepared.missing if collisions else ("none was to be loaded",)
-        self.client_id, self.body_id = self._world.client_id, self._world.body_id
         # Made when first needed, because it takes a model.
         self._make_drive = partial(
             make_drive, urdf_text, self.joints, locked_positions, gears, physics_dt
@@ -227,61 +192,6 @@ class BulletRobot:
         q = self._q - 0.5 * self.physics_dt * self._v
         return RobotState(q, self._v.copy(), self._motor_torque.copy())
 
-    def apply_wrench(self, link: str, force: ArrayLike, torque: ArrayLike) -> None:
-        """Push on a link, from the next physics step until `clear_wrenches`.
-
-        Wrenches on several links add up; a new one on the same link replaces the old.
-
-        Args:
-            link: any link of the URDF; the wrench acts at its origin. On a link that stands
-                still with the base it has no effect.
-            force: shape (3,), N, in world-aligned axes.
-            torque: shape (3,), N m, in world-aligned axes.
-        """
-        frame = self._frame(link)
-        force, torque = finite_vector("force", force, 3), finite_vector("torque", torque, 3)
-        self._wrenches[link] = frame, force.tolist(), torque.tolist()
-
-    def clear_wrenches(self) -> None:
-        """Take all wrenches off."""
-        self._wrenches.clear()
-
-    def add_obstacle(self, obstacle: Obstacle) -> None:
-        """Put an obstacle into the world, in place of the one of its name if there is one.
-
-        Raises:
-            RobotDescriptionError: the robot's collision shapes are not all there.
-        """
-        if self._without_shape:
-            missing = "; ".join(self._without_shape)
-            raise RobotDescriptionError(f"collision shapes are missing: {missing}")
-        self._world.obstacles.add(obstacle)
-
-    def remove_obstacle(self, name: str) -> bool:
-        """Take an obstacle out of the world; return whether there was one of that name."""
-        return self._world.obstacles.remove(name)
-
-    def clear_obstacles(self) -> None:
-        """Take all obstacles out of the world."""
-        self._world.obstacles.clear()
-
-    def contacts(self) -> list[Contact]:
-        """Return where obstacles pushed on the robot in the last physics step."""
-        return self._world.obstacles.contacts()
-
-    def link_pose(self, link: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return where a link is, by PyBullet's own joint positions.
-
-        Returns:
-            Position, shape (3,), m, and orientation, shape (4,), a quaternion x, y, z, w, of
-            any link of the URDF in the frame of its root link.
-        """
-        return self._world.pose(self._frame(link))
-
-    def close(self) -> None:
-        """Leave the physics world; after that the robot is of no more use."""
-        self._world.close()
-
     def _advance(
         self,
         substeps: int,
@@ -327,10 +237,3 @@ class BulletRobot:
         if self._brakes.any():
             self._brakes.fill(0.0)
             self._world.set_brakes(self._brakes)
-
-    def _frame(self, link: str) -> FramePlacement:
-        """Return the placement of `link`, or raise `RobotDescriptionError`."""
-        if link not in self._frames:
-            known = ", ".join(self._frames)
-            raise RobotDescriptionError(f"unknown link {link!r}; the URDF has: {known}")
-        return self._frames[link]

@@ -63,7 +63,6 @@ class BulletWorld:
         obstacles: what else is in the world.
         client_id: PyBullet's physics client; -1 when closed.
         body_id: the robot in that client.
-        step: makes a physics step.
         joint_states: returns a tuple for each joint: position, velocity, reaction, and what its
             brake applied.
 
@@ -82,7 +81,6 @@ class BulletWorld:
     ) -> None:
         self._bullet = bullet = _Client()
         self.client_id = bullet.id
-        self.step = bullet.stepSimulation
         bullet.setGravity(*gravity)
         bullet.setPhysicsEngineParameter(
             fixedTimeStep=physics_dt,
@@ -117,7 +115,7 @@ class BulletWorld:
         for joint, rotor in self._rotors.items():
             self._couple(joint, rotor)
         names = {index: link for link, index in self._links.items()}
-        self.obstacles = BulletObstacles(bullet, body, names, material)
+        self.obstacles = BulletObstacles(bullet, body, names, material, physics_dt, gravity)
 
     def _load(self, urdf: str) -> int:
         with tempfile.TemporaryDirectory() as directory:
@@ -145,12 +143,22 @@ class BulletWorld:
         # concern. PyBullet asks for v + ratio * v_rotor = 0.
         self._bullet.changeConstraint(gear, gearRatio=-1.0, erp=0.0, maxForce=_GEAR_TORQUE_MAX)
 
+    def step(self) -> None:
+        """Make a physics step."""
+        if self.obstacles:
+            self.obstacles.before_step()
+            self._bullet.stepSimulation()
+            self.obstacles.after_step()
+        else:
+            self._bullet.stepSimulation()
+
     def set_state(self, q: np.ndarray, v: np.ndarray) -> None:
         """Put the joints at positions `q`, rad, with velocities `v`, rad/s, shape (n,) each."""
         for index, *state in zip(self._joints, q.tolist(), v.tolist(), strict=True):
             self._bullet.resetJointState(self.body_id, index, *state)
             if index in self._rotors:
                 self._bullet.resetJointState(self.body_id, self._rotors[index], *state)
+        self.obstacles.reset()
 
     def set_torques(self, torques: np.ndarray) -> None:
         """Apply joint torques, shape (n,), N m."""

@@ -75,7 +75,6 @@ class Contact(NamedTuple):
     position: np.ndarray  # of the point on the robot, shape (3,), m
     normal: np.ndarray  # from the obstacle to the robot, shape (3,)
     force: np.ndarray  # of the obstacle on the robot, shape (3,), N
-    distance: float  # m, negative where the two overlap
 
 
 @dataclass(frozen=True)
@@ -84,22 +83,21 @@ class ContactMaterial:
 
     Args:
         friction: Coulomb's coefficient.
-        stiffness: N/m; 0 is rigid.
-        damping: N s/m, of obstacles that are not rigid.
+        stiffness: how much an obstacle as a whole resists being pressed, N/m.
+        damping: the same of its speed, N s/m.
 
     Raises:
-        ValueError: one of them is negative or not finite, or rigid obstacles are to be damped.
+        ValueError: one of them is not finite, the stiffness not positive, another one negative.
     """
 
     friction: float = 0.5
-    stiffness: float = 0.0
-    damping: float = 0.0
+    stiffness: float = 2e5
+    damping: float = 600.0
 
     def __post_init__(self) -> None:
         """Check."""
-        for name in ("friction", "stiffness", "damping"):
+        for name, low in (("friction", True), ("stiffness", False), ("damping", True)):
             value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"the {name} of obstacles must be finite and >= 0, not {value}")
-        if self.damping and not self.stiffness:
-            raise ValueError("obstacles without stiffness are rigid: they have no damping")
+            if not (math.isfinite(value) and (value > 0.0 or (low and value == 0.0))):
+                least = ">= 0" if low else "> 0"
+                raise ValueError(f"obstacle {name} must be finite and {least}, not {value}")

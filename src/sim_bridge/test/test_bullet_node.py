@@ -398,14 +398,14 @@ def test_obstacles_come_and_go_with_their_stamps(ros):
     obstacles.publish(MarkerArray(markers=markers))
     ros.wait_until(lambda: len(robot.node._world) == 3, "the obstacles")
     robot.step()
-    assert set(world._bodies) == {"first"}
+    assert world.names == {"first"}
     robot.step(times=2)
-    assert set(world._bodies) == {"first"}
+    assert world.names == {"first"}
     robot.step()
-    assert set(world._bodies) == {"second"}
+    assert world.names == {"second"}
     ros.wait_until(lambda: "obstacles: 2;" in robot.reported("commands_refused"))
     ros.call(Trigger, "bullet_node/reset", Trigger.Request())
-    assert not world._bodies
+    assert not world.names
 
 
 @pytest.mark.parametrize(("link", "force"), [("no_such_link", 1.0), ("panda_link4", math.nan)])
