@@ -4,6 +4,9 @@ For Panda and for TALOS' torso and arm, pairs chosen automatically, among a tabl
 and a ball. States are random ones around the start posture, at up to 1 rad/s. With cold caches
 means that other data has been read since the last call, as in a control loop. Beside it coal,
 called through Pinocchio, for the same capsules and for the convex hulls of the links' meshes.
+
+Whole controller steps with and without collision avoidance are timed in turns, in the states of
+one motion to random poses, as its parameter file sets the controller up.
 """
 
 from __future__ import annotations
@@ -18,11 +21,16 @@ import numpy as np
 import pinocchio as pin
 import yaml
 
+from torque_safety_controller import controller_parameters
+from torque_safety_controller.additional_torque import AdditionalTorque
 from torque_safety_controller.collision_avoidance import CollisionAvoidance
 from torque_safety_controller.collision_geometry import link_shapes, load_geometry
 from torque_safety_controller.collision_kernels import BOX, CAPSULES, HALF_SPACE, Pairs
 from torque_safety_controller.collision_model import CollisionModel, build_collision_model
 from torque_safety_controller.collision_obstacles import box, capsule, half_space, sphere
+from torque_safety_controller.controller import Controller
+from torque_safety_controller.robot_model import RobotModel
+from viability_bounds_pkg import bounds_parameters
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -56,17 +64,42 @@ class Robot:
         )
         urdf = read_urdf(values["robot_description"])
         self.name, self.dt = name, 2.0 / values["rate_hz"]
-        self.model = build_model(urdf, values["joints"], locked)
+        self.values = values
+        self.model = build_model(urdf, values["joints"], locked, values.get("rotor_inertia"))
         self.geometry = load_geometry(urdf, self.model, locked)
         self.q = np.array(values["start_positions"])
         self.a_min = np.array(values["acceleration_min"])
         self.a_max = np.array(values["acceleration_max"])
         build_collision_model(self.model, self.geometry, self.q)  # compiles
         start = time.perf_counter()
+        load_geometry(urdf, self.model, locked)
         self.collision = build_collision_model(
             self.model, self.geometry, self.q, SURROUNDINGS[name]
         )
         self.seconds = time.perf_counter() - start
+
+    def controller(self, collision: CollisionAvoidance | None) -> Controller:
+        """Return the controller that its parameter file describes."""
+        table = controller_parameters.TABLE
+        values = {row.name: row.coerce(self.values.get(row.name)) for row in table}
+        config = controller_parameters.make_configuration(values)
+        controller = Controller(
+            RobotModel(self.model, config.end_effector_frame, config.dt),
+            config.tau_max,
+            config.gains,
+            config.tau_rate_max,
+            AdditionalTorque(config.additional, config.task_rows),
+            config.qp_solver,
+            collision,
+        )
+        controller.warm_up()
+        return controller
+
+    def bounds(self):
+        """Return the function from a state to bounds that its parameter file describes."""
+        table = bounds_parameters.TABLE
+        values = {row.name: row.coerce(self.values.get(row.name)) for row in table}
+        return bounds_parameters.make_configuration(values, lambda _: self.model).solve
 
     def states(self, speed: float = 1.0) -> list[tuple[np.ndarray, ...]]:
         """Return arguments of `CollisionAvoidance.rows`."""
@@ -154,6 +187,42 @@ def pairs(robot: Robot) -> None:
             f"  {name:<22} {count:4d} pairs: {costs['near']:5.2f} us each with all its features, "
             f"{costs['far']:5.2f} us with most of them far"
         )
+
+
+def controllers(robot: Robot, goals: int = 5, duration: float = 1.0) -> None:
+    """Measure controller steps with and without collision avoidance, in turns."""
+    avoidance = robot.avoidance()
+    pair = {"with": robot.controller(avoidance), "without": robot.controller(None)}
+    bounds, dt = robot.bounds(), pair["with"].robot.dt
+    rng = np.random.default_rng(0)
+    q, v = robot.q.copy(), np.zeros(len(robot.q))
+    low, high = robot.values["position_min"], robot.values["position_max"]
+    data = robot.model.createData()
+    frame = robot.model.getFrameId(robot.values["end_effector_frame"])
+    times: dict[str, list[float]] = {"with": [], "without": []}
+    rows = []
+    for step in range(round(goals * duration / dt)):
+        if step % round(duration / dt) == 0:
+            pin.framesForwardKinematics(robot.model, data, rng.uniform(low, high))
+            for controller in pair.values():
+                controller.set_pose_goal(data.oMf[frame].copy())
+        lower, upper, _ = bounds(q, v)
+        for name in pair if step % 2 else reversed(pair):
+            start = time.perf_counter()
+            answer = pair[name].step(q, v, lower, upper)
+            times[name].append(time.perf_counter() - start)
+            if name == "with":
+                a = answer.a
+        rows.append(avoidance.count)
+        q, v = q + v * dt + 0.5 * a * dt * dt, v + a * dt
+    medians = {name: 1e6 * statistics.median(each) for name, each in times.items()}
+    slow = {name: 1e6 * float(np.percentile(each, 99)) for name, each in times.items()}
+    ratio = statistics.median(a / b for a, b in zip(times["with"], times["without"], strict=True))
+    print(
+        f"  controller step: {medians['with']:.0f} us with, {medians['without']:.0f} us without "
+        f"(99%: {slow['with']:.0f} and {slow['without']:.0f} us), {ratio:.2f} times as long in "
+        f"the median; rows {np.mean(rows):.1f}, {max(rows)} at most"
+    )
 
 
 def coal_pairs(robot: Robot) -> None:
@@ -254,6 +323,7 @@ def main() -> None:
         print("  not guarded:", ", ".join(model.left_out.get("near at start", [])) or "none")
         excess(robot)
         steps(robot)
+        controllers(robot)
         pairs(robot)
         coal_pairs(robot)
 
