@@ -13,17 +13,13 @@ from typing import Any
 
 import numpy as np
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import WrenchStamped
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
-from trajectory_msgs.msg import JointTrajectory
 
-from sim_bridge.recording import Recorder, Run
+from sim_bridge.recording import Run
+from sim_bridge.ros_run_listener import RunListener
 from sim_bridge.ros_scenario_messages import (
     Request,
     change_parameters,
@@ -34,15 +30,12 @@ from sim_bridge.ros_scenario_messages import (
 from sim_bridge.ros_scenario_sender import Caller, Outbox, ScenarioRefused
 from sim_bridge.scenario_events import ServiceEvent
 from sim_bridge.scenario_parameters import TABLE, make_configuration
-from viability_bounds_pkg.ros_parameters import (
-    NodeParameters,
-    ParameterError,
-)
-from viability_bounds_pkg.ros_runtime import make_executor, report_refusal, stamp_to_ns
+from viability_bounds_pkg.ros_parameters import NodeParameters, ParameterError
+from viability_bounds_pkg.ros_runtime import make_executor, report_refusal
 
-_RECORDING_QOS = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.BEST_EFFORT)
 _SHOW_PERIOD = 0.5
 _POLL_PERIOD = 0.02
+_REFUSALS = {"controller_node": "goals_refused", "bullet_node": "commands_refused"}
 _RESUME = Request("bullet_node/pause", SetBool, SetBool.Request(data=False))
 
 
@@ -67,10 +60,7 @@ class ScenarioNode(Node):
     Attributes:
         phase: how far it has come.
         failure: why it cannot be played on; None while it can.
-        stamp: of the last state, ns.
-        robot: the robot's last diagnostics, by key.
-        controller: the controller's.
-        bounds: the bounds node's.
+        heard: what the other nodes say.
     """
 
     def __init__(self, **node_arguments: Any) -> None:
@@ -83,16 +73,9 @@ class ScenarioNode(Node):
         self.config = config
         self.phase = Phase.GETTING_READY
         self.failure: ScenarioRefused | None = None
-        self.robot: dict[str, str] = {}
-        self.controller: dict[str, str] = {}
-        self.bounds: dict[str, str] = {}
-        self._recorder = Recorder(config.joints)
-        self._state: JointState | None = None
-        self.stamp = self._first = 0
-        self._period = 1
-        self._answered = False
-        self._index: list[int] | None = None
-        self._refused: tuple[str, ...] = ()
+        self.heard = RunListener(self, config.joints)
+        self._first, self._period = 0, 1
+        self._refused: dict[str, str] = {}
         self._halt = self._end = 0  # periods from the beginning
         frames = config.base_frame, config.end_effector_frame
         self._goals = Outbox(self, to_controller(config.scenario, *frames))
@@ -100,57 +83,17 @@ class ScenarioNode(Node):
         self._due = deque(e for e in config.scenario.events if isinstance(e, ServiceEvent))
         own = _RESUME, change_parameters("bullet_node", {})
         self._caller = Caller(self, [*own, *map(to_service, self._due)])
-        self.create_subscription(JointState, "joint_states", self._on_state, _RECORDING_QOS)
-        self.create_subscription(
-            JointTrajectory, "acceleration_limits", self._on_limits, _RECORDING_QOS
-        )
-        self.create_subscription(JointState, "joint_commands", self._on_command, _RECORDING_QOS)
-        self.create_subscription(WrenchStamped, "ft_wrench", self._on_wrench, _RECORDING_QOS)
-        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_POLL_PERIOD, self._proceed, clock=steady)
 
+    @property
+    def robot(self) -> dict[str, str]:
+        """The robot's last diagnostics, by key."""
+        return self.heard.diagnostics["bullet_node"]
+
     def recorded_run(self) -> Run:
         """Return what was recorded since the robot began to move."""
-        return self._recorder.run(self._first)
-
-    # What comes in
-
-    def _on_state(self, message: JointState) -> None:
-        if self._index is None:
-            where = {name: i for i, name in enumerate(message.name)}
-            if any(joint not in where for joint in self.config.joints):
-                return
-            self._index = [where[joint] for joint in self.config.joints]
-        self._state = message
-        self.stamp = stamp_to_ns(message.header.stamp)
-        self._recorder.add_state(self.stamp, *self._arrays(message.position, message.velocity))
-
-    def _arrays(self, *sequences) -> list[list[float]]:
-        return [[sequence[i] for i in self._index] for sequence in sequences]
-
-    def _on_limits(self, message: JointTrajectory) -> None:
-        lower, upper = (point.accelerations for point in message.points)
-        self._recorder.add_limits(stamp_to_ns(message.header.stamp), lower, upper)
-
-    def _on_command(self, message: JointState) -> None:
-        self._answered = True
-        self._recorder.add_torque(stamp_to_ns(message.header.stamp), message.effort)
-
-    def _on_wrench(self, message: WrenchStamped) -> None:
-        f, t = message.wrench.force, message.wrench.torque
-        stamp = stamp_to_ns(message.header.stamp)
-        self._recorder.add_wrench(stamp, (f.x, f.y, f.z, t.x, t.y, t.z))
-
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            values = {value.key: value.value for value in status.values}
-            if status.name == "controller_node":
-                self.controller = values
-            elif status.name == "bullet_node":
-                self.robot = values
-            elif status.name == "bounds_node":
-                self.bounds = values
+        return self.heard.recorder.run(self._first)
 
     # What happens when
 
@@ -175,7 +118,7 @@ class ScenarioNode(Node):
         topics = self._goals.unheard() + self._world.unheard()
         return (
             ([] if paused else ["a paused robot"])
-            + ([] if self._answered else ["joint commands"])
+            + ([] if self.heard.answered else ["joint commands"])
             + [f"service {service}" for service in self._caller.missing()]
             + [f"a subscriber of {topic}" for topic in topics]
         )
@@ -183,24 +126,25 @@ class ScenarioNode(Node):
     def _plan(self) -> None:
         # Resuming begins a period of its own: the first state that moves is the next.
         self._period = round(1e9 * float(self.robot["period_s"]))
-        self._first = self.stamp + self._period
+        self._first = self.heard.stamp + self._period
         self._end = round(1e9 * self.config.scenario.duration / self._period)
         self._refused = self._refusals()
 
     def _load(self) -> bool:
         """Send ahead what others have room for; return whether they have it all."""
-        refused = self._refusals()
-        if refused != self._refused:
-            raise ScenarioRefused(f"goals, pushes or obstacles refused: {' '.join(refused)}")
-        waiting = [
-            (self._goals, self.controller, "goals_pending"),
-            (self._world, self.robot, "world_changes_pending"),
-        ]
-        done = [out.proceed(self._first, int(of.get(key, 0))) for out, of, key in waiting]
-        return all(done)
+        for node, refused in self._refusals().items():
+            if refused != self._refused[node]:
+                raise ScenarioRefused(f"{node} refused what it was sent: {refused}")
+        goals = self.heard.diagnostics["controller_node"].get("goals_pending", 0)
+        changes = self.robot["world_changes_pending"]
+        loaded = self._goals.proceed(self._first, int(goals))
+        return self._world.proceed(self._first, int(changes)) and loaded
 
-    def _refusals(self) -> tuple[str, ...]:
-        return self.controller.get("goals_refused", ""), self.robot["commands_refused"]
+    def _refusals(self) -> dict[str, str]:
+        """Return what was refused so far, and how often, by node."""
+        return {
+            node: self.heard.diagnostics[node].get(key, "none") for node, key in _REFUSALS.items()
+        }
 
     def _play(self) -> None:
         # In lockstep it pauses where a service is to be called, and what it reports when it has
@@ -208,7 +152,7 @@ class ScenarioNode(Node):
         over = int(self.robot["stamp_ns"]) >= self._first + (self._halt - 1) * self._period
         if not over or self.robot["paused"] != "True":
             if self.robot["clock"] != "lockstep":
-                self._call((self.stamp - self._first) // self._period)
+                self._call((self.heard.stamp - self._first) // self._period)
         elif self._halt == self._end:
             self.phase = Phase.DONE
         else:
@@ -216,12 +160,10 @@ class ScenarioNode(Node):
 
     def _go_on(self) -> None:
         """Call what is due where the robot has halted, then let it go on to the next halt."""
-        now = self._halt
+        now, self._halt = self._halt, self._end
         self._call(now)
-        lockstep = self.robot["clock"] == "lockstep"
-        self._halt = (
-            min(self._end, self._period_of(self._due[0])) if self._due and lockstep else self._end
-        )
+        if self._due and self.robot["clock"] == "lockstep":
+            self._halt = min(self._end, self._period_of(self._due[0]))
         left = 1e-9 * self._period * (self._halt - now)
         self._caller.add("", change_parameters("bullet_node", {"pause_after": left}))
         self._caller.add("", _RESUME)
@@ -241,15 +183,16 @@ class ScenarioNode(Node):
 
     def live_line(self) -> str:
         """Return the state of the run in one line."""
-        if self.phase is Phase.GETTING_READY or self._state is None:
+        q = self.heard.q
+        if self.phase is Phase.GETTING_READY or q is None:
             return "waiting for the nodes"
-        q = np.array(self._arrays(self._state.position)[0])
         distance = np.minimum(q - self.config.q_min, self.config.q_max - q)
         nearest = int(np.argmin(distance))
-        error = float(self.controller.get("position_error_m", "nan"))
+        controller = self.heard.diagnostics["controller_node"]
+        error = float(controller.get("position_error_m", "nan"))
         return (
-            f"{max(0.0, (self.stamp - self._first) * 1e-9):6.2f} s  "
-            f"{self.controller.get('mode', '?'):<8}  "
+            f"{max(0.0, (self.heard.stamp - self._first) * 1e-9):6.2f} s  "
+            f"{controller.get('mode', '?'):<8}  "
             f"nearest limit {self.config.joints[nearest]} {distance[nearest]:+.4f} rad  "
             f"pose error {1e3 * error:7.2f} mm  "
             f"{float(self.robot.get('rate_hz', 'nan')):5.0f} Hz"
@@ -280,8 +223,8 @@ def play(node: ScenarioNode, others: Sequence[Node] = (), *, quiet: bool = False
         if node.failure is not None:
             raise node.failure
         now = time.monotonic()
-        if (node.stamp, node.phase) != progress:
-            progress, moved_at = (node.stamp, node.phase), now
+        if (node.heard.stamp, node.phase) != progress:
+            progress, moved_at = (node.heard.stamp, node.phase), now
         elif now - moved_at > node.config.ready_timeout:
             phase = node.phase.name.lower().replace("_", " ")
             awaited = ": there is no " + ", no ".join(node.awaited()) if node.awaited() else ""
@@ -318,11 +261,9 @@ def main(args: list[str] | None = None) -> int:
             return 0
         from sim_bridge.report import write_report  # matplotlib takes a second to import
 
-        return (
-            0
-            if write_report(out, node.config, node.recorded_run(), node.robot, node.bounds)
-            else 1
-        )
+        bounds = node.heard.diagnostics["bounds_node"]
+        kept = write_report(out, node.config, node.recorded_run(), node.robot, bounds)
+        return 0 if kept else 1
     except (TimeoutError, ScenarioRefused) as error:
         report_refusal(error)
         return 2

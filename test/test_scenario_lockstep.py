@@ -1,0 +1,134 @@
+"""A scenario with everything in it, played by the nodes and without them: the same numbers."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from chain import load_values, run_chain
+from direct import DirectLoop, column
+
+from sim_bridge.obstacles import Obstacle
+from sim_bridge.ros_scenario_sender import ScenarioRefused
+from torque_safety_controller.pose_trajectory import PoseTrajectory, circle
+
+ROBOT = "panda"
+DURATION = 0.9
+GAIN = 200.0  # 1/s^2
+BEGIN, DIAMETER, PERIOD = 0.1, 0.1, 0.7  # of the circle, s, m
+PUSHES = {"panda_link4": (0.2, 0.4, (0.0, 20.0, 0.0)), "panda_link6": (0.3, 0.5, (0.0, 0.0, 9.0))}
+"""From, to, s, and force, N: they overlap."""
+SIZE, OFFSET = np.array([0.3, 0.02, 0.3]), np.array([0.0, 0.16, 0.0])
+"""Of a box in the way of the hand, m."""
+GONE = 0.3  # s; while it is touched
+
+
+def events(pose):
+    orientation = pin.Quaternion(pose.rotation).coeffs()
+    round_trip = {
+        "start": pose.translation.tolist(),
+        "diameter": DIAMETER,
+        "plane": ["y", "z"],
+        "phase": -0.5 * np.pi,
+        "period": PERIOD,
+        "orientation": (orientation / np.linalg.norm(orientation)).tolist(),
+    }
+    box = {"name": "box", "shape": "box", "size": SIZE.tolist()}
+    box["position"] = (pose.translation + OFFSET).tolist()
+    yield {"time": BEGIN, "trajectory": {"circle": round_trip}}
+    yield {"time": 0.15, "obstacle": box}
+    for link, (begin, end, force) in PUSHES.items():
+        push = {"link": link, "duration": end - begin, "force": list(force)}
+        yield {"time": begin, "push": push}
+    change = {"node": "controller_node", "values": {"pose_kp": GAIN}}
+    yield {"time": 0.25, "parameters": change}
+    yield {"time": GONE, "remove_obstacle": {"name": "box"}}
+
+
+def play_directly():
+    """Return the samples of a loop without messages, and how often the box was touched."""
+    loop = DirectLoop(ROBOT)
+    start = loop.pose()
+    trajectory = PoseTrajectory(circle(start, DIAMETER, PERIOD, 1))
+    touched = []
+
+    def before(t):
+        k = round(t / loop.dt)
+        due = {round(time / loop.dt): time for time in (0.15, 0.25, GONE)}.get(k)
+        if due == 0.15:
+            position = start.translation + OFFSET
+            loop.robot.add_obstacle(Obstacle("box", "box", SIZE, position))
+        elif due == 0.25:
+            loop.change(pose_kp=GAIN)
+        elif due == GONE:
+            loop.robot.remove_obstacle("box")
+        for link, (begin, end, force) in PUSHES.items():
+            on = round(begin / loop.dt) <= k < round(end / loop.dt)
+            loop.robot.apply_wrench(link, force if on else np.zeros(3), np.zeros(3))
+        if k >= round(BEGIN / loop.dt):
+            loop.controller.set_pose_goal(*trajectory.sample(t - BEGIN))
+        touched.append(len(loop.robot.contacts()) > 0)
+
+    return loop.run(DURATION, before), np.array(touched), start
+
+
+def test_the_nodes_play_what_a_loop_without_messages_plays():
+    samples, touched, start = play_directly()
+    scenario = {"duration": DURATION, "events": list(events(start))}
+    runs = [run_chain(load_values(ROBOT), scenario, {}).run for _ in range(2)]
+    for name in ("t", "q", "v", "tau"):
+        np.testing.assert_array_equal(*(getattr(run, name) for run in runs))
+    # Rounding; a push or a gain one step early or late makes a hundred times as much and more.
+    np.testing.assert_allclose(runs[0].q, column(samples, "q"), atol=1e-6)
+    assert touched.sum() > 20
+
+
+def rest():
+    values = load_values(ROBOT)
+    return dict(zip(values["joints"], values["start_positions"], strict=True))
+
+
+def test_torque_control_is_handed_over_and_back():
+    scenario = {
+        "duration": 0.4,
+        "events": [
+            {"time": 0.0, "posture": rest()},
+            {"time": 0.1, "enable_torque": False},
+            {"time": 0.3, "enable_torque": True},
+        ],
+    }
+    result = run_chain(load_values(ROBOT), scenario, {})
+    run = result.run
+    by_drives = np.isnan(run.tau).any(axis=1)
+    assert not by_drives[run.t < 0.099].any()
+    assert by_drives[(run.t > 0.101) & (run.t < 0.299)].all()
+    assert not by_drives[run.t > 0.305].any()
+    assert run.lost == 0
+    assert result.vector("torque_ratio").max() <= 1.0 + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("event", "names"),
+    [
+        (
+            {"time": 0.1, "parameters": {"node": "controller_node", "values": {"pose_kp": -1.0}}},
+            ("at 0.1 s: controller_node/set_parameters", "pose_kp"),
+        ),
+        ({"time": 0.1, "call": {"service": "bullet_node/no"}}, ("no service bullet_node/no",)),
+        (
+            {"time": 0.1, "posture": {**rest(), "panda_joint4": 0.5}},
+            ("controller_node refused", "target_posture: 1"),
+        ),
+        (
+            {"time": 0.1, "push": {"link": "no_link", "duration": 1.0}},
+            ("bullet_node refused", "external_wrench: "),
+        ),
+    ],
+)
+def test_what_is_refused_ends_the_scenario_and_says_why(event, names):
+    with pytest.raises((ScenarioRefused, TimeoutError)) as error:
+        run_chain(
+            load_values(ROBOT),
+            {"duration": 0.3, "events": [event]},
+            {"scenario_node": {"ready_timeout": 1.0}},
+        )
+    for name in names:
+        assert name in str(error.value)
