@@ -4,11 +4,16 @@
 arm:
 
     g_ob = -Kp (F_ref - F) - Kv (F_ref' - F').                                         (27)
+
+Alone in the air, (27) and the damping kd of the pose task, with equal weights, would let the hand
+go at Kp |F_ref| / kd. A limit of that speed, which the paper has not, keeps it from rushing at
+what it is to touch, and from running away when what it leans on gives way.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,32 +29,46 @@ class AdmittanceGains:
         force_kd: m/s^2 per N/s.
         moment_kp: rad/s^2 per N m.
         moment_kd: rad/s^2 per N m/s.
+        speed_max: m/s that it asks for at most, against the damping of the pose task.
+        turn_max: rad/s, likewise.
     """
 
     force_kp: float = 5e-3
     force_kd: float = 1e-7
     moment_kp: float = 5e-3
     moment_kd: float = 1e-7
+    speed_max: float = math.inf
+    turn_max: float = math.inf
 
-    def rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the diagonals of Kp and Kv, shape (6,) each."""
-        force_kp, force_kd, moment_kp, moment_kd = (getattr(self, f.name) for f in fields(self))
-        return (
-            np.array([force_kp] * 3 + [moment_kp] * 3),
-            np.array([force_kd] * 3 + [moment_kd] * 3),
-        )
+    def acceleration(
+        self, error: np.ndarray, error_rate: np.ndarray, damping: float
+    ) -> np.ndarray:
+        """Return g_ob of (27), shape (6,), m/s^2 and rad/s^2, within the limits of speed.
+
+        Args:
+            error: F_ref - F, shape (6,), N and N m.
+            error_rate: its time derivative, shape (6,).
+            damping: that it acts against, 1/s.
+        """
+        g = np.empty(6)
+        for part, kp, kd, most in (
+            (slice(0, 3), self.force_kp, self.force_kd, self.speed_max),
+            (slice(3, 6), self.moment_kp, self.moment_kd, self.turn_max),
+        ):
+            asked = -kp * error[part] - kd * error_rate[part]
+            size, most = math.sqrt(asked.dot(asked)), damping * most
+            g[part] = asked * (most / size) if size > most else asked
+        return g
 
 
 def admittance_task(
     J: np.ndarray,
     drift: np.ndarray,
-    error: np.ndarray,
-    error_rate: np.ndarray,
-    gains: AdmittanceGains,
+    acceleration: np.ndarray,
     weight: float,
     rows: np.ndarray | None = None,
 ) -> TaskTerm:
-    """Return (27) as a task on the accelerations.
+    """Return (27) as a task on the joint accelerations.
 
     It shares the Jacobian of the pose task. With the weight of that, each is served by half, as
     in the paper: along a direction of both the hand accelerates by their mean.
@@ -57,14 +76,11 @@ def admittance_task(
     Args:
         J: Jacobian of the end effector in its own axes, shape (6, n).
         drift: its acceleration at zero joint acceleration, shape (6,).
-        error: F_ref - F, shape (6,), N and N m.
-        error_rate: its time derivative, shape (6,).
-        gains: Kp and Kv.
+        acceleration: g_ob, shape (6,).
         weight: of the squared error of acceleration.
         rows: directions in which it acts, shape (m,), indices; None for all.
     """
-    kp, kd = gains.rows()
-    b = -kp * error - kd * error_rate - drift
+    b = acceleration - drift
     if rows is None:
         return TaskTerm(J, b, weight)
     return TaskTerm(np.ascontiguousarray(J[rows]), b[rows], weight)

@@ -74,7 +74,7 @@ class InteractionSettings:
     force_step: float = 0.5
     closed: tuple[int, ...] = ()
     dual: DualSettings | None = None
-    yielding_gains: AdmittanceGains = AdmittanceGains(0.1, 0.0, 1.0, 0.0)
+    yielding_gains: AdmittanceGains = AdmittanceGains(0.1, 0.0, 1.0, 0.0, 0.25, 1.0)
 
 
 class Interaction:
@@ -247,16 +247,15 @@ class Interaction:
         if weight == 0.0 or self.state not in (Compliance.FORCE, Compliance.YIELDING):
             return []
         F, rate = self.sensor.wrench, self.sensor.rate
+        # Of the mean of the two tasks, see `admittance_task`.
+        damping = gains.pose_kd * gains.pose_weight / weight
         if self.state is Compliance.YIELDING:
-            return [
-                admittance_task(robot.J, robot.drift, -F, -rate, settings.yielding_gains, weight)
-            ]
+            led = settings.yielding_gains.acceleration(-F, -rate, damping)
+            return [admittance_task(robot.J, robot.drift, led, weight)]
         error, error_rate = self.reference - F, self._goal_rate - rate
-        return [
-            admittance_task(
-                robot.J, robot.drift, error, error_rate, settings.gains, weight, self._rows
-            )
-        ]
+        error[~settings.directions] = error_rate[~settings.directions] = 0.0
+        moved = settings.gains.acceleration(error, error_rate, damping)
+        return [admittance_task(robot.J, robot.drift, moved, weight, self._rows)]
 
     def forces(self, robot: RobotModel) -> ContactForces | None:
         """Return what contacts may exert in this step, with their wrench tasks; None if nothing.
@@ -286,7 +285,7 @@ class Interaction:
     ) -> tuple[list[TaskTerm], ContactForces | None]:
         """Return tasks and forces of every kind that there may be, to compile what they need."""
         zero, weight = np.zeros(6), max(gains.pose_weight, 1.0)
-        common = robot.J, robot.drift, zero, zero, self._settings.gains, weight
+        common = robot.J, robot.drift, zero, weight
         tasks = [admittance_task(*common), admittance_task(*common, np.arange(1))]
         contacts = self.contacts
         if contacts is None:

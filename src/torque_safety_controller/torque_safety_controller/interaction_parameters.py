@@ -59,6 +59,14 @@ TABLE = (
     Parameter("admittance_moment_kp", float, "gain of (27), rad/s^2 per N m", 5e-3, live=True),
     Parameter("admittance_moment_kd", float, "gain of (27), rad/s^2 per N m/s", 1e-7, live=True),
     Parameter(
+        "admittance_speed_max",
+        list[float],
+        "speeds at which the hand looks for what it is to press on, m/s and rad/s; 0.01 and 0.05 "
+        "if empty",
+        np.zeros(0),
+        live=True,
+    ),
+    Parameter(
         "admittance_weight", float, "weight of the task; -1: that of the pose task", -1.0, True
     ),
     Parameter("wrench_weight", float, "weight of a wrench task, > 0", 10.0, live=True),
@@ -77,6 +85,13 @@ TABLE = (
     Parameter("yield_release", float, "share of both below which it stops", 0.5, live=True),
     Parameter("yield_force_kp", float, "how easily it is led, m/s^2 per N", 0.1, live=True),
     Parameter("yield_moment_kp", float, "how easily, rad/s^2 per N m", 1.0, live=True),
+    Parameter(
+        "yield_speed_max",
+        list[float],
+        "speeds at which it is led at most, m/s and rad/s; 0.25 and 1 if empty",
+        np.zeros(0),
+        live=True,
+    ),
     Parameter(
         "contact_frames",
         list[str],
@@ -158,7 +173,8 @@ def interaction_settings(values: Mapping[str, Any]) -> InteractionSettings:
             *(
                 positive(values, f"admittance_{name}", zero=True)
                 for name in ("force_kp", "force_kd", "moment_kp", "moment_kd")
-            )
+            ),
+            *_speeds(values, "admittance_speed_max", (0.01, 0.05)),
         ),
         weight=None if weight == -1.0 else positive(values, "admittance_weight"),
         wrench_weight=positive(values, "wrench_weight"),
@@ -171,6 +187,7 @@ def interaction_settings(values: Mapping[str, Any]) -> InteractionSettings:
             0.0,
             positive(values, "yield_moment_kp", zero=True),
             0.0,
+            *_speeds(values, "yield_speed_max", (0.25, 1.0)),
         ),
     )
 
@@ -181,6 +198,17 @@ def _dual(values: Mapping[str, Any]) -> DualSettings | None:
     if release > 1.0:
         raise ParameterError("yield_release", release, "a number from 0 to 1")
     return DualSettings(force, moment, release) if values["dual_compliance"] else None
+
+
+def _speeds(
+    values: Mapping[str, Any], name: str, default: tuple[float, float]
+) -> tuple[float, float]:
+    value = values[name]
+    if not len(value):
+        return default
+    if len(value) != 2 or not (np.isfinite(value) & (value > 0.0)).all():
+        raise ParameterError(name, value, "two finite numbers > 0, m/s and rad/s")
+    return float(value[0]), float(value[1])
 
 
 def _six(values: Mapping[str, Any], name: str) -> np.ndarray:
