@@ -57,7 +57,7 @@ class CollisionModel:
         names: of the two bodies of each pair, ``link - link`` or ``link - obstacle``.
         capsules: of each link, in the axes of the joint that moves it.
         left_out: pairs that were pruned, by reason: ``far``, ``near at start``,
-            ``near mostly``.
+            ``near mostly``; with obstacles ``near always``, as what the arm is mounted on.
     """
 
     chain: Chain
@@ -90,7 +90,8 @@ def build_collision_model(
             neighbours, less those that `pruning` leaves out.
         base_frame: that obstacles are given in; None: the URDF's root. Fixed to the base.
         capsules_per_link: at most.
-        pruning: of the pairs; it also leaves out obstacles that a link cannot come near.
+        pruning: of the pairs; it also leaves out obstacles that a link cannot come near, or
+            cannot get away from.
 
     Raises:
         CollisionError: an unknown link, a frame that moves, names that are not different, a
@@ -227,6 +228,8 @@ def _prune(model, chain, bodies, candidates, own, automatic, q_start, pruning):
         reason = ""
         if nearest[k] > pruning.near:
             reason = "far"
+        elif k >= own and often[k] == pruning.samples:
+            reason = "near always"
         elif automatic and k < own:
             if at_start[k] < least:
                 reason = "near at start"

@@ -24,6 +24,7 @@ _BLUNT = 1e-3  # m; axes nearer than this have met, and no curvature is told any
 _PARALLEL = 1e-2
 _LEAST_BRAKING = 1e-2  # m/s^2
 _LEAST_SHARE = 0.1
+_LEVER = 0.1  # m/rad
 _ROUNDING = 1e-9
 
 
@@ -165,7 +166,7 @@ def write_row(pair, d, radius, n, p, joint, o, other, sliding, step, chain, moti
         ) / d
     k = rows.count[0]
     G = rows.G[k]
-    brake, most, least, pushed = 0.0, 0.0, 0.0, 0.0
+    brake, lever, most, least, pushed = 0.0, 0.0, 0.0, 0.0, 0.0
     axes, origins, slides = motion.axis, motion.origin, chain.slides
     moves, moves_other = chain.moved_by[joint], chain.moved_by[other]
     a_lower, a_upper, a_brake = step.a_lower, step.a_upper, step.a_brake
@@ -177,6 +178,7 @@ def write_row(pair, d, radius, n, p, joint, o, other, sliding, step, chain, moti
             g -= _lever(at(axes, m + 1), at(origins, m + 1), slides[m + 1], o, n)
         G[m] = g
         brake += abs(g) * a_brake[m]
+        lever = max(lever, abs(g))
         pushed += g * step.disturbance[m]
         low, high = g * a_lower[m], g * a_upper[m]
         most += max(low, high)
@@ -185,7 +187,12 @@ def write_row(pair, d, radius, n, p, joint, o, other, sliding, step, chain, moti
     braking = min(law.braking, law.share * brake)
     braking = max(min(braking, law.share * brake + bias), _LEAST_SHARE * braking, _LEAST_BRAKING)
     room = d - radius - law.margin - law.reserve
-    wanted = _lowest(room, rate, braking, step, rows.joint, rows.kept) - bias - min(pushed, 0.0)
+    wanted = _lowest(room, rate, braking, step, rows.joint, rows.kept)
+    if room < 0.0:
+        # Where a distance is greatest its levers vanish, and so does what is asked for.
+        gentle = min(law.braking, law.share * brake) * min(1.0, lever / _LEVER)
+        wanted = min(wanted, _recovery(room, rate, gentle, law))
+    wanted -= bias + min(pushed, 0.0)
     if wanted <= least:
         return
     rounding = _ROUNDING * (1e-3 + abs(most) + abs(least))
@@ -248,13 +255,20 @@ def _lowest(room, rate, braking, step, x, kept):
     ranges, sides, budgets, speeds = step.ranges, step.sides, step.budgets, step.speeds
     solve(x[0], x[1], ranges, sides, budgets, speeds, x[2], x[3], kept)
     law = step.law
-    lowest = max(x[2, 0, 0] * braking, (-law.speed_max - rate) / law.dt)
-    if room < 0.0:
-        # Beyond the limit, back within a step is enough: full braking would be a kick there,
-        # and rounding alone takes a distance at rest on its limit beyond it.
-        back = -2.0 * (room / law.dt + rate) / law.dt
-        lowest = min(lowest, back, (law.recovery_speed - rate) / law.dt)
-    return lowest
+    return max(x[2, 0, 0] * braking, (-law.speed_max - rate) / law.dt)
+
+
+@compiled
+def _recovery(room, rate, gentle, law):
+    """Return the acceleration of a distance beyond its limit with which it gets back well enough.
+
+    The approach ends at once; then it accelerates by `gentle`, up to the speed of recovery. To be
+    back within a step is always enough: full braking would be a kick there, and rounding alone
+    takes a distance at rest on its limit beyond it.
+    """
+    back = -2.0 * (room / law.dt + rate) / law.dt
+    stop = max(-rate, 0.0) / law.dt
+    return min(back, stop + gentle, (law.recovery_speed - rate) / law.dt)
 
 
 @compiled

@@ -10,6 +10,12 @@ from torque_safety_controller.controller import Step
 if TYPE_CHECKING:
     from rclpy.impl.rcutils_logger import RcutilsLogger
 
+_MEANING = {
+    "near at start": "as they are near each other in collision_posture",
+    "near mostly": "as they are near each other in most postures",
+    "near always": "as they are near each other in all postures",
+}
+
 _SLIGHT = 1e-3  # m; less than this inside the margin is no news
 
 
@@ -35,13 +41,10 @@ class CollisionReport:
             f"collision avoidance keeps {len(avoidance.model.names)} pairs of shapes "
             f"{avoidance.settings.margin:g} m apart"
         )
-        for reason in ("near at start", "near mostly"):
+        for reason, meaning in _MEANING.items():
             pairs = sorted(set(avoidance.model.left_out.get(reason, ())))
             if pairs:
-                logger.warning(
-                    f"not kept apart, {_MEANING[reason]}: {', '.join(pairs)}; "
-                    "to keep them, list collision_pairs"
-                )
+                logger.warning(f"not kept apart, {meaning}: {', '.join(pairs)}")
 
     def note(self, step: Step) -> None:
         """Look at the distances in a step."""
@@ -74,9 +77,3 @@ class CollisionReport:
             "collision_not_viable_steps": self._not_viable_steps,
             "collision_relaxed_steps": self._relaxed_steps,
         }
-
-
-_MEANING = {
-    "near at start": "as they are near each other in collision_posture",
-    "near mostly": "as they are near each other in most postures",
-}
