@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from xml.etree.ElementTree import fromstring
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sim_bridge.bullet_world import BulletWorld
+from sim_bridge.force_torque_sensor import ForceTorqueSensor, Push
 from sim_bridge.obstacles import Contact, ContactMaterial, Obstacle
+from sim_bridge.urdf_links import carried_links
 from sim_bridge.urdf_preparation import FramePlacement, prepare_urdf
 from sim_bridge.vectors import finite_vector
 from viability_bounds_pkg.robot_description import RobotDescriptionError
@@ -29,6 +32,7 @@ class BulletBody:
         visuals: load the visual shapes, for cameras.
         collisions: load the collision shapes, meshes as their convex hulls, for contacts.
         material: of obstacles; hard, with a friction of 0.5, by default.
+        sensor_frame: link that is a force/torque sensor; none if empty.
         rotor_inertias: as `prepare_urdf` has them.
         direct_solver: as `BulletWorld` has it.
 
@@ -54,6 +58,7 @@ class BulletBody:
         visuals: bool = False,
         collisions: bool = True,
         material: ContactMaterial | None = None,
+        sensor_frame: str = "",
         rotor_inertias: Mapping[str, float] | None = None,
         direct_solver: bool = False,
     ) -> None:
@@ -68,6 +73,7 @@ class BulletBody:
             visuals=visuals,
             collisions=collisions,
             mechanical_stops=mechanical_stops,
+            apart=carried_links(fromstring(urdf_text), sensor_frame) if sensor_frame else (),
             mass_scales=mass_scales,
             rotor_inertias=rotor_inertias,
         )
@@ -82,6 +88,17 @@ class BulletBody:
             direct_solver,
             material or ContactMaterial(),
         )
+        self._sensor = None
+        if sensor_frame:
+            self._sensor = ForceTorqueSensor(
+                urdf_text,
+                sensor_frame,
+                self.joints,
+                locked_positions,
+                mass_scales,
+                gravity,
+                physics_dt,
+            )
         self.client_id, self.body_id = self._world.client_id, self._world.body_id
 
     def apply_wrench(self, link: str, force: ArrayLike, torque: ArrayLike) -> None:
@@ -128,6 +145,27 @@ class BulletBody:
     def contacts(self) -> list[Contact]:
         """Return where obstacles pushed on the robot in the last physics step."""
         return self._world.obstacles.contacts()
+
+    def sensor_wrench(self) -> np.ndarray:
+        """Return what the force/torque sensor felt in the last physics step.
+
+        Returns:
+            Force, N, and moment, N m, on the sensor of all that is mounted on it: contacts and
+            pushes, weight and inertia; at the origin of `sensor_frame`, in its axes, shape (6,).
+            Right after a reset it is what it would feel if nothing accelerated.
+
+        Raises:
+            ValueError: there is no sensor.
+        """
+        if self._sensor is None:
+            raise ValueError("the robot has no force/torque sensor")
+        return self._sensor.wrench.copy()
+
+    def _feel(self, q: np.ndarray, v: np.ndarray, v_next: np.ndarray) -> None:
+        """Let the sensor feel a step from (q, v) to v_next; see `ForceTorqueSensor`."""
+        pushes = [Push(link, None, *wrench[1:]) for link, wrench in self._wrenches.items()]
+        pushes += [Push(*force) for force in self._world.obstacles.forces()]
+        self._sensor.update(q, v, v_next, pushes)
 
     def link_pose(self, link: str) -> tuple[np.ndarray, np.ndarray]:
         """Return where a link is, by PyBullet's own joint positions.

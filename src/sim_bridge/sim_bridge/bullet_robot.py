@@ -122,6 +122,8 @@ class BulletRobot(BulletBody):
         self._q[:], self._v[:] = raw, v
         self._motor_torque.fill(0.0)
         self._driving = self._stepped = False
+        if self._sensor is not None:
+            self._feel(self._q, self._v, self._v)
 
     def step(self, tau: ArrayLike, substeps: int = 1) -> None:
         """Apply joint torques for some physics steps.
@@ -202,7 +204,7 @@ class BulletRobot(BulletBody):
         if substeps < 1:
             raise ValueError(f"substeps must be at least 1, not {substeps}")
         world = self._world
-        state_matters = target is not None or self._gears is not None
+        state_matters = target is not None or self._gears is not None or self._sensor is not None
         for remaining in range(substeps, 0, -1):
             if target is not None:
                 self._motor_torque[:] = self._drive.torque(*self.state()[:2], *target)
@@ -216,12 +218,15 @@ class BulletRobot(BulletBody):
             self._stepped = True
             if self.monitor is None and remaining > 1 and not state_matters:
                 continue
+            before = self._q.copy(), self._v.copy()
             states = world.joint_states()
             self._q[:] = [state[0] for state in states]
             self._v[:] = [state[1] for state in states]
             if braking:  # PyBullet counts friction in, and the last of a brake now off
                 applied = [state[3] for state in states]
                 self._motor_torque[:] = np.clip(applied, -self._brakes, self._brakes)
+            if self._sensor is not None and remaining == 1:
+                self._feel(*before, self._v)
             if self.monitor is not None:
                 self.monitor.update(self._q, self._v, self._motor_torque)
 

@@ -63,3 +63,36 @@ def placed_shapes(
             continue
         shapes.append(shape)
     return shapes
+
+
+def carried_links(root: Element, link: str) -> list[str]:
+    """Return the links of the URDF `root` that are mounted on `link`.
+
+    Raises:
+        RobotDescriptionError: there is no such link, or nothing is mounted on it.
+    """
+    known = [element.get("name", "") for element in root.findall("link")]
+    if link not in known:
+        raise RobotDescriptionError(f"unknown link {link!r}; the URDF has: {', '.join(known)}")
+    carried = _children(root).get(link)
+    if not carried:
+        raise RobotDescriptionError(f"link {link!r} carries nothing that could be felt")
+    return carried
+
+
+def links_beyond(root: Element, link: str) -> set[str]:
+    """Return `link` and all links of the URDF `root` that it carries, directly or not."""
+    children, beyond, pending = _children(root), set(), [link]
+    while pending:
+        name = pending.pop()
+        beyond.add(name)
+        pending += children.get(name, ())
+    return beyond
+
+
+def _children(root: Element) -> dict[str, list[str]]:
+    children: dict[str, list[str]] = {}
+    for joint in root.findall("joint"):
+        parent, child = (joint.find(end).get("link", "") for end in ("parent", "child"))
+        children.setdefault(parent, []).append(child)
+    return children
