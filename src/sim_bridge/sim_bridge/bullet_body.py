@@ -146,6 +146,10 @@ class BulletBody:
         """Return where obstacles pushed on the robot in the last physics step."""
         return self._world.obstacles.contacts()
 
+    def contact_force(self) -> tuple[float, float]:
+        """Return the largest force of an obstacle, N: in the last step, and since the reset."""
+        return self._world.obstacles.force, self._world.obstacles.force_max
+
     def sensor_wrench(self) -> np.ndarray:
         """Return what the force/torque sensor felt in the last physics step.
 

@@ -20,6 +20,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from sim_bridge.bullet_parameters import TABLE, make_configuration, make_robot
 from sim_bridge.limit_monitor import LimitMonitor
+from sim_bridge.ros_ft_sensor import ForceTorquePublisher
 from sim_bridge.ros_joint_command import CommandError, JointCommand, TorqueCommand, read_command
 from sim_bridge.ros_world_inbox import WorldInbox
 from viability_bounds_pkg.ros_messages import Diagnostics
@@ -78,6 +79,9 @@ class BulletNode(Node):
         self._advanced = True
         self._refused: Counter[str] = Counter()
         self._world = WorldInbox(self, self._robot, config.external_wrench_timeout, self._refused)
+        self._ft_publisher = None
+        if config.sensor.frame:
+            self._ft_publisher = ForceTorquePublisher(self, self._robot, config.sensor)
         self._restart()
 
         self._state = JointState(name=list(config.joints))
@@ -103,6 +107,8 @@ class BulletNode(Node):
         n = len(config.joints)
         self._world.clear()
         self._robot.reset(config.q_start, np.zeros(n))
+        if self._ft_publisher is not None:
+            self._ft_publisher.restart()
         self._monitor.reset()
         self._command: JointCommand | None = None
         self._missed_in_row = self._missed = self._braked = 0
@@ -132,6 +138,8 @@ class BulletNode(Node):
         set_stamp(state.header.stamp, self._stamp)
         if self._clock_publisher is not None:
             self._clock_publisher.publish(ClockMessage(clock=state.header.stamp))
+        if self._ft_publisher is not None:  # first, for who waits for both
+            self._ft_publisher.publish(self._stamp)
         self._published_at = time.monotonic()
         self._state_publisher.publish(state)
 
@@ -176,6 +184,8 @@ class BulletNode(Node):
         """Send the state again if the chain lost it, or does not listen yet."""
         waiting = self._paused or (self._config.lockstep and not self._advanced)
         if waiting and time.monotonic() - self._published_at > _RETRY_PERIOD:
+            if self._ft_publisher is not None:
+                self._ft_publisher.repeat()
             self._state_publisher.publish(self._state)
 
     # Commands
@@ -237,6 +247,7 @@ class BulletNode(Node):
         latencies = np.array(self._latencies) if self._latencies else np.full(1, np.nan)
         median, slow = np.percentile(latencies, (50, 99)) * 1e6
         elapsed = time.monotonic() - self._started_at
+        contact_force, contact_force_max = self._robot.contact_force()
         values = {
             "clock": "lockstep" if self._config.lockstep else "real_time",
             "paused": self._paused,
@@ -250,6 +261,8 @@ class BulletNode(Node):
             "braked_periods": self._braked,
             "commands_refused": self._refused,
             "world_changes_pending": len(self._world),
+            "contact_force_n": contact_force,
+            "contact_force_max_n": contact_force_max,
             "latency_p50_us": float(median),
             "latency_p99_us": float(slow),
             "commanded_torque_ratio_max": self._torque_ratio,

@@ -62,6 +62,10 @@ class BulletObstacles:
         material: of the obstacles.
         physics_dt: the physics step, s.
         gravity: shape (3,), m/s^2.
+
+    Attributes:
+        force: the largest that one obstacle exerted in the last physics step, N.
+        force_max: the same of all steps since the last reset, N.
     """
 
     def __init__(
@@ -82,6 +86,7 @@ class BulletObstacles:
         # By link and body of the obstacle, of those in touch.
         self._bristles: dict[tuple[int, int], Bristle] = {}
         self._points: dict[tuple[int, int], np.ndarray] = {}
+        self.force = self.force_max = 0.0
         self._friction: list[tuple[tuple[int, int], LinkForce]] = []
 
     def __len__(self) -> int:
@@ -141,6 +146,7 @@ class BulletObstacles:
         if surface is None:
             return False
         del self._by_body[surface.body]
+        self.force = 0.0
         for key in [key for key in self._bristles if key[1] == surface.body]:
             del self._bristles[key]
             self._points.pop(key, None)
@@ -186,7 +192,8 @@ class BulletObstacles:
             self._friction.append((key, LinkForce(self._links[link], point, force)))
 
     def reset(self) -> None:
-        """Let go of the robot."""
+        """Let go of the robot, and forget how hard it was pushed."""
+        self.force = self.force_max = 0.0
         self._bristles.clear()
         self._points.clear()
         self._friction.clear()
@@ -212,8 +219,14 @@ class BulletObstacles:
         self._bristles = {
             key: known.get(key) or Bristle(self._dt, self._material.stiffness) for key in rows
         }
-        for _, body in rows:
-            self._by_body[body].moved = True
+        total: dict[int, np.ndarray] = {}
+        for key, points in self._points.items():
+            total[key[1]] = total.get(key[1], 0.0) + points[:, 6] @ points[:, 3:6]
+            self._by_body[key[1]].moved = True
+        for (_, body), friction in self._friction:
+            total[body] = total.get(body, 0.0) + friction.force
+        self.force = max((float(np.linalg.norm(force)) for force in total.values()), default=0.0)
+        self.force_max = max(self.force, self.force_max)
 
     def forces(self) -> list[LinkForce]:
         """Return all that acted on the robot in the last physics step."""

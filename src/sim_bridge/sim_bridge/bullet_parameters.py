@@ -11,6 +11,8 @@ import numpy as np
 
 from sim_bridge.bullet_robot import BulletRobot
 from sim_bridge.gears import DEFAULT_STRIBECK_VELOCITY, Gears
+from sim_bridge.obstacles import ContactMaterial
+from sim_bridge.ros_ft_sensor import SENSOR_TABLE, SensorConfiguration, sensor_configuration
 from viability_bounds_pkg.robot_description import RobotDescriptionError
 from viability_bounds_pkg.ros_parameters import (
     Parameter,
@@ -29,6 +31,7 @@ from viability_bounds_pkg.ros_robot_parameters import (
 )
 
 CLOCKS = ("real_time", "lockstep")
+_MATERIAL = ContactMaterial()
 
 TABLE = (
     *ROBOT_TABLE,
@@ -95,6 +98,25 @@ TABLE = (
     Parameter(
         "external_wrench_timeout", float, "how long a push lasts, s of robot time", default=0.5
     ),
+    Parameter(
+        "obstacle_friction",
+        float,
+        "Coulomb's coefficient between robot and obstacles",
+        default=_MATERIAL.friction,
+    ),
+    Parameter(
+        "obstacle_stiffness",
+        float,
+        "how much an obstacle resists being pressed, N/m",
+        default=_MATERIAL.stiffness,
+    ),
+    Parameter(
+        "obstacle_damping",
+        float,
+        "the same of the speed of being pressed, N s/m",
+        default=_MATERIAL.damping,
+    ),
+    *SENSOR_TABLE,
 )
 
 
@@ -120,6 +142,8 @@ class BulletConfiguration:
     pause_after: float
     publish_clock: bool
     external_wrench_timeout: float
+    material: ContactMaterial
+    sensor: SensorConfiguration
 
 
 def make_configuration(values: Mapping[str, Any]) -> BulletConfiguration:
@@ -159,6 +183,12 @@ def make_configuration(values: Mapping[str, Any]) -> BulletConfiguration:
         pause_after=positive(values, "pause_after", zero=True),
         publish_clock=values["publish_clock"],
         external_wrench_timeout=positive(values, "external_wrench_timeout"),
+        material=ContactMaterial(
+            positive(values, "obstacle_friction", zero=True),
+            positive(values, "obstacle_stiffness"),
+            positive(values, "obstacle_damping", zero=True),
+        ),
+        sensor=sensor_configuration(values),
     )
 
 
@@ -214,6 +244,8 @@ def make_robot(config: BulletConfiguration, values: Mapping[str, Any]) -> Bullet
             physics_dt=config.dt / config.substeps,
             gears=config.gears,
             mass_scales=config.mass_scales,
+            material=config.material,
+            sensor_frame=config.sensor.frame,
         )
     except RobotDescriptionError as error:
         name, allowed = _culprit(config)
@@ -230,4 +262,7 @@ def _culprit(config: BulletConfiguration) -> tuple[str, str]:
         return "locked_joints", "other joints of the URDF"
     if not {link.get("name") for link in root.iter("link")} >= set(config.mass_scales):
         return "mass_scale_links", "links of the URDF"
+    carriers = {parent.get("link") for parent in root.iter("parent")}
+    if config.sensor.frame and config.sensor.frame not in carriers:
+        return "ft_frame", "a link of the URDF that carries others, or empty"
     return "robot_description", "a URDF that PyBullet can load"

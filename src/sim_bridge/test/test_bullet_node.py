@@ -14,7 +14,7 @@ from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
 from sim_bridge.bullet_node import BulletNode
-from viability_bounds_pkg.robot_description import build_model, read_urdf
+from viability_bounds_pkg.robot_description import build_model, inertia_beyond, read_urdf
 from viability_bounds_pkg.ros_parameters import ParameterError
 from viability_bounds_pkg.ros_runtime import GOAL_QOS, LATCHED_QOS, set_stamp, stamp_to_ns
 
@@ -421,6 +421,66 @@ def test_a_push_that_cannot_be_is_refused(ros, link, force):
     np.testing.assert_allclose(robot.q, Q, atol=1e-6)
 
 
+def test_the_sensor_is_published_for_each_state_with_bias_and_seeded_noise(ros):
+    robot = Robot(ros, ft_seed=3)
+    felt = ros.listen(WrenchStamped, "ft_wrench")
+    ros.hears("ft_wrench")
+
+    def course():
+        """Let 40 periods pass after a reset; return what was felt, shape (40, 6)."""
+        begin = robot.stamp
+        assert ros.call(Trigger, "bullet_node/reset", Trigger.Request()).success
+        ros.wait_until(lambda: robot.stamp > begin)
+        robot.step(times=40)
+        ros.wait_until(lambda: felt and felt.stamps[-1] == robot.stamp)
+        of = {stamp_to_ns(message.header.stamp): message.wrench for message in felt}
+        wrenches = [of[stamp] for stamp in sorted(of) if stamp > begin + PERIOD]
+        assert felt[-1].header.frame_id == VALUES["ft_frame"]
+        return np.array(
+            [
+                [w.force.x, w.force.y, w.force.z, w.torque.x, w.torque.y, w.torque.z]
+                for w in wrenches
+            ]
+        )
+
+    one, other = course(), course()
+    assert one.shape == (40, 6)
+    np.testing.assert_array_equal(one, other)
+    noise, bias = np.array(VALUES["ft_noise"]), np.array(VALUES["ft_bias"])
+    assert (0.5 * noise < one.std(axis=0)).all() and (one.std(axis=0) < 2.0 * noise).all()
+    tool = inertia_beyond(read_urdf(VALUES["robot_description"]), VALUES["ft_frame"])
+    weight = one.mean(axis=0)[:3] - bias[:3]  # the hand points down
+    np.testing.assert_allclose(weight, [0.0, 0.0, 9.81 * tool.mass], atol=0.08)
+
+
+def test_contacts_are_felt_by_motion_sensor_and_diagnostics(ros):
+    robot = Robot(ros, obstacle_stiffness=1e5, ft_bias=[], ft_noise=[])
+    felt = ros.listen(WrenchStamped, "ft_wrench")
+    arm = robot.node._robot
+    finger = arm.link_pose("panda_leftfinger")[0]
+    floor = Marker(ns="floor", type=Marker.CUBE)
+    floor.header.frame_id = VALUES["base_frame"]
+    floor.scale.x = floor.scale.y = floor.scale.z = 0.2
+    floor.pose.position.x, floor.pose.position.y = finger[:2]
+    floor.pose.position.z = finger[2] - 0.0538 - 0.1 - 0.002
+    floor.pose.orientation.w = 1.0
+    ros.talk(MarkerArray, "obstacles", GOAL_QOS).publish(MarkerArray(markers=[floor]))
+    ros.wait_until(lambda: len(robot.node._world) == 1, "the floor")
+    data, frame = ARM.model.createData(), ARM.model.getFrameId("panda_hand")
+    for _ in range(300):
+        q, v = robot.q, robot.v
+        J = pin.computeFrameJacobian(ARM.model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
+        robot.step(robot.gravity() + J.T @ [0.0, 0.0, -15.0, 0.0, 0.0, 0.0] - 5.0 * v)
+    assert arm.contacts()
+    ros.diagnostics.clear()
+    ros.wait_until(lambda: robot.reported("contact_force_n"))
+    assert float(robot.reported("contact_force_n")) == pytest.approx(15.0, rel=0.1)
+    assert float(robot.reported("contact_force_max_n")) < 60.0
+    tool = inertia_beyond(read_urdf(VALUES["robot_description"]), VALUES["ft_frame"])
+    ros.wait_until(lambda: felt.stamps[-1] == robot.stamp)
+    assert felt[-1].wrench.force.z == pytest.approx(9.81 * tool.mass - 15.0, abs=1.5)
+
+
 def test_robot_description_and_clock_are_published(ros):
     clocks = ros.listen(Clock, "/clock")
     robot = Robot(ros, publish_clock=True)
@@ -534,6 +594,16 @@ def test_the_first_period_after_a_pause_is_a_whole_one(ros):
             "mass_scale_links",
             "each once",
         ),
+        ({"obstacle_friction": -0.1}, "obstacle_friction", ">= 0"),
+        ({"obstacle_stiffness": 0.0}, "obstacle_stiffness", "> 0"),
+        ({"obstacle_damping": math.nan}, "obstacle_damping", "nan"),
+        ({"ft_frame": "wing"}, "ft_frame", "carries others"),
+        ({"ft_frame": "panda_leftfinger"}, "ft_frame", "carries others"),
+        ({"ft_frame": ""}, "ft_bias", "only with"),
+        ({"ft_bias": [1.0] * 3}, "ft_bias", "6 finite numbers"),
+        ({"ft_noise": [math.inf] * 6}, "ft_noise", "6 finite numbers"),
+        ({"ft_noise": [-0.1] * 6}, "ft_noise", "not negative"),
+        ({"ft_seed": -1}, "ft_seed", "at least 0"),
     ],
 )
 def test_it_does_not_start_with_bad_parameters(ros, changed, name, shown):
