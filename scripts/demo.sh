@@ -3,11 +3,13 @@
 set -eu
 usage() {
     cat <<'USAGE'
-usage: bash scripts/demo.sh [robot] [--bounds exact|naive] [--rate HZ] [--lockstep]
+usage: bash scripts/demo.sh [robot] [scenario] [--bounds exact|naive] [--rate HZ] [--lockstep]
                             [--out DIRECTORY]
 
   robot        a parameter file in config/ that has a scenario: baxter_left_arm (default), panda,
                talos_left_arm
+  scenario     what config/scenarios/<robot>_<scenario>.yaml describes, or a file of your own,
+               see docs/scenarios.md (default: demo)
   --bounds     how acceleration limits are computed; naive breaks the limits (default: exact)
   --rate       control rate in Hz (default: the robot's own)
   --lockstep   each step waits for its command, as fast as the machine can; repeatable
@@ -18,7 +20,7 @@ USAGE
 }
 
 root="$(cd "$(dirname "$0")/.." && pwd)"
-robot=baxter_left_arm bounds=exact rate='' clock=real_time out="$root/results/demo"
+robot='' scenario='' bounds=exact rate='' clock=real_time out="$root/results/demo"
 while [ $# -gt 0 ]; do
     case "$1" in
     --bounds) bounds="${2:?--bounds needs a value}"; shift ;;
@@ -27,15 +29,29 @@ while [ $# -gt 0 ]; do
     --lockstep) clock=lockstep ;;
     -h | --help) usage; exit 0 ;;
     -*) echo "error: unknown option '$1'" >&2; usage >&2; exit 2 ;;
-    *) robot="$1" ;;
+    *)
+        if [ -z "$robot" ]; then robot="$1"
+        elif [ -z "$scenario" ]; then scenario="$1"
+        else echo "error: unknown argument '$1'" >&2; usage >&2; exit 2
+        fi
+        ;;
     esac
     shift
 done
+robot="${robot:-baxter_left_arm}" scenario="${scenario:-demo}"
+scenarios="$root/config/scenarios"
 config="$root/config/$robot.yaml"
-scenario="$root/config/scenarios/${robot}_demo.yaml"
-if [ ! -f "$config" ] || [ ! -f "$scenario" ]; then
-    known="$(cd "$root/config/scenarios" && ls -- *_demo.yaml | sed 's/_demo.yaml//' | tr '\n' ' ')"
+if [ ! -f "$config" ] || [ ! -f "$scenarios/${robot}_demo.yaml" ]; then
+    known="$(cd "$scenarios" && ls -- *_demo.yaml | sed 's/_demo.yaml//' | tr '\n' ' ')"
     echo "error: unknown robot '$robot'; there are: $known" >&2
+    exit 2
+fi
+if [ -f "$scenarios/${robot}_$scenario.yaml" ]; then
+    scenario="$scenarios/${robot}_$scenario.yaml"
+elif [ ! -f "$scenario" ]; then
+    known="$(cd "$scenarios" && ls -- "${robot}"_*.yaml)"
+    known="$(sed "s/^${robot}_//; s/.yaml$//" <<<"$known" | tr '\n' ' ')"
+    echo "error: unknown scenario '$scenario' of $robot; there are: $known" >&2
     exit 2
 fi
 

@@ -77,6 +77,7 @@ def test_naive_bounds_break_the_elbow_and_say_so(tmp_path):
     ("arguments", "names"),
     [
         (["no_such_robot"], "no_such_robot"),
+        (["panda", "no_such_scenario"], "no_such_scenario"),
         (["--no-such-option"], "--no-such-option"),
         (["--bounds", "guessed", "--lockstep"], "method"),
     ],
