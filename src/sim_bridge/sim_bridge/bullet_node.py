@@ -117,7 +117,7 @@ class BulletNode(Node):
         self._torque_ratio = 0.0
         self._refused.clear()
         self._latencies: deque[float] = deque(maxlen=_LATENCIES_KEPT)
-        self._started_at = time.monotonic()
+        self._started_at, self._played = time.monotonic(), 0
 
     def _plan_pause(self) -> None:
         """Find the period at which to pause, as `pause_after` says; counted from now."""
@@ -227,7 +227,7 @@ class BulletNode(Node):
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         if self._paused and not request.data:
             self._paused = False
-            self._started_at = time.monotonic()
+            self._started_at, self._played = time.monotonic(), self._periods
             self._plan_pause()
             # A new stamp: what was answered during the pause answered old goals. In real time
             # it comes with the next tick, so that the first period is a whole one.
@@ -255,7 +255,7 @@ class BulletNode(Node):
             "stamp_ns": self._stamp,
             "period_s": self._config.dt,
             "periods": self._periods,
-            "rate_hz": self._periods / elapsed,
+            "rate_hz": (self._periods - self._played) / elapsed,
             "physics_steps_per_period": self._config.substeps,
             "deadline_misses": self._missed,
             "braked_periods": self._braked,
