@@ -37,6 +37,7 @@ class BulletBody:
         direct_solver: as `BulletWorld` has it.
 
     Attributes:
+        description: URDF, moving joints, and where others are locked.
         client_id: PyBullet's physics client, for cameras.
         body_id: the robot in that client.
 
@@ -65,6 +66,7 @@ class BulletBody:
         if not (math.isfinite(physics_dt) and physics_dt > 0.0):
             raise ValueError(f"physics_dt must be positive and finite, not {physics_dt}")
         self.joints, self.physics_dt = tuple(joints), physics_dt
+        self.description = urdf_text, self.joints, dict(locked_positions or {})
         gravity = finite_vector("gravity", gravity, 3)
         prepared = prepare_urdf(
             urdf_text,
@@ -141,6 +143,11 @@ class BulletBody:
     def clear_obstacles(self) -> None:
         """Take all obstacles out of the world."""
         self._world.obstacles.clear()
+
+    @property
+    def obstacles(self) -> dict[str, Obstacle]:
+        """All obstacles, by name."""
+        return self._world.obstacles.present
 
     def contacts(self) -> list[Contact]:
         """Return where obstacles pushed on the robot in the last physics step."""

@@ -47,8 +47,9 @@ class LinkForce(NamedTuple):
 class _Surface:
     """An obstacle in the world."""
 
-    def __init__(self, name: str, body: int, place: Sequence[float]) -> None:
-        self.name, self.body, self.place = name, body, tuple(place)
+    def __init__(self, obstacle: Obstacle, body: int) -> None:
+        self.obstacle, self.body = obstacle, body
+        self.place = tuple(obstacle.position.tolist())
         self.moved = False
 
 
@@ -93,9 +94,9 @@ class BulletObstacles:
         return len(self._surfaces)
 
     @property
-    def names(self) -> set[str]:
-        """Of all obstacles."""
-        return set(self._surfaces)
+    def present(self) -> dict[str, Obstacle]:
+        """All obstacles, by name."""
+        return {name: surface.obstacle for name, surface in self._surfaces.items()}
 
     def add(self, obstacle: Obstacle) -> None:
         """Put an obstacle into the world, in place of the one of its name if there is one.
@@ -105,19 +106,11 @@ class BulletObstacles:
         """
         bullet = self._bullet
         self.remove(obstacle.name)
-        x, _, z = obstacle.size.tolist()
-        if obstacle.shape == "box":
-            extents = (0.5 * obstacle.size).tolist()
-            shape = bullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=extents)
-        elif obstacle.shape == "sphere":
-            shape = bullet.createCollisionShape(pybullet.GEOM_SPHERE, radius=0.5 * x)
-        else:
-            shape = bullet.createCollisionShape(pybullet.GEOM_CYLINDER, radius=0.5 * x, height=z)
-        place = obstacle.position.tolist()
+        shape = bullet.createCollisionShape(**shape_arguments(obstacle))
         body = bullet.createMultiBody(
             baseMass=self._mass,
             baseCollisionShapeIndex=shape,
-            basePosition=place,
+            basePosition=obstacle.position.tolist(),
             baseOrientation=obstacle.orientation.tolist(),
         )
         bullet.changeDynamics(
@@ -130,7 +123,7 @@ class BulletObstacles:
         )
         bullet.setCollisionFilterGroupMask(body, -1, *_OBSTACLES_MEET_ROBOTS)
         bullet.setPhysicsEngineParameter(globalCFM=_SOFTNESS)
-        surface = _Surface(obstacle.name, body, place)
+        surface = _Surface(obstacle, body)
         self._surfaces[obstacle.name] = self._by_body[body] = surface
         near = bullet.getClosestPoints(self._body, body, 0.0)
         overlap = -min((point[8] for point in near), default=0.0)
@@ -248,6 +241,16 @@ class BulletObstacles:
                 position, normal, pressure = row[:3], row[3:6], row[6]
                 # The friction acts at the centre of pressure, as if it were shared out like this.
                 force = pressure * normal + pressure / rows[:, 6].sum() * along
-                name = self._by_body[body].name
+                name = self._by_body[body].obstacle.name
                 found.append(Contact(self._links[link], name, position, normal, force))
         return found
+
+
+def shape_arguments(obstacle: Obstacle) -> dict[str, Any]:
+    """Return what PyBullet's `createCollisionShape` takes for an obstacle."""
+    x, y, z = (0.5 * obstacle.size).tolist()
+    if obstacle.shape == "box":
+        return {"shapeType": pybullet.GEOM_BOX, "halfExtents": [x, y, z]}
+    if obstacle.shape == "sphere":
+        return {"shapeType": pybullet.GEOM_SPHERE, "radius": x}
+    return {"shapeType": pybullet.GEOM_CYLINDER, "radius": x, "height": 2.0 * z}

@@ -12,13 +12,13 @@ back to the former.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from sim_bridge.bullet_client import BulletClient
 from sim_bridge.bullet_obstacles import BulletObstacles
 from sim_bridge.obstacles import ContactMaterial
 from sim_bridge.quiet_pybullet import pybullet, silenced
@@ -32,18 +32,6 @@ _RIGID_BODY = {"linearDamping": 0.0, "angularDamping": 0.0, "maxJointVelocity": 
 _SOLVER_ITERATIONS = 500
 _SOLVER_RESIDUAL = 1e-14
 _GEAR_TORQUE_MAX = 1e9  # far beyond what any gear transmits, N m
-
-
-class _Client:
-    """PyBullet's functions, bound to a private physics client without a window."""
-
-    def __init__(self) -> None:
-        self.id = pybullet.connect(pybullet.DIRECT)
-
-    def __getattr__(self, name: str) -> Callable[..., Any]:
-        bound = partial(getattr(pybullet, name), physicsClientId=self.id)
-        setattr(self, name, bound)  # found directly from now on
-        return bound
 
 
 class BulletWorld:
@@ -79,7 +67,7 @@ class BulletWorld:
         direct_solver: bool,
         material: ContactMaterial,
     ) -> None:
-        self._bullet = bullet = _Client()
+        self._bullet = bullet = BulletClient()
         self.client_id = bullet.id
         bullet.setGravity(*gravity)
         bullet.setPhysicsEngineParameter(

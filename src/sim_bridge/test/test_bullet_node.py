@@ -386,7 +386,7 @@ def test_obstacles_come_and_go_with_their_stamps(ros):
         set_stamp(marker.header.stamp, stamp)
         return marker
 
-    world = robot.node._robot._world.obstacles
+    arm = robot.node._robot
     later = robot.stamp + 3 * PERIOD
     markers = [
         marker("first", 0),
@@ -398,14 +398,14 @@ def test_obstacles_come_and_go_with_their_stamps(ros):
     obstacles.publish(MarkerArray(markers=markers))
     ros.wait_until(lambda: len(robot.node._world) == 3, "the obstacles")
     robot.step()
-    assert world.names == {"first"}
+    assert set(arm.obstacles) == {"first"}
     robot.step(times=2)
-    assert world.names == {"first"}
+    assert set(arm.obstacles) == {"first"}
     robot.step()
-    assert world.names == {"second"}
+    assert set(arm.obstacles) == {"second"}
     ros.wait_until(lambda: "obstacles: 2;" in robot.reported("commands_refused"))
     ros.call(Trigger, "bullet_node/reset", Trigger.Request())
-    assert not world.names
+    assert not arm.obstacles
 
 
 @pytest.mark.parametrize(("link", "force"), [("no_such_link", 1.0), ("panda_link4", math.nan)])
