@@ -113,7 +113,7 @@ def main() -> None:
         "step, other bounds active (solver)": off_and_on,
         "  model at the current state": lambda: robot.update(q, v, v),
         "  torque of the middle of the step": lambda: robot.torque(q, v, v),
-        "  limits and rate of torque": lambda: controller._limited(tau_max),
+        "  limits and rate of torque": lambda: controller._limiter.limited(tau_max),
     }
     rows |= qp_alone(controller, q, v)
     for name, function in rows.items():

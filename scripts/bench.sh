@@ -7,6 +7,7 @@
 #                                     also beside TSID's, which is installed into .venv-tsid
 #     bash scripts/bench.sh robot     physics steps of the simulated robot, and their accuracy
 #     bash scripts/bench.sh antiwindup  limits on the integral torque, and the solver's way
+#     bash scripts/bench.sh compliance  controller steps with all that compliance adds
 set -eu
 root="$(cd "$(dirname "$0")/.." && pwd)"
 name="${1:-}"

@@ -16,6 +16,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from torque_safety_controller.tasks import TaskTerm
 
@@ -50,15 +51,44 @@ class AdmittanceGains:
             error_rate: its time derivative, shape (6,).
             damping: that it acts against, 1/s.
         """
-        g = np.empty(6)
-        for part, kp, kd, most in (
-            (slice(0, 3), self.force_kp, self.force_kd, self.speed_max),
-            (slice(3, 6), self.moment_kp, self.moment_kd, self.turn_max),
-        ):
-            asked = -kp * error[part] - kd * error_rate[part]
-            size, most = math.sqrt(asked.dot(asked)), damping * most
-            g[part] = asked * (most / size) if size > most else asked
-        return g
+        return _acceleration(
+            error,
+            error_rate,
+            self.force_kp,
+            self.force_kd,
+            damping * self.speed_max,
+            self.moment_kp,
+            self.moment_kd,
+            damping * self.turn_max,
+        )
+
+
+@njit(cache=True)
+def _acceleration(
+    error: np.ndarray,
+    error_rate: np.ndarray,
+    force_kp: float,
+    force_kd: float,
+    force_most: float,
+    moment_kp: float,
+    moment_kd: float,
+    moment_most: float,
+) -> np.ndarray:
+    """Return g_ob of (27), shape (6,); parts beyond their greatest size are made shorter."""
+    g = np.empty(6)
+    for first, kp, kd, most in (
+        (0, force_kp, force_kd, force_most),
+        (3, moment_kp, moment_kd, moment_most),
+    ):
+        size = 0.0
+        for i in range(first, first + 3):
+            g[i] = -kp * error[i] - kd * error_rate[i]
+            size += g[i] * g[i]
+        size = math.sqrt(size)
+        if size > most:
+            for i in range(first, first + 3):
+                g[i] *= most / size
+    return g
 
 
 def admittance_task(

@@ -124,6 +124,7 @@ class Interaction:
     def settings(self, settings: InteractionSettings) -> None:
         self._settings = settings
         self._rows = np.flatnonzero(settings.directions)
+        self._mask = settings.directions.astype(float)
         self._shares = np.where(settings.directions, settings.stiffness, 1.0)
         if settings.dual is None:
             self._dual = None
@@ -252,9 +253,10 @@ class Interaction:
         if self.state is Compliance.YIELDING:
             led = settings.yielding_gains.acceleration(-F, -rate, damping)
             return [admittance_task(robot.J, robot.drift, led, weight)]
-        error, error_rate = self.reference - F, self._goal_rate - rate
-        error[~settings.directions] = error_rate[~settings.directions] = 0.0
-        moved = settings.gains.acceleration(error, error_rate, damping)
+        mask = self._mask
+        moved = settings.gains.acceleration(
+            mask * (self.reference - F), mask * (self._goal_rate - rate), damping
+        )
         return [admittance_task(robot.J, robot.drift, moved, weight, self._rows)]
 
     def forces(self, robot: RobotModel) -> ContactForces | None:
@@ -286,6 +288,7 @@ class Interaction:
         """Return tasks and forces of every kind that there may be, to compile what they need."""
         zero, weight = np.zeros(6), max(gains.pose_weight, 1.0)
         common = robot.J, robot.drift, zero, weight
+        self._settings.gains.acceleration(zero, zero, 1.0)
         tasks = [admittance_task(*common), admittance_task(*common, np.arange(1))]
         contacts = self.contacts
         if contacts is None:

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
+from numba import njit
 from numpy.typing import ArrayLike
 
 _TARE_TIME = 0.2  # s, of the mean that becomes the bias
@@ -68,10 +69,14 @@ class WrenchSensor:
         self.settings = settings or SensorSettings()
         self.placement = placement
         self.bias = np.zeros(6)
-        self._action = placement.toDualActionMatrix()
-        self._R = placement.rotation
+        self._action = np.ascontiguousarray(placement.toDualActionMatrix())
+        self._R = np.ascontiguousarray(placement.rotation)
         self._weight = tool.mass * np.asarray(gravity, dtype=float)
         self._com = tool.lever.copy()
+        self.start()
+        # The first call compiles; let it be this one and not one in a control loop.
+        self.receive(np.zeros(6))
+        self.update(np.eye(3), 0.0)
         self.start()
 
     def start(self) -> None:
@@ -80,7 +85,7 @@ class WrenchSensor:
         self.silent = True
         self._raw: np.ndarray | None = None
         self._age = math.inf
-        self._filtered = self._mean = np.zeros(6)
+        self._filtered, self._mean = np.zeros(6), np.zeros(6)
 
     def receive(self, raw: ArrayLike) -> None:
         """Take a measurement, in the sensor's axes, shape (6,), N and N m, for the next `update`.
@@ -105,20 +110,23 @@ class WrenchSensor:
             if self._age > self.settings.timeout and not self.silent:
                 self.start()
             return
-        force = (rotation @ self._R).T @ self._weight
-        found = self._raw - np.concatenate([force, np.cross(self._com, force)])
-        time, self._age, self._raw = self._age, 0.0, None
+        time, self._age = self._age, 0.0
         if self.silent or not time > 0.0:
-            self._filtered, self._mean = found, found
-            self.rate = np.zeros(6)
-        else:
-            change = found - self._filtered
-            change *= -math.expm1(-2.0 * math.pi * self.settings.filter_hz * time)
-            self._filtered = self._filtered + change
-            self._mean = self._mean - math.expm1(-time / _TARE_TIME) * (found - self._mean)
-            self.rate = self._action @ (change / time)
-        self.silent = False
-        self.wrench = self._action @ (self._filtered - self.bias)
+            time = math.inf
+        self.wrench, self.rate = _measured(
+            self._raw,
+            np.ascontiguousarray(rotation),
+            self._R,
+            self._weight,
+            self._com,
+            self._action,
+            self.bias,
+            time,
+            2.0 * math.pi * self.settings.filter_hz,
+            self._filtered,
+            self._mean,
+        )
+        self._raw, self.silent = None, False
 
     def tare(self) -> np.ndarray:
         """Take what is measured now, the tool's weight subtracted, for the bias; return it.
@@ -133,3 +141,59 @@ class WrenchSensor:
         self.bias = self._mean.copy()
         self.wrench = self._action @ (self._filtered - self.bias)
         return self.bias
+
+
+@njit(cache=True)
+def _measured(
+    raw: np.ndarray,
+    rotation: np.ndarray,
+    R: np.ndarray,
+    weight: np.ndarray,
+    com: np.ndarray,
+    action: np.ndarray,
+    bias: np.ndarray,
+    time: float,
+    cut_off: float,
+    filtered: np.ndarray,
+    mean: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return wrench and rate, shape (6,) each; updates `filtered` and `mean`, shape (6,).
+
+    Args:
+        raw: measurement, shape (6,).
+        rotation: of the end effector in the root frame, shape (3, 3).
+        R: of the sensor in the end effector's frame, shape (3, 3).
+        weight: of the tool in the root frame, shape (3,), N.
+        com: its centre of mass in the sensor's axes, shape (3,), m.
+        action: of the sensor's placement on wrenches, shape (6, 6).
+        bias: shape (6,).
+        time: since the last measurement, s; inf if there was none.
+        cut_off: of the filter, rad/s.
+        filtered: shape (6,).
+        mean: shape (6,).
+    """
+    found = raw.copy()
+    force = np.zeros(3)
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                force[i] += R[j, i] * rotation[k, j] * weight[k]
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        found[i] -= force[i]
+        found[3 + i] -= com[j] * force[k] - com[k] * force[j]
+    share = -math.expm1(-cut_off * time)
+    mean_share = -math.expm1(-time / _TARE_TIME)
+    change, clean = np.empty(6), np.empty(6)
+    for i in range(6):
+        step = share * (found[i] - filtered[i])
+        filtered[i] += step
+        mean[i] += mean_share * (found[i] - mean[i])
+        change[i] = step / time
+        clean[i] = filtered[i] - bias[i]
+    wrench, rate = np.zeros(6), np.zeros(6)
+    for i in range(6):
+        for j in range(6):
+            wrench[i] += action[i, j] * clean[j]
+            rate[i] += action[i, j] * change[j]
+    return wrench, rate
