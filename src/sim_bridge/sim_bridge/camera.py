@@ -21,7 +21,7 @@ from sim_bridge.vectors import finite_vector
 _OVERSAMPLING = 2  # PyBullet's renderer does not smooth edges
 _NEAR, _FAR = 0.05, 20.0  # m
 _OBSTACLE_COLOR = (0.25, 0.45, 0.7)
-_FLOOR_COLOR = (0.93, 0.93, 0.92)
+_FLOOR_COLOR = (0.8, 0.8, 0.78)
 _SKY_TOP, _SKY_BOTTOM = np.array([214, 224, 236]), np.array([250, 250, 250])
 _LIGHT = {
     "lightDirection": (1.5, 1.0, 3.0),
@@ -41,7 +41,7 @@ class Camera:
 
     Args:
         robot: as it is and will be.
-        floor: height of a disc to stand on, m; none by default.
+        floor: height of a plate to stand on, m; none by default.
         colors: red, green, blue, 0 to 1, of obstacles, by name.
 
     Raises:
@@ -70,8 +70,8 @@ class Camera:
             bullet.changeVisualShape(body, shape[1], flags=pybullet.VISUAL_SHAPE_DOUBLE_SIDED)
         self._shown: dict[str, tuple[Obstacle, int]] = {}
         if floor is not None:
-            disc = Obstacle("floor", "cylinder", [3.5, 3.5, 0.02], [0.0, 0.0, floor - 0.01])
-            self._make(disc, _FLOOR_COLOR)
+            plate = Obstacle("floor", "box", [3.0, 3.0, 0.04], [0.0, 0.0, floor - 0.02])
+            self._make(plate, _FLOOR_COLOR)
 
     def snapshot(
         self,
