@@ -16,6 +16,7 @@ from chain import ROOT
 
 from sim_bridge import bullet_parameters
 from sim_bridge.limit_monitor import LimitMonitor
+from sim_bridge.ros_ft_sensor import ForceTorqueReading
 from torque_safety_controller import controller_assembly, controller_parameters
 from torque_safety_controller.controller import Step
 from viability_bounds_pkg import bounds_parameters
@@ -45,6 +46,7 @@ class DirectLoop:
         robot: in PyBullet.
         controller: with its goals at the start pose.
         samples: one a control step.
+        sensing: whether the force/torque sensor says anything.
     """
 
     def __init__(self, robot: str, changed: Mapping[str, Any] | None = None) -> None:
@@ -75,6 +77,11 @@ class DirectLoop:
         values = self._values("controller_node", controller_parameters.TABLE)
         made = controller_parameters.make_configuration(values)
         self.controller, _ = controller_assembly.make_controller(values, made)
+        self.sensing = True
+        self._sensor = None
+        interaction = self.controller.interaction
+        if config.sensor.frame and interaction is not None and interaction.sensor is not None:
+            self._sensor = ForceTorqueReading(self.robot, config.sensor)
         self.samples: list[Sample] = []
         self.t = 0.0
         self.robot.reset(config.q_start, np.zeros(len(config.joints)))
@@ -132,6 +139,8 @@ class DirectLoop:
     def step(self) -> Step:
         """Play one control step under torque control."""
         q, v, _ = self.robot.state()
+        if self._sensor is not None and self.sensing:
+            self.controller.interaction.sensor.receive(self._sensor.read())
         bounds = self._bounds(q, v)
         step = self.controller.step(q, v, bounds.lower, bounds.upper)
         self._record(q, v, step.tau)

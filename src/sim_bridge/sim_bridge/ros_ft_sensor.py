@@ -73,6 +73,28 @@ def sensor_configuration(values: Mapping[str, Any]) -> SensorConfiguration:
     return SensorConfiguration(values["ft_frame"], bias, noise, values["ft_seed"])
 
 
+class ForceTorqueReading:
+    """What the sensor of a robot says: what it feels, a bias and noise.
+
+    Args:
+        robot: with a sensor.
+        config: of that sensor.
+    """
+
+    def __init__(self, robot: BulletRobot, config: SensorConfiguration) -> None:
+        self._robot, self._config = robot, config
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin the noise anew."""
+        self._random = np.random.default_rng(self._config.seed)
+
+    def read(self) -> np.ndarray:
+        """Return force and moment, shape (6,), N and N m, with other noise each time."""
+        noise = self._config.noise * self._random.standard_normal(6)
+        return self._robot.sensor_wrench() + self._config.bias + noise
+
+
 class ForceTorquePublisher:
     """Publishes ``ft_wrench``.
 
@@ -83,23 +105,21 @@ class ForceTorquePublisher:
     """
 
     def __init__(self, node: Node, robot: BulletRobot, config: SensorConfiguration) -> None:
-        self._robot, self._config = robot, config
+        self._reading = ForceTorqueReading(robot, config)
         self._message = WrenchStamped()
         self._message.header.frame_id = config.frame
         self._publisher = node.create_publisher(WrenchStamped, "ft_wrench", CONTROL_QOS)
-        self.restart()
 
     def restart(self) -> None:
         """Begin the noise anew."""
-        self._random = np.random.default_rng(self._config.seed)
+        self._reading.restart()
 
     def publish(self, stamp: int) -> None:
         """Publish what is felt at `stamp`, ns."""
-        config, message = self._config, self._message
-        noise = config.noise * self._random.standard_normal(6)
-        felt = (self._robot.sensor_wrench() + config.bias + noise).tolist()
+        message = self._message
         set_stamp(message.header.stamp, stamp)
         force, torque = message.wrench.force, message.wrench.torque
+        felt = self._reading.read().tolist()
         force.x, force.y, force.z, torque.x, torque.y, torque.z = felt
         self._publisher.publish(message)
 
