@@ -115,11 +115,11 @@ def test_torque_control_is_handed_over_and_back():
         ({"time": 0.1, "call": {"service": "bullet_node/no"}}, ("no service bullet_node/no",)),
         (
             {"time": 0.1, "posture": {**rest(), "panda_joint4": 0.5}},
-            ("controller_node refused", "target_posture: 1"),
+            ("refused by controller_node: target_posture: 1",),
         ),
         (
             {"time": 0.1, "push": {"link": "no_link", "duration": 1.0}},
-            ("bullet_node refused", "external_wrench: "),
+            ("refused by bullet_node: external_wrench: ",),
         ),
     ],
 )

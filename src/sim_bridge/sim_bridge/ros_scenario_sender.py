@@ -84,6 +84,11 @@ class Caller:
         """Call a service after those that were added before; `when` is told if it is refused."""
         self._waiting.append((when, request))
 
+    def drop(self) -> None:
+        """Forget the calls that have not been answered."""
+        self._waiting.clear()
+        self._answer = None
+
     def proceed(self) -> bool:
         """Go on; return whether all calls have been answered.
 

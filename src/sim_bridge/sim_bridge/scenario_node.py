@@ -35,7 +35,12 @@ from viability_bounds_pkg.ros_runtime import make_executor, report_refusal
 
 _SHOW_PERIOD = 0.5
 _POLL_PERIOD = 0.02
-_REFUSALS = {"controller_node": "goals_refused", "bullet_node": "commands_refused"}
+_TAKEN_BY = {
+    "controller_node": ("goals_refused", "target_"),
+    "bullet_node": ("commands_refused", ("external_wrench", "obstacles")),
+}
+"""By node, where it counts what it refuses, and the topics of a scenario."""
+_PAUSE = Request("bullet_node/pause", SetBool, SetBool.Request(data=True))
 _RESUME = Request("bullet_node/pause", SetBool, SetBool.Request(data=False))
 
 
@@ -47,6 +52,8 @@ class Phase(Enum):
     LOADING = auto()
     """What is to happen is sent ahead; not all of it has been reported as received."""
     PLAYING = auto()
+    STOPPING = auto()
+    """Something was refused; the robot is being paused."""
     DONE = auto()
 
 
@@ -75,7 +82,8 @@ class ScenarioNode(Node):
         self.failure: ScenarioRefused | None = None
         self.heard = RunListener(self, config.joints)
         self._first, self._period = 0, 1
-        self._refused: dict[str, str] = {}
+        self._refused: dict[str, list[str]] = {}  # before the first message of the scenario
+        self._refusal: ScenarioRefused | None = None
         self._halt = self._end = 0  # periods from the beginning
         frames = config.base_frame, config.end_effector_frame
         self._goals = Outbox(self, to_controller(config.scenario, *frames))
@@ -99,6 +107,8 @@ class ScenarioNode(Node):
 
     def _proceed(self) -> None:
         try:
+            if self.phase in (Phase.LOADING, Phase.PLAYING):
+                self._check_refusals()
             if self.phase is Phase.GETTING_READY and not self.awaited():
                 self.phase = Phase.LOADING
                 self._plan()
@@ -107,8 +117,12 @@ class ScenarioNode(Node):
                 self._go_on()
             elif self.phase is Phase.PLAYING and self._caller.proceed():
                 self._play()
+            elif self.phase is Phase.STOPPING and self._caller.proceed():
+                self.failure, self.phase = self._refusal, Phase.DONE
         except ScenarioRefused as error:
-            self.failure = error
+            self._refusal, self.phase = error, Phase.STOPPING
+            self._caller.drop()
+            self._caller.add("", _PAUSE)
 
     def awaited(self) -> list[str]:
         """Return what other nodes have to do before this one can go on."""
@@ -128,23 +142,20 @@ class ScenarioNode(Node):
         self._period = round(1e9 * float(self.robot["period_s"]))
         self._first = self.heard.stamp + self._period
         self._end = round(1e9 * self.config.scenario.duration / self._period)
-        self._refused = self._refusals()
 
     def _load(self) -> bool:
         """Send ahead what others have room for; return whether they have it all."""
-        for node, refused in self._refusals().items():
-            if refused != self._refused[node]:
-                raise ScenarioRefused(f"{node} refused what it was sent: {refused}")
         goals = self.heard.diagnostics["controller_node"].get("goals_pending", 0)
         changes = self.robot["world_changes_pending"]
         loaded = self._goals.proceed(self._first, int(goals))
         return self._world.proceed(self._first, int(changes)) and loaded
 
-    def _refusals(self) -> dict[str, str]:
-        """Return what was refused so far, and how often, by node."""
-        return {
-            node: self.heard.diagnostics[node].get(key, "none") for node, key in _REFUSALS.items()
-        }
+    def _check_refusals(self) -> None:
+        for node, (key, topics) in _TAKEN_BY.items():
+            counts = self.heard.diagnostics[node].get(key, "").split("; ")
+            refused = [count for count in counts if count.startswith(topics)]
+            if refused != self._refused.setdefault(node, refused):
+                raise ScenarioRefused(f"refused by {node}: {' '.join(refused)}")
 
     def _play(self) -> None:
         # In lockstep it pauses where a service is to be called, and what it reports when it has
@@ -220,8 +231,6 @@ def play(node: ScenarioNode, others: Sequence[Node] = (), *, quiet: bool = False
     progress, moved_at = None, time.monotonic()
     while node.phase is not Phase.DONE and rclpy.ok(context=node.context):
         executor.spin_once(timeout_sec=0.1)
-        if node.failure is not None:
-            raise node.failure
         now = time.monotonic()
         if (node.heard.stamp, node.phase) != progress:
             progress, moved_at = (node.heard.stamp, node.phase), now
@@ -234,6 +243,8 @@ def play(node: ScenarioNode, others: Sequence[Node] = (), *, quiet: bool = False
         if not quiet and now - shown_at > _SHOW_PERIOD:
             shown_at = now
             print(node.live_line(), end="\r" if terminal else "\n", flush=True)
+    if node.failure is not None:
+        raise node.failure
     if node.phase is not Phase.DONE:
         raise ExternalShutdownException
     if not quiet:

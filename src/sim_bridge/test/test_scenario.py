@@ -1,4 +1,6 @@
+import re
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
@@ -6,6 +8,7 @@ from sim_bridge.scenario import load_scenario
 from sim_bridge.scenario_events import (
     AddObstacle,
     EnableTorque,
+    Event,
     ParameterChange,
     PoseGoal,
     PostureGoal,
@@ -16,7 +19,9 @@ from sim_bridge.scenario_events import (
 )
 from sim_bridge.scenario_fields import ScenarioError
 
-SCENARIOS = Path(__file__).resolve().parents[3] / "config" / "scenarios"
+ROOT = Path(__file__).resolve().parents[3]
+SCENARIOS = ROOT / "config" / "scenarios"
+DOCUMENTATION = ROOT / "docs" / "scenarios.md"
 
 
 def write(directory, text):
@@ -31,6 +36,12 @@ def test_shipped_scenarios_load(path):
     assert scenario.duration > 0.0
     assert scenario.events
     assert all(event.time < scenario.duration for event in scenario.events)
+
+
+def test_what_the_documentation_shows_loads_and_leaves_nothing_out(tmp_path):
+    examples = re.findall(r"```yaml\n(.*?)```", DOCUMENTATION.read_text(), re.DOTALL)
+    events = [event for text in examples for event in load_scenario(write(tmp_path, text)).events]
+    assert {type(event) for event in events} == set(get_args(Event))
 
 
 def test_events_come_in_order_of_time(tmp_path):
