@@ -34,7 +34,6 @@ class BulletBody:
         material: of obstacles; hard, with a friction of 0.5, by default.
         sensor_frame: link that is a force/torque sensor; none if empty.
         rotor_inertias: as `prepare_urdf` has them.
-        direct_solver: as `BulletWorld` has it.
 
     Attributes:
         description: URDF, moving joints, and where others are locked.
@@ -61,7 +60,6 @@ class BulletBody:
         material: ContactMaterial | None = None,
         sensor_frame: str = "",
         rotor_inertias: Mapping[str, float] | None = None,
-        direct_solver: bool = False,
     ) -> None:
         if not (math.isfinite(physics_dt) and physics_dt > 0.0):
             raise ValueError(f"physics_dt must be positive and finite, not {physics_dt}")
@@ -87,7 +85,6 @@ class BulletBody:
             self.joints,
             physics_dt,
             gravity.tolist(),
-            direct_solver,
             material or ContactMaterial(),
         )
         self._sensor = None

@@ -93,7 +93,6 @@ class BulletRobot(BulletBody):
             physics_dt=physics_dt,
             locked_positions=locked_positions,
             rotor_inertias={joint: inertia for joint, inertia in inertias if inertia > 0.0},
-            direct_solver=not gears.ideal,
             **body,
         )
         self.monitor: LimitMonitor | None = None

@@ -1,12 +1,10 @@
 """A PyBullet world with one robot in it, rid of what PyBullet adds to rigid-body dynamics.
 
-Two ways to solve for constraint impulses are used. Brakes alone, and contacts, are left to
-PyBullet's sequential impulses, which solve one constraint after another, again and again. A
-robot with gears has a row for each rotor and each friction that is always there, coupled through
-the whole arm: sequential impulses take several times as long for them as PyBullet's Dantzig
-solver, a direct one, and stop some percent short, where that is exact to rounding
-(docs/simulated_robot.md). When it finds no solution, as with redundant contacts, PyBullet falls
-back to the former.
+Constraint impulses, those of brakes, friction, rotors and contacts, are solved for by PyBullet's
+Dantzig solver, a direct one. They are coupled through the whole arm: sequential impulses,
+PyBullet's other way, take several times as long for them and stop some percent short, where that
+is exact to rounding (docs/simulated_robot.md). Should it find no solution, PyBullet falls back to
+the latter.
 """
 
 from __future__ import annotations
@@ -27,8 +25,8 @@ from viability_bounds_pkg.robot_description import RobotDescriptionError
 
 # What PyBullet adds to rigid-body dynamics: 4 % of damping and a clip of joint velocities at 100.
 _RIGID_BODY = {"linearDamping": 0.0, "angularDamping": 0.0, "maxJointVelocity": 1e9}
-# With PyBullet's defaults (50 rounds, 1e-7) a held Baxter arm creeps at 1.6e-3 rad/s, with these
-# at 1.6e-7 rad/s. Without brakes or contacts there is nothing to solve, and no cost.
+# Of sequential impulses. With PyBullet's defaults (50 rounds, 1e-7) a held Baxter arm creeps at
+# 1.6e-3 rad/s, with these at 1.6e-7 rad/s.
 _SOLVER_ITERATIONS = 500
 _SOLVER_RESIDUAL = 1e-14
 _GEAR_TORQUE_MAX = 1e9  # far beyond what any gear transmits, N m
@@ -44,7 +42,6 @@ class BulletWorld:
         joints: its n joints, in the order of all arrays.
         physics_dt: the physics step, s.
         gravity: shape (3,), m/s^2.
-        direct_solver: whether constraint impulses are solved for by Dantzig's algorithm.
         material: of what the robot may touch.
 
     Attributes:
@@ -64,7 +61,6 @@ class BulletWorld:
         joints: Sequence[str],
         physics_dt: float,
         gravity: Sequence[float],
-        direct_solver: bool,
         material: ContactMaterial,
     ) -> None:
         self._bullet = bullet = BulletClient()
@@ -76,11 +72,10 @@ class BulletWorld:
             solverResidualThreshold=_SOLVER_RESIDUAL,
             deterministicOverlappingPairs=1,
         )
-        if direct_solver:
-            with silenced(1):  # it says which solver it takes
-                bullet.setPhysicsEngineParameter(
-                    constraintSolverType=pybullet.CONSTRAINT_SOLVER_LCP_DANTZIG
-                )
+        with silenced(1):  # it says which solver it takes
+            bullet.setPhysicsEngineParameter(
+                constraintSolverType=pybullet.CONSTRAINT_SOLVER_LCP_DANTZIG
+            )
         self.body_id = body = self._load(prepared.text)
         infos = [bullet.getJointInfo(body, i) for i in range(bullet.getNumJoints(body))]
         indices = {info[1].decode(): info[0] for info in infos}
