@@ -13,11 +13,13 @@ import yaml
 from sim_bridge.bullet_robot import BulletRobot
 from sim_bridge.gears import Gears
 from sim_bridge.limit_monitor import LimitMonitor
+from sim_bridge.obstacles import Obstacle
 from sim_bridge.quiet_pybullet import pybullet, silenced
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 
 ROOT = Path(__file__).resolve().parent.parent
 H = 1e-3  # s
+FRICTION = ("friction_coulomb", "friction_static", "friction_viscous", "stribeck_velocity")
 STEPS, ROUNDS = 1000, 9
 SOLVERS = {
     "sequential impulses": pybullet.CONSTRAINT_SOLVER_LCP_SI,
@@ -38,14 +40,17 @@ class Configured:
         )
         self.q = np.array(values["start_positions"])
         self.tau_max = np.array(values["torque_max"])
-        self.friction = {k: v for k, v in values.items() if k.startswith(("friction", "stribeck"))}
+        self.friction = {k: v for k, v in values.items() if k in FRICTION}
+        self.hand, self.sensor = values["end_effector_frame"], values.get("ft_frame", "")
         self.rotors = values.get("rotor_inertia", 0.0)
         self.masses = dict(
             zip(values.get("mass_scale_links", []), values.get("mass_scales", []), strict=True)
         )
 
-    def robot(self, *, masses: bool = False, **gears: object) -> BulletRobot:
-        """Return a simulated robot with such gears."""
+    def robot(
+        self, body: dict[str, object] | None = None, *, masses: bool = False, **gears: object
+    ) -> BulletRobot:
+        """Return a simulated robot with such gears; `body` is what `BulletBody` takes."""
         robot = BulletRobot(
             self.urdf,
             self.joints,
@@ -53,6 +58,7 @@ class Configured:
             physics_dt=H,
             gears=Gears(len(self.joints), **gears),
             mass_scales=self.masses if masses else None,
+            **(body or {}),
         )
         infinite = np.full(len(self.joints), np.inf)
         robot.monitor = LimitMonitor(-infinite, infinite, infinite, self.tau_max)
@@ -77,6 +83,52 @@ def cost(arm: Configured, robot: BulletRobot, *, drives: bool = False) -> float:
                 robot.step(tau)
         best = min(best, (time.perf_counter() - start) / STEPS)
     return 1e6 * best
+
+
+def cost_of_pressing(arm: Configured, robot: BulletRobot) -> tuple[float, int, float]:
+    """Return microseconds a physics step at rest with the hand on a table.
+
+    Returns:
+        That, in how many points it touches, and the force, N.
+    """
+    zero = np.zeros(len(arm.joints))
+    model = build_model(arm.urdf, arm.joints, arm.locked)
+    data, frame = model.createData(), model.getFrameId(arm.hand)
+    robot.reset(arm.q, zero)
+    hand = robot.link_pose(arm.hand)[0]
+    low = hand - [0.0, 0.0, 0.3]
+    robot.add_obstacle(Obstacle("table", "box", [0.4, 0.4, 0.1], low))
+    for _ in range(4000):
+        q, v, _ = robot.state()
+        J = pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
+        tau = pin.computeGeneralizedGravity(model, data, q) - 120.0 * J[2] - 5.0 * v
+        robot.step(tau)
+    best = np.inf
+    for _ in range(ROUNDS):
+        start = time.perf_counter()
+        robot.step(tau, STEPS // 4)
+        best = min(best, 4.0 * (time.perf_counter() - start) / STEPS)
+    return 1e6 * best, len(robot.contacts()), robot.contact_force()[0]
+
+
+def surroundings(arm: Configured, gears: dict[str, object]) -> None:
+    """Measure and print what shapes, a sensor and obstacles cost."""
+    print(f"\nmicroseconds a physics step of {arm.name}")
+    cases = {"without shapes": {"collisions": False}, "with shapes": {}}
+    if arm.sensor:
+        cases["with a sensor, in each step"] = {"sensor_frame": arm.sensor}
+    for case, body in cases.items():
+        with closing(arm.robot(body, **gears)) as robot:
+            print(f"  {case:30s} {cost(arm, robot):6.1f}")
+    with closing(arm.robot(**gears)) as robot:
+        robot.reset(arm.q, np.zeros(len(arm.joints)))
+        for count in (1, 10):
+            for i in range(count):
+                robot.add_obstacle(Obstacle(f"{i}", "box", [0.1] * 3, [5.0, i, 0.0]))
+            print(f"  {f'{count} obstacles, out of reach':30s} {cost(arm, robot):6.1f}")
+        robot.clear_obstacles()
+        took, points, force = cost_of_pressing(arm, robot)
+        print(f"  {'hand on a table':30s} {took:6.1f} ({points} points, {force:.0f} N)")
 
 
 def choose(robot: BulletRobot, solver: int) -> None:
@@ -157,6 +209,8 @@ def main() -> None:
             f"  {name:20s} {took:6.1f} us, error {error:.1e} of the friction,"
             f" a held joint creeps at {creep:.1e} rad/s"
         )
+    for name, gears in (("panda", {}), (arm.name, everything)):
+        surroundings(Configured(name), gears)
 
 
 if __name__ == "__main__":
