@@ -42,13 +42,13 @@ class Talk:
         self.limits = ros.talk(JointTrajectory, "acceleration_limits")
         ros.hears("joint_commands")
 
-    def answer(self, stamp, q, v=np.zeros(ARM.n)) -> np.ndarray:
-        """The torques for a state with this stamp, ms."""
+    def answer(self, stamp, q) -> np.ndarray:
+        """The torques for a state at rest with this stamp, ms."""
 
         def ask():
             bounds = np.full(ARM.n, -2.0), np.full(ARM.n, 2.0)
             self.limits.publish(acceleration_limits(JOINTS, stamp * MS, *bounds))
-            self.states.publish(joint_state(JOINTS, stamp * MS, q, v))
+            self.states.publish(joint_state(JOINTS, stamp * MS, q, np.zeros(ARM.n)))
 
         self.ros.wait_until(lambda: stamp * MS in self.commands.stamps, "a command", each=ask)
         return np.array(self.commands[self.commands.stamps.index(stamp * MS)].effort)
