@@ -286,6 +286,17 @@ def test_obstacles_are_replaced_and_removed():
         assert robot.state().q[2] < -1.0
 
 
+def test_the_same_contacts_give_the_same_numbers():
+    runs = []
+    for _ in range(2):
+        with gantry(SKEW, Gears(3, rotor_inertia=0.3, friction_coulomb=1.0)) as robot:
+            robot.add_obstacle(floor(-0.051))
+            robot.step([6.0, 9.0, -30.0], 300)
+            runs.append(np.hstack([*robot.state(), total(robot.contacts())]))
+    assert robot.contact_force()[0] > 5.0
+    np.testing.assert_array_equal(*runs)
+
+
 def test_an_obstacle_where_the_robot_is_is_refused():
     with gantry(STRAIGHT) as robot:
         with pytest.raises(ObstacleError, match=r"'floor' overlaps the robot by 20\.0 mm"):
