@@ -4,17 +4,21 @@ With the simulated sensor, its bias, noise and a tool heavier than the URDF says
 """
 
 import numpy as np
+import pinocchio as pin
+import pytest
 from compliance_hand import (
     ELBOW,
     ELBOW_PUSH,
     FORCE,
     HAND,
     PULL,
+    ROBOT,
     judge_press,
     lead,
     press,
     within_limits,
 )
+from direct import DirectLoop
 
 
 def test_a_pulled_hand_moves_and_stays_where_it_is_let_go():
@@ -56,3 +60,22 @@ def test_a_table_is_pressed_on_without_a_bounce_while_the_hand_slides():
     assert numbers["periods_without_contact"] == 0.0
     assert numbers["slid_m"] > 0.14
     assert numbers["limits_kept"]
+
+
+@pytest.mark.parametrize("mode", ["joints", "task"])
+def test_a_start_with_a_stretched_elbow_and_a_goal_beyond_reach(mode):
+    """J has lost rank; the arm stays within its limits, comes to rest, and gets away again."""
+    straight = [0.0, 0.15, -0.3, 0.5, -0.3, -0.02, 0.0, 0.0, 0.0]
+    loop = DirectLoop(ROBOT, {"start_positions": np.array(straight), "integral_action": mode})
+    assert np.linalg.svd(loop.controller.robot.J)[1][-1] < 0.05
+    start = loop.pose()
+    away = start.translation / np.linalg.norm(start.translation)
+    loop.controller.set_pose_goal(pin.SE3(start.rotation, start.translation + 0.2 * away))
+    samples = loop.run(2.5)
+    last = np.array([sample.error[:3] for sample in samples[-200:]])
+    assert np.ptp(last, axis=0).max() < 0.005
+    back = start.translation - 0.1 * away
+    loop.controller.set_pose_goal(pin.SE3(start.rotation, back))
+    loop.run(2.5)
+    assert np.linalg.norm(loop.pose().translation - back) < 0.02
+    assert within_limits(loop)
