@@ -3,8 +3,10 @@
 import numpy as np
 import pinocchio as pin
 import pytest
+import yaml
 from chain import load_values, run_chain
 from direct import DirectLoop, column
+from ros_harness import CONFIG
 
 from sim_bridge.obstacles import Obstacle
 from sim_bridge.ros_scenario_sender import ScenarioRefused
@@ -79,6 +81,22 @@ def test_the_nodes_play_what_a_loop_without_messages_plays():
     # Rounding; a push or a gain one step early or late makes a hundred times as much and more.
     np.testing.assert_allclose(runs[0].q, column(samples, "q"), atol=1e-6)
     assert touched.sum() > 20
+
+
+def test_a_hand_presses_on_a_table_as_hard_as_it_is_told():
+    """The beginning of the scenario that is shipped: a table, parameters, tare, a wrench."""
+    scenario = yaml.safe_load((CONFIG / "scenarios" / "panda_press_on_table.yaml").read_text())
+    scenario = {
+        "duration": 2.5,
+        "events": [event for event in scenario["events"] if event["time"] < 2.5],
+    }
+    result = run_chain(load_values(ROBOT), scenario, {})
+    run = result.run
+    tared, pressing = run.t < 0.5, run.t > 2.2
+    force = run.ft_wrench[:, :3] - run.ft_wrench[tared, :3].mean(axis=0)
+    assert abs(force[tared]).max() < 1.0  # noise
+    np.testing.assert_allclose(force[pressing].mean(axis=0), [0.0, 0.0, -10.0], atol=0.5)
+    assert float(result.robot["contact_force_max_n"]) < 13.0
 
 
 def rest():
