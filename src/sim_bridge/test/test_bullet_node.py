@@ -408,6 +408,34 @@ def test_obstacles_come_and_go_with_their_stamps(ros):
     assert not arm.obstacles
 
 
+def test_obstacles_that_cannot_be_are_dropped_and_counted(ros):
+    robot = Robot(ros)
+    obstacles = ros.talk(MarkerArray, "obstacles", GOAL_QOS)
+    markers = []
+    for change in (
+        lambda m: setattr(m, "ns", ""),
+        lambda m: setattr(m.pose.position, "x", math.nan),
+        lambda m: setattr(m.pose.orientation, "w", 0.0),
+        lambda m: setattr(m.scale, "x", 0.0),
+        lambda m: setattr(m.scale, "y", 0.2),  # not round
+        lambda m: setattr(m, "action", 7),
+        lambda m: setattr(m, "action", Marker.DELETE),  # there is none
+        lambda m: setattr(m.pose.position, "x", 0.0),  # in the robot
+    ):
+        marker = Marker(ns="thing", type=Marker.CYLINDER)
+        marker.pose.position.x, marker.pose.position.z = 2.0, 0.3
+        marker.pose.orientation.w = 1.0
+        marker.scale.x = marker.scale.y = marker.scale.z = 0.3
+        change(marker)
+        markers.append(marker)
+    obstacles.publish(MarkerArray(markers=markers))
+    ros.wait_until(lambda: "obstacles: 6;" in robot.reported("commands_refused"))
+    robot.step(times=3)
+    ros.wait_until(lambda: "obstacles: 8;" in robot.reported("commands_refused"))
+    assert not robot.node._robot.obstacles
+    np.testing.assert_allclose(robot.q, Q, atol=1e-6)
+
+
 @pytest.mark.parametrize(("link", "force"), [("no_such_link", 1.0), ("panda_link4", math.nan)])
 def test_a_push_that_cannot_be_is_refused(ros, link, force):
     robot = Robot(ros)
