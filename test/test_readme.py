@@ -11,7 +11,10 @@ ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text()
 
 # Shorter than by default: here it is only shown that they run.
-SHORTER = {"bash scripts/bench.sh chain": "bash scripts/bench.sh chain --cycles 200"}
+SHORTER = {
+    "bash scripts/bench.sh chain": "bash scripts/bench.sh chain --cycles 200",
+    "bash scripts/bench.sh compliance": "bash scripts/bench.sh compliance --steps 200",
+}
 NOT_HERE = {"bash scripts/test.sh"}
 """What runs this test."""
 
