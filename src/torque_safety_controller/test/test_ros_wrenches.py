@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from arms import load_arm
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from ros_harness import acceleration_limits, joint_state, read_config
 from sensor_msgs.msg import JointState
@@ -114,6 +115,8 @@ def test_a_pull_is_yielded_to_until_the_sensor_falls_silent(ros):
     hand.feels = None
     hand.until("compliance", "sensor silent")
     assert hand.reported("mode") == "TRACKING"
+    assert hand.reported("level") == DiagnosticStatus.WARN
+    assert "sensor is silent" in hand.reported("message")
     hand.feels = wrench(force=(0.0, 1.0, 0.0))
     hand.until("compliance", "holding")
 

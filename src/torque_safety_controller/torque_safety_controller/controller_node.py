@@ -310,8 +310,8 @@ class ControllerNode(Node):
             }
         )
         level, text = LEVELS[self._modes.mode], f"{self._modes.mode.value}: {self._modes.reason}"
-        if self._collision.too_near:
-            level, text = max(level, DiagnosticStatus.WARN), f"{text}; {self._collision.too_near}"
+        for trouble in filter(None, (self._collision.too_near, self._wrenches.trouble)):
+            level, text = max(level, DiagnosticStatus.WARN), f"{text}; {trouble}"
         return level, text, values
 
 

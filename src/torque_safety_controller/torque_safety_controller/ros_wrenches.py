@@ -121,6 +121,14 @@ class WrenchInbox:
         else:
             self._logger.info(text)
 
+    @property
+    def trouble(self) -> str:
+        """What is wrong at present, or empty."""
+        interaction = self._interaction
+        if interaction is None or interaction.state is not Compliance.SILENT:
+            return ""
+        return "the force/torque sensor is silent"
+
     def values(self) -> dict[str, Any]:
         """Return what to report in /diagnostics."""
         interaction = self._interaction
