@@ -104,6 +104,23 @@ def rest():
     return dict(zip(values["joints"], values["start_positions"], strict=True))
 
 
+def test_more_than_a_queue_holds_is_sent_in_portions():
+    """A reader keeps ten messages of a topic until it gets round to them."""
+    push = {"link": "panda_link4", "duration": 0.002, "force": [0.0, 1.0, 0.0]}
+    scenario = {
+        "duration": 0.1,
+        "events": [
+            *({"time": 0.004 * k, "posture": rest()} for k in range(12)),
+            *({"time": 0.004 * k, "push": push} for k in range(6)),
+        ],
+    }
+    changed = {"scenario_node": {"ready_timeout": 5.0}}
+    # It begins when all of them have been reported as received.
+    result = run_chain(load_values(ROBOT), scenario, changed)
+    assert result.run.lost == 0
+    assert result.robot["world_changes_pending"] == "0"
+
+
 def test_torque_control_is_handed_over_and_back():
     scenario = {
         "duration": 0.4,

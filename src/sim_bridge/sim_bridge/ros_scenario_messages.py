@@ -101,6 +101,11 @@ def change_parameters(node: str, values: Any) -> Request:
     )
 
 
+def pause(data: bool) -> Request:
+    """Return the call that pauses the robot, or lets it go on."""
+    return Request("bullet_node/pause", SetBool, SetBool.Request(data=data))
+
+
 def refusals(request: Request, response: Any) -> Iterator[str]:
     """Return why a call, or parts of it, were refused; nothing if they were not."""
     if request.kind is SetParameters:

@@ -16,13 +16,12 @@ import rclpy
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from std_srvs.srv import SetBool
 
 from sim_bridge.recording import Run
 from sim_bridge.ros_run_listener import RunListener
 from sim_bridge.ros_scenario_messages import (
-    Request,
     change_parameters,
+    pause,
     to_controller,
     to_robot,
     to_service,
@@ -40,8 +39,6 @@ _TAKEN_BY = {
     "bullet_node": ("commands_refused", ("external_wrench", "obstacles")),
 }
 """By node, where it counts what it refuses, and the topics of a scenario."""
-_PAUSE = Request("bullet_node/pause", SetBool, SetBool.Request(data=True))
-_RESUME = Request("bullet_node/pause", SetBool, SetBool.Request(data=False))
 
 
 class Phase(Enum):
@@ -89,7 +86,7 @@ class ScenarioNode(Node):
         self._goals = Outbox(self, to_controller(config.scenario, *frames))
         self._world = Outbox(self, to_robot(config.scenario, config.base_frame))
         self._due = deque(e for e in config.scenario.events if isinstance(e, ServiceEvent))
-        own = _RESUME, change_parameters("bullet_node", {})
+        own = pause(False), change_parameters("bullet_node", {})
         self._caller = Caller(self, [*own, *map(to_service, self._due)])
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_POLL_PERIOD, self._proceed, clock=steady)
@@ -122,10 +119,12 @@ class ScenarioNode(Node):
         except ScenarioRefused as error:
             self._refusal, self.phase = error, Phase.STOPPING
             self._caller.drop()
-            self._caller.add("", _PAUSE)
+            self._caller.add("", pause(True))
 
     def awaited(self) -> list[str]:
         """Return what other nodes have to do before this one can go on."""
+        if self.phase is Phase.LOADING:
+            return ["report that goals, pushes and obstacles have arrived"]
         if self.phase is not Phase.GETTING_READY:
             return self._caller.awaited
         paused = self.robot.get("paused") == "True"
@@ -146,9 +145,9 @@ class ScenarioNode(Node):
     def _load(self) -> bool:
         """Send ahead what others have room for; return whether they have it all."""
         goals = self.heard.diagnostics["controller_node"].get("goals_pending", 0)
-        changes = self.robot["world_changes_pending"]
         loaded = self._goals.proceed(self._first, int(goals))
-        return self._world.proceed(self._first, int(changes)) and loaded
+        changes = int(self.robot["world_changes_pending"])
+        return self._world.proceed(self._first, changes) and loaded
 
     def _check_refusals(self) -> None:
         for node, (key, topics) in _TAKEN_BY.items():
@@ -177,7 +176,7 @@ class ScenarioNode(Node):
             self._halt = min(self._end, self._period_of(self._due[0]))
         left = 1e-9 * self._period * (self._halt - now)
         self._caller.add("", change_parameters("bullet_node", {"pause_after": left}))
-        self._caller.add("", _RESUME)
+        self._caller.add("", pause(False))
         self._caller.proceed()
 
     def _call(self, period: int) -> None:
