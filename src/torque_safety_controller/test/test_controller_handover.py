@@ -444,3 +444,27 @@ def test_the_handover_is_not_felt(ros, robot, changed, load):
         assert np.abs(q[first:last] - q[first]).max() < 1e-3
         assert np.abs(q[last:] - q[last]).max() < 1e-3
         assert (steps[last : last + 2] < 0.01).all()
+
+
+def test_an_arm_in_motion_is_brought_to_rest_before_its_drives_take_it(ros):
+    arm = Arm(ros, "talos_left_arm")
+    arm.run(50)
+    arm.enable(True)
+    arm.run(50)
+    joints = list(arm.states[0].name)
+    goal = np.array(arm.states[0].position) + 0.25
+    goals = ros.talk(JointState, "target_posture", GOAL_QOS)
+    arm.ros.set_parameters(NODE, posture_kp=20.0, pose_weight=0.0)
+    goals.publish(JointState(name=joints, position=goal.tolist()))
+    arm.ros.wait_until(lambda: np.abs(arm.states[-1].velocity).max() > 0.3, "motion")
+    arm.enable(False)
+    arm.ros.wait_until(
+        lambda: arm.ros.reported(NODE, "control") == "position", "the drives", timeout=30.0
+    )
+    arm.run(300)
+    q, tau, by_torque = arm.recorded()
+    last = np.flatnonzero(by_torque)[-1]
+    steps = np.abs(np.diff(tau, axis=0)) / arm.tau_max
+    # Taken in motion, the drives brake with 0.7 of the torque limit in one step.
+    assert steps[last : last + 50].max() < 0.1
+    assert np.abs(q[last:] - q[last]).max() < 2e-3

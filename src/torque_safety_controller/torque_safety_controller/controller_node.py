@@ -144,7 +144,7 @@ class ControllerNode(Node):
             self._goal_at = time.monotonic()
         states, limits = self._states, self._limits
         now = states.q, states.v, limits.lower, limits.upper
-        if self._goal_lost():
+        if self._goal_lost() or self._handover.control is Control.GIVING_BACK:
             step = self._controller.rest(*now, self._elapsed())
         else:
             step = self._controller.step(*now, self._elapsed())
@@ -163,6 +163,7 @@ class ControllerNode(Node):
     def _answer(self, step: Step, stamp: Any) -> None:
         """Publish the torques of `step` for the state with `stamp`."""
         now = time.monotonic()
+        elapsed = self._elapsed() or 0.0
         self._commands.torque(step.tau, stamp)
         self._answered_stamp = self._states.stamp
         self._record.note(step, now - self._message_at)
@@ -172,12 +173,16 @@ class ControllerNode(Node):
             self._enter(Mode.TRACKING, "goal")
         else:
             self._enter(Mode.HOLD, self._why_hold(step))
+        if self._handover.control is Control.GIVING_BACK:
+            self._handover.slow_down(self._states.q, self._states.v, elapsed)
 
     def _why_hold(self, step: Step) -> str:
         if step.failure:
             return f"solver failed: {step.failure}"
         if self._bounds_lost:
             return "acceleration limits are stale"
+        if self._handover.control is Control.GIVING_BACK:
+            return "on the way to position control"
         if self._controller.goals.any:
             return "goal lost"
         return "no goal"
@@ -230,8 +235,8 @@ class ControllerNode(Node):
                 self._bounds_lost = False
                 response.message = "torque control begins with the next state"
             else:
-                self._handover.to_position(states.q, silence < config.state_timeout)
-                response.message = "position control begins with the next state"
+                self._handover.to_position(states.q, states.v, silence < config.state_timeout)
+                response.message = "position control begins when the arm is at rest"
             response.success = True
         except HandoverRefused as error:
             response.message = str(error)

@@ -4,6 +4,9 @@
 configuration, makes its first torque; in the next step torque is what the robot is given. The
 integral action begins with the difference between the torque measured and the one computed, so
 that the torque goes on from what the drives applied (`Controller.take_over`).
+
+Drives brake an arm in motion as hard as they can. So on the way back it is brought to rest under
+torque control first.
 """
 
 from __future__ import annotations
@@ -17,6 +20,13 @@ TORQUE_TOLERANCE = 0.01
 """By how much of its limit a measured torque may exceed it: the step that is left is no larger."""
 
 
+REST_SPEED = 0.02
+"""Joints slower than this, rad/s, are at rest enough for drives to take them."""
+
+PATIENCE = 2.0
+"""How long an arm is waited for to come to rest, s; one that somebody pushes may not."""
+
+
 class Control(Enum):
     """Who is in command of the joints."""
 
@@ -25,6 +35,8 @@ class Control(Enum):
     """The drives, at positions that they are sent."""
     TAKING_OVER = "taking over"
     """Still the drives, while the QP makes its first torque."""
+    GIVING_BACK = "giving back"
+    """Torque still, which brings the arm to rest before the drives take it."""
 
 
 class HandoverRefused(ValueError):
@@ -57,6 +69,7 @@ class Handover:
         self.control = self._start = Control(control)
         self.reason = "as at start"
         self._q_hold: np.ndarray | None = None
+        self._waited = 0.0
         self._joints = joints
         self._q_min, self._q_max = np.asarray(q_min), np.asarray(q_max)
         self._tau_max = np.asarray(tau_max)
@@ -64,7 +77,7 @@ class Handover:
     @property
     def by_drives(self) -> bool:
         """Whether positions are to be sent."""
-        return self.control is not Control.TORQUE
+        return self.control in (Control.POSITION, Control.TAKING_OVER)
 
     def hold(self, q: np.ndarray) -> np.ndarray:
         """Return where the drives are to hold the joints, captured at the first call.
@@ -78,7 +91,8 @@ class Handover:
 
     def robot_was_away(self) -> None:
         """Begin anew, the robot having been silent or started over: never with torque unasked."""
-        back = self._start is Control.POSITION or self.control is Control.TAKING_OVER
+        between = (Control.TAKING_OVER, Control.GIVING_BACK)
+        back = self._start is Control.POSITION or self.control in between
         if back and self.control is not Control.POSITION:
             self._set(Control.POSITION, "the robot was silent or started over")
         self._q_hold = None
@@ -87,6 +101,8 @@ class Handover:
         self, q: np.ndarray, tau: np.ndarray | None, fresh: bool, bounds_fresh: bool
     ) -> None:
         """Begin the handover to torque control; the next state with limits completes it.
+
+        One from torque that is under way is called off.
 
         Args:
             q: position, shape (n,), rad.
@@ -103,6 +119,9 @@ class Handover:
             raise HandoverRefused("no joint state, or only old ones")
         if not bounds_fresh:
             raise HandoverRefused("no acceleration limits, or only old ones")
+        if self.control is Control.GIVING_BACK:
+            self._set(Control.TORQUE, "enable_torque")
+            return
         self.check(q, tau)
         self._set(Control.TAKING_OVER, "enable_torque")
 
@@ -131,23 +150,40 @@ class Handover:
         """Leave the arm to the drives, where they hold it."""
         self._set(Control.POSITION, f"handover failed: {reason}")
 
-    def to_position(self, q: np.ndarray, fresh: bool) -> None:
-        """Let the drives hold the arm where it is.
+    def to_position(self, q: np.ndarray, v: np.ndarray, fresh: bool) -> None:
+        """Let the drives hold the arm where it is, or where it comes to rest.
 
         Args:
             q: position, shape (n,), rad.
+            v: velocity, shape (n,), rad/s.
             fresh: whether joint states come.
 
         Raises:
             HandoverRefused: they do so already, or nobody knows where it is.
         """
-        if self.control is Control.POSITION:
+        if self.control in (Control.POSITION, Control.GIVING_BACK):
             raise HandoverRefused("position control is on already")
         if not fresh:
             raise HandoverRefused("no joint state, or only old ones")
-        if self.control is Control.TORQUE:
+        if self.control is Control.TAKING_OVER:
+            self._set(Control.POSITION, "enable_torque")
+            return
+        self._waited = 0.0
+        self._set(Control.GIVING_BACK, "enable_torque")
+        self.slow_down(q, v, 0.0)
+
+    def slow_down(self, q: np.ndarray, v: np.ndarray, elapsed: float) -> None:
+        """Let the drives take the arm from the next state on if it is at rest, or was waited for.
+
+        Args:
+            q: position, shape (n,), rad.
+            v: velocity, shape (n,), rad/s.
+            elapsed: time since it was asked for last, s.
+        """
+        self._waited += elapsed
+        if np.abs(v).max() <= REST_SPEED or self._waited > PATIENCE:
             self._q_hold = q.copy()
-        self._set(Control.POSITION, "enable_torque")
+            self._set(Control.POSITION, "enable_torque")
 
     def _set(self, control: Control, reason: str) -> None:
         self.control, self.reason = control, reason
