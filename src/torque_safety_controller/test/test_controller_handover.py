@@ -465,6 +465,6 @@ def test_an_arm_in_motion_is_brought_to_rest_before_its_drives_take_it(ros):
     q, tau, by_torque = arm.recorded()
     last = np.flatnonzero(by_torque)[-1]
     steps = np.abs(np.diff(tau, axis=0)) / arm.tau_max
-    # Taken in motion, the drives brake with 0.7 of the torque limit in one step.
+    # Taken in motion, drives brake it with the whole of their torque in one step.
     assert steps[last : last + 50].max() < 0.1
     assert np.abs(q[last:] - q[last]).max() < 2e-3
