@@ -1,0 +1,308 @@
+"""Figures 10 and 11 of [Benallegue2021]: a curve among poles that nobody told the robot of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Any, NamedTuple
+
+import matplotlib.pyplot as plt
+import numpy as np
+from compliance_push import MODES, ROBOT, off, within_limits
+from direct import DirectLoop, Sample, column
+from figure import Figure
+from paper1_integral import hand
+
+from sim_bridge.obstacles import Obstacle
+from torque_safety_controller.pose_trajectory import PoseTrajectory, circle
+
+# Where a circle of 0.4 m in the y-z plane stays far from all limits for several turns.
+START = [-0.33, 0.22, -1.06, 1.44, 0.08, -1.43, 0.67, -0.21, 0.04]  # rad
+DIAMETER, PERIOD, TURNS = 0.4, 8.0, 3  # m, s
+SETTLING = 0.5  # s
+_SIDE = np.sqrt(0.5)
+
+
+def _pole(name: str, along: str, centre: tuple[float, float, float], length: float) -> Obstacle:
+    turned = {"x": (0.0, _SIDE, 0.0, _SIDE), "y": (_SIDE, 0.0, 0.0, _SIDE)}
+    return Obstacle(name, "cylinder", (0.04, 0.04, length), centre, turned[along])
+
+
+# One above the elbow where it rises, one below the upper arm where it comes down.
+POLES = (
+    _pole("upper pole", "x", (0.40, 0.36, 0.44), 0.25),
+    _pole("lower pole", "y", (0.42, 0.0, 0.28), 0.2),
+)
+
+
+class Drawn(NamedTuple):
+    """A curve as it was drawn."""
+
+    samples: tuple[Sample, ...]
+    goals: np.ndarray
+    """Where the hand should have been, shape (N, 3), m."""
+    places: np.ndarray
+    """Where it was, shape (N, 3), m."""
+    forces: np.ndarray
+    """Sum of what the poles pressed with at each step, shape (N,), N."""
+    touched: frozenset[str]
+    """Links that touched a pole."""
+    loop: DirectLoop
+
+    @property
+    def turn(self) -> np.ndarray:
+        """In which turn the reference was at each step, from 0, shape (N,)."""
+        y, z = (self.goals - self.goals[0])[:, 1:].T
+        angle = np.unwrap(np.arctan2(y, 0.5 * DIAMETER - z))
+        return np.minimum(angle / (2.0 * np.pi), angle[-1] / (2.0 * np.pi) - 0.5).astype(int)
+
+    @property
+    def t(self) -> np.ndarray:
+        """Time from the start, shape (N,), s."""
+        return column(self.samples, "t") - self.samples[0].t
+
+
+def draw(
+    changed: Mapping[str, Any],
+    poles: Sequence[Obstacle] = (),
+    turns: int = TURNS,
+    period: float = PERIOD,
+    switches: Mapping[float, str] | None = None,
+) -> Drawn:
+    """Draw the curve with the arm.
+
+    Args:
+        changed: parameters that differ from the file's.
+        poles: that stand in the way.
+        turns: how often.
+        period: mean duration of a turn, s.
+        switches: which integral action to go over to, by time, s.
+    """
+    loop = DirectLoop(ROBOT, {"start_positions": START, **changed})
+    for pole in poles:
+        loop.robot.add_obstacle(pole)
+    loop.run(SETTLING)
+    trajectory = PoseTrajectory(circle(loop.pose(), DIAMETER, period, turns))
+    begin = loop.t
+    due = sorted((switches or {}).items())
+    goals, forces, touched = [], [], set()
+
+    def each(t: float) -> None:
+        while due and t - begin >= due[0][0] - 0.5 * loop.dt:
+            loop.change(integral_action=due.pop(0)[1])
+        pose, twist, twist_rate = trajectory.sample(t - begin)
+        loop.controller.set_pose_goal(pose, twist, twist_rate)
+        goals.append(pose.translation)
+        contacts = loop.robot.contacts() if poles else []
+        forces.append(sum(np.linalg.norm(contact.force) for contact in contacts))
+        touched.update(contact.link for contact in contacts)
+
+    samples = loop.run(trajectory.duration, each)
+    return Drawn(
+        samples,
+        np.array(goals),
+        hand(loop, samples),
+        np.array(forces),
+        frozenset(touched),
+        loop,
+    )
+
+
+def judge(run: Drawn) -> dict[str, float]:
+    """Return what a run amounts to."""
+    place, turn = off(run.samples)
+    touching = run.forces > 0.0
+    result = {
+        "hand_m": float(place.max()),
+        "hand_rms_m": float(np.sqrt(np.mean(place**2))),
+        "hand_rad": float(turn.max()),
+        "force_n": float(run.forces.max()),
+        "force_mean_n": float(run.forces[touching].mean()) if touching.any() else 0.0,
+        "impulse_n_s": float(run.forces.sum() * run.loop.dt),
+        "touching_s": float(touching.sum() * run.loop.dt),
+        "within_limits": float(within_limits(run.loop)),
+        "torque_share": float(run.loop.robot.monitor.max_torque_ratio.max()),
+    }
+    for k in range(run.turn[-1] + 1):
+        result[f"turn_{k + 1}_hand_m"] = float(place[run.turn == k].max())
+        result[f"turn_{k + 1}_force_n"] = float(run.forces[run.turn == k].max())
+    return result
+
+
+def steps_at(run: Drawn, switches: Mapping[float, str]) -> list[tuple[float, float]]:
+    """Return the torque's steps at switches, and the largest beside them, in torque limits.
+
+    A switch acts in the step after the one that brings it; three steps are counted as its own,
+    those within 0.2 s before and after as beside it.
+    """
+    tau = column(run.samples, "tau") / run.loop.config.tau_max
+    steps = np.abs(np.diff(tau, axis=0)).max(axis=1)
+    wide, result = round(0.2 / run.loop.dt), []
+    for time in sorted(switches):
+        k = round(time / run.loop.dt)
+        beside = np.concatenate([steps[k - 1 - wide : k - 1], steps[k + 2 : k + 2 + wide]])
+        result.append((float(steps[k - 1 : k + 2].max()), float(beside.max())))
+    return result
+
+
+SPRING = {"posture_kp": 1.0}
+"""1/s^2: barely felt, but brings the null space back to the poles in every turn."""
+SWITCHES = {1.5: "task", 2.5: "joints", 3.2: "task", 4.0: "joints", 4.6: "task"}
+"""In the middle of a turn of 6 s, where the hand is fastest."""
+
+
+@cache
+def among_poles() -> dict[str, Drawn]:
+    """Return the curve among the poles without and with null-space compliance."""
+    return {name: draw(changed | SPRING, POLES) for name, changed in MODES.items()}
+
+
+def figure_10() -> Figure:
+    """The curve, free and among poles, without and with null-space compliance."""
+    figure = Figure("paper1-fig10")
+    free = {name: draw(changed) for name, changed in MODES.items()}
+    poles = among_poles()
+    slack = {name: draw(changed, POLES) for name, changed in MODES.items()}
+    found = {}
+    for kind, runs in (("free", free), ("poles", poles), ("poles, kp 0", slack)):
+        for name, run in runs.items():
+            found[kind, name] = judge(run)
+            figure.metrics |= {f"{kind}, {name}: {k}": v for k, v in found[kind, name].items()}
+            figure.data |= {
+                f"{kind}, {name}: {what}": value.astype(np.float32)
+                for what, value in (
+                    ("t", run.t),
+                    ("goal", run.goals),
+                    ("place", run.places),
+                    ("force", run.forces),
+                    ("q", column(run.samples, "q")),
+                )
+            }
+    figure.rows += _rows(found)
+    figure.save(_picture(free, poles))
+    return figure
+
+
+def _told(found: dict[str, float]) -> str:
+    limits = "no limit broken" if found["within_limits"] else "a limit BROKEN"
+    return f"hand within {1e3 * found['hand_m']:.1f} mm, {limits}"
+
+
+def _forces(found: dict[str, float]) -> str:
+    turns = [found[f"turn_{k + 1}_force_n"] for k in range(TURNS)]
+    return (
+        f"{', '.join(f'{each:.0f}' for each in turns)} N in turns 1 to {TURNS}, "
+        f"{found['impulse_n_s']:.0f} N s in all"
+    )
+
+
+def _rows(found: dict[tuple[str, str], dict[str, float]]) -> list[tuple[str, str, str, str]]:
+    without, with_ = MODES
+    rows = []
+    both = [found["free", name] for name in MODES]
+    good = all(each["hand_m"] < 0.02 and each["within_limits"] for each in both)
+    rows.append(
+        (
+            f"Fig. 10, 11: {TURNS} turns of a circle of 40 cm in the y-z plane, nothing there",
+            "-",
+            f"without: {_told(both[0])}; with: {_told(both[1])}",
+            "under 2 cm" if good else "DIFFERS",
+        )
+    )
+    for kind, what in (
+        ("poles", "the same among two rigid poles, posture kp 1 1/s²"),
+        ("poles, kp 0", "the same, posture kp 0: the arm stays where the poles have put it"),
+    ):
+        with_it, lacking = found[kind, with_], found[kind, without]
+        kept = with_it["hand_m"] < 0.02 and with_it["within_limits"]
+        lower = with_it["force_n"] < lacking["force_n"]
+        lower &= with_it["impulse_n_s"] < lacking["impulse_n_s"]
+        rows.append(
+            (
+                f"Fig. 10, 11: {what}",
+                "the disturbance is visible, the error remains under 2 cm; only tried with "
+                "null-space compliance",
+                f"with: {_told(with_it)}, {_forces(with_it)}; without: {_told(lacking)}, "
+                f"{_forces(lacking)}",
+                "agrees" if kept and lower else "DIFFERS",
+            )
+        )
+    return rows
+
+
+def _picture(free: Mapping[str, Drawn], poles: Mapping[str, Drawn]) -> plt.Figure:
+    picture, axes = plt.subplots(4, 2, figsize=(13, 12), layout="constrained")
+    for column_of, name in zip(axes.T, MODES, strict=True):
+        runs = {"free": (free[name], "tab:green"), "among poles": (poles[name], "tab:red")}
+        plane, path, error, force = column_of
+        goals = free[name].goals
+        plane.plot(goals[:, 1], goals[:, 2], "k--", label="reference")
+        for k, label in ((1, "y"), (2, "z")):
+            path.plot(free[name].t, goals[:, k], "k--", label="reference" if k == 1 else None)
+            color = "tab:blue" if k == 1 else "tab:orange"
+            run = poles[name]
+            path.plot(run.t, run.places[:, k], color=color, label=f"{label}, among poles")
+        for kind, (run, color) in runs.items():
+            plane.plot(run.places[:, 1], run.places[:, 2], color=color, label=kind, lw=1)
+            off_goal = 1e3 * np.linalg.norm(run.places - run.goals, axis=1)
+            error.semilogy(run.t, np.maximum(off_goal, 1e-2), color=color, label=kind, lw=1)
+        error.axhline(20.0, color="black", linestyle=":", label="2 cm")
+        force.plot(poles[name].t, poles[name].forces, color="tab:red", lw=1)
+        for axis in (path, error, force):
+            for k in np.flatnonzero(np.diff(free[name].turn)):
+                axis.axvline(free[name].t[k], color="gray", linestyle="--", lw=1)
+        plane.set(xlabel="y [m]", ylabel="z [m]", title=name, aspect="equal")
+        path.set(xlabel="time [s]; dashed: turns", ylabel="hand, y and z [m]")
+        error.set(xlabel="time [s]", ylabel="hand off its reference [mm]", ylim=(1e-2, 300.0))
+        top = max(run.forces.max() for run in poles.values())
+        force.set(xlabel="time [s]", ylabel="poles press with [N]", ylim=(0.0, 1.05 * top))
+        for axis in column_of[:3]:
+            axis.legend(loc="upper right", fontsize="small")
+        for axis in column_of[1:]:
+            axis.grid(alpha=0.3)
+    return picture
+
+
+def switching() -> Figure:
+    """Null-space compliance switched on and off while the hand draws the curve."""
+    figure = Figure("paper1-switching")
+    run = draw({"integral_action": "joints"}, turns=1, period=6.0, switches=SWITCHES)
+    found = steps_at(run, SWITCHES)
+    place, _ = off(run.samples)
+    at, beside = (max(values) for values in zip(*found, strict=True))
+    figure.metrics = {
+        "largest_step_share": at,
+        "largest_step_beside_share": beside,
+        "hand_m": float(place.max()),
+        "within_limits": float(within_limits(run.loop)),
+    }
+    tau = column(run.samples, "tau") / run.loop.config.tau_max
+    figure.data = {"t": run.t, "tau": column(run.samples, "tau"), "hand": place}
+    picture, axes = plt.subplots(3, 1, figsize=(10, 9), sharex=True, layout="constrained")
+    axes[0].plot(run.t, tau, lw=1, label=run.loop.config.joints)
+    axes[0].set(ylabel="torque [torque limits]", title="switched in motion")
+    axes[0].legend(fontsize="x-small", ncols=3)
+    steps = np.abs(np.diff(tau, axis=0)).max(axis=1)
+    axes[1].semilogy(run.t[1:], np.maximum(1e2 * steps, 1e-4), color="black", lw=0.7)
+    axes[1].set(ylabel="largest step of a torque\n[% of its limit a period]")
+    axes[2].plot(run.t, 1e3 * place, color="tab:red", lw=1)
+    axes[2].set(xlabel="time [s]", ylabel="hand off its reference [mm]")
+    spans = [0.0, *SWITCHES, run.t[-1]]
+    for k, axis in enumerate(axes):
+        axis.grid(alpha=0.3)
+        for index, (begin, end) in enumerate(zip(spans, spans[1:], strict=False)):
+            if index % 2 == 1:
+                label = "null-space compliance" if k == 2 and index == 1 else None
+                axis.axvspan(begin, end, color="tab:blue", alpha=0.12, label=label)
+    axes[2].legend(loc="upper right")
+    figure.rows.append(
+        (
+            f"Switched on and off {len(SWITCHES)} times in motion",
+            "-",
+            f"largest step of a torque at a switch {at:.3%} of its limit, within 0.2 s beside "
+            f"one {beside:.3%}; hand within {1e3 * place.max():.1f} mm",
+            "no jump" if at <= 1.5 * beside else "DIFFERS",
+        )
+    )
+    figure.save(picture)
+    return figure
