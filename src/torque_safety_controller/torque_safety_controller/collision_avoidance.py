@@ -175,15 +175,8 @@ class CollisionAvoidance:
 
         Values that are not finite are the caller's to refuse.
         """
-        pushed = self._undisturbed if disturbance is None else disturbance
-        step = Step(a_lower, a_upper, pushed, *self._fixed)
-        k = collision_rows(q, v, self.model.pairs, self.model.bodies, step, *self._arm)
-        self._count = k
-        rows = self._rows
-        chosen: slice | NDArray = slice(k)
-        if k > self._rows_max:
-            chosen = np.sort(np.argpartition(rows.distance[:k], self._rows_max)[: self._rows_max])
-        names = self.model.names
+        chosen = self._update(q, v, a_lower, a_upper, disturbance)
+        rows, names = self._rows, self.model.names
         return CollisionRows(
             rows.G[chosen],
             rows.lower[chosen],
@@ -193,6 +186,17 @@ class CollisionAvoidance:
             rows.bias[chosen],
             rows.viable[chosen],
         )
+
+    def _update(self, q, v, a_lower, a_upper, disturbance) -> slice | NDArray[np.int64]:
+        """Compute the rows of a step; return which are to be used."""
+        pushed = self._undisturbed if disturbance is None else disturbance
+        step = Step(a_lower, a_upper, pushed, *self._fixed)
+        k = collision_rows(q, v, self.model.pairs, self.model.bodies, step, *self._arm)
+        self._count = k
+        if k <= self._rows_max:
+            return slice(k)
+        nearest = np.argpartition(self._rows.distance[:k], self._rows_max)
+        return np.sort(nearest[: self._rows_max])
 
     def constraint(
         self,
@@ -220,9 +224,9 @@ class CollisionAvoidance:
             a_lower, a_upper = (
                 np.nan_to_num(bound, posinf=_FAST, neginf=-_FAST) for bound in (a_lower, a_upper)
             )
-        found = self.rows(q, v, a_lower, a_upper, disturbance)
-        upper = np.full(len(found.lower), np.inf)
-        return Rows(ROW_SCALE * found.G, ROW_SCALE * found.lower, upper)
+        chosen = self._update(q, v, a_lower, a_upper, disturbance)
+        G, lower = self._rows.G[chosen], self._rows.lower[chosen]
+        return Rows(ROW_SCALE * G, ROW_SCALE * lower, np.full(len(lower), np.inf))
 
     @property
     def count(self) -> int:

@@ -166,7 +166,7 @@ def write_row(pair, d, radius, n, p, joint, o, other, sliding, step, chain, moti
         ) / d
     k = rows.count[0]
     G = rows.G[k]
-    brake, lever, most, least, pushed = 0.0, 0.0, 0.0, 0.0, 0.0
+    brake, most, least, pushed = 0.0, 0.0, 0.0, 0.0
     axes, origins, slides = motion.axis, motion.origin, chain.slides
     moves, moves_other = chain.moved_by[joint], chain.moved_by[other]
     a_lower, a_upper, a_brake = step.a_lower, step.a_upper, step.a_brake
@@ -178,7 +178,6 @@ def write_row(pair, d, radius, n, p, joint, o, other, sliding, step, chain, moti
             g -= _lever(at(axes, m + 1), at(origins, m + 1), slides[m + 1], o, n)
         G[m] = g
         brake += abs(g) * a_brake[m]
-        lever = max(lever, abs(g))
         pushed += g * step.disturbance[m]
         low, high = g * a_lower[m], g * a_upper[m]
         most += max(low, high)
@@ -189,8 +188,7 @@ def write_row(pair, d, radius, n, p, joint, o, other, sliding, step, chain, moti
     room = d - radius - law.margin - law.reserve
     wanted = _lowest(room, rate, braking, step, rows.joint, rows.kept)
     if room < 0.0:
-        # Where a distance is greatest its levers vanish, and so does what is asked for.
-        gentle = min(law.braking, law.share * brake) * min(1.0, lever / _LEVER)
+        gentle = min(law.braking, law.share * brake) * min(1.0, _largest(G) / _LEVER)
         wanted = min(wanted, _recovery(room, rate, gentle, law))
     wanted -= bias + min(pushed, 0.0)
     if wanted <= least:
@@ -256,6 +254,15 @@ def _lowest(room, rate, braking, step, x, kept):
     solve(x[0], x[1], ranges, sides, budgets, speeds, x[2], x[3], kept)
     law = step.law
     return max(x[2, 0, 0] * braking, (-law.speed_max - rate) / law.dt)
+
+
+@compiled
+def _largest(G):
+    """Return the largest lever: where a distance is greatest they vanish, and so does the push."""
+    lever = 0.0
+    for g in G:
+        lever = max(lever, abs(g))
+    return lever
 
 
 @compiled
