@@ -24,7 +24,11 @@ _SIDE = np.sqrt(0.5)
 
 
 def _pole(name: str, along: str, centre: tuple[float, float, float], length: float) -> Obstacle:
-    turned = {"x": (0.0, _SIDE, 0.0, _SIDE), "y": (_SIDE, 0.0, 0.0, _SIDE)}
+    turned = {
+        "x": (0.0, _SIDE, 0.0, _SIDE),
+        "y": (_SIDE, 0.0, 0.0, _SIDE),
+        "z": (0.0, 0.0, 0.0, 1.0),
+    }
     return Obstacle(name, "cylinder", (0.04, 0.04, length), centre, turned[along])
 
 
@@ -33,6 +37,8 @@ POLES = (
     _pole("upper pole", "x", (0.40, 0.36, 0.44), 0.25),
     _pole("lower pole", "y", (0.42, 0.0, 0.28), 0.2),
 )
+# Where the null space cannot go far: a joint of the wrist comes to its limit.
+UPRIGHT = _pole("upright pole", "z", (0.40, 0.40, 0.5), 1.2)
 
 
 class Drawn(NamedTuple):
@@ -180,6 +186,29 @@ def figure_10() -> Figure:
             }
     figure.rows += _rows(found)
     figure.save(_picture(free, poles))
+    return figure
+
+
+def adverse() -> Figure:
+    """A pole that the null space cannot give way to."""
+    figure = Figure("paper1-adverse-pole")
+    found = {name: judge(draw(changed, [UPRIGHT], 2)) for name, changed in MODES.items()}
+    for name, each in found.items():
+        figure.metrics |= {f"{name}: {key}": value for key, value in each.items()}
+    told = [
+        f"{_told(each)}, {each['force_n']:.0f} N, {each['impulse_n_s']:.0f} N s"
+        for each in found.values()
+    ]
+    kept = all(each["within_limits"] for each in found.values())
+    figure.rows.append(
+        (
+            "An upright pole at the left, where the null space has little room, 2 turns",
+            "-",
+            f"without: {told[0]}; with: {told[1]}",
+            "for comparison: not every pole is given way to" if kept else "DIFFERS",
+        )
+    )
+    figure.save(None)
     return figure
 
 

@@ -14,18 +14,37 @@ import argparse
 from collections.abc import Callable
 
 from chain import ROOT
-from compliance_curve import figure_10, switching
+from compliance_curve import adverse, figure_10, switching
+from compliance_hand import dual, pressing
 from compliance_push import figure_6, forces
 from compliance_stills import embed, figure_10_stills, figures_7_and_8
 from figure import Figure, table
+
+
+def figure_9() -> Figure:
+    """Dual compliance."""
+    figure = Figure("paper1-fig9")
+    dual(figure)
+    return figure
+
+
+def press() -> Figure:
+    """Pressing on a table, sliding along it."""
+    figure = Figure("paper1-press")
+    pressing(figure)
+    return figure
+
 
 PARTS: dict[str, Callable[[], Figure]] = {
     "fig6": figure_6,
     "fig7": figures_7_and_8,
     "force": forces,
+    "fig9": figure_9,
     "fig10": figure_10,
     "stills": figure_10_stills,
+    "adverse": adverse,
     "switching": switching,
+    "press": press,
 }
 PAGE = """# Compliance: what the paper reports, and what came out
 
