@@ -76,7 +76,7 @@ def test_the_nodes_play_what_a_loop_without_messages_plays():
     samples, touched, start = play_directly()
     scenario = {"duration": DURATION, "events": list(events(start))}
     runs = [run_chain(load_values(ROBOT), scenario, {}).run for _ in range(2)]
-    for name in ("t", "q", "v", "tau"):
+    for name in ("t", "q", "v", "tau", "ft_wrench"):
         np.testing.assert_array_equal(*(getattr(run, name) for run in runs))
     # Rounding; a push or a gain one step early or late makes a hundred times as much and more.
     np.testing.assert_allclose(runs[0].q, column(samples, "q"), atol=1e-6)

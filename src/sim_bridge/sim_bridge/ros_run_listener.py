@@ -29,7 +29,7 @@ class RunListener:
         recorder: has the states and what belongs to them.
         stamp: of the last state, ns.
         q: its positions, shape (n,), rad; None before the first.
-        answered: whether there was a command yet.
+        answered: stamp of the last command, ns; -1 before the first.
         diagnostics: the last of each node, values by key, by node name.
     """
 
@@ -37,7 +37,7 @@ class RunListener:
         self.recorder = Recorder(joints)
         self.stamp = 0
         self.q: np.ndarray | None = None
-        self.answered = False
+        self.answered = -1
         self.diagnostics: dict[str, dict[str, str]] = {
             name: {} for name in ("bullet_node", "controller_node", "bounds_node")
         }
@@ -67,8 +67,8 @@ class RunListener:
         self.recorder.add_limits(stamp_to_ns(message.header.stamp), lower, upper)
 
     def _on_command(self, message: JointState) -> None:
-        self.answered = True
-        self.recorder.add_torque(stamp_to_ns(message.header.stamp), message.effort)
+        self.answered = stamp_to_ns(message.header.stamp)
+        self.recorder.add_torque(self.answered, message.effort)
 
     def _on_wrench(self, message: WrenchStamped) -> None:
         f, t = message.wrench.force, message.wrench.torque

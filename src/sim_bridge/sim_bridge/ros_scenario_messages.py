@@ -34,6 +34,18 @@ _NOTHING = (0.0, 0.0, 0.0)
 _SHAPES = {"box": Marker.CUBE, "sphere": Marker.SPHERE, "cylinder": Marker.CYLINDER}
 
 
+class Request(NamedTuple):
+    """A call of a service."""
+
+    service: str
+    kind: Any
+    content: Any
+
+
+RESET = Request("bullet_node/reset", Trigger, Trigger.Request())
+"""Puts the robot at its start."""
+
+
 class Letter(NamedTuple):
     """A message, where it goes, and when it is to take effect."""
 
@@ -43,14 +55,6 @@ class Letter(NamedTuple):
     """Where in the message its stamp is."""
     delay: int
     """From the scenario's beginning, ns."""
-
-
-class Request(NamedTuple):
-    """A call of a service."""
-
-    service: str
-    kind: Any
-    content: Any
 
 
 def to_controller(scenario: Scenario, base_frame: str, end_effector_frame: str) -> list[Letter]:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-import time
 from collections import deque
-from collections.abc import Sequence
 from enum import Enum, auto
 from pathlib import Path
 from typing import Any
@@ -20,19 +18,20 @@ from rclpy.node import Node
 from sim_bridge.recording import Run
 from sim_bridge.ros_run_listener import RunListener
 from sim_bridge.ros_scenario_messages import (
+    RESET,
     change_parameters,
     pause,
     to_controller,
     to_robot,
     to_service,
 )
+from sim_bridge.ros_scenario_play import play
 from sim_bridge.ros_scenario_sender import Caller, Outbox, ScenarioRefused
 from sim_bridge.scenario_events import ServiceEvent
 from sim_bridge.scenario_parameters import TABLE, make_configuration
 from viability_bounds_pkg.ros_parameters import NodeParameters, ParameterError
-from viability_bounds_pkg.ros_runtime import make_executor, report_refusal
+from viability_bounds_pkg.ros_runtime import report_refusal
 
-_SHOW_PERIOD = 0.5
 _POLL_PERIOD = 0.02
 _TAKEN_BY = {
     "controller_node": ("goals_refused", "target_"),
@@ -46,6 +45,8 @@ class Phase(Enum):
 
     GETTING_READY = auto()
     """The robot is paused; the chain does not answer yet."""
+    RESETTING = auto()
+    """The robot is put at its start; the chain has not answered that state."""
     LOADING = auto()
     """What is to happen is sent ahead; not all of it has been reported as received."""
     PLAYING = auto()
@@ -56,6 +57,8 @@ class Phase(Enum):
 
 class ScenarioNode(Node):
     """Starts a paused robot with the goals of a scenario in place, and follows the run.
+
+    It is reset before: what had reached whom by then makes no difference.
 
     Goals, pushes and obstacles are sent ahead with the stamps at which they take effect. In
     lockstep the robot is halted where a service is to be called, and goes on when it has
@@ -86,10 +89,15 @@ class ScenarioNode(Node):
         self._goals = Outbox(self, to_controller(config.scenario, *frames))
         self._world = Outbox(self, to_robot(config.scenario, config.base_frame))
         self._due = deque(e for e in config.scenario.events if isinstance(e, ServiceEvent))
-        own = pause(False), change_parameters("bullet_node", {})
+        own = RESET, pause(False), change_parameters("bullet_node", {})
         self._caller = Caller(self, [*own, *map(to_service, self._due)])
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_POLL_PERIOD, self._proceed, clock=steady)
+
+    @property
+    def done(self) -> bool:
+        """Whether it is over."""
+        return self.phase is Phase.DONE
 
     @property
     def robot(self) -> dict[str, str]:
@@ -107,6 +115,9 @@ class ScenarioNode(Node):
             if self.phase in (Phase.LOADING, Phase.PLAYING):
                 self._check_refusals()
             if self.phase is Phase.GETTING_READY and not self.awaited():
+                self.phase, self._first = Phase.RESETTING, self.heard.stamp
+                self._caller.add("", RESET)
+            elif self.phase is Phase.RESETTING and self._caller.proceed() and self._is_reset():
                 self.phase = Phase.LOADING
                 self._plan()
             elif self.phase is Phase.LOADING and self._load():
@@ -131,10 +142,14 @@ class ScenarioNode(Node):
         topics = self._goals.unheard() + self._world.unheard()
         return (
             ([] if paused else ["a paused robot"])
-            + ([] if self.heard.answered else ["joint commands"])
+            + ([] if self.heard.answered >= 0 else ["joint commands"])
             + [f"service {service}" for service in self._caller.missing()]
             + [f"a subscriber of {topic}" for topic in topics]
         )
+
+    def _is_reset(self) -> bool:
+        """Return whether the state that a reset published has been answered."""
+        return self.heard.answered == self.heard.stamp > self._first
 
     def _plan(self) -> None:
         # Resuming begins a period of its own: the first state that moves is the next.
@@ -207,47 +222,6 @@ class ScenarioNode(Node):
             f"pose error {1e3 * error:7.2f} mm  "
             f"{float(self.robot.get('rate_hz', 'nan')):5.0f} Hz"
         )
-
-
-def play(node: ScenarioNode, others: Sequence[Node] = (), *, quiet: bool = False) -> None:
-    """Run the scenario to its end, showing a live line.
-
-    Args:
-        node: the scenario.
-        others: nodes to run in the same process.
-        quiet: show nothing.
-
-    Raises:
-        TimeoutError: the other nodes did not come up, or stopped answering.
-        ScenarioRefused: another node refused what the scenario asks of it.
-        ExternalShutdownException: told to stop before the end.
-    """
-    executor = make_executor(node.context)
-    for each in (node, *others):
-        executor.add_node(each)
-    terminal = sys.stdout.isatty()
-    shown_at = -math.inf
-    progress, moved_at = None, time.monotonic()
-    while node.phase is not Phase.DONE and rclpy.ok(context=node.context):
-        executor.spin_once(timeout_sec=0.1)
-        now = time.monotonic()
-        if (node.heard.stamp, node.phase) != progress:
-            progress, moved_at = (node.heard.stamp, node.phase), now
-        elif now - moved_at > node.config.ready_timeout:
-            phase = node.phase.name.lower().replace("_", " ")
-            awaited = ": there is no " + ", no ".join(node.awaited()) if node.awaited() else ""
-            raise TimeoutError(
-                f"nothing has moved for {node.config.ready_timeout:g} s ({phase}{awaited})"
-            )
-        if not quiet and now - shown_at > _SHOW_PERIOD:
-            shown_at = now
-            print(node.live_line(), end="\r" if terminal else "\n", flush=True)
-    if node.failure is not None:
-        raise node.failure
-    if node.phase is not Phase.DONE:
-        raise ExternalShutdownException
-    if not quiet:
-        print(node.live_line(), flush=True)
 
 
 def main(args: list[str] | None = None) -> int:
