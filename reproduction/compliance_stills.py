@@ -123,4 +123,6 @@ def embed() -> None:
         image = Image.open(RESULTS / name / "figure.png").convert("RGB")
         width = 1100
         small = image.resize((width, round(image.height * width / image.width)))
-        small.quantize(96).save(ROOT / "docs" / "images" / f"{to}.png", optimize=True)
+        small.quantize(200, Image.Quantize.MAXCOVERAGE).save(
+            ROOT / "docs" / "images" / f"{to}.png", optimize=True
+        )
