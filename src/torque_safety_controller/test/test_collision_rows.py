@@ -6,7 +6,11 @@ from collision_arm import panda, two_links
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torque_safety_controller.collision_avoidance import CollisionAvoidance, CollisionSettings
+from torque_safety_controller.collision_avoidance import (
+    ROW_SCALE,
+    CollisionAvoidance,
+    CollisionSettings,
+)
 from torque_safety_controller.collision_kernels import BOX, CAPSULES
 from torque_safety_controller.collision_kinematics import make_chain, make_motion, move
 from torque_safety_controller.collision_obstacles import (
@@ -370,3 +374,52 @@ def test_limits_and_steps_that_cannot_be_are_refused():
         CollisionAvoidance(collision, limits.a_min, limits.a_max, 1e-3, rows_max=0)
     with pytest.raises(CollisionError, match="dt"):
         CollisionAvoidance(collision, limits.a_min, limits.a_max, 0.0)
+
+
+def ball_before_a_wall(**changes):
+    """An arm in the x-y plane with a ball at its end, and a wall at x = 0.9 m."""
+    block = box("block", [1.0, 0.0, 0.0], [0.2, 2.0, 2.0])
+    return two_links(BALL, 0.3, [block], dt=4e-3, **changes)[0]
+
+
+@pytest.mark.parametrize("beyond", [1e-13, 1e-9, 1e-6])
+def test_a_distance_just_beyond_its_limit_is_brought_back_without_a_kick(beyond):
+    """Both at rest and on its way in; just inside about the same is asked for."""
+    q = np.array([0.9, -0.9])  # the forearm along x: the ball's centre at x = 0.5 cos 0.9 + 0.3
+    wide = np.full(2, 20.0)
+    gap = 0.9 - (0.5 * np.cos(0.9) + 0.3) - 0.05
+    for v in (np.zeros(2), np.array([-1e-6, 0.0])):
+        asked = []
+        for inside in (beyond, -beyond):
+            avoidance = ball_before_a_wall(margin=gap - 0.002 + inside, influence=1.0)
+            rows = avoidance.rows(q, v, -wide, wide)
+            asked.append(rows.lower[np.argmin(rows.distance)])
+        assert abs(asked[0]) < 2.1 * beyond / 4e-3**2 + 3e-3  # m/s^2
+        assert asked[0] == pytest.approx(asked[1], abs=5.0 * beyond / 4e-3**2 + 3e-3)
+
+
+def test_what_pushes_towards_a_body_is_asked_for_in_addition():
+    avoidance = ball_before_a_wall(margin=0.1, influence=1.0)
+    q, v, wide = np.array([0.6, -0.4]), np.array([-0.5, 0.2]), np.full(2, 5000.0)
+    plain = avoidance.rows(q, v, -wide, wide)
+    G, lower = plain.G.copy(), plain.lower.copy()
+    for e in (np.array([-2.0, 1.0]), np.array([2.0, -1.0])):
+        pushed = avoidance.rows(q, v, -wide, wide, e)
+        assert len(lower) == len(pushed.lower) > 0
+        np.testing.assert_allclose(pushed.lower, lower + np.maximum(-G @ e, 0.0), atol=1e-9)
+
+
+def test_constraints_for_the_qp_are_finite_whatever_it_is_given():
+    avoidance = ball_before_a_wall(margin=0.1, influence=1.0)
+    q, v, wide = np.array([0.6, -0.4]), np.array([-0.5, 0.2]), np.full(2, 5000.0)
+    rows = avoidance.rows(q, v, -wide, wide)
+    G, lower = rows.G.copy(), rows.lower.copy()
+    scaled = avoidance.constraint(q, v, -wide, wide)
+    np.testing.assert_allclose(scaled.G, ROW_SCALE * G)
+    np.testing.assert_allclose(scaled.lower, ROW_SCALE * lower)
+    assert np.isposinf(scaled.upper).all()
+    for bad in (np.array([np.nan, 0.0]), np.array([0.0, np.inf])):
+        assert avoidance.constraint(bad, v, -wide, wide) is None
+        assert avoidance.constraint(q, bad, -wide, wide) is None
+    unbounded = avoidance.constraint(q, v, np.full(2, -np.inf), np.full(2, np.inf))
+    np.testing.assert_allclose(unbounded.lower, ROW_SCALE * lower)

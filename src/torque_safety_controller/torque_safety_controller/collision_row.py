@@ -190,6 +190,8 @@ def write_row(pair, d, radius, n, p, joint, o, other, sliding, step, chain, moti
     if room < 0.0:
         gentle = min(law.braking, law.share * brake) * min(1.0, _largest(G) / _LEVER)
         wanted = min(wanted, _recovery(room, rate, gentle, law))
+    elif rate < 0.0:
+        wanted = min(wanted, max(_back(room, rate, law), -rate / law.dt))
     wanted -= bias + min(pushed, 0.0)
     if wanted <= least:
         return
@@ -266,16 +268,24 @@ def _largest(G):
 
 
 @compiled
+def _back(room, rate, law):
+    """Return the acceleration with which a distance is at its limit after a step.
+
+    More is never asked for where it approaches its limit or is beyond it, but to end the
+    approach: the last micrometres would be a reason for full braking, which would be a kick,
+    again and again, where nothing but rounding or noise takes a distance there.
+    """
+    return -2.0 * (room / law.dt + rate) / law.dt
+
+
+@compiled
 def _recovery(room, rate, gentle, law):
     """Return the acceleration of a distance beyond its limit with which it gets back well enough.
 
-    The approach ends at once; then it accelerates by `gentle`, up to the speed of recovery. To be
-    back within a step is always enough: full braking would be a kick there, and rounding alone
-    takes a distance at rest on its limit beyond it.
+    The approach ends at once; then it accelerates by `gentle`, up to the speed of recovery.
     """
-    back = -2.0 * (room / law.dt + rate) / law.dt
     stop = max(-rate, 0.0) / law.dt
-    return min(back, stop + gentle, (law.recovery_speed - rate) / law.dt)
+    return min(_back(room, rate, law), stop + gentle, (law.recovery_speed - rate) / law.dt)
 
 
 @compiled
