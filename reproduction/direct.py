@@ -17,7 +17,7 @@ from chain import ROOT
 from sim_bridge import bullet_parameters
 from sim_bridge.limit_monitor import LimitMonitor
 from sim_bridge.ros_ft_sensor import ForceTorqueReading
-from torque_safety_controller import controller_assembly, controller_parameters
+from torque_safety_controller import controller_parameters, ros_controller_assembly
 from torque_safety_controller.controller import Step
 from viability_bounds_pkg import bounds_parameters
 from viability_bounds_pkg.robot_description import build_model, read_urdf
@@ -76,7 +76,7 @@ class DirectLoop:
         self._bounds = bounds.solve
         values = self._values("controller_node", controller_parameters.TABLE)
         made = controller_parameters.make_configuration(values)
-        self.controller, _ = controller_assembly.make_controller(values, made)
+        self.controller, _ = ros_controller_assembly.make_controller(values, made)
         self.sensing = True
         self._sensor = None
         interaction = self.controller.interaction
@@ -100,7 +100,7 @@ class DirectLoop:
         self._changed |= parameters
         values = self._values("controller_node", controller_parameters.TABLE)
         made = controller_parameters.make_configuration(values)
-        controller_assembly.configure(self.controller, made)
+        ros_controller_assembly.configure(self.controller, made)
 
     @property
     def dt(self) -> float:

@@ -14,8 +14,8 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from torque_safety_controller import controller_parameters
-from torque_safety_controller.controller_assembly import make_controller
 from torque_safety_controller.controller_node import ControllerNode
+from torque_safety_controller.ros_controller_assembly import make_controller
 from viability_bounds_pkg.ros_parameters import ParameterError
 from viability_bounds_pkg.ros_runtime import CONTROL_QOS, GOAL_QOS, set_stamp
 

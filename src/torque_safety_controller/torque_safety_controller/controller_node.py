@@ -15,7 +15,6 @@ from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
 from torque_safety_controller.controller import Step
-from torque_safety_controller.controller_assembly import configure, make_controller
 from torque_safety_controller.controller_parameters import (
     TABLE,
     ControllerConfiguration,
@@ -24,6 +23,7 @@ from torque_safety_controller.controller_parameters import (
 from torque_safety_controller.handover import Control, Handover, HandoverRefused
 from torque_safety_controller.modes import Mode, ModeKeeper
 from torque_safety_controller.ros_collision_report import CollisionReport
+from torque_safety_controller.ros_controller_assembly import configure, make_controller
 from torque_safety_controller.ros_controller_report import LEVELS, StepRecord
 from torque_safety_controller.ros_goals import GoalInbox
 from torque_safety_controller.ros_joint_commands import JointCommands
