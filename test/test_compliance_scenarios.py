@@ -16,7 +16,7 @@ LACKING, COMPLIANT = pushing.MODES
 def pushed():
     """Pushes along z at the hand, then at the elbow, there and back."""
     return {
-        name: pushing.push(changed, axes="z", held=1.0) for name, changed in pushing.MODES.items()
+        name: pushing.push(changed, axes="z", held=0.7) for name, changed in pushing.MODES.items()
     }
 
 
@@ -42,7 +42,7 @@ def test_the_hand_is_as_stiff(pushed):
 
 def test_unknown_poles_are_given_way_to_and_the_curve_is_drawn():
     runs = {
-        name: curve.draw(changed, curve.POLES, turns=1) for name, changed in pushing.MODES.items()
+        name: curve.draw(changed, curve.POLES, 1, 6.0) for name, changed in pushing.MODES.items()
     }
     found = {name: curve.judge(run) for name, run in runs.items()}
     # Both are hit, by their links; the hand and what carries it never are.
