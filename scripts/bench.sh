@@ -6,6 +6,7 @@
 #     bash scripts/bench.sh bounds    acceleration bounds: one arm, and batches; with --tsid
 #                                     also beside TSID's, which is installed into .venv-tsid
 #     bash scripts/bench.sh robot     physics steps of the simulated robot, and their accuracy
+#     bash scripts/bench.sh collision pairs of shapes, and controller steps with and without them
 #     bash scripts/bench.sh antiwindup  limits on the integral torque, and the solver's way
 #     bash scripts/bench.sh compliance  controller steps with all that compliance adds
 set -eu
