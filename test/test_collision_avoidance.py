@@ -172,3 +172,62 @@ def test_a_push_into_the_wall_is_countered():
     assert contacts == 0
     assert distances.min() > MARGIN
     assert distances.max() < MARGIN + 2.0 * RESERVE
+
+
+def rows_of(loop, q, v, bounds):
+    """The rows of a state, as the controller gets them, in their own scale."""
+    found = loop.controller.collision.rows(q, v, -bounds, bounds)
+    return found.G.copy(), found.lower.copy()
+
+
+def test_every_way_to_solve_has_the_rows_and_none_has_a_nan():
+    _, known = around_the_wall()
+    loop = DirectLoop("panda", known)
+    controller = loop.controller
+    # The hand 5 mm before the limit of its distance to the wall, on its way in.
+    play(loop, 1.0, [PoseGoal(0.0, (0.75, 0.0, 0.45), (1.0, 0.0, 0.0, 0.0))])
+    q = loop.robot.state().q
+    distance = controller.collision.closest()[0]
+    assert distance < 0.03
+    v, wide = np.array([0.0, 0.3, 0.0, 0.3, 0.0, 0.0, 0.0]), np.full(7, 15.0)
+    G, lower = rows_of(loop, q, v, wide)
+    assert len(lower) > 0
+    assert (G @ (-controller.gains.hold_kd * v) < lower).any(), "damping alone would do"
+    controller.start(q)
+    for solve in (controller.rest, controller.step):
+        step = solve(q, v, -wide, wide)
+        assert not step.failure
+        assert (G @ step.a >= lower - 1e-6).all()
+    step = controller.take_over(q, v, -wide, wide, np.zeros(7))
+    assert not step.failure
+    assert (G @ step.a >= lower - 1e-6).all()
+    infinite = np.full(7, np.inf)
+    assert (G @ controller.step(q, v, -infinite, infinite).a >= lower - 1e-6).all()
+    for bad in (np.full(7, np.nan), np.r_[np.inf, np.zeros(6)]):
+        for state in ((q, bad), (bad, v)):
+            step = controller.step(*state, -wide, wide)
+            assert step.failure
+            assert np.isfinite(step.tau).all()
+            assert (np.abs(step.tau) <= controller.tau_max).all()
+    assert not controller.step(q, v, -wide, wide).failure
+
+
+def test_distances_that_contradict_each_other_give_way_before_the_joints_bounds():
+    """Between a floor and a ceiling that both overlap the hand."""
+    known = {
+        "collision_avoidance": True,
+        "obstacle_names": ["floor", "ceiling"],
+        "obstacle_shapes": ["half_space", "half_space"],
+        "obstacle_sizes": [0.0] * 6,
+        "obstacle_positions": [0.0, 0.0, 0.54, 0.0, 0.0, 0.64],
+        "obstacle_orientations": [0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0],
+    }
+    loop = DirectLoop("panda", known)
+    relaxed = 0
+    for _ in range(500):
+        step = loop.step()
+        if step.row_relaxation is not None:
+            relaxed += step.row_relaxation.max() > 0.0
+            assert step.relaxation.max() < 1e-3  # rad/s^2
+    assert relaxed > 100
+    assert_no_limit_broken(loop)
