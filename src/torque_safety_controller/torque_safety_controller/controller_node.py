@@ -183,9 +183,7 @@ class ControllerNode(Node):
             return "acceleration limits are stale"
         if self._handover.control is Control.GIVING_BACK:
             return "on the way to position control"
-        if self._controller.goals.any:
-            return "goal lost"
-        return "no goal"
+        return "goal lost" if self._goal_lost() else "no goal"
 
     def _hold(self, stamp: Any) -> None:
         """Answer the newest state without acceleration limits."""
