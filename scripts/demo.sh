@@ -4,7 +4,7 @@ set -eu
 usage() {
     cat <<'USAGE'
 usage: bash scripts/demo.sh [robot] [scenario] [--bounds exact|naive] [--rate HZ] [--lockstep]
-                            [--out DIRECTORY]
+                            [--params FILE] [--out DIRECTORY]
 
   robot        a parameter file in config/ that has a scenario: baxter_left_arm (default), panda,
                talos_left_arm
@@ -13,6 +13,7 @@ usage: bash scripts/demo.sh [robot] [scenario] [--bounds exact|naive] [--rate HZ
   --bounds     how acceleration limits are computed; naive breaks the limits (default: exact)
   --rate       control rate in Hz (default: the robot's own)
   --lockstep   each step waits for its command, as fast as the machine can; repeatable
+  --params     a second parameter file, such as config/obstacles/panda_wall.yaml
   --out        where figure, data and metrics go (default: results/demo)
 
 Exits with 0 when no limit was broken, 1 when one was, 2 when it could not run.
@@ -20,11 +21,12 @@ USAGE
 }
 
 root="$(cd "$(dirname "$0")/.." && pwd)"
-robot='' scenario='' bounds=exact rate='' clock=real_time out="$root/results/demo"
+robot='' scenario='' bounds=exact rate='' params='' clock=real_time out="$root/results/demo"
 while [ $# -gt 0 ]; do
     case "$1" in
     --bounds) bounds="${2:?--bounds needs a value}"; shift ;;
     --rate) rate="${2:?--rate needs a value}"; shift ;;
+    --params) params="${2:?--params needs a value}"; shift ;;
     --out) out="${2:?--out needs a value}"; shift ;;
     --lockstep) clock=lockstep ;;
     -h | --help) usage; exit 0 ;;
@@ -55,6 +57,11 @@ elif [ ! -f "$scenario" ]; then
     exit 2
 fi
 
+if [ -n "$params" ] && [ ! -f "$params" ]; then
+    echo "error: no parameter file '$params'" >&2
+    exit 2
+fi
+
 set +u # ROS' own set-up scripts use unset variables
 # shellcheck disable=SC1091
 source "$root/scripts/setup.sh"
@@ -64,7 +71,9 @@ set -u
 export ROS_DOMAIN_ID="${ROS_DOMAIN_ID:-$((1 + $$ % 100))}"
 export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
 
-overrides=(-p "clock:=$clock" -p "bounds_node:method:=$bounds" -p start_paused:=true)
+overrides=()
+[ -z "$params" ] || overrides+=(--params-file "$params")
+overrides+=(-p "clock:=$clock" -p "bounds_node:method:=$bounds" -p start_paused:=true)
 [ -z "$rate" ] || overrides+=(-p "rate_hz:=$rate")
 if [ "$clock" = lockstep ]; then
     # The robot waits: a busy machine must not look like a dead node.
