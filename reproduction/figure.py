@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
 import json
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import matplotlib
@@ -51,3 +53,35 @@ def table(
     for figure in figures:
         lines += ["| " + " | ".join(row) + " |" for row in figure.rows]
     return "\n".join(lines)
+
+
+def verdict(agrees: bool, text: str = "agrees") -> str:
+    """Return the last entry of a row: `text`, or that it differs."""
+    return text if agrees else "DIFFERS"
+
+
+def reproduce(
+    description: str,
+    parts: Mapping[str, Callable[[], Figure]],
+    write: Callable[[list[Figure]], None],
+    show: Callable[[list[Figure]], str] = table,
+) -> int:
+    """Reproduce what the command line names, print the table, and tell whether all agrees.
+
+    Args:
+        description: of the command, its first line.
+        parts: by name.
+        write: makes a page of all figures; called when all were made.
+        show: makes the table.
+
+    Returns:
+        1 when a row says that it differs from the paper, else 0.
+    """
+    parser = argparse.ArgumentParser(description=description.splitlines()[0])
+    parser.add_argument("part", nargs="?", default="all", choices=("all", *parts))
+    part = parser.parse_args().part
+    figures = [make() for make in (parts.values() if part == "all" else [parts[part]])]
+    print(show(figures))
+    if part == "all":
+        write(figures)
+    return int(any("DIFFERS" in row[-1] for figure in figures for row in figure.rows))

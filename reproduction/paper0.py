@@ -6,16 +6,14 @@ bash scripts/reproduce.sh paper0 fig5    one figure
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 import yaml
 from chain import ROOT, ChainResult, load_values, run_chain
-from figure import Figure, table
+from figure import Figure, reproduce, table
 from matplotlib.colors import BoundaryNorm, ListedColormap
 
 from viability_bounds_pkg import baselines, paper_algorithms, viability
@@ -391,9 +389,9 @@ FIGURES: dict[str, Callable[[], Figure]] = {
 }
 
 
-def write_document(figures: list[Figure], path: Path) -> None:
+def write_document(figures: list[Figure]) -> None:
     """Write docs/reproduction.md."""
-    path.write_text(
+    (ROOT / "docs" / "reproduction.md").write_text(
         "# What the paper reports, and what came out\n\n"
         "Written by `bash scripts/reproduce.sh paper0`; do not edit. [DelPrete2018] through the\n"
         "real nodes, in lockstep; pictures and data are under `results/`.\n\n"
@@ -405,18 +403,5 @@ def write_document(figures: list[Figure], path: Path) -> None:
     )
 
 
-def main() -> int:
-    """Reproduce, print the table, and tell whether everything agrees."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("figure", nargs="?", default="all", choices=("all", *FIGURES))
-    options = parser.parse_args()
-    chosen = FIGURES.values() if options.figure == "all" else [FIGURES[options.figure]]
-    figures = [make() for make in chosen]
-    print(table(figures))
-    if options.figure == "all":
-        write_document(figures, ROOT / "docs" / "reproduction.md")
-    return int(any("DIFFERS" in row[3] for figure in figures for row in figure.rows))
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(reproduce(__doc__, FIGURES, write_document))

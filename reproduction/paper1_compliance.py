@@ -10,7 +10,6 @@ is compared is its integral action ``joints`` with ``task``; all else is the sam
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 
 from chain import ROOT
@@ -18,7 +17,7 @@ from compliance_curve import adverse, figure_10, switching
 from compliance_hand import dual, pressing
 from compliance_push import figure_6, forces
 from compliance_stills import embed, figure_10_stills, figures_7_and_8
-from figure import Figure, table
+from figure import Figure, reproduce, table
 
 
 def figure_9() -> Figure:
@@ -68,20 +67,12 @@ At the start, and where the poles press hardest in each of three turns. Red: the
 """
 
 
-def main() -> int:
-    """Reproduce, print the table, and tell whether everything agrees."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("part", nargs="?", default="all", choices=("all", *PARTS))
-    options = parser.parse_args()
-    chosen = PARTS.values() if options.part == "all" else [PARTS[options.part]]
-    figures = [make() for make in chosen]
-    print(table(figures))
-    if options.part == "all":
-        embed()
-        page = PAGE.format(table=table(figures))
-        (ROOT / "docs" / "reproduction_compliance.md").write_text(page)
-    return int(any("DIFFERS" in row[-1] for figure in figures for row in figure.rows))
+def write_document(figures: list[Figure]) -> None:
+    """Write docs/reproduction_compliance.md and its pictures."""
+    embed()
+    page = PAGE.format(table=table(figures))
+    (ROOT / "docs" / "reproduction_compliance.md").write_text(page)
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(reproduce(__doc__, PARTS, write_document))

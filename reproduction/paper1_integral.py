@@ -9,7 +9,6 @@ TALOS' torso and left arm, 9 joints at 1 kHz, with friction of 10% of the torque
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 from typing import Any
 
@@ -18,7 +17,7 @@ import numpy as np
 import pinocchio as pin
 from chain import ROOT
 from direct import DirectLoop, Sample, column
-from figure import Figure, table
+from figure import Figure, reproduce, table
 
 ROBOT = "talos_left_arm"
 ELBOW = 5
@@ -423,24 +422,16 @@ def tables(figures: list[Figure]) -> str:
     return "\n\n".join(parts)
 
 
-def main() -> int:
-    """Reproduce, print the tables, and tell whether everything agrees."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("part", nargs="?", default="all", choices=("all", *PARTS))
-    options = parser.parse_args()
-    chosen = PARTS.values() if options.part == "all" else [PARTS[options.part]]
-    figures = [make() for make in chosen]
-    print(tables(figures))
-    if options.part == "all":
-        (ROOT / "docs" / "reproduction_integral.md").write_text(
-            "# Integral action: what the paper reports, and what came out\n\n"
-            "Written by `bash scripts/reproduce.sh paper1-integral`; do not edit.\n"
-            "[Benallegue2021] on TALOS' torso and left arm at 1 kHz, with friction, rotors and\n"
-            "mass errors; pictures and data are under `results/`.\n\n"
-            f"{tables(figures)}\n"
-        )
-    return int(any("DIFFERS" in row[-1] for figure in figures for row in figure.rows))
+def write_document(figures: list[Figure]) -> None:
+    """Write docs/reproduction_integral.md."""
+    (ROOT / "docs" / "reproduction_integral.md").write_text(
+        "# Integral action: what the paper reports, and what came out\n\n"
+        "Written by `bash scripts/reproduce.sh paper1-integral`; do not edit.\n"
+        "[Benallegue2021] on TALOS' torso and left arm at 1 kHz, with friction, rotors and\n"
+        "mass errors; pictures and data are under `results/`.\n\n"
+        f"{tables(figures)}\n"
+    )
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(reproduce(__doc__, PARTS, write_document, tables))
