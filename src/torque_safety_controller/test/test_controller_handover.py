@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 from chain import load_values
+from controller_chain import NODE, ControllerChain
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from ros_harness import acceleration_limits, joint_state, read_config
+from ros_harness import read_config
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool
-from trajectory_msgs.msg import JointTrajectory
 
 from sim_bridge.bullet_node import BulletNode
 from torque_safety_controller.controller_node import ControllerNode
@@ -20,9 +20,7 @@ from viability_bounds_pkg.bounds_node import BoundsNode
 from viability_bounds_pkg.ros_parameters import ParameterError
 from viability_bounds_pkg.ros_runtime import GOAL_QOS
 
-NODE = "controller_node"
 SERVICE = f"{NODE}/enable_torque"
-MS = 1_000_000
 
 # Watchdogs that do not bark while a busy machine runs the other tests.
 VALUES = read_config("panda", NODE) | {
@@ -39,30 +37,18 @@ SMALL = 0.01 * TAU_MAX
 WIDE = np.full(N, 5.0)
 
 
-class Chain:
+class Chain(ControllerChain):
     """The other side of the controller: robot, bounds node and user."""
 
     def __init__(self, ros, **changed) -> None:
-        self.ros = ros
-        self.node = ros.start(ControllerNode, VALUES | changed)
-        self.commands = ros.listen(JointState, "joint_commands")
-        self.states = ros.talk(JointState, "joint_states")
-        self.limits = ros.talk(JointTrajectory, "acceleration_limits")
-        ros.hears("joint_commands")
+        super().__init__(ros, VALUES | changed)
         self.stamp = 0
 
     def state(self, stamp, q=Q, tau=TAU) -> None:
-        self.states.publish(joint_state(JOINTS, stamp * MS, q, np.zeros(N), tau))
+        self.send_state(stamp, q, np.zeros(N), tau)
 
     def bound(self, stamp) -> None:
-        self.limits.publish(acceleration_limits(JOINTS, stamp * MS, -WIDE, WIDE))
-
-    def await_command(self, stamp, each=None) -> JointState:
-        """Wait for the command with a stamp, ms."""
-        self.ros.wait_until(
-            lambda: stamp * MS in self.commands.stamps, f"a command for {stamp}", each=each
-        )
-        return self.commands[self.commands.stamps.index(stamp * MS)]
+        self.send_limits(stamp, -WIDE, WIDE)
 
     def answer(self, q=Q, tau=TAU, bounds=True) -> JointState:
         """Send the next state, and limits, until the command comes; return that."""

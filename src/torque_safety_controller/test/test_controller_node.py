@@ -7,6 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from arms import load_arm
+from controller_chain import MS, NODE, ControllerChain
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from ros_harness import ROOT, acceleration_limits, joint_state, read_config
@@ -21,8 +22,6 @@ from viability_bounds_pkg.robot_description import read_urdf
 from viability_bounds_pkg.ros_parameters import ParameterError
 from viability_bounds_pkg.ros_runtime import GOAL_QOS, LATCHED_QOS, set_stamp, stamp_to_ns
 
-NODE = "controller_node"
-MS = 1_000_000
 ARM = load_arm("baxter_left_arm")
 # Watchdogs that do not bark while a busy machine runs the other tests.
 VALUES = read_config("baxter_left_arm", NODE) | {"bounds_timeout": 20.0, "state_timeout": 40.0}
@@ -75,24 +74,19 @@ def pose_message(pose: pin.SE3, frame="base", stamp=0) -> PoseStamped:
     return message
 
 
-class Chain:
+class Chain(ControllerChain):
     """The other side of the controller: robot, bounds node and user."""
 
     def __init__(self, ros, **changed) -> None:
-        self.ros = ros
-        self.node = ros.start(ControllerNode, VALUES | changed)
-        self.commands = ros.listen(JointState, "joint_commands")
-        self.states = ros.talk(JointState, "joint_states")
-        self.limits = ros.talk(JointTrajectory, "acceleration_limits")
+        super().__init__(ros, VALUES | changed)
         self.poses = ros.talk(PoseStamped, "target_pose", GOAL_QOS)
         self.postures = ros.talk(JointState, "target_posture", GOAL_QOS)
-        ros.hears("joint_commands")
 
     def state(self, stamp, q=Q, v=V) -> None:
-        self.states.publish(joint_state(JOINTS, stamp * MS, q, v))
+        self.send_state(stamp, q, v)
 
     def bound(self, stamp, lower=LOWER, upper=UPPER) -> None:
-        self.limits.publish(acceleration_limits(JOINTS, stamp * MS, lower, upper))
+        self.send_limits(stamp, lower, upper)
 
     def both(self, stamp, q=Q, v=V, lower=LOWER, upper=UPPER) -> None:
         self.bound(stamp, lower, upper)
@@ -100,10 +94,7 @@ class Chain:
 
     def await_command(self, stamp, each=None) -> np.ndarray:
         """Wait for the command with a stamp, ms; return its torques."""
-        self.ros.wait_until(
-            lambda: stamp * MS in self.commands.stamps, f"a command for {stamp}", each=each
-        )
-        command = self.commands[self.commands.stamps.index(stamp * MS)]
+        command = super().await_command(stamp, each)
         assert command.name == JOINTS
         return np.array(command.effort)
 
@@ -117,9 +108,6 @@ class Chain:
             f"mode {mode} {reason}",
             each=each,
         )
-
-    def reported(self, key) -> str:
-        return self.ros.reported(NODE, key)
 
 
 def give_goal(chain, message=None, first=1) -> int:

@@ -6,22 +6,18 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from arms import load_arm
+from controller_chain import NODE, ControllerChain
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from ros_harness import acceleration_limits, joint_state, read_config
-from sensor_msgs.msg import JointState
+from ros_harness import read_config
 from std_srvs.srv import Trigger
-from trajectory_msgs.msg import JointTrajectory
 
 from torque_safety_controller import controller_parameters
-from torque_safety_controller.controller_node import ControllerNode
 from torque_safety_controller.ros_controller_assembly import make_controller
 from viability_bounds_pkg.ros_parameters import ParameterError
 from viability_bounds_pkg.ros_runtime import CONTROL_QOS, GOAL_QOS, set_stamp
 
-MS = 1_000_000
 ARM = load_arm("panda")
-NODE = "controller_node"
 KNOWN = {row.name for row in controller_parameters.TABLE}
 FORCES = {
     "ft_frame": "panda_link8",
@@ -49,48 +45,37 @@ def wrench(force=(0.0, 0.0, 0.0), torque=(0.0, 0.0, 0.0), frame="", stamp=0) -> 
     return message
 
 
-class Hand:
-    """The other side of the controller."""
+class Hand(ControllerChain):
+    """The other side of the controller, with a force/torque sensor."""
 
     def __init__(self, ros, **changed) -> None:
-        self.ros = ros
-        self.node = ros.start(ControllerNode, VALUES | changed)
-        self.commands = ros.listen(JointState, "joint_commands")
-        self.states = ros.talk(JointState, "joint_states")
-        self.limits = ros.talk(JointTrajectory, "acceleration_limits")
+        super().__init__(ros, VALUES | changed)
         self.measured = None
         if changed.get("ft_frame") != "":
             self.measured = ros.talk(WrenchStamped, "ft_wrench", CONTROL_QOS)
         self.targets = ros.talk(WrenchStamped, "target_wrench", GOAL_QOS)
         self.poses = ros.talk(PoseStamped, "target_pose", GOAL_QOS)
-        ros.hears("joint_commands")
         self.stamp = 0
         self.feels: WrenchStamped | None = None
 
     def step(self) -> np.ndarray:
         """Let 2 ms of robot time pass; return the torques."""
-        self.stamp += 2 * MS
+        self.stamp += 2
         wide = np.full(ARM.n, 50.0)
 
         def send() -> None:
             if self.feels is not None:
                 self.measured.publish(self.feels)
-            self.limits.publish(acceleration_limits(VALUES["joints"], self.stamp, -wide, wide))
-            self.states.publish(
-                joint_state(VALUES["joints"], self.stamp, ARM.q_start, np.zeros(ARM.n))
-            )
+            self.send_limits(self.stamp, -wide, wide)
+            self.send_state(self.stamp, ARM.q_start, np.zeros(ARM.n))
 
-        self.ros.wait_until(lambda: self.stamp in self.commands.stamps, "an answer", each=send)
-        tau = np.array(self.commands[self.commands.stamps.index(self.stamp)].effort)
+        tau = np.array(self.await_command(self.stamp, send).effort)
         assert np.isfinite(tau).all()
         assert (np.abs(tau) <= ARM.tau_max).all()
         return tau
 
     def until(self, key: str, value: str) -> None:
         self.ros.wait_until(lambda: value in self.reported(key), f"{key} {value}", each=self.step)
-
-    def reported(self, key: str) -> str:
-        return self.ros.reported(NODE, key)
 
     def give_pose(self) -> None:
         pose = ARM.robot(0.0)
