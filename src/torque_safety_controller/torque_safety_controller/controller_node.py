@@ -14,6 +14,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
+from torque_safety_controller import NOTHING_COMPILED
 from torque_safety_controller.controller import Step
 from torque_safety_controller.controller_parameters import (
     TABLE,
@@ -49,6 +50,8 @@ class ControllerNode(Node):
                 self, TABLE, make_configuration, self._configure
             )
             values, config = self._node_parameters.values, self._node_parameters.configuration
+            if NOTHING_COMPILED:
+                self.get_logger().info("compiling, as at each first start: about a minute")
             self._controller, base = make_controller(values, config, self)
         except ParameterError:
             self.destroy_node()

@@ -12,7 +12,7 @@ def test_a_change_in_a_called_file_is_noticed(tmp_path):
     package.mkdir()
     (package / "__init__.py").write_text(
         "from viability_bounds_pkg.compiled_cache import keep_compiled\n"
-        "keep_compiled(__path__[0])\n"
+        "NOTHING_COMPILED = keep_compiled(__path__[0])\n"
     )
     (package / "outer.py").write_text(
         "from numba import njit\nfrom kernels.inner import inner\n\n"
@@ -24,7 +24,10 @@ def test_a_change_in_a_called_file_is_noticed(tmp_path):
             "from numba import njit\n\n"
             f"@njit(cache=True)\ndef inner(x):\n    return {factor} * x\n"
         )
-        code = "from kernels.outer import outer; print(outer(1.0), len(outer.stats.cache_hits))"
+        code = (
+            "import kernels; from kernels.outer import outer\n"
+            "print(outer(1.0), len(outer.stats.cache_hits), kernels.NOTHING_COMPILED)"
+        )
         run = subprocess.run(
             [sys.executable, "-c", code],
             env={"PYTHONPATH": f"{tmp_path}:{PACKAGE}", "PATH": "/usr/bin:/bin"},
@@ -32,7 +35,8 @@ def test_a_change_in_a_called_file_is_noticed(tmp_path):
             text=True,
             check=True,
         )
-        result, hits = run.stdout.split()
+        result, hits, nothing = run.stdout.split()
+        assert (nothing == "True") == (hits == "0")
         return float(result), hits == "1"
 
     assert value(1.0) == (10.0, False)

@@ -17,13 +17,16 @@ import numba
 _RECORD = "compiled.sha256"
 
 
-def keep_compiled(*packages: str) -> None:
+def keep_compiled(*packages: str) -> bool:
     """Drop what was compiled from other sources, before anything of a package is compiled.
 
     Args:
         packages: directories whose files the last one's functions may call. The cache is beside
             its sources, or in ``NUMBA_CACHE_DIR`` if that is set, or, if it cannot be written
             there, in the user's cache directory.
+
+    Returns:
+        Whether nothing is left, so that all that is used has to be compiled.
     """
     digest = hashlib.sha256()
     for package in packages:
@@ -33,12 +36,12 @@ def keep_compiled(*packages: str) -> None:
     elsewhere = os.environ.get("NUMBA_CACHE_DIR")
     if elsewhere:
         numba.config.CACHE_DIR = str(Path(elsewhere) / state)
-        return
+        return not (Path(elsewhere) / state).exists()
     cache = Path(packages[-1]) / "__pycache__"
     record = cache / _RECORD
     try:
         if record.exists() and record.read_text() == state:
-            return
+            return False
         cache.mkdir(exist_ok=True)
         for pattern in ("*.nbi", "*.nbc"):
             for path in cache.glob(pattern):
@@ -46,4 +49,7 @@ def keep_compiled(*packages: str) -> None:
                     path.unlink()
         record.write_text(state)
     except OSError:
-        numba.config.CACHE_DIR = str(Path.home() / ".cache" / "viability_bounds" / state)
+        directory = Path.home() / ".cache" / "viability_bounds" / state
+        numba.config.CACHE_DIR = str(directory)
+        return not directory.exists()
+    return True
