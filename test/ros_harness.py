@@ -24,6 +24,7 @@ import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import SetParameters
+from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -103,6 +104,8 @@ class RosHarness:
             domain_id=domain,
             signal_handler_options=SignalHandlerOptions.NO,
         )
+        # Of the whole process, so that it may be what another context wanted.
+        set_logger_level("", LoggingSeverity.INFO)
         self.executor = make_executor(self.context)
         self._nodes: list[Node] = []
         self.probe = self.add(Node("probe", context=self.context, start_parameter_services=False))

@@ -3,17 +3,14 @@
 import numpy as np
 import pytest
 from arms import load_arm
+from controller_chain import MS, NODE, ControllerChain
 from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import Log
-from ros_harness import acceleration_limits, joint_state, read_config
-from sensor_msgs.msg import JointState
-from trajectory_msgs.msg import JointTrajectory
+from ros_harness import joint_state, read_config
 
 from torque_safety_controller.controller_node import ControllerNode
 from viability_bounds_pkg.ros_parameters import ParameterError
 
-NODE = "controller_node"
-MS = 1_000_000
 ARM = load_arm("panda")
 VALUES = read_config("panda", NODE) | {
     "bounds_timeout": 20.0,
@@ -28,30 +25,23 @@ JOINTS = VALUES["joints"]
 AWAY = ARM.q_start + np.array([1.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
-class Talk:
-    """The other side of the controller."""
+class Talk(ControllerChain):
+    """The other side of the controller, and what this says."""
 
     def __init__(self, ros) -> None:
-        self.ros = ros
         self.said = []
         ros.probe.create_subscription(Log, "/rosout", self.said.append, 100)
         ros.hears("/rosout", 1)
-        self.node = ros.start(ControllerNode, VALUES)
-        self.commands = ros.listen(JointState, "joint_commands")
-        self.states = ros.talk(JointState, "joint_states")
-        self.limits = ros.talk(JointTrajectory, "acceleration_limits")
-        ros.hears("joint_commands")
+        super().__init__(ros, VALUES)
 
     def answer(self, stamp, q) -> np.ndarray:
         """The torques for a state at rest with this stamp, ms."""
 
         def ask():
-            bounds = np.full(ARM.n, -2.0), np.full(ARM.n, 2.0)
-            self.limits.publish(acceleration_limits(JOINTS, stamp * MS, *bounds))
-            self.states.publish(joint_state(JOINTS, stamp * MS, q, np.zeros(ARM.n)))
+            self.send_limits(stamp, np.full(ARM.n, -2.0), np.full(ARM.n, 2.0))
+            self.send_state(stamp, q, np.zeros(ARM.n))
 
-        self.ros.wait_until(lambda: stamp * MS in self.commands.stamps, "a command", each=ask)
-        return np.array(self.commands[self.commands.stamps.index(stamp * MS)].effort)
+        return np.array(self.await_command(stamp, ask).effort)
 
 
 def test_an_overlap_is_reported_and_countered_and_a_nan_stays_outside(ros):
