@@ -6,6 +6,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from test_demo import SHOWN
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text()
@@ -15,8 +16,10 @@ SHORTER = {
     "bash scripts/bench.sh chain": "bash scripts/bench.sh chain --cycles 200",
     "bash scripts/bench.sh compliance": "bash scripts/bench.sh compliance --steps 200",
 }
-NOT_HERE = {"bash scripts/test.sh"}
-"""What runs this test."""
+NOT_HERE = {"bash scripts/test.sh"} | {
+    " ".join(("bash scripts/demo.sh", robot, *options, "--lockstep")) for robot, options in SHOWN
+}
+"""What runs this test, and what another one runs."""
 
 
 def commands():

@@ -119,8 +119,9 @@ def test_a_missing_file_is_refused_in_one_line(tmp_path):
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("node", [BOUNDS, CONTROLLER, ROBOT])
 def test_nodes_end_when_told_to(node, sent):
+    still = ("-p", "start_paused:=true") if node is ROBOT else ()
     process = subprocess.Popen(
-        command(node, "--params-file", ROOT / "config" / "panda.yaml"),
+        command(node, "--params-file", ROOT / "config" / "panda.yaml", *still),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

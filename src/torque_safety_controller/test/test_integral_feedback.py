@@ -173,6 +173,7 @@ def passive_by(feedback, M, C, y):
     Kz = feedback.settings.lambda_ * np.diag(M) * z
     wanted = C @ z + np.clip(Kz, -limit, limit)
     size = np.abs(z) @ (np.abs(y) + np.abs(C) @ np.abs(z) + np.abs(Kz)) + abs(z @ M @ z)
+    size += np.finfo(float).tiny / SHARP  # below, numbers lose their digits
     return z @ y + feedback.leak * (z @ M @ z) - z @ wanted, size
 
 
