@@ -30,7 +30,7 @@ from sim_bridge.ros_scenario_sender import Caller, Outbox, ScenarioRefused
 from sim_bridge.scenario_events import ServiceEvent
 from sim_bridge.scenario_parameters import TABLE, make_configuration
 from viability_bounds_pkg.ros_parameters import NodeParameters, ParameterError
-from viability_bounds_pkg.ros_runtime import report_refusal
+from viability_bounds_pkg.ros_runtime import leave, report_refusal
 
 _POLL_PERIOD = 0.02
 _TAKEN_BY = {
@@ -254,8 +254,7 @@ def main(args: list[str] | None = None) -> int:
     except (KeyboardInterrupt, ExternalShutdownException):
         return 130
     finally:
-        node.destroy_node()
-        rclpy.try_shutdown()
+        leave(node)
 
 
 def _output_directory(argv: list[str]) -> Path | None:

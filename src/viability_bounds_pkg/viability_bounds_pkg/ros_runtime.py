@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import signal
 import sys
 from collections.abc import Callable
 
@@ -34,6 +35,9 @@ LATCHED_QOS = QoSProfile(
 """Sent once, received by whoever comes later: robot_description."""
 
 _SIGNAL_CHECK_PERIOD = 0.2
+
+_LONGEST_GOODBYE = 5
+"""How long a node may take to leave the graph, s."""
 
 
 def make_executor(context: rclpy.Context | None = None) -> Executor:
@@ -93,11 +97,23 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
         if rclpy.ok():
             raise
     finally:
-        if node is not None:
-            node.destroy_node()
-        rclpy.try_shutdown()
+        leave(node)
         gc.unfreeze()
     return 0
+
+
+def leave(node: Node | None) -> None:
+    """Take a node down, and ROS with it, at the end of a process; from its main thread.
+
+    When another process leaves at the same moment, Fast DDS 2.14 may wait for itself for ever,
+    and no Python runs any more. So the system ends the process if this takes too long.
+    """
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    signal.alarm(_LONGEST_GOODBYE)
+    if node is not None:
+        node.destroy_node()
+    rclpy.try_shutdown()
+    signal.alarm(0)
 
 
 def report_refusal(error: Exception) -> None:
