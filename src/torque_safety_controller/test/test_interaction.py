@@ -288,6 +288,23 @@ def test_directions_taken_back_end_the_pressing_where_the_hand_is():
     assert hand.controller.goals.pose_des.isApprox(hand.controller.robot.pose)
 
 
+def test_directions_exchanged_while_pressing_hold_the_hand_where_it_is():
+    """Else what was pressed along would spring back to a goal that the hand has left."""
+    hand = Hand(directions=Z)
+    hand.interaction.set_target(force(z=10.0))
+    hand.step(force())
+    elsewhere = Q + 0.05
+    hand.step(force(), elsewhere)
+    assert hand.controller.goals.pose_des.isApprox(hand.pose.pose)
+    hand.interaction.settings = replace(hand.interaction.settings, directions=np.roll(Z, -1))
+    hand.step(force(), elsewhere)
+    assert hand.state is Compliance.FORCE
+    assert hand.controller.goals.pose_des.isApprox(hand.controller.robot.pose)
+    taken = hand.controller.goals.taken
+    hand.step(force(), elsewhere)
+    assert hand.controller.goals.taken == taken
+
+
 def test_settings_that_change_do_not_let_go_of_a_hand_that_is_led():
     hand = Hand(dual=DualSettings(force=10.0))
     hand.step(force(x=20.0))

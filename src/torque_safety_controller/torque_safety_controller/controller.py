@@ -172,7 +172,7 @@ class Controller:
         if not self.goals.any:
             return self.rest(q, v, a_lower, a_upper, elapsed)
         additional = self._begin(q, v, elapsed)
-        tasks, contacts = self._tasks(self.goals, q, v)
+        tasks, contacts = self._tasks(q, v)
         return self._solve(q, v, tasks, a_lower, a_upper, additional, contacts)
 
     def rest(
@@ -252,11 +252,9 @@ class Controller:
             return None
         return additional.torque(robot, v, self._a_last, elapsed)
 
-    def _tasks(
-        self, goals: Goals, q: np.ndarray, v: np.ndarray
-    ) -> tuple[list[TaskTerm], ContactForces | None]:
+    def _tasks(self, q: np.ndarray, v: np.ndarray) -> tuple[list[TaskTerm], ContactForces | None]:
         """Return the tasks of a step, and the forces that contacts may exert."""
-        robot, gains, interaction = self.robot, self.gains, self.interaction
+        robot, goals, gains, interaction = self.robot, self.goals, self.gains, self.interaction
         if interaction is None:
             return goals.tasks(robot, q, v, gains), None
         tasks = goals.tasks(robot, q, v, gains, interaction.stiffness)

@@ -111,7 +111,8 @@ class Interaction:
         self._to_contact = placement.inverse().toDualActionMatrix()
         self._target: tuple[Array, Array | None] | None = None
         self._dual: DualCompliance | None = None
-        self.settings = settings or InteractionSettings()
+        self._turned = False
+        self._settings = self.settings = settings or InteractionSettings()
         self.state, self.reason, self.changes = Compliance.OFF, "at start", 0
         self.start()
 
@@ -122,6 +123,8 @@ class Interaction:
 
     @settings.setter
     def settings(self, settings: InteractionSettings) -> None:
+        # What was pressed along is to be held where it is, not where a goal was meanwhile.
+        self._turned |= not np.array_equal(settings.directions, self._settings.directions)
         self._settings = settings
         self._rows = np.flatnonzero(settings.directions)
         self._mask = settings.directions.astype(float)
@@ -140,6 +143,8 @@ class Interaction:
         self._counted = np.zeros(6)  # on, at the contact of the hand, in its axes
         self._missing = np.zeros(6)  # of that, in the QP, in the end effector's axes
         self._enter(Compliance.OFF, "at start")
+        if self.contacts is not None:
+            self.contacts.closed[:] = False
         if self.sensor is not None:
             self.sensor.start()
 
@@ -213,6 +218,9 @@ class Interaction:
                 goals.hold(robot.pose)  # its damping is needed
             self._goal = measured
             self._missing = np.zeros(6)
+        elif self._turned:
+            goals.hold(robot.pose)
+        self._turned = False
         before = self._goal
         share = -math.expm1(-elapsed / self._settings.wrench_time) if elapsed > 0.0 else 0.0
         self._goal = before + share * (wrench - before)
