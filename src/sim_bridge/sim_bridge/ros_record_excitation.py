@@ -25,6 +25,7 @@ from sim_bridge.bullet_parameters import (
 from sim_bridge.bullet_robot import BulletRobot
 from sim_bridge.excitation import ExcitationError, excitation
 from sim_bridge.limit_monitor import LimitMonitor
+from viability_bounds_pkg.command_line import Parser, positive, run_tool
 from viability_bounds_pkg.limits_file import (
     ParameterFileError,
     check_writable,
@@ -32,16 +33,6 @@ from viability_bounds_pkg.limits_file import (
     write_whole,
 )
 from viability_bounds_pkg.ros_parameters import ParameterError
-
-INTERRUPTED = 130
-"""Exit code of a program ended by SIGINT, as shells report it."""
-
-
-class _Parser(argparse.ArgumentParser):
-    """Reports a usage error in one line."""
-
-    def error(self, message: str) -> None:
-        self.exit(2, f"{self.prog}: error: {message}\n")
 
 
 def _share(text: str) -> float:
@@ -51,15 +42,8 @@ def _share(text: str) -> float:
     return value
 
 
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"must be positive, is {text}")
-    return value
-
-
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = _Parser(
+    parser = Parser(
         prog="record_excitation",
         description="Move the joints of the simulated robot, slowly and fast, each way, under "
         "position control by its drives, and record it for identify_friction.",
@@ -69,7 +53,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add("-o", "--output", type=Path, required=True, help="recording to write (.npz)")
     add(
         "--amplitude",
-        type=_positive,
+        type=positive,
         default=0.6,
         metavar="RAD",
         help="how far a joint moves at most (default: %(default)s)",
@@ -150,14 +134,8 @@ def record(
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the tool; return its exit code: 0, 1 for an error, 2 for usage, 130 for an interrupt."""
     options = _parse(arguments)
-    try:
-        return _run(options)
-    except (ParameterFileError, ParameterError, ExcitationError, OSError) as error:
-        print(f"record_excitation: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("record_excitation: interrupted, nothing written", file=sys.stderr)
-        return INTERRUPTED
+    errors = (ParameterFileError, ParameterError, ExcitationError)
+    return run_tool("record_excitation", lambda: _run(options), errors)
 
 
 if __name__ == "__main__":

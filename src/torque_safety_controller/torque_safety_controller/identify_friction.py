@@ -20,6 +20,7 @@ from torque_safety_controller.friction_identification import (
     identify,
 )
 from torque_safety_controller.joint_recording import RecordingError, load_recording
+from viability_bounds_pkg.command_line import Parser, run_tool
 from viability_bounds_pkg.limits_file import (
     ParameterFileError,
     check_writable,
@@ -29,9 +30,6 @@ from viability_bounds_pkg.limits_file import (
 )
 from viability_bounds_pkg.robot_description import RobotDescriptionError
 
-INTERRUPTED = 130
-"""Exit code of a program ended by SIGINT, as shells report it."""
-
 NODE = "/**/controller_node"
 """The node whose parameters the friction is."""
 
@@ -39,15 +37,8 @@ _NAMES = ("coulomb", "static", "viscous", "stribeck_velocity")
 _UNITS = ("N m", "N m", "N m s/rad", "rad/s")
 
 
-class _Parser(argparse.ArgumentParser):
-    """Reports a usage error in one line."""
-
-    def error(self, message: str) -> None:
-        self.exit(2, f"{self.prog}: error: {message}\n")
-
-
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = _Parser(
+    parser = Parser(
         prog="identify_friction",
         description="Identify the friction of a robot's joints from a recording of its motion.",
         epilog="The recording holds arrays t (N,) in s, and q, v, tau (N, n) in rad, rad/s and "
@@ -129,14 +120,8 @@ def _rounded(values: np.ndarray) -> np.ndarray:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the tool; return its exit code: 0, 1 for an error, 2 for usage, 130 for an interrupt."""
     options = _parse(arguments)
-    try:
-        return _run(options)
-    except (ParameterFileError, RecordingError, RobotDescriptionError, OSError) as error:
-        print(f"identify_friction: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("identify_friction: interrupted, nothing written", file=sys.stderr)
-        return INTERRUPTED
+    errors = (ParameterFileError, RecordingError, RobotDescriptionError)
+    return run_tool("identify_friction", lambda: _run(options), errors)
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from viability_bounds_pkg.acceleration_limits import (
     limits_from_worst_cases,
     unavailable_share,
 )
+from viability_bounds_pkg.command_line import INTERRUPTED, Parser, positive, run_tool
 from viability_bounds_pkg.discretisation_margin import (
     DiscretisationMargin,
     discretisation_margin,
@@ -40,28 +41,11 @@ from viability_bounds_pkg.robot_description import RobotDescriptionError
 from viability_bounds_pkg.state_space import Array, LimitEstimateError, StateSpace
 from viability_bounds_pkg.worst_case_search import WorstCases
 
-INTERRUPTED = 130
-"""Exit code of a program ended by SIGINT, as shells report it."""
-
-
-class _Parser(argparse.ArgumentParser):
-    """Reports a usage error in one line."""
-
-    def error(self, message: str) -> None:
-        self.exit(2, f"{self.prog}: error: {message}\n")
-
 
 def _count(text: str) -> int:
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"must be at least 1, is {value}")
-    return value
-
-
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"must be positive, is {text}")
     return value
 
 
@@ -83,11 +67,11 @@ def _override(text: str) -> tuple[str, tuple[float, float]]:
 
 def _cap(text: str) -> tuple[str, float]:
     joint, _, value = text.rpartition("=")
-    return joint, _positive(value)
+    return joint, positive(value)
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = _Parser(
+    parser = Parser(
         prog="estimate_acceleration_limits",
         description="Estimate the joint accelerations that the torque limits always allow.",
         epilog="The limits found are the worst of the states searched, never surely the worst of "
@@ -133,7 +117,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     add(
         "--margin-dt",
-        type=_positive,
+        type=positive,
         metavar="DT",
         help="also find how fast accelerations drift while a torque is held for DT seconds",
     )
@@ -262,14 +246,8 @@ def _origin(options: argparse.Namespace, worst: WorstCases, interrupted: bool) -
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the tool; return its exit code: 0, 1 for an error, 2 for usage, 130 for an interrupt."""
     options = _parse(arguments)
-    try:
-        return _run(options)
-    except (LimitEstimateError, ParameterFileError, RobotDescriptionError, OSError) as error:
-        print(f"estimate_acceleration_limits: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("estimate_acceleration_limits: interrupted, nothing written", file=sys.stderr)
-        return INTERRUPTED
+    errors = (LimitEstimateError, ParameterFileError, RobotDescriptionError)
+    return run_tool("estimate_acceleration_limits", lambda: _run(options), errors)
 
 
 if __name__ == "__main__":
