@@ -25,7 +25,7 @@ from torque_safety_controller.anti_windup import (
     scale_factor,
     scale_to_limits,
 )
-from torque_safety_controller.integral_feedback import (
+from torque_safety_controller.integral_feedback.feedback import (
     IntegralFeedback,
     IntegralSettings,
     paper_settings,

@@ -24,13 +24,13 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from sim_bridge.bullet_robot import BulletRobot
-from sim_bridge.scenario import load_scenario
-from sim_bridge.scenario_events import PoseGoal
-from torque_safety_controller.controller_node import ControllerNode
-from viability_bounds_pkg.bounds_node import BoundsNode
+from sim_bridge.bullet.robot import BulletRobot
+from sim_bridge.scenario.events import PoseGoal
+from sim_bridge.scenario.scenario import load_scenario
+from torque_safety_controller.node.controller_node import ControllerNode
+from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.robot_description import build_model, read_urdf
-from viability_bounds_pkg.ros_runtime import CONTROL_QOS, GOAL_QOS, make_executor, set_stamp
+from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS, make_executor, set_stamp
 
 ROOT = Path(__file__).resolve().parent.parent
 DT_NS = 1_000_000

@@ -21,16 +21,16 @@ import numpy as np
 import pinocchio as pin
 import yaml
 
-from torque_safety_controller import controller_parameters
 from torque_safety_controller.additional_torque import AdditionalTorque
-from torque_safety_controller.collision_avoidance import CollisionAvoidance
-from torque_safety_controller.collision_geometry import link_shapes, load_geometry
-from torque_safety_controller.collision_kernels import BOX, CAPSULES, HALF_SPACE, Pairs
-from torque_safety_controller.collision_model import CollisionModel, build_collision_model
-from torque_safety_controller.collision_obstacles import box, capsule, half_space, sphere
+from torque_safety_controller.collision.avoidance import CollisionAvoidance
+from torque_safety_controller.collision.geometry import link_shapes, load_geometry
+from torque_safety_controller.collision.kernels import BOX, CAPSULES, HALF_SPACE, Pairs
+from torque_safety_controller.collision.model import CollisionModel, build_collision_model
+from torque_safety_controller.collision.obstacles import box, capsule, half_space, sphere
 from torque_safety_controller.controller import Controller
+from torque_safety_controller.parameters import controller_parameters
 from torque_safety_controller.robot_model import RobotModel
-from viability_bounds_pkg import bounds_parameters
+from viability_bounds_pkg.node import bounds_parameters
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 
 ROOT = Path(__file__).resolve().parent.parent

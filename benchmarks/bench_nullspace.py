@@ -19,11 +19,11 @@ import numpy as np
 import pinocchio as pin
 import yaml
 
-from torque_safety_controller.generalized_inverse import (
+from torque_safety_controller.linalg.generalized_inverse import (
     dynamically_consistent_inverse,
     pseudo_inverse,
 )
-from torque_safety_controller.nullspace_compliance import NullspaceCompliance, NullspaceSettings
+from torque_safety_controller.nullspace.compliance import NullspaceCompliance, NullspaceSettings
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -10,11 +10,11 @@ import numpy as np
 import pinocchio as pin
 import yaml
 
-from sim_bridge.bullet_robot import BulletRobot
-from sim_bridge.gears import Gears
-from sim_bridge.limit_monitor import LimitMonitor
-from sim_bridge.obstacles import Obstacle
-from sim_bridge.quiet_pybullet import pybullet, silenced
+from sim_bridge.bullet.joint_friction import Gears
+from sim_bridge.bullet.limit_monitor import LimitMonitor
+from sim_bridge.bullet.obstacles import Obstacle
+from sim_bridge.bullet.quiet_pybullet import pybullet, silenced
+from sim_bridge.bullet.robot import BulletRobot
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -10,10 +10,10 @@ import numpy as np
 import pinocchio as pin
 import yaml
 
-from torque_safety_controller.constraints import Rows
-from torque_safety_controller.contacts import Contact, Contacts
+from torque_safety_controller.contact.contacts import Contact, Contacts
 from torque_safety_controller.controller import Controller, Gains
-from torque_safety_controller.inverse_dynamics_qp import InverseDynamicsQP
+from torque_safety_controller.qp.constraints import Rows
+from torque_safety_controller.qp.inverse_dynamics_qp import InverseDynamicsQP
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 

@@ -14,11 +14,12 @@ import rclpy
 import yaml
 from rclpy.parameter import Parameter
 
-from sim_bridge.bullet_node import BulletNode
-from sim_bridge.recording import Run
-from sim_bridge.scenario_node import ScenarioNode, play
-from torque_safety_controller.controller_node import ControllerNode
-from viability_bounds_pkg.bounds_node import BoundsNode
+from sim_bridge.nodes.bullet_node import BulletNode
+from sim_bridge.nodes.scenario_node import ScenarioNode
+from sim_bridge.nodes.scenario_play import play
+from sim_bridge.scenario.recording import Run
+from torque_safety_controller.node.controller_node import ControllerNode
+from viability_bounds_pkg.node.bounds_node import BoundsNode
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -13,8 +13,8 @@ from direct import DirectLoop, Sample, column
 from figure import Figure
 from paper1_integral import hand
 
-from sim_bridge.obstacles import Obstacle
-from torque_safety_controller.pose_trajectory import PoseTrajectory, circle
+from sim_bridge.bullet.obstacles import Obstacle
+from torque_safety_controller.tasks.pose_trajectory import PoseTrajectory, circle
 
 # Where a circle of 0.4 m in the y-z plane stays far from all limits for several turns.
 START = [-0.33, 0.22, -1.06, 1.44, 0.08, -1.43, 0.67, -0.21, 0.04]  # rad

@@ -12,8 +12,8 @@ from compliance_push import ELBOW, HAND, RAMP, ROBOT, within_limits
 from direct import DirectLoop
 from figure import Figure, verdict
 
-from sim_bridge.obstacles import Obstacle
-from torque_safety_controller.pose_trajectory import PoseTrajectory, TrajectoryPoint
+from sim_bridge.bullet.obstacles import Obstacle
+from torque_safety_controller.tasks.pose_trajectory import PoseTrajectory, TrajectoryPoint
 
 DUAL = {"integral_action": "task", "dual_compliance": True}
 PULL = np.array([20.0, 0.0, 0.0])  # N

@@ -14,7 +14,7 @@ from compliance_push import ELBOW, Pushed, runs
 from figure import RESULTS, Figure
 from PIL import Image
 
-from sim_bridge.camera import Camera
+from sim_bridge.tools.camera import Camera
 
 FLOOR = -1.07  # m, under the feet
 

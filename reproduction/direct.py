@@ -14,14 +14,15 @@ import pinocchio as pin
 import yaml
 from chain import ROOT
 
-from sim_bridge import bullet_parameters
-from sim_bridge.limit_monitor import LimitMonitor
-from sim_bridge.ros_ft_sensor import ForceTorqueReading
-from torque_safety_controller import controller_parameters, ros_controller_assembly
+from sim_bridge.bullet.limit_monitor import LimitMonitor
+from sim_bridge.nodes import bullet_parameters
+from sim_bridge.nodes.ft_sensor import ForceTorqueReading
 from torque_safety_controller.controller import Step
-from viability_bounds_pkg import bounds_parameters
+from torque_safety_controller.node import assembly as ros_controller_assembly
+from torque_safety_controller.parameters import controller_parameters
+from viability_bounds_pkg.node import bounds_parameters
 from viability_bounds_pkg.robot_description import build_model, read_urdf
-from viability_bounds_pkg.ros_parameters import Parameter
+from viability_bounds_pkg.ros.parameters import Parameter
 
 
 class Sample(NamedTuple):

@@ -16,9 +16,10 @@ from chain import ROOT, ChainResult, load_values, run_chain
 from figure import Figure, reproduce, table
 from matplotlib.colors import BoundaryNorm, ListedColormap
 
-from viability_bounds_pkg import baselines, paper_algorithms, viability
+from viability_bounds_pkg import baselines, viability
 from viability_bounds_pkg.acceleration_limits import estimate_acceleration_limits
 from viability_bounds_pkg.joint_limits import JointLimits
+from viability_bounds_pkg.kernel import paper_algorithms
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 
 

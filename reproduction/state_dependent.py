@@ -13,8 +13,8 @@ import numpy as np
 from chain import ChainResult, load_values, run_chain
 from figure import Figure, table
 
-from viability_bounds_pkg.bounds_parameters import PEAK
-from viability_bounds_pkg.discretisation_margin import discretisation_margin
+from viability_bounds_pkg.estimation.discretisation_margin import discretisation_margin
+from viability_bounds_pkg.node.bounds_parameters import PEAK
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 
 ROBOT = "baxter_left_arm"

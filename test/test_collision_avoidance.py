@@ -8,9 +8,9 @@ import yaml
 from direct import DirectLoop, column
 from ros_harness import CONFIG
 
-from sim_bridge.scenario import load_scenario
-from sim_bridge.scenario_events import AddObstacle, PoseGoal
-from torque_safety_controller.collision_geometry import load_geometry
+from sim_bridge.scenario.events import AddObstacle, PoseGoal
+from sim_bridge.scenario.scenario import load_scenario
+from torque_safety_controller.collision.geometry import load_geometry
 from viability_bounds_pkg.robot_description import read_urdf
 
 MARGIN = 0.02  # m

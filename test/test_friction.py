@@ -10,14 +10,14 @@ import pytest
 from direct import DirectLoop, column
 from ros_harness import CONFIG, read_config
 
-from sim_bridge import bullet_parameters
-from sim_bridge.excitation import excitation
-from sim_bridge.ros_record_excitation import record
-from torque_safety_controller.friction_compensation import GAIN
-from torque_safety_controller.friction_identification import friction_model, identify
-from torque_safety_controller.joint_recording import Recording
-from torque_safety_controller.tasks import critical_damping
-from viability_bounds_pkg.limits_file import read_robot
+from sim_bridge.nodes import bullet_parameters
+from sim_bridge.tools.excitation import excitation
+from sim_bridge.tools.record_excitation import record
+from torque_safety_controller.friction.compensation import GAIN
+from torque_safety_controller.friction.identification import friction_model, identify
+from torque_safety_controller.friction.joint_recording import Recording
+from torque_safety_controller.tasks.tasks import critical_damping
+from viability_bounds_pkg.cli.limits_file import read_robot
 
 ROBOT = "talos_left_arm"
 GIVEN = read_config(ROBOT, "bullet_node")

@@ -8,9 +8,9 @@ from chain import load_values, run_chain
 from direct import DirectLoop, column
 from ros_harness import CONFIG
 
-from sim_bridge.obstacles import Obstacle
-from sim_bridge.ros_scenario_sender import ScenarioRefused
-from torque_safety_controller.pose_trajectory import PoseTrajectory, circle
+from sim_bridge.bullet.obstacles import Obstacle
+from sim_bridge.nodes.scenario_sender import ScenarioRefused
+from torque_safety_controller.tasks.pose_trajectory import PoseTrajectory, circle
 
 ROBOT = "panda"
 DURATION = 0.9

@@ -4,13 +4,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from sim_bridge.pose_path import circle, sample
-from sim_bridge.ros_scenario_messages import to_controller
-from sim_bridge.scenario import Scenario
-from sim_bridge.scenario_events import TrajectoryGoal
-from sim_bridge.scenario_trajectory import read_points
-from torque_safety_controller import pose_trajectory
-from torque_safety_controller.ros_goals import trajectory_from_message
+from sim_bridge.nodes.scenario_messages import to_controller
+from sim_bridge.scenario.events import TrajectoryGoal
+from sim_bridge.scenario.pose_path import circle, sample
+from sim_bridge.scenario.scenario import Scenario
+from sim_bridge.scenario.trajectory import read_points
+from torque_safety_controller.node.goals import trajectory_from_message
+from torque_safety_controller.tasks import pose_trajectory
 
 
 def received(points, base):

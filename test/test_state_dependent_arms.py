@@ -6,9 +6,9 @@ from arms import load_arm
 from ros_harness import read_config
 
 from torque_safety_controller.controller import Controller, Gains
-from viability_bounds_pkg.discretisation_margin import discretisation_margin
+from viability_bounds_pkg.estimation.discretisation_margin import discretisation_margin
 from viability_bounds_pkg.joint_limits import JointLimits
-from viability_bounds_pkg.state_dependent_limits import StateDependentBounds
+from viability_bounds_pkg.state_dependent.limits import StateDependentBounds
 from viability_bounds_pkg.torque_margin import tightened, torque_margins
 from viability_bounds_pkg.viability import BoundsSolver
 

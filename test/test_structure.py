@@ -28,9 +28,19 @@ ROS = {
 }
 
 
+ROS_ROOMS = {"node", "nodes", "ros", "parameters", "tools"}
+"""Folders whose modules may import ROS."""
+
+
 def modules():
     for package in PACKAGES:
-        yield from sorted((ROOT / "src" / package / package).glob("*.py"))
+        yield from sorted((ROOT / "src" / package / package).rglob("*.py"))
+
+
+def dotted(path):
+    """Return the name that a module is imported by."""
+    parts = path.relative_to(ROOT / "src").with_suffix("").parts[1:]
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
 def imports(path):
@@ -44,26 +54,79 @@ def imports(path):
 
 
 def is_about_ros(name):
-    """Nodes, their parameters and what is named ros_ may import ROS; the maths may not."""
-    return name.startswith("ros_") or name.endswith(("_node", "_parameters"))
+    """Nodes, their parameters and tools that run nodes may import ROS; the maths may not."""
+    return not ROS_ROOMS.isdisjoint(name.split("."))
 
 
-@pytest.mark.parametrize(
-    "path", [p for p in modules() if not is_about_ros(p.stem)], ids=lambda path: path.stem
-)
+def graph():
+    """Return for each module the modules of this project that it imports."""
+    names = {dotted(path): path for path in modules()}
+    return {
+        name: {each for each in imports(path) if each in names and each != name}
+        for name, path in names.items()
+    }
+
+
+def circle(arrows):
+    """Return a circle in a graph as a list of nodes, empty if there is none."""
+    done, way = set(), []
+
+    def visit(node):
+        if node in way:
+            return [*way[way.index(node) :], node]
+        if node in done:
+            return []
+        way.append(node)
+        for each in sorted(arrows.get(node, ())):
+            if found := visit(each):
+                return found
+        way.pop()
+        done.add(node)
+        return []
+
+    return next((found for node in sorted(arrows) if (found := visit(node))), [])
+
+
+@pytest.mark.parametrize("path", [p for p in modules() if not is_about_ros(dotted(p))], ids=dotted)
 def test_maths_does_not_import_ros(path):
     for name in imports(path):
-        parts = name.split(".")
-        assert parts[0] not in ROS, f"{path.name} imports {name}"
-        if parts[0] in PACKAGES and len(parts) > 1:
-            assert not is_about_ros(parts[1]), f"{path.name} imports {name}"
+        assert name.split(".")[0] not in ROS, f"{path} imports {name}"
+        if name.split(".")[0] in PACKAGES:
+            assert not is_about_ros(name), f"{path} imports {name}"
 
 
-@pytest.mark.parametrize("path", list(modules()), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", list(modules()), ids=dotted)
 def test_arrows_between_packages_go_one_way(path):
-    package = path.parent.name
+    package = dotted(path).split(".")[0]
     imported = {name.split(".")[0] for name in imports(path)} & set(PACKAGES)
     assert imported - {package} <= PACKAGES[package]
+
+
+def test_every_module_is_looked_at():
+    assert len(graph()) > 100
+    assert any(name.count(".") == 2 for name in graph())
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    assert circle(graph()) == []
+
+
+def test_no_rooms_import_each_other_in_a_circle():
+    rooms = {}
+    for name, imported in graph().items():
+        room = ".".join(name.split(".")[:2])
+        others = {".".join(each.split(".")[:2]) for each in imported}
+        rooms.setdefault(room, set()).update(others - {room, room.split(".")[0]})
+    assert circle(rooms) == []
+
+
+def test_no_folder_is_crowded_and_each_says_what_it_is():
+    for package in PACKAGES:
+        for folder in {path.parent for path in modules() if dotted(path).startswith(package)}:
+            files = list(folder.glob("*.py"))
+            assert len(files) <= 14, f"{folder}: {len(files)} modules"
+            text = ast.get_docstring(ast.parse((folder / "__init__.py").read_text()))
+            assert text, f"{folder} has no docstring"
 
 
 @pytest.mark.parametrize(

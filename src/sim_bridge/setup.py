@@ -20,9 +20,9 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "bullet_node = sim_bridge.bullet_node:main",
-            "record_excitation = sim_bridge.ros_record_excitation:main",
-            "scenario_node = sim_bridge.scenario_node:main",
+            "bullet_node = sim_bridge.nodes.bullet_node:main",
+            "record_excitation = sim_bridge.tools.record_excitation:main",
+            "scenario_node = sim_bridge.nodes.scenario_play:main",
         ],
     },
 )

@@ -20,8 +20,8 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "controller_node = torque_safety_controller.controller_node:main",
-            "identify_friction = torque_safety_controller.identify_friction:main",
+            "controller_node = torque_safety_controller.node.controller_node:main",
+            "identify_friction = torque_safety_controller.cli.identify_friction:main",
         ],
     },
 )

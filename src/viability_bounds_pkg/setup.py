@@ -20,9 +20,9 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "bounds_node = viability_bounds_pkg.bounds_node:main",
+            "bounds_node = viability_bounds_pkg.node.bounds_node:main",
             "estimate_acceleration_limits = "
-            "viability_bounds_pkg.estimate_acceleration_limits:main",
+            "viability_bounds_pkg.cli.estimate_acceleration_limits:main",
         ],
     },
 )

@@ -12,16 +12,16 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from torque_safety_controller.friction_compensation import FrictionCompensation
-from torque_safety_controller.friction_settings import FrictionSettings, no_friction
-from torque_safety_controller.integral_feedback import IntegralFeedback
-from torque_safety_controller.integral_settings import IntegralSettings
-from torque_safety_controller.nullspace_compliance import NullspaceCompliance
-from torque_safety_controller.nullspace_settings import NullspaceSettings
+from torque_safety_controller.friction.compensation import FrictionCompensation
+from torque_safety_controller.friction.settings import FrictionSettings, no_friction
+from torque_safety_controller.integral_feedback.feedback import IntegralFeedback
+from torque_safety_controller.integral_feedback.settings import IntegralSettings
+from torque_safety_controller.nullspace.compliance import NullspaceCompliance
+from torque_safety_controller.nullspace.settings import NullspaceSettings
 from torque_safety_controller.robot_model import RobotModel
+from viability_bounds_pkg.compiled import compiled
 
 Array = NDArray[np.float64]
 
@@ -252,7 +252,7 @@ class AdditionalTorque:
         self._faded = bool(np.abs(torque).max() < _NEGLIGIBLE)
 
 
-@njit(cache=True)
+@compiled
 def _jumped(
     M: Array,
     q_last: Array,

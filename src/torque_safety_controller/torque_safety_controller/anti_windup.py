@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torque_safety_controller import anti_windup_kernels as kernels
+from torque_safety_controller.integral_feedback import anti_windup_kernels as kernels
 
 Array = NDArray[np.float64]
 

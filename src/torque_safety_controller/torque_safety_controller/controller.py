@@ -11,20 +11,23 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from torque_safety_controller.additional_torque import LONGEST_GAP, AdditionalTorque
-from torque_safety_controller.collision_avoidance import CollisionAvoidance
-from torque_safety_controller.disturbance_observer import DisturbanceObserver
-from torque_safety_controller.gains import Gains
-from torque_safety_controller.goals import Goals
-from torque_safety_controller.interaction import Interaction
-from torque_safety_controller.inverse_dynamics_qp import (
+from torque_safety_controller.additional_torque import (
+    LONGEST_GAP,
+    AdditionalTorque,
+)
+from torque_safety_controller.collision.avoidance import CollisionAvoidance
+from torque_safety_controller.contact.interaction import Interaction
+from torque_safety_controller.qp.inverse_dynamics_qp import (
     ContactForces,
     InverseDynamicsQP,
     NoSolutionFound,
 )
 from torque_safety_controller.robot_model import RobotModel
-from torque_safety_controller.tasks import TaskTerm, damping_task
-from torque_safety_controller.torque_limiter import TorqueLimiter
+from torque_safety_controller.safety.disturbance_observer import DisturbanceObserver
+from torque_safety_controller.safety.torque_limiter import TorqueLimiter
+from torque_safety_controller.tasks.gains import Gains
+from torque_safety_controller.tasks.goals import Goals
+from torque_safety_controller.tasks.tasks import TaskTerm, damping_task
 
 __all__ = ["Controller", "Gains", "Step"]
 

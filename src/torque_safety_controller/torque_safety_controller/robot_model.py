@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 
-from torque_safety_controller.dense_kernels import middle_of_step
+from torque_safety_controller.linalg.dense_kernels import middle_of_step
 from viability_bounds_pkg.robot_description import RobotDescriptionError
 
 

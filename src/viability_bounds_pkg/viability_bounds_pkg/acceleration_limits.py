@@ -24,14 +24,14 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from viability_bounds_pkg.batch_dynamics import BatchDynamics
-from viability_bounds_pkg.state_space import Array, LimitEstimateError, StateSpace
-from viability_bounds_pkg.velocity_scale import (
+from viability_bounds_pkg.estimation.batch_dynamics import BatchDynamics
+from viability_bounds_pkg.estimation.state_space import Array, LimitEstimateError, StateSpace
+from viability_bounds_pkg.estimation.velocity_scale import (
     USEFUL_ACCELERATION,
     VelocityScale,
     largest_velocity_scale,
 )
-from viability_bounds_pkg.worst_case_search import (
+from viability_bounds_pkg.estimation.worst_case_search import (
     WorstCases,
     acceleration_room,
     search_by_sampling,

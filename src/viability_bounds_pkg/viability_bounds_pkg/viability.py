@@ -22,17 +22,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from viability_bounds_pkg.bounds_kernel import make_table, solve
-from viability_bounds_pkg.braking import Side, highest_speeds, make_side
-from viability_bounds_pkg.condition_11 import (
+from viability_bounds_pkg.joint_limits import ROUNDING, JointLimits, JointLimitsError
+from viability_bounds_pkg.kernel.bounds_kernel import make_table, solve
+from viability_bounds_pkg.kernel.braking import Side, highest_speeds, make_side
+from viability_bounds_pkg.kernel.discrete_kernel import StoppingCurve, stopping_curves
+from viability_bounds_pkg.kernel.discrete_time_condition import (
     KernelBraking,
     checked_margin,
     checked_step,
     condition_11,
     kernel_braking,
 )
-from viability_bounds_pkg.discrete_kernel import StoppingCurve, stopping_curves
-from viability_bounds_pkg.joint_limits import ROUNDING, JointLimits, JointLimitsError
 
 __all__ = [
     "AccelerationBounds",

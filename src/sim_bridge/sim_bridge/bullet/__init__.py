@@ -1,0 +1,1 @@
+"""The simulated robot: PyBullet, drives, joint friction, sensors and obstacles."""

@@ -1,0 +1,139 @@
+"""Position control as motor drives do it: a cascade of loops in each joint, by itself.
+
+    v_ref = v_des + kappa (q_des - q), at most the speed limit,
+    tau   = k (v_ref - v) + z,    z' = (k / T) (v_ref - v),
+    k     = max(omega_v diag(M), tau_max / (kappa e_full)),
+
+a proportional loop for position around a proportional-integral one for velocity, fast enough for
+the inertia and stiff enough for the friction, which grows with tau_max. The torque is clipped to
+what the motor has, and z does not run away meanwhile. Within a small window around the goal z
+rests, as it does in real drives, or else stiction would make it hunt for ever.
+
+Drives close their loops ten times faster than a physics step. Stiff loops sampled at the physics
+rate are unstable as soon as the joints' inertias are coupled; this one therefore uses what it
+expects at the end of the step ([Tan2011]), v + h a and q + h v + h^2 a / 2. With the error e,
+
+    e = v_des + kappa (q_des - q - h v) - v,    tau = k e + z - P a,    P = h k (1 + kappa h / 2),
+
+as long as the speed limit is not active (then P = h k), and with M a + b = tau, b the bias forces,
+
+    (M + P) a = k e + z - b.
+
+The drive takes over without a jump: z starts where, with nothing to correct, tau is the torque
+that was there before, z = tau + P a with M a = tau - b.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from sim_bridge.bullet.joint_friction import Gears
+from viability_bounds_pkg.robot_description import build_model, kinematic_order
+
+Array = NDArray[np.float64]
+
+POSITION_GAIN = 30.0
+"""kappa, 1/s."""
+
+VELOCITY_BANDWIDTH = 200.0
+"""omega_v, 1/s."""
+
+INTEGRAL_TIME = 4.0 / VELOCITY_BANDWIDTH
+"""T, s: both poles of the velocity loop at omega_v / 2."""
+
+FULL_TORQUE_ERROR = 0.01
+"""e_full at which the drive uses all its torque at the latest, rad."""
+
+WINDOW = 2e-4
+"""How near to a goal at rest is near enough for the integral, rad."""
+
+
+class PositionDrive:
+    """The drives of n joints; arrays of shape (n,) in the order of `joints`.
+
+    Args:
+        model: the robot with its rotors; it sets the gains, and what else is taken from it
+            stands in for the faster loops of a drive.
+        joints: the model's joints in the caller's order.
+        dt: time between two calls of `torque`, s.
+    """
+
+    def __init__(self, model: pin.Model, joints: Sequence[str], dt: float) -> None:
+        self._model, self._data, self._dt = model, model.createData(), dt
+        self._order = [list(joints).index(name) for name in model.names[1:]]
+        self._z = np.zeros(model.nv)  # in the model's order, as all that is inside
+
+    def start(self, q: Array, v: Array, tau_max: Array, tau: Array | None) -> None:
+        """Take over.
+
+        Args:
+            q: position, rad.
+            v: velocity, rad/s.
+            tau_max: torque limits, N m.
+            tau: the torque of the motors until now, N m; None for what holds the robot up.
+        """
+        M, bias, k = self._dynamics(q[self._order], v[self._order], tau_max[self._order])
+        tau = bias if tau is None else tau[self._order]
+        P = self._dt * k * (1.0 + 0.5 * POSITION_GAIN * self._dt)
+        self._z = tau + P * np.linalg.solve(M, tau - bias)
+
+    def torque(
+        self, q: Array, v: Array, q_des: Array, v_des: Array, v_max: Array, tau_max: Array
+    ) -> Array:
+        """Return the torque of the motors for one physics step, N m.
+
+        Args:
+            q: position, rad.
+            v: velocity, rad/s.
+            q_des: where to be at the end of the step, rad.
+            v_des: how fast to pass there, rad/s.
+            v_max: the drive does not ask for more speed, rad/s.
+            tau_max: torque limits, N m.
+        """
+        q, v, q_des, v_des, v_max, tau_max = np.stack((q, v, q_des, v_des, v_max, tau_max))[
+            :, self._order
+        ]
+        h = self._dt
+        M, bias, k = self._dynamics(q, v, tau_max)
+        wanted = v_des + POSITION_GAIN * (q_des - q - h * v)
+        v_ref = np.clip(wanted, -v_max, v_max)
+        P = h * k * np.where(v_ref == wanted, 1.0 + 0.5 * POSITION_GAIN * h, 1.0)
+        error = v_ref - v
+        u = k * error + self._z
+        tau = u - P * np.linalg.solve(M + np.diag(P), u - bias)
+        clipped = np.clip(tau, -tau_max, tau_max)
+        resting = (np.abs(q_des - q) < WINDOW) & (v_des == 0.0)
+        runaway = (tau - clipped) * error > 0.0
+        self._z += np.where(resting | runaway, 0.0, (h / INTEGRAL_TIME) * k * error)
+        output = np.empty_like(clipped)
+        output[self._order] = clipped
+        return output
+
+    def _dynamics(self, q: Array, v: Array, tau_max: Array) -> tuple[Array, Array, Array]:
+        """Return M, the bias forces b and the velocity gains k, in the model's order."""
+        M = pin.crba(self._model, self._data, q)
+        bias = pin.nonLinearEffects(self._model, self._data, q, v)
+        stiff = tau_max / (POSITION_GAIN * FULL_TORQUE_ERROR)
+        return M, bias, np.maximum(VELOCITY_BANDWIDTH * M.diagonal(), stiff)
+
+
+def make_drive(
+    urdf: str,
+    joints: Sequence[str],
+    locked_positions: Mapping[str, float] | None,
+    gears: Gears,
+    dt: float,
+) -> PositionDrive:
+    """Return the drives of a robot's `joints`, whatever their order.
+
+    Raises:
+        RobotDescriptionError: as `build_model` does.
+    """
+    order = kinematic_order(urdf, joints)
+    rotors = dict(zip(joints, gears.rotor_inertia, strict=True))
+    model = build_model(urdf, order, locked_positions, [rotors[joint] for joint in order])
+    return PositionDrive(model, joints, dt)

@@ -1,0 +1,1 @@
+"""The robot node and the scenario node, with their parameters and messages."""

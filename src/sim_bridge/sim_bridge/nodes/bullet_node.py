@@ -1,0 +1,296 @@
+"""The robot node: plays an arm with torque- and position-controlled motors over topics."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from array import array
+from collections import Counter, deque
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rosgraph_msgs.msg import Clock as ClockMessage
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+
+from sim_bridge.bullet.limit_monitor import LimitMonitor
+from sim_bridge.nodes.bullet_parameters import TABLE, make_configuration, make_robot
+from sim_bridge.nodes.ft_sensor import ForceTorquePublisher
+from sim_bridge.nodes.joint_command import CommandError, JointCommand, TorqueCommand, read_command
+from sim_bridge.nodes.world_subscriber import WorldInbox
+from viability_bounds_pkg.ros.messages import Diagnostics
+from viability_bounds_pkg.ros.parameters import NodeParameters, ParameterError
+from viability_bounds_pkg.ros.runtime import (
+    CONTROL_QOS,
+    LATCHED_QOS,
+    run,
+    set_stamp,
+    stamp_to_ns,
+)
+
+_RETRY_PERIOD = 0.2
+_LATENCIES_KEPT = 100_000
+
+
+class BulletNode(Node):
+    """An arm: publishes ``joint_states``, obeys ``joint_commands``.
+
+    A command with efforts sets the torques of the motors. One with positions, and perhaps
+    velocities, but no efforts leaves it to the motors' own drives to bring the joints there and
+    hold them. It may change from one to the next.
+
+    With ``clock: real_time`` each control period lasts its time on the wall clock. A command
+    that comes within the period of the state it answers acts during that period; when none
+    does, the last one is held, and after ``command_timeout`` periods the robot brakes. With
+    ``clock: lockstep`` a period ends when the command with its stamp has come, however long
+    that takes.
+
+    The robot's brakes are on until the first command.
+    """
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("bullet_node", **node_arguments)
+        try:
+            self._node_parameters = NodeParameters(self, TABLE, make_configuration)
+            config = self._node_parameters.configuration
+            self._robot = make_robot(config, self._node_parameters.values)
+        except ParameterError:
+            self.destroy_node()
+            raise
+        self._config = config
+        self._monitor = LimitMonitor(
+            config.q_min,
+            config.q_max,
+            config.v_max,
+            config.tau_max,
+            # The simulated motors are clipped at exactly their limits; the sum is not exact.
+            torque_tolerance=1e-9 * float(config.tau_max.max()),
+        )
+        self._robot.monitor = self._monitor
+        self._dt_ns = round(1e9 * config.dt)
+        self._paused = config.start_paused
+        # In lockstep robot time is its own, from one period on: zero means "no stamp".
+        self._stamp = 0 if config.lockstep else self.get_clock().now().nanoseconds
+        self._advanced = True
+        self._refused: Counter[str] = Counter()
+        self._world = WorldInbox(self, self._robot, config.external_wrench_timeout, self._refused)
+        self._ft_publisher = None
+        if config.sensor.frame:
+            self._ft_publisher = ForceTorquePublisher(self, self._robot, config.sensor)
+        self._restart()
+
+        self._state = JointState(name=list(config.joints))
+        self._state_publisher = self.create_publisher(JointState, "joint_states", CONTROL_QOS)
+        self._clock_publisher = None
+        if config.publish_clock:
+            self._clock_publisher = self.create_publisher(ClockMessage, "/clock", CONTROL_QOS)
+        description = self.create_publisher(String, "robot_description", LATCHED_QOS)
+        description.publish(String(data=config.urdf))
+        self.create_subscription(JointState, "joint_commands", self._on_command, CONTROL_QOS)
+        self.create_service(Trigger, "~/reset", self._on_reset)
+        self.create_service(SetBool, "~/pause", self._on_pause)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        if not config.lockstep:
+            self.create_timer(config.dt, self._tick, clock=steady)
+        self.create_timer(_RETRY_PERIOD, self._retry, clock=steady)
+        self._diagnostics = Diagnostics(self, self._report)
+        self._next_state()
+
+    def _restart(self) -> None:
+        """Put the robot at its start and all counts to zero; robot time goes on."""
+        config = self._config
+        n = len(config.joints)
+        self._world.clear()
+        self._robot.reset(config.q_start, np.zeros(n))
+        if self._ft_publisher is not None:
+            self._ft_publisher.restart()
+        self._monitor.reset()
+        self._command: JointCommand | None = None
+        self._missed_in_row = self._missed = self._braked = 0
+        self._periods = self._pause_at = 0
+        self._plan_pause()
+        self._torque_ratio = 0.0
+        self._refused.clear()
+        self._latencies: deque[float] = deque(maxlen=_LATENCIES_KEPT)
+        self._started_at, self._played = time.monotonic(), 0
+
+    def _plan_pause(self) -> None:
+        """Find the period at which to pause, as `pause_after` says; counted from now."""
+        periods = round(self._node_parameters.configuration.pause_after / self._config.dt)
+        self._pause_at = self._periods + periods if periods else math.inf
+
+    # The course of time
+
+    def _next_state(self) -> None:
+        """Begin a control period: publish the state at its start."""
+        self._stamp += self._dt_ns
+        self._advanced = False
+        q, v, tau = self._robot.state()
+        state = self._state
+        state.position = array("d", q.tobytes())
+        state.velocity = array("d", v.tobytes())
+        state.effort = array("d", tau.tobytes())
+        set_stamp(state.header.stamp, self._stamp)
+        if self._clock_publisher is not None:
+            self._clock_publisher.publish(ClockMessage(clock=state.header.stamp))
+        if self._ft_publisher is not None:  # first, for who waits for both
+            self._ft_publisher.publish(self._stamp)
+        self._published_at = time.monotonic()
+        self._state_publisher.publish(state)
+
+    def _advance(self) -> None:
+        """Play the current period to its end, under the last command or the brakes."""
+        config = self._config
+        self._world.apply_due(self._stamp)
+        if self._command is None:
+            self._braked += 1
+            self._robot.brake(config.substeps, config.tau_max)
+        elif isinstance(self._command, TorqueCommand):
+            self._robot.step(self._command.tau, config.substeps)
+        else:
+            self._robot.move(*self._command, config.tau_max, config.v_max, config.substeps)
+        self._periods += 1
+        self._advanced = True
+        if self._periods >= self._pause_at:
+            self._pause_at = math.inf
+            self._pause()
+
+    def _tick(self) -> None:
+        """End a period of the wall clock and begin the next."""
+        if self._paused:
+            return
+        if not self._advanced:
+            if self._command is not None:
+                self._missed += 1
+                self._missed_in_row += 1
+                if self._missed_in_row > self._config.command_timeout:
+                    self._command = None
+                    self.get_logger().warning(
+                        f"no command for {self._missed_in_row} periods: braking"
+                    )
+            self._advance()
+        self._next_state()
+
+    def _pause(self) -> None:
+        self._paused = True
+        self._diagnostics.publish()
+
+    def _retry(self) -> None:
+        """Send the state again if the chain lost it, or does not listen yet."""
+        waiting = self._paused or (self._config.lockstep and not self._advanced)
+        if waiting and time.monotonic() - self._published_at > _RETRY_PERIOD:
+            if self._ft_publisher is not None:
+                self._ft_publisher.repeat()
+            self._state_publisher.publish(self._state)
+
+    # Commands
+
+    def _on_command(self, message: JointState) -> None:
+        if stamp_to_ns(message.header.stamp) != self._stamp or self._advanced:
+            if not self._paused:
+                self._refused["not for this period"] += 1
+            return
+        if self._paused:
+            return
+        try:
+            command = read_command(message, self._state.name)
+        except CommandError as error:
+            self._refused[str(error)] += 1
+            return
+        self._latencies.append(time.monotonic() - self._published_at)
+        self._missed_in_row = 0
+        if isinstance(command, TorqueCommand):
+            tau, tau_max = command.tau, self._config.tau_max
+            self._torque_ratio = max(self._torque_ratio, float(np.max(np.abs(tau) / tau_max)))
+            # The drives do not exceed their limits, whatever they are told.
+            command = TorqueCommand(np.clip(tau, -tau_max, tau_max))
+        self._command = command
+        self._advance()
+        # When it pauses itself, the next state waits too: time stands still for all.
+        if self._config.lockstep and not self._paused:
+            self._next_state()
+
+    # Services
+
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._restart()
+        self._next_state()
+        response.success = True
+        response.message = "at the start configuration, at rest"
+        return response
+
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        if self._paused and not request.data:
+            self._paused = False
+            self._started_at, self._played = time.monotonic(), self._periods
+            self._plan_pause()
+            # A new stamp: what was answered during the pause answered old goals. In real time
+            # it comes with the next tick, so that the first period is a whole one.
+            self._advanced = True
+            if self._config.lockstep:
+                self._next_state()
+        elif request.data:
+            self._pause()
+        response.success = True
+        response.message = "paused" if self._paused else "running"
+        return response
+
+    # Diagnostics
+
+    def _report(self) -> tuple[bytes, str, dict[str, Any]]:
+        monitor = self._monitor
+        latencies = np.array(self._latencies) if self._latencies else np.full(1, np.nan)
+        median, slow = np.percentile(latencies, (50, 99)) * 1e6
+        elapsed = time.monotonic() - self._started_at
+        contact_force, contact_force_max = self._robot.contact_force()
+        values = {
+            "clock": "lockstep" if self._config.lockstep else "real_time",
+            "paused": self._paused,
+            "control": "brakes" if self._command is None else self._command.control,
+            "stamp_ns": self._stamp,
+            "period_s": self._config.dt,
+            "periods": self._periods,
+            "rate_hz": (self._periods - self._played) / elapsed,
+            "physics_steps_per_period": self._config.substeps,
+            "deadline_misses": self._missed,
+            "braked_periods": self._braked,
+            "commands_refused": self._refused,
+            "world_changes_pending": len(self._world),
+            "contact_force_n": contact_force,
+            "contact_force_max_n": contact_force_max,
+            "latency_p50_us": float(median),
+            "latency_p99_us": float(slow),
+            "commanded_torque_ratio_max": self._torque_ratio,
+            "position_violation_rad": monitor.max_position_violation,
+            "velocity_violation_rad_s": monitor.max_velocity_violation,
+            "torque_ratio": monitor.max_torque_ratio,
+            "lower_clearance_rad": monitor.closest_to_q_min,
+            "upper_clearance_rad": monitor.closest_to_q_max,
+        }
+        if monitor.first_violation_step is not None:
+            return DiagnosticStatus.ERROR, "a limit was broken", values
+        if self._paused:
+            return DiagnosticStatus.OK, "paused", values
+        if self._command is None:
+            return DiagnosticStatus.WARN, "braking: no commands", values
+        return DiagnosticStatus.OK, "running", values
+
+    def destroy_node(self) -> None:
+        """Leave the physics world too."""
+        if hasattr(self, "_robot"):
+            self._robot.close()
+        super().destroy_node()
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the robot node until it is told to stop."""
+    return run(BulletNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

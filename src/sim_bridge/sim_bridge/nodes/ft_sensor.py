@@ -1,0 +1,128 @@
+"""The simulated force/torque sensor's topic, with the bias and noise of a real one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import WrenchStamped
+from rclpy.node import Node
+
+from sim_bridge.bullet.robot import BulletRobot
+from viability_bounds_pkg.ros.parameters import Parameter, ParameterError
+from viability_bounds_pkg.ros.runtime import CONTROL_QOS, set_stamp
+
+SENSOR_TABLE = (
+    Parameter("ft_frame", str, "link that is a force/torque sensor; none if empty", default=""),
+    Parameter(
+        "ft_bias",
+        list[float],
+        "what the sensor adds, force and moment, N and N m; none if empty",
+        default=np.zeros(0),
+    ),
+    Parameter(
+        "ft_noise",
+        list[float],
+        "standard deviation of its noise, force and moment, N and N m; none if empty",
+        default=np.zeros(0),
+    ),
+    Parameter("ft_seed", int, "of that noise", default=0),
+)
+
+
+@dataclass(frozen=True)
+class SensorConfiguration:
+    """A sensor.
+
+    Args:
+        frame: its link; empty if there is none.
+        bias: what it adds, force and moment, shape (6,), N and N m.
+        noise: standard deviation of what it adds in each control period, likewise.
+        seed: of the noise.
+    """
+
+    frame: str
+    bias: np.ndarray
+    noise: np.ndarray
+    seed: int
+
+
+def sensor_configuration(values: Mapping[str, Any]) -> SensorConfiguration:
+    """Check parameter values.
+
+    Raises:
+        ParameterError: a value cannot be used.
+    """
+    for name in ("ft_bias", "ft_noise"):
+        value = values[name]
+        if not len(value):
+            continue
+        if not values["ft_frame"]:
+            raise ParameterError(name, value, "only with a force/torque sensor, 'ft_frame'")
+        if len(value) != 6 or not np.isfinite(value).all():
+            raise ParameterError(name, value, "6 finite numbers")
+    bias, noise = (
+        values[name] if len(values[name]) else np.zeros(6) for name in ("ft_bias", "ft_noise")
+    )
+    if (noise < 0.0).any():
+        raise ParameterError("ft_noise", noise, "not negative")
+    if values["ft_seed"] < 0:
+        raise ParameterError("ft_seed", values["ft_seed"], "at least 0")
+    return SensorConfiguration(values["ft_frame"], bias, noise, values["ft_seed"])
+
+
+class ForceTorqueReading:
+    """What the sensor of a robot says: what it feels, a bias and noise.
+
+    Args:
+        robot: with a sensor.
+        config: of that sensor.
+    """
+
+    def __init__(self, robot: BulletRobot, config: SensorConfiguration) -> None:
+        self._robot, self._config = robot, config
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin the noise anew."""
+        self._random = np.random.default_rng(self._config.seed)
+
+    def read(self) -> np.ndarray:
+        """Return force and moment, shape (6,), N and N m, with other noise each time."""
+        noise = self._config.noise * self._random.standard_normal(6)
+        return self._robot.sensor_wrench() + self._config.bias + noise
+
+
+class ForceTorquePublisher:
+    """Publishes ``ft_wrench``.
+
+    Args:
+        node: publishes.
+        robot: with a sensor.
+        config: of that sensor.
+    """
+
+    def __init__(self, node: Node, robot: BulletRobot, config: SensorConfiguration) -> None:
+        self._reading = ForceTorqueReading(robot, config)
+        self._message = WrenchStamped()
+        self._message.header.frame_id = config.frame
+        self._publisher = node.create_publisher(WrenchStamped, "ft_wrench", CONTROL_QOS)
+
+    def restart(self) -> None:
+        """Begin the noise anew."""
+        self._reading.restart()
+
+    def publish(self, stamp: int) -> None:
+        """Publish what is felt at `stamp`, ns."""
+        message = self._message
+        set_stamp(message.header.stamp, stamp)
+        force, torque = message.wrench.force, message.wrench.torque
+        felt = self._reading.read().tolist()
+        force.x, force.y, force.z, torque.x, torque.y, torque.z = felt
+        self._publisher.publish(message)
+
+    def repeat(self) -> None:
+        """Publish the last message again."""
+        self._publisher.publish(self._message)

@@ -1,0 +1,95 @@
+"""The scenario node's parameters: the table, and their checks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sim_bridge.scenario.events import PostureGoal, WrenchGoal
+from sim_bridge.scenario.fields import ScenarioError
+from sim_bridge.scenario.scenario import Scenario, load_scenario
+from viability_bounds_pkg.ros.parameters import Parameter, ParameterError, joint_names, positive
+from viability_bounds_pkg.ros.robot_parameters import (
+    ROBOT_TABLE,
+    all_positive,
+    locked_joints,
+    position_limits,
+    robot_urdf,
+)
+
+TABLE = (
+    Parameter("robot_name", str, "what the report calls the robot", default="robot"),
+    *ROBOT_TABLE,
+    Parameter("base_frame", str, "frame of pose goals"),
+    Parameter("end_effector_frame", str, "frame that pose goals move"),
+    Parameter("velocity_max", list[float], "speed limits, rad/s"),
+    Parameter("scenario", str, "YAML file that says what happens when"),
+    Parameter(
+        "ready_timeout",
+        float,
+        "how long the other nodes may take to be there, s; at their first start they compile",
+        default=180.0,
+    ),
+)
+
+
+@dataclass(frozen=True)
+class ScenarioConfiguration:
+    """Checked parameters of the scenario node."""
+
+    name: str
+    urdf: str
+    joints: tuple[str, ...]
+    locked: dict[str, float]
+    base_frame: str
+    end_effector_frame: str
+    q_min: np.ndarray
+    q_max: np.ndarray
+    v_max: np.ndarray
+    tau_max: np.ndarray
+    scenario: Scenario
+    ready_timeout: float
+
+
+def make_configuration(values: Mapping[str, Any]) -> ScenarioConfiguration:
+    """Check parameter values and read the scenario.
+
+    Raises:
+        ParameterError: a value cannot be used.
+    """
+    joints = joint_names(values)
+    try:
+        scenario = load_scenario(values["scenario"])
+    except ScenarioError as error:
+        raise ParameterError("scenario", values["scenario"], str(error)) from error
+    for event in scenario.events:
+        if isinstance(event, PostureGoal) and set(joints) - set(event.positions):
+            missing = ", ".join(joint for joint in joints if joint not in event.positions)
+            allowed = f"postures of all 'joints'; at {event.time:g} s there is none of {missing}"
+            raise ParameterError("scenario", values["scenario"], allowed)
+    frames = "", values["end_effector_frame"], values["base_frame"]
+    for event in scenario.events:
+        if isinstance(event, WrenchGoal) and event.frame not in frames:
+            allowed = (
+                f"wrenches in the axes of {' or '.join(frames[1:])}; at {event.time:g} s there is "
+                f"one in those of {event.frame!r}"
+            )
+            raise ParameterError("scenario", values["scenario"], allowed)
+    q_min, q_max = position_limits(values, joints)
+    return ScenarioConfiguration(
+        name=values["robot_name"],
+        urdf=robot_urdf(values),
+        joints=joints,
+        locked=locked_joints(values),
+        base_frame=values["base_frame"],
+        end_effector_frame=values["end_effector_frame"],
+        q_min=q_min,
+        q_max=q_max,
+        v_max=all_positive(values, "velocity_max", joints),
+        tau_max=all_positive(values, "torque_max", joints),
+        scenario=scenario,
+        ready_timeout=positive(values, "ready_timeout"),
+    )

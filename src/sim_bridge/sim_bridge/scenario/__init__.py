@@ -1,0 +1,1 @@
+"""Scenarios: what happens when, and the report of a run."""

@@ -1,0 +1,234 @@
+"""The report of a run: a table, a verdict, a figure, and the numbers behind them."""
+
+from __future__ import annotations
+
+import json
+from contextlib import closing
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from sim_bridge.bullet.robot import BulletRobot
+from sim_bridge.scenario.events import TrajectoryGoal
+from sim_bridge.scenario.pose_reference import pose_errors, pose_reference
+from sim_bridge.scenario.recording import Run
+
+TOLERANCE = 1e-9
+"""What counts as a violation, rad, rad/s and share of the torque limit: rounding does not."""
+
+_RECORDED = ("t", "q", "v", "a_lower", "a_upper", "tau", "ft_wrench")
+
+
+def write_report(
+    directory: Path, config, run: Run, robot: dict[str, str], bounds: dict[str, str]
+) -> bool:
+    """Write ``figure.png``, ``data.npz`` and ``metrics.json``; print a table and the verdict.
+
+    Args:
+        directory: where to; made if it is not there.
+        config: the scenario node's configuration.
+        run: what was recorded.
+        robot: the robot's last diagnostics, by key: it saw every physics step.
+        bounds: the bounds node's.
+
+    Returns:
+        Whether every limit was kept.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    reference = pose_reference(config.scenario.events, run.t)
+    errors = _errors(config, run, reference)
+    metrics = _metrics(config, run, robot, errors, bounds)
+    np.savez_compressed(
+        directory / "data.npz",
+        joints=np.array(run.joints),
+        position_error=errors[:, 0],
+        orientation_error=errors[:, 1],
+        pose_reference=reference,
+        **{name: getattr(run, name) for name in _RECORDED},
+    )
+    (directory / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
+    _draw(directory / "figure.png", config, run, errors, metrics)
+    _print_table(config, metrics)
+    print(f"figure, data and metrics are in {directory}")
+    return metrics["limits_kept"]
+
+
+def _errors(config, run: Run, reference: np.ndarray) -> np.ndarray:
+    """Return the pose error of each state, shape (N, 2), m and rad; NaN without a reference.
+
+    The robot's own forward kinematics are PyBullet's, which share nothing with the
+    controller's.
+    """
+    with closing(
+        BulletRobot(config.urdf, config.joints, locked_positions=config.locked, physics_dt=1e-3)
+    ) as robot:
+        return pose_errors(robot, config.base_frame, config.end_effector_frame, run, reference)
+
+
+def _floats(robot: dict[str, str], key: str) -> np.ndarray:
+    return np.array([float(item) for item in robot[key].split()])
+
+
+def _or_none(value: float) -> float | None:
+    """Return what JSON has a word for: without a pose goal there is no error."""
+    return float(value) if np.isfinite(value) else None
+
+
+def _trajectory_error(config, run: Run, errors: np.ndarray) -> float:
+    """Return the largest distance to a trajectory while it lasted, m; NaN if there was none."""
+    worst = np.nan
+    for event in config.scenario.events:
+        if isinstance(event, TrajectoryGoal):
+            during = (run.t >= event.time) & (run.t <= event.time + event.points[-1].time)
+            worst = np.fmax(worst, np.fmax.reduce(errors[during, 0], initial=np.nan))
+    return worst
+
+
+def _metrics(
+    config, run: Run, robot: dict[str, str], errors: np.ndarray, bounds: dict[str, str]
+) -> dict:
+    position = _floats(robot, "position_violation_rad")
+    velocity = _floats(robot, "velocity_violation_rad_s")
+    ratio = max(float(robot["commanded_torque_ratio_max"]), _floats(robot, "torque_ratio").max())
+    kept = position.max() <= TOLERANCE and velocity.max() <= TOLERANCE and ratio <= 1.0 + TOLERANCE
+    return {
+        "robot": config.name,
+        "bounds_method": bounds.get("method", "unknown"),
+        "clock": robot["clock"],
+        "rate_hz": 1.0 / float(robot["period_s"]),
+        "measured_rate_hz": float(robot["rate_hz"]),
+        "steps": int(robot["periods"]),
+        "physics_steps_per_period": int(robot["physics_steps_per_period"]),
+        "limits_kept": bool(kept),
+        "max_position_violation_rad": float(position.max()),
+        "most_violated_joint": (
+            run.joints[int(np.argmax(position))] if position.max() > TOLERANCE else None
+        ),
+        "max_velocity_violation_rad_s": float(velocity.max()),
+        "max_torque_ratio": float(ratio),
+        "final_position_error_m": _or_none(errors[-1, 0]),
+        "final_orientation_error_rad": _or_none(errors[-1, 1]),
+        "max_trajectory_error_m": _or_none(_trajectory_error(config, run, errors)),
+        "max_contact_force_n": _or_none(float(robot.get("contact_force_max_n", "nan"))),
+        "deadline_misses": int(robot["deadline_misses"]),
+        "latency_p50_us": float(robot["latency_p50_us"]),
+        "latency_p99_us": float(robot["latency_p99_us"]),
+        "recording_lost_periods": run.lost,
+        "joints": {
+            name: {
+                "lower_clearance_rad": low,
+                "upper_clearance_rad": high,
+                "max_speed_ratio": speed,
+                "max_torque_ratio": torque,
+            }
+            for name, low, high, speed, torque in zip(
+                run.joints,
+                _floats(robot, "lower_clearance_rad").tolist(),
+                _floats(robot, "upper_clearance_rad").tolist(),
+                (np.abs(run.v).max(axis=0) / config.v_max).tolist(),
+                _floats(robot, "torque_ratio").tolist(),
+                strict=True,
+            )
+        },
+    }
+
+
+def _print_table(config, metrics: dict) -> None:
+    print()
+    width = max(map(len, metrics["joints"]))
+    print(f"{'joint':<{width}}  to lower limit  to upper limit  top speed  top torque")
+    print(f"{'':<{width}}             rad             rad  of limit     of limit")
+    for name, row in metrics["joints"].items():
+        print(
+            f"{name:<{width}}  {row['lower_clearance_rad']:+14.6f}  "
+            f"{row['upper_clearance_rad']:+14.6f}  {row['max_speed_ratio']:9.1%}  "
+            f"{row['max_torque_ratio']:10.1%}"
+        )
+    print()
+    if metrics["final_position_error_m"] is not None:
+        print(
+            f"pose error at the end: {1e3 * metrics['final_position_error_m']:.3f} mm, "
+            f"{1e3 * metrics['final_orientation_error_rad']:.3f} mrad"
+        )
+    if metrics["max_trajectory_error_m"] is not None:
+        print(f"off the trajectory: {1e3 * metrics['max_trajectory_error_m']:.3f} mm at most")
+    if metrics["max_contact_force_n"]:
+        print(f"obstacles pushed on the arm with {metrics['max_contact_force_n']:.1f} N at most")
+    print(
+        f"{metrics['steps']} control periods, {metrics['deadline_misses']} deadlines missed, "
+        f"command latency {metrics['latency_p50_us']:.0f} us (median), "
+        f"{metrics['latency_p99_us']:.0f} us (99%)"
+    )
+    if metrics["limits_kept"]:
+        print("VERDICT: no limit was broken, at any physics step.")
+        return
+    broken = [
+        f"position by {metrics['max_position_violation_rad']:.4g} rad"
+        f" ({metrics['most_violated_joint']})"
+        if metrics["max_position_violation_rad"] > TOLERANCE
+        else "",
+        f"speed by {metrics['max_velocity_violation_rad_s']:.4g} rad/s"
+        if metrics["max_velocity_violation_rad_s"] > TOLERANCE
+        else "",
+        f"torque, {metrics['max_torque_ratio']:.4g} of its limit"
+        if metrics["max_torque_ratio"] > 1.0 + TOLERANCE
+        else "",
+    ]
+    print(f"VERDICT: limits were BROKEN: {'; '.join(filter(None, broken))}.")
+
+
+def _draw(path: Path, config, run: Run, errors: np.ndarray, metrics: dict) -> None:
+    """Draw the joint that came nearest to a limit in detail, and all joints in proportion."""
+    clearance = np.minimum(run.q - config.q_min, config.q_max - run.q).min(axis=0)
+    j = int(np.argmin(clearance))
+    t = run.t
+    figure, axes = plt.subplots(4, 2, figsize=(12, 10), sharex=True, layout="constrained")
+    verdict = "no limit broken" if metrics["limits_kept"] else "LIMITS BROKEN"
+    figure.suptitle(
+        f"{config.name}: {metrics['bounds_method']} bounds, {metrics['rate_hz']:g} Hz, "
+        f"{metrics['clock']}: {verdict}"
+    )
+    one, every = axes[:, 0], axes[:, 1]
+    limit = {"color": "tab:red", "linestyle": "--", "linewidth": 1.2}
+
+    one[0].plot(t, run.q[:, j])
+    for value in (config.q_min[j], config.q_max[j]):
+        one[0].axhline(value, **limit)
+    one[0].set(title=f"{run.joints[j]}, the joint nearest to a limit", ylabel="position [rad]")
+    one[1].plot(t, run.v[:, j])
+    for sign in (-1, 1):
+        one[1].axhline(sign * config.v_max[j], **limit)
+        one[3].axhline(sign * config.tau_max[j], **limit)
+        for axis in every[:3]:
+            axis.axhline(sign, **limit)
+    one[1].set(ylabel="velocity [rad/s]")
+    dt = 1.0 / metrics["rate_hz"]
+    one[2].fill_between(t, run.a_lower[:, j], run.a_upper[:, j], alpha=0.25, label="allowed")
+    one[2].plot(t[:-1], np.diff(run.v[:, j]) / dt, linewidth=1.0, label="measured")
+    one[2].set(ylabel="acceleration [rad/s$^2$]")
+    one[2].legend(loc="upper right")
+    one[3].plot(t, run.tau[:, j])
+    one[3].set(ylabel="torque [N m]", xlabel="time [s]")
+
+    middle, half = 0.5 * (config.q_max + config.q_min), 0.5 * (config.q_max - config.q_min)
+    for i, name in enumerate(run.joints):
+        every[0].plot(t, (run.q[:, i] - middle[i]) / half[i], label=name)
+        every[1].plot(t, run.v[:, i] / config.v_max[i])
+        every[2].plot(t, run.tau[:, i] / config.tau_max[i])
+    every[0].set(title="all joints, limits at -1 and 1", ylabel="position / limit")
+    every[0].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize="small")
+    every[1].set(ylabel="velocity / limit")
+    every[2].set(ylabel="torque / limit")
+    every[3].semilogy(t, np.maximum(1e3 * errors[:, 0], 1e-3), label="position [mm]")
+    every[3].semilogy(t, np.maximum(1e3 * errors[:, 1], 1e-3), label="orientation [mrad]")
+    every[3].set(ylabel="error of the pose goal", xlabel="time [s]")
+    every[3].legend(loc="upper right")
+    for axis in axes.flat:
+        axis.grid(alpha=0.3)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)

@@ -1,0 +1,81 @@
+"""A scenario: a timeline of goals, pushes, obstacles and calls, read from YAML and checked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from sim_bridge.scenario.events import AddObstacle, Event, Push, RemoveObstacle, read_event
+from sim_bridge.scenario.fields import ScenarioError, number, refuse
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """What happens when; all times in seconds of robot time from the start.
+
+    Attributes:
+        duration: when it is over.
+        events: in order of time.
+    """
+
+    duration: float
+    events: tuple[Event, ...]
+
+
+def load_scenario(path: str | Path) -> Scenario:
+    """Read a scenario; ``docs/scenarios.md`` describes the file.
+
+    Raises:
+        ScenarioError: the file is missing, or an entry in it is unknown, malformed or out of
+            range; the message names file, entry and what is allowed.
+    """
+    try:
+        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ScenarioError(f"scenario {path}: {error}") from error
+    if not isinstance(content, dict) or set(content) - {"duration", "events"}:
+        raise ScenarioError(f"scenario {path}: has keys other than 'duration' and 'events'")
+    try:
+        duration = number(content.get("duration"), "duration")
+        entries = content.get("events") or []
+        if not isinstance(entries, list):
+            raise ScenarioError(f"events is {entries!r}; allowed: a list")
+        events = [read_event(entry, f"events[{i}]") for i, entry in enumerate(entries)]
+        for i, event in enumerate(events):
+            if event.time >= duration:
+                raise refuse(f"events[{i}].time", event.time, f"less than {duration:g}, the end")
+        events.sort(key=lambda event: event.time)
+        _check_pushes(events)
+        _check_obstacles(events)
+    except ScenarioError as error:
+        raise ScenarioError(f"scenario {path}: {error}") from None
+    return Scenario(duration, tuple(events))
+
+
+def _check_pushes(events: list[Event]) -> None:
+    """Refuse pushes of the same link that overlap: the robot holds one for each."""
+    until: dict[str, float] = {}
+    for push in (event for event in events if isinstance(event, Push)):
+        if push.time < until.get(push.link, 0.0) - 1e-9:
+            raise ScenarioError(
+                f"the push of {push.link} at {push.time:g} s begins before the one before it ends "
+                f"at {until[push.link]:g} s; allowed: one push of a link at a time"
+            )
+        until[push.link] = push.time + push.duration
+
+
+def _check_obstacles(events: list[Event]) -> None:
+    """Refuse to remove what is not there."""
+    there: set[str] = set()
+    for event in events:
+        if isinstance(event, AddObstacle):
+            there.add(event.obstacle.name)
+        elif isinstance(event, RemoveObstacle):
+            if event.name not in there:
+                known = ", ".join(sorted(there)) or "none"
+                raise ScenarioError(
+                    f"remove_obstacle at {event.time:g} s names {event.name!r}; there are: {known}"
+                )
+            there.remove(event.name)

@@ -1,0 +1,151 @@
+"""Pictures of a robot and of the obstacles around it, without a display."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sim_bridge.bullet.client import BulletClient
+from sim_bridge.bullet.obstacle_bodies import shape_arguments
+from sim_bridge.bullet.obstacles import Obstacle
+from sim_bridge.bullet.quiet_pybullet import pybullet, silenced
+from sim_bridge.bullet.robot import BulletRobot
+from sim_bridge.bullet.vectors import finite_vector
+from sim_bridge.urdf.preparation import prepare_urdf
+
+_OVERSAMPLING = 2  # PyBullet's renderer does not smooth edges
+_NEAR, _FAR = 0.05, 20.0  # m
+_OBSTACLE_COLOR = (0.25, 0.45, 0.7)
+_FLOOR_COLOR = (0.8, 0.8, 0.78)
+_SKY_TOP, _SKY_BOTTOM = np.array([214, 224, 236]), np.array([250, 250, 250])
+_LIGHT = {
+    "lightDirection": (1.5, 1.0, 3.0),
+    "lightColor": (1.0, 1.0, 1.0),
+    "lightDistance": 4.0,
+    "lightAmbientCoeff": 0.55,
+    "lightDiffuseCoeff": 0.5,
+    "lightSpecularCoeff": 0.1,
+    "shadow": 1,
+}
+
+
+class Camera:
+    """Renders a robot with its meshes, in a PyBullet world of its own: the robot's is not touched.
+
+    Call `close` after use; `contextlib.closing` does.
+
+    Args:
+        robot: as it is and will be.
+        floor: height of a plate to stand on, m; none by default.
+        colors: red, green, blue, 0 to 1, of obstacles, by name.
+
+    Raises:
+        RobotDescriptionError: a mesh cannot be found.
+    """
+
+    def __init__(
+        self,
+        robot: BulletRobot,
+        *,
+        floor: float | None = None,
+        colors: Mapping[str, Sequence[float]] | None = None,
+    ) -> None:
+        self._robot, self._colors = robot, dict(colors or {})
+        prepared = prepare_urdf(*robot.description, visuals=True)
+        self._bullet = bullet = BulletClient()
+        with tempfile.TemporaryDirectory() as directory, silenced(1), silenced(2):
+            path = Path(directory) / "robot.urdf"
+            path.write_text(prepared.text, encoding="utf-8")
+            self._body = body = bullet.loadURDF(str(path), useFixedBase=True)
+        infos = [bullet.getJointInfo(body, i) for i in range(bullet.getNumJoints(body))]
+        indices = {info[1].decode(): info[0] for info in infos}
+        self._joints = [indices[name] for name in robot.joints]
+        for shape in bullet.getVisualShapeData(body):
+            # Mirrored meshes would be seen from inside.
+            bullet.changeVisualShape(body, shape[1], flags=pybullet.VISUAL_SHAPE_DOUBLE_SIDED)
+        self._shown: dict[str, tuple[Obstacle, int]] = {}
+        if floor is not None:
+            plate = Obstacle("floor", "box", [3.0, 3.0, 0.04], [0.0, 0.0, floor - 0.02])
+            self._make(plate, _FLOOR_COLOR)
+
+    def snapshot(
+        self,
+        eye: ArrayLike,
+        target: ArrayLike,
+        size: tuple[int, int] = (800, 600),
+        *,
+        q: ArrayLike | None = None,
+        angle: float = 40.0,
+    ) -> np.ndarray:
+        """Return a picture.
+
+        Args:
+            eye: where the camera is, in the frame of the robot's root link, shape (3,), m.
+            target: where it looks, shape (3,), m.
+            size: width and height, pixels.
+            q: positions of the joints, shape (n,), rad; those of the robot by default.
+            angle: that the picture covers from top to bottom, degrees.
+
+        Returns:
+            Red, green and blue, shape (height, width, 3), uint8.
+        """
+        bullet = self._bullet
+        joints = self._robot.state().q if q is None else q
+        positions = finite_vector("q", joints, len(self._joints)).tolist()
+        for joint, position in zip(self._joints, positions, strict=True):
+            bullet.resetJointState(self._body, joint, position)
+        self._follow_obstacles()
+        eye, target = finite_vector("eye", eye, 3), finite_vector("target", target, 3)
+        width, height = (_OVERSAMPLING * pixels for pixels in size)
+        image = bullet.getCameraImage(
+            width,
+            height,
+            bullet.computeViewMatrix(eye.tolist(), target.tolist(), [0.0, 0.0, 1.0]),
+            bullet.computeProjectionMatrixFOV(angle, width / height, _NEAR, _FAR),
+            renderer=pybullet.ER_TINY_RENDERER,
+            **_LIGHT,
+        )
+        picture = np.reshape(image[2], (height, width, 4))[:, :, :3].astype(float)
+        nothing = np.reshape(image[4], (height, width)) < 0
+        sky = np.linspace(_SKY_TOP, _SKY_BOTTOM, height)[:, None, :]
+        picture = np.where(nothing[:, :, None], sky, picture)
+        blocks = picture.reshape(size[1], _OVERSAMPLING, size[0], _OVERSAMPLING, 3)
+        return blocks.mean(axis=(1, 3)).round().astype(np.uint8)
+
+    def _follow_obstacles(self) -> None:
+        """Show the obstacles that the robot's world has now."""
+        present = self._robot.obstacles
+        for name, (shown, body) in list(self._shown.items()):
+            if present.get(name) is not shown:
+                self._bullet.removeBody(body)
+                del self._shown[name]
+        for name, obstacle in present.items():
+            if name not in self._shown:
+                color = self._colors.get(name, _OBSTACLE_COLOR)
+                self._shown[name] = obstacle, self._make(obstacle, color)
+
+    def _make(self, obstacle: Obstacle, color: Sequence[float]) -> int:
+        arguments = shape_arguments(obstacle)
+        if "height" in arguments:
+            arguments["length"] = arguments.pop("height")
+        shape = self._bullet.createVisualShape(**arguments, rgbaColor=(*color, 1.0))
+        return self._bullet.createMultiBody(
+            0.0, -1, shape, obstacle.position.tolist(), obstacle.orientation.tolist()
+        )
+
+    def close(self) -> None:
+        """Leave the world of pictures."""
+        self._bullet.disconnect()
+
+
+def snapshot(
+    robot: BulletRobot, eye: ArrayLike, target: ArrayLike, size: tuple[int, int] = (800, 600)
+) -> np.ndarray:
+    """Return one picture of `robot`; `Camera.snapshot` has the details, and is faster for more."""
+    with closing(Camera(robot)) as camera:
+        return camera.snapshot(eye, target, size)

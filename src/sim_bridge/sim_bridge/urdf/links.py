@@ -1,0 +1,98 @@
+"""What the links of a URDF weigh, and what shapes they have."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from copy import deepcopy
+from xml.etree.ElementTree import Element, SubElement
+
+import numpy as np
+
+from sim_bridge.urdf.geometry import number_text, origin_attributes, read_numbers, transform_of
+from viability_bounds_pkg.robot_description import RobotDescriptionError, resolve_uri
+
+
+def scale_masses(root: Element, scales: Mapping[str, float]) -> None:
+    """Let links of the URDF `root` weigh more or less; their inertias follow.
+
+    Raises:
+        RobotDescriptionError: an unknown link, or one scaled by other than a finite positive
+            number.
+    """
+    links = {link.get("name", ""): link for link in root.findall("link")}
+    for name, scale in scales.items():
+        if name not in links:
+            raise RobotDescriptionError(f"unknown link {name!r}; the URDF has: {', '.join(links)}")
+        if not (math.isfinite(scale) and scale > 0.0):
+            raise RobotDescriptionError(f"the mass of link {name!r} cannot be scaled by {scale}")
+        for inertial in links[name].findall("inertial"):
+            for part in (*inertial.findall("mass"), *inertial.findall("inertia")):
+                for key in part.attrib:
+                    part.set(key, number_text(scale * read_numbers(part, key, 1)))
+
+
+def placed_shapes(
+    link: Element, kind: str, placement: np.ndarray, missing: list[str] | None = None
+) -> list[Element]:
+    """Return the shapes of `link` as shapes of the body that it sits on.
+
+    Args:
+        link: of a URDF.
+        kind: visual or collision.
+        placement: of the link on the body, shape (4, 4).
+        missing: takes the meshes that cannot be found, whose shapes are left out.
+
+    Raises:
+        RobotDescriptionError: a mesh cannot be found, and `missing` is None.
+    """
+    shapes = []
+    for original in link.findall(kind):
+        shape = deepcopy(original)
+        origin = shape.find("origin")
+        if origin is None:
+            origin = SubElement(shape, "origin")
+        origin.attrib = origin_attributes(placement @ transform_of(origin))
+        try:
+            for mesh in shape.iter("mesh"):
+                mesh.set("filename", str(resolve_uri(mesh.get("filename", "")).resolve()))
+        except RobotDescriptionError as error:
+            if missing is None:
+                raise
+            missing.append(str(error))
+            continue
+        shapes.append(shape)
+    return shapes
+
+
+def carried_links(root: Element, link: str) -> list[str]:
+    """Return the links of the URDF `root` that are mounted on `link`.
+
+    Raises:
+        RobotDescriptionError: there is no such link, or nothing is mounted on it.
+    """
+    known = [element.get("name", "") for element in root.findall("link")]
+    if link not in known:
+        raise RobotDescriptionError(f"unknown link {link!r}; the URDF has: {', '.join(known)}")
+    carried = _children(root).get(link)
+    if not carried:
+        raise RobotDescriptionError(f"link {link!r} carries nothing that could be felt")
+    return carried
+
+
+def links_beyond(root: Element, link: str) -> set[str]:
+    """Return `link` and all links of the URDF `root` that it carries, directly or not."""
+    children, beyond, pending = _children(root), set(), [link]
+    while pending:
+        name = pending.pop()
+        beyond.add(name)
+        pending += children.get(name, ())
+    return beyond
+
+
+def _children(root: Element) -> dict[str, list[str]]:
+    children: dict[str, list[str]] = {}
+    for joint in root.findall("joint"):
+        parent, child = (joint.find(end).get("link", "") for end in ("parent", "child"))
+        children.setdefault(parent, []).append(child)
+    return children

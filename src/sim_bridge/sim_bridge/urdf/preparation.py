@@ -1,0 +1,285 @@
+"""A URDF made ready for PyBullet, so that its dynamics equal Pinocchio's reduced model.
+
+PyBullet reads a URDF in ways that silently change the dynamics; nothing is left to that here:
+
+- a link without ``<inertial>`` would weigh 1 kg: every link made here has one;
+- inertia tensors would be diagonalised to a relative 1e-6 only, and one that breaks the
+  triangle inequality, if only by rounding as a flat link's may, would become zero: the text
+  has the principal axes and stand-ins for the moments, which the caller sets after loading;
+- joint damping and friction, and joint stops, would act: they are removed.
+
+Links that do not move against each other become one, with the sum of their inertias: PyBullet
+steps every link, fixed or not, and a humanoid becomes as fast as its arm.
+`PreparedUrdf.frames` remembers where each of the original links went.
+
+What a URDF cannot say is added on request: rotors that gears will couple to the joints
+(`sim_bridge.bullet.joint_friction` has the reasons), and links that weigh other than the URDF
+believes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field
+from typing import NamedTuple
+from xml.etree.ElementTree import Element, ParseError, SubElement, fromstring, tostring
+
+import numpy as np
+
+from sim_bridge.urdf.geometry import (
+    joint_axis,
+    number_text,
+    origin_attributes,
+    point_inertia,
+    read_numbers,
+    roll_pitch_yaw,
+    transform_of,
+)
+from sim_bridge.urdf.links import placed_shapes, scale_masses
+from viability_bounds_pkg.robot_description import RobotDescriptionError
+
+_MOVABLE = ("revolute", "continuous", "prismatic")
+# PyBullet makes no stop where lower > upper.
+_NO_STOP = {"lower": "1", "upper": "-1", "effort": "0", "velocity": "0"}
+
+
+class FramePlacement(NamedTuple):
+    """Where a link of the original URDF sits: on which link left, and where on it.
+
+    Relative to the link's principal frame: centre of mass and principal axes. PyBullet reports
+    that in double precision, but URDF frames in single precision.
+    """
+
+    link: str
+    position: np.ndarray  # shape (3,), m
+    orientation: np.ndarray  # shape (4,), quaternion x, y, z, w
+
+
+@dataclass(frozen=True)
+class PreparedUrdf:
+    """A URDF for PyBullet, and what it takes to use it."""
+
+    text: str  # without any joints but those asked for
+    frames: Mapping[str, FramePlacement]  # of every link of the original URDF
+    principal_inertias: Mapping[str, np.ndarray]  # to set for each link left, shape (3,), kg m^2
+    rotors: Mapping[str, str]  # the joint of the rotor that belongs to a joint, where there is one
+    missing: Sequence[str]  # meshes of collision shapes that cannot be found and are left out
+
+
+@dataclass
+class _Body:
+    """Links that move as one, gathered in the frame of the first of them."""
+
+    name: str
+    mass: float = 0.0
+    moment: np.ndarray = field(default_factory=lambda: np.zeros(3))  # mass times centre of mass
+    inertia: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))  # about the frame
+    shapes: list[Element] = field(default_factory=list)
+
+
+def prepare_urdf(
+    urdf: str,
+    joints: Sequence[str],
+    locked_positions: Mapping[str, float] | None = None,
+    *,
+    visuals: bool = False,
+    collisions: bool = False,
+    mechanical_stops: bool = False,
+    apart: Collection[str] = (),
+    mass_scales: Mapping[str, float] | None = None,
+    rotor_inertias: Mapping[str, float] | None = None,
+) -> PreparedUrdf:
+    """Return `urdf` reduced to `joints` and rewritten for PyBullet.
+
+    Args:
+        urdf: text of the URDF.
+        joints: the joints that move, in any order: revolute, continuous or prismatic.
+        locked_positions: where other joints are locked, rad or m; joints left out are locked
+            at zero. Mimic joints are joints like any other here, as they are in Pinocchio.
+        visuals: keep the visual shapes; the files they name are looked up.
+        collisions: keep the collision shapes of what moves.
+        mechanical_stops: keep the position limits as hard stops, which hide violations.
+        apart: links that do not become one with those that carry them, even if they are fixed.
+        mass_scales: factors for mass and inertia of links, by name.
+        rotor_inertias: for each of `joints` that gets a rotor, its inertia, kg m^2 (kg for a
+            prismatic joint). The rotors turn about axes fixed to the ground, through their
+            centres: neither gravity nor the arm's motion acts on them.
+
+    Raises:
+        RobotDescriptionError: not a URDF, a joint that is unknown, repeated, both moved and
+            locked, or of a type with other than one coordinate; an unknown link, or one scaled
+            by other than a finite positive number; a mesh that cannot be found.
+    """
+    try:
+        root = fromstring(urdf)
+    except ParseError as error:
+        raise RobotDescriptionError(f"URDF is not well-formed XML ({error})") from error
+    locked = dict(locked_positions or {})
+    _check_joints(root, joints, locked)
+    scale_masses(root, mass_scales or {})
+
+    output = Element("robot", name=root.get("name", "robot"))
+    output.extend(deepcopy(root.findall("material")))
+    links = {link.get("name", ""): link for link in root.findall("link")}
+    outgoing: dict[str, list[Element]] = {}
+    children = []
+    for joint in root.findall("joint"):
+        outgoing.setdefault(_linked(joint, "parent", links), []).append(joint)
+        children.append(_linked(joint, "child", links))
+    roots = [name for name in links if name not in children]
+    if len(roots) != 1 or len(set(children)) != len(children):
+        raise RobotDescriptionError(f"the links do not form one tree; roots: {roots}")
+
+    missing: list[str] = []
+    bodies = [_Body(roots[0])]
+    placed: dict[str, tuple[_Body, np.ndarray]] = {}
+    pending = [(roots[0], bodies[0], np.eye(4))]
+    while pending:
+        name, body, placement = pending.pop()
+        placed[name] = body, placement
+        _add_inertia(body, links[name], placement)
+        if visuals:
+            body.shapes += placed_shapes(links[name], "visual", placement)
+        if collisions and body is not bodies[0]:  # what stands still meets nothing
+            body.shapes += placed_shapes(links[name], "collision", placement, missing)
+        for joint in outgoing.get(name, ()):
+            child = _linked(joint, "child", links)
+            origin = placement @ transform_of(joint.find("origin"))
+            moves = joint.get("name") in joints
+            if not moves:
+                origin = origin @ _locked_motion(joint, locked.get(joint.get("name", ""), 0.0))
+            if moves or child in apart:
+                stops = mechanical_stops and moves
+                output.append(_joint_between(joint, moves, body.name, child, origin, stops))
+                bodies.append(_Body(child))
+                pending.append((child, bodies[-1], np.eye(4)))
+            else:
+                pending.append((child, body, origin))
+
+    # What stands on the ground takes no part in the dynamics; its frame stays where it is.
+    bodies[0] = _Body(roots[0], shapes=bodies[0].shapes)
+    principal = {body.name: _append_link(output, body) for body in bodies}
+    frames = {
+        name: _frame(body.name, np.linalg.solve(principal[body.name][0], placement))
+        for name, (body, placement) in placed.items()
+    }
+    inertias = {name: moments for name, (_, moments) in principal.items()}
+    rotors = {joint: f"{joint} rotor" for joint in rotor_inertias or {}}
+    for joint, rotor in rotors.items():
+        _append_rotor(output, bodies[0].name, rotor)
+        inertias[rotor] = np.full(3, rotor_inertias[joint])
+    return PreparedUrdf(tostring(output, encoding="unicode"), frames, inertias, rotors, missing)
+
+
+def _check_joints(root: Element, joints: Sequence[str], locked: Mapping[str, float]) -> None:
+    """Raise `RobotDescriptionError` unless each joint named exists and can do its part."""
+    types = {joint.get("name"): joint.get("type") for joint in root.findall("joint")}
+    for name in (*joints, *locked):
+        if name not in types:
+            known = ", ".join(str(n) for n, kind in types.items() if kind != "fixed")
+            raise RobotDescriptionError(f"unknown joint {name!r}; the URDF has: {known}")
+        if types[name] not in _MOVABLE:
+            raise RobotDescriptionError(f"joint {name!r} is {types[name]}, none of {_MOVABLE}")
+    if not joints or len(set(joints)) != len(joints):
+        raise RobotDescriptionError(f"joints must be listed once each, not {list(joints)}")
+    for name, position in locked.items():
+        if name in joints:
+            raise RobotDescriptionError(f"joint {name!r} cannot be both moved and locked")
+        if not math.isfinite(position):
+            raise RobotDescriptionError(f"joint {name!r} cannot be locked at {position}")
+
+
+def _linked(joint: Element, end: str, links: Mapping[str, object]) -> str:
+    """Return the link at the 'parent' or 'child' `end` of `joint`."""
+    element = joint.find(end)
+    name = "" if element is None else element.get("link", "")
+    if name not in links:
+        raise RobotDescriptionError(f"joint {joint.get('name')!r}: no {end} link {name!r}")
+    return name
+
+
+def _add_inertia(body: _Body, link: Element, placement: np.ndarray) -> None:
+    """Add the inertia of `link` placed on `body`."""
+    for inertial in link.findall("inertial"):
+        frame = placement @ transform_of(inertial.find("origin"))
+        rotation, centre = frame[:3, :3], frame[:3, 3]
+        mass = read_numbers(inertial.find("mass"), "value", 1)[0]
+        xx, xy, xz, yy, yz, zz = (
+            read_numbers(inertial.find("inertia"), name, 1)[0]
+            for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+        )
+        own = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        body.mass += mass
+        body.moment += mass * centre
+        body.inertia += rotation @ own @ rotation.T + point_inertia(mass, centre)
+
+
+def _append_link(output: Element, body: _Body) -> tuple[np.ndarray, np.ndarray]:
+    """Add `body` to the URDF; return its principal frame, shape (4, 4), and moments (3,)."""
+    frame = np.eye(4)
+    frame[:3, 3] = centre = body.moment / body.mass if body.mass else np.zeros(3)
+    moments, axes = np.linalg.eigh(body.inertia - point_inertia(body.mass, centre))
+    axes[:, 2] *= np.sign(np.linalg.det(axes))  # eigenvectors may come left-handed
+    frame[:3, :3] = axes
+    link = SubElement(output, "link", name=body.name)
+    inertial = SubElement(link, "inertial")
+    SubElement(inertial, "origin", origin_attributes(frame))
+    SubElement(inertial, "mass", value=number_text([body.mass]))
+    SubElement(inertial, "inertia", ixx="1", ixy="0", ixz="0", iyy="1", iyz="0", izz="1")
+    link.extend(body.shapes)
+    return frame, moments
+
+
+def _append_rotor(output: Element, base: str, name: str) -> None:
+    """Add a rotor that turns against `base`; the caller sets its inertia, as for all links."""
+    inertial = SubElement(SubElement(output, "link", name=name), "inertial")
+    SubElement(inertial, "mass", value="1")
+    SubElement(inertial, "inertia", ixx="1", ixy="0", ixz="0", iyy="1", iyz="0", izz="1")
+    joint = SubElement(output, "joint", name=name, type="revolute")
+    SubElement(joint, "parent", link=base)
+    SubElement(joint, "child", link=name)
+    SubElement(joint, "axis", xyz="0 0 1")
+    SubElement(joint, "limit", _NO_STOP)
+
+
+def _frame(link: str, transform: np.ndarray) -> FramePlacement:
+    """Return the frame that `transform`, shape (4, 4), places on `link`."""
+    half = 0.5 * np.array(roll_pitch_yaw(transform))
+    (sr, sp, sy), (cr, cp, cy) = np.sin(half), np.cos(half)
+    x, y, z = sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy
+    w = cr * cp * cy + sr * sp * sy
+    return FramePlacement(link, transform[:3, 3], np.array([x, y, z, w]))
+
+
+def _joint_between(
+    joint: Element, moves: bool, parent: str, child: str, origin: np.ndarray, stops: bool
+) -> Element:
+    """Return `joint` placed at `origin` on `parent`, without friction, damping or mimicry."""
+    kind = "prismatic" if joint.get("type") == "prismatic" else "revolute"
+    result = Element("joint", name=joint.get("name", ""), type=kind if moves else "fixed")
+    SubElement(result, "origin", origin_attributes(origin))
+    SubElement(result, "parent", link=parent)
+    SubElement(result, "child", link=child)
+    if not moves:
+        return result
+    SubElement(result, "axis", xyz=number_text(joint_axis(joint)))
+    limit = joint.find("limit")
+    if stops and limit is not None and joint.get("type") != "continuous":
+        result.append(deepcopy(limit))
+    else:
+        SubElement(result, "limit", _NO_STOP)
+    return result
+
+
+def _locked_motion(joint: Element, position: float) -> np.ndarray:
+    """Return the transform, shape (4, 4), that `joint` makes at `position` (rad or m)."""
+    motion = np.eye(4)
+    if joint.get("type") == "prismatic":
+        motion[:3, 3] = position * joint_axis(joint)
+    elif position != 0.0:  # Rodrigues: R = I + sin(q) K + (1 - cos(q)) K^2
+        x, y, z = joint_axis(joint)
+        skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        motion[:3, :3] += math.sin(position) * skew + (1.0 - math.cos(position)) * skew @ skew
+    return motion

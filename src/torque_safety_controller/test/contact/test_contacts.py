@@ -1,0 +1,403 @@
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import linprog, nnls
+from task_arm import TaskArm
+
+from torque_safety_controller.contact.contacts import (
+    Contact,
+    ContactError,
+    Contacts,
+    friction_pyramid,
+)
+from torque_safety_controller.qp.constraints import Rows, stack_rows
+from torque_safety_controller.qp.inverse_dynamics_qp import InverseDynamicsQP
+from torque_safety_controller.tasks.tasks import TaskTerm
+
+SOLE = np.array([[0.05, 0.03, 0.1], [0.05, -0.03, 0.1], [-0.05, -0.03, 0.1], [-0.05, 0.03, 0.1]])
+HAND = "panda_hand_tcp"
+ELBOW = "panda_link4"
+
+directions = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda x: np.linalg.norm(x) > 0.1)
+frictions = st.floats(0.0, 3.0)
+facet_numbers = st.integers(3, 40)
+
+
+def parts(force, normal):
+    """Length of a force across a normal, and along it."""
+    normal = np.asarray(normal) / np.linalg.norm(normal)
+    along = normal @ force
+    return np.linalg.norm(force - along * normal), along
+
+
+@given(directions, frictions, facet_numbers, st.integers(0, 1000))
+@settings(max_examples=200, deadline=None)
+def test_forces_in_an_inscribed_pyramid_do_not_slip(normal, friction, facets, seed):
+    edges = friction_pyramid(np.array(normal), friction, facets)
+    rho = np.random.default_rng(seed).exponential(size=facets) ** 3
+    across, along = parts(edges @ rho, normal)
+    assert across <= friction * along + 1e-9 * rho.sum()
+    assert along == pytest.approx(rho.sum())
+    for edge in edges.T:  # the edges are at the limit: nothing is given up there
+        across, along = parts(edge, normal)
+        assert across == pytest.approx(friction * along, abs=1e-12)
+
+
+@given(directions, st.floats(0.05, 3.0), facet_numbers, st.floats(0.0, 2 * np.pi))
+@settings(max_examples=100, deadline=None)
+def test_what_a_pyramid_spans(normal, friction, facets, angle):
+    """Inscribed: all of a cone cos(pi / facets) as wide; circumscribed: all of the cone."""
+    wide = friction_pyramid(np.array(normal), friction, 5000).T[int(angle * 5000 / 6.3)]
+    unit = np.array(normal) / np.linalg.norm(normal)
+    for inscribed, share in ((True, np.cos(np.pi / facets)), (False, 1.0)):
+        edges = friction_pyramid(np.array(normal), friction, facets, inscribed)
+        force = unit + share * (1.0 - 1e-9) * (wide - unit)
+        assert nnls(edges, force)[1] < 1e-7
+
+
+def test_more_facets_fill_the_cone():
+    normal = np.array([0.0, 0.0, 1.0])
+    rng = np.random.default_rng(1)
+    reached = []
+    for facets in (3, 4, 8, 64, 512):
+        edges = friction_pyramid(normal, 0.7, facets)
+        t = rng.normal(size=(200, 2))
+        t /= np.linalg.norm(t, axis=1)[:, None]
+        # The furthest along each direction across the normal, at a normal force of 1.
+        least = min(
+            -linprog(
+                -np.r_[np.zeros(facets), 1.0],
+                A_eq=np.c_[np.vstack([edges]), np.r_[-x, 0.0]],
+                b_eq=[0.0, 0.0, 1.0],
+            ).fun
+            for x in t[:20]
+        )
+        reached.append(least / 0.7)
+        assert least / 0.7 >= np.cos(np.pi / facets) - 1e-6
+    assert np.all(np.diff(reached) > 0.0)
+    assert reached[-1] > 0.9999
+
+
+def test_a_patch_exerts_moments_with_the_centre_of_pressure_inside():
+    contact = Contact(HAND, SOLE, np.array([0.0, 0.0, -2.0]), 0.5, 6)
+    assert contact.W.shape == (6, 24)
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        rho = rng.exponential(size=24) ** 3
+        force, moment = contact.W[:3] @ rho, contact.W[3:] @ rho
+        expected = sum(
+            np.cross(point, friction_pyramid([0, 0, -1.0], 0.5, 6) @ rho[6 * i : 6 * i + 6])
+            for i, point in enumerate(SOLE)
+        )
+        np.testing.assert_allclose(moment, expected, atol=1e-12)
+        moment = moment - np.cross([0.0, 0.0, 0.1], force)  # about the middle of the sole
+        centre = np.array([-moment[1], moment[0]]) / force[2]
+        assert (np.abs(centre) <= [0.05 + 1e-12, 0.03 + 1e-12]).all()
+    assert np.linalg.matrix_rank(contact.W) == 6
+    assert np.linalg.matrix_rank(Contact(HAND, SOLE[0], [0, 0, 1.0], 0.5).W) == 3
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"facets": 0}, "0 facets"),
+        ({"facets": 2}, "2 facets"),
+        ({"facets": 3.5}, "3.5 facets"),
+        ({"facets": -4}, "-4 facets"),
+        ({"facets": True}, "facets"),
+        ({"friction": -0.1}, "friction -0.1"),
+        ({"friction": np.nan}, "friction nan"),
+        ({"friction": np.inf}, "friction inf"),
+        ({"normal": [0.0, 0.0, 0.0]}, "normal"),
+        ({"normal": [0.0, np.nan, 1.0]}, "normal"),
+        ({"normal": [0.0, 1.0]}, "normal"),
+        ({"points": np.zeros((0, 3))}, "points"),
+        ({"points": np.zeros((2, 2))}, "points"),
+        ({"points": [0.0, 0.0, np.inf]}, "points"),
+    ],
+)
+def test_what_cannot_be_is_refused(change, words):
+    values = {"frame": HAND, "points": SOLE, "normal": [0.0, 0.0, 1.0], "friction": 0.5}
+    Contact(**values)
+    with pytest.raises(ContactError, match=words):
+        Contact(**{**values, **change})
+
+
+def test_unknown_frames_and_no_contacts_are_refused():
+    model = TaskArm("panda").model
+    with pytest.raises(ContactError, match="'tentacle'.*panda_hand_tcp"):
+        Contacts(model, [Contact("tentacle", SOLE, [0, 0, 1.0], 0.5)])
+    with pytest.raises(ContactError, match="no contacts"):
+        Contacts(model, [])
+
+
+class Arm:
+    """Panda with a sole on its hand and a point on its elbow, at a state."""
+
+    def __init__(self, seed=3, speed=1.0, facets=4):
+        rng = np.random.default_rng(seed)
+        self.model = TaskArm("panda").model
+        self.data = self.model.createData()
+        self.contacts = Contacts(
+            self.model,
+            [
+                Contact(HAND, SOLE, [0.0, 0.0, -1.0], 0.6, facets),
+                Contact(ELBOW, [0.02, 0.1, -0.03], [0.3, 1.0, 0.0], 0.4, facets),
+            ],
+        )
+        self.q = TaskArm("panda").posture + 0.1 * rng.normal(size=7)
+        self.v = speed * rng.normal(size=7)
+        self.to(self.q, self.v)
+
+    def to(self, q, v):
+        pin.computeJointJacobians(self.model, self.data, q)
+        pin.forwardKinematics(self.model, self.data, q, v, np.zeros(7))
+        self.contacts.update(self.data)
+
+    def points(self, q, index):
+        """Points of a contact in base axes, and the rotation of its frame."""
+        contact, data = self.contacts.contacts[index], self.model.createData()
+        pin.framesForwardKinematics(self.model, data, q)
+        pose = data.oMf[self.model.getFrameId(contact.frame)]
+        return contact.points @ pose.rotation.T + pose.translation, pose.rotation
+
+    def dynamics(self):
+        M = pin.crba(self.model, self.data, self.q)
+        return M, pin.nonLinearEffects(self.model, self.data, self.q, self.v)
+
+    def accelerations(self, tau, rho):
+        """By the articulated-body algorithm, with the forces on their links."""
+        forces = [pin.Force.Zero() for _ in range(self.model.njoints)]
+        for index, contact in enumerate(self.contacts.contacts):
+            frame = self.model.frames[self.model.getFrameId(contact.frame)]
+            forces[frame.parentJoint] += frame.placement.act(
+                pin.Force(self.contacts.wrench(index, rho))
+            )
+        return pin.aba(self.model, self.model.createData(), self.q, self.v, tau, forces)
+
+
+def test_joint_torques_do_the_work_of_the_forces():
+    """Virtual work, with the points' displacements by finite differences."""
+    arm = Arm()
+    B, step = arm.contacts.forces().B, 1e-6
+    column = 0
+    for index, contact in enumerate(arm.contacts.contacts):
+        _, rotation = arm.points(arm.q, index)
+        edges = rotation @ friction_pyramid(contact.normal, contact.friction, contact.facets)
+        for point in range(len(contact.points)):
+            for edge in edges.T:
+                work = [
+                    edge
+                    @ (
+                        arm.points(arm.q + step * e, index)[0][point]
+                        - arm.points(arm.q - step * e, index)[0][point]
+                    )
+                    / (2.0 * step)
+                    for e in np.eye(7)
+                ]
+                np.testing.assert_allclose(B[:, column], work, atol=1e-8)
+                column += 1
+    assert column == arm.contacts.r == 20
+
+
+@pytest.mark.parametrize("index", [0, 1])
+@pytest.mark.parametrize("normal_only", [False, True])
+def test_acceleration_of_the_points(index, normal_only):
+    """Against finite differences of where they are, twice."""
+    arm = Arm()
+    a, step = np.random.default_rng(4).normal(size=7), 1e-4
+    A, v_c, drift = arm.contacts.acceleration(index, normal_only)
+    x, rotation = arm.points(arm.q, index)
+    ahead, behind = (
+        arm.points(arm.q + t * arm.v + 0.5 * t * t * a, index)[0] for t in (step, -step)
+    )
+    velocity = (ahead - behind) / (2.0 * step) @ rotation
+    acceleration = (ahead - 2.0 * x + behind) / step**2 @ rotation
+    if normal_only:
+        normal = arm.contacts.contacts[index].normal
+        velocity, acceleration = velocity @ normal, acceleration @ normal
+    np.testing.assert_allclose(v_c, velocity.reshape(-1), atol=1e-6)
+    np.testing.assert_allclose(A @ a + drift, acceleration.reshape(-1), atol=1e-5)
+    term = arm.contacts.rest_task(index, 20.0, 3.0, normal_only)
+    np.testing.assert_allclose(term.b, -20.0 * v_c - drift)
+    assert term.weight == 3.0 / len(x)
+    rows = arm.contacts.rest_rows(index, 20.0, normal_only)
+    np.testing.assert_array_equal(rows.lower, rows.upper)
+    np.testing.assert_allclose(rows.G, term.A)
+    np.testing.assert_allclose(rows.lower, term.b)
+
+
+def press(arm, F_des, tau_max, index=0, posture_weight=1e4, weight=10.0, rows=None):
+    """Hold still and let a contact exert a wrench; return the solution and the torque."""
+    M, h = arm.dynamics()
+    wide = np.full(7, 100.0)
+    solution = InverseDynamicsQP(7, 1e-9).solve(
+        [TaskTerm(None, -20.0 * arm.v, posture_weight)],
+        -wide,
+        wide,
+        M,
+        -tau_max - h,
+        tau_max - h,
+        rows,
+        arm.contacts.forces([arm.contacts.wrench_task(index, F_des, weight)]),
+    )
+    assert (solution.rho >= 0.0).all()
+    tau = M @ solution.a + h - solution.contact_torque
+    assert (np.abs(tau) <= tau_max + 1e-6).all()
+    # What is asked for is what happens, if the environment pushes back so.
+    np.testing.assert_allclose(arm.accelerations(tau, solution.rho), solution.a, atol=1e-6)
+    return solution, tau
+
+
+def test_pressing_at_rest_takes_gravity_and_the_transposed_jacobian_times_the_force():
+    arm = Arm(speed=0.0)
+    F_des = np.array([1.0, -2.0, -10.0, 0.1, 0.2, 0.0])
+    F_des[3:] += np.cross([0.0, 0.0, 0.1], F_des[:3])  # about the sole's middle
+    solution, tau = press(arm, F_des, np.full(7, 80.0))
+    np.testing.assert_allclose(arm.contacts.wrench(0, solution.rho), F_des, atol=1e-4)
+    np.testing.assert_allclose(arm.contacts.wrench(1, solution.rho), 0.0, atol=1e-4)
+    np.testing.assert_allclose(solution.a, 0.0, atol=1e-6)
+    J = pin.computeFrameJacobian(
+        arm.model, arm.model.createData(), arm.q, arm.model.getFrameId(HAND), pin.LOCAL
+    )
+    h = pin.computeGeneralizedGravity(arm.model, arm.model.createData(), arm.q)
+    np.testing.assert_allclose(tau, h - J.T @ F_des, atol=1e-4)
+
+
+def test_pressing_in_motion_serves_both_tasks():
+    arm = Arm(speed=0.2)
+    F_des = np.array([0.0, 0.0, -10.0, 0.0, 0.0, 0.0])
+    solution, _ = press(arm, F_des, np.full(7, 80.0))
+    np.testing.assert_allclose(arm.contacts.wrench(0, solution.rho), F_des, atol=1e-4)
+    np.testing.assert_allclose(solution.a, -20.0 * arm.v, atol=1e-6)
+
+
+def test_the_force_ends_where_the_torque_does():
+    """Nearly the greatest normal force that torques at rest can give, by a linear programme."""
+    arm = Arm(speed=0.0, facets=16)
+    arm.contacts.closed[1] = False  # to brace against it would help
+    h, tau_max = arm.dynamics()[1], np.full(7, 40.0)
+    F_des = np.array([0.0, 0.0, -1000.0, 0.0, 0.0, 0.0])
+    solution, tau = press(arm, F_des, tau_max, posture_weight=1e7)
+    np.testing.assert_allclose(solution.a, 0.0, atol=1e-2)
+    assert np.isclose(np.abs(tau), tau_max, atol=1e-5).any()
+    B, W = arm.contacts.forces().B, arm.contacts.contacts[0].W
+    r = W.shape[1]
+    most = linprog(
+        W[2] @ np.eye(r),
+        np.vstack([B[:, :r], -B[:, :r]]),
+        np.r_[tau_max + h, tau_max - h],
+        method="highs",
+    )
+    force = arm.contacts.wrench(0, solution.rho)[2]
+    assert 1.01 * most.fun <= force <= 0.9 * most.fun
+    arm.contacts.closed[1] = True
+    braced, _ = press(arm, F_des, tau_max, posture_weight=1e7)
+    assert arm.contacts.wrench(0, braced.rho)[2] < 1.2 * force
+    assert braced.rho[64:].sum() > 10.0
+
+
+def test_a_pull_is_not_to_be_had():
+    arm = Arm(speed=0.0)
+    solution, _ = press(arm, np.array([0.0, 0.0, 10.0, 0.0, 0.0, 0.0]), np.full(7, 80.0))
+    np.testing.assert_allclose(arm.contacts.wrench(0, solution.rho), 0.0, atol=1e-6)
+
+
+def test_open_contacts_exert_nothing():
+    arm = Arm(speed=0.0)
+    arm.contacts.closed[0] = False
+    solution, _ = press(arm, np.array([0.0, 0.0, -10.0, 0.0, 0.0, 0.0]), np.full(7, 80.0))
+    np.testing.assert_array_equal(solution.rho[:16], 0.0)
+    arm.contacts.closed[0] = True
+    solution, _ = press(arm, np.array([0.0, 0.0, -10.0, 0.0, 0.0, 0.0]), np.full(7, 80.0))
+    assert solution.rho[:16].sum() == pytest.approx(10.0, abs=1e-3)
+
+
+def test_friction_limits_what_a_point_exerts():
+    """The force of the pyramid that is nearest to one far outside the cone, by another way."""
+    arm = Arm(speed=0.0)
+    F_des = np.r_[np.cross([0.3, 1.0, 0.0], [0.0, 0.0, 20.0]) + [3.0, 10.0, 0.0], 0.0, 0.0, 0.0]
+    solution, _ = press(arm, F_des, np.full(7, 80.0), index=1)
+    contact = arm.contacts.contacts[1]
+    nearest = contact.W[:3] @ nnls(contact.W[:3], F_des[:3])[0]
+    np.testing.assert_allclose(arm.contacts.wrench(1, solution.rho)[:3], nearest, atol=1e-3)
+    across, along = parts(nearest, contact.normal)
+    assert 0.2 < across / along <= 0.4 + 1e-9
+
+
+def test_points_that_must_rest_do():
+    """Rows keep the elbow's point where it is whatever is asked for; it may slide if allowed."""
+    arm = Arm(speed=0.3)
+    M, h = arm.dynamics()
+    wide = np.full(7, 500.0)
+    wanted = TaskTerm(None, np.random.default_rng(5).normal(size=7), 1.0)
+    for normal_only in (False, True):
+        A, v_c, drift = arm.contacts.acceleration(1, normal_only)
+        rows = arm.contacts.rest_rows(1, 20.0, normal_only)
+        qp = InverseDynamicsQP(7, 1e-9)
+        hard = qp.solve([wanted], -wide, wide, M, -wide - h, wide - h, rows)
+        assert hard.relaxation is None
+        np.testing.assert_allclose(A @ hard.a + drift, -20.0 * v_c, atol=1e-6)
+        task = arm.contacts.rest_task(1, 20.0, 1e4, normal_only)
+        soft = qp.solve([wanted, task], -wide, wide, M, -wide - h, wide - h)
+        np.testing.assert_allclose(soft.a, hard.a, atol=0.02)
+        assert np.abs(hard.a - wanted.b).max() > 0.1
+
+
+def test_rows_are_stacked_in_order():
+    one = Rows(np.ones((1, 2)), np.zeros(1), np.ones(1))
+    two = Rows(2.0 * np.ones((2, 2)), np.full(2, 2.0), np.full(2, 3.0))
+    none = Rows(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+    assert stack_rows([]) is None
+    assert stack_rows([none, none]) is None
+    assert stack_rows([none, two]) is two
+    stacked = stack_rows([one, none, two])
+    np.testing.assert_array_equal(stacked.G, [[1, 1], [2, 2], [2, 2]])
+    np.testing.assert_array_equal(stacked.lower, [0, 2, 2])
+    np.testing.assert_array_equal(stacked.upper, [1, 3, 3])
+
+
+def test_the_force_on_a_springy_table_becomes_the_one_that_is_asked_for():
+    """The hand holds its place along the table and presses; what pushes back is a spring."""
+    arm, dt, steps = Arm(speed=0.0), 1e-3, 1500
+    model, frame = arm.model, arm.model.getFrameId(HAND)
+    up = np.array([0.0, 0.0, 1.0])
+    normal = arm.points(arm.q, 0)[1].T @ up
+    contacts = Contacts(model, [Contact(HAND, np.zeros(3), normal, 0.5)])
+    F_des = np.r_[10.0 * normal, 0.0, 0.0, 0.0]
+    across = np.eye(6)
+    across[:3, :3] -= np.outer(normal, normal)
+    data, q, v = arm.data, arm.q.copy(), np.zeros(7)
+    pin.updateFramePlacement(model, data, frame)
+    goal, wide, tau_max = data.oMf[frame].copy(), np.full(7, 50.0), np.full(7, 80.0)
+    qp, forces = InverseDynamicsQP(7), []
+    for _ in range(steps):
+        M, h = pin.crba(model, data, q), pin.nonLinearEffects(model, data, q, v)
+        pin.computeJointJacobians(model, data, q)
+        pin.forwardKinematics(model, data, q, v, np.zeros(7))
+        pose = pin.updateFramePlacement(model, data, frame)
+        contacts.update(data)
+        J = pin.getFrameJacobian(model, data, frame, pin.LOCAL)
+        drift = pin.getFrameAcceleration(model, data, frame, pin.LOCAL).vector
+        error = across @ pin.log6(pose.actInv(goal)).vector
+        hand = TaskTerm(J, 900.0 * error - 50.0 * J @ v - drift, 1e4)
+        solution = qp.solve(
+            [hand, TaskTerm(None, -5.0 * v, 10.0)],
+            -wide,
+            wide,
+            M,
+            -tau_max - h,
+            tau_max - h,
+            contacts=contacts.forces([contacts.wrench_task(0, F_des, 10.0)]),
+        )
+        tau = M @ solution.a + h - solution.contact_torque
+        speed = up @ (pose.rotation @ (J @ v)[:3])
+        pushed = max(0.0, 2000.0 * (goal.translation[2] - pose.translation[2]) - 20.0 * speed)
+        v = v + dt * np.linalg.solve(M, tau - h + J[:3].T @ pose.rotation.T @ (pushed * up))
+        q = q + dt * v
+        forces.append(pushed)
+    np.testing.assert_allclose(forces[-200:], 10.0, atol=0.1)
+    assert np.abs(v).max() < 1e-2
+    assert np.linalg.norm(error[:3]) < 1e-3

@@ -1,0 +1,274 @@
+"""Friction compensation in the controller and its node: parameters, limits, handover."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arms import load_arm
+from ros_harness import acceleration_limits, joint_state, read_config
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory
+
+from torque_safety_controller.additional_torque import (
+    AdditionalSettings,
+    AdditionalTorque,
+)
+from torque_safety_controller.controller import Controller, Gains
+from torque_safety_controller.friction.settings import FrictionModel, FrictionSettings
+from torque_safety_controller.integral_feedback.settings import IntegralSettings
+from torque_safety_controller.node.controller_node import ControllerNode
+from torque_safety_controller.parameters.friction_parameters import TABLE, friction_settings
+from viability_bounds_pkg.ros.parameters import ParameterError
+
+NODE = "controller_node"
+MS = 1_000_000
+ARM = load_arm("panda")
+N = ARM.n
+DT = 1e-3
+COULOMB = 0.1 * ARM.tau_max
+MODEL = FrictionModel(COULOMB, 1.3 * COULOMB, 0.2 * COULOMB, np.full(N, 0.02))
+ON = FrictionSettings(MODEL, 0.2 * ARM.tau_max, 1.0)
+GAINS = Gains(100.0, 20.0, 0.0, 100.0, 20.0, 1.0, True, 20.0)
+WIDE = np.full(N, 50.0)
+V = 0.3 * np.sign(0.5 - np.arange(N) % 2)
+# Of a state that does not change: each joint is wanted to stop, and does not.
+WANTED = -np.sign(V)
+FIRM = slice(0, 5)  # joints with inertia enough to call for all of the friction
+
+
+def additional(mode="none", friction=ON, budget=0.05) -> AdditionalTorque:
+    integral = IntegralSettings(budget * ARM.tau_max, lambda_=30.0)
+    return AdditionalTorque(AdditionalSettings(mode, integral, None, 2.0 * ARM.tau_max, friction))
+
+
+def controller(**others) -> Controller:
+    made = Controller(ARM.robot(DT), ARM.tau_max, GAINS, None, additional(**others))
+    made.start(ARM.q_start)
+    made.set_posture_goal(ARM.q_start)
+    return made
+
+
+def steps(made, count, q=ARM.q_start, v=V):
+    """Return the last of some steps at one state."""
+    for _ in range(count):
+        step = made.step(q, v, -WIDE, WIDE)
+    return step
+
+
+def test_both_are_added_and_the_integral_s_budget_is_its_own():
+    made = controller(mode="joints")
+    steps(made, 3000)
+    both = made.additional
+    np.testing.assert_allclose(both.last, both.joints.additional_torque + both.friction.last)
+    assert both.saturated.any()
+    budget = both.joints.settings.budget
+    assert (np.abs(both.joints.additional_torque) <= budget * (1.0 + 1e-9)).all()
+    assert (np.abs(both.last) > budget).any()
+
+
+def test_without_integral_action_there_is_friction_only():
+    made = controller()
+    tau = steps(made, 2000).tau
+    np.testing.assert_array_equal(made.additional.last, made.additional.friction.last)
+    without = controller(friction=None)
+    steps(without, 2000)
+    assert without.additional.idle
+    full = WANTED * np.minimum(MODEL.level(V), ON.budget)
+    added = tau - steps(without, 1).tau
+    np.testing.assert_allclose(added[FIRM], full[FIRM], rtol=1e-2)
+
+
+@pytest.mark.parametrize("share", [0.2, 1.0])
+def test_the_qp_keeps_the_sum_within_the_torque_limits(share):
+    """Not by cutting it: the torque sent is the one for the acceleration returned."""
+    rng = np.random.default_rng(0)
+    strong = FrictionModel(share * ARM.tau_max, share * ARM.tau_max, 0.0 * COULOMB, np.ones(N))
+    made = controller(friction=FrictionSettings(strong, 0.5 * ARM.tau_max, 1.0))
+    at_limit = 0
+    for _ in range(400):
+        q = ARM.q_start + 0.3 * rng.standard_normal(N)
+        v = 0.2 * rng.standard_normal(N)
+        step = made.step(q, v, -WIDE, WIDE)
+        assert (np.abs(step.tau) <= ARM.tau_max).all()
+        assert not step.failure
+        wanted = made.robot.torque(q, v, step.a) + made.additional.last
+        np.testing.assert_allclose(step.tau, wanted, atol=0.02 * ARM.tau_max.max())
+        at_limit += (np.abs(step.tau) > 0.98 * ARM.tau_max).any()
+    assert at_limit > 20
+
+
+def test_the_handover_goes_on_from_the_drives_torque_and_friction_fades_in():
+    made = controller(mode="joints")
+    steps(made, 2000)
+    q, rest = ARM.q_start, np.zeros(N)
+    made.robot.update(q, rest, rest)
+    tau = made.robot.h + 0.04 * ARM.tau_max
+    made.take_over(q, V, -WIDE, WIDE, tau)
+    np.testing.assert_array_equal(made.additional.friction.last, 0.0)
+    first = made.step(q, V, -WIDE, WIDE)
+    friction = made.additional.friction.last
+    assert (np.abs(friction) <= 1.01 * DT / 0.2 * MODEL.level(V)).all()
+    assert np.abs((first.tau - tau) / ARM.tau_max).max() < 0.01
+    steps(made, 2000)
+    full = WANTED * MODEL.level(V)
+    np.testing.assert_allclose(made.additional.friction.last[FIRM], full[FIRM], rtol=1e-2)
+
+
+def test_what_comes_after_a_gap_or_a_jump_does_not_kick():
+    made = controller(mode="joints")
+    before = steps(made, 500)
+    for elapsed in (0.4, 0.0, -1.0, math.nan):
+        w = made.additional.friction.reference_velocity.copy()
+        tau = made.step(ARM.q_start, V, -WIDE, WIDE, elapsed).tau
+        np.testing.assert_array_equal(made.additional.friction.reference_velocity, w)
+        assert np.abs((tau - before.tau) / ARM.tau_max).max() < 2e-3
+    w = made.additional.friction.last.copy()
+    made.step(ARM.q_start, V + 200.0, -WIDE, WIDE)  # a glitch of the sensor
+    np.testing.assert_array_equal(made.additional.friction.last, w)
+
+
+# Parameters
+
+
+def values(**changed):
+    return {row.name: row.coerce(changed.get(row.name)) for row in TABLE}
+
+
+def test_defaults_are_off():
+    made = friction_settings(values(), "abcdefg", ARM.tau_max)
+    assert made.scale == 0.0
+    assert made.model.level(np.ones(N)).max() == 0.0
+    np.testing.assert_allclose(made.budget, 0.2 * ARM.tau_max)
+
+
+def test_each_parameter_reaches_the_settings():
+    rows = {
+        "friction_model_coulomb": COULOMB,
+        "friction_model_static": 1.3 * COULOMB,
+        "friction_model_viscous": 0.2 * COULOMB,
+        "friction_model_stribeck_velocity": np.full(N, 0.07),
+        "friction_budget": 0.3 * ARM.tau_max,
+    }
+    given = values(
+        friction_compensation=0.4,
+        friction_theta=11.0,
+        friction_gain=70.0,
+        **{key: value.tolist() for key, value in rows.items()},
+    )
+    made = friction_settings(given, "abcdefg", ARM.tau_max)
+    assert (made.scale, made.theta, made.gain) == (0.4, 11.0, 70.0)
+    found = (
+        *(getattr(made.model, k) for k in ("coulomb", "static", "viscous", "stribeck_velocity")),
+        made.budget,
+    )
+    for value, expected in zip(found, rows.values(), strict=True):
+        np.testing.assert_array_equal(value, expected)
+    only = friction_settings(
+        values(friction_model_coulomb=COULOMB.tolist()), "abcdefg", ARM.tau_max
+    )
+    np.testing.assert_array_equal(only.model.static, COULOMB)
+    np.testing.assert_array_equal(only.model.viscous, 0.0)
+    np.testing.assert_array_equal(only.model.stribeck_velocity, 0.01)
+
+
+REFUSED = [
+    ("friction_compensation", 1.1, "0 to 1"),
+    ("friction_compensation", -0.1, "0 to 1"),
+    ("friction_compensation", math.nan, "0 to 1"),
+    ("friction_compensation", "on", "a number"),
+    ("friction_model_coulomb", [1.0] * (N - 1), f"{N} numbers"),
+    ("friction_model_coulomb", [-1.0] * N, ">= 0"),
+    ("friction_model_coulomb", [math.inf] * N, "finite"),
+    ("friction_model_static", [0.01] * N, "at least coulomb"),
+    ("friction_model_viscous", [math.nan] * N, "not NaN"),
+    ("friction_model_stribeck_velocity", [0.0] * N, "> 0"),
+    ("friction_budget", [1e3] * N, "at most torque_max"),
+    ("friction_budget", [-1.0] * N, ">= 0"),
+    ("friction_theta", -3.0, ">= 0"),
+    ("friction_gain", 0.0, "> 0"),
+]
+GIVEN = {
+    "friction_compensation": 0.5,
+    "friction_model_coulomb": COULOMB.tolist(),
+    "friction_model_static": (1.3 * COULOMB).tolist(),
+}
+
+
+@pytest.mark.parametrize(("name", "value", "allowed"), REFUSED)
+def test_what_cannot_be_is_refused_by_name(name, value, allowed):
+    with pytest.raises(ParameterError, match=f"parameter '{name}' is .*{re.escape(allowed)}"):
+        friction_settings(values(**GIVEN | {name: value}), "abcdefg", ARM.tau_max)
+
+
+def test_there_must_be_a_model_to_compensate():
+    with pytest.raises(ParameterError, match="0 as long as no friction_model_coulomb"):
+        friction_settings(values(friction_compensation=0.5), "abcdefg", ARM.tau_max)
+
+
+class Chain:
+    """A robot that stands at one place, and its bounds node, in front of the real node."""
+
+    def __init__(self, ros, **changed) -> None:
+        given = read_config("panda", NODE) | {"bounds_timeout": 20.0, "state_timeout": 40.0}
+        self.ros, self.joints, self.stamp = ros, given["joints"], 0
+        self.node = ros.start(ControllerNode, given | changed)
+        self.commands = ros.listen(JointState, "joint_commands")
+        self.states = ros.talk(JointState, "joint_states")
+        self.limits = ros.talk(JointTrajectory, "acceleration_limits")
+        ros.hears("joint_commands")
+
+    def answer(self) -> np.ndarray:
+        """Return the torques for the next period."""
+        self.stamp += round(1e3 * ARM.dt)
+        stamp = self.stamp * MS
+
+        def send():
+            self.limits.publish(acceleration_limits(self.joints, stamp, -WIDE, WIDE))
+            self.states.publish(joint_state(self.joints, stamp, ARM.q_start, V))
+
+        self.ros.wait_until(lambda: stamp in self.commands.stamps, "a command", each=send)
+        return np.array(self.commands[self.commands.stamps.index(stamp)].effort)
+
+
+def test_it_is_switched_while_the_node_runs(ros):
+    chain = Chain(ros, **GIVEN | {"friction_compensation": 0.0})
+    torques = [chain.answer() for _ in range(2)]
+    ros.accepts(NODE, friction_compensation=1.0)
+    torques += [chain.answer() for _ in range(60)]
+    # Nothing is viscous, and V too fast for stiction.
+    share = 1.0 - math.exp(-60 * ARM.dt / 0.2)
+    wanted = share * WANTED * COULOMB
+    np.testing.assert_allclose((torques[-1] - torques[1])[FIRM], wanted[FIRM], atol=1e-3)
+    most = 1.1 * ARM.dt / 0.2 * COULOMB
+    assert (np.abs(torques[2] - torques[1]) < most).all()
+    ros.wait_until(
+        lambda: (
+            float((ros.reported(NODE, "friction_torque_nm") or "0").split()[0])
+            == pytest.approx(wanted[0], abs=1e-3)
+        ),
+        "the diagnostics",
+    )
+    ros.accepts(NODE, friction_compensation=0.0)
+    after = [chain.answer() for _ in range(60)]
+    assert (np.abs(after[0] - torques[-1]) < most)[FIRM].all()
+    left = (1.0 - share) * wanted
+    np.testing.assert_allclose((after[-1] - torques[1])[FIRM], left[FIRM], atol=1e-3)
+
+
+def test_what_cannot_be_is_refused_while_the_node_runs(ros):
+    chain = Chain(ros, **GIVEN)
+    before = chain.node.get_parameter("friction_compensation").value
+    for name, value, allowed in REFUSED:
+        reason = ros.refuses(NODE, **{name: value})
+        assert reason.startswith(f"parameter '{name}' is ") and allowed in reason
+    assert chain.node.get_parameter("friction_compensation").value == before
+
+
+def test_settings_may_be_without_friction():
+    settings = replace(additional().settings, friction=None)
+    assert settings.friction.model.n == N
+    assert settings.friction.scale == 0.0

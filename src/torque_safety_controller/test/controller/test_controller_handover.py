@@ -1,0 +1,456 @@
+"""Handover between position and torque control over real DDS, and with the real robot node."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from chain import load_values
+from controller_chain import NODE, ControllerChain
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from ros_harness import read_config
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import SetBool
+
+from sim_bridge.nodes.bullet_node import BulletNode
+from torque_safety_controller.node.controller_node import ControllerNode
+from viability_bounds_pkg.node.bounds_node import BoundsNode
+from viability_bounds_pkg.ros.parameters import ParameterError
+from viability_bounds_pkg.ros.runtime import GOAL_QOS
+
+SERVICE = f"{NODE}/enable_torque"
+
+# Watchdogs that do not bark while a busy machine runs the other tests.
+VALUES = read_config("panda", NODE) | {
+    "start_control": "position",
+    "bounds_timeout": 20.0,
+    "state_timeout": 40.0,
+}
+JOINTS = VALUES["joints"]
+N = len(JOINTS)
+TAU_MAX = np.array(VALUES["torque_max"])
+Q = np.array(read_config("panda", "bullet_node")["start_positions"])
+TAU = 0.1 * TAU_MAX  # of the motors, by which the arm is held
+SMALL = 0.01 * TAU_MAX
+WIDE = np.full(N, 5.0)
+
+
+class Chain(ControllerChain):
+    """The other side of the controller: robot, bounds node and user."""
+
+    def __init__(self, ros, **changed) -> None:
+        super().__init__(ros, VALUES | changed)
+        self.stamp = 0
+
+    def state(self, stamp, q=Q, tau=TAU) -> None:
+        self.send_state(stamp, q, np.zeros(N), tau)
+
+    def bound(self, stamp) -> None:
+        self.send_limits(stamp, -WIDE, WIDE)
+
+    def answer(self, q=Q, tau=TAU, bounds=True) -> JointState:
+        """Send the next state, and limits, until the command comes; return that."""
+        self.stamp += 1
+        stamp = self.stamp
+
+        def send():
+            if bounds:
+                self.bound(stamp)
+            self.state(stamp, q, tau)
+
+        return self.await_command(stamp, send)
+
+    def call(self, torque: bool) -> SetBool.Response:
+        return self.ros.call(SetBool, SERVICE, SetBool.Request(data=torque))
+
+    def enable(self, torque: bool) -> None:
+        response = self.call(torque)
+        assert response.success, response.message
+
+    def refuses(self, torque: bool) -> str:
+        response = self.call(torque)
+        assert not response.success
+        return response.message
+
+    def await_report(self, each=None, **values) -> None:
+        self.ros.wait_until(
+            lambda: all(v in self.ros.reported(NODE, k) for k, v in values.items()),
+            f"{values}, not {self.ros.diagnostics.get(NODE)}",
+            each=each,
+        )
+
+
+def assert_position(command: JointState, q=Q) -> None:
+    assert command.name == JOINTS
+    assert not len(command.effort)
+    np.testing.assert_array_equal(command.position, q)
+    np.testing.assert_array_equal(command.velocity, np.zeros(N))
+
+
+def assert_torque(command: JointState) -> np.ndarray:
+    assert not len(command.position)
+    assert (np.abs(command.effort) <= TAU_MAX).all()
+    return np.array(command.effort)
+
+
+# From position to torque and back
+
+
+def test_it_goes_over_to_the_torque_of_the_motors_and_back(ros):
+    chain = Chain(ros)
+    assert_position(chain.answer(bounds=False))
+    chain.await_report(mode="POSITION", reason="as at start", control="position")
+    # The goal of the drives does not follow the arm.
+    assert_position(chain.answer(Q + 1e-3))
+    chain.enable(True)
+    assert_position(chain.answer(Q + 1e-3))
+    first = assert_torque(chain.answer(Q + 1e-3))
+    assert (np.abs(first - TAU) < SMALL).all()
+    chain.await_report(mode="TRACKING", control="torque")
+    for _ in range(3):
+        assert_torque(chain.answer(Q + 1e-3))
+    chain.enable(False)
+    assert_position(chain.answer(Q + 2e-3), Q + 1e-3)
+    chain.await_report(mode="POSITION", reason="enable_torque", control="position")
+    # And again, from another torque.
+    chain.enable(True)
+    chain.answer(Q, -TAU)
+    assert (np.abs(assert_torque(chain.answer(Q, -TAU)) + TAU) < SMALL).all()
+
+
+def test_a_state_asked_for_again_gets_what_it_got(ros):
+    chain = Chain(ros)
+    chain.answer()
+    chain.enable(True)
+    handover = chain.answer()
+    chain.commands.clear()
+    stamp = chain.stamp
+    ros.wait_until(lambda: len(chain.commands) > 2, each=lambda: chain.state(stamp))
+    assert all(command == handover for command in chain.commands)
+    torque = chain.answer()
+    chain.enable(False)
+    chain.commands.clear()
+    stamp = chain.stamp
+    ros.wait_until(lambda: len(chain.commands) > 2, each=lambda: chain.state(stamp))
+    assert all(command == torque for command in chain.commands)
+
+
+def test_a_call_between_a_state_and_its_limits_is_obeyed(ros):
+    chain = Chain(ros, start_control="torque")
+    assert_torque(chain.answer())
+    ros.run_for(0.05, each=lambda: chain.state(10))
+    chain.enable(False)
+    assert_position(chain.await_command(10, lambda: chain.bound(10)))
+    chain.stamp = 10
+    for _ in range(3):
+        assert_position(chain.answer())
+    assert ros.reported(NODE, "control") == "position"
+
+
+def test_a_handover_that_was_asked_for_can_be_called_off(ros):
+    chain = Chain(ros)
+    chain.answer()
+    chain.enable(True)
+    chain.enable(False)
+    for _ in range(3):
+        assert_position(chain.answer(Q + 0.01))
+
+
+def test_an_arm_in_hold_is_given_to_its_drives(ros):
+    chain = Chain(ros, start_control="torque")
+    assert_torque(chain.answer())
+    chain.await_report(mode="HOLD")
+    chain.enable(False)
+    assert_position(chain.answer())
+
+
+def test_goals_from_before_the_handover_are_dropped(ros):
+    chain = Chain(ros)
+    chain.answer()
+    poses = ros.talk(PoseStamped, "target_pose", GOAL_QOS)
+    far = PoseStamped()
+    far.pose.position.x, far.pose.orientation.w = 0.3, 1.0
+    poses.publish(far)
+    chain.await_report(goals_pending="1")
+    chain.enable(True)
+    chain.answer()
+    first = assert_torque(chain.answer())
+    assert (np.abs(first - TAU) < SMALL).all()
+    chain.await_report(goals_pending="0", mode="TRACKING")
+    ros.diagnostics.clear()
+    ros.wait_until(lambda: ros.reported(NODE, "position_error_m"))
+    assert float(ros.reported(NODE, "position_error_m")) < 1e-9
+
+
+def test_efforts_for_ros2_control_are_silent_under_position_control(ros):
+    topic = "/effort_controller/commands"
+    chain = Chain(ros, ros2_control_topic=topic)
+    efforts = ros.listen(Float64MultiArray, topic)
+    ros.hears(topic)
+    chain.answer()
+    chain.enable(True)
+    chain.answer()
+    ros.run_for(0.05)
+    assert not efforts
+    torque = chain.answer()
+    ros.wait_until(lambda: efforts, "efforts", each=lambda: chain.state(chain.stamp))
+    np.testing.assert_array_equal(efforts[0].data, torque.effort)
+
+
+# Refused
+
+
+def test_torque_is_refused_before_the_first_state(ros):
+    chain = Chain(ros)
+    assert "no joint state" in chain.refuses(True)
+    assert "position control is on already" in chain.refuses(False)
+    assert_position(chain.answer())
+
+
+def test_torque_is_refused_while_states_are_old(ros):
+    chain = Chain(ros, bounds_timeout=0.1)
+    chain.answer()
+    ros.run_for(0.15)
+    assert "no joint state, or only old ones" in chain.refuses(True)
+    chain.answer()
+    chain.enable(True)
+
+
+@pytest.mark.parametrize("stamp", [1, 1_000_000])
+def test_torque_is_refused_while_limits_are_old_or_of_another_run(ros, stamp):
+    chain = Chain(ros, bounds_timeout=5.0)
+    chain.stamp = 10_000  # ms
+    chain.answer(bounds=False)
+    assert "no acceleration limits" in chain.refuses(True)
+    ros.run_for(0.05, each=lambda: chain.bound(stamp))
+    assert "no acceleration limits" in chain.refuses(True)
+    assert_position(chain.answer())
+    chain.enable(True)
+
+
+@pytest.mark.parametrize(
+    ("q", "tau", "reason"),
+    [
+        (Q + 10.0 * np.eye(N)[2], TAU, f"outside the position limits: {JOINTS[2]}"),
+        (Q, (), "no motor torque"),
+        (Q, [*TAU[:6], math.nan], "no motor torque"),
+        (Q, [*TAU[:6], 1.1 * TAU_MAX[6]], f"motor torque beyond torque_max: {JOINTS[6]}"),
+    ],
+)
+def test_torque_is_refused_where_it_cannot_begin(ros, q, tau, reason):
+    chain = Chain(ros)
+    chain.answer(q, tau)
+    assert reason in chain.refuses(True)
+    assert_position(chain.answer(q, tau), q)
+    chain.await_report(control="position")
+
+
+def test_what_is_on_already_is_refused(ros):
+    chain = Chain(ros, start_control="torque")
+    before = assert_torque(chain.answer())
+    assert "torque control is on already" in chain.refuses(True)
+    np.testing.assert_allclose(assert_torque(chain.answer()), before, atol=1e-6)
+    chain.enable(False)
+    chain.answer()
+    assert "position control is on already" in chain.refuses(False)
+
+
+def test_it_starts_with_torque_or_position_only(ros):
+    with pytest.raises(ParameterError, match="'start_control' is 'velocity'; allowed: one of"):
+        ros.start(ControllerNode, VALUES | {"start_control": "velocity"})
+    Chain(ros)
+    assert "read-only" in ros.refuses(NODE, start_control="torque")
+
+
+# What goes wrong on the way
+
+
+def test_a_handover_ends_where_limits_stop_coming(ros):
+    chain = Chain(ros, bounds_timeout=0.2)
+    chain.answer()
+    chain.enable(True)
+    # Repeated, as by a robot in lockstep, and not answered until then.
+    command = chain.answer(Q + 1e-3, bounds=False)
+    assert_position(command)
+    chain.await_report(
+        mode="POSITION",
+        reason="handover failed: acceleration limits are stale",
+        control="position",
+    )
+    for _ in range(3):
+        assert_position(chain.answer(bounds=False))
+    assert "no acceleration limits" not in chain.call(True).message  # 4 ms old by their stamps
+
+
+@pytest.mark.parametrize(
+    ("q", "tau", "reason"),
+    [
+        (Q, (), "joint_states carry no motor torque"),
+        (Q + 10.0, TAU, "outside the position limits"),
+    ],
+)
+def test_a_handover_ends_where_torque_cannot_begin_after_all(ros, q, tau, reason):
+    chain = Chain(ros)
+    chain.answer()
+    chain.enable(True)
+    assert_position(chain.answer(q, tau))
+    chain.await_report(mode="POSITION", reason=f"handover failed: {reason}")
+    assert_position(chain.answer())
+
+
+@pytest.mark.parametrize("start", ["torque", "position"])
+def test_a_robot_that_was_silent_is_commanded_as_at_start(ros, start):
+    chain = Chain(ros, start_control=start, state_timeout=0.3, bounds_timeout=0.3)
+    chain.answer()
+    if start == "position":
+        chain.enable(True)
+        chain.answer()
+    assert_torque(chain.answer())
+    chain.await_report(mode="STOPPED")
+    assert "no joint state" in chain.refuses(False)
+    again = chain.answer()
+    if start == "torque":
+        assert_torque(again)
+    else:
+        assert_position(again)
+        chain.await_report(reason="the robot was silent or started over")
+
+
+def test_nothing_is_sent_once_it_is_stopped(ros):
+    chain = Chain(ros, state_timeout=0.3, bounds_timeout=0.1)
+    chain.answer()
+    # States that cannot be used: the drives hold on.
+    bad = np.full(N, math.nan)
+    chain.commands.clear()
+    assert_position(chain.await_command(50, lambda: chain.state(50, bad)))
+    chain.await_report(each=lambda: chain.state(50, bad), mode="STOPPED", reason="refused")
+    chain.commands.clear()
+    ros.run_for(0.1, each=lambda: chain.state(50, bad))
+    assert not chain.commands
+
+
+# With the robot
+
+
+class Arm:
+    """A robot in lockstep with bounds and controller, all of them real; recorded."""
+
+    def __init__(self, ros, robot, **changed) -> None:
+        values = load_values(robot) | {
+            "clock": "lockstep",
+            "bounds_timeout": 20.0,
+            "state_timeout": 40.0,
+            "start_control": "position",
+        }
+        values = {key: value for key, value in (values | changed).items() if value != []}
+        self.ros = ros
+        self.tau_max = np.array(values["torque_max"])
+        self.states = ros.listen(JointState, "joint_states")
+        self.commands = ros.listen(JointState, "joint_commands")
+        ros.start(ControllerNode, values)
+        ros.start(BoundsNode, values)
+        self.wrenches = ros.probe.create_publisher(WrenchStamped, "external_wrench", GOAL_QOS)
+        ros.hears("joint_commands")
+        ros.start(BulletNode, values)
+
+    def run(self, periods: int) -> None:
+        """Let the robot move on by at least as many control periods."""
+        goal = len(self.states) + periods
+        self.ros.wait_until(lambda: len(self.states) >= goal, f"{periods} periods", timeout=30.0)
+
+    def enable(self, torque: bool) -> None:
+        response = self.ros.call(SetBool, SERVICE, SetBool.Request(data=torque))
+        assert response.success, response.message
+
+    def push(self, link, force) -> None:
+        message = WrenchStamped()
+        message.header.frame_id = link
+        message.wrench.force.x, message.wrench.force.y, message.wrench.force.z = force
+        self.wrenches.publish(message)
+
+    def recorded(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return positions, torques of the motors, and which periods torque commands began."""
+        states = dict(zip(self.states.stamps, self.states, strict=True))
+        commands = dict(zip(self.commands.stamps, self.commands, strict=True))
+        stamps = sorted(states)[:-1]
+        q = np.array([states[s].position for s in stamps])
+        tau = np.array([states[s].effort for s in stamps])
+        return q, tau, np.array([len(commands[s].effort) > 0 for s in stamps])
+
+
+PUSHED = {"talos_left_arm": "arm_left_5_link", "panda": "panda_link5"}
+FORCE = {"talos_left_arm": (30.0, -40.0, 50.0), "panda": (20.0, -30.0, 40.0)}  # N
+# Panda's gears are good; here they are not.
+POOR_GEARS = {
+    "integral_action": "task",
+    "rotor_inertia": [0.3, 0.3, 0.3, 0.3, 0.1, 0.1, 0.1],
+    "friction_coulomb": (0.08 * TAU_MAX).tolist(),
+    "friction_static": (0.1 * TAU_MAX).tolist(),
+}
+
+
+@pytest.mark.parametrize(
+    ("robot", "changed", "load"),
+    [
+        ("talos_left_arm", {}, ""),
+        ("talos_left_arm", {}, "friction"),
+        ("talos_left_arm", {"integral_action": "none"}, "friction"),
+        ("talos_left_arm", {}, "push"),
+        ("panda", {}, ""),
+        ("panda", {}, "push"),
+        ("panda", POOR_GEARS, "friction"),
+    ],
+    ids=["talos", "talos-friction", "talos-none", "talos-push", "panda", "panda-push", "poor"],
+)
+def test_the_handover_is_not_felt(ros, robot, changed, load):
+    arm = Arm(ros, robot, **changed)
+    arm.run(100)
+    if load:
+        arm.push(PUSHED[robot], FORCE[robot])  # for half a second
+        arm.run(750 if load == "friction" else 200)
+    arm.enable(True)
+    arm.run(200)
+    arm.enable(False)
+    arm.run(300)
+    q, tau, by_torque = arm.recorded()
+    first, last = np.flatnonzero(by_torque)[[0, -1]]
+    assert by_torque[first:last].all()
+    assert last - first > 150
+    # In the state after the one first answered with torque, the effort is that torque.
+    steps = np.abs(np.diff(tau, axis=0)) / arm.tau_max
+    if load:
+        assert np.ptp(tau[50:first] / arm.tau_max, axis=0).max() > 0.05, "hardly a load"
+    ordinary = steps[first - 50 : first].max(axis=0)
+    assert (steps[first] < ordinary + 0.01).all()
+    assert (steps[first + 1 : first + 50] < 0.01).all()
+    if load != "push":
+        # Nothing is to be seen of it either, nor of the way back.
+        assert np.abs(q[first:last] - q[first]).max() < 1e-3
+        assert np.abs(q[last:] - q[last]).max() < 1e-3
+        assert (steps[last : last + 2] < 0.01).all()
+
+
+def test_an_arm_in_motion_is_brought_to_rest_before_its_drives_take_it(ros):
+    arm = Arm(ros, "talos_left_arm")
+    arm.run(50)
+    arm.enable(True)
+    arm.run(50)
+    joints = list(arm.states[0].name)
+    goal = np.array(arm.states[0].position) + 0.25
+    goals = ros.talk(JointState, "target_posture", GOAL_QOS)
+    arm.ros.set_parameters(NODE, posture_kp=20.0, pose_weight=0.0)
+    goals.publish(JointState(name=joints, position=goal.tolist()))
+    arm.ros.wait_until(lambda: np.abs(arm.states[-1].velocity).max() > 0.3, "motion")
+    arm.enable(False)
+    arm.ros.wait_until(
+        lambda: arm.ros.reported(NODE, "control") == "position", "the drives", timeout=30.0
+    )
+    arm.run(300)
+    q, tau, by_torque = arm.recorded()
+    last = np.flatnonzero(by_torque)[-1]
+    steps = np.abs(np.diff(tau, axis=0)) / arm.tau_max
+    # Taken in motion, drives brake it with the whole of their torque in one step.
+    assert steps[last : last + 50].max() < 0.1
+    assert np.abs(q[last:] - q[last]).max() < 2e-3

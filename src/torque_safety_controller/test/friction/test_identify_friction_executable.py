@@ -1,0 +1,225 @@
+"""The identify_friction executable, started as a user starts it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import yaml
+
+import torque_safety_controller
+import viability_bounds_pkg
+from torque_safety_controller.cli.identify_friction import main
+from torque_safety_controller.friction.settings import FrictionModel
+from viability_bounds_pkg.cli.limits_file import read_robot
+
+PACKAGES = [
+    str(Path(package.__file__).resolve().parents[1])
+    for package in (torque_safety_controller, viability_bounds_pkg)
+]
+COMMAND = [sys.executable, "-m", "torque_safety_controller.cli.identify_friction"]
+TIME_LIMIT = 60.0
+
+LIMIT = '<limit lower="-2" upper="2" effort="30" velocity="4"/>'
+URDF = f"""
+<robot name="arm"><link name="base"/>
+<joint name="shoulder" type="revolute"><parent link="base"/><child link="arm"/>
+<axis xyz="0 1 0"/>{LIMIT}</joint>
+<link name="arm"><inertial><origin xyz="0 0 -0.5"/><mass value="2"/>
+<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="wrist" type="revolute"><parent link="arm"/><child link="hand"/>
+<origin xyz="0 0 -0.5"/><axis xyz="0 1 0"/>{LIMIT}</joint>
+<link name="hand"><inertial><origin xyz="0 0 -0.1"/><mass value="0.5"/>
+<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>
+"""
+ROBOT = """\
+/**:
+  ros__parameters:
+    robot_description: {urdf}
+    joints: [shoulder, wrist]
+"""
+TRUTH = FrictionModel([3.0, 0.4], [4.0, 0.5], [0.5, 0.1], [0.03, 0.03])
+
+
+@pytest.fixture
+def robot(tmp_path):
+    """Path of a robot's parameter file."""
+    (tmp_path / "arm.urdf").write_text(URDF)
+    path = tmp_path / "robot.yaml"
+    path.write_text(ROBOT.format(urdf=tmp_path / "arm.urdf"))
+    return path
+
+
+@pytest.fixture
+def recording(robot, tmp_path):
+    """Path of 20 s of a robot that is a tenth heavier, joints in another order."""
+    model = read_robot(robot).model
+    for inertia in model.inertias[1:]:
+        inertia.mass *= 1.1
+    dt = 1e-3
+    t = dt * np.arange(20001)
+    omega = 2.0 * np.pi * np.where(t[:, None] < 10.0, [0.1, 0.1], [0.5, 0.7])
+
+    def states(times):
+        phase = omega * times[:, None]
+        return (
+            0.5 * (1 - np.cos(phase)),
+            0.5 * omega * np.sin(phase),
+            0.5 * omega**2 * np.cos(phase),
+        )
+
+    q, v, a = states(t - 0.5 * dt)
+    data = model.createData()
+    tau = np.array([pin.rnea(model, data, *state) for state in zip(q, v, a, strict=True)])
+    tau += np.sign(v) * TRUTH.level(v)
+    q, v, _ = states(t)
+    path = tmp_path / "run.npz"
+    columns = {"q": q[:, ::-1], "v": v[:, ::-1], "tau": tau[:, ::-1]}
+    np.savez(path, joints=np.array(["wrist", "shoulder"]), t=t, **columns)
+    return path
+
+
+def environment():
+    paths = [*PACKAGES, os.environ.get("PYTHONPATH", "")]
+    return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
+
+
+def run(*arguments):
+    return subprocess.run(
+        [*COMMAND, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        env=environment(),
+        timeout=TIME_LIMIT,
+    )
+
+
+@pytest.fixture
+def call(capsys):
+    """Runs the tool in this process; returns exit code, output and errors."""
+
+    def run_here(*arguments):
+        try:
+            code = main([str(argument) for argument in arguments])
+        except SystemExit as ended:
+            code = ended.code
+        return code, *capsys.readouterr()
+
+    return run_here
+
+
+def parameters_in(text):
+    content = yaml.safe_load(text)
+    assert list(content) == ["/**/controller_node"]
+    return content["/**/controller_node"]["ros__parameters"]
+
+
+def test_friction_is_written_as_an_overlay(robot, recording, tmp_path):
+    output = tmp_path / "friction.yaml"
+    ended = run(robot, recording, "-o", output)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    written = parameters_in(output.read_text())
+    names = ("coulomb", "static", "viscous", "stribeck_velocity")
+    # Not the switch: identifying must not change how the robot is controlled.
+    assert set(written) == {f"friction_model_{name}" for name in names}
+    for name in names:
+        found = written[f"friction_model_{name}"]
+        np.testing.assert_allclose(found, getattr(TRUTH, name), rtol=0.05)
+    for shown in ("shoulder: ", "coulomb", "+-", "residual", f"written to {output}"):
+        assert shown in ended.stdout
+    assert "run.npz" in output.read_text()
+
+
+def test_without_a_file_it_is_printed(robot, recording, call):
+    code, out, errors = call(robot, recording)
+    assert (code, errors) == (0, "")
+    parameters_in(out[out.index("# Friction found") :])
+
+
+def test_what_is_not_told_is_said_in_the_file(robot, recording, call, tmp_path):
+    with np.load(recording) as file:
+        arrays = dict(file)
+    arrays["v"][:, 0] = 0.0  # the wrist stands
+    np.savez(recording, **arrays)
+    output = tmp_path / "friction.yaml"
+    assert call(robot, recording, "-o", output)[0] == 0
+    text = output.read_text()
+    assert "# wrist: nothing found: it did not move both ways" in text
+    assert parameters_in(text)["friction_model_coulomb"][1] == 0.0
+
+
+def test_nothing_at_all_is_an_error_and_no_file(robot, recording, call, tmp_path):
+    with np.load(recording) as file:
+        arrays = {key: file[key][:4000] if key != "joints" else file[key] for key in file}
+    np.savez(recording, **arrays)
+    output = tmp_path / "friction.yaml"
+    code, out, errors = call(robot, recording, "-o", output)
+    assert code == 1
+    assert errors.strip().endswith("tells nothing about friction: see above")
+    assert "did not move both ways" in out
+    assert not output.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["{robot}"], 2, "the following arguments are required: recording"),
+        (["{robot}", "{run}", "-o", "{tmp}"], 1, "is a directory"),
+        (["{robot}", "{run}", "-o", "{tmp}/none/friction.yaml"], 1, "no directory"),
+        (["{robot}", "{run}", "-o", "{robot}"], 1, "is read, and cannot be written too"),
+        (["{robot}", "{run}", "-o", "{run}"], 1, "is read, and cannot be written too"),
+        (["{robot}", "{tmp}/none.npz"], 1, "none.npz: no NumPy file"),
+        (["{tmp}/none.yaml", "{run}"], 1, "none.yaml"),
+        (["{robot}", "{robot}"], 1, "no NumPy file"),
+    ],
+)
+def test_what_cannot_be_done_is_told_in_one_line(
+    robot, recording, call, tmp_path, arguments, code, message
+):
+    before = robot.read_bytes(), recording.read_bytes()
+    names = {"robot": robot, "run": recording, "tmp": tmp_path}
+    ended, _, errors = call(*(argument.format(**names) for argument in arguments))
+    assert ended == code
+    assert errors.startswith("identify_friction: ") and errors.count("\n") == 1
+    assert message in errors
+    assert (robot.read_bytes(), recording.read_bytes()) == before
+
+
+INTERRUPTIBLE = """
+import os, signal, sys
+from torque_safety_controller.cli import identify_friction as tool
+fits = tool.identify
+def interrupted(*arguments):
+    for fit in fits(*arguments):
+        os.kill(os.getpid(), signal.SIGINT)
+        yield fit
+tool.identify = interrupted
+sys.exit(tool.main())
+"""
+
+
+def test_an_interrupt_leaves_nothing_behind(robot, recording, tmp_path):
+    output = tmp_path / "friction.yaml"
+    output.write_text("old")
+    ended = subprocess.run(
+        [sys.executable, "-c", INTERRUPTIBLE, robot, recording, "-o", output],
+        capture_output=True,
+        text=True,
+        env=environment(),
+        timeout=TIME_LIMIT,
+    )
+    assert ended.returncode == 128 + signal.SIGINT
+    assert ended.stderr.strip() == "identify_friction: interrupted, nothing written"
+    assert output.read_text() == "old"
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "arm.urdf",
+        "robot.yaml",
+        "run.npz",
+        "friction.yaml",
+    }

@@ -1,0 +1,35 @@
+import numpy as np
+import pytest
+
+from torque_safety_controller.linalg.cholesky import factorise, solve_columns, solve_vector
+
+
+@pytest.mark.parametrize("n", [1, 2, 6, 9])
+def test_factorisation_and_solves_against_numpy(n):
+    rng = np.random.default_rng(n)
+    A = rng.normal(size=(n, n + 2))
+    A = A @ A.T
+    L = A.copy()
+    assert factorise(L)
+    np.testing.assert_allclose(np.tril(L), np.linalg.cholesky(A), rtol=1e-12, atol=1e-13)
+    x, B = rng.normal(size=n), rng.normal(size=(n, 4))
+    y, Y = x.copy(), B.copy()
+    solve_vector(L, y)
+    solve_columns(L, Y)
+    np.testing.assert_allclose(A @ y, x, atol=1e-9)
+    np.testing.assert_allclose(A @ Y, B, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "A",
+    [
+        np.zeros((2, 2)),
+        np.diag([1.0, -1.0]),
+        np.ones((3, 3)),
+        np.diag([1.0, np.nan]),
+        np.diag([np.inf, 1.0]),
+    ],
+    ids=["zero", "indefinite", "singular", "nan", "infinite"],
+)
+def test_what_is_not_positive_definite_is_told(A):
+    assert not factorise(A.copy())

@@ -1,0 +1,238 @@
+"""Wrenches over topics: measured, refused, exerted, yielded to; and what a silent sensor ends."""
+
+import math
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from arms import load_arm
+from controller_chain import NODE, ControllerChain
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from ros_harness import read_config
+from std_srvs.srv import Trigger
+
+from torque_safety_controller.node.assembly import make_controller
+from torque_safety_controller.parameters import controller_parameters
+from viability_bounds_pkg.ros.parameters import ParameterError
+from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS, set_stamp
+
+ARM = load_arm("panda")
+KNOWN = {row.name for row in controller_parameters.TABLE}
+FORCES = {
+    "ft_frame": "panda_link8",
+    "ft_tool_mass": 0.0,
+    "ft_timeout": 0.021,
+    "force_directions": [0.0, 0.0, 1.0, 0.0, 0.0, 0.0],
+    "dual_compliance": True,
+    "contact_frames": ["panda_hand"],
+    "contact_points": [0.0, 0.0, 0.1],
+    "contact_normals": [0.0, 0.0, -1.0],
+    "contact_friction": [0.5],
+}
+VALUES = {k: v for k, v in (read_config("panda", NODE) | FORCES).items() if k in KNOWN} | {
+    "state_timeout": 20.0,
+    "bounds_timeout": 10.0,
+}
+
+
+def wrench(force=(0.0, 0.0, 0.0), torque=(0.0, 0.0, 0.0), frame="", stamp=0) -> WrenchStamped:
+    message = WrenchStamped()
+    message.header.frame_id = frame
+    set_stamp(message.header.stamp, stamp)
+    for vector, values in ((message.wrench.force, force), (message.wrench.torque, torque)):
+        vector.x, vector.y, vector.z = map(float, values)
+    return message
+
+
+class Hand(ControllerChain):
+    """The other side of the controller, with a force/torque sensor."""
+
+    def __init__(self, ros, **changed) -> None:
+        super().__init__(ros, VALUES | changed)
+        self.measured = None
+        if changed.get("ft_frame") != "":
+            self.measured = ros.talk(WrenchStamped, "ft_wrench", CONTROL_QOS)
+        self.targets = ros.talk(WrenchStamped, "target_wrench", GOAL_QOS)
+        self.poses = ros.talk(PoseStamped, "target_pose", GOAL_QOS)
+        self.stamp = 0
+        self.feels: WrenchStamped | None = None
+
+    def step(self) -> np.ndarray:
+        """Let 2 ms of robot time pass; return the torques."""
+        self.stamp += 2
+        wide = np.full(ARM.n, 50.0)
+
+        def send() -> None:
+            if self.feels is not None:
+                self.measured.publish(self.feels)
+            self.send_limits(self.stamp, -wide, wide)
+            self.send_state(self.stamp, ARM.q_start, np.zeros(ARM.n))
+
+        tau = np.array(self.await_command(self.stamp, send).effort)
+        assert np.isfinite(tau).all()
+        assert (np.abs(tau) <= ARM.tau_max).all()
+        return tau
+
+    def until(self, key: str, value: str) -> None:
+        self.ros.wait_until(lambda: value in self.reported(key), f"{key} {value}", each=self.step)
+
+    def give_pose(self) -> None:
+        pose = ARM.robot(0.0)
+        pose.update(ARM.q_start, np.zeros(ARM.n), np.zeros(ARM.n))
+        message = PoseStamped()
+        p = message.pose.position
+        p.x, p.y, p.z = map(float, pose.pose.translation)
+        o = message.pose.orientation
+        o.x, o.y, o.z, o.w = map(float, pin.Quaternion(pose.pose.rotation).coeffs())
+        self.poses.publish(message)
+        self.until("mode", "TRACKING")
+
+
+def test_a_pull_is_yielded_to_until_the_sensor_falls_silent(ros):
+    hand = Hand(ros)
+    hand.feels = wrench(force=(1.0, 0.0, 0.0), frame="panda_link8")
+    hand.give_pose()
+    hand.until("compliance", "holding")
+    hand.feels = wrench(force=(0.0, 30.0, 0.0), frame="panda_link8")
+    hand.until("compliance", "yielding")
+    assert "threshold" in hand.reported("compliance_reason")
+    hand.feels = None
+    hand.until("compliance", "sensor silent")
+    assert hand.reported("mode") == "TRACKING"
+    assert hand.reported("level") == DiagnosticStatus.WARN
+    assert "sensor is silent" in hand.reported("message")
+    hand.feels = wrench(force=(0.0, 1.0, 0.0))
+    hand.until("compliance", "holding")
+
+
+def test_measurements_that_are_none_are_dropped_counted_and_named(ros):
+    hand = Hand(ros)
+    hand.feels = wrench(force=(0.0, 30.0, math.nan), frame="panda_link8")
+    hand.give_pose()
+    hand.until("wrenches_refused", "not six finite numbers")
+    assert hand.reported("compliance") == "sensor silent"
+    hand.feels = wrench(force=(0.0, 30.0, 0.0), frame="moon")
+    hand.until("wrenches_refused", "frame_id is 'moon'; allowed: 'panda_link8' or empty")
+    assert hand.reported("compliance") == "sensor silent"
+
+
+def test_a_target_is_exerted_and_torques_say_so(ros):
+    """In contact with what gives exactly that back, the motors carry it."""
+    hand = Hand(ros, dual_compliance=False, wrench_time=1e-3, contact_force_step=20.0)
+    hand.feels = wrench()
+    hand.give_pose()
+    before = hand.step()
+    hand.targets.publish(wrench(force=(0.0, 0.0, 10.0), frame="panda_hand"))
+    hand.feels = wrench(force=(0.0, 0.0, -10.0))
+    hand.until("compliance", "force")
+    for _ in range(20):
+        after = hand.step()
+    hand.until("contacts_closed", "panda_hand")
+    robot = ARM.robot(0.0)
+    robot.update(ARM.q_start, np.zeros(ARM.n), np.zeros(ARM.n))
+    pressed = robot.J.T @ np.array([0.0, 0.0, 10.0, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(after - before, pressed, atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("message", "changed"),
+    [
+        (wrench(force=(0.0, 0.0, math.inf)), {}),
+        (wrench(frame="moon"), {}),
+        (wrench(force=(0.0, 0.0, 10.0)), {"force_directions": [0.0] * 6}),
+        (
+            wrench(force=(0.0, 0.0, 10.0)),
+            {"ft_frame": "", "force_directions": [0.0] * 6, "dual_compliance": False},
+        ),
+    ],
+)
+def test_targets_that_cannot_be_exerted_are_refused(ros, message, changed):
+    hand = Hand(ros, **changed)
+    if changed.get("ft_frame") != "":
+        hand.feels = wrench()
+    hand.give_pose()
+    hand.targets.publish(message)
+    hand.until("goals_refused", "target_wrench")
+    assert hand.reported("compliance") != "force"
+
+
+def test_a_tare_takes_what_is_felt_for_the_bias_but_not_from_a_hand_that_is_led(ros):
+    hand = Hand(ros)
+    hand.feels = wrench(force=(4.0, 0.0, 0.0))
+    hand.give_pose()
+    for _ in range(3):
+        hand.step()
+    answer = ros.call(Trigger, f"{NODE}/tare_ft_sensor", Trigger.Request())
+    assert answer.success
+    np.testing.assert_allclose(hand.node._controller.interaction.sensor.bias[0], 4.0)
+    hand.feels = wrench(force=(40.0, 0.0, 0.0))
+    hand.until("compliance", "yielding")
+    answer = ros.call(Trigger, f"{NODE}/tare_ft_sensor", Trigger.Request())
+    assert not answer.success
+    assert "in contact" in answer.message
+
+
+# Parameters
+
+
+def build(**changed):
+    given = VALUES | changed
+    values = {row.name: row.coerce(given.get(row.name)) for row in controller_parameters.TABLE}
+    return make_controller(values, controller_parameters.make_configuration(values))[0]
+
+
+@pytest.mark.parametrize(
+    ("changed", "named"),
+    [
+        ({"ft_frame": "moon"}, "ft_frame"),
+        ({"ft_frame": "panda_link3"}, "ft_frame"),
+        ({"ft_frame": ""}, "force_directions"),
+        ({"ft_frame": "", "force_directions": []}, "dual_compliance"),
+        ({"ft_tool_mass": -2.0}, "ft_tool_mass"),
+        ({"ft_tool_com": [0.0, 1.0]}, "ft_tool_com"),
+        ({"ft_filter_hz": 0.0}, "ft_filter_hz"),
+        ({"ft_timeout": -1.0}, "ft_timeout"),
+        ({"force_directions": [1.0] * 5}, "force_directions"),
+        ({"force_directions": [0.5] * 6}, "force_directions"),
+        ({"force_stiffness": [2.0] * 6}, "force_stiffness"),
+        ({"admittance_force_kp": -1.0}, "admittance_force_kp"),
+        ({"admittance_moment_kd": math.inf}, "admittance_moment_kd"),
+        ({"admittance_weight": -3.0}, "admittance_weight"),
+        ({"admittance_speed_max": [0.1]}, "admittance_speed_max"),
+        ({"yield_speed_max": [0.0, 1.0]}, "yield_speed_max"),
+        ({"yield_force": 0.0}, "yield_force"),
+        ({"yield_release": 1.5}, "yield_release"),
+        ({"wrench_weight": 0.0}, "wrench_weight"),
+        ({"contact_frames": ["moon"]}, "contact_frames"),
+        ({"contact_frames": ["panda_hand", "panda_link8"]}, "contact_points"),
+        ({"contact_normals": [0.0, 0.0, 0.0]}, "contact_normals"),
+        ({"contact_friction": [-0.5]}, "contact_friction"),
+        ({"contact_facets": 2}, "contact_facets"),
+        ({"closed_contacts": ["panda_link4"]}, "closed_contacts"),
+    ],
+)
+def test_a_wrong_parameter_is_named(changed, named):
+    with pytest.raises(ParameterError, match=f"'{named}'"):
+        build(**changed)
+
+
+def test_points_of_one_link_are_one_contact():
+    corners = [[x, y, 0.1] for x in (-0.02, 0.02) for y in (-0.01, 0.01)]
+    controller = build(
+        contact_frames=["panda_hand"] * 4 + ["panda_link4"],
+        contact_points=[*np.ravel(corners), 0.0, 0.0, 0.0],
+        contact_normals=[0.0, 0.0, -1.0] * 4 + [0.0, 1.0, 0.0],
+        contact_friction=[0.5] * 4 + [0.2],
+        closed_contacts=["panda_link4"],
+    )
+    hand, elbow = controller.interaction.contacts.contacts
+    assert hand.points.shape == (4, 3)
+    assert elbow.points.shape == (1, 3)
+    assert controller.interaction.settings.closed == (1,)
+
+
+def test_without_sensor_and_contacts_there_is_nothing_to_do():
+    nothing = {name: [] for name in FORCES if name.startswith("contact")}
+    controller = build(**nothing, ft_frame="", force_directions=[], dual_compliance=False)
+    assert controller.interaction is None

@@ -1,0 +1,246 @@
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import scipy.sparse as sparse
+from proxsuite import proxqp
+from scipy.optimize import linprog, nnls
+
+from torque_safety_controller.qp.active_set import FAILED, INFEASIBLE, minimise
+
+
+class Problem(NamedTuple):
+    H: np.ndarray
+    g: np.ndarray
+    C: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+
+    def cost(self, x):
+        return 0.5 * x @ self.H @ x + self.g @ x
+
+    def rows(self):
+        return np.vstack([np.eye(len(self.g)), self.C])
+
+    def violation(self, x):
+        value = self.rows() @ x
+        return max(0.0, (self.lower - value).max(), (value - self.upper).max())
+
+
+def random_problem(rng, n, m, tight=1.0, flat=1e-3, inside=True) -> Problem:
+    """Some limits infinite, some equal; with `inside` there is a point that keeps them all."""
+    A = rng.normal(size=(max(1, n // 2), n))
+    C = rng.normal(size=(m, n)) * 10.0 ** rng.uniform(-1, 1, (m, 1))
+    if m > 3:
+        C[3] = 2.0 * C[2]  # parallel, so that the two are active together or contradict
+    x = rng.normal(size=n)
+    middle = np.r_[x, C @ x] if inside else rng.normal(size=n + m)
+    lower, upper = (middle + s * tight * rng.uniform(0.0, 2.0, n + m) for s in (-1.0, 1.0))
+    kind = rng.random(n + m)
+    lower[kind < 0.2] = -np.inf
+    upper[(kind > 0.1) & (kind < 0.3)] = np.inf
+    equal = kind > 0.95
+    lower[equal] = upper[equal] = middle[equal]
+    return Problem(A.T @ A + flat * np.eye(n), 10.0 * rng.normal(size=n), C, lower, upper)
+
+
+def solve(problem, side=None):
+    x = np.full(len(problem.g), np.nan)
+    side = np.zeros(len(problem.lower)) if side is None else side
+    return minimise(*problem, side, x), x, side
+
+
+def assert_optimal(problem, x, side):
+    """Karush-Kuhn-Tucker: limits kept, and multipliers of the right sign balance the slope."""
+    assert problem.violation(x) < 1e-7
+    value, N = problem.rows() @ x, problem.rows()
+    at_lower, at_upper = (np.abs(value - each) < 1e-7 for each in (problem.lower, problem.upper))
+    np.testing.assert_array_equal((side > 0) <= at_lower, True)
+    np.testing.assert_array_equal((side < 0) <= at_upper, True)
+    slope = problem.H @ x + problem.g
+    _, left = nnls(np.vstack([N[at_lower], -N[at_upper]]).T, slope)
+    assert left < 1e-7 * (1.0 + np.linalg.norm(problem.g))
+
+
+def has_a_point(problem) -> bool:
+    N = problem.rows()
+    A = np.vstack([N, -N])
+    b = np.r_[problem.upper, -problem.lower]
+    finite = np.isfinite(b)
+    found = linprog(np.zeros(N.shape[1]), A[finite], b[finite], bounds=(None, None))
+    return found.status == 0
+
+
+def every_active_set(problem):
+    """The best of all points that are minima on some limits and keep the others; None if none."""
+    n, N = len(problem.g), problem.rows()
+    best = None
+    for sides in product((0, 1, -1), repeat=len(problem.lower)):
+        on = np.flatnonzero(sides)
+        b = np.where(np.array(sides) > 0, problem.lower, problem.upper)[on]
+        if len(on) > n or not np.isfinite(b).all():
+            continue
+        A = N[on]
+        if len(on) and np.linalg.matrix_rank(A, 1e-9) < len(on):
+            continue
+        zero = np.zeros((len(on), len(on)))
+        x = np.linalg.solve(np.block([[problem.H, A.T], [A, zero]]), np.r_[-problem.g, b])[:n]
+        if problem.violation(x) < 1e-9 and (best is None or problem.cost(x) < problem.cost(best)):
+            best = x
+    return best
+
+
+def by_proxqp(problem):
+    """A solver of another kind: an augmented Lagrangian, sparse, with equations apart."""
+    n, N = len(problem.g), problem.rows()
+    equal = problem.lower == problem.upper
+    qp = proxqp.sparse.QP(n, int(equal.sum()), int((~equal).sum()))
+    qp.settings.eps_abs = 1e-9
+    qp.settings.eps_rel = 0.0
+    qp.settings.check_duality_gap = True
+    qp.settings.eps_duality_gap_abs = 1e-7
+    qp.settings.max_iter = 200
+    qp.init(
+        sparse.csc_matrix(problem.H),
+        problem.g,
+        sparse.csc_matrix(N[equal]),
+        problem.lower[equal],
+        sparse.csc_matrix(N[~equal]),
+        problem.lower[~equal],
+        problem.upper[~equal],
+    )
+    qp.solve()
+    solved = qp.results.info.status == proxqp.QPSolverOutput.PROXQP_SOLVED
+    return np.array(qp.results.x) if solved else None
+
+
+@pytest.mark.parametrize(("n", "m"), [(2, 1), (2, 3), (3, 2)])
+def test_agrees_with_trying_every_active_set(n, m):
+    rng = np.random.default_rng(1)
+    none = limited = 0
+    for k in range(60):
+        problem = random_problem(rng, n, m, tight=0.5, inside=k % 2 == 0)
+        best = every_active_set(problem)
+        changes, x, side = solve(problem)
+        if best is None:
+            none += 1
+            assert changes == INFEASIBLE
+            continue
+        assert changes >= 0
+        limited += side.any()
+        np.testing.assert_allclose(x, best, atol=1e-6)
+    assert limited > 20
+    assert none > 3
+
+
+@pytest.mark.parametrize(("n", "m"), [(7, 7), (9, 19), (25, 40)])
+@pytest.mark.parametrize("flat", [1.0, 1e-3, 1e-6])
+def test_is_optimal_and_agrees_with_another_solver(n, m, flat):
+    rng = np.random.default_rng(2)
+    compared = 0
+    for _ in range(20):
+        problem = random_problem(rng, n, m, flat=flat)
+        changes, x, side = solve(problem)
+        assert changes > 0
+        assert_optimal(problem, x, side)
+        other = by_proxqp(problem) if flat > 1e-6 else None
+        if other is not None:
+            compared += 1
+            assert problem.cost(x) <= problem.cost(other) + 1e-5
+            np.testing.assert_allclose(x, other, atol=1e-3)
+    assert compared > 10 or flat == 1e-6
+
+
+@pytest.mark.parametrize("tight", [0.03, 0.3, 1.0])
+def test_knows_whether_there_is_a_solution(tight):
+    rng = np.random.default_rng(3)
+    known = {True: 0, False: 0}
+    for _ in range(80):
+        n, m = rng.integers(2, 10), rng.integers(1, 15)
+        problem = random_problem(rng, n, m, tight * rng.uniform(0.3, 3.0), inside=False)
+        changes, x, side = solve(problem)
+        exists = has_a_point(problem)
+        known[exists] += 1
+        assert (changes == INFEASIBLE) == (not exists)
+        if exists:
+            assert_optimal(problem, x, side)
+        else:
+            assert not side.any()
+    assert min(known.values()) > 5
+
+
+def test_wherever_it_begins_it_ends_at_the_same_point():
+    rng = np.random.default_rng(4)
+    for _ in range(40):
+        problem = random_problem(rng, 9, 15)
+        _, x, side = solve(problem)
+        changes, again, _ = solve(problem, side.copy())
+        assert changes == 0
+        np.testing.assert_allclose(again, x, atol=1e-9)
+        guess = rng.integers(-1, 2, len(side)).astype(float)
+        changes, other, side = solve(problem, guess)
+        assert changes >= 0
+        np.testing.assert_allclose(other, x, atol=1e-6)
+        assert_optimal(problem, other, side)
+
+
+def test_rows_that_say_the_same_do_no_harm():
+    rng = np.random.default_rng(5)
+    for _ in range(40):
+        problem = random_problem(rng, 7, 8)
+        C = np.vstack([problem.C, problem.C[::-1], np.eye(7), np.zeros((2, 7))])
+        lower, upper = (
+            np.r_[each, each[7:][::-1], each[:7], 0.0, sign]
+            for each, sign in ((problem.lower, -1.0), (problem.upper, 1.0))
+        )
+        twice = Problem(problem.H, problem.g, C, lower, upper)
+        changes, x, side = solve(twice)
+        assert changes >= 0
+        assert_optimal(twice, x, side)
+        np.testing.assert_allclose(x, solve(problem)[1], atol=1e-6)
+
+
+def test_rows_that_contradict_each_other_through_others_have_no_solution():
+    """One row is a combination of the others but for rounding, and its limit is not."""
+    rng = np.random.default_rng(9)
+    for _ in range(100):
+        n, m = 12, 4
+        problem = random_problem(rng, n, 0)
+        C, b = rng.normal(size=(m, n)), rng.normal(size=m)
+        share = rng.uniform(0.1, 1.0, m)
+        C, b = np.vstack([C, share @ C / 3.0]), np.r_[b, share @ b / 3.0 - 1e-3]
+        no = np.full(n, np.inf)
+        changes, *_ = solve(
+            problem._replace(
+                C=C, lower=np.r_[-no, b[:m], -np.inf], upper=np.r_[no, np.full(m, np.inf), b[m]]
+            )
+        )
+        assert changes == INFEASIBLE
+
+
+def test_a_row_of_zeros_that_excludes_zero_has_no_solution():
+    problem = random_problem(np.random.default_rng(6), 4, 1)
+    no = Problem(
+        problem.H, problem.g, np.zeros((1, 4)), np.r_[np.full(4, -9.0), 1.0], np.full(5, 9.0)
+    )
+    assert solve(no)[0] == INFEASIBLE
+
+
+@pytest.mark.parametrize("field", Problem._fields)
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_fails_or_is_no_limit(field, value):
+    problem = random_problem(np.random.default_rng(7), 5, 3)
+    poisoned = getattr(problem, field).copy()
+    poisoned.flat[-1] = value
+    allowed = (field, value) in {("lower", -np.inf), ("upper", np.inf)}
+    changes, x, side = solve(problem._replace(**{field: poisoned}), np.ones(8))
+    assert (changes >= 0) == allowed
+    assert allowed or changes == FAILED and not side.any()
+    assert not allowed or np.isfinite(x).all()
+
+
+def test_crossed_limits_and_indefinite_costs_fail():
+    problem = random_problem(np.random.default_rng(8), 5, 3)
+    assert solve(problem._replace(lower=problem.upper + 1.0))[0] == FAILED
+    assert solve(problem._replace(H=-problem.H))[0] == FAILED

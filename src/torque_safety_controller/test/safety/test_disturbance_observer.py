@@ -1,0 +1,95 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torque_safety_controller.safety.disturbance_observer import DisturbanceObserver
+from viability_bounds_pkg.joint_limits import JointLimits
+from viability_bounds_pkg.viability import BoundsSolver
+
+DT = 1e-3
+LARGEST = np.array([50.0])
+
+
+def ride(time_constant, disturbance, noise=0.0, seed=0):
+    """Push a joint at its upper limits as hard as the bounds allow, with something pushing too.
+
+    Returns how far it got beyond its position and its speed limit.
+    """
+    limits = JointLimits(["joint"], [-1.0], [1.0], [1.0], [-20.0], [20.0])
+    solver = BoundsSolver(limits, 2 * DT, period=DT)
+    observer = DisturbanceObserver(1, time_constant)
+    rng = np.random.default_rng(seed)
+    q, v, a = np.array([-0.9]), np.zeros(1), np.zeros(1)
+    beyond = [-math.inf, -math.inf]
+    for k in range(4000):
+        seen = v + noise * rng.normal(size=1)
+        bounds = solver.bounds(q, seen)
+        observer.observe(seen, a, DT, LARGEST, np.eye(1))
+        _, upper = observer.shift(bounds.lower, bounds.upper)
+        a = upper
+        true = a + disturbance(k * DT)
+        q = q + DT * v + 0.5 * DT * DT * true
+        v = v + DT * true
+        beyond = [max(beyond[0], q[0] - 1.0), max(beyond[1], v[0] - 1.0)]
+    return beyond
+
+
+def test_a_lasting_push_towards_the_limit_does_not_carry_the_joint_beyond():
+    def push(t):
+        return 8.0
+
+    position, speed = ride(None, push)
+    assert position > 1e-4 and speed > 5e-3
+    # One step passes before the push is known: its effect, v dt + a dt^2 / 2, may remain.
+    position, speed = ride(0.0, push)
+    assert position < 8.0 * DT**2 and speed < 1e-9
+    position, speed = ride(0.003, push)
+    assert position < 8.0 * DT**2 and speed < 1e-3
+
+
+def test_friction_does_not_widen_the_bounds():
+    """It brakes; when it is gone, as at a reversal, nothing had relied on it."""
+    observer = DisturbanceObserver(1, 0.0)
+    lower, upper = np.array([-5.0]), np.array([3.0])
+    v, a = np.zeros(1), np.array([3.0])
+    observer.observe(v, a, DT, LARGEST, np.eye(1))
+    observer.observe(v, a, DT, LARGEST, np.eye(1))  # asked for 3 rad/s^2 and had none
+    np.testing.assert_allclose(observer.estimate, -3.0)
+    low, high = observer.shift(lower, upper)
+    assert high == upper and low == lower + 3.0
+
+
+def test_noise_of_the_velocity_costs_little():
+    position, speed = ride(0.003, lambda t: 0.0, noise=1e-4)
+    assert position < 1e-4 and speed < 1e-3
+
+
+NUMBERS = st.floats(allow_nan=True, allow_infinity=True)
+
+
+@given(st.lists(NUMBERS, min_size=3, max_size=3), st.lists(NUMBERS, min_size=3, max_size=3))
+def test_bounds_stay_bounds(v, a):
+    observer = DisturbanceObserver(3, 0.002)
+    largest = np.full(3, 30.0)
+    lower, upper = np.array([-5.0, 2.0, 0.0]), np.array([5.0, 2.0, 1e-12])
+    with np.errstate(all="ignore"):
+        for sign in (1.0, -1.0, 1.0):
+            observer.observe(sign * np.array(v), np.array(a), DT, largest, np.eye(3))
+            low, high = observer.shift(lower, upper)
+            assert (low <= high).all()
+            assert (np.abs(low - lower) <= 30.0 + 10.0).all()
+
+
+def test_it_forgets():
+    observer = DisturbanceObserver(1, 0.0)
+    for v in (0.0, 1.0):
+        observer.observe(np.array([v]), np.zeros(1), 0.1, LARGEST, np.eye(1))
+    assert observer.estimate == pytest.approx(10.0)
+    observer.observe(np.array([1.0]), np.zeros(1), 0.0, LARGEST, np.eye(1))
+    assert observer.estimate == 0.0
+    lower, upper = np.array([-1.0]), np.array([1.0])
+    observer.start()
+    assert observer.shift(lower, upper) == (lower, upper)

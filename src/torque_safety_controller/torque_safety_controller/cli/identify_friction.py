@@ -1,0 +1,128 @@
+"""Command line tool: the friction of a robot's joints from a recording of its motion.
+
+Reads a robot's parameter file and a recording, reports what it found and what not, and writes a
+parameter file for the controller.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from torque_safety_controller.friction.identification import (
+    JointFit,
+    friction_model,
+    identify,
+)
+from torque_safety_controller.friction.joint_recording import RecordingError, load_recording
+from viability_bounds_pkg.cli.command_line import Parser, run_tool
+from viability_bounds_pkg.cli.limits_file import (
+    ParameterFileError,
+    check_writable,
+    overlay,
+    read_robot,
+    write_whole,
+)
+from viability_bounds_pkg.robot_description import RobotDescriptionError
+
+NODE = "/**/controller_node"
+"""The node whose parameters the friction is."""
+
+_NAMES = ("coulomb", "static", "viscous", "stribeck_velocity")
+_UNITS = ("N m", "N m", "N m s/rad", "rad/s")
+
+
+def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = Parser(
+        prog="identify_friction",
+        description="Identify the friction of a robot's joints from a recording of its motion.",
+        epilog="The recording holds arrays t (N,) in s, and q, v, tau (N, n) in rad, rad/s and "
+        "N m of the motors, as in joint_states; perhaps joints, their names. Every joint is to "
+        "pass the same positions both ways, slowly and fast; record_excitation makes one in "
+        "simulation. What the recording does not tell is left at zero, and said.",
+    )
+    add = parser.add_argument
+    add("parameters", type=Path, help="the robot's parameter file (ROS 2 YAML)")
+    add("recording", type=Path, help="the recording (.npz)")
+    add(
+        "-o", "--output", type=Path, help="parameter file to write, to be passed after the robot's"
+    )
+    return parser.parse_args(arguments)
+
+
+def _run(options: argparse.Namespace) -> int:
+    if options.output is not None:
+        check_writable(options.output)
+        for path in (options.parameters, options.recording):
+            if options.output.resolve() == path.resolve():
+                raise ParameterFileError(f"{options.output} is read, and cannot be written too")
+    model = read_robot(options.parameters).model
+    names = list(model.names)[1:]
+    recording = load_recording(options.recording, names)
+    # With no terminal to draw on there is no bar.
+    bar = tqdm(identify(model, recording), total=len(names), unit=" joints", disable=None)
+    try:
+        fits = list(bar)
+    except RecordingError as error:
+        raise RecordingError(f"{options.recording}: {error}") from error
+    report(names, fits)
+    if not any(fit.static > 0.0 or fit.viscous > 0.0 for fit in fits):
+        raise RecordingError(f"{options.recording} tells nothing about friction: see above")
+    text = overlay_text(names, fits, options)
+    if options.output is None:
+        print("\n" + text, end="")
+    else:
+        write_whole(options.output, text)
+        print(f"\nwritten to {options.output}")
+    return 0
+
+
+def report(names: Sequence[str], fits: Sequence[JointFit]) -> None:
+    """Print what was found, with standard errors, and what not."""
+    for name, fit in zip(names, fits, strict=True):
+        print(
+            f"{name}: {fit.blocks} blocks, {fit.speeds[0]:.2g} to {fit.speeds[1]:.2g} rad/s, "
+            f"residual {fit.residual:.2g} N m"
+        )
+        for what, error, unit in zip(_NAMES, fit.errors, _UNITS, strict=True):
+            if np.isfinite(error):
+                print(f"  {what:18}{getattr(fit, what):10.4g} +- {error:.2g} {unit}")
+        for note in fit.notes:
+            print(f"  {note}")
+
+
+def overlay_text(
+    names: Sequence[str], fits: Sequence[JointFit], options: argparse.Namespace
+) -> str:
+    """Return the parameter file; it leaves the compensation switched as it is."""
+    notes = [
+        f"Friction found by identify_friction in {options.recording.name}, to be passed as a "
+        f"parameter file after {options.parameters.name}",
+        f"joints: {', '.join(names)}; {', '.join(dict.fromkeys(_UNITS))}",
+    ]
+    notes += [
+        f"{name}: {note}" for name, fit in zip(names, fits, strict=True) for note in fit.notes
+    ]
+    model = friction_model(fits)
+    found = {f"friction_model_{name}": _rounded(getattr(model, name)) for name in _NAMES}
+    return overlay(found, notes, NODE)
+
+
+def _rounded(values: np.ndarray) -> np.ndarray:
+    return np.array([float(f"{value:.4g}") for value in values])
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the tool; return its exit code: 0, 1 for an error, 2 for usage, 130 for an interrupt."""
+    options = _parse(arguments)
+    errors = (ParameterFileError, RecordingError, RobotDescriptionError)
+    return run_tool("identify_friction", lambda: _run(options), errors)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

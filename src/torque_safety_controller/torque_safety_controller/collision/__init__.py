@@ -1,0 +1,1 @@
+"""Collision avoidance: distances that can always be kept."""

@@ -1,0 +1,154 @@
+"""The collision geometry of a URDF, loaded through Pinocchio and coal, as triangles of links."""
+
+from __future__ import annotations
+
+import warnings
+from collections import Counter
+from collections.abc import Mapping
+from typing import NamedTuple
+from xml.etree import ElementTree
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from torque_safety_controller.collision.capsule_fit import Capsule
+from viability_bounds_pkg.robot_description import RobotDescriptionError, package_directories
+
+_SIDES = 16  # of the prism around a cylinder
+
+
+class LinkShape(NamedTuple):
+    """Collision geometry of a link, in the axes of the joint that moves it.
+
+    Attributes:
+        link: its name.
+        joint: index of the joint in the reduced model; 0 for links fixed to the base.
+        vertices: of its meshes, boxes and cylinders, shape (m, 3), m.
+        triangles: indices of these, shape (k, 3).
+        capsules: its spheres and capsules.
+    """
+
+    link: str
+    joint: int
+    vertices: NDArray[np.float64]
+    triangles: NDArray[np.int64]
+    capsules: list[Capsule]
+
+
+def load_geometry(
+    urdf: str, model: pin.Model, locked_positions: Mapping[str, float] | None = None
+) -> pin.GeometryModel:
+    """Return the collision geometry for a model of `robot_description.build_model`.
+
+    Args:
+        urdf: text of the URDF.
+        model: made of it, other joints locked.
+        locked_positions: as given to `build_model`, rad.
+
+    Raises:
+        RobotDescriptionError: a mesh cannot be found or loaded, or a shape is not understood.
+    """
+    full = pin.buildModelFromXML(urdf)
+    directories = [str(path) for path in package_directories() if path.is_dir()]
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of Pinocchio, about how it was called
+            geometry = pin.buildGeomFromUrdfString(
+                full, urdf, pin.GeometryType.COLLISION, directories
+            )
+    except (ValueError, RuntimeError) as error:
+        raise RobotDescriptionError(f"collision geometry does not load: {error}") from error
+    _check_complete(urdf, full, geometry)
+    configuration = pin.neutral(full)
+    for name, position in (locked_positions or {}).items():
+        configuration[full.joints[full.getJointId(name)].idx_q] = position
+    kept = set(model.names)
+    locked = [i for i in range(1, full.njoints) if full.names[i] not in kept]
+    reduced, (geometry,) = pin.buildReducedModel(full, [geometry], locked, configuration)
+    if list(reduced.names) != list(model.names):
+        raise RobotDescriptionError("the model was not made of this URDF")
+    return geometry
+
+
+def link_shapes(model: pin.Model, geometry: pin.GeometryModel) -> list[LinkShape]:
+    """Return the shapes of all links that have any, base to tip.
+
+    Args:
+        model: with the joints that the geometry hangs on.
+        geometry: of `load_geometry`.
+
+    Raises:
+        RobotDescriptionError: a kind of geometry that a URDF does not have.
+    """
+    shapes: dict[str, LinkShape] = {}
+    for item in geometry.geometryObjects:
+        link = model.frames[item.parentFrame].name
+        shape = shapes.setdefault(
+            link,
+            LinkShape(
+                link, item.parentJoint, np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64), []
+            ),
+        )
+        placement = item.placement
+        if isinstance(item.geometry, coal.Sphere | coal.Capsule):
+            half = getattr(item.geometry, "halfLength", 0.0) * placement.rotation[:, 2]
+            centre = placement.translation
+            shape.capsules.append(Capsule(centre - half, centre + half, item.geometry.radius))
+            continue
+        vertices, triangles = _mesh(item)
+        vertices = vertices @ placement.rotation.T + placement.translation
+        shapes[link] = shape._replace(
+            vertices=np.vstack([shape.vertices, vertices]),
+            triangles=np.vstack([shape.triangles, triangles + len(shape.vertices)]),
+        )
+    return sorted(shapes.values(), key=lambda shape: shape.joint)
+
+
+def _check_complete(urdf: str, model: pin.Model, geometry: pin.GeometryModel) -> None:
+    """Raise if a shape of the URDF is missing: its parser drops what it does not understand."""
+    found = Counter(model.frames[item.parentFrame].name for item in geometry.geometryObjects)
+    for link in ElementTree.fromstring(urdf).iter("link"):
+        name, shapes = link.get("name", ""), len(link.findall("collision"))
+        if model.existFrame(name) and found[name] != shapes:
+            raise RobotDescriptionError(
+                f"link {name!r}: only {found[name]} of {shapes} collision shapes were understood"
+            )
+
+
+def _mesh(item: pin.GeometryObject) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices and triangles of a mesh, a box or a cylinder in its own axes."""
+    shape = item.geometry
+    if isinstance(shape, coal.BVHModelBase):
+        indices = map(shape.tri_indices, range(shape.num_tris))
+        triangles = [(t[0], t[1], t[2]) for t in indices]  # it does not say where it ends
+        return np.array(shape.vertices()), np.array(triangles, dtype=np.int64)
+    if isinstance(shape, coal.Box):
+        corners = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij")).reshape(3, 8).T
+        return corners * shape.halfSide, _faces([[0, 1, 3, 2], [4, 6, 7, 5]], 4)
+    if isinstance(shape, coal.Cylinder):
+        angle = 2.0 * np.pi * np.arange(_SIDES) / _SIDES
+        radius = shape.radius / np.cos(np.pi / _SIDES)  # the prism is outside
+        ring = radius * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+        lift = np.array([0.0, 0.0, shape.halfLength])
+        rings = [list(range(_SIDES)), list(range(_SIDES, 2 * _SIDES))]
+        return np.vstack([ring - lift, ring + lift]), _faces(rings, _SIDES)
+    raise RobotDescriptionError(
+        f"{item.name}: collision geometry {type(shape).__name__} is not among "
+        "mesh, box, cylinder, capsule and sphere"
+    )
+
+
+def _faces(ends: list[list[int]], sides: int) -> np.ndarray:
+    """Return triangles of two end faces and the quadrilaterals between them."""
+    triangles = []
+    for end in ends:
+        triangles += [[end[0], end[k], end[k + 1]] for k in range(1, sides - 1)]
+    first, second = ends
+    if sides == 4:
+        second = [i + 4 for i in first]
+    for k in range(sides):
+        j = (k + 1) % sides
+        triangles += [[first[k], first[j], second[k]], [second[k], first[j], second[j]]]
+    return np.array(triangles, dtype=np.int64)

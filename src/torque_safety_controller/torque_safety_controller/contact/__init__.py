@@ -1,0 +1,1 @@
+"""Forces at the hand and other contacts."""

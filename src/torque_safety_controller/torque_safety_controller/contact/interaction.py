@@ -1,0 +1,321 @@
+"""Forces at the hand: pressing with a wrench that was asked for, and yielding to who pulls.
+
+One object puts together the sensor, the contacts of the QP with their wrench tasks, the
+admittance task (27) and dual compliance: [Benallegue2021], III-E and IV-C. Wrenches are those of
+the environment on the arm, about the end effector's origin and in its axes; what the arm is to
+exert is the negative.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from torque_safety_controller.contact.admittance import AdmittanceGains, admittance_task
+from torque_safety_controller.contact.contacts import Contacts
+from torque_safety_controller.contact.dual_compliance import DualCompliance, DualSettings
+from torque_safety_controller.contact.wrench_sensor import WrenchSensor
+from torque_safety_controller.qp.inverse_dynamics_qp import ContactForces
+from torque_safety_controller.robot_model import RobotModel
+from torque_safety_controller.tasks.gains import Gains
+from torque_safety_controller.tasks.goals import Goals
+from torque_safety_controller.tasks.tasks import TaskTerm
+
+Array = NDArray[np.float64]
+
+
+class Compliance(Enum):
+    """What is done about the wrench at the hand."""
+
+    OFF = "off"
+    """Nothing: there is no sensor, or nothing was asked for."""
+    HOLDING = "holding"
+    """The pose is held; a pull beyond the threshold will be yielded to."""
+    YIELDING = "yielding"
+    """The hand is led."""
+    FORCE = "force"
+    """A wrench is exerted in the directions set for it."""
+    SILENT = "sensor silent"
+    """As OFF, for want of measurements."""
+
+
+@dataclass(frozen=True, eq=False)
+class InteractionSettings:
+    """What may change while the controller runs.
+
+    Attributes:
+        directions: of the end effector's axes, those in which force is controlled, shape (6,),
+            bool.
+        stiffness: share of the pose task's stiffness that is left there, shape (6,), 0 to 1: 0
+            for hybrid, more for parallel control. Its damping always stays.
+        gains: of the admittance task when a wrench is exerted.
+        weight: of the admittance task; None for that of the pose task.
+        wrench_weight: of the wrench tasks.
+        wrench_time: time constant with which a new target wrench is gone over to, s, > 0.
+        force_step: by how much the force that the QP counts on at the hand may exceed the
+            measured one along the contact's normal, N: the hand neither rushes at what it is to
+            touch, nor presses on what is not there.
+        closed: indices of other contacts that there are at present.
+        dual: when the hand yields; None never.
+        yielding_gains: of the admittance task when it does.
+    """
+
+    directions: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(6, dtype=bool))
+    stiffness: Array = field(default_factory=lambda: np.zeros(6))
+    gains: AdmittanceGains = AdmittanceGains()
+    weight: float | None = None
+    wrench_weight: float = 10.0
+    wrench_time: float = 0.1
+    force_step: float = 0.5
+    closed: tuple[int, ...] = ()
+    dual: DualSettings | None = None
+    yielding_gains: AdmittanceGains = AdmittanceGains(0.1, 0.0, 1.0, 0.0, 0.25, 1.0)
+
+
+class Interaction:
+    """What an arm does about forces.
+
+    Args:
+        sensor: at the hand; None for none: then nothing is done but what `contacts` want.
+        contacts: that the QP may use forces of; None for none.
+        hand: index of the contact at the hand, with which a wrench is exerted; None for none.
+        placement: of that contact's frame in the end effector's.
+        settings: may be replaced between steps.
+
+    Attributes:
+        sensor, contacts, settings: as given.
+        state: what is done at present.
+        reason: why.
+        changes: how often the state has changed.
+        reference: wrench that (27) goes by, F_ref, shape (6,).
+    """
+
+    def __init__(
+        self,
+        sensor: WrenchSensor | None,
+        contacts: Contacts | None = None,
+        hand: int | None = None,
+        placement: pin.SE3 | None = None,
+        settings: InteractionSettings | None = None,
+    ) -> None:
+        self.sensor = sensor
+        self.contacts = contacts
+        self._hand = hand
+        placement = pin.SE3.Identity() if placement is None else placement
+        self._to_hand = placement.toDualActionMatrix()  # from the contact's frame
+        self._to_contact = placement.inverse().toDualActionMatrix()
+        self._target: tuple[Array, Array | None] | None = None
+        self._dual: DualCompliance | None = None
+        self._turned = False
+        self._settings = self.settings = settings or InteractionSettings()
+        self.state, self.reason, self.changes = Compliance.OFF, "at start", 0
+        self.start()
+
+    @property
+    def settings(self) -> InteractionSettings:
+        """Settings; the next step goes by them."""
+        return self._settings
+
+    @settings.setter
+    def settings(self, settings: InteractionSettings) -> None:
+        # What was pressed along is to be held where it is, not where a goal was meanwhile.
+        self._turned |= not np.array_equal(settings.directions, self._settings.directions)
+        self._settings = settings
+        self._rows = np.flatnonzero(settings.directions)
+        self._mask = settings.directions.astype(float)
+        self._shares = np.where(settings.directions, settings.stiffness, 1.0)
+        if settings.dual is None:
+            self._dual = None
+        elif self._dual is None:
+            self._dual = DualCompliance(settings.dual)
+        else:
+            self._dual.settings = settings.dual
+
+    def start(self) -> None:
+        """Forget the past and the target."""
+        self._target = None
+        self._goal = self._goal_rate = self.reference = np.zeros(6)
+        self._counted = np.zeros(6)  # on, at the contact of the hand, in its axes
+        self._missing = np.zeros(6)  # of that, in the QP, in the end effector's axes
+        self._enter(Compliance.OFF, "at start")
+        if self.contacts is not None:
+            self.contacts.closed[:] = False
+        if self.sensor is not None:
+            self.sensor.start()
+
+    def set_target(self, wrench: Array, rotation: Array | None = None) -> None:
+        """Exert a wrench in the directions set for it.
+
+        Args:
+            wrench: what the arm is to exert about the end effector's origin, shape (6,), N and
+                N m.
+            rotation: of the frame that its axes are those of, in the root frame; None for the
+                end effector's axes.
+        """
+        self._target = (-np.asarray(wrench, dtype=float), rotation)
+
+    @property
+    def target(self) -> Array:
+        """Wrench that the arm is to exert, as `set_target` was given it, shape (6,)."""
+        return np.zeros(6) if self._target is None else -self._target[0]
+
+    # Each step
+
+    def observe(self, robot: RobotModel, goals: Goals, elapsed: float) -> None:
+        """Go by what is measured; take the pose where the hand is for its goal when it yields.
+
+        Args:
+            robot: updated to the current state.
+            goals: of the arm.
+            elapsed: time since the last step, s.
+        """
+        if self.sensor is None:
+            return
+        sensor = self.sensor
+        sensor.update(robot.pose.rotation, elapsed)
+        active = self.state in (Compliance.FORCE, Compliance.YIELDING)
+        if sensor.silent:
+            if active:
+                # Nothing is known of what touches the hand: stop, and stay.
+                goals.hold(robot.pose)
+                self._target = None
+            wanted = self._target is not None or self._dual is not None
+            state = Compliance.SILENT if active or wanted else Compliance.OFF
+            if self.state is not Compliance.SILENT:
+                self._enter(state, "no measurement")
+            if self._dual is not None:
+                self._dual.yielding = False
+            return
+        if self._target is not None and self._rows.size:
+            self._exert(robot, goals, elapsed)
+            return
+        if self.state is Compliance.FORCE:
+            goals.hold(robot.pose)
+            self._target = None
+        if self._dual is None or goals.pose_des is None:
+            self._enter(Compliance.OFF, "no target wrench")
+        elif self._dual.update(sensor.wrench):
+            # Where the hand is is where it should be, so that nothing pulls it back.
+            goals.hold(robot.pose)
+            self._enter(Compliance.YIELDING, "wrench above the threshold")
+        else:
+            self._enter(Compliance.HOLDING, "wrench below the threshold")
+
+    def _exert(self, robot: RobotModel, goals: Goals, elapsed: float) -> None:
+        wrench, rotation = self._target
+        if rotation is not None:
+            turn = robot.pose.rotation.T @ rotation
+            wrench = np.concatenate([turn @ wrench[:3], turn @ wrench[3:]])
+        measured = self.sensor.wrench
+        if self.state is not Compliance.FORCE:
+            self._enter(Compliance.FORCE, "target wrench")
+            if goals.pose_des is None:
+                goals.hold(robot.pose)  # its damping is needed
+            self._goal = measured
+            self._missing = np.zeros(6)
+        elif self._turned:
+            goals.hold(robot.pose)
+        self._turned = False
+        before = self._goal
+        share = -math.expm1(-elapsed / self._settings.wrench_time) if elapsed > 0.0 else 0.0
+        self._goal = before + share * (wrench - before)
+        self._goal_rate = (self._goal - before) / elapsed if elapsed > 0.0 else np.zeros(6)
+        # What the QP says that limits allow is what is to be felt: III-E (b), one step late.
+        self.reference = self._goal - self._missing
+        self._count_on(measured)
+
+    def _count_on(self, measured: Array) -> None:
+        """Find how much of the goal the QP may count on at the hand, given what is measured."""
+        if self._hand is None:
+            return
+        normal = self.contacts.contacts[self._hand].normal
+        goal = self._to_contact @ self._goal
+        wanted = normal @ goal[:3]
+        most = max(normal @ (self._to_contact @ measured)[:3], 0.0) + self._settings.force_step
+        self._counted = goal * (most / wanted) if wanted > most else goal
+
+    @property
+    def stiffness(self) -> Array | None:
+        """Share of the pose task's stiffness by direction, shape (6,); None for all of it."""
+        return self._shares if self.state is Compliance.FORCE else None
+
+    def tasks(self, robot: RobotModel, gains: Gains) -> list[TaskTerm]:
+        """Return the admittance task, (27), if there is one in this state.
+
+        Args:
+            robot: updated to the current state.
+            gains: of the tasks.
+        """
+        settings = self._settings
+        weight = gains.pose_weight if settings.weight is None else settings.weight
+        if weight == 0.0 or self.state not in (Compliance.FORCE, Compliance.YIELDING):
+            return []
+        F, rate = self.sensor.wrench, self.sensor.rate
+        # Of the mean of the two tasks, see `admittance_task`.
+        damping = gains.pose_kd * gains.pose_weight / weight
+        if self.state is Compliance.YIELDING:
+            led = settings.yielding_gains.acceleration(-F, -rate, damping)
+            return [admittance_task(robot.J, robot.drift, led, weight)]
+        mask = self._mask
+        moved = settings.gains.acceleration(
+            mask * (self.reference - F), mask * (self._goal_rate - rate), damping
+        )
+        return [admittance_task(robot.J, robot.drift, moved, weight, self._rows)]
+
+    def forces(self, robot: RobotModel) -> ContactForces | None:
+        """Return what contacts may exert in this step, with their wrench tasks; None if nothing.
+
+        Args:
+            robot: updated to the current state.
+        """
+        contacts = self.contacts
+        if contacts is None:
+            return None
+        closed = contacts.closed
+        for index in range(len(closed)):
+            closed[index] = index in self._settings.closed
+        if self._hand is not None:
+            closed[self._hand] = self.state is Compliance.FORCE
+        if not closed.any():
+            return None
+        contacts.update(robot.data)
+        tasks = []
+        for index in np.flatnonzero(closed).tolist():
+            wanted = self._counted if index == self._hand else np.zeros(6)
+            tasks.append(contacts.wrench_task(index, wanted, self._settings.wrench_weight))
+        return contacts.forces(tasks)
+
+    def rehearsal(
+        self, robot: RobotModel, gains: Gains
+    ) -> tuple[list[TaskTerm], ContactForces | None]:
+        """Return tasks and forces of every kind that there may be, to compile what they need."""
+        zero, weight = np.zeros(6), max(gains.pose_weight, 1.0)
+        common = robot.J, robot.drift, zero, weight
+        self._settings.gains.acceleration(zero, zero, 1.0)
+        tasks = [admittance_task(*common), admittance_task(*common, np.arange(1))]
+        contacts = self.contacts
+        if contacts is None:
+            return tasks, None
+        contacts.update(robot.data)
+        contacts.closed[:] = True
+        wrench_tasks = [contacts.wrench_task(i, zero, 1.0) for i in range(len(contacts.closed))]
+        return tasks, contacts.forces(wrench_tasks)
+
+    def note_forces(self, rho: Array) -> None:
+        """Take note of the forces that the QP counts on, shape (r,), N."""
+        if self._hand is None or not self.contacts.closed[self._hand]:
+            return
+        missing = self._counted - self.contacts.wrench(self._hand, rho)
+        if len(self.contacts.contacts[self._hand].points) == 1:
+            missing[3:] = 0.0  # a point exerts no moment; none was asked of it
+        self._missing = self._to_hand @ missing
+
+    def _enter(self, state: Compliance, reason: str) -> None:
+        if state is not self.state:
+            self.state, self.reason = state, reason
+            self.changes += 1

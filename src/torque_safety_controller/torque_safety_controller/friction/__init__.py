@@ -1,0 +1,1 @@
+"""Joint friction: compensation and identification."""

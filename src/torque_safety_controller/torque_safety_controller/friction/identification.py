@@ -1,0 +1,222 @@
+"""Friction of each joint from a recorded motion, whatever the masses really are.
+
+What the motors gave beyond what the model asks for,
+
+    tau - rnea(q, v, a) = sign(v) (F_c + (F_s - F_c) exp(-(v / v_s)^2)) + d v + Y(q, v, a) x + b,
+
+is friction, an error x of masses, centres of mass, inertias and rotors, in which rigid-body
+dynamics are linear, and a bias b. Played backward a motion has the same Y and the opposite
+friction: where a joint passes the same positions both ways, the two cannot be taken for one
+another. So x and b are eliminated, in each joint by itself, and friction is fitted to what is
+left, by least squares with weights after Huber; v_s is searched (variable projection,
+[Golub1973]). Standard errors come from the scatter between pieces of the recording, as residuals
+next to each other are alike. `docs/friction.md` shows what comes out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from torque_safety_controller.friction.joint_recording import (
+    Blocks,
+    Recording,
+    RecordingError,
+    make_blocks,
+)
+from torque_safety_controller.friction.regression import JointRegression
+from torque_safety_controller.friction.settings import DEFAULT_STRIBECK_VELOCITY, FrictionModel
+
+Array = NDArray[np.float64]
+
+BLOCK = 0.02
+"""Duration of the blocks that are averaged over, s."""
+
+STANDING = 1e-3
+"""Below this speed, rad/s, or four times the noise, a joint may stand: the torque says little."""
+
+SURE = 3.0
+"""Standard errors that a coefficient has to be away from zero to be told."""
+
+LEAST_LEFT = 0.05
+"""Share of the friction that must not look like an error of the model."""
+
+_BEND = 0.2  # of its speed that a joint may be off steady acceleration: else it stuck or slipped
+_FEWEST = 20  # blocks in each direction
+_FEWEST_SLOW = 8  # blocks below half of v_s, without which stiction is a guess
+_BLOCKS_PER_UNKNOWN = 1.5
+_ROUNDS = 3
+_CANDIDATES = np.geomspace(1.0, 300.0, 48)  # v_s in standing speeds
+
+
+@dataclass
+class JointFit:
+    """What was found about one joint.
+
+    Attributes:
+        coulomb, static, viscous, stribeck_velocity: as in `FrictionModel`; zero where nothing
+            was found, and static friction that of motion.
+        errors: their standard errors in this order, shape (4,); NaN where nothing was found.
+        residual: standard deviation of what the fit leaves, N m.
+        blocks: how many entered.
+        speeds: least and greatest among them, rad/s.
+        notes: what could not be found, and why.
+    """
+
+    coulomb: float = 0.0
+    static: float = 0.0
+    viscous: float = 0.0
+    stribeck_velocity: float = DEFAULT_STRIBECK_VELOCITY
+    errors: Array = field(default_factory=lambda: np.full(4, np.nan))
+    residual: float = float("nan")
+    blocks: int = 0
+    speeds: tuple[float, float] = (0.0, 0.0)
+    notes: list[str] = field(default_factory=list)
+
+
+def identify(model: pin.Model, recording: Recording) -> Iterator[JointFit]:
+    """Fit one joint after the other.
+
+    Args:
+        model: nominal, n joints, rotors as armature.
+        recording: of these joints in the model's order.
+
+    Raises:
+        RecordingError: the recording has another number of joints, or is too short.
+    """
+    if recording.n != model.nv:
+        raise RecordingError(f"it has {recording.n} joints, the robot {model.nv}")
+    blocks = make_blocks(recording, BLOCK)
+    beyond, errors = model_errors(model, blocks)
+    for joint in range(model.nv):
+        yield fit_joint(blocks, joint, beyond[:, joint], errors[:, joint])
+
+
+def friction_model(fits: Sequence[JointFit]) -> FrictionModel:
+    """Return what was found as a model."""
+    names = ("coulomb", "static", "viscous", "stribeck_velocity")
+    return FrictionModel(*(np.array([getattr(fit, name) for fit in fits]) for name in names))
+
+
+def model_errors(model: pin.Model, blocks: Blocks) -> tuple[Array, Array]:
+    """Return the torque beyond the model's, and what errors of the model may have to do with it.
+
+    Returns:
+        Shape (B, n), N m, and the Y of each joint with its rotor and a bias, (B, n, 10 n + 2).
+    """
+    data = model.createData()
+    count, n = blocks.q.shape
+    beyond = np.empty((count, n))
+    errors = np.empty((count, n, 10 * n + 2))
+    for k, (q, v, a) in enumerate(zip(blocks.q, blocks.v, blocks.a, strict=True)):
+        beyond[k] = blocks.tau[k] - pin.rnea(model, data, q, v, a)
+        errors[k, :, :-2] = pin.computeJointTorqueRegressor(model, data, q, v, a)
+        errors[k, :, -2] = a
+    errors[:, :, -1] = 1.0
+    return beyond, errors
+
+
+def fit_joint(blocks: Blocks, joint: int, beyond: Array, errors: Array) -> JointFit:
+    """Return the friction of one joint.
+
+    Args:
+        blocks: of the recording.
+        joint: its number.
+        beyond: torque beyond the model's, shape (B,), N m.
+        errors: columns that errors of the model explain, shape (B, k).
+    """
+    fit = JointFit()
+    speed, noise = blocks.v[:, joint], blocks.noise[joint]
+    standing = max(STANDING, 4.0 * noise)
+    direction = np.sign(speed)
+    slowest = (blocks.samples[:, :, joint] * direction[:, None]).min(axis=1)
+    samples = blocks.samples.shape[1] + 1
+    steady = blocks.bend[:, joint] < _BEND * np.abs(speed) + 2.0 * noise * np.sqrt(samples)
+    used = (np.abs(speed) > standing) & (slowest > 0.5 * standing) & steady
+    fit.blocks = int(used.sum())
+    if fit.blocks:
+        fit.speeds = float(np.abs(speed[used]).min()), float(np.abs(speed[used]).max())
+    one_way = min(int((direction[used] == side).sum()) for side in (1.0, -1.0))
+    if one_way < _FEWEST:
+        fit.notes.append("nothing found: it did not move both ways for long enough")
+        return fit
+    data = JointRegression(
+        blocks.samples[used][:, :, joint],
+        direction[used],
+        blocks.t[used],
+        beyond[used],
+        errors[used],
+    )
+    if fit.blocks < _BLOCKS_PER_UNKNOWN * data.unknowns:
+        fit.notes.append(
+            f"nothing found: {fit.blocks} blocks of {BLOCK:g} s are too few for {data.unknowns} "
+            "unknowns"
+        )
+        return fit
+    if data.left(direction[used]) < LEAST_LEFT:
+        fit.notes.append(
+            "nothing found: from this motion friction cannot be told from errors of the model; "
+            "pass the same positions both ways"
+        )
+        return fit
+    _fill(fit, data, standing)
+    return fit
+
+
+def _fill(fit: JointFit, data: JointRegression, standing: float) -> None:
+    """Fit, and keep of it what is sure."""
+    candidates = standing * _CANDIDATES
+    candidates = candidates[candidates < max(fit.speeds[1], 2.0 * standing)]
+    kept = [0, 1, 2]
+    for _ in range(_ROUNDS):
+        v_s = _best(data, candidates, kept)
+        for _ in range(_ROUNDS):
+            data.reweight(v_s, data.solve(v_s, kept)[1])
+    names = ("Coulomb friction", "stiction beyond Coulomb friction", "viscous friction")
+    while kept:
+        v_s = _best(data, candidates, kept)
+        x = data.solve(v_s, kept)[1]
+        errors, fit.residual = data.standard_errors(v_s, x, kept)
+        # NaN and zero are not sure.
+        unsure = [k for k in kept if not x[k] > SURE * errors[k]]
+        if not unsure:
+            break
+        worst = min(unsure, key=lambda k: x[k] / errors[k] if errors[k] > 0.0 else 0.0)
+        fit.notes.append(
+            f"{names[worst]} not told: {x[worst]:.2g} with a standard error of {errors[worst]:.2g}"
+        )
+        kept.remove(worst)
+    else:
+        return
+    fit.coulomb, fit.static, fit.viscous = float(x[0]), float(x[0] + x[1]), float(x[2])
+    fit.errors = errors[[0, 4, 2, 3]]
+    if 1 in kept and data.slower(0.5 * v_s) >= _FEWEST_SLOW:
+        fit.stribeck_velocity = v_s
+    elif 1 in kept:
+        fit.notes.append(
+            f"stiction not told: the motion was hardly ever slower than {0.5 * v_s:.2g} rad/s"
+        )
+        fit.static, fit.errors[1], fit.errors[3] = fit.coulomb, fit.errors[0], np.nan
+
+
+def _best(data: JointRegression, candidates: Array, kept: Sequence[int]) -> float:
+    """Return the v_s that fits best: of the candidates, then between the best one's neighbours."""
+    if 1 not in kept:
+        return float(candidates[0])
+    costs = [data.solve(v_s, kept)[0] for v_s in candidates]
+    k = int(np.argmin(costs))
+    if k == 0:
+        return float(candidates[0])
+    low, high = np.log(candidates[k - 1]), np.log(candidates[min(k + 1, len(candidates) - 1)])
+    ratio = 0.5 * (np.sqrt(5.0) - 1.0)
+    while high - low > 1e-3:
+        left, right = high - ratio * (high - low), low + ratio * (high - low)
+        if data.solve(np.exp(left), kept)[0] < data.solve(np.exp(right), kept)[0]:
+            high = right
+        else:
+            low = left
+    return float(np.exp(0.5 * (low + high)))

@@ -1,0 +1,1 @@
+"""Integral torque feedback that cannot wind up."""

@@ -1,0 +1,1 @@
+"""The controller node: messages in, messages out."""

@@ -1,0 +1,58 @@
+"""A controller made of its parameters, and changed with them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import pinocchio as pin
+
+from torque_safety_controller.additional_torque import AdditionalTorque
+from torque_safety_controller.controller import Controller
+from torque_safety_controller.parameters.collision_parameters import load_collision
+from torque_safety_controller.parameters.controller_parameters import (
+    ControllerConfiguration,
+    load_robot,
+)
+from torque_safety_controller.parameters.interaction_parameters import make_interaction
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
+
+
+def make_controller(
+    values: Mapping[str, Any], config: ControllerConfiguration, node: Node | None = None
+) -> tuple[Controller, pin.SE3]:
+    """Return a controller, warmed up, and the placement of the base frame.
+
+    Args:
+        values: parameter values by name.
+        config: made of them by `make_configuration`.
+        node: listens for the URDF if it comes from a topic.
+
+    Raises:
+        ParameterError: something that only the URDF could tell is wrong.
+    """
+    robot, base, urdf = load_robot(values, node)
+    controller = Controller(
+        robot,
+        config.tau_max,
+        config.gains,
+        config.tau_rate_max,
+        AdditionalTorque(config.additional, config.task_rows),
+        config.qp_solver,
+        load_collision(values, config.collision, urdf, robot.model),
+        make_interaction(values, robot, urdf, config.interaction),
+    )
+    controller.warm_up()
+    return controller, base
+
+
+def configure(controller: Controller, config: ControllerConfiguration) -> None:
+    """Change what may change while the controller runs."""
+    controller.gains = config.gains
+    controller.additional.settings = config.additional
+    if controller.interaction is not None:
+        controller.interaction.settings = config.interaction
+        if controller.interaction.sensor is not None:
+            controller.interaction.sensor.settings = config.sensor

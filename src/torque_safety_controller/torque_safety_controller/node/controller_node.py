@@ -1,0 +1,327 @@
+"""The controller node: joint states, acceleration limits and goals in, joint torques out."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool
+from trajectory_msgs.msg import JointTrajectory
+
+from torque_safety_controller.controller import Step
+from torque_safety_controller.node.assembly import configure, make_controller
+from torque_safety_controller.node.collision_report import CollisionReport
+from torque_safety_controller.node.controller_report import LEVELS, StepRecord
+from torque_safety_controller.node.goals import GoalInbox
+from torque_safety_controller.node.joint_commands import JointCommands
+from torque_safety_controller.node.limits import LimitsReader
+from torque_safety_controller.node.wrenches import WrenchInbox
+from torque_safety_controller.parameters.controller_parameters import (
+    TABLE,
+    ControllerConfiguration,
+    make_configuration,
+)
+from torque_safety_controller.safety.handover import Control, Handover, HandoverRefused
+from torque_safety_controller.safety.modes import Mode, ModeKeeper
+from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, Verdict
+from viability_bounds_pkg.ros.parameters import NodeParameters, ParameterError
+from viability_bounds_pkg.ros.runtime import CONTROL_QOS, run
+
+
+class ControllerNode(Node):
+    """Answers each joint state, once its acceleration limits are there, with torques.
+
+    Subscribes to ``joint_states``, ``acceleration_limits`` and goals; publishes
+    ``joint_commands`` with the stamp of the state answered. The service ``~/enable_torque``
+    hands over between the robot's position control and torque.
+    """
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("controller_node", **node_arguments)
+        try:
+            self._node_parameters = NodeParameters(
+                self, TABLE, make_configuration, self._configure
+            )
+            values, config = self._node_parameters.values, self._node_parameters.configuration
+            self._controller, base = make_controller(values, config, self)
+        except ParameterError:
+            self.destroy_node()
+            raise
+        self._config = config
+        self._handover = Handover(
+            config.start_control, config.joints, config.q_min, config.q_max, config.tau_max
+        )
+        self._states = JointStateReader(config.joints, config.state_timeout)
+        self._limits = LimitsReader(config.joints)
+        self._goals = GoalInbox(self, self._controller, config, base)
+        self._wrenches = WrenchInbox(self, self._controller.interaction, self._goals, config, base)
+        self._modes = ModeKeeper()
+        self._goal_at = time.monotonic()
+        self._message_at = self._state_at = self._waiting_since = -np.inf
+        self._message_stamp = None
+        self._answered_stamp = -1
+        self._bounds_lost = False
+        self._record = StepRecord(len(config.joints))
+        self._collision = CollisionReport(self.get_logger(), self._controller.collision)
+
+        self._commands = JointCommands(self, config.joints, config.ros2_control_topic)
+        self.create_subscription(JointState, "joint_states", self._on_state, CONTROL_QOS)
+        self.create_subscription(
+            JointTrajectory, "acceleration_limits", self._on_limits, CONTROL_QOS
+        )
+        self.create_service(SetBool, "~/enable_torque", self._on_enable_torque)
+        # Watchdogs must bark when time itself, as the clock topic tells it, stands still.
+        self._watchdog = self.create_timer(
+            min(config.bounds_timeout, config.state_timeout) / 4,
+            self._watch,
+            clock=Clock(clock_type=ClockType.STEADY_TIME),
+        )
+        self._diagnostics = Diagnostics(self, self._report)
+
+    def _configure(self, config: ControllerConfiguration) -> None:
+        self._config = config
+        configure(self._controller, config)
+
+    # Streams
+
+    def _on_state(self, message: JointState) -> None:
+        now = time.monotonic()
+        self._message_at, self._message_stamp = now, message.header.stamp
+        last = self._states.stamp
+        verdict = self._states.read(message, now)
+        if verdict is Verdict.REFUSED:
+            return
+        silent = now - self._state_at > self._config.state_timeout
+        self._state_at = now
+        if silent or (verdict is Verdict.NEW and self._states.stamp <= last):
+            self._begin(verdict)
+        elif verdict is Verdict.REPEAT:
+            if self._answered_stamp == last:
+                self._commands.again(message.header.stamp)
+            return
+        elif self._answered_stamp == last:
+            self._waiting_since = now
+        if self._handover.control is Control.POSITION:
+            self._hold_position(message.header.stamp)
+        elif self._limits.stamp == self._states.stamp:
+            self._track(message.header.stamp)
+        elif self._bounds_lost:
+            self._hold(message.header.stamp)
+
+    def _begin(self, verdict: Verdict) -> None:
+        """Forget the past: the robot was silent, or started over."""
+        if verdict is Verdict.NEW and self._limits.stamp == self._answered_stamp:
+            self._limits.stamp = -1  # of another run, in which stamps may have been the same
+        self._answered_stamp = -1
+        self._waiting_since = self._state_at
+        self._controller.start(self._states.q)
+        self._handover.robot_was_away()
+
+    def _on_limits(self, message: JointTrajectory) -> None:
+        if not self._limits.read(message):
+            return
+        if self._limits.stamp == self._states.stamp != self._answered_stamp:
+            self._track(message.header.stamp)
+        elif self._limits.stamp == self._states.stamp:
+            # They are alive again, but this state was answered in HOLD already.
+            self._bounds_lost = False
+
+    def _track(self, stamp: Any) -> None:
+        """Answer the newest state, whose acceleration limits are there."""
+        self._bounds_lost = False
+        if self._handover.by_drives:
+            self._hold_position(stamp)
+            if self._handover.control is Control.TAKING_OVER:
+                self._take_over()
+            return
+        if self._goals.apply_due(self._states.stamp):
+            self._goal_at = time.monotonic()
+        states, limits = self._states, self._limits
+        now = states.q, states.v, limits.lower, limits.upper
+        if self._goal_lost() or self._handover.control is Control.GIVING_BACK:
+            step = self._controller.rest(*now, self._elapsed())
+        else:
+            step = self._controller.step(*now, self._elapsed())
+        self._answer(step, stamp)
+
+    def _elapsed(self) -> float | None:
+        """Return the time since the state answered last, s; None if there is none."""
+        if self._answered_stamp < 0:
+            return None
+        return 1e-9 * (self._states.stamp - self._answered_stamp)
+
+    def _goal_lost(self) -> bool:
+        timeout = self._config.goal_timeout
+        return timeout > 0.0 and time.monotonic() - self._goal_at > timeout
+
+    def _answer(self, step: Step, stamp: Any) -> None:
+        """Publish the torques of `step` for the state with `stamp`."""
+        now = time.monotonic()
+        elapsed = self._elapsed() or 0.0
+        self._commands.torque(step.tau, stamp)
+        self._answered_stamp = self._states.stamp
+        self._record.note(step, now - self._message_at)
+        self._wrenches.note()
+        self._collision.note(step)
+        if step.tracking:
+            self._enter(Mode.TRACKING, "goal")
+        else:
+            self._enter(Mode.HOLD, self._why_hold(step))
+        if self._handover.control is Control.GIVING_BACK:
+            self._handover.slow_down(self._states.q, self._states.v, elapsed)
+
+    def _why_hold(self, step: Step) -> str:
+        if step.failure:
+            return f"solver failed: {step.failure}"
+        if self._bounds_lost:
+            return "acceleration limits are stale"
+        if self._handover.control is Control.GIVING_BACK:
+            return "on the way to position control"
+        return "goal lost" if self._goal_lost() else "no goal"
+
+    def _hold(self, stamp: Any) -> None:
+        """Answer the newest state without acceleration limits."""
+        states = self._states
+        self._answer(self._controller.hold(states.q, states.v, self._elapsed()), stamp)
+
+    # Position control
+
+    def _hold_position(self, stamp: Any) -> None:
+        """Answer the newest state with the position that the drives hold."""
+        self._commands.position(self._handover.hold(self._states.q), stamp)
+        self._answered_stamp = self._states.stamp
+        self._enter(Mode.POSITION, self._handover.reason)
+
+    def _take_over(self) -> None:
+        """Prepare to go on with torque from the next state; this one is still the drives'."""
+        states, limits = self._states, self._limits
+        if self._goals.apply_due(states.stamp):
+            self.get_logger().warning("goals from before the handover are dropped")
+        try:
+            tau = self._handover.check(states.q, states.effort())
+        except HandoverRefused as error:
+            self._fail_handover(str(error))
+            return
+        step = self._controller.take_over(states.q, states.v, limits.lower, limits.upper, tau)
+        if step.failure:
+            self._fail_handover(f"solver failed: {step.failure}")
+            return
+        self._goal_at = time.monotonic()
+        self._handover.taken_over()
+
+    def _fail_handover(self, reason: str) -> None:
+        self._handover.failed(reason)
+        self.get_logger().error(self._handover.reason)
+        self._enter(Mode.POSITION, self._handover.reason)
+
+    def _on_enable_torque(
+        self, request: SetBool.Request, response: SetBool.Response
+    ) -> SetBool.Response:
+        states, silence = self._states, time.monotonic() - self._state_at
+        config = self._config
+        try:
+            if request.data:
+                fresh = silence < config.bounds_timeout
+                follow = self._limits_follow(states.stamp)
+                self._handover.to_torque(states.q, states.effort(), fresh, follow)
+                self._bounds_lost = False
+                response.message = "torque control begins with the next state"
+            else:
+                self._handover.to_position(states.q, states.v, silence < config.state_timeout)
+                response.message = "position control begins when the arm is at rest"
+            response.success = True
+        except HandoverRefused as error:
+            response.message = str(error)
+            self.get_logger().warning(f"enable_torque refused: {error}")
+        return response
+
+    def _limits_follow(self, stamp: int) -> bool:
+        """Return whether acceleration limits keep up with the state with this stamp, ns."""
+        apart = 1e-9 * abs(stamp - self._limits.stamp)  # those of another run may lie ahead
+        return self._limits.stamp >= 0 and apart <= self._config.bounds_timeout
+
+    # Watchdogs
+
+    def _watch(self) -> None:
+        now = time.monotonic()
+        config = self._config
+        if now - self._state_at > config.state_timeout:
+            if self._modes.mode is not Mode.STOPPED:
+                quiet = now - self._message_at > config.state_timeout
+                self._enter(Mode.STOPPED, "no joint state" if quiet else self._why_refused())
+            return
+        waiting = self._states.stamp != self._answered_stamp
+        if waiting and now - self._waiting_since > config.bounds_timeout:
+            self._bounds_lost = True
+            if self._handover.control is Control.TAKING_OVER:
+                self._fail_handover("acceleration limits are stale")
+            if self._handover.by_drives:
+                self._hold_position(self._message_stamp)
+            else:
+                self._hold(self._message_stamp)
+        elif (
+            now - self._state_at > config.bounds_timeout
+            and now - self._message_at < config.bounds_timeout
+        ):
+            # States come but cannot be used: keep gravity off the arm until STOPPED.
+            if self._handover.by_drives:
+                self._hold_position(self._message_stamp)
+                return
+            step = self._controller.hold(self._states.q, np.zeros_like(self._states.v), 0.0)
+            self._commands.torque(step.tau, self._message_stamp)
+            self._enter(Mode.HOLD, self._why_refused())
+
+    def _why_refused(self) -> str:
+        return "joint states are refused: " + ", ".join(self._states.refused)
+
+    def _enter(self, mode: Mode, reason: str) -> None:
+        if not self._modes.set(mode, reason):
+            return
+        text = f"{mode.value}: {reason}"
+        # One call site per severity: rclpy ties the two together.
+        if mode in (Mode.TRACKING, Mode.POSITION):
+            self.get_logger().info(text)
+        else:
+            self.get_logger().warning(text)
+        self._diagnostics.publish()
+
+    # Diagnostics
+
+    def _report(self) -> tuple[bytes, str, dict[str, Any]]:
+        values = self._record.values(
+            self._config.joints, self._controller, self._limits.lower, self._limits.upper
+        )
+        values |= (
+            self._collision.values()
+            | self._wrenches.values()
+            | {
+                "mode": self._modes.mode.value,
+                "reason": self._modes.reason,
+                "mode_changes": self._modes.changes,
+                "control": self._handover.control.value,
+                "integral_action": self._config.additional.mode,
+                "goals_pending": len(self._goals),
+                "goals_refused": self._goals.refused,
+                "states_refused": self._states.refused,
+                "limits_refused": self._limits.refused,
+            }
+        )
+        level, text = LEVELS[self._modes.mode], f"{self._modes.mode.value}: {self._modes.reason}"
+        for trouble in filter(None, (self._collision.too_near, self._wrenches.trouble)):
+            level, text = max(level, DiagnosticStatus.WARN), f"{text}; {trouble}"
+        return level, text, values
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the controller node until it is told to stop."""
+    return run(ControllerNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

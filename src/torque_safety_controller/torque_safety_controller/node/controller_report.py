@@ -1,0 +1,91 @@
+"""What the controller node says of itself in /diagnostics."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+
+from torque_safety_controller.controller import Controller, Step
+from torque_safety_controller.safety.modes import Mode
+
+LEVELS = {
+    Mode.TRACKING: DiagnosticStatus.OK,
+    Mode.POSITION: DiagnosticStatus.OK,
+    Mode.HOLD: DiagnosticStatus.WARN,
+    Mode.STOPPED: DiagnosticStatus.ERROR,
+}
+
+_LATENCIES_KEPT = 4096
+_SLIGHT = 1e-3  # rad/s^2; by less than this bounds give way beside distances that do
+
+
+class StepRecord:
+    """Counts steps and keeps what was noteworthy about them.
+
+    Args:
+        n: number of joints.
+    """
+
+    def __init__(self, n: int) -> None:
+        self._steps = self._relaxed_steps = self._failures = 0
+        self._latencies: deque[float] = deque(maxlen=_LATENCIES_KEPT)
+        self._last_relaxation = np.zeros(n)
+
+    def note(self, step: Step, latency: float) -> None:
+        """Count a step that was answered `latency` seconds after its state came."""
+        self._latencies.append(latency)
+        self._steps += 1
+        if step.failure:
+            self._failures += 1
+        if step.relaxation is not None and step.relaxation.max() > _SLIGHT:
+            self._relaxed_steps += 1
+            self._last_relaxation = step.relaxation
+
+    def values(
+        self,
+        joints: tuple[str, ...],
+        controller: Controller,
+        a_lower: np.ndarray,
+        a_upper: np.ndarray,
+    ) -> dict[str, Any]:
+        """Return what to report.
+
+        Args:
+            joints: names of the n joints.
+            controller: which they are controlled by.
+            a_lower: acceleration limits of the last step, shape (n,), rad/s^2.
+            a_upper: shape (n,), rad/s^2.
+        """
+        latencies = np.array(self._latencies) if self._latencies else np.full(1, np.nan)
+        median, slow = np.percentile(latencies, (50, 99)) * 1e6
+        a = controller.acceleration
+        near = 1e-3 * (a_upper - a_lower) + 1e-6
+        at_limit = (a <= a_lower + near) | (a >= a_upper - near)
+        values = {
+            "steps": self._steps,
+            "position_error_m": float(np.linalg.norm(controller.goals.error[:3])),
+            "orientation_error_rad": float(np.linalg.norm(controller.goals.error[3:])),
+            "qp_iterations": controller.iterations,
+            "qp_failures": self._failures,
+            "bounds_relaxed_steps": self._relaxed_steps,
+            "bounds_last_relaxation_rad_s2": self._last_relaxation,
+            "joints_at_acceleration_limit": _named(joints, at_limit),
+            "latency_p50_us": float(median),
+            "latency_p99_us": float(slow),
+        }
+        if controller.additional is not None:
+            values |= {
+                "additional_torque_nm": controller.additional.last,
+                "friction_torque_nm": controller.additional.friction.last,
+                "joints_at_integral_budget": _named(joints, controller.additional.saturated),
+                "integral_skipped_steps": controller.additional.skipped,
+            }
+        return values
+
+
+def _named(joints: tuple[str, ...], flags: np.ndarray) -> str:
+    """Return the names of the joints that are flagged."""
+    return ", ".join(name for name, flag in zip(joints, flags, strict=True) if flag) or "none"

@@ -1,0 +1,235 @@
+"""Goals from messages: checked, and kept until their time has come."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pinocchio as pin
+from geometry_msgs.msg import Point, PoseStamped, Quaternion, Vector3, WrenchStamped
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import MultiDOFJointTrajectory
+
+from torque_safety_controller.controller import Controller
+from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
+from torque_safety_controller.tasks.pose_trajectory import (
+    PoseTrajectory,
+    TrajectoryError,
+    TrajectoryPoint,
+)
+from viability_bounds_pkg.ros.runtime import GOAL_QOS, stamp_to_ns
+
+_QUATERNION_TOLERANCE = 1e-3
+
+
+class GoalRefused(ValueError):
+    """A goal message that cannot be followed."""
+
+
+def pose_from_message(message: PoseStamped, base_frame: str) -> pin.SE3:
+    """Return the placement that a message asks for, in the base frame.
+
+    Raises:
+        GoalRefused: another frame, a number that is not finite, a quaternion that is not unit.
+    """
+    _check_frame(message, base_frame)
+    return _placement(message.pose.position, message.pose.orientation)
+
+
+def trajectory_from_message(
+    message: MultiDOFJointTrajectory, base_frame: str, end_effector_frame: str, base: pin.SE3
+) -> PoseTrajectory:
+    """Return the trajectory that a message asks of the end effector.
+
+    Args:
+        message: each point has one transform, and one velocity and one acceleration or none,
+            which are then zero; all in the base frame.
+        base_frame: what the message's ``frame_id`` may be, if it is not empty.
+        end_effector_frame: what its only joint name may be, if there is one.
+        base: placement of the base frame in the URDF's root frame, in which the result is.
+
+    Raises:
+        GoalRefused: frames, sizes or numbers that cannot be followed.
+    """
+    _check_frame(message, base_frame)
+    if list(message.joint_names) not in ([], [end_effector_frame]):
+        raise GoalRefused(
+            f"joint_names is {list(message.joint_names)}; allowed: '{end_effector_frame}' or none"
+        )
+    R = base.rotation
+    points = []
+    for k, point in enumerate(message.points):
+        sizes = len(point.transforms), len(point.velocities), len(point.accelerations)
+        if sizes[0] != 1 or max(sizes) > 1:
+            raise GoalRefused(f"points[{k}] must have one transform, velocity and acceleration")
+        transform = point.transforms[0]
+        rates = [np.zeros(6), np.zeros(6)]
+        for rate, given in zip(rates, (point.velocities, point.accelerations), strict=True):
+            for twist in given:
+                rate[:3] = R @ _vector(twist.linear)
+                rate[3:] = R @ _vector(twist.angular)
+        pose = base * _placement(transform.translation, transform.rotation)
+        time = point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec
+        points.append(TrajectoryPoint(time, pose, *rates))
+    try:
+        return PoseTrajectory(points)
+    except TrajectoryError as error:
+        raise GoalRefused(str(error)) from error
+
+
+def _check_frame(message: PoseStamped | MultiDOFJointTrajectory, base_frame: str) -> None:
+    frame = message.header.frame_id
+    if frame not in ("", base_frame):
+        raise GoalRefused(f"frame_id is '{frame}'; allowed: '{base_frame}' or empty")
+
+
+def _vector(message: Vector3) -> np.ndarray:
+    return np.array([message.x, message.y, message.z])
+
+
+def _placement(p: Point | Vector3, o: Quaternion) -> pin.SE3:
+    values = (p.x, p.y, p.z, o.x, o.y, o.z, o.w)
+    if not all(map(math.isfinite, values)):
+        raise GoalRefused("pose is not finite")
+    norm = math.hypot(o.x, o.y, o.z, o.w)
+    if abs(norm - 1.0) > _QUATERNION_TOLERANCE:
+        raise GoalRefused(f"orientation has norm {norm:.4g}; allowed: 1 within 0.001")
+    quaternion = pin.Quaternion(o.w / norm, o.x / norm, o.y / norm, o.z / norm)
+    return pin.SE3(quaternion.toRotationMatrix(), np.array([p.x, p.y, p.z]))
+
+
+def posture_from_message(
+    message: JointState, joints: Sequence[str], q_min: np.ndarray, q_max: np.ndarray
+) -> np.ndarray:
+    """Return the positions that a message asks for, shape (n,), rad, matched by name.
+
+    Raises:
+        GoalRefused: a joint is missing, a number is not finite or outside the limits.
+    """
+    if len(message.name) != len(message.position):
+        raise GoalRefused(f"{len(message.name)} names but {len(message.position)} positions")
+    where = dict(zip(message.name, message.position, strict=True))
+    missing = [joint for joint in joints if joint not in where]
+    if missing:
+        raise GoalRefused(f"no position for {', '.join(missing)}")
+    q_des = np.array([where[joint] for joint in joints])
+    for joint, value, low, high in zip(joints, q_des, q_min, q_max, strict=True):
+        if not (math.isfinite(value) and low <= value <= high):
+            raise GoalRefused(f"{joint} is {value:g} rad; allowed: {low:g} to {high:g}")
+    return q_des
+
+
+class GoalQueue:
+    """Goals whose stamps lie ahead of the robot's time, until they are due.
+
+    A stamp of zero, or one that has passed, takes effect with the next control step; one ahead
+    takes effect with the first state at or after it, which makes a plan of goals repeatable.
+    """
+
+    def __init__(self) -> None:
+        self._pending: list[tuple[int, Callable[[], None]]] = []
+        self.refused: Counter[str] = Counter()
+
+    def __len__(self) -> int:
+        return len(self._pending)
+
+    def add(
+        self,
+        message: PoseStamped | JointState | MultiDOFJointTrajectory | WrenchStamped,
+        apply: Callable[[], None],
+    ) -> None:
+        """Call `apply` when the time in the header of `message` has come."""
+        self._pending.append((stamp_to_ns(message.header.stamp), apply))
+        self._pending.sort(key=lambda entry: entry[0])
+
+    def apply_due(self, stamp: int) -> bool:
+        """Apply the goals that are due at `stamp`, ns; return whether there were any."""
+        due = False
+        while self._pending and self._pending[0][0] <= stamp:
+            self._pending.pop(0)[1]()
+            due = True
+        return due
+
+
+class GoalInbox(GoalQueue):
+    """Takes goals for `controller` from ``target_pose``, ``_posture`` and ``_trajectory``.
+
+    Args:
+        node: listens and logs what is refused.
+        controller: is given the goals when they are due.
+        config: has the names and limits that they are checked by.
+        base: placement of the base frame in the URDF's root frame.
+    """
+
+    def __init__(
+        self, node: Node, controller: Controller, config: ControllerConfiguration, base: pin.SE3
+    ) -> None:
+        super().__init__()
+        self._controller, self._config, self._base = controller, config, base
+        self._logger = node.get_logger()
+        node.create_subscription(PoseStamped, "target_pose", self._on_pose, GOAL_QOS)
+        node.create_subscription(JointState, "target_posture", self._on_posture, GOAL_QOS)
+        node.create_subscription(
+            MultiDOFJointTrajectory, "target_trajectory", self._on_trajectory, GOAL_QOS
+        )
+        self._trajectory: PoseTrajectory | None = None
+        self._begin = 0
+        self._taken = controller.goals.taken
+
+    def apply_due(self, stamp: int) -> bool:
+        """Apply the goals that are due at `stamp`, ns, and go on with a trajectory.
+
+        A trajectory ends where the arm has taken the pose where it was for its goal.
+        """
+        if self._taken != self._controller.goals.taken:
+            self._taken, self._trajectory = self._controller.goals.taken, None
+        due = super().apply_due(stamp)
+        if self._trajectory is None:
+            return due
+        self._begin = self._begin or stamp
+        t = 1e-9 * (stamp - self._begin)
+        self._controller.set_pose_goal(*self._trajectory.sample(t))
+        if t >= self._trajectory.duration:
+            self._trajectory = None
+        return True
+
+    def _on_pose(self, message: PoseStamped) -> None:
+        try:
+            pose = pose_from_message(message, self._config.base_frame)
+        except GoalRefused as error:
+            return self.refuse("target_pose", error)
+        self.add(message, lambda: self._rest_at(self._base * pose))
+
+    def _rest_at(self, pose: pin.SE3) -> None:
+        self._trajectory = None
+        self._controller.set_pose_goal(pose)
+
+    def _on_trajectory(self, message: MultiDOFJointTrajectory) -> None:
+        config = self._config
+        try:
+            trajectory = trajectory_from_message(
+                message, config.base_frame, config.end_effector_frame, self._base
+            )
+        except GoalRefused as error:
+            return self.refuse("target_trajectory", error)
+        self.add(message, lambda: self._follow(trajectory, stamp_to_ns(message.header.stamp)))
+
+    def _follow(self, trajectory: PoseTrajectory, begin: int) -> None:
+        """Follow a trajectory from the time `begin` on, ns; 0 for the next control step."""
+        self._trajectory, self._begin = trajectory, begin
+
+    def _on_posture(self, message: JointState) -> None:
+        config = self._config
+        try:
+            q_des = posture_from_message(message, config.joints, config.q_min, config.q_max)
+        except GoalRefused as error:
+            return self.refuse("target_posture", error)
+        self.add(message, lambda: self._controller.set_posture_goal(q_des))
+
+    def refuse(self, topic: str, error: GoalRefused) -> None:
+        """Count and log a goal that cannot be followed."""
+        self.refused[topic] += 1
+        self._logger.warning(f"{topic} refused: {error}")

@@ -1,0 +1,56 @@
+"""What the controller node tells the robot: torques, or positions for the robot's own drives."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+from viability_bounds_pkg.ros.runtime import CONTROL_QOS
+
+
+class JointCommands:
+    """Publishes ``joint_commands``, and torques where ros2_control listens too.
+
+    Args:
+        node: the publishing node.
+        joints: names of the n joints.
+        ros2_control_topic: of the torques in `joints` order; empty for none.
+    """
+
+    def __init__(self, node: Node, joints: Sequence[str], ros2_control_topic: str) -> None:
+        self._torques = JointState(name=list(joints))
+        self._positions = JointState(
+            name=list(joints), velocity=array("d", np.zeros(len(joints)).tobytes())
+        )
+        self._last = self._torques
+        self._publisher = node.create_publisher(JointState, "joint_commands", CONTROL_QOS)
+        self._efforts = None
+        if ros2_control_topic:
+            self._efforts = node.create_publisher(
+                Float64MultiArray, ros2_control_topic, CONTROL_QOS
+            )
+
+    def torque(self, tau: np.ndarray, stamp: Any) -> None:
+        """Send torques, shape (n,), N m, for the state with `stamp`."""
+        self._torques.effort = array("d", tau.tobytes())
+        self._last = self._torques
+        self.again(stamp)
+
+    def position(self, q: np.ndarray, stamp: Any) -> None:
+        """Have the drives hold positions, shape (n,), rad, from the state with `stamp` on."""
+        self._positions.position = array("d", q.tobytes())
+        self._last = self._positions
+        self.again(stamp)
+
+    def again(self, stamp: Any) -> None:
+        """Send what was sent last, torques or positions: the robot asks once more."""
+        self._last.header.stamp = stamp
+        self._publisher.publish(self._last)
+        if self._efforts is not None and self._last is self._torques:
+            self._efforts.publish(Float64MultiArray(data=self._torques.effort))

@@ -1,0 +1,56 @@
+"""Acceleration limits from messages: names matched, sizes, values and order checked."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+from trajectory_msgs.msg import JointTrajectory
+
+from viability_bounds_pkg.kernel.array_checks import both_finite, in_order
+from viability_bounds_pkg.ros.runtime import stamp_to_ns
+
+
+class LimitsReader:
+    """Reads ``acceleration_limits`` into arrays in the order of `joints`.
+
+    Attributes:
+        lower, upper: of the last accepted message, shape (n,), rad/s^2.
+        stamp: of the state that they belong to, ns.
+        refused: how many messages were dropped, by reason.
+    """
+
+    def __init__(self, joints: Sequence[str]) -> None:
+        self.lower = np.zeros(len(joints))
+        self.upper = np.zeros(len(joints))
+        self.stamp = -1
+        self.refused: Counter[str] = Counter()
+        self._joints = list(joints)
+        in_order(self.lower, self.upper)  # compiled now, not when the first message comes
+
+    def read(self, message: JointTrajectory) -> bool:
+        """Take a message; return whether it was accepted."""
+        if len(message.points) != 2:
+            return self._refuse("wrong number of points")
+        first, second = message.points
+        lower, upper = np.array(first.accelerations), np.array(second.accelerations)
+        if not len(lower) == len(upper) == len(message.joint_names):
+            return self._refuse("wrong size")
+        if message.joint_names != self._joints:
+            where = {name: i for i, name in enumerate(message.joint_names)}
+            if any(joint not in where for joint in self._joints):
+                return self._refuse("missing joint")
+            index = [where[joint] for joint in self._joints]
+            lower, upper = lower[index], upper[index]
+        if not both_finite(lower, upper):
+            return self._refuse("not finite")
+        if not in_order(lower, upper):
+            return self._refuse("lower above upper")
+        self.lower, self.upper = lower, upper
+        self.stamp = stamp_to_ns(message.header.stamp)
+        return True
+
+    def _refuse(self, reason: str) -> bool:
+        self.refused[reason] += 1
+        return False

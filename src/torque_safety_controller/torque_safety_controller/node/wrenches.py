@@ -1,0 +1,153 @@
+"""Wrenches from messages: measured ones, and those that the arm is to exert."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from geometry_msgs.msg import WrenchStamped
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+from torque_safety_controller.contact.interaction import Compliance, Interaction
+from torque_safety_controller.contact.wrench_sensor import WrenchError
+from torque_safety_controller.node.goals import GoalInbox, GoalRefused
+from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
+from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS
+
+
+def wrench_of(message: WrenchStamped) -> np.ndarray:
+    """Return the numbers of a message, shape (6,), N and N m."""
+    force, torque = message.wrench.force, message.wrench.torque
+    return np.array([force.x, force.y, force.z, torque.x, torque.y, torque.z])
+
+
+class WrenchInbox:
+    """Takes ``ft_wrench`` and ``target_wrench``; serves ``~/tare_ft_sensor``.
+
+    Args:
+        node: listens and logs what is refused.
+        interaction: is given what comes; None for an arm that handles no forces.
+        goals: keeps targets until they are due.
+        config: names the frames.
+        base: placement of the base frame in the URDF's root frame.
+
+    Attributes:
+        refused: measurements that could not be used, by reason.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        interaction: Interaction | None,
+        goals: GoalInbox,
+        config: ControllerConfiguration,
+        base: pin.SE3,
+    ) -> None:
+        self._interaction, self._goals, self._config = interaction, goals, config
+        self._base = base
+        self._logger = node.get_logger()
+        self.refused: Counter[str] = Counter()
+        self._changes = 0
+        node.create_subscription(WrenchStamped, "target_wrench", self._on_target, GOAL_QOS)
+        if interaction is None or interaction.sensor is None:
+            return
+        node.create_subscription(WrenchStamped, "ft_wrench", self._on_measured, CONTROL_QOS)
+        node.create_service(Trigger, "~/tare_ft_sensor", self._on_tare)
+
+    def _on_measured(self, message: WrenchStamped) -> None:
+        frame, wanted = message.header.frame_id, self._config.ft_frame
+        try:
+            if frame not in ("", wanted):
+                raise WrenchError(f"frame_id is '{frame}'; allowed: '{wanted}' or empty")
+            self._interaction.sensor.receive(wrench_of(message))
+        except WrenchError as error:
+            reason = str(error)
+            self.refused[reason] += 1
+            if self.refused[reason] == 1:
+                self._logger.warning(f"ft_wrench refused: {reason}")
+
+    def _on_target(self, message: WrenchStamped) -> None:
+        config = self._config
+        try:
+            if self._interaction is None or self._interaction.sensor is None:
+                raise GoalRefused("there is no force/torque sensor, 'ft_frame'")
+            wrench = wrench_of(message)
+            if not np.isfinite(wrench).all():
+                raise GoalRefused("wrench is not finite")
+            frame = message.header.frame_id
+            allowed = ("", config.end_effector_frame, config.base_frame)
+            if frame not in allowed:
+                raise GoalRefused(f"frame_id is '{frame}'; allowed: {allowed[1:]} or empty")
+        except GoalRefused as error:
+            self._goals.refuse("target_wrench", error)
+            return
+        rotation = self._base.rotation if frame == config.base_frame else None
+        self._goals.add(message, lambda: self._apply(wrench, rotation))
+
+    def _apply(self, wrench: np.ndarray, rotation: np.ndarray | None) -> None:
+        if not self._interaction.settings.directions.any():
+            error = GoalRefused("no direction of 'force_directions' is set")
+            self._goals.refuse("target_wrench", error)
+            return
+        self._interaction.set_target(wrench, rotation)
+
+    def _on_tare(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        interaction = self._interaction
+        if interaction.state in (Compliance.FORCE, Compliance.YIELDING):
+            response.message = "refused: the hand is in contact"
+            return response
+        try:
+            bias = interaction.sensor.tare()
+        except WrenchError as error:
+            response.message = f"refused: {error}"
+            return response
+        response.success = True
+        response.message = f"bias: {np.array2string(bias, precision=3)}"
+        return response
+
+    def note(self) -> None:
+        """Log what has changed of what is done about forces."""
+        interaction = self._interaction
+        if interaction is None or interaction.changes == self._changes:
+            return
+        self._changes = interaction.changes
+        text = f"compliance: {interaction.state.value} ({interaction.reason})"
+        # One call site per severity: rclpy ties the two together.
+        if interaction.state is Compliance.SILENT:
+            self._logger.warning(text)
+        else:
+            self._logger.info(text)
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong at present, or empty."""
+        interaction = self._interaction
+        if interaction is None or interaction.state is not Compliance.SILENT:
+            return ""
+        return "the force/torque sensor is silent"
+
+    def values(self) -> dict[str, Any]:
+        """Return what to report in /diagnostics."""
+        interaction = self._interaction
+        if interaction is None:
+            return {"compliance": Compliance.OFF.value}
+        values: dict[str, Any] = {
+            "compliance": interaction.state.value,
+            "compliance_reason": interaction.reason,
+            "compliance_changes": interaction.changes,
+        }
+        if interaction.sensor is not None:
+            values |= {
+                "hand_wrench": interaction.sensor.wrench,
+                "target_wrench": interaction.target,
+                "ft_bias": interaction.sensor.bias,
+                "wrenches_refused": self.refused,
+            }
+        if interaction.contacts is not None:
+            closed = zip(interaction.contacts.contacts, interaction.contacts.closed, strict=True)
+            names = [contact.frame for contact, flag in closed if flag]
+            values["contacts_closed"] = ", ".join(names) or "none"
+        return values

@@ -1,0 +1,1 @@
+"""Null-space compliance: stiff in a task, free in its null space."""

@@ -1,0 +1,1 @@
+"""The controller node's parameters, checked and made into settings."""

@@ -1,0 +1,115 @@
+"""Parameters of the friction compensation: the table, and the settings made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from torque_safety_controller.friction.settings import (
+    DEFAULT_STRIBECK_VELOCITY,
+    FrictionModel,
+    FrictionSettings,
+    FrictionSettingsError,
+)
+from viability_bounds_pkg.ros.parameters import Parameter, ParameterError, per_joint
+
+BUDGET = 0.2
+"""Default budget in torque limits."""
+
+MODEL = {
+    "coulomb": "dry friction of moving joints, N m",
+    "static": "dry friction of joints at rest, N m; that of moving ones if empty",
+    "viscous": "friction that grows with speed, N m s/rad; none if empty",
+    "stribeck_velocity": "speed at which static has become Coulomb friction but for 1/e of the "
+    f"difference, rad/s; {DEFAULT_STRIBECK_VELOCITY:g} if empty",
+}
+"""What the controller believes of each joint's friction; `identify_friction` finds it."""
+
+TABLE = (
+    Parameter(
+        "friction_compensation",
+        float,
+        "share of the friction model that is compensated, 0 (off) to 1",
+        default=0.0,
+        live=True,
+    ),
+    *(
+        Parameter(f"friction_model_{name}", list[float], text, default=np.zeros(0), live=True)
+        for name, text in MODEL.items()
+    ),
+    Parameter(
+        "friction_budget",
+        list[float],
+        f"most that is compensated, N m; {BUDGET:g} of torque_max if empty",
+        default=np.zeros(0),
+        live=True,
+    ),
+    Parameter(
+        "friction_theta",
+        float,
+        "rate at which the reference velocity returns to the measured one, 1/s",
+        default=3.0,
+        live=True,
+    ),
+    Parameter(
+        "friction_gain",
+        float,
+        "gain of the reference velocity, 1/s; -1: what the control rate allows",
+        default=-1.0,
+        live=True,
+    ),
+)
+
+_PARAMETER_OF = {"scale": "friction_compensation", "theta": "friction_theta"}
+
+
+def friction_settings(
+    values: Mapping[str, Any], joints: Sequence[str], tau_max: np.ndarray
+) -> FrictionSettings:
+    """Return the settings of the friction compensation.
+
+    Args:
+        values: parameter values by name.
+        joints: names of the n joints.
+        tau_max: torque limits, shape (n,), N m.
+
+    Raises:
+        ParameterError: a value cannot be used.
+    """
+    n = len(joints)
+    scale = values["friction_compensation"]
+    defaults = {
+        "coulomb": np.zeros(n),
+        "viscous": np.zeros(n),
+        "stribeck_velocity": np.full(n, DEFAULT_STRIBECK_VELOCITY),
+    }
+    given = {name: values[f"friction_model_{name}"] for name in MODEL}
+    if scale > 0.0 and not any(len(given[name]) for name in ("coulomb", "static", "viscous")):
+        allowed = "0 as long as no friction_model_coulomb, _static or _viscous is given"
+        raise ParameterError("friction_compensation", scale, allowed)
+    found = {
+        name: per_joint(values, f"friction_model_{name}", joints)
+        if len(value)
+        else defaults.get(name)
+        for name, value in given.items()
+    }
+    if found["static"] is None:
+        found["static"] = found["coulomb"]
+    budget = BUDGET * tau_max
+    if len(values["friction_budget"]):
+        budget = per_joint(values, "friction_budget", joints)
+        if (budget > tau_max).any():
+            raise ParameterError("friction_budget", budget, "at most torque_max")
+    try:
+        model = FrictionModel(**found)
+    except FrictionSettingsError as error:
+        name = f"friction_model_{error.name}"
+        raise ParameterError(name, error.value, error.allowed) from error
+    try:
+        gain = None if values["friction_gain"] == -1.0 else values["friction_gain"]
+        return FrictionSettings(model, budget, scale, values["friction_theta"], gain)
+    except FrictionSettingsError as error:
+        name = _PARAMETER_OF.get(error.name, f"friction_{error.name}")
+        raise ParameterError(name, error.value, error.allowed) from error

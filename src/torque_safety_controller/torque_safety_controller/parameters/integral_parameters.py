@@ -1,0 +1,141 @@
+"""Parameters of the integral action: the table, and the settings made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from torque_safety_controller.additional_torque import MODES, AdditionalSettings
+from torque_safety_controller.integral_feedback.settings import (
+    METHODS,
+    IntegralSettings,
+    IntegralSettingsError,
+)
+from torque_safety_controller.nullspace.settings import NullspaceSettings
+from torque_safety_controller.parameters.friction_parameters import friction_settings
+from viability_bounds_pkg.ros.parameters import Parameter, ParameterError, per_joint
+
+BUDGET = 0.1
+"""Default budget in torque limits: the paper's tau_m."""
+
+DISTURBANCE_MAX = 2.0
+"""Disturbances beyond this many torque limits are not integrated."""
+
+TASKS = {"pose": slice(0, 6), "position": slice(0, 3)}
+"""Rows of the pose's Jacobian that are a task of integral action ``task``."""
+
+TABLE = (
+    Parameter(
+        "integral_action",
+        str,
+        f"one of {', '.join(MODES)}: none; all joints stiff; or the task stiff and its null "
+        "space compliant",
+        default="none",
+        live=True,
+    ),
+    Parameter(
+        "integral_budget",
+        list[float],
+        f"limits of the additional torque, N m; {BUDGET:g} of torque_max if empty",
+        default=np.zeros(0),
+        live=True,
+    ),
+    Parameter("integral_lambda", float, "gain, K = lambda diag(M), 1/s", default=2.0, live=True),
+    Parameter(
+        "integral_theta_slow", float, "rate of slow forgetting, 1/s", default=0.1, live=True
+    ),
+    Parameter(
+        "integral_theta_fast", float, "rate of fast forgetting, 1/s", default=100.0, live=True
+    ),
+    Parameter("integral_mu", float, "share of the fast memory, 0 to 1", default=0.5, live=True),
+    Parameter(
+        "integral_anti_windup",
+        str,
+        f"for joints: one of {', '.join(METHODS)}; qp is eq. (11)",
+        default="qp",
+        live=True,
+    ),
+    Parameter(
+        "integral_as_printed",
+        bool,
+        "limit K s only and leave the integrators as they are, as the paper does",
+        default=False,
+        live=True,
+    ),
+    Parameter(
+        "integral_task",
+        str,
+        f"for task: one of {', '.join(TASKS)}; what is stiff of the end effector",
+        default="pose",
+    ),
+)
+
+_NAME_OF = {"lambda_": "lambda"}
+
+
+def additional_settings(
+    values: Mapping[str, Any], joints: Sequence[str], tau_max: np.ndarray
+) -> AdditionalSettings:
+    """Return the settings of the additional torque.
+
+    Args:
+        values: parameter values by name.
+        joints: names of the n joints.
+        tau_max: torque limits, shape (n,), N m.
+
+    Raises:
+        ParameterError: a value cannot be used.
+    """
+    mode = values["integral_action"]
+    if mode not in MODES:
+        raise ParameterError("integral_action", mode, f"one of {', '.join(MODES)}")
+    rows = task_rows(values)
+    if mode == "task" and rows.stop >= len(joints):
+        allowed = f"'none' or 'joints': {len(joints)} joints have no null space left of the task"
+        raise ParameterError("integral_action", mode, allowed)
+    budget = BUDGET * tau_max
+    if len(values["integral_budget"]):
+        budget = per_joint(values, "integral_budget", joints)
+        if (budget > tau_max).any():
+            raise ParameterError("integral_budget", budget, "at most torque_max")
+    common = {
+        "budget": budget,
+        "lambda_": values["integral_lambda"],
+        "theta_slow": values["integral_theta_slow"],
+        "theta_fast": values["integral_theta_fast"],
+        "mu": values["integral_mu"],
+    }
+    as_printed = values["integral_as_printed"]
+    try:
+        return AdditionalSettings(
+            mode,
+            IntegralSettings(
+                **common,
+                anti_windup=values["integral_anti_windup"],
+                whole_torque=not as_printed,
+                correct_state=not as_printed,
+                paper_form=as_printed,
+            ),
+            NullspaceSettings(**common, keep_integral=as_printed)
+            if rows.stop < len(joints)
+            else None,
+            DISTURBANCE_MAX * tau_max,
+            friction_settings(values, joints, tau_max),
+        )
+    except IntegralSettingsError as error:
+        name = f"integral_{_NAME_OF.get(error.name, error.name)}"
+        raise ParameterError(name, error.value, error.allowed) from error
+
+
+def task_rows(values: Mapping[str, Any]) -> slice:
+    """Return which rows of the pose's Jacobian ``integral_task`` names.
+
+    Raises:
+        ParameterError: it is unknown.
+    """
+    task = values["integral_task"]
+    if task not in TASKS:
+        raise ParameterError("integral_task", task, f"one of {', '.join(TASKS)}")
+    return TASKS[task]

@@ -1,0 +1,1 @@
+"""The inverse-dynamics quadratic program and the solvers for it."""

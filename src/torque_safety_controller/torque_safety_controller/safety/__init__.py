@@ -1,0 +1,1 @@
+"""The last checks of a torque, the disturbance observer, modes and handover."""

@@ -1,0 +1,1 @@
+"""Tasks: what the accelerations should do, and the goals that they serve."""

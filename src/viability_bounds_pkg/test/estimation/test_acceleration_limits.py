@@ -1,0 +1,522 @@
+"""Algorithm 4, the refined search, and the margin of a held torque, against Pinocchio."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from viability_bounds_pkg.acceleration_limits import (
+    EmptyIntervalError,
+    estimate_acceleration_limits,
+    limits_from_worst_cases,
+    unavailable_share,
+)
+from viability_bounds_pkg.estimation.batch_dynamics import BLOCK, BatchDynamics
+from viability_bounds_pkg.estimation.descent import descend
+from viability_bounds_pkg.estimation.discretisation_margin import discretisation_margin
+from viability_bounds_pkg.estimation.state_space import LimitEstimateError, StateSpace
+from viability_bounds_pkg.estimation.velocity_scale import largest_velocity_scale
+from viability_bounds_pkg.estimation.worst_case_search import search_by_sampling, search_refined
+from viability_bounds_pkg.estimation.zero_order_hold import (
+    acceleration_rate,
+    hold_defects,
+    mid_step_torque,
+)
+from viability_bounds_pkg.robot_description import build_model, read_urdf
+
+ROBOTS = "package://example-robot-data/robots"
+PENDULUM_MASS, PENDULUM_LENGTH, GRAVITY = 2.0, 0.5, 9.81
+
+
+def baxter():
+    joints = [f"left_{name}" for name in ("s0", "s1", "e0", "e1", "w0", "w1", "w2")]
+    return build_model(read_urdf(f"{ROBOTS}/baxter_description/urdf/baxter.urdf"), joints)
+
+
+def panda():
+    joints = [f"panda_joint{i}" for i in range(1, 8)]
+    return build_model(read_urdf(f"{ROBOTS}/panda_description/urdf/panda.urdf"), joints)
+
+
+def limits_of(model):
+    """The URDF's q_min, q_max, v_max, tau_max."""
+    return (
+        model.lowerPositionLimit,
+        model.upperPositionLimit,
+        model.velocityLimit,
+        model.effortLimit,
+    )
+
+
+def pendulum_urdf(*, joint_type="continuous", tip_mass=PENDULUM_MASS, links=1):
+    """Point masses on massless rods that swing about y; angles zero hang straight down."""
+    parts = ['<robot name="pendulum"><link name="link0"/>']
+    for i in range(1, links + 1):
+        parts.append(
+            f'<joint name="joint{i}" type="{joint_type}"><parent link="link{i - 1}"/>'
+            f'<child link="link{i}"/><origin xyz="0 0 {0 if i == 1 else -PENDULUM_LENGTH}"/>'
+            '<axis xyz="0 1 0"/><limit lower="-3" upper="3" effort="30" velocity="4"/></joint>'
+            f'<link name="link{i}"><inertial><origin xyz="0 0 {-PENDULUM_LENGTH}"/>'
+            f'<mass value="{tip_mass}"/>'
+            '<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        )
+    return "".join(parts) + "</robot>"
+
+
+def pendulum(**kwargs):
+    links = kwargs.get("links", 1)
+    return build_model(pendulum_urdf(**kwargs), [f"joint{i}" for i in range(1, links + 1)])
+
+
+def random_tree():
+    """A branching robot with every kind of joint a URDF has, and rotors."""
+    rng = np.random.default_rng(3)
+    model = pin.Model()
+    oblique = np.array([0.6, 0.0, -0.8])
+    joints = [
+        (pin.JointModelPZ(), 0),
+        (pin.JointModelRY(), 1),
+        (pin.JointModelPrismaticUnaligned(oblique), 2),
+        (pin.JointModelRevoluteUnaligned(oblique), 2),
+        (pin.JointModelPX(), 4),
+        (pin.JointModelRZ(), 5),
+        (pin.JointModelRX(), 3),
+    ]
+    for i, (joint, parent) in enumerate(joints):
+        turn = pin.exp3(rng.normal(size=3))
+        placement = pin.SE3(turn, rng.normal(size=3))
+        index = model.addJoint(parent, joint, placement, f"joint{i}")
+        spread = rng.normal(size=(4, 3))
+        inertia = pin.Inertia(1.0 + i, rng.normal(size=3), spread.T @ spread)
+        model.appendBodyToJoint(index, inertia, pin.SE3.Identity())
+    model.armature = np.linspace(0.0, 1.0, model.nv)
+    return model
+
+
+def algorithm_4(model, q, v, tau_max):
+    """Lines 6 to 12 of Algorithm 4 as printed, over the states given."""
+    data = model.createData()
+    upper, lower = np.full(model.nv, np.inf), np.full(model.nv, -np.inf)
+    for q_i, v_i in zip(q, v, strict=True):
+        inertia = pin.crba(model, data, q_i)
+        h = pin.nonLinearEffects(model, data, q_i, v_i)
+        for j in range(model.nv):
+            upper[j] = min(upper[j], (tau_max[j] - h[j]) / inertia[j, j])
+            lower[j] = max(lower[j], (-tau_max[j] - h[j]) / inertia[j, j])
+    return lower, upper
+
+
+@pytest.mark.parametrize("make", [baxter, panda, random_tree])
+def test_batch_dynamics_equal_pinocchio(make):
+    model = make()
+    rng = np.random.default_rng(0)
+    count = BLOCK + 40  # more than one block, the last one short
+    q, v = rng.uniform(-2, 2, (count, model.nq)), rng.uniform(-3, 3, (count, model.nv))
+    h, inertia = BatchDynamics(model).torque_terms(q, v)
+    data = model.createData()
+    for i in (0, 1, BLOCK - 1, BLOCK, count - 1):
+        scale = 1.0 + np.abs(h[i]).max()
+        np.testing.assert_allclose(
+            h[i], pin.nonLinearEffects(model, data, q[i], v[i]), atol=1e-12 * scale
+        )
+        np.testing.assert_allclose(inertia[i], pin.crba(model, data, q[i]).diagonal(), rtol=1e-11)
+
+
+def test_batches_and_single_states_agree():
+    model = random_tree()
+    rng = np.random.default_rng(1)
+    q, v = rng.uniform(-2, 2, (100, model.nq)), rng.uniform(-3, 3, (100, model.nv))
+    dynamics = BatchDynamics(model)
+    batch = dynamics.torque_terms(q, v)
+    for i in range(100):
+        alone = dynamics.torque_terms(q[i : i + 1], v[i : i + 1])
+        for whole, single in zip(batch, alone, strict=True):
+            np.testing.assert_allclose(whole[i], single[0], rtol=1e-9, atol=1e-9)
+
+
+def test_sampling_is_algorithm_4():
+    model, count = panda(), 3000
+    q_min, q_max, v_max, tau_max = limits_of(model)
+    unit = np.random.default_rng(5).random((count, 14))
+    q = q_min + unit[:, :7] * (q_max - q_min)
+    v = (2 * unit[:, 7:] - 1) * v_max
+    lower, upper = algorithm_4(model, q, v, tau_max)
+    limits = estimate_acceleration_limits(model, q_min, q_max, v_max, tau_max, count, 5)
+    np.testing.assert_allclose(limits.a_min, lower, rtol=1e-10)
+    np.testing.assert_allclose(limits.a_max, upper, rtol=1e-10)
+    assert limits.worst.evaluations == count
+
+
+@pytest.mark.parametrize("method", ["sampling", "refined"])
+def test_worst_states_give_the_limits(method):
+    model = panda()
+    q_min, q_max, v_max, tau_max = limits_of(model)
+    worst = estimate_acceleration_limits(
+        model, q_min, q_max, 0.5 * v_max, tau_max, 2000, 1, method=method
+    ).worst
+    for j in range(model.nv):
+        for q, v, expected, side in (
+            (worst.q_at_a_max[j], worst.v_at_a_max[j], worst.a_max[j], 1),
+            (worst.q_at_a_min[j], worst.v_at_a_min[j], worst.a_min[j], -1),
+        ):
+            assert np.all((q_min <= q) & (q <= q_max))
+            assert np.all(np.abs(v) <= 0.5 * v_max)
+            a = np.zeros(model.nv)
+            a[j] = expected
+            tau = pin.rnea(model, model.createData(), q, v, a)
+            assert tau[j] == pytest.approx(side * tau_max[j], rel=1e-9)
+
+
+@pytest.mark.parametrize("method", ["sampling", "refined"])
+def test_pendulum_limits_are_the_analytic_ones(method):
+    inertia = PENDULUM_MASS * PENDULUM_LENGTH**2
+    weight = PENDULUM_MASS * GRAVITY * PENDULUM_LENGTH
+    model = pendulum()
+    assert np.isinf(model.upperPositionLimit).all()  # so that the angle is drawn from a full turn
+    limits = estimate_acceleration_limits(
+        model, [-np.inf], [np.inf], [4.0], [30.0], 4000, 0, method=method
+    )
+    expected = (30.0 - weight) / inertia
+    assert limits.a_max[0] == pytest.approx(expected, rel=1e-5)
+    assert limits.a_min[0] == pytest.approx(-expected, rel=1e-5)
+    assert abs(limits.worst.q_at_a_max[0, 0]) == pytest.approx(math.pi / 2, abs=0.01)
+
+
+def test_two_link_limits_are_the_analytic_ones():
+    """Joint 1's room, h and M written out for two equal point masses on equal rods."""
+    model = pendulum(links=2, joint_type="revolute")
+    mass, length, v_max, tau_max = PENDULUM_MASS, PENDULUM_LENGTH, 1.0, 60.0
+    grid = np.linspace(-3.0, 3.0, 601)
+    q_1, q_2 = np.meshgrid(grid, grid)
+    expected = np.inf
+    for v_1 in (-v_max, v_max):
+        for v_2 in (-v_max, 0.0, v_max):
+            coriolis = -mass * length**2 * np.sin(q_2) * (2 * v_1 * v_2 + v_2**2)
+            weight = mass * GRAVITY * length * (2 * np.sin(q_1) + np.sin(q_1 + q_2))
+            inertia = mass * length**2 * (3 + 2 * np.cos(q_2))
+            expected = min(expected, ((tau_max - coriolis - weight) / inertia).min())
+    limits = estimate_acceleration_limits(
+        model, [-3, -3], [3, 3], [v_max] * 2, [tau_max] * 2, 2000, method="refined"
+    )
+    assert limits.a_max[0] == pytest.approx(expected, rel=1e-3)
+    assert limits.a_min[0] == pytest.approx(-expected, rel=1e-3)  # mirror image
+
+
+@pytest.mark.parametrize("make", [baxter, panda])
+def test_refined_beats_a_million_samples_with_ten_thousand_evaluations(make):
+    model = make()
+    space = StateSpace.of(model, *limits_of(model))
+    *_, sampled = search_by_sampling(model, space, 1_000_000, 0)
+    *_, refined = search_refined(model, space, 10_000, 0)
+    assert refined.evaluations <= 10_000
+    assert np.all(refined.a_max <= sampled.a_max)
+    assert np.all(refined.a_min >= sampled.a_min)
+    # The gain is not marginal: several limits are a fifth tighter.
+    gain = (sampled.a_max - refined.a_max) / np.abs(sampled.a_max)
+    assert np.count_nonzero(gain > 0.2) >= 2
+
+
+def test_search_counts_every_evaluation(monkeypatch):
+    calls = 0
+    for name in ("crba", "computeRNEADerivatives"):
+        original = getattr(pin, name)
+
+        def counted(*arguments, original=original):
+            nonlocal calls
+            calls += 1
+            return original(*arguments)
+
+        monkeypatch.setattr(pin, name, counted)
+    monkeypatch.setattr("viability_bounds_pkg.estimation.batch_dynamics.FEW", 10**9)  # no batches
+    model = panda()
+    *_, worst = search_refined(model, StateSpace.of(model, *limits_of(model)), 1000, 0)
+    assert calls == worst.evaluations <= 1000
+
+
+@pytest.mark.parametrize("method", ["sampling", "refined"])
+def test_same_seed_same_limits(method):
+    model = baxter()
+    space = StateSpace.of(model, *limits_of(model))
+    search = {"sampling": search_by_sampling, "refined": search_refined}[method]
+    *_, first = search(model, space, 3000, 7)
+    *_, again = search(model, space, 3000, 7)
+    *_, other = search(model, space, 3000, 8)
+    np.testing.assert_array_equal(first.a_max, again.a_max)
+    np.testing.assert_array_equal(first.q_at_a_min, again.q_at_a_min)
+    assert np.any(first.a_max != other.a_max)
+
+
+@pytest.mark.parametrize("method", ["sampling", "refined"])
+def test_history_tightens_and_ends_with_the_result(method):
+    model = baxter()
+    search = {"sampling": search_by_sampling, "refined": search_refined}[method]
+    *_, worst = search(model, StateSpace.of(model, *limits_of(model)), 5000, 0)
+    counts = [entry.evaluations for entry in worst.history]
+    assert counts[:4] == [1, 2, 4, 8]
+    assert counts[-1] == worst.evaluations
+    assert np.all(np.diff([entry.a_max for entry in worst.history], axis=0) <= 0)
+    assert np.all(np.diff([entry.a_min for entry in worst.history], axis=0) >= 0)
+    np.testing.assert_array_equal(worst.history[-1].a_max, worst.a_max)
+
+
+def test_shorter_run_is_the_start_of_a_longer_one():
+    model = baxter()
+    space = StateSpace.of(model, *limits_of(model))
+    *_, short = search_by_sampling(model, space, 64, 3)
+    *_, long = search_by_sampling(model, space, 300, 3)
+    entry = next(entry for entry in long.history if entry.evaluations == 64)
+    np.testing.assert_array_equal(entry.a_max, short.a_max)
+
+
+def test_snapshots_stay_as_they_were():
+    model = baxter()
+    search = search_by_sampling(model, StateSpace.of(model, *limits_of(model)), 1000, 0)
+    first = next(search)
+    before = first.a_max.copy()
+    list(search)
+    np.testing.assert_array_equal(first.a_max, before)
+
+
+def test_reserve_caps_and_overrides():
+    model = baxter()
+    limits = limits_of(model)
+    arguments = {"samples": 2000, "seed": 0, "overrides": {"left_s1": (-3.0, 2.0)}}
+    plain = estimate_acceleration_limits(model, *limits, **arguments)
+    assert (plain.a_min[1], plain.a_max[1]) == (-3.0, 2.0)
+    assert plain.overridden == {"left_s1"}
+    less = estimate_acceleration_limits(model, *limits, **arguments, torque_reserve=5.0)
+    np.testing.assert_array_less(less.worst.a_max, plain.worst.a_max)
+    reduced = (*limits[:3], limits[3] - 5.0)
+    by_hand = estimate_acceleration_limits(model, *reduced, **arguments)
+    np.testing.assert_array_equal(less.a_max, by_hand.a_max)
+    capped = estimate_acceleration_limits(model, *limits, **arguments, cap=15.0)
+    assert capped.a_max[6] == 15.0 and capped.a_min[6] == -15.0
+    assert capped.a_max[0] == plain.a_max[0] < 15.0
+    assert (capped.a_min[1], capped.a_max[1]) == (-3.0, 2.0)
+
+
+def test_progress_is_told():
+    model = pendulum()
+    seen = []
+    estimate_acceleration_limits(
+        model, *limits_of(model)[:2], [4.0], [30.0], 100, 0, progress=seen.append
+    )
+    assert seen[-1].evaluations == 100
+    assert [worst.evaluations for worst in seen] == sorted({w.evaluations for w in seen})
+
+
+def test_gravity_beyond_the_torque_is_named():
+    model = baxter()
+    with pytest.raises(EmptyIntervalError) as raised:
+        estimate_acceleration_limits(model, *limits_of(model), 20_000, 0)
+    error = raised.value
+    assert error.joint == error.suggestion.joint == "left_s1"
+    assert error.suggestion.scale == 0.0
+    static = pin.computeGeneralizedGravity(model, model.createData(), error.suggestion.q)
+    assert error.suggestion.static_torque == pytest.approx(static[1])
+    assert abs(static[1]) > error.torque_max == 50.0
+    h = pin.nonLinearEffects(model, model.createData(), error.q, error.v)
+    assert abs(h[1]) > 50.0
+    assert "left_s1" in str(error) and "50 N m" in str(error) and "\n" not in str(error)
+    assert "lower velocities do not help" in str(error)
+
+
+def test_too_much_speed_is_told_with_the_scale_that_helps():
+    model = panda()
+    limits = limits_of(model)
+    with pytest.raises(EmptyIntervalError) as raised:
+        estimate_acceleration_limits(model, *limits, 10_000, 0, method="refined")
+    error = raised.value
+    assert error.joint == "panda_joint2"
+    scale = error.suggestion.scale
+    assert 0.8 < scale < 0.95
+    assert f"{scale:.3f}" in str(error)
+
+    def least_room(factor):
+        slower = (*limits[:2], factor * limits[2], limits[3])
+        *_, worst = search_refined(model, StateSpace.of(model, *slower), 20_000, 11)
+        return min(worst.a_max.min(), -worst.a_min.max())
+
+    # The scale leaves 1 rad/s^2 either way, and hardly any more.
+    assert least_room(scale) == pytest.approx(1.0, abs=0.1)
+    assert least_room(1.1 * scale) < 0.2
+
+
+def test_velocity_scale_of_a_pendulum_in_closed_form():
+    """At the tip of a two-link arm only the Coriolis torque grows with speed."""
+    model = pendulum(links=2, joint_type="revolute")
+    space = StateSpace.of(model, [-3, -3], [3, 3], [8.0, 8.0], [60.0, 30.0])
+    found = largest_velocity_scale(model, space, 1.0)
+    assert 0.0 < found.scale < 1.0
+    assert found.joint == "joint1" or found.joint == "joint2"
+    h = pin.nonLinearEffects(model, model.createData(), found.q, found.v)
+    inertia = pin.crba(model, model.createData(), found.q).diagonal()
+    room = (space.tau_max - np.abs(h)) / inertia
+    assert room.min() == pytest.approx(1.0, abs=0.01)
+    stronger = StateSpace.of(model, [-3, -3], [3, 3], [8.0, 8.0], [600.0, 300.0])
+    assert largest_velocity_scale(model, stronger, 1.0).scale == 1.0
+    with pytest.raises(LimitEstimateError, match="required"):
+        largest_velocity_scale(model, space, -1.0)
+
+
+def test_unavailable_share_counts_states():
+    model = baxter()
+    space = StateSpace.of(model, *limits_of(model))
+    *_, worst = search_refined(model, space, 5000, 0)
+    limits = limits_from_worst_cases(model, space, worst, {"left_s1": (-3.0, 3.0)})
+    share = unavailable_share(model, space, limits)
+    assert 0.15 < share[1] < 0.25
+    np.testing.assert_array_equal(np.delete(share, 1), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"q_min": [0.0]}, "q_min must have 7 values"),
+        ({"q_min": np.full(7, 9.0)}, "joint left_s0: position limits"),
+        ({"q_max": np.full(7, np.inf)}, "joint left_s0: position limits"),
+        ({"v_max": np.zeros(7)}, "joint left_s0: v_max must be positive"),
+        ({"tau_max": np.full(7, np.nan)}, "torque_reserve|tau_max"),
+        ({"samples": 0}, "samples must be at least 1, is 0"),
+        ({"samples": 0, "method": "refined"}, "samples must be at least 1, is 0"),
+        ({"method": "guess"}, "method must be one of sampling, refined"),
+        ({"torque_reserve": 15.0}, "torque_reserve"),
+        ({"torque_reserve": -1.0}, "torque_reserve"),
+        ({"overrides": {"elbow": (-1, 1)}}, "unknown joint 'elbow'"),
+        ({"overrides": {"left_s0": (1, 2)}}, "joint left_s0: override"),
+        ({"cap": 0.0}, "cap must be positive"),
+        ({"cap": [1.0, 2.0]}, "cap must be positive, one value or 7"),
+    ],
+)
+def test_bad_arguments(change, message):
+    model = baxter()
+    keys = ("q_min", "q_max", "v_max", "tau_max")
+    arguments = dict(zip(keys, limits_of(model), strict=True)) | {"samples": 10, "seed": 0}
+    with pytest.raises(LimitEstimateError, match=message):
+        estimate_acceleration_limits(model, **arguments | change)
+
+
+@pytest.mark.parametrize("count", [4, 400])
+def test_joint_that_moves_nothing_is_named(count):
+    model = pendulum(tip_mass=0.0)
+    with pytest.raises(LimitEstimateError, match="joint joint1 moves no inertia"):
+        estimate_acceleration_limits(model, [-1], [1], [1], [1], count, 0)
+
+
+def test_descent_ends_on_the_bounds_and_uses_curvature():
+    """A quadratic a hundred times steeper in one direction, its minimum outside the cube."""
+    turn = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+    hessian = turn @ np.diag([1.0, 100.0, 1.0]) @ turn.T
+    centre = np.array([0.3, 0.6, 1.7])
+    visited = []
+
+    def value(x):
+        visited.append((1.0 + 0.5 * (x - centre) @ hessian @ (x - centre), x))
+        return visited[-1][0]
+
+    descend(value, lambda x: hessian @ (x - centre), np.array([0.9, 0.1, 0.2]), 15, 0.0)
+    least, x = min(visited, key=lambda visit: visit[0])
+    np.testing.assert_allclose(x, [0.3, 0.6, 1.0], atol=1e-4)
+    assert least == pytest.approx(1.0 + 0.5 * 0.7**2)
+    assert all(np.all((x >= 0.0) & (x <= 1.0)) for _, x in visited)
+
+
+def test_acceleration_rate_is_the_time_derivative():
+    model = panda()
+    rng = np.random.default_rng(2)
+    q, v = rng.uniform(-1, 1, (3, 7)), rng.uniform(-2, 2, (3, 7))
+    a = rng.uniform(-9, 9, (3, 7))
+    tau, rate = acceleration_rate(model, q, v, a)
+    data, step = model.createData(), 1e-5
+    for i in range(3):
+        later, earlier = (
+            pin.aba(model, data, q[i] + t * v[i] + t * t / 2 * a[i], v[i] + t * a[i], tau[i])
+            for t in (step, -step)
+        )
+        np.testing.assert_allclose(rate[i], (later - earlier) / (2 * step), rtol=1e-5, atol=1e-4)
+
+
+def test_hold_defects_do_not_depend_on_the_integration_step():
+    model = panda()
+    rng = np.random.default_rng(4)
+    q, v, a = rng.uniform(-1, 1, (5, 7)), rng.uniform(-2, 2, (5, 7)), rng.uniform(-9, 9, (5, 7))
+    tau = mid_step_torque(model, q, v, a, 0.01)
+    coarse = hold_defects(model, q, v, a, tau, 0.01)
+    fine = hold_defects(model, q, v, a, tau, 0.01, substeps=16)
+    np.testing.assert_allclose(coarse, fine, rtol=2e-3, atol=1e-5)
+
+
+def test_hold_defects_of_a_pendulum_in_closed_form():
+    """Leading orders of the drift: gravity's torque changes as the pendulum swings."""
+    model = pendulum()
+    q, v, a, dt = np.array([[0.4]]), np.array([[2.0]]), np.array([[3.0]]), 1e-3
+    rate = GRAVITY / PENDULUM_LENGTH * math.cos(0.4) * 2.0
+    held = hold_defects(model, q, v, a, mid_step_torque(model, q, v, a, dt), dt)[0, :, 0]
+    assert held[0] == pytest.approx(rate * dt / 2, rel=0.01)
+    assert held[1] < 1e-3 * held[0]
+    assert held[2] == pytest.approx(rate * dt**3 / 12, rel=0.01)
+    plain = hold_defects(model, q, v, a, mid_step_torque(model, q, v, a, 0.0), dt)[0, :, 0]
+    assert plain[0] == pytest.approx(rate * dt, rel=0.01)
+    assert plain[1] == pytest.approx(rate * dt / 2, rel=0.01)
+    assert plain[2] == pytest.approx(rate * dt**3 / 6, rel=0.01)
+
+
+def margin_of(dt, **options):
+    model = baxter()
+    bound = np.array([5.0, 3.0, 11.0, 15.0, 15.0, 15.0, 15.0])
+    options = {"samples": 3000, "seed": 0, "starts": 4, "rounds": 4} | options
+    return discretisation_margin(
+        model, *limits_of(model)[:3], -bound, bound, model.effortLimit, dt, **options
+    )
+
+
+def test_mid_step_torque_halves_the_drift():
+    margin = margin_of(0.002)
+    ratio = margin.mid_step.acceleration / margin.start_of_step.acceleration
+    np.testing.assert_allclose(ratio, 0.5, atol=0.05)
+    np.testing.assert_allclose(margin.mid_step.acceleration, margin.rate * 0.001, rtol=0.1)
+    assert np.all(margin.mid_step.mean_acceleration < 0.05 * margin.mid_step.acceleration)
+    np.testing.assert_allclose(
+        margin.start_of_step.mean_acceleration, margin.mid_step.acceleration, rtol=0.1
+    )
+    np.testing.assert_allclose(margin.mid_step.position, margin.rate * 0.002**3 / 12, rtol=0.1)
+    assert margin.margin is margin.mid_step.acceleration
+
+
+def test_drift_is_of_first_order_in_the_period():
+    whole, half = margin_of(0.002), margin_of(0.001)
+    np.testing.assert_allclose(half.margin / whole.margin, 0.5, atol=0.03)
+
+
+def test_margin_is_attained_within_the_limits():
+    margin, model = margin_of(0.002), baxter()
+    held = margin.mid_step
+    for j in range(7):
+        q, v, a = held.q[j : j + 1], held.v[j : j + 1], held.a[j : j + 1]
+        assert np.all((model.lowerPositionLimit <= q) & (q <= model.upperPositionLimit))
+        assert np.all(np.abs(v) <= model.velocityLimit)
+        tau = mid_step_torque(model, q, v, a, 0.002)
+        assert np.all(np.abs(tau) <= model.effortLimit)
+        defects = hold_defects(model, q, v, a, tau, 0.002)
+        assert defects[0, 0, j] == pytest.approx(held.acceleration[j], rel=1e-9)
+
+
+def test_local_search_finds_worse_than_sampling():
+    sampled, searched = margin_of(0.002, rounds=0), margin_of(0.002)
+    assert np.all(searched.margin >= sampled.margin)
+    assert np.count_nonzero(searched.margin > 1.2 * sampled.margin) >= 4
+
+
+@pytest.mark.parametrize("dt", [0.0, -1.0, math.nan])
+def test_margin_needs_a_period(dt):
+    with pytest.raises(LimitEstimateError, match="dt must be positive"):
+        margin_of(dt)
+
+
+def test_margin_without_a_state_within_torque_limits():
+    model = pendulum()
+    with pytest.raises(LimitEstimateError, match="within the torque limits"):
+        discretisation_margin(model, [-1], [1], [1], [90], [91], [1.0], 0.01, samples=50)

@@ -1,0 +1,510 @@
+"""The estimate_acceleration_limits executable, started as a user starts it."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from viability_bounds_pkg.cli import limits_file
+from viability_bounds_pkg.cli.estimate_acceleration_limits import main
+
+PACKAGE_ROOT = Path(limits_file.__file__).resolve().parents[2]
+COMMAND = [sys.executable, "-m", "viability_bounds_pkg.cli.estimate_acceleration_limits"]
+TIME_LIMIT = 60.0
+
+LIMITS = 'lower="-1" upper="2" effort="30" velocity="4"'
+LIMIT = f"<limit {LIMITS}/>"
+URDF = """
+<robot name="arm"><link name="base"/>
+<joint name="shoulder" type="{type}"><parent link="base"/><child link="arm"/>
+<axis xyz="0 1 0"/>{limit}</joint>
+<link name="arm"><inertial><origin xyz="0 0 -0.5"/><mass value="{mass}"/>
+<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="wrist" type="revolute"><parent link="arm"/><child link="hand"/>
+<origin xyz="0 0 -0.5"/><axis xyz="0 1 0"/><limit {limits}/></joint>
+<link name="hand"><inertial><origin xyz="0 0 -0.1"/><mass value="{hand_mass}"/>
+<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>
+"""
+ROBOT = """\
+# A comment.
+/**:
+  ros__parameters:
+    robot_description: {urdf}
+    joints: [shoulder, wrist]
+{more}
+/**/bounds_node:
+  ros__parameters:
+    acceleration_min: [-1.0, -1.0]
+"""
+
+
+@pytest.fixture
+def robot(tmp_path):
+    """Writes a robot's URDF and parameter file; returns the latter's path."""
+
+    def write(
+        limit=LIMIT,
+        type="revolute",
+        mass=2.0,
+        hand_mass=0.5,
+        parameters="",
+        text=ROBOT,
+    ):
+        urdf = tmp_path / "arm.urdf"
+        urdf.write_text(
+            URDF.format(limit=limit, type=type, mass=mass, hand_mass=hand_mass, limits=LIMITS)
+        )
+        path = tmp_path / "robot.yaml"
+        path.write_text(text.format(urdf=urdf, more=parameters))
+        return path
+
+    return write
+
+
+def environment():
+    paths = [str(PACKAGE_ROOT), os.environ.get("PYTHONPATH", "")]
+    return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
+
+
+def run(*arguments):
+    return subprocess.run(
+        [*COMMAND, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        env=environment(),
+        timeout=TIME_LIMIT,
+    )
+
+
+def parameters_in(text):
+    return yaml.safe_load(text)["/**/bounds_node"]["ros__parameters"]
+
+
+def printed(ended):
+    """The parameters on standard output, where they go without -o."""
+    return parameters_in(ended.stdout[ended.stdout.index("/**/bounds_node:") :])
+
+
+@pytest.mark.parametrize("method", ["sampling", "refined"])
+def test_limits_are_written_as_an_overlay(robot, tmp_path, method):
+    path, output = robot(), tmp_path / "limits.yaml"
+    before = path.read_bytes()
+    ended = run(path, "-o", output, "--samples", 3000, "--method", method, "--seed", 2)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert path.read_bytes() == before
+    written = parameters_in(output.read_text())
+    assert set(written) == {"acceleration_min", "acceleration_max"}
+    controller = yaml.safe_load(output.read_text())["/**/controller_node"]
+    assert controller["ros__parameters"] == written
+    # The shoulder with the arm stretched out to the side, at rest or nearly.
+    inertia, weight = 2.0 * 0.25 + 0.5 * 0.36, 9.81 * (2.0 * 0.5 + 0.5 * 0.6)
+    at_rest = (30.0 - weight) / inertia
+    assert 0.6 * at_rest < written["acceleration_max"][0] <= 1.01 * at_rest
+    for word in ("shoulder: torque leaves", "worst a_min at q = [", "after N", "evaluations"):
+        assert word in ended.stdout
+
+
+def test_same_seed_same_file(robot, call, tmp_path):
+    path = robot()
+    outputs = [tmp_path / name for name in ("first.yaml", "second.yaml", "third.yaml")]
+    for output, seed in zip(outputs, (4, 4, 5), strict=True):
+        assert call(path, "-o", output, "--samples", 200, "--seed", seed).returncode == 0
+    texts = [output.read_text() for output in outputs]
+    assert texts[0] == texts[1]
+    assert parameters_in(texts[0]) != parameters_in(texts[2])
+
+
+def test_options_reach_the_limits(robot, call):
+    common = ("--samples", 500)
+    path = robot()
+    plain = printed(call(path, *common))
+    ended = call(
+        path,
+        *common,
+        *("--torque-reserve", 0.2),
+        *("--override", "wrist=-3,2.5"),
+        *("--cap", 40, "--cap", "shoulder=5"),
+        *("--margin-dt", 0.01),
+    )
+    assert (ended.returncode, ended.stderr) == (0, "")
+    changed = printed(ended)
+    assert plain["acceleration_max"][0] > 5.0
+    assert changed["acceleration_min"] == [-5.0, -3.0]
+    assert changed["acceleration_max"] == [5.0, 2.5]
+    capped = printed(call(path, *common, "--cap", 4, "--cap", "wrist=6"))
+    assert capped["acceleration_min"] == [-4.0, -6.0]
+    # The drift has half of the period to make the acceleration wrong.
+    off = re.findall(r"acceleration off by ([\d.]+)", ended.stdout)
+    np.testing.assert_allclose(
+        changed["acceleration_drift"], np.array(off, dtype=float) / 0.005, rtol=0.05
+    )
+    assert "shoulder: a in [-5, 5] rad/s^2 (capped)" in ended.stdout
+    assert "with the torque held for 0.01 s" in ended.stdout
+
+
+def test_reserve_takes_its_part_of_the_torque(robot, call):
+    path = robot(parameters="    torque_max: [30.0, 30.0]")
+    reserved = call(path, "--samples", 300, "--torque-reserve", 0.5)
+    halved = call(
+        robot(parameters="    torque_max: [15.0, 15.0]"), "--samples", 300, "--torque-reserve", 0
+    )
+    first, second = (printed(ended) for ended in (reserved, halved))
+    assert first == second
+
+
+def test_limits_of_the_parameter_file_beat_those_of_the_urdf(robot, call):
+    path = robot(
+        limit="",
+        type="continuous",
+        parameters="    velocity_max: [1, 1]\n    torque_max: [50.0, 30.0]\n",
+    )
+    ended = call(path, "--samples", 2000)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    limits = printed(ended)
+    inertia, weight = 2.0 * 0.25 + 0.5 * 0.36, 9.81 * (2.0 * 0.5 + 0.5 * 0.6)
+    assert limits["acceleration_max"][0] == pytest.approx((50 - weight) / inertia, rel=0.05)
+
+
+def test_locked_joints(robot, call):
+    path = robot()
+    lines = path.read_text().replace("joints: [shoulder, wrist]", "joints: [shoulder]")
+    lines = lines.replace("acceleration_min: [-1.0, -1.0]", "acceleration_min: [-1.0]")
+    found = []
+    for angle in (0.0, 3.0):  # the hand stretched out, and folded back
+        locked = f"joints: [shoulder]\n    locked_joints: [wrist]\n    locked_positions: [{angle}]"
+        path.write_text(lines.replace("joints: [shoulder]", locked))
+        ended = call(path, "--samples", 500)
+        assert ended.returncode == 0, ended.stderr
+        found.append(printed(ended))
+    assert found[1]["acceleration_max"][0] > 1.1 * found[0]["acceleration_max"][0]
+
+
+def one_line(ended, code=1):
+    assert ended.returncode == code, ended.stderr
+    assert ended.stderr.count("\n") == 1, ended.stderr
+    assert "Traceback" not in ended.stderr
+    return ended.stderr
+
+
+@pytest.fixture
+def call(capfd):
+    """Runs the tool in this process, which saves the start of an interpreter for each case."""
+
+    def called(*arguments):
+        try:
+            code = main([str(argument) for argument in arguments])
+        except SystemExit as error:
+            code = error.code
+        return subprocess.CompletedProcess(arguments, code, *capfd.readouterr())
+
+    return called
+
+
+def test_gravity_beyond_the_torque(robot, tmp_path):
+    output = tmp_path / "limits.yaml"
+    path = robot(parameters="    torque_max: [5.0, 30.0]")
+    line = one_line(run(path, "--samples", 500, "-o", output))
+    assert "joint shoulder" in line and "5 N m" in line
+    assert "lower velocities do not help" in line
+    assert not output.exists()
+    ended = run(path, "--samples", 500, "-o", output, "--override", "shoulder=-1,1")
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert "override, NOT available in" in ended.stdout
+    assert parameters_in(output.read_text())["acceleration_max"][0] == 1.0
+
+
+def test_too_much_speed_for_the_torque(robot, call, tmp_path):
+    """Joint, state, lower velocities and the override: all that is offered helps."""
+    output = tmp_path / "limits.yaml"
+    fast = "    velocity_max: [40.0, 40.0]\n    torque_max: [30.0, 10.0]"
+    line = one_line(call(robot(parameters=fast), "--samples", 3000, "-o", output))
+    assert re.search(r"joint (shoulder|wrist): its torque of .* at q = \[.*\], v = \[.*\]", line)
+    assert not output.exists()
+    scale = float(re.search(r"scaled by ([\d.]+)", line)[1])
+    lower = [float(x) for x in re.search(r"to \[([^]]*)\] rad/s", line)[1].split(",")]
+    assert lower == pytest.approx([40.0 * scale, 40.0 * scale], rel=0.01)
+    slower = fast.replace("[40.0, 40.0]", str(lower))
+    ended = call(robot(parameters=slower), "--samples", 3000, "-o", output)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    found = parameters_in(output.read_text())
+    smallest = min(*found["acceleration_max"], *(-a for a in found["acceleration_min"]))
+    assert 0.5 < smallest < 1.5
+    joint = re.search(r"--override (\w+)=MIN,MAX", line)[1]
+    both = [word for name in ("shoulder", "wrist") for word in ("--override", f"{name}=-1,1")]
+    assert joint in ("shoulder", "wrist")
+    assert call(robot(parameters=fast), "--samples", 100, *both).returncode == 0
+
+
+def test_continuous_joint_with_limits_of_the_urdf(robot, call):
+    path = robot(limit='<limit effort="30" velocity="4"/>', type="continuous")
+    ended = call(path, "--samples", 2000)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    inertia, weight = 2.0 * 0.25 + 0.5 * 0.36, 9.81 * (2.0 * 0.5 + 0.5 * 0.6)
+    # All the way round, it meets gravity at its worst on both sides.
+    limits = printed(ended)
+    assert limits["acceleration_max"][0] <= 1.01 * (30.0 - weight) / inertia
+    assert limits["acceleration_min"][0] == pytest.approx(-limits["acceleration_max"][0], rel=0.05)
+
+
+def test_a_link_without_mass_that_carries_others_is_fine(robot, call):
+    ended = call(robot(mass=0.0), "--samples", 300)
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("case", "message"),
+    [
+        ({"limit": "", "type": "continuous"}, "parameter 'velocity_max' is missing"),
+        (
+            {
+                "limit": "",
+                "type": "continuous",
+                "parameters": "    velocity_max: [1.0, 1.0]",
+            },
+            "joint shoulder has no limit in the URDF to use: parameter 'torque_max' is missing",
+        ),
+        ({"limit": ""}, "arm.urdf: joint shoulder has no effort limit"),
+        (
+            {"limit": '<limit lower="-1" upper="1" effort="30"/>'},
+            "arm.urdf: joint shoulder has no velocity limit",
+        ),
+        ({"limit": LIMIT.replace("30", "0")}, "parameter 'torque_max' is missing"),
+        ({"hand_mass": 0.0}, "joint wrist moves no inertia"),
+        ({"hand_mass": 0.0, "mass": 0.0}, "joint shoulder moves no inertia"),
+        ({"parameters": "    velocity_max: [1.0]"}, "'velocity_max' must be a list of 2 numbers"),
+        ({"parameters": "    velocity_max: [1, fast]"}, "must be a list of 2 numbers"),
+        ({"parameters": "    velocity_max: [1, 0]"}, "joint wrist: v_max must be positive"),
+        ({"parameters": "    position_min: [3, 0]"}, "joint shoulder: position limits"),
+        ({"text": "/**:\n  ros__parameters:\n    joints: [shoulder]\n"}, "'robot_description'"),
+        (
+            {"text": "/**:\n  ros__parameters:\n    robot_description: {urdf}\n"},
+            "parameter 'joints' is missing",
+        ),
+        ({"text": ROBOT.replace("wrist", "elbow")}, "unknown joint 'elbow'"),
+        ({"text": ROBOT.replace("{urdf}", "/no/such.urdf")}, "/no/such.urdf: no such file"),
+        ({"text": "other: 1\n"}, "no parameters under '/**'"),
+        ({"text": "/**: 1\n"}, "'/**' has no 'ros__parameters'"),
+        ({"text": "[1, 2\n"}, "not a YAML file"),
+        ({"text": ""}, "no parameters"),
+    ],
+)
+def test_bad_robots_are_told_in_one_line(robot, call, case, message):
+    assert message in one_line(call(robot(**case), "--samples", 100))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--samples", "0"], "--samples: must be at least 1, is 0"),
+        (["--samples", "many"], "--samples: invalid"),
+        (["--seed", "-1"], "--seed: must be at least 0"),
+        (["--method", "guess"], "--method: invalid choice"),
+        (["--torque-reserve", "1"], "--torque-reserve: must be at least 0 and less than 1"),
+        (["--override", "wrist"], "--override: must read JOINT=MIN,MAX"),
+        (["--cap", "-2"], "--cap: must be positive"),
+        (["--margin-dt", "0"], "--margin-dt: must be positive"),
+    ],
+)
+def test_bad_usage_is_told_in_one_line(robot, call, arguments, message):
+    assert message in one_line(call(robot(), *arguments), code=2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--override", "elbow=-1,1"], "override of unknown joint 'elbow'"),
+        (["--override", "wrist=1,2"], "joint wrist: override must be finite with min < 0 < max"),
+        (["--cap", "elbow=1"], "cap of unknown joint 'elbow'"),
+        (["-o", "{tmp}"], "is a directory"),
+        (["-o", "{tmp}/none/limits.yaml"], "no directory"),
+        (["-o", "{tmp}/robot.yaml"], "is the robot's parameter file"),
+        # Where nobody may create a file, root included.
+        (["-o", "/proc/limits.yaml"], "/proc cannot be written to"),
+    ],
+)
+def test_options_that_do_not_fit_the_robot(robot, call, tmp_path, arguments, message):
+    path = robot()
+    before = path.read_text()
+    arguments = [argument.replace("{tmp}", str(tmp_path)) for argument in arguments]
+    assert message in one_line(call(path, "--samples", 100, *arguments))
+    assert path.read_text() == before
+
+
+def test_missing_parameter_file(tmp_path):
+    """In a process of its own, as proof that the exit code gets out."""
+    assert "none.yaml" in one_line(run(tmp_path / "none.yaml"))
+
+
+def interrupt_when(process, ready):
+    """Send SIGINT once `ready()` of a line of output says so, or the time is up."""
+    timer = threading.Timer(TIME_LIMIT, process.kill)
+    timer.start()
+    lines = []
+    for line in process.stdout:
+        lines.append(line)
+        if ready(line):
+            process.send_signal(signal.SIGINT)
+            break
+    rest, errors = process.communicate()
+    timer.cancel()
+    return "".join(lines) + rest, errors
+
+
+def start(code, *arguments):
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment(),
+    )
+
+
+# Says when the search has found something: a marker to wait for instead of a time.
+ANNOUNCED_SEARCH = """
+import sys
+from viability_bounds_pkg.cli import estimate_acceleration_limits as tool
+search = tool.SEARCHES["sampling"]
+def announced(*arguments):
+    for count, worst in enumerate(search(*arguments)):
+        if count == 3:
+            print("SEARCHING", flush=True)
+        yield worst
+tool.SEARCHES["sampling"] = announced
+sys.exit(tool.main())
+"""
+
+
+def test_interrupt_keeps_what_was_found(robot, tmp_path):
+    output = tmp_path / "limits.yaml"
+    samples = 10**9  # hours
+    process = start(
+        ANNOUNCED_SEARCH, robot(), "-o", output, "--method", "sampling", "--samples", samples
+    )
+    out, errors = interrupt_when(process, lambda line: "SEARCHING" in line)
+    assert process.returncode == 130, errors
+    assert f"of {samples} evaluations: the limits are those found so far" in errors
+    assert "Traceback" not in errors
+    assert "shoulder: torque leaves" in out
+    text = output.read_text()
+    assert "INTERRUPTED" in text
+    written = parameters_in(text)
+    assert max(written["acceleration_min"]) < 0.0 < min(written["acceleration_max"])
+
+
+def test_interrupt_in_the_margin_keeps_the_limits(robot, tmp_path):
+    output = tmp_path / "limits.yaml"
+    slow = ANNOUNCED_SEARCH.replace(
+        "sys.exit",
+        "import functools\ntool.discretisation_margin = functools.partial("
+        "tool.discretisation_margin, samples=10**6, starts=10**4, rounds=10**4)\nsys.exit",
+    )
+    process = start(slow, robot(), "-o", output, "--samples", 500, "--margin-dt", 0.01)
+    _, errors = interrupt_when(process, lambda line: "drift of a held torque" in line)
+    assert process.returncode == 130, errors
+    assert "acceleration_drift is left out" in errors
+    assert set(parameters_in(output.read_text())) == {"acceleration_min", "acceleration_max"}
+
+
+def test_interrupt_before_anything_was_found(robot, tmp_path):
+    output = tmp_path / "limits.yaml"
+    output.write_text("old")
+    code = (
+        "import sys\nfrom viability_bounds_pkg import estimate_acceleration_limits as tool\n"
+        "def wait(path):\n    print('READING', flush=True)\n    while True:\n        pass\n"
+        "tool.read_robot = wait\nsys.exit(tool.main())\n"
+    )
+    process = start(code, robot(), "-o", output)
+    _, errors = interrupt_when(process, lambda line: "READING" in line)
+    assert process.returncode == 130
+    assert "nothing written" in errors
+    assert output.read_text() == "old"
+
+
+def test_existing_file_is_replaced_whole(tmp_path):
+    path = tmp_path / "limits.yaml"
+    path.write_text("old")
+    path.chmod(0o640)
+    before = path.stat().st_ino
+    limits_file.write_whole(path, "new")
+    assert path.read_text() == "new"
+    assert path.stat().st_ino != before  # another file took its place
+    assert path.stat().st_mode & 0o777 == 0o640
+    assert os.listdir(tmp_path) == ["limits.yaml"]
+
+
+@pytest.mark.parametrize("broken", ["fsync", "replace"])
+@pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()])
+def test_a_write_that_fails_leaves_the_old_file(tmp_path, monkeypatch, broken, error):
+    path = tmp_path / "limits.yaml"
+    path.write_text("old")
+
+    def fail(*arguments):
+        raise error
+
+    monkeypatch.setattr(limits_file.os, broken, fail)
+    with pytest.raises(type(error)):
+        limits_file.write_whole(path, "new")
+    assert path.read_text() == "old"
+    assert os.listdir(tmp_path) == ["limits.yaml"]
+
+
+def test_a_write_protected_file_is_left_alone(tmp_path, monkeypatch):
+    path = tmp_path / "limits.yaml"
+    path.write_text("old")
+    access = os.access
+    # The permissions themselves do not stop root, who may be running this.
+    monkeypatch.setattr(
+        limits_file.os, "access", lambda p, mode: mode != os.W_OK and access(p, mode)
+    )
+    with pytest.raises(PermissionError, match="write-protected"):
+        limits_file.check_writable(path)
+    assert os.listdir(tmp_path) == ["limits.yaml"]
+
+
+def test_checking_leaves_nothing_behind(tmp_path):
+    limits_file.check_writable(tmp_path / "limits.yaml")
+    assert os.listdir(tmp_path) == []
+
+
+def test_what_was_found_is_printed_when_it_cannot_be_written(robot, call, tmp_path, monkeypatch):
+    output = tmp_path / "limits.yaml"
+    output.write_text("old")
+
+    def full(*arguments):
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(limits_file.os, "fsync", full)
+    ended = call(robot(), "--samples", 300, "-o", output)
+    assert "no space left" in one_line(ended)
+    assert set(printed(ended)) == {"acceleration_min", "acceleration_max"}
+    assert output.read_text() == "old"
+
+
+def test_a_link_keeps_pointing_to_the_file_written(tmp_path):
+    target, link = tmp_path / "limits.yaml", tmp_path / "link.yaml"
+    link.symlink_to(target)
+    limits_file.write_whole(link, "new")
+    assert link.is_symlink() and target.read_text() == "new"
+
+
+def test_written_numbers_err_to_the_safe_side():
+    values = np.array([3.0, -3.0, 5.08769, -5.08769, 0.00123456, 1741.837, 15.0, 0.3, 0.0])
+    down = limits_file.round_towards_zero(values)
+    up = limits_file.round_away_from_zero(values)
+    np.testing.assert_array_equal(
+        down, [3.0, -3.0, 5.087, -5.087, 0.001234, 1741.0, 15.0, 0.3, 0.0]
+    )
+    np.testing.assert_array_equal(up, [3.0, -3.0, 5.088, -5.088, 0.001235, 1742.0, 15.0, 0.3, 0.0])
+    text = limits_file.overlay({"acceleration_min": down}, ["note"])
+    assert text.startswith("# note\n")
+    np.testing.assert_array_equal(parameters_in(text)["acceleration_min"], down)

@@ -1,0 +1,58 @@
+"""What is compiled is never older than the functions of other files that it calls."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+PACKAGE = Path(__file__).resolve().parents[2]
+
+
+def test_a_change_in_a_called_file_of_a_subfolder_is_noticed(tmp_path):
+    package = tmp_path / "arm"
+    room = package / "rooms" / "kernel"
+    room.mkdir(parents=True)
+    (package / "outer.py").write_text(
+        "from viability_bounds_pkg.compiled import compiled\n"
+        "from arm.rooms.kernel.inner import inner\n\n"
+        "@compiled\ndef outer(x):\n    return 10.0 * inner(x)\n"
+    )
+
+    def value(factor):
+        (room / "inner.py").write_text(
+            "from viability_bounds_pkg.compiled import compiled\n\n"
+            f"@compiled\ndef inner(x):\n    return {factor} * x\n"
+        )
+        code = (
+            "from arm.outer import outer\nprint(outer(1.0), sum(outer.stats.cache_hits.values()))"
+        )
+        run = subprocess.run(
+            [sys.executable, "-c", code],
+            env={"PYTHONPATH": f"{tmp_path}:{PACKAGE}", "PATH": "/usr/bin:/bin"},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        result, hits = run.stdout.split()
+        return float(result), hits == "1"
+
+    assert value(1.0) == (10.0, False)
+    assert value(1.0) == (10.0, True)
+    assert value(3.25) == (32.5, False)
+    assert value(3.25) == (32.5, True)
+    assert list((package / "__pycache__").glob("outer*.nbc"))
+
+
+def test_importing_writes_nothing_and_changes_no_setting(tmp_path):
+    code = (
+        "import numba\n"
+        "before = numba.config.CACHE_DIR\n"
+        "import viability_bounds_pkg.viability\n"
+        "assert numba.config.CACHE_DIR == before\n"
+    )
+    cache = tmp_path / "cache"
+    subprocess.run(
+        [sys.executable, "-B", "-c", code],
+        env={"PYTHONPATH": str(PACKAGE), "PATH": "/usr/bin:/bin", "NUMBA_CACHE_DIR": str(cache)},
+        check=True,
+    )
+    assert not [path for path in cache.rglob("*") if path.is_file()]

@@ -1,0 +1,213 @@
+"""The bounds keep the limits: in motion, under disturbances, and on the way back from outside."""
+
+import numpy as np
+import pytest
+from adversary import (
+    POLICIES,
+    VIOLATION,
+    Violations,
+    advance,
+    bring_back,
+    drive,
+    states_in_kernel,
+    states_outside,
+)
+from against_brute_force import detour
+from joint_cases import (
+    CASES,
+    FAILING,
+    FAST_LOOP,
+    HOLDING,
+    ODD_STEPS,
+    column,
+    one_joint,
+    states_of,
+)
+
+from viability_bounds_pkg.joint_limits import JointLimitsError
+from viability_bounds_pkg.kernel import paper_algorithms
+from viability_bounds_pkg.viability import BoundsSolver, condition_11
+
+LIMITED_ABOVE = {name: case for name, case in CASES.items() if np.isfinite(case[1])}
+CASES = {**CASES, **FAST_LOOP, **ODD_STEPS}
+
+MOTIONS = 400
+STEPS = 50
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+@pytest.mark.parametrize("name", CASES)
+def test_limits_hold_for_ever(name, policy):
+    """In all, 2 million joint-steps; `bash scripts/reproduce.sh exactness` makes far more."""
+    case = CASES[name]
+    solver = BoundsSolver(one_joint(*case[:5]), case[5])
+    rng = np.random.default_rng(1)
+    q, v = states_in_kernel(solver, case, MOTIONS, rng)
+    kept = drive(solver, q, v, policy, STEPS, rng)
+    assert kept.lost == 0
+    assert max(kept.position, kept.speed) <= VIOLATION
+
+
+@pytest.mark.parametrize("name", FAILING)
+def test_algorithm_3_breaks_the_limits_where_condition_11_fails(name):
+    """Which is why there is more to do there, and shows that this harness can tell."""
+    case = FAILING[name]
+    limits, dt = one_joint(*case[:5]), case[5]
+    worst = -np.inf
+    for policy in POLICIES.values():
+        rng = np.random.default_rng(1)
+        q, _ = (column(x) for x in states_of(case, 200, seed=2))
+        v = np.zeros_like(q)
+        seen = Violations(limits)
+        for _ in range(STEPS):
+            lower, upper = paper_algorithms.combined_bounds(q, v, limits, dt)
+            lower, upper = (np.clip(b, limits.a_min, limits.a_max) for b in (lower, upper))
+            a = policy(q, v, np.minimum(lower, upper), upper, limits, rng)
+            q, v, low, high = advance(q, v, a, dt)
+            seen.see(low, high, v)
+        worst = max(worst, seen.worst)
+    assert worst > 1e-3 * min(case[2], case[1] - case[0])
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_limits_hold_for_any_shorter_period(name):
+    case = CASES[name]
+    limits, dt = one_joint(*case[:5]), case[5]
+    solver = BoundsSolver(limits, dt, period=0.3 * dt)
+    rng = np.random.default_rng(3)
+    for policy in POLICIES.values():
+        q, v = states_in_kernel(solver, case, 100, rng)
+        seen = Violations(limits)
+        for _ in range(60):
+            lower, upper, viable = solver.bounds(q, v)
+            assert viable.all()
+            a = policy(q, v, lower, upper, limits, rng)
+            q, v, low, high = advance(q, v, a, dt * rng.uniform(0.05, 1.0))
+            seen.see(low, high, v)
+        assert seen.worst <= VIOLATION
+
+
+def test_the_exact_kernel_is_for_one_period_where_condition_11_fails():
+    """So that a shorter period must be told to the solver: it breaks the limits otherwise."""
+    case = CASES["hardly affected"]
+    limits, dt = one_joint(*case[:5]), case[5]
+    solver = BoundsSolver(limits, dt)
+    assert solver.exact.all()
+    assert not BoundsSolver(limits, dt, period=0.5 * dt).exact.any()
+    q, v = states_in_kernel(solver, case, 400, np.random.default_rng(4))
+    seen = Violations(limits)
+    for _ in range(100):
+        q, v, low, high = advance(q, v, solver.bounds(q, v).upper, 0.5 * dt)
+        seen.see(low, high, v)
+    assert seen.worst > 1e-3
+
+
+DISTURBANCES = {
+    "pushes up": lambda v, sign, w, rng: w + 0.0 * v,
+    "pushes down": lambda v, sign, w, rng: -w + 0.0 * v,
+    "pushes on": lambda v, sign, w, rng: w * np.sign(v),
+    "pushes where it is told to go": lambda v, sign, w, rng: w * sign,
+    "changes within the step": lambda v, sign, w, rng: w * rng.choice([-1.0, 1.0], v.shape),
+    "any": lambda v, sign, w, rng: rng.uniform(-w, w, v.shape),
+}
+
+
+@pytest.mark.parametrize("period", [1.0, 0.5])
+@pytest.mark.parametrize("share", [0.02, 0.3])
+@pytest.mark.parametrize("name", CASES)
+def test_a_margin_holds_against_any_disturbance(name, share, period):
+    case = CASES[name]
+    limits, dt = one_joint(*case[:5]), case[5]
+    w = share * min(-case[3], case[4])
+    try:
+        solver = BoundsSolver(limits, dt, [w], period=period * dt)
+    except JointLimitsError:
+        # Then indeed the disturbance alone can throw the joint out within a few steps.
+        assert w * dt > 0.1 * min(case[2], (case[1] - case[0]) / dt)
+        return
+    for policy in POLICIES.values():
+        for disturbance in DISTURBANCES.values():
+            rng = np.random.default_rng(5)
+            q, v = states_in_kernel(solver, case, 40, rng)
+            seen = Violations(limits)
+            for _ in range(20):
+                lower, upper, viable = solver.bounds(q, v)
+                assert viable.all()
+                assert (upper >= lower).all()
+                a = policy(q, v, lower, upper, limits, rng)
+                sign = np.where(a > 0.5 * (lower + upper), 1.0, -1.0)
+                for part in (0.4, 0.1, 0.5):
+                    true = a + disturbance(v, sign, w, rng)
+                    q, v, low, high = advance(q, v, true, part * period * dt)
+                    seen.see(low, high, v)
+            assert seen.worst <= VIOLATION
+
+
+def test_without_a_margin_the_disturbance_breaks_the_limits():
+    case = HOLDING["figure 3"]
+    limits, dt = one_joint(*case[:5]), case[5]
+    solver = BoundsSolver(limits, dt)
+    q, v = states_in_kernel(solver, case, 100, np.random.default_rng(6))
+    seen = Violations(limits)
+    for _ in range(20):
+        q, v, low, high = advance(q, v, solver.bounds(q, v).upper + 0.2, dt)
+        seen.see(low, high, v)
+    assert seen.worst > 1e-3
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+@pytest.mark.parametrize("name", [name for name in CASES if name != "tiny step"])
+@pytest.mark.parametrize("margin", [0.0, 0.05])
+def test_every_joint_returns(name, policy, margin):
+    case = CASES[name]
+    limits, dt = one_joint(*case[:5]), case[5]
+    w = margin * min(-case[3], case[4])
+    try:
+        solver = BoundsSolver(limits, dt, [w])
+    except JointLimitsError:
+        return
+    rng = np.random.default_rng(7)
+    q, v = states_outside(solver, case, 300, rng)
+    assert q.size == 300
+    run = bring_back(solver, q, v, policy, 3000, rng)
+    assert run.stray == 0
+    assert max(run.again, run.speed) <= VIOLATION
+    if condition_11(limits, dt, [w]).all():
+        assert run.position <= VIOLATION
+
+
+@pytest.mark.parametrize("name", [name for name in LIMITED_ABOVE if name in FAILING])
+def test_no_joint_leaves_further_than_it_must(name):
+    """Where (11) fails, braking at its limit would throw a joint against the other limit."""
+    case = LIMITED_ABOVE[name]
+    solver = BoundsSolver(one_joint(*case[:5]), case[5])
+    rng = np.random.default_rng(9)
+    q, v = states_outside(solver, case, 200, rng)
+    # On the way out, with the other limits kept.
+    out = ((v >= 0.0) & (v <= case[2]) & (q >= case[0]))[:, 0]
+    q, v = q[out][:10], v[out][:10]
+    runs = [bring_back(solver, q, v, policy, 3000, rng) for policy in POLICIES]
+    highest = np.max([run.highest for run in runs], axis=0)
+    result = detour(case, q[:, 0], v[:, 0], highest[:, 0])
+    assert result.compared == 10
+    # Narrow ones also see to it that they will not leave a second time.
+    assert result.share <= (0.02 if name == "far too narrow" else 1e-5)
+
+
+def test_return_to_a_range_that_one_step_may_cross():
+    """It neither rushes through to the other side nor breaks its speed limit to avoid that."""
+    limits, dt = one_joint(-0.5, 0.5, 2.0, -12.0, 9.0), 10.0
+    solver = BoundsSolver(limits, dt)
+    q, v = column([0.51, 0.51, -5.0, 3.0]), column([-2.07, 2.0, 2.0, -1.0])
+    for policy in POLICIES:
+        run = bring_back(solver, q, v, policy, 30, np.random.default_rng(0))
+        assert run.stray == 0
+        assert run.speed <= VIOLATION
+
+
+def test_a_step_beyond_the_limit_by_rounding_is_no_emergency():
+    limits = one_joint(-1.0, 1.0, 2.0, -10.0, 10.0)
+    lower, upper, viable = BoundsSolver(limits, 0.01).bounds([np.nextafter(1.0, 2.0)], [0.0])
+    assert viable[0]
+    assert upper[0] == pytest.approx(0.0, abs=1e-10)
+    assert lower[0] == -10.0

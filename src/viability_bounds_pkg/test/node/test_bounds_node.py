@@ -1,0 +1,401 @@
+import math
+import re
+import time
+
+import numpy as np
+import pytest
+from arms import load_arm
+from diagnostic_msgs.msg import DiagnosticStatus
+from ros_harness import acceleration_limits, joint_state, read_config
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory
+
+from viability_bounds_pkg.baselines import naive_bounds
+from viability_bounds_pkg.joint_limits import JointLimits
+from viability_bounds_pkg.node.bounds_node import BoundsNode
+from viability_bounds_pkg.node.bounds_parameters import TABLE, make_configuration
+from viability_bounds_pkg.ros.parameters import ParameterError
+from viability_bounds_pkg.state_dependent.limits import StateDependentBounds
+from viability_bounds_pkg.torque_margin import tightened, torque_margins
+from viability_bounds_pkg.viability import acceleration_bounds
+
+NODE = "bounds_node"
+JOINTS = ["turn", "lift", "spin"]
+PERIOD = 0.01  # s
+MS = 1_000_000
+VALUES = {
+    "joints": JOINTS,
+    "position_min": [-1.0, -0.5, -math.inf],
+    "position_max": [1.0, 2.0, math.inf],
+    "velocity_max": [1.0, 2.0, 3.0],
+    "acceleration_min": [-10.0, -4.0, -20.0],
+    "acceleration_max": [8.0, 5.0, 20.0],
+    "rate_hz": 1.0 / PERIOD,
+    "bounds_dt_factor": 2.0,
+    "state_timeout": 0.2,
+}
+LIMITS = JointLimits(
+    tuple(JOINTS),
+    *(
+        VALUES[name]
+        for name in (
+            "position_min",
+            "position_max",
+            "velocity_max",
+            "acceleration_min",
+            "acceleration_max",
+        )
+    ),
+)
+REST = [0.0, 0.0, 0.0]
+# Each joint on its way to its upper limit, braking hard enough for the bounds to be narrow.
+NEAR = [0.96, 1.9, 4.0], [0.6, 0.85, 2.95]
+
+
+def exact(q, v, factor=2.0):
+    return acceleration_bounds(q, v, LIMITS, factor * PERIOD, None, PERIOD)
+
+
+class Robot:
+    """The other side: sends states, keeps answers."""
+
+    def __init__(self, ros, **changed) -> None:
+        self.ros = ros
+        self.node = ros.start(BoundsNode, VALUES | changed)
+        self.answers = ros.listen(JointTrajectory, "acceleration_limits")
+        self.states = ros.talk(JointState, "joint_states")
+        ros.hears("acceleration_limits")
+
+    def send(self, stamp, q, v, joints=JOINTS) -> None:
+        self.states.publish(joint_state(joints, stamp, q, v))
+
+    def ask(self, stamp, q, v, joints=JOINTS) -> JointTrajectory:
+        """Send a state until it is answered, return the answer."""
+        self.answers.clear()
+        self.ros.wait_until(
+            lambda: stamp in self.answers.stamps,
+            "an answer",
+            each=lambda: self.send(stamp, q, v, joints),
+            period=0.1,
+        )
+        return self.answers[self.answers.stamps.index(stamp)]
+
+
+def check(answer: JointTrajectory, bounds) -> None:
+    assert answer.joint_names == JOINTS
+    lower, upper = (point.accelerations for point in answer.points)
+    np.testing.assert_allclose(lower, bounds.lower, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(upper, bounds.upper, rtol=1e-12, atol=1e-12)
+
+
+def test_answers_are_those_of_the_solver_with_the_stamp_of_the_state(ros):
+    robot = Robot(ros)
+    rng = np.random.default_rng(1)
+    seen = set()
+    for k in range(1, 41):
+        # Some of them outside the limits.
+        q = rng.uniform([-1.1, -0.6, -50.0], [1.1, 2.1, 50.0])
+        v = rng.uniform(-1.2, 1.2, 3) * VALUES["velocity_max"]
+        bounds = exact(q, v)
+        check(robot.ask(k * 10 * MS + k, q, v), bounds)
+        seen.add(tuple(bounds.viable))
+    assert len(seen) > 4, "the states hardly differ"
+
+
+def test_joints_in_any_order_and_others_with_them(ros):
+    robot = Robot(ros)
+    order = [2, 0, 1]
+    q, v = np.array(NEAR)
+    answer = robot.ask(
+        10 * MS,
+        [*q[order], math.nan],
+        [*v[order], 0.0],
+        [*(JOINTS[i] for i in order), "other"],
+    )
+    check(answer, exact(q, v))
+
+
+def test_the_same_state_again_gets_the_same_answer_again(ros):
+    robot = Robot(ros)
+    first = robot.ask(10 * MS, *NEAR)
+    for _ in range(3):
+        assert robot.ask(10 * MS, *NEAR) == first
+    ros.wait_until(lambda: ros.reported(NODE, "states_answered") == "1", "one state answered")
+
+
+@pytest.mark.parametrize(
+    ("stamp", "q", "v", "joints", "reason"),
+    [
+        (20, [0.0, math.nan, 0.0], REST, JOINTS, "not finite"),
+        (20, REST, [0.0, 0.0, math.inf], JOINTS, "not finite"),
+        (20, REST, REST[:2], JOINTS, "wrong size"),
+        (20, REST[:2], REST[:2], JOINTS[:2], "missing joint"),
+        (20, [], [], [], "missing joint"),
+        (5, REST, REST, JOINTS, "old stamp"),
+        (0, REST, REST, JOINTS, "no stamp"),
+        (10, REST, REST, JOINTS, "other values under the same stamp"),
+    ],
+)
+def test_what_is_wrong_is_dropped_and_counted(ros, stamp, q, v, joints, reason):
+    robot = Robot(ros, state_timeout=30.0)
+    robot.ask(10 * MS, *NEAR)
+    robot.answers.clear()
+    ros.wait_until(
+        lambda: re.search(f"{reason}: [1-9]", ros.reported(NODE, "states_refused")),
+        f"a refusal: {reason}",
+        each=lambda: robot.send(stamp * MS, q, v, joints),
+    )
+    assert ros.diagnostics[NODE]["level"] == DiagnosticStatus.WARN
+    assert not robot.answers, "what was refused was answered"
+    check(robot.ask(30 * MS, *NEAR), exact(*map(np.array, NEAR)))
+
+
+def test_an_empty_first_message_does_no_harm(ros):
+    robot = Robot(ros)
+    ros.wait_until(
+        lambda: "missing joint" in ros.reported(NODE, "states_refused"),
+        "a refusal",
+        each=lambda: robot.send(10 * MS, [], [], []),
+    )
+    check(robot.ask(20 * MS, *NEAR), exact(*map(np.array, NEAR)))
+
+
+def test_a_robot_that_starts_over_is_answered_after_the_time_out(ros):
+    robot = Robot(ros)
+    begin = time.monotonic()
+    robot.ask(5000 * MS, *NEAR)
+    check(robot.ask(10 * MS, REST, REST), exact(*np.zeros((2, 3))))
+    assert time.monotonic() - begin >= VALUES["state_timeout"]
+    check(robot.ask(20 * MS, *NEAR), exact(*map(np.array, NEAR)))
+    ros.wait_until(lambda: "old stamp" in ros.reported(NODE, "states_refused"), "the refusals")
+
+
+def test_diagnostics(ros):
+    robot = Robot(ros)
+    ros.wait_until(lambda: ros.reported(NODE, "message") == "no joint state yet")
+    assert ros.diagnostics[NODE]["level"] == DiagnosticStatus.WARN
+    robot.ask(10 * MS, REST, REST)
+    robot.ask(20 * MS, [0.0, 2.1, 0.0], REST)
+    robot.ask(30 * MS, [0.0, 2.1, 0.0], [0.0, 0.0, 3.1])
+    ros.wait_until(lambda: ros.reported(NODE, "states_answered") == "3")
+    report = ros.diagnostics[NODE]
+    assert report["level"] == DiagnosticStatus.OK
+    assert report["message"] == "answering"
+    assert report["method"] == "exact"
+    assert report["states_outside_kernel_by_joint"] == "0 2 1"
+    assert float(report["control_period_s"]) == pytest.approx(PERIOD)
+    assert float(report["bounds_period_s"]) == pytest.approx(2.0 * PERIOD)
+
+
+def test_method_and_horizon_change_while_it_runs(ros):
+    robot = Robot(ros)
+    q, v = map(np.array, NEAR)
+    check(robot.ask(10 * MS, q, v), exact(q, v))
+    ros.accepts(NODE, bounds_dt_factor=4.0)
+    check(robot.ask(20 * MS, q, v), exact(q, v, 4.0))
+    assert (exact(q, v, 4.0).upper < exact(q, v).upper).all(), "the factor has no effect here"
+    ros.accepts(NODE, method="naive")
+    naive = naive_bounds(q, v, LIMITS, 4.0 * PERIOD)
+    check(robot.ask(30 * MS, q, v), naive)
+    assert (naive.upper[:2] > exact(q, v, 4.0).upper[:2]).all(), "the method has no effect here"
+    ros.accepts(NODE, method="exact", bounds_dt_factor=1)
+    check(robot.ask(40 * MS, q, v), exact(q, v, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("bounds_dt_factor", 0.99),
+        ("bounds_dt_factor", -2.0),
+        ("bounds_dt_factor", math.nan),
+        ("bounds_dt_factor", math.inf),
+        ("bounds_dt_factor", "two"),
+        ("method", "guess"),
+        ("method", ""),
+        ("method", 1),
+    ],
+)
+def test_a_bad_change_is_refused_and_the_old_value_keeps_working(ros, name, value):
+    robot = Robot(ros)
+    reason = ros.refuses(NODE, **{name: value})
+    assert reason.startswith(f"parameter '{name}' is ")
+    assert robot.node.get_parameter(name).value == {"method": "exact"}.get(name, 2.0)
+    q, v = map(np.array, NEAR)
+    check(robot.ask(10 * MS, q, v), exact(q, v))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("joints", ["a", "b", "c"]),
+        ("position_min", [-9.0, -9.0, -9.0]),
+        ("position_max", [9.0, 9.0, 9.0]),
+        ("velocity_max", [9.0, 9.0, 9.0]),
+        ("acceleration_min", [-9.0, -9.0, -9.0]),
+        ("acceleration_max", [9.0, 9.0, 9.0]),
+        ("acceleration_drift", [0.0, 0.0, 0.0]),
+        ("position_margin", 0.0),
+        ("rate_hz", 1000.0),
+        ("state_timeout", 1.0),
+    ],
+)
+def test_limits_and_rates_are_read_only(ros, name, value):
+    robot = Robot(ros)
+    assert "read-only" in ros.refuses(NODE, **{name: value})
+    q, v = map(np.array, NEAR)
+    check(robot.ask(10 * MS, q, v), exact(q, v))
+
+
+@pytest.mark.parametrize(
+    ("changed", "name", "shown"),
+    [
+        ({"position_min": [-1.0, 2.0, -math.inf]}, "position_max", "2"),
+        ({"position_min": [-1.0, 2.5, -math.inf]}, "position_max", "2"),
+        ({"position_min": [math.inf, -0.5, -math.inf]}, "position_min", "inf"),
+        ({"position_min": [math.nan, -0.5, 0.0]}, "position_min", "nan"),
+        ({"position_max": [1.0, 2.0]}, "position_max", "[1, 2]"),
+        ({"position_max": [1.0, 2.0, 3.0, 4.0]}, "position_max", "[1, 2, 3, 4]"),
+        ({"velocity_max": [1.0, 0.0, 3.0]}, "velocity_max", "0"),
+        ({"velocity_max": [1.0, -2.0, 3.0]}, "velocity_max", "-2"),
+        ({"velocity_max": [1.0, math.inf, 3.0]}, "velocity_max", "inf"),
+        ({"acceleration_min": [-1.0, 0.0, -1.0]}, "acceleration_min", "0"),
+        ({"acceleration_min": [-1.0, 4.0, -1.0]}, "acceleration_min", "4"),
+        ({"acceleration_max": [1.0, -4.0, 1.0]}, "acceleration_max", "-4"),
+        ({"acceleration_max": [1.0, math.nan, 1.0]}, "acceleration_max", "nan"),
+        ({"acceleration_drift": [1.0]}, "acceleration_drift", "[1]"),
+        ({"acceleration_drift": [1.0, -1.0, 1.0]}, "acceleration_drift", "-1"),
+        ({"acceleration_drift": [1.0, math.inf, 1.0]}, "acceleration_drift", "inf"),
+        ({"position_margin": -1e-3}, "position_margin", "-0.001"),
+        ({"position_margin": math.nan}, "position_margin", "nan"),
+        ({"joints": ["turn", "lift", "turn"]}, "joints", "['turn', 'lift', 'turn']"),
+        ({"joints": ["turn", "", "spin"]}, "joints", "['turn', '', 'spin']"),
+        ({"joints": None}, "joints", "not set"),
+        ({"velocity_max": None}, "velocity_max", "not set"),
+        ({"rate_hz": None}, "rate_hz", "not set"),
+        ({"rate_hz": 0.0}, "rate_hz", "0"),
+        ({"rate_hz": -100.0}, "rate_hz", "-100"),
+        ({"rate_hz": math.inf}, "rate_hz", "inf"),
+        ({"method": "magic"}, "method", "'magic'"),
+        ({"bounds_dt_factor": 0.5}, "bounds_dt_factor", "0.5"),
+        ({"bounds_dt_factor": math.nan}, "bounds_dt_factor", "nan"),
+        ({"state_timeout": 0.0}, "state_timeout", "0"),
+    ],
+)
+def test_it_does_not_start_with_bad_parameters(ros, changed, name, shown):
+    with pytest.raises(ParameterError) as refusal:
+        ros.start(BoundsNode, VALUES | changed)
+    text = str(refusal.value)
+    assert refusal.value.name == name
+    assert re.fullmatch(rf"parameter '{name}' is (.+); allowed: (.+)", text), text
+    assert shown in text
+    assert "\n" not in text
+
+
+@pytest.mark.parametrize("robot", ["baxter_left_arm", "panda"])
+def test_the_configured_margins_only_narrow_the_bounds(robot):
+    values = dict.fromkeys(("acceleration_drift", "position_margin"))
+    margins = read_config(robot, NODE)
+    assert all(margins[name] for name in values)
+
+    def solver(parameters):
+        table = {row.name: row.coerce(parameters.get(row.name)) for row in TABLE}
+        return make_configuration(table, load_model=None)
+
+    with_margins = solver(margins)
+    without = solver(margins | {"acceleration_drift": [], "position_margin": 0.0})
+    limits = without.limits
+    rng = np.random.default_rng(2)
+    q = rng.uniform(limits.q_min, limits.q_max, (2000, len(limits)))
+    v = rng.uniform(-limits.v_max, limits.v_max, (2000, len(limits)))
+    narrow, wide = with_margins.solve(q, v), without.solve(q, v)
+    inside = narrow.viable
+    assert inside.mean() > 0.2
+    assert (wide.viable | ~inside).all()
+    slack = 1e-9  # rad/s^2
+    assert (narrow.upper <= wide.upper + slack)[inside].all()
+    assert (narrow.lower >= wide.lower - slack)[inside].all()
+    assert (narrow.upper < wide.upper - 1e-3)[inside].any()
+
+
+def test_a_second_robot_can_use_what_it_answers(ros):
+    # The format that the controller takes; see the table of topics.
+    robot = Robot(ros)
+    q, v = map(np.array, NEAR)
+    bounds = exact(q, v)
+    answer = robot.ask(10 * MS, q, v)
+    assert answer == acceleration_limits(JOINTS, 10 * MS, bounds.lower, bounds.upper)
+
+
+PANDA = read_config("panda", NODE)
+PANDA_VALUES = {row.name: PANDA[row.name] for row in TABLE if row.name in PANDA}
+
+
+def test_state_dependent_limits_are_those_of_the_solver(ros):
+    values = PANDA_VALUES | {"acceleration_limits": "state_dependent", "state_timeout": 0.2}
+    ros.start(BoundsNode, values)
+    answers = ros.listen(JointTrajectory, "acceleration_limits")
+    states = ros.talk(JointState, "joint_states")
+    ros.hears("acceleration_limits")
+    arm = load_arm("panda")
+    limits = JointLimits(
+        PANDA["joints"],
+        arm.q_min,
+        arm.q_max,
+        arm.v_max,
+        PANDA["acceleration_min"],
+        PANDA["acceleration_max"],
+    )
+    margins = torque_margins(PANDA["acceleration_drift"], arm.dt)
+    margins.position[:] += PANDA["position_margin"]
+    solver = StateDependentBounds(
+        arm.model,
+        tightened(limits, margins),
+        arm.tau_max,
+        3.0 * np.maximum(-limits.a_min, limits.a_max),
+        2.0 * arm.dt,
+        margins.acceleration,
+        arm.dt,
+        margins.position,
+    )
+    wider = 0
+    # Steps of 2 ms towards a limit, then one after a gap: the path of the last is forgotten.
+    for k, stamp in enumerate((2, 4, 6, 8, 50)):
+        q = arm.q_start.copy()
+        q[1], v = 1.48 + 0.0026 * k, np.full(7, 1.3)
+        ros.wait_until(
+            lambda stamp=stamp: stamp * MS in answers.stamps,
+            "an answer",
+            each=lambda q=q, v=v, s=stamp: states.publish(
+                joint_state(PANDA["joints"], s * MS, q, v)
+            ),
+            period=0.1,
+        )
+        if stamp == 50:
+            solver.start()
+        bounds = solver.bounds(q, v)
+        answer = answers[answers.stamps.index(stamp * MS)]
+        assert answer == acceleration_limits(
+            PANDA["joints"], stamp * MS, bounds.lower, bounds.upper
+        )
+        wider += int((bounds.upper > limits.a_max).sum())
+    assert wider > 10
+    ros.wait_until(lambda: "certified" in ros.reported(NODE, "steps_by_limits"), "diagnostics")
+
+
+@pytest.mark.parametrize(
+    ("changed", "name", "shown"),
+    [
+        ({"acceleration_limits": "best"}, "acceleration_limits", "worst_case, state_dependent"),
+        ({"robot_description": ""}, "robot_description", "for state-dependent"),
+        ({"robot_description": "/nowhere.urdf"}, "robot_description", "/nowhere.urdf"),
+        ({"torque_max": [1.0]}, "torque_max", "7 numbers"),
+        ({"acceleration_peak": [1.0] * 7}, "acceleration_peak", "at least that of the worst"),
+        ({"acceleration_peak": [50.0]}, "acceleration_peak", "7 numbers"),
+    ],
+)
+def test_bad_parameters_of_state_dependent_limits(ros, changed, name, shown):
+    values = PANDA_VALUES | {"acceleration_limits": "state_dependent"} | changed
+    with pytest.raises(ParameterError) as refusal:
+        ros.start(BoundsNode, values)
+    assert refusal.value.name == name
+    assert shown in str(refusal.value)

@@ -1,0 +1,206 @@
+import math
+from array import array
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from rclpy.node import Node
+from ros_harness import overrides
+
+from viability_bounds_pkg.ros.parameters import (
+    NodeParameters,
+    Parameter,
+    ParameterError,
+    joint_names,
+    per_joint,
+    positive,
+)
+from viability_bounds_pkg.ros.robot_parameters import locked_joints
+
+TABLE = (
+    Parameter("joints", list[str], "names"),
+    Parameter("limits", list[float], "one a joint, m"),
+    Parameter("extra", list[float], "may be left out", default=np.zeros(0)),
+    Parameter("rate", float, "Hz"),
+    Parameter("gain", float, "1/s", default=2.0, live=True),
+    Parameter("offset", float, "less than the gain, 1/s", default=1.0, live=True),
+    Parameter("count", int, "of something", default=3, live=True),
+    Parameter("shape", str, "round or flat", default="round", live=True),
+    Parameter("enabled", bool, "or not", default=True, live=True),
+)
+VALUES = {"joints": ["a", "b"], "limits": [1.0, 2.0], "rate": 100.0}
+
+
+class Configuration(NamedTuple):
+    gain: float
+    offset: float
+    shape: str
+
+
+def make_configuration(values):
+    joints = joint_names(values)
+    per_joint(values, "limits", joints)
+    positive(values, "rate")
+    if positive(values, "gain") <= values["offset"]:
+        raise ParameterError("offset", values["offset"], "less than gain")
+    if values["shape"] not in ("round", "flat"):
+        raise ParameterError("shape", values["shape"], "round or flat")
+    return Configuration(values["gain"], values["offset"], values["shape"])
+
+
+class Tunable(Node):
+    def __init__(self, **node_arguments):
+        super().__init__("tunable", **node_arguments)
+        self.changes = []
+        self.parameters = NodeParameters(self, TABLE, make_configuration, self.changes.append)
+
+
+def start(ros, **changed) -> Tunable:
+    return ros.start(Tunable, VALUES | changed)
+
+
+def test_values_and_defaults_arrive(ros):
+    node = start(ros, gain=4.5)
+    assert node.parameters.configuration == Configuration(4.5, 1.0, "round")
+    values = node.parameters.values
+    assert values["joints"] == ("a", "b")
+    np.testing.assert_array_equal(values["limits"], [1.0, 2.0])
+    assert values["extra"].shape == (0,)
+    assert (values["count"], values["enabled"]) == (3, True)
+
+
+def test_whole_numbers_are_taken_for_floats(ros):
+    node = start(ros, gain=4, rate=100, limits=[1, 2])
+    assert node.parameters.configuration.gain == 4.0
+    assert node.parameters.values["limits"].dtype == float
+
+
+def test_a_change_arrives_once_and_all_of_it(ros):
+    node = start(ros)
+    ros.accepts("tunable", gain=5.0)
+    assert node.changes == [Configuration(5.0, 1.0, "round")]
+    ros.accepts("tunable", shape="flat")
+    assert node.changes[1:] == [Configuration(5.0, 1.0, "flat")]
+    assert node.parameters.configuration == Configuration(5.0, 1.0, "flat")
+    ros.accepts("tunable", gain=6)  # ros2 param set sends a whole number for "6"
+    assert node.parameters.configuration.gain == 6.0
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("gain", -1.0, "parameter 'gain' is -1; allowed: a finite number > 0"),
+        ("gain", 0.0, "parameter 'gain' is 0; allowed: a finite number > 0"),
+        ("gain", math.nan, "parameter 'gain' is nan; allowed: a finite number > 0"),
+        ("gain", math.inf, "parameter 'gain' is inf; allowed: a finite number > 0"),
+        ("gain", "high", "parameter 'gain' is 'high'; allowed: a number"),
+        ("gain", True, "parameter 'gain' is True; allowed: a number"),
+        ("gain", [1.0, 2.0], "parameter 'gain' is [1, 2]; allowed: a number"),
+        ("count", 1.5, "parameter 'count' is 1.5; allowed: a whole number"),
+        ("enabled", 1, "parameter 'enabled' is 1; allowed: true or false"),
+        ("shape", 1, "parameter 'shape' is 1; allowed: a string"),
+        ("shape", "oval", "parameter 'shape' is 'oval'; allowed: round or flat"),
+        # Fine by itself, but not together with the others.
+        ("offset", 2.0, "parameter 'offset' is 2; allowed: less than gain"),
+    ],
+)
+def test_a_bad_change_is_refused_and_the_old_value_stays(ros, name, value, expected):
+    node = start(ros)
+    before = node.get_parameter(name).value
+    assert ros.refuses("tunable", **{name: value}) == expected
+    assert node.get_parameter(name).value == before
+    assert node.parameters.values[name] == before
+    assert node.changes == []
+
+
+def test_changes_are_judged_one_by_one_unless_asked_for_together(ros):
+    node = start(ros)
+    first, second = ros.set_parameters("tunable", offset=3.0, gain=4.0)
+    assert (first.successful, second.successful) == (False, True)
+    assert node.parameters.configuration == Configuration(4.0, 1.0, "round")
+    result = node.set_parameters_atomically(overrides({"offset": 5.0, "gain": 8.0}))
+    assert result.successful
+    assert node.changes == [Configuration(4.0, 1.0, "round"), Configuration(8.0, 5.0, "round")]
+    result = node.set_parameters_atomically(overrides({"shape": "flat", "gain": -1.0}))
+    assert not result.successful
+    assert node.parameters.configuration == Configuration(8.0, 5.0, "round")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("joints", ["a", "b"]), ("limits", [1.0, 2.0]), ("rate", 200.0)]
+)
+def test_what_is_not_live_is_read_only(ros, name, value):
+    node = start(ros)
+    assert "read-only" in ros.refuses("tunable", **{name: value})
+    assert node.changes == []
+
+
+def test_parameters_of_others_are_left_alone(ros):
+    node = start(ros)
+    node.declare_parameter("mine", 1.0)
+    ros.accepts("tunable", mine=2.0)
+    assert node.changes == []
+
+
+@pytest.mark.parametrize(
+    ("changed", "expected"),
+    [
+        ({"rate": None}, "parameter 'rate' is not set; allowed: a number"),
+        ({"joints": None}, "parameter 'joints' is not set; allowed: a list of strings"),
+        ({"limits": None}, "parameter 'limits' is not set; allowed: a list of numbers"),
+        ({"rate": "fast"}, "parameter 'rate' is 'fast'; allowed: a number"),
+        ({"joints": "a"}, "parameter 'joints' is 'a'; allowed: a list of strings"),
+        ({"joints": [1, 2]}, "parameter 'joints' is [1, 2]; allowed: a list of strings"),
+        ({"limits": 1.0}, "parameter 'limits' is 1; allowed: a list of numbers"),
+        ({"limits": ["x"]}, "parameter 'limits' is ['x']; allowed: a list of numbers"),
+        ({"limits": [True, False]}, "parameter 'limits' is [True, False]; allowed: a list of "),
+        ({"limits": [1.0]}, "parameter 'limits' is [1]; allowed: 2 numbers, one for each of "),
+        ({"limits": [1.0, math.nan]}, "parameter 'limits' is [1, nan]; allowed: numbers, not NaN"),
+        ({"joints": ["a", "a"]}, "parameter 'joints' is ['a', 'a']; allowed: at least one joint "),
+        ({"joints": ["a", ""]}, "parameter 'joints' is ['a', '']; allowed: at least one joint "),
+        ({"rate": 0.0}, "parameter 'rate' is 0; allowed: a finite number > 0"),
+        ({"gain": 0.5}, "parameter 'offset' is 1; allowed: less than gain"),
+    ],
+)
+def test_a_node_does_not_start_with_bad_values(ros, changed, expected):
+    with pytest.raises(ParameterError) as refusal:
+        start(ros, **changed)
+    assert str(refusal.value).startswith(expected)
+    assert "\n" not in str(refusal.value)
+    assert refusal.value.name in expected
+
+
+def test_descriptions_tell_what_may_change(ros):
+    node = start(ros)
+    assert node.describe_parameter("gain").description == "1/s"
+    assert not node.describe_parameter("gain").read_only
+    assert node.describe_parameter("rate").read_only
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [
+        (np.array([1.0, 2.5]), "[1, 2.5]"),
+        (array("d", [1.0, 2.5]), "[1, 2.5]"),
+        (("a", "b"), "['a', 'b']"),
+        (0.1, "0.1"),
+        (7, "7"),
+        (False, "False"),
+    ],
+)
+def test_values_are_shown_as_they_are_written(value: Any, shown: str):
+    assert str(ParameterError("p", value, "x")) == f"parameter 'p' is {shown}; allowed: x"
+
+
+@pytest.mark.parametrize(("value", "zero"), [(0.0, True), (1e-300, False), (1e300, True)])
+def test_positive_takes(value, zero):
+    assert positive({"p": value}, "p", zero=zero) == value
+
+
+def test_locked_joints():
+    names, positions = ("x", "y"), np.array([0.5, -1.0])
+    values = {"locked_joints": names, "locked_positions": positions}
+    assert locked_joints(values) == {"x": 0.5, "y": -1.0}
+    for bad in (positions[:1], np.array([0.5, math.nan]), np.array([0.5, math.inf])):
+        with pytest.raises(ParameterError, match="'locked_positions'"):
+            locked_joints(values | {"locked_positions": bad})

@@ -1,0 +1,246 @@
+"""The robot's parameter file that limits are estimated from, and the one they are written to."""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pinocchio as pin
+import yaml
+
+from viability_bounds_pkg.estimation.state_space import Array
+from viability_bounds_pkg.robot_description import build_model, read_urdf
+
+NODE = "/**/bounds_node"
+"""The node whose parameters the limits are."""
+
+CONTROLLER = "/**/controller_node"
+"""The node that must know them, too, to keep distances."""
+
+DIGITS = 4
+"""Significant digits written."""
+
+
+class ParameterFileError(ValueError):
+    """A parameter file that cannot be read or lacks what is needed."""
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A robot and the limits its parameter file gives.
+
+    Attributes:
+        model: Pinocchio's, one degree of freedom a joint, n of them.
+        q_min: lower position limits, shape (n,), rad; infinite for continuous joints.
+        q_max: upper position limits, shape (n,), rad.
+        v_max: velocity limits, shape (n,), rad/s.
+        tau_max: torque limits, shape (n,), N m.
+    """
+
+    model: pin.Model
+    q_min: Array
+    q_max: Array
+    v_max: Array
+    tau_max: Array
+
+
+def read_robot(path: Path) -> Robot:
+    """Return the robot that a ROS 2 parameter file describes.
+
+    Parameters are looked up under ``/**`` and, before that, under the bounds node. Limits that
+    the file does not give are those of the URDF.
+
+    Args:
+        path: the parameter file.
+
+    Raises:
+        ParameterFileError: the file cannot be read, is no parameter file, or a parameter is
+            missing or of the wrong type or length.
+        RobotDescriptionError: the URDF cannot be found or loaded, or lacks a joint; a rotor
+            inertia is negative.
+    """
+    parameters = node_parameters(path)
+    for key in ("robot_description", "joints"):
+        if key not in parameters:
+            raise ParameterFileError(f"{path}: parameter '{key}' is missing")
+    if not isinstance(parameters["robot_description"], str):
+        raise ParameterFileError(f"{path}: parameter 'robot_description' must be a string")
+    joints = _texts(parameters, "joints", path)
+    locked = _texts(parameters, "locked_joints", path)
+    positions = _numbers(parameters, "locked_positions", len(locked), path)
+    locked_positions = dict(zip(locked, positions, strict=True)) if positions is not None else {}
+    urdf = read_urdf(parameters["robot_description"])
+    _check_limits(urdf, parameters["robot_description"])
+    rotor_inertia = _numbers(parameters, "rotor_inertia", len(joints), path)
+    model = build_model(urdf, joints, locked_positions, rotor_inertia)
+    limits = {}
+    for key, from_urdf in (
+        ("position_min", model.lowerPositionLimit),
+        ("position_max", model.upperPositionLimit),
+        ("velocity_max", model.velocityLimit),
+        ("torque_max", model.effortLimit),
+    ):
+        limits[key] = _numbers(parameters, key, len(joints), path)
+        if limits[key] is not None:
+            continue
+        limits[key] = np.array(from_urdf)
+        if key.startswith("position"):
+            continue
+        for joint, value in zip(joints, from_urdf, strict=True):
+            if not (math.isfinite(value) and value > 0):
+                raise ParameterFileError(
+                    f"{path}: joint {joint} has no limit in the URDF to use: "
+                    f"parameter '{key}' is missing"
+                )
+    return Robot(model, *limits.values())
+
+
+def _check_limits(urdf: str, source: str) -> None:
+    """Raise where a limit that every URDF must give is missing: the parser names it less well."""
+    for joint in ElementTree.fromstring(urdf).iter("joint"):
+        if joint.get("type") not in ("revolute", "prismatic"):
+            continue
+        limit = joint.find("limit")
+        for key in ("effort", "velocity"):
+            if limit is None or limit.get(key) is None:
+                raise ParameterFileError(f"{source}: joint {joint.get('name')} has no {key} limit")
+
+
+def node_parameters(path: Path, node: str = NODE) -> dict[str, Any]:
+    """Return the parameters of one node, those for all nodes included.
+
+    Args:
+        path: the parameter file.
+        node: ``/**/name``; sections ``name`` and ``/name`` count as well.
+
+    Raises:
+        ParameterFileError: the file cannot be read, is no parameter file, or has none for `node`.
+    """
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ParameterFileError(f"{path}: {error}") from error
+    except yaml.YAMLError as error:
+        reason = " ".join(str(error).split())
+        raise ParameterFileError(f"{path}: not a YAML file ({reason})") from error
+    parameters: dict[str, Any] = {}
+    name = node.rpartition("/")[2]
+    for key in ("/**", name, f"/{name}", node):
+        section = document.get(key) if isinstance(document, Mapping) else None
+        if section is None:
+            continue
+        values = section.get("ros__parameters") if isinstance(section, Mapping) else None
+        if not isinstance(values, Mapping):
+            raise ParameterFileError(f"{path}: '{key}' has no 'ros__parameters'")
+        parameters.update(values)
+    if not parameters:
+        raise ParameterFileError(f"{path}: no parameters under '/**' or '{node}'")
+    return parameters
+
+
+def _texts(parameters: Mapping[str, Any], key: str, path: Path) -> list[str]:
+    values = parameters.get(key, [])
+    if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
+        raise ParameterFileError(f"{path}: parameter '{key}' must be a list of names")
+    return values
+
+
+def _numbers(parameters: Mapping[str, Any], key: str, count: int, path: Path) -> Array | None:
+    values = parameters.get(key)
+    if values is None:
+        return None
+    if (
+        not isinstance(values, list)
+        or len(values) != count
+        or any(isinstance(value, bool) or not isinstance(value, int | float) for value in values)
+    ):
+        raise ParameterFileError(f"{path}: parameter '{key}' must be a list of {count} numbers")
+    return np.array(values, dtype=float)
+
+
+def overlay(parameters: Mapping[str, Array], notes: Sequence[str], node: str = NODE) -> str:
+    """Return a parameter file that sets `parameters` of one node and nothing else.
+
+    It is meant as a second ``--params-file``, after the robot's: what a person wrote there, with
+    the comments, stays as it is.
+
+    Args:
+        parameters: values by name; they must have few enough digits to be written as they are.
+        notes: comment lines for the head of the file.
+        node: whose parameters they are.
+    """
+    lines = [f"# {note}" for note in notes]
+    lines += [f"{node}:", "  ros__parameters:"]
+    for name, values in parameters.items():
+        lines.append(f"    {name}: [{', '.join(repr(float(value)) for value in values)}]")
+    return "\n".join(lines) + "\n"
+
+
+def round_towards_zero(values: Array) -> Array:
+    """Return `values` with `DIGITS` significant digits, never larger in magnitude."""
+    return np.array([_rounded(value, math.floor) for value in values])
+
+
+def round_away_from_zero(values: Array) -> Array:
+    """Return `values` with `DIGITS` significant digits, never smaller in magnitude."""
+    return np.array([_rounded(value, math.ceil) for value in values])
+
+
+def _rounded(value: float, towards: Any) -> float:
+    if value == 0.0:
+        return 0.0
+    places = DIGITS - 1 - math.floor(math.log10(abs(value)))
+    # Half a unit in the 9th digit: 3.0 must not become 2.999 for a rounding error in the scaling.
+    scaled = round(abs(value) * 10.0**places, 9 - DIGITS)
+    return math.copysign(float(f"{towards(scaled)}e{-places}"), value)
+
+
+def check_writable(path: Path) -> None:
+    """Raise `OSError` if `path` cannot be written, before the work that it should hold."""
+    target = path.resolve()
+    if target.is_dir():
+        raise IsADirectoryError(f"{path} is a directory")
+    if not target.parent.is_dir():
+        raise FileNotFoundError(f"{path}: no directory {target.parent}")
+    if target.exists() and not os.access(target, os.W_OK):
+        raise PermissionError(f"{path} is write-protected")
+    try:
+        # Permissions do not tell everything: the file system may be read-only.
+        tempfile.NamedTemporaryFile(prefix=f".{target.name}.", dir=target.parent).close()
+    except OSError as error:
+        reason = f"directory {target.parent} cannot be written to ({error.strerror})"
+        raise OSError(f"{path}: {reason}") from error
+
+
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Write `content` to `path` so that at any time the old or the new file is there, complete.
+
+    Raises:
+        OSError: the file cannot be written; what was there before still is.
+    """
+    target = path.resolve()
+    mode = target.stat().st_mode & 0o777 if target.exists() else 0o666 & ~_umask()
+    descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(content.encode() if isinstance(content, str) else content)
+            file.flush()
+            os.fchmod(file.fileno(), mode)
+            os.fsync(file.fileno())
+        os.replace(name, target)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

@@ -1,0 +1,1 @@
+"""Worst-case acceleration limits from torque limits, and the cost of holding a torque."""

@@ -1,0 +1,114 @@
+"""What becomes of an acceleration while the torque computed for it is held for a period."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+
+from viability_bounds_pkg.estimation.state_space import Array
+
+SUBSTEPS = 2
+"""Runge-Kutta steps a period: its error, of order (dt / SUBSTEPS)^5, is far below the defects."""
+
+
+def mid_step_torque(model: pin.Model, q: Array, v: Array, a: Array, dt: float) -> Array:
+    """Return the torque for `a` at the middle of a period in which `a` is constant.
+
+    Holding it, the acceleration is too small by about half a period's drift at the start and too
+    large by as much at the end, and right on average to second order in `dt`.
+
+    Args:
+        model: the robot.
+        q: positions, shape (batch, n), rad.
+        v: velocities, shape (batch, n), rad/s.
+        a: accelerations wanted, shape (batch, n), rad/s^2.
+        dt: period, s; zero gives the plain inverse dynamics of the state.
+
+    Returns:
+        Torques, shape (batch, n), N m.
+    """
+    q_mid = q + 0.5 * dt * v + 0.125 * dt**2 * a
+    return _inverse_dynamics(model, q_mid, v + 0.5 * dt * a, a)
+
+
+def acceleration_rate(model: pin.Model, q: Array, v: Array, a: Array) -> tuple[Array, Array]:
+    """Return the torque for `a` and how fast the acceleration changes while it is held.
+
+    The time derivative of ``M a + h = tau`` at constant tau: ``M da/dt`` is
+    ``-(dtau/dq v + dtau/dv a)``, with the partial derivatives of the inverse dynamics.
+
+    Args:
+        model: the robot.
+        q: positions, shape (batch, n), rad.
+        v: velocities, shape (batch, n), rad/s.
+        a: accelerations, shape (batch, n), rad/s^2.
+
+    Returns:
+        Torques, shape (batch, n), N m, and rates, shape (batch, n), rad/s^3.
+    """
+    data = model.createData()
+    tau, drive = np.empty_like(q), np.empty_like(q)
+    inertia = np.empty((*q.shape, q.shape[1]))
+    for i, (q_i, v_i, a_i) in enumerate(zip(q, v, a, strict=True)):
+        by_q, by_v, inertia[i] = pin.computeRNEADerivatives(model, data, q_i, v_i, a_i)
+        tau[i] = data.tau
+        drive[i] = by_q @ v_i + by_v @ a_i
+    return tau, -np.linalg.solve(inertia, drive[..., None])[..., 0]
+
+
+def hold_defects(
+    model: pin.Model, q: Array, v: Array, a: Array, tau: Array, dt: float, substeps: int = SUBSTEPS
+) -> Array:
+    """Integrate ``M a + h = tau`` with `tau` held and return the three defects of `HoldDefects`.
+
+    Classical Runge-Kutta; a(t) is looked at where the integrator's steps begin and end, which
+    includes both ends of the period, where the drift, linear in time to first order, is largest.
+
+    Args:
+        model: the robot.
+        q: positions at the start, shape (batch, n), rad.
+        v: velocities at the start, shape (batch, n), rad/s.
+        a: accelerations wanted, shape (batch, n), rad/s^2.
+        tau: torques held, shape (batch, n), N m.
+        dt: period, s.
+        substeps: integration steps.
+
+    Returns:
+        Defects of acceleration, mean acceleration and position, shape (batch, 3, n).
+    """
+    step = dt / substeps
+    q_now, v_now = q, v
+    drift = np.zeros_like(q)
+    for _ in range(substeps):
+        a_1 = _forward_dynamics(model, q_now, v_now, tau)
+        v_2 = v_now + 0.5 * step * a_1
+        a_2 = _forward_dynamics(model, q_now + 0.5 * step * v_now, v_2, tau)
+        v_3 = v_now + 0.5 * step * a_2
+        a_3 = _forward_dynamics(model, q_now + 0.5 * step * v_2, v_3, tau)
+        v_4 = v_now + step * a_3
+        a_4 = _forward_dynamics(model, q_now + step * v_3, v_4, tau)
+        drift = np.maximum(drift, np.abs(a_1 - a))
+        q_now = q_now + step / 6 * (v_now + 2 * v_2 + 2 * v_3 + v_4)
+        v_now = v_now + step / 6 * (a_1 + 2 * a_2 + 2 * a_3 + a_4)
+    drift = np.maximum(drift, np.abs(_forward_dynamics(model, q_now, v_now, tau) - a))
+    mean = np.abs((v_now - v) / dt - a)
+    position = np.abs(q_now - q - dt * v - 0.5 * dt**2 * a)
+    return np.stack([drift, mean, position], axis=1)
+
+
+def _inverse_dynamics(model: pin.Model, q: Array, v: Array, a: Array) -> Array:
+    """Return ``M(q) a + h(q, v)`` of a batch, every array of shape (batch, n)."""
+    data = model.createData()
+    tau = np.empty(q.shape)
+    for i in range(len(q)):
+        tau[i] = pin.rnea(model, data, q[i], v[i], a[i])
+    return tau
+
+
+def _forward_dynamics(model: pin.Model, q: Array, v: Array, tau: Array) -> Array:
+    """Return the accelerations that `tau` causes, every array of shape (batch, n)."""
+    data = model.createData()
+    a = np.empty(q.shape)
+    for i in range(len(q)):
+        a[i] = pin.aba(model, data, q[i], v[i], tau[i])
+    return a

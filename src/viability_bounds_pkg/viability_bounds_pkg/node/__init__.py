@@ -1,0 +1,1 @@
+"""The bounds node and its parameters."""

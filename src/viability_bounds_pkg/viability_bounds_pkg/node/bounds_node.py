@@ -1,0 +1,144 @@
+"""The bounds node: joint states in, acceleration limits out."""
+
+from __future__ import annotations
+
+import sys
+import time
+from array import array
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from viability_bounds_pkg import viability
+from viability_bounds_pkg.node.bounds_parameters import (
+    TABLE,
+    BoundsConfiguration,
+    make_configuration,
+)
+from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, Verdict
+from viability_bounds_pkg.ros.parameters import NodeParameters, ParameterError
+from viability_bounds_pkg.ros.robot_parameters import load_model
+from viability_bounds_pkg.ros.runtime import CONTROL_QOS, run
+
+
+class BoundsNode(Node):
+    """Answers every joint state with the accelerations that keep the limits for ever.
+
+    Subscribes to ``joint_states``; publishes ``acceleration_limits`` with the stamp of the
+    state that it answers: ``points[0].accelerations`` lower, ``points[1].accelerations``
+    upper, rad/s^2, in the order of the parameter ``joints``.
+    """
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("bounds_node", **node_arguments)
+        self._model: pin.Model | None = None
+        try:
+            self._node_parameters = NodeParameters(
+                self,
+                TABLE,
+                partial(make_configuration, load_model=self._load_model),
+                self._configure,
+            )
+        except ParameterError:
+            self.destroy_node()
+            raise
+        config = self._node_parameters.configuration
+        joints = config.limits.names
+        self._solve = config.solve
+        self._state_dependent = config.state_dependent
+        self._longest_ns = round(1.5e9 * config.control_dt)
+        self._reader = JointStateReader(joints, config.state_timeout)
+        self._answered = 0
+        self._outside = np.zeros(len(joints), dtype=int)
+        self._answer = JointTrajectory(
+            joint_names=list(joints), points=[JointTrajectoryPoint(), JointTrajectoryPoint()]
+        )
+        self._publisher = self.create_publisher(
+            JointTrajectory, "acceleration_limits", CONTROL_QOS
+        )
+        self.create_subscription(JointState, "joint_states", self._on_state, CONTROL_QOS)
+        self._diagnostics = Diagnostics(self, self._report)
+        self._warn_of_affected_joints(config)
+
+    def _load_model(self, values: Mapping[str, Any]) -> pin.Model:
+        """Return the model, loaded once: parameters that change it are read-only."""
+        if self._model is None:
+            self._model = load_model(values, self)
+        return self._model
+
+    def _configure(self, config: BoundsConfiguration) -> None:
+        self._solve = config.solve
+        self._state_dependent = config.state_dependent
+        self._warn_of_affected_joints(config)
+
+    def _warn_of_affected_joints(self, config: BoundsConfiguration) -> None:
+        if config.method != "exact":
+            self.get_logger().warning(
+                f"method '{config.method}' does not keep the limits; it is for comparison"
+            )
+            return
+        holds = viability.condition_11(config.limits, config.bounds_dt)
+        for name, fine in zip(config.limits.names, holds, strict=True):
+            if not fine:
+                self.get_logger().warning(
+                    f"joint '{name}' can cross its range or exceed its speed within one braking "
+                    f"step of {config.bounds_dt:g} s (condition (11)); its bounds are stricter"
+                )
+
+    def _on_state(self, message: JointState) -> None:
+        last = self._reader.stamp
+        verdict = self._reader.read(message, time.monotonic())
+        if verdict is Verdict.REFUSED:
+            return
+        if verdict is Verdict.NEW:
+            if self._state_dependent is not None:
+                elapsed = self._reader.stamp - last
+                if not 0 < elapsed <= self._longest_ns:
+                    self._state_dependent.start()
+            bounds = self._solve(self._reader.q, self._reader.v)
+            points = self._answer.points
+            points[0].accelerations = array("d", bounds.lower.tobytes())
+            points[1].accelerations = array("d", bounds.upper.tobytes())
+            self._answer.header.stamp = message.header.stamp
+            if not bounds.viable.all():
+                self._outside += ~bounds.viable
+            self._answered += 1
+        self._publisher.publish(self._answer)
+
+    def _report(self) -> tuple[bytes, str, dict[str, Any]]:
+        config = self._node_parameters.configuration
+        silent = self._reader.stamp < 0
+        values = {
+            "method": config.method,
+            "control_period_s": config.control_dt,
+            "bounds_period_s": config.bounds_dt,
+            "position_margin_rad": config.margins.position,
+            "velocity_margin_rad_s": config.margins.velocity,
+            "acceleration_margin_rad_s2": config.margins.acceleration,
+            "states_answered": self._answered,
+            "states_refused": self._reader.refused,
+            "states_outside_kernel_by_joint": self._outside,
+        }
+        if self._state_dependent is not None:
+            values["steps_by_limits"] = self._state_dependent.outcomes
+        if silent:
+            return DiagnosticStatus.WARN, "no joint state yet", values
+        if self._reader.refused:
+            return DiagnosticStatus.WARN, "joint states were refused", values
+        return DiagnosticStatus.OK, "answering", values
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the bounds node until it is told to stop."""
+    return run(BoundsNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,183 @@
+"""Messages into arrays: names matched, sizes, values and stamps checked, refusals counted."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from enum import Enum
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+
+from viability_bounds_pkg.kernel.array_checks import both_finite
+from viability_bounds_pkg.ros.runtime import stamp_to_ns
+
+
+class Verdict(Enum):
+    """What a message turned out to be."""
+
+    NEW = 1
+    """Accepted: the arrays hold its values."""
+    REPEAT = 2
+    """The stamp of the last accepted message again: a robot that asks once more."""
+    REFUSED = 3
+    """Dropped and counted; the arrays hold what they held."""
+
+
+class StampGuard:
+    """Lets stamps only grow, yet does not lock out a source that started over.
+
+    A robot or simulation that restarts counts time from the beginning again, and one corrupt
+    stamp may lie far in the future. After `reset_after` seconds without an accepted stamp,
+    whatever comes is taken as a new beginning.
+    """
+
+    def __init__(self, reset_after: float) -> None:
+        self.last = -1
+        self._accepted_at = -math.inf
+        self._reset_after = reset_after
+
+    def check(self, stamp: int, now: float) -> Verdict:
+        """Judge a stamp in ns that arrived at `now`, in s on the steady clock."""
+        if stamp == self.last:
+            return Verdict.REPEAT
+        if stamp < self.last and not self.may_start_over(now):
+            return Verdict.REFUSED
+        return Verdict.NEW
+
+    def may_start_over(self, now: float) -> bool:
+        """Return whether the source has been silent for so long that any stamp will do."""
+        return now - self._accepted_at >= self._reset_after
+
+    def accept(self, stamp: int, now: float) -> None:
+        """Note that the message with this stamp was taken."""
+        self.last = stamp
+        self._accepted_at = now
+
+
+class JointStateReader:
+    """Reads ``sensor_msgs/JointState`` into arrays in the order of `joints`.
+
+    Names may come in any order, and joints of other limbs with them.
+
+    Attributes:
+        q, v: position and velocity of the last accepted message, shape (n,), rad and rad/s.
+        stamp: its stamp, ns.
+        refused: how many messages were dropped, by reason.
+    """
+
+    def __init__(self, joints: Sequence[str], reset_after: float = 1.0) -> None:
+        n = len(joints)
+        self.q = np.zeros(n)
+        self.v = np.zeros(n)
+        self.stamp = -1
+        self.refused: Counter[str] = Counter()
+        self._joints = tuple(joints)
+        both_finite(self.q, self.v)  # compiled now, not when the first message comes
+        self._guard = StampGuard(reset_after)
+        self._names: list[str] | None = None
+        self._index: np.ndarray | None = None
+        self._accepted: tuple[JointState, np.ndarray | None] | None = None
+
+    def read(self, message: JointState, now: float) -> Verdict:
+        """Take a message that arrived at `now`, in s on the steady clock."""
+        stamp = stamp_to_ns(message.header.stamp)
+        if stamp == 0:
+            # All of them would have this one, and the first answer would serve for ever.
+            return self._refuse("no stamp")
+        verdict = self._guard.check(stamp, now)
+        if verdict is Verdict.REFUSED:
+            return self._refuse("old stamp")
+        if message.name != self._names and not self._match(message.name):
+            return self._refuse("missing joint")
+        if not len(message.position) == len(message.velocity) == len(self._names):
+            return self._refuse("wrong size")
+        q, v = np.array(message.position), np.array(message.velocity)
+        if self._index is not None:
+            q, v = q[self._index], v[self._index]
+        if not both_finite(q, v):
+            return self._refuse("not finite")
+        if verdict is Verdict.REPEAT:
+            if np.array_equal(q, self.q) and np.array_equal(v, self.v):
+                return verdict
+            if not self._guard.may_start_over(now):
+                return self._refuse("other values under the same stamp")
+        self.q, self.v, self.stamp = q, v, stamp
+        self._accepted = message, self._index
+        self._guard.accept(stamp, now)
+        return Verdict.NEW
+
+    def effort(self) -> np.ndarray | None:
+        """Return the torque of the motors in the last accepted message, shape (n,), N m.
+
+        None where it does not tell, for each joint, a finite number.
+        """
+        if self._accepted is None:
+            return None
+        message, index = self._accepted
+        if len(message.effort) != len(message.name):
+            return None
+        tau = np.array(message.effort)
+        if index is not None:
+            tau = tau[index]
+        return tau if np.isfinite(tau).all() else None
+
+    def _match(self, names: Sequence[str]) -> bool:
+        where = {name: i for i, name in enumerate(names)}
+        if any(joint not in where for joint in self._joints):
+            return False
+        self._names = list(names)
+        index = [where[joint] for joint in self._joints]
+        same_order = index == list(range(len(names)))
+        self._index = None if same_order else np.array(index)
+        return True
+
+    def _refuse(self, reason: str) -> Verdict:
+        self.refused[reason] += 1
+        return Verdict.REFUSED
+
+
+class Diagnostics:
+    """Publishes one status on ``/diagnostics``, regularly and when asked.
+
+    Args:
+        node: the publishing node; its name is the status' name.
+        report: returns level (a constant of ``DiagnosticStatus``), a message and the values.
+        period: seconds between two messages.
+    """
+
+    def __init__(self, node: Node, report, period: float = 0.5) -> None:
+        self._report = report
+        self._node = node
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        # Also while time, as the clock topic tells it, stands still.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = node.create_timer(period, self.publish, clock=steady)
+
+    def publish(self) -> None:
+        """Send the status now."""
+        level, message, values = self._report()
+        status = DiagnosticStatus(
+            level=level,
+            name=self._node.get_name(),
+            message=message,
+            hardware_id=self._node.get_namespace(),
+            values=[KeyValue(key=key, value=_text(value)) for key, value in values.items()],
+        )
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(array)
+
+
+def _text(value) -> str:
+    if isinstance(value, float):
+        return f"{value:.9g}"
+    if isinstance(value, np.ndarray):
+        return " ".join(f"{item:.9g}" for item in value)
+    if isinstance(value, Counter):
+        return " ".join(f"{key}: {count};" for key, count in value.items()) or "none"
+    return str(value)

@@ -1,0 +1,1 @@
+"""Acceleration limits from the torque available in the present state."""

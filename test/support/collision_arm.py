@@ -1,0 +1,148 @@
+"""Arms among obstacles, and a small QP that moves them, for tests of the collision avoidance."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pinocchio as pin
+from arms import Arm, load_arm
+from proxsuite import proxqp
+from ros_harness import read_config
+
+from torque_safety_controller.collision.avoidance import (
+    CollisionAvoidance,
+    CollisionRows,
+    CollisionSettings,
+)
+from torque_safety_controller.collision.geometry import load_geometry
+from torque_safety_controller.collision.model import (
+    CollisionModel,
+    Pruning,
+    build_collision_model,
+)
+from torque_safety_controller.collision.obstacles import box, capsule, half_space, sphere
+from viability_bounds_pkg.joint_limits import JointLimits
+from viability_bounds_pkg.robot_description import build_model, read_urdf
+from viability_bounds_pkg.viability import BoundsSolver
+
+SURROUNDINGS = (
+    box("table", [0.7, 0.0, 0.2], [0.4, 1.0, 0.05], [0.1, 0.2, 0.3, 1.0]),
+    half_space("floor", [0.0, 0.0, -0.2], [0.0, 0.1, 1.0]),
+    sphere("ball", [0.5, 0.3, 0.5], 0.1),
+    capsule("pole", [0.4, -0.3, 0.0], [0.5, -0.3, 1.0], 0.04),
+)
+
+_TWO_LINKS = """<robot name="two_links">
+  <link name="base"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1"
+    ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/>
+    <axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="100" velocity="5"/></joint>
+  <link name="upper"><inertial><origin xyz="0.25 0 0"/><mass value="1"/><inertia ixx="0.01"
+    iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="elbow" type="{kind}"><parent link="upper"/><child link="fore"/>
+    <origin xyz="0.5 0 0"/><axis xyz="{axis}"/>
+    <limit lower="-3" upper="3" effort="100" velocity="5"/></joint>
+  <link name="fore"><inertial><origin xyz="0.2 0 0"/><mass value="1"/><inertia ixx="0.01"
+    iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><origin xyz="{reach} 0 0" rpy="0 1.5707963267948966 0"/>
+      <geometry>{shape}</geometry></collision></link>
+</robot>"""
+
+
+def two_links(
+    shape: str, reach: float, obstacles, kind="revolute", axis="0 0 1", **settings
+) -> tuple[CollisionAvoidance, pin.Model]:
+    """Return an arm in the x-y plane whose forearm has one collision shape, 20 rad/s^2 a joint."""
+    urdf = _TWO_LINKS.format(shape=shape, reach=reach, kind=kind, axis=axis)
+    model = build_model(urdf, ["shoulder", "elbow"])
+    collision = build_collision_model(
+        model,
+        load_geometry(urdf, model),
+        np.zeros(2),
+        obstacles,
+        pruning=Pruning(samples=10, near=10.0),
+    )
+    limit = np.full(2, 20.0)
+    dt = settings.pop("dt", 1e-3)
+    given = CollisionSettings(**settings)
+    return CollisionAvoidance(collision, -limit, limit, dt, given), model
+
+
+@cache
+def panda(obstacles: bool = True) -> tuple[Arm, JointLimits, CollisionModel, pin.GeometryModel]:
+    """Return Panda with its limits, its collision model and the geometry this was made from."""
+    arm = load_arm("panda")
+    config, bounds = (read_config("panda", node) for node in ("controller_node", "bounds_node"))
+    geometry = load_geometry(read_urdf(config["robot_description"]), arm.model)
+    limits = JointLimits(
+        tuple(config["joints"]),
+        arm.q_min,
+        arm.q_max,
+        arm.v_max,
+        np.array(bounds["acceleration_min"]),
+        np.array(bounds["acceleration_max"]),
+    )
+    surroundings = SURROUNDINGS if obstacles else ()
+    pruning = Pruning(samples=3000)
+    collision = build_collision_model(
+        arm.model, geometry, arm.q_start, surroundings, pruning=pruning
+    )
+    return arm, limits, collision, geometry
+
+
+def least_relaxed(
+    a_des: np.ndarray, a_lower: np.ndarray, a_upper: np.ndarray, rows: CollisionRows
+) -> np.ndarray:
+    """Return the accelerations nearest to those wanted; rows give way only to the bounds."""
+    n, k = len(a_des), len(rows.names)
+    if not k:
+        return np.clip(a_des, a_lower, a_upper)
+    H = np.diag(np.r_[np.ones(n), np.full(k, 1e-6)])
+    C = np.hstack([rows.G, np.eye(k)])
+    qp = proxqp.dense.QP(n + k, 0, k, True)
+    qp.settings.eps_abs, qp.settings.eps_rel = 1e-8, 0.0
+    free = np.full(k, np.inf)
+    qp.init(
+        H,
+        np.r_[-a_des, np.full(k, 1e4)],
+        None,
+        None,
+        C,
+        rows.lower.copy(),
+        free,
+        np.r_[a_lower, np.zeros(k)],
+        np.r_[a_upper, free],
+    )
+    qp.solve()
+    return np.clip(qp.results.x[:n], a_lower, a_upper)
+
+
+class Journey:
+    """An arm on its way to joint goals, kept inside its bounds and away from everything.
+
+    Args:
+        avoidance: rows; None to do without.
+        limits: of the joints.
+        dt: control period, s; the bounds look two of them ahead.
+        move: (q, v, a) -> the next state; None: constant acceleration.
+    """
+
+    def __init__(self, avoidance, limits: JointLimits, dt: float, move=None) -> None:
+        self.avoidance, self.dt = avoidance, dt
+        self._bounds = BoundsSolver(limits, 2.0 * dt, period=dt)
+        self._move = move or (lambda q, v, a: (q + v * dt + 0.5 * a * dt * dt, v + a * dt))
+        self.distances: list[float] = []
+        self.viable: list[bool] = []
+
+    def go(self, q: np.ndarray, goal: np.ndarray, duration: float, kp: float = 30.0):
+        """Return the state after a while, from rest at q."""
+        v = np.zeros(len(q))
+        for _ in range(round(duration / self.dt)):
+            lower, upper, _ = self._bounds.bounds(q, v)
+            rows = self.avoidance.rows(q, v, lower, upper)
+            self.distances.append(self.avoidance.closest()[0])
+            self.viable.append(bool(rows.viable.all()))
+            a = least_relaxed(kp * (goal - q) - 2.0 * np.sqrt(kp) * v, lower, upper, rows)
+            q, v = self._move(q, v, a)
+        return q, v

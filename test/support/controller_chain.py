@@ -1,0 +1,59 @@
+"""The other side of the controller node, for tests: a robot and a bounds node."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from ros_harness import RosHarness, acceleration_limits, joint_state
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory
+
+from torque_safety_controller.node.controller_node import ControllerNode
+
+MS = 1_000_000
+NODE = "controller_node"
+
+
+class ControllerChain:
+    """A controller node, and what talks to it.
+
+    Args:
+        ros: harness.
+        values: parameters of the node.
+
+    Attributes:
+        node: under test.
+        commands: heard from it.
+        joints: names.
+        states: publisher of joint states.
+        limits: publisher of acceleration limits.
+    """
+
+    def __init__(self, ros: RosHarness, values: Mapping[str, Any]) -> None:
+        self.ros = ros
+        self.joints = list(values["joints"])
+        self.node = ros.start(ControllerNode, values)
+        self.commands = ros.listen(JointState, "joint_commands")
+        self.states = ros.talk(JointState, "joint_states")
+        self.limits = ros.talk(JointTrajectory, "acceleration_limits")
+        ros.hears("joint_commands")
+
+    def send_state(self, stamp: int, q, v, tau=()) -> None:
+        """Publish a state with a stamp in ms."""
+        self.states.publish(joint_state(self.joints, stamp * MS, q, v, tau))
+
+    def send_limits(self, stamp: int, lower, upper) -> None:
+        """Publish acceleration limits with a stamp in ms."""
+        self.limits.publish(acceleration_limits(self.joints, stamp * MS, lower, upper))
+
+    def await_command(self, stamp: int, each: Callable[[], None] | None = None) -> JointState:
+        """Wait for the command with a stamp, ms."""
+        self.ros.wait_until(
+            lambda: stamp * MS in self.commands.stamps, f"a command for {stamp}", each=each
+        )
+        return self.commands[self.commands.stamps.index(stamp * MS)]
+
+    def reported(self, key: str) -> str:
+        """Return a value of the node's last diagnostics, or the empty string."""
+        return self.ros.reported(NODE, key)
