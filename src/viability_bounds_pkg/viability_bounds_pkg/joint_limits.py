@@ -9,11 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from viability_bounds_pkg.exceptions import ArmSafetyError
+
 ROUNDING = 64.0 * float(np.finfo(np.float64).eps)
 """Relative tolerance for numbers that are equal but for rounding."""
 
 
-class JointLimitsError(ValueError):
+class JointLimitsError(ArmSafetyError, ValueError):
     """A joint limit, or a setting that depends on one, is unusable.
 
     Attributes:

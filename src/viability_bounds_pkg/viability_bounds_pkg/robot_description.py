@@ -18,8 +18,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
+from viability_bounds_pkg.exceptions import ArmSafetyError
 
-class RobotDescriptionError(ValueError):
+
+class RobotDescriptionError(ArmSafetyError, ValueError):
     """A URDF that cannot be found or loaded, or that does not fit what is asked of it."""
 
 

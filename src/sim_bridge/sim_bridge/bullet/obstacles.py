@@ -9,13 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from sim_bridge.bullet.vectors import finite_vector
+from viability_bounds_pkg.exceptions import ArmSafetyError
 
 SHAPES = ("box", "sphere", "cylinder")
 _ROUND = {"sphere": (0, 1, 2), "cylinder": (0, 1)}  # axes along which they are equally large
 _SIZE_MIN, _SIZE_MAX = 1e-3, 1e3  # m; beyond them PyBullet's collision detection is off
 
 
-class ObstacleError(ValueError):
+class ObstacleError(ArmSafetyError, ValueError):
     """An obstacle that cannot be."""
 
 

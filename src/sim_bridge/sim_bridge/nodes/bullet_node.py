@@ -23,8 +23,9 @@ from sim_bridge.nodes.bullet_parameters import TABLE, make_configuration, make_r
 from sim_bridge.nodes.ft_sensor import ForceTorquePublisher
 from sim_bridge.nodes.joint_command import CommandError, JointCommand, TorqueCommand, read_command
 from sim_bridge.nodes.world_subscriber import WorldInbox
+from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.ros.messages import Diagnostics
-from viability_bounds_pkg.ros.parameters import NodeParameters, ParameterError
+from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.runtime import (
     CONTROL_QOS,
     LATCHED_QOS,
@@ -59,7 +60,7 @@ class BulletNode(Node):
             self._node_parameters = NodeParameters(self, TABLE, make_configuration)
             config = self._node_parameters.configuration
             self._robot = make_robot(config, self._node_parameters.values)
-        except ParameterError:
+        except SettingError:
             self.destroy_node()
             raise
         self._config = config

@@ -13,10 +13,10 @@ from sim_bridge.bullet.joint_friction import DEFAULT_STRIBECK_VELOCITY, Gears
 from sim_bridge.bullet.obstacles import ContactMaterial
 from sim_bridge.bullet.robot import BulletRobot
 from sim_bridge.nodes.ft_sensor import SENSOR_TABLE, SensorConfiguration, sensor_configuration
+from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import RobotDescriptionError
 from viability_bounds_pkg.ros.parameters import (
     Parameter,
-    ParameterError,
     joint_names,
     per_joint,
     positive,
@@ -150,19 +150,19 @@ def make_configuration(values: Mapping[str, Any]) -> BulletConfiguration:
     """Check parameter values and read the URDF.
 
     Raises:
-        ParameterError: a value cannot be used.
+        SettingError: a value cannot be used.
     """
     joints = joint_names(values)
     urdf = robot_urdf(values)
     if values["clock"] not in CLOCKS:
-        raise ParameterError("clock", values["clock"], f"one of {', '.join(CLOCKS)}")
+        raise SettingError("clock", values["clock"], f"one of {', '.join(CLOCKS)}")
     if values["command_timeout"] < 1:
-        raise ParameterError("command_timeout", values["command_timeout"], "at least 1")
+        raise SettingError("command_timeout", values["command_timeout"], "at least 1")
     dt = 1.0 / positive(values, "rate_hz")
     q_min, q_max = position_limits(values, joints)
     q_start = per_joint(values, "start_positions", joints)
     if not np.isfinite(q_start).all():
-        raise ParameterError("start_positions", q_start, "finite numbers")
+        raise SettingError("start_positions", q_start, "finite numbers")
     return BulletConfiguration(
         urdf=urdf,
         joints=joints,
@@ -198,7 +198,7 @@ def _gears(values: Mapping[str, Any], joints: tuple[str, ...]) -> Gears:
     if len(values["friction_static"]):
         static = not_negative(values, "friction_static", joints)
         if not (static >= coulomb).all():
-            raise ParameterError("friction_static", static, "at least friction_coulomb everywhere")
+            raise SettingError("friction_static", static, "at least friction_coulomb everywhere")
     stribeck = DEFAULT_STRIBECK_VELOCITY
     if len(values["stribeck_velocity"]):
         stribeck = all_positive(values, "stribeck_velocity", joints)
@@ -206,7 +206,7 @@ def _gears(values: Mapping[str, Any], joints: tuple[str, ...]) -> Gears:
     if len(bias):
         bias = per_joint(values, "torque_bias", joints)
         if not np.isfinite(bias).all():
-            raise ParameterError("torque_bias", bias, "finite numbers")
+            raise SettingError("torque_bias", bias, "finite numbers")
     return Gears(
         len(joints),
         friction_coulomb=coulomb,
@@ -221,12 +221,12 @@ def _gears(values: Mapping[str, Any], joints: tuple[str, ...]) -> Gears:
 def _mass_scales(values: Mapping[str, Any]) -> dict[str, float]:
     links, scales = values["mass_scale_links"], values["mass_scales"]
     if len(set(links)) != len(links):
-        raise ParameterError("mass_scale_links", links, "links of the URDF, each once")
+        raise SettingError("mass_scale_links", links, "links of the URDF, each once")
     if len(links) != len(scales):
         allowed = f"{len(links)} numbers, one for each of 'mass_scale_links'"
-        raise ParameterError("mass_scales", scales, allowed)
+        raise SettingError("mass_scales", scales, allowed)
     if not (np.isfinite(scales).all() and (scales > 0).all()):
-        raise ParameterError("mass_scales", scales, "finite numbers > 0")
+        raise SettingError("mass_scales", scales, "finite numbers > 0")
     return dict(zip(links, map(float, scales), strict=True))
 
 
@@ -234,7 +234,7 @@ def make_robot(config: BulletConfiguration, values: Mapping[str, Any]) -> Bullet
     """Return the robot that the parameters describe.
 
     Raises:
-        ParameterError: a URDF that does not load, or a joint or link that it does not have.
+        SettingError: a URDF that does not load, or a joint or link that it does not have.
     """
     try:
         return BulletRobot(
@@ -249,7 +249,7 @@ def make_robot(config: BulletConfiguration, values: Mapping[str, Any]) -> Bullet
         )
     except RobotDescriptionError as error:
         name, allowed = _culprit(config)
-        raise ParameterError(name, values[name], f"{allowed} ({error})") from error
+        raise SettingError(name, values[name], f"{allowed} ({error})") from error
 
 
 def _culprit(config: BulletConfiguration) -> tuple[str, str]:

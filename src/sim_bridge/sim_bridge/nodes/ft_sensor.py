@@ -11,7 +11,8 @@ from geometry_msgs.msg import WrenchStamped
 from rclpy.node import Node
 
 from sim_bridge.bullet.robot import BulletRobot
-from viability_bounds_pkg.ros.parameters import Parameter, ParameterError
+from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.ros.parameters import Parameter
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, set_stamp
 
 SENSOR_TABLE = (
@@ -53,23 +54,23 @@ def sensor_configuration(values: Mapping[str, Any]) -> SensorConfiguration:
     """Check parameter values.
 
     Raises:
-        ParameterError: a value cannot be used.
+        SettingError: a value cannot be used.
     """
     for name in ("ft_bias", "ft_noise"):
         value = values[name]
         if not len(value):
             continue
         if not values["ft_frame"]:
-            raise ParameterError(name, value, "only with a force/torque sensor, 'ft_frame'")
+            raise SettingError(name, value, "only with a force/torque sensor, 'ft_frame'")
         if len(value) != 6 or not np.isfinite(value).all():
-            raise ParameterError(name, value, "6 finite numbers")
+            raise SettingError(name, value, "6 finite numbers")
     bias, noise = (
         values[name] if len(values[name]) else np.zeros(6) for name in ("ft_bias", "ft_noise")
     )
     if (noise < 0.0).any():
-        raise ParameterError("ft_noise", noise, "not negative")
+        raise SettingError("ft_noise", noise, "not negative")
     if values["ft_seed"] < 0:
-        raise ParameterError("ft_seed", values["ft_seed"], "at least 0")
+        raise SettingError("ft_seed", values["ft_seed"], "at least 0")
     return SensorConfiguration(values["ft_frame"], bias, noise, values["ft_seed"])
 
 

@@ -8,10 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 
+from viability_bounds_pkg.exceptions import ArmSafetyError
+
 Array = NDArray[np.float64]
 
 
-class CommandError(ValueError):
+class CommandError(ArmSafetyError, ValueError):
     """A command that cannot be obeyed; its text is the reason, in a few words."""
 
 

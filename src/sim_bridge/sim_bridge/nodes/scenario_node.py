@@ -24,7 +24,8 @@ from sim_bridge.nodes.scenario_parameters import TABLE, make_configuration
 from sim_bridge.nodes.scenario_sender import Caller, Outbox, ScenarioRefused
 from sim_bridge.scenario.events import ServiceEvent
 from sim_bridge.scenario.recording import Run
-from viability_bounds_pkg.ros.parameters import NodeParameters, ParameterError
+from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.ros.parameters import NodeParameters
 
 _POLL_PERIOD = 0.02
 _TAKEN_BY = {
@@ -68,7 +69,7 @@ class ScenarioNode(Node):
         super().__init__("scenario_node", **node_arguments)
         try:
             config = NodeParameters(self, TABLE, make_configuration).configuration
-        except ParameterError:
+        except SettingError:
             self.destroy_node()
             raise
         self.config = config

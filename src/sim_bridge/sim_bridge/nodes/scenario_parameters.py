@@ -11,7 +11,8 @@ import numpy as np
 from sim_bridge.scenario.events import PostureGoal, WrenchGoal
 from sim_bridge.scenario.fields import ScenarioError
 from sim_bridge.scenario.scenario import Scenario, load_scenario
-from viability_bounds_pkg.ros.parameters import Parameter, ParameterError, joint_names, positive
+from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.ros.parameters import Parameter, joint_names, positive
 from viability_bounds_pkg.ros.robot_parameters import (
     ROBOT_TABLE,
     all_positive,
@@ -58,18 +59,18 @@ def make_configuration(values: Mapping[str, Any]) -> ScenarioConfiguration:
     """Check parameter values and read the scenario.
 
     Raises:
-        ParameterError: a value cannot be used.
+        SettingError: a value cannot be used.
     """
     joints = joint_names(values)
     try:
         scenario = load_scenario(values["scenario"])
     except ScenarioError as error:
-        raise ParameterError("scenario", values["scenario"], str(error)) from error
+        raise SettingError("scenario", values["scenario"], str(error)) from error
     for event in scenario.events:
         if isinstance(event, PostureGoal) and set(joints) - set(event.positions):
             missing = ", ".join(joint for joint in joints if joint not in event.positions)
             allowed = f"postures of all 'joints'; at {event.time:g} s there is none of {missing}"
-            raise ParameterError("scenario", values["scenario"], allowed)
+            raise SettingError("scenario", values["scenario"], allowed)
     frames = "", values["end_effector_frame"], values["base_frame"]
     for event in scenario.events:
         if isinstance(event, WrenchGoal) and event.frame not in frames:
@@ -77,7 +78,7 @@ def make_configuration(values: Mapping[str, Any]) -> ScenarioConfiguration:
                 f"wrenches in the axes of {' or '.join(frames[1:])}; at {event.time:g} s there is "
                 f"one in those of {event.frame!r}"
             )
-            raise ParameterError("scenario", values["scenario"], allowed)
+            raise SettingError("scenario", values["scenario"], allowed)
     q_min, q_max = position_limits(values, joints)
     return ScenarioConfiguration(
         name=values["robot_name"],

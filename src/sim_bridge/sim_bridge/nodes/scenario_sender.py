@@ -8,13 +8,14 @@ from collections.abc import Iterable, Sequence
 from rclpy.node import Node
 
 from sim_bridge.nodes.scenario_messages import Letter, Request, refusals
+from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp
 
 _AT_ONCE = GOAL_QOS.depth - 2
 """How many messages may be on their way: a reader keeps no more than its depth."""
 
 
-class ScenarioRefused(RuntimeError):
+class ScenarioRefused(ArmSafetyError, RuntimeError):
     """Another node does not do what the scenario asks; its text says which and why."""
 
 

@@ -6,10 +6,12 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from viability_bounds_pkg.exceptions import ArmSafetyError
+
 _QUATERNION_TOLERANCE = 1e-3
 
 
-class ScenarioError(ValueError):
+class ScenarioError(ArmSafetyError, ValueError):
     """A scenario file that cannot be played."""
 
 

@@ -16,6 +16,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from viability_bounds_pkg.exceptions import ArmSafetyError
+
 Array = NDArray[np.float64]
 
 PARTS = ((10.0, 0.04, np.inf), (16.0, 0.15, np.inf), (10.0, np.inf, 1.0))
@@ -25,7 +27,7 @@ ROOM = 0.9
 """Share of the way to a position limit that is used."""
 
 
-class ExcitationError(ValueError):
+class ExcitationError(ArmSafetyError, ValueError):
     """The joints have no room for the motion."""
 
 

@@ -14,8 +14,8 @@ from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
 from sim_bridge.nodes.bullet_node import BulletNode
+from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import build_model, inertia_beyond, read_urdf
-from viability_bounds_pkg.ros.parameters import ParameterError
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, LATCHED_QOS, set_stamp, stamp_to_ns
 
 ARM = load_arm("panda")
@@ -635,7 +635,7 @@ def test_the_first_period_after_a_pause_is_a_whole_one(ros):
     ],
 )
 def test_it_does_not_start_with_bad_parameters(ros, changed, name, shown):
-    with pytest.raises(ParameterError) as refusal:
+    with pytest.raises(SettingError) as refusal:
         ros.start(BulletNode, VALUES | changed)
     text = str(refusal.value)
     assert refusal.value.name == name

@@ -11,7 +11,7 @@ from ros_harness import CONFIG, ROOT, read_config
 
 from sim_bridge.nodes.scenario_node import ScenarioNode
 from sim_bridge.scenario.report import write_report
-from viability_bounds_pkg.ros.parameters import ParameterError
+from viability_bounds_pkg.exceptions import SettingError
 
 DEADLINE = 30.0  # s
 VALUES = read_config("panda", "scenario_node")
@@ -52,7 +52,7 @@ def run(*arguments):
 def test_a_posture_must_have_every_joint(ros, tmp_path):
     some = {name: REST[name] for name in VALUES["joints"][1:]}
     path = write(tmp_path, 1.0, {"time": 0.5, "posture": some})
-    with pytest.raises(ParameterError, match="'scenario'.*at 0.5 s.*none of panda_joint1$"):
+    with pytest.raises(SettingError, match="'scenario'.*at 0.5 s.*none of panda_joint1$"):
         ros.start(ScenarioNode, VALUES | {"scenario": path})
 
 

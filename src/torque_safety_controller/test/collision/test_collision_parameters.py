@@ -9,8 +9,8 @@ from torque_safety_controller.collision.obstacles import SHAPES, make_obstacle
 from torque_safety_controller.parameters import controller_parameters
 from torque_safety_controller.parameters.collision_parameters import TABLE, load_collision
 from torque_safety_controller.parameters.controller_parameters import make_configuration
+from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import read_urdf
-from viability_bounds_pkg.ros.parameters import ParameterError
 
 PANDA = read_config("panda", "controller_node")
 TURNED = [0.0, 0.0, np.sin(0.4), np.cos(0.4)]
@@ -132,7 +132,7 @@ def test_what_an_arm_is_mounted_on_is_left_out_and_said_to_be():
     ],
 )
 def test_what_cannot_be_is_refused_by_the_name_of_the_parameter(changes, name):
-    with pytest.raises(ParameterError) as error:
+    with pytest.raises(SettingError) as error:
         configuration(**THINGS | changes)
     assert error.value.name == name
 
@@ -147,13 +147,13 @@ def test_what_cannot_be_is_refused_by_the_name_of_the_parameter(changes, name):
     ],
 )
 def test_what_the_robot_does_not_have_is_refused_by_the_name_of_the_parameter(changes, name):
-    with pytest.raises(ParameterError) as error:
+    with pytest.raises(SettingError) as error:
         load(**changes)
     assert error.value.name == name
 
 
 def test_the_parameters_are_checked_even_while_it_is_off():
-    with pytest.raises(ParameterError, match="obstacle_shapes"):
+    with pytest.raises(SettingError, match="obstacle_shapes"):
         configuration(collision_avoidance=False, obstacle_names=["table"])
 
 

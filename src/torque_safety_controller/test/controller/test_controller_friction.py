@@ -22,7 +22,7 @@ from torque_safety_controller.friction.settings import FrictionModel, FrictionSe
 from torque_safety_controller.integral_feedback.settings import IntegralSettings
 from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.parameters.friction_parameters import TABLE, friction_settings
-from viability_bounds_pkg.ros.parameters import ParameterError
+from viability_bounds_pkg.exceptions import SettingError
 
 NODE = "controller_node"
 MS = 1_000_000
@@ -200,12 +200,12 @@ GIVEN = {
 
 @pytest.mark.parametrize(("name", "value", "allowed"), REFUSED)
 def test_what_cannot_be_is_refused_by_name(name, value, allowed):
-    with pytest.raises(ParameterError, match=f"parameter '{name}' is .*{re.escape(allowed)}"):
+    with pytest.raises(SettingError, match=f"parameter '{name}' is .*{re.escape(allowed)}"):
         friction_settings(values(**GIVEN | {name: value}), "abcdefg", ARM.tau_max)
 
 
 def test_there_must_be_a_model_to_compensate():
-    with pytest.raises(ParameterError, match="0 as long as no friction_model_coulomb"):
+    with pytest.raises(SettingError, match="0 as long as no friction_model_coulomb"):
         friction_settings(values(friction_compensation=0.5), "abcdefg", ARM.tau_max)
 
 

@@ -16,8 +16,8 @@ from std_srvs.srv import SetBool
 
 from sim_bridge.nodes.bullet_node import BulletNode
 from torque_safety_controller.node.controller_node import ControllerNode
+from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.node.bounds_node import BoundsNode
-from viability_bounds_pkg.ros.parameters import ParameterError
 from viability_bounds_pkg.ros.runtime import GOAL_QOS
 
 SERVICE = f"{NODE}/enable_torque"
@@ -258,7 +258,7 @@ def test_what_is_on_already_is_refused(ros):
 
 
 def test_it_starts_with_torque_or_position_only(ros):
-    with pytest.raises(ParameterError, match="'start_control' is 'velocity'; allowed: one of"):
+    with pytest.raises(SettingError, match="'start_control' is 'velocity'; allowed: one of"):
         ros.start(ControllerNode, VALUES | {"start_control": "velocity"})
     Chain(ros)
     assert "read-only" in ros.refuses(NODE, start_control="torque")

@@ -21,7 +21,7 @@ from torque_safety_controller.integral_feedback.settings import IntegralSettings
 from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.nullspace.settings import NullspaceSettings
 from torque_safety_controller.tasks.tasks import critical_damping
-from viability_bounds_pkg.ros.parameters import ParameterError
+from viability_bounds_pkg.exceptions import SettingError
 
 NODE = "controller_node"
 MS = 1_000_000
@@ -212,7 +212,7 @@ BAD = [
 
 @pytest.mark.parametrize(("name", "value", "allowed"), BAD)
 def test_it_does_not_start_with_bad_parameters(ros, name, value, allowed):
-    with pytest.raises(ParameterError) as refusal:
+    with pytest.raises(SettingError) as refusal:
         ros.start(ControllerNode, VALUES | {name: value})
     text = str(refusal.value)
     assert refusal.value.name == name
@@ -238,7 +238,7 @@ def test_bad_parameters_are_refused_live_and_the_old_ones_stay(ros):
 
 
 def test_the_task_is_read_only_and_known(ros):
-    with pytest.raises(ParameterError, match="'integral_task' is 'elbow'; allowed: one of pose"):
+    with pytest.raises(SettingError, match="'integral_task' is 'elbow'; allowed: one of pose"):
         ros.start(ControllerNode, VALUES | {"integral_task": "elbow"})
     Chain(ros)
     assert "read-only" in ros.refuses(NODE, integral_task="position")
@@ -251,7 +251,7 @@ def six_joints() -> dict:
 
 def test_six_joints_have_no_null_space_of_a_pose(ros):
     values = six_joints()
-    with pytest.raises(ParameterError) as refusal:
+    with pytest.raises(SettingError) as refusal:
         ros.start(ControllerNode, values | {"integral_action": "task"})
     assert str(refusal.value) == (
         "parameter 'integral_action' is 'task'; allowed: 'none' or 'joints': "

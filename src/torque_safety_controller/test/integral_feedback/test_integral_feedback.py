@@ -19,13 +19,13 @@ from torque_safety_controller.anti_windup import (
 from torque_safety_controller.integral_feedback.feedback import (
     IntegralFeedback,
     IntegralSettings,
-    IntegralSettingsError,
     LeakyIntegrator,
     SeedingError,
     paper_settings,
 )
 from torque_safety_controller.integral_feedback.leaky_integrator import mix
 from torque_safety_controller.integral_feedback.settings import METHODS
+from viability_bounds_pkg.exceptions import SettingError
 
 N = 5
 DT = 1e-3
@@ -508,22 +508,25 @@ def test_first_call_is_a_start_and_start_forgets():
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"budget": [1.0, -1.0]}, "budget .* a number >= 0 for each joint"),
+        ({"budget": [1.0, -1.0]}, "'budget' is .* a number >= 0 for each joint"),
         ({"budget": [1.0, math.nan]}, "budget"),
         ({"budget": []}, "budget"),
         ({"budget": [[1.0]]}, "budget"),
-        ({"lambda_": 0.0}, "lambda_ = 0.0: must be a finite number > 0"),
+        ({"lambda_": 0.0}, "'lambda_' is '?0'?; allowed: a finite number > 0"),
         ({"lambda_": math.nan}, "lambda_"),
-        ({"theta_slow": -0.1}, "theta_slow = -0.1: must be a finite number >= 0"),
+        ({"theta_slow": -0.1}, "'theta_slow' is '?-0.1'?; allowed: a finite number >= 0"),
         ({"theta_fast": math.inf}, "theta_fast"),
-        ({"mu": 1.1}, "mu = 1.1: must be a number from 0 to 1"),
+        ({"mu": 1.1}, "'mu' is '?1.1'?; allowed: a number from 0 to 1"),
         ({"mu": math.nan}, "mu"),
         ({"widening_time": 0.0}, "widening_time"),
-        ({"anti_windup": "hope"}, "anti_windup = hope: must be none or clip or scaling or qp"),
+        (
+            {"anti_windup": "hope"},
+            "'anti_windup' is '?hope'?; allowed: none or clip or scaling or qp",
+        ),
     ],
 )
 def test_settings_out_of_range_are_refused(values, message):
-    with pytest.raises(IntegralSettingsError, match=message) as caught:
+    with pytest.raises(SettingError, match=message) as caught:
         IntegralSettings(**{"budget": np.ones(2), **values})
     assert caught.value.name in values
 
@@ -532,7 +535,7 @@ def test_unusable_input_changes_nothing():
     rng = np.random.default_rng(14)
     feedback = IntegralFeedback(IntegralSettings(np.ones(N)))
     M, C, v, _ = moving(feedback, rng)
-    with pytest.raises(IntegralSettingsError, match="one number for each of 5 joints"):
+    with pytest.raises(SettingError, match="one number for each of 5 joints"):
         feedback.settings = IntegralSettings(np.ones(N + 1))
     assert feedback.settings.budget.shape == (N,)
     before = feedback._memory.copy()

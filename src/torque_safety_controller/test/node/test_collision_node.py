@@ -9,7 +9,7 @@ from rcl_interfaces.msg import Log
 from ros_harness import joint_state, read_config
 
 from torque_safety_controller.node.controller_node import ControllerNode
-from viability_bounds_pkg.ros.parameters import ParameterError
+from viability_bounds_pkg.exceptions import SettingError
 
 ARM = load_arm("panda")
 VALUES = read_config("panda", NODE) | {
@@ -82,5 +82,5 @@ def test_an_overlap_is_reported_and_countered_and_a_nan_stays_outside(ros):
 
 
 def test_a_link_that_there_is_not_ends_the_node_with_one_line(ros):
-    with pytest.raises(ParameterError, match="'collision_pairs'.*gripper"):
+    with pytest.raises(SettingError, match="'collision_pairs'.*gripper"):
         ros.start(ControllerNode, VALUES | {"collision_pairs": ["panda_hand gripper"]})

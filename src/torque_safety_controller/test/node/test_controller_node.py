@@ -18,8 +18,8 @@ from trajectory_msgs.msg import JointTrajectory
 from torque_safety_controller.controller import Controller, Gains
 from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.tasks.tasks import critical_damping
+from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import read_urdf
-from viability_bounds_pkg.ros.parameters import ParameterError
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, LATCHED_QOS, set_stamp, stamp_to_ns
 
 ARM = load_arm("baxter_left_arm")
@@ -683,7 +683,7 @@ BROKEN_URDF = str(ROOT / "pyproject.toml")
     ],
 )
 def test_it_does_not_start_with_bad_parameters(ros, changed, name, shown):
-    with pytest.raises(ParameterError) as refusal:
+    with pytest.raises(SettingError) as refusal:
         ros.start(ControllerNode, VALUES | changed)
     text = str(refusal.value)
     assert refusal.value.name == name
@@ -694,7 +694,7 @@ def test_it_does_not_start_with_bad_parameters(ros, changed, name, shown):
 def test_a_urdf_that_does_not_load_is_named(ros, tmp_path):
     path = tmp_path / "arm.urdf"
     path.write_text('<robot name="r"><link name="a"/><joint name="j" type="revolute"/></robot>')
-    with pytest.raises(ParameterError) as refusal:
+    with pytest.raises(SettingError) as refusal:
         ros.start(ControllerNode, VALUES | {"robot_description": str(path)})
     assert refusal.value.name == "robot_description"
 
@@ -714,7 +714,7 @@ def test_the_description_may_come_from_its_topic(ros):
 def test_a_description_that_is_none_stops_it(ros):
     publisher = ros.probe.create_publisher(String, "robot_description", LATCHED_QOS)
     publisher.publish(String(data="no robot"))
-    with pytest.raises(ParameterError, match="'robot_description' is 'topic'.*not well-formed"):
+    with pytest.raises(SettingError, match="'robot_description' is 'topic'.*not well-formed"):
         ros.start(
             ControllerNode,
             read_config("panda", "controller_node") | {"robot_description": "topic"},

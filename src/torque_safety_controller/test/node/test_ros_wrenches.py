@@ -14,7 +14,7 @@ from std_srvs.srv import Trigger
 
 from torque_safety_controller.node.assembly import make_controller
 from torque_safety_controller.parameters import controller_parameters
-from viability_bounds_pkg.ros.parameters import ParameterError
+from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS, set_stamp
 
 ARM = load_arm("panda")
@@ -213,7 +213,7 @@ def build(**changed):
     ],
 )
 def test_a_wrong_parameter_is_named(changed, named):
-    with pytest.raises(ParameterError, match=f"'{named}'"):
+    with pytest.raises(SettingError, match=f"'{named}'"):
         build(**changed)
 
 

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from task_arm import TaskArm
 
 from torque_safety_controller.integral_feedback.feedback import IntegralFeedback, IntegralSettings
-from torque_safety_controller.integral_feedback.settings import IntegralSettingsError
 from torque_safety_controller.linalg.generalized_inverse import GeneralizedInverseError
 from torque_safety_controller.nullspace.compliance import NullspaceCompliance, NullspaceSettings
 from torque_safety_controller.nullspace.law import Terms, energy_product
 from torque_safety_controller.nullspace.limit import torque_matrix
+from viability_bounds_pkg.exceptions import SettingError
 
 DT = 2e-3
 
@@ -471,30 +471,30 @@ def test_any_task_with_a_null_space_is_served(m):
 @pytest.mark.parametrize(
     "changes, message",
     [
-        (dict(budget=np.array([1.0, -1.0])), "budget = .* >= 0"),
-        (dict(budget=np.array([np.nan])), "budget = .* >= 0"),
+        (dict(budget=np.array([1.0, -1.0])), "'budget' is .* >= 0"),
+        (dict(budget=np.array([np.nan])), "'budget' is .* >= 0"),
         (dict(budget=np.ones((2, 2))), "budget"),
-        (dict(lambda_=0.0), "lambda_ = 0.0: must be a finite number > 0"),
+        (dict(lambda_=0.0), "'lambda_' is '?0'?; allowed: a finite number > 0"),
         (dict(lambda_=np.nan), "lambda_"),
-        (dict(mu=1.5), "mu = 1.5: must be a number from 0 to 1"),
+        (dict(mu=1.5), "'mu' is '?1.5'?; allowed: a number from 0 to 1"),
         (dict(mu=np.nan), "mu"),
-        (dict(theta_slow=-0.1), "theta_slow = -0.1"),
-        (dict(theta_fast=0.01), "theta_fast = 0.01: must be .* >= theta_slow = 0.1"),
-        (dict(theta_null=0.01), "theta_null = 0.01: must be .* >= theta_slow = 0.1"),
+        (dict(theta_slow=-0.1), "'theta_slow' is -0.1"),
+        (dict(theta_fast=0.01), "'theta_fast' is '?0.01'?; allowed: .* >= theta_slow = 0.1"),
+        (dict(theta_null=0.01), "'theta_null' is '?0.01'?; allowed: .* >= theta_slow = 0.1"),
         (dict(theta_null=np.inf), "theta_null"),
-        (dict(threshold=0.0), "threshold = 0.0: must be a finite number > 0"),
+        (dict(threshold=0.0), "'threshold' is '?0'?; allowed: a finite number > 0"),
         (dict(blend_time=0.0), "blend_time"),
         (dict(widening_time=-1.0), "widening_time"),
     ],
 )
 def test_bad_settings_are_refused(changes, message):
-    with pytest.raises(IntegralSettingsError, match=message):
+    with pytest.raises(SettingError, match=message):
         replace(unlimited(2), **changes)
 
 
 def test_budgets_of_another_arm_are_refused():
     compliance = NullspaceCompliance(unlimited(7), 6)
-    with pytest.raises(IntegralSettingsError, match="one number for each of 7 joints"):
+    with pytest.raises(SettingError, match="one number for each of 7 joints"):
         compliance.settings = unlimited(6)
 
 

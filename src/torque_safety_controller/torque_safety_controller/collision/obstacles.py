@@ -9,8 +9,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
+from viability_bounds_pkg.exceptions import ArmSafetyError
 
-class CollisionError(ValueError):
+
+class CollisionError(ArmSafetyError, ValueError):
     """An obstacle, a pair or a setting of the collision avoidance that cannot be used.
 
     Args:

@@ -25,9 +25,10 @@ import pinocchio as pin
 from torque_safety_controller.qp.constraints import Rows
 from torque_safety_controller.qp.inverse_dynamics_qp import ContactForces
 from torque_safety_controller.tasks.tasks import TaskTerm, WrenchTerm
+from viability_bounds_pkg.exceptions import ArmSafetyError
 
 
-class ContactError(ValueError):
+class ContactError(ArmSafetyError, ValueError):
     """A contact that cannot be: which part of it, its value and what is allowed."""
 
 

@@ -20,11 +20,12 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from viability_bounds_pkg.compiled import compiled
+from viability_bounds_pkg.exceptions import ArmSafetyError
 
 _TARE_TIME = 0.2  # s, of the mean that becomes the bias
 
 
-class WrenchError(ValueError):
+class WrenchError(ArmSafetyError, ValueError):
     """A measurement, or a property of the sensor or the tool, that cannot be used."""
 
 

@@ -15,12 +15,14 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
+from viability_bounds_pkg.exceptions import ArmSafetyError
+
 Array = NDArray[np.float64]
 
 KEYS = ("t", "q", "v", "tau")
 
 
-class RecordingError(ValueError):
+class RecordingError(ArmSafetyError, ValueError):
     """A recording that cannot be read or used."""
 
 

@@ -8,24 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from viability_bounds_pkg.exceptions import SettingError
+
 DEFAULT_STRIBECK_VELOCITY = 0.01
 """rad/s."""
-
-
-class FrictionSettingsError(ValueError):
-    """A setting of the friction compensation is unusable.
-
-    Attributes:
-        name: of the setting.
-        value: what was given.
-        allowed: what would have been accepted.
-    """
-
-    def __init__(self, name: str, value: object, allowed: str) -> None:
-        self.name = name
-        self.value = value
-        self.allowed = allowed
-        super().__init__(f"{name} = {value}: must be {allowed}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +27,7 @@ class FrictionModel:
         stribeck_velocity: v_s between the two, shape (n,), rad/s, > 0.
 
     Raises:
-        FrictionSettingsError: a value is out of range, or the shapes differ.
+        SettingError: a value is out of range, or the shapes differ.
     """
 
     coulomb: NDArray[np.float64]
@@ -54,12 +40,12 @@ class FrictionModel:
         for name in ("coulomb", "static", "viscous", "stribeck_velocity"):
             value = _finite_vector(name, getattr(self, name), n)
             if not (value >= 0.0).all():
-                raise FrictionSettingsError(name, value, "numbers >= 0")
+                raise SettingError(name, value, "numbers >= 0")
             object.__setattr__(self, name, value)
         if not (self.static >= self.coulomb).all():
-            raise FrictionSettingsError("static", self.static, "at least coulomb everywhere")
+            raise SettingError("static", self.static, "at least coulomb everywhere")
         if not (self.stribeck_velocity > 0.0).all():
-            raise FrictionSettingsError("stribeck_velocity", self.stribeck_velocity, "numbers > 0")
+            raise SettingError("stribeck_velocity", self.stribeck_velocity, "numbers > 0")
 
     @property
     def n(self) -> int:
@@ -92,7 +78,7 @@ class FrictionSettings:
             the control rate allows.
 
     Raises:
-        FrictionSettingsError: a value is out of range.
+        SettingError: a value is out of range.
     """
 
     model: FrictionModel
@@ -104,20 +90,20 @@ class FrictionSettings:
     def __post_init__(self) -> None:
         budget = _finite_vector("budget", self.budget, self.model.n)
         if not (budget >= 0.0).all():
-            raise FrictionSettingsError("budget", budget, "numbers >= 0")
+            raise SettingError("budget", budget, "numbers >= 0")
         object.__setattr__(self, "budget", budget)
         if not 0.0 <= self.scale <= 1.0:
-            raise FrictionSettingsError("scale", self.scale, "a number from 0 to 1")
+            raise SettingError("scale", self.scale, "a number from 0 to 1")
         if not (math.isfinite(self.theta) and self.theta >= 0.0):
-            raise FrictionSettingsError("theta", self.theta, "a finite number >= 0")
+            raise SettingError("theta", self.theta, "a finite number >= 0")
         if self.gain is not None and not (math.isfinite(self.gain) and self.gain > 0.0):
-            raise FrictionSettingsError("gain", self.gain, "a finite number > 0")
+            raise SettingError("gain", self.gain, "a finite number > 0")
 
 
 def _finite_vector(name: str, value: ArrayLike, n: int) -> NDArray[np.float64]:
     """Return n finite numbers as a read-only copy."""
     vector = np.array(value, dtype=np.float64)
     if vector.shape != (n,) or n == 0 or not np.isfinite(vector).all():
-        raise FrictionSettingsError(name, value, f"{n} finite numbers, one for each joint")
+        raise SettingError(name, value, f"{n} finite numbers, one for each joint")
     vector.flags.writeable = False
     return vector

@@ -21,14 +21,13 @@ from torque_safety_controller.integral_feedback.leaky_integrator import LeakyInt
 from torque_safety_controller.integral_feedback.settings import (
     METHODS,
     IntegralSettings,
-    IntegralSettingsError,
     paper_settings,
 )
+from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError
 
 __all__ = [
     "IntegralFeedback",
     "IntegralSettings",
-    "IntegralSettingsError",
     "LeakyIntegrator",
     "SeedingError",
     "paper_settings",
@@ -39,7 +38,7 @@ Array = NDArray[np.float64]
 _AMPLIFIED = 10.0  # how much larger than the torque asked for K s may be when it is seeded
 
 
-class SeedingError(ValueError):
+class SeedingError(ArmSafetyError, ValueError):
     """The integral action cannot be made to give the torque asked for."""
 
 
@@ -87,9 +86,7 @@ class IntegralFeedback:
     def settings(self, settings: IntegralSettings) -> None:
         if settings.budget.shape != self._shape:
             n = self._shape[0]
-            raise IntegralSettingsError(
-                "budget", settings.budget, f"one number for each of {n} joints"
-            )
+            raise SettingError("budget", settings.budget, f"one number for each of {n} joints")
         if self._started:
             self._next = settings
         else:

@@ -8,24 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from viability_bounds_pkg.exceptions import SettingError
+
 METHODS = ("none", "clip", "scaling", "qp")
 """Ways to limit the additional torque: not at all, component by component, (10), (11)."""
-
-
-class IntegralSettingsError(ValueError):
-    """A setting of the integral action is unusable.
-
-    Attributes:
-        name: of the setting.
-        value: what was given.
-        allowed: what would have been accepted.
-    """
-
-    def __init__(self, name: str, value: object, allowed: str) -> None:
-        self.name = name
-        self.value = value
-        self.allowed = allowed
-        super().__init__(f"{name} = {value}: must be {allowed}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +35,7 @@ class IntegralSettings:
             what it should be, s, > 0.
 
     Raises:
-        IntegralSettingsError: a value is out of range.
+        SettingError: a value is out of range.
     """
 
     budget: NDArray[np.float64]
@@ -66,21 +52,21 @@ class IntegralSettings:
     def __post_init__(self) -> None:
         budget = np.array(self.budget, dtype=np.float64)
         if budget.ndim != 1 or len(budget) == 0 or not (budget >= 0.0).all():
-            raise IntegralSettingsError("budget", self.budget, "a number >= 0 for each joint")
+            raise SettingError("budget", self.budget, "a number >= 0 for each joint")
         budget.flags.writeable = False
         object.__setattr__(self, "budget", budget)
         for name in ("theta_slow", "theta_fast"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
-                raise IntegralSettingsError(name, value, "a finite number >= 0")
+                raise SettingError(name, value, "a finite number >= 0")
         for name in ("lambda_", "widening_time"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
-                raise IntegralSettingsError(name, value, "a finite number > 0")
+                raise SettingError(name, value, "a finite number > 0")
         if not 0.0 <= self.mu <= 1.0:
-            raise IntegralSettingsError("mu", self.mu, "a number from 0 to 1")
+            raise SettingError("mu", self.mu, "a number from 0 to 1")
         if self.anti_windup not in METHODS:
-            raise IntegralSettingsError("anti_windup", self.anti_windup, " or ".join(METHODS))
+            raise SettingError("anti_windup", self.anti_windup, " or ".join(METHODS))
 
 
 def paper_settings(budget: ArrayLike) -> IntegralSettings:

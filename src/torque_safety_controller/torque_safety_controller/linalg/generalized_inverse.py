@@ -23,6 +23,7 @@ from torque_safety_controller.linalg.singularity_damping import (
     is_clear_of_singularities,
 )
 from viability_bounds_pkg.compiled import compiled
+from viability_bounds_pkg.exceptions import ArmSafetyError
 
 THRESHOLD = 0.03
 """Singular value of J below which its direction is damped, unless told otherwise."""
@@ -44,7 +45,7 @@ class GeneralizedInverse(NamedTuple):
     damped: bool
 
 
-class GeneralizedInverseError(ValueError):
+class GeneralizedInverseError(ArmSafetyError, ValueError):
     """A Jacobian or mass matrix that has no such inverse."""
 
 

@@ -31,7 +31,7 @@ def make_controller(
         node: listens for the URDF if it comes from a topic.
 
     Raises:
-        ParameterError: something that only the URDF could tell is wrong.
+        SettingError: something that only the URDF could tell is wrong.
     """
     robot, base, urdf = load_robot(values, node)
     controller = Controller(

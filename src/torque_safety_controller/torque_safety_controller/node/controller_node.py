@@ -29,8 +29,9 @@ from torque_safety_controller.parameters.controller_parameters import (
 )
 from torque_safety_controller.safety.handover import Control, Handover, HandoverRefused
 from torque_safety_controller.safety.modes import Mode, ModeKeeper
+from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, Verdict
-from viability_bounds_pkg.ros.parameters import NodeParameters, ParameterError
+from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, run
 
 
@@ -50,7 +51,7 @@ class ControllerNode(Node):
             )
             values, config = self._node_parameters.values, self._node_parameters.configuration
             self._controller, base = make_controller(values, config, self)
-        except ParameterError:
+        except SettingError:
             self.destroy_node()
             raise
         self._config = config

@@ -20,12 +20,13 @@ from torque_safety_controller.tasks.pose_trajectory import (
     TrajectoryError,
     TrajectoryPoint,
 )
+from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, stamp_to_ns
 
 _QUATERNION_TOLERANCE = 1e-3
 
 
-class GoalRefused(ValueError):
+class GoalRefused(ArmSafetyError, ValueError):
     """A goal message that cannot be followed."""
 
 

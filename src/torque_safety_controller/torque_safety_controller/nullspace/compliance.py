@@ -21,11 +21,11 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torque_safety_controller.integral_feedback.settings import IntegralSettingsError
 from torque_safety_controller.linalg.generalized_inverse import check_task_shape
 from torque_safety_controller.nullspace import kernels
 from torque_safety_controller.nullspace.law import Law
 from torque_safety_controller.nullspace.settings import NullspaceSettings
+from viability_bounds_pkg.exceptions import SettingError
 
 __all__ = ["NullspaceCompliance", "NullspaceSettings"]
 
@@ -78,9 +78,7 @@ class NullspaceCompliance:
     def settings(self, settings: NullspaceSettings) -> None:
         n = self._shapes[0]
         if settings.budget.shape != (n,):
-            raise IntegralSettingsError(
-                "budget", settings.budget, f"one number for each of {n} joints"
-            )
+            raise SettingError("budget", settings.budget, f"one number for each of {n} joints")
         if self._started:
             self._next = settings
         else:

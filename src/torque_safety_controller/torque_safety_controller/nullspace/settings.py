@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from torque_safety_controller.integral_feedback.settings import IntegralSettingsError
 from torque_safety_controller.linalg.generalized_inverse import THRESHOLD
+from viability_bounds_pkg.exceptions import SettingError
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class NullspaceSettings:
             should be, s, > 0.
 
     Raises:
-        IntegralSettingsError: a value is out of range.
+        SettingError: a value is out of range.
     """
 
     budget: NDArray[np.float64]
@@ -56,25 +56,25 @@ class NullspaceSettings:
     def __post_init__(self) -> None:
         budget = np.array(self.budget, dtype=np.float64)
         if budget.ndim != 1 or len(budget) == 0 or not (budget >= 0.0).all():
-            raise IntegralSettingsError("budget", self.budget, "a number >= 0 for each joint")
+            raise SettingError("budget", self.budget, "a number >= 0 for each joint")
         budget.flags.writeable = False
         object.__setattr__(self, "budget", budget)
         if not (math.isfinite(self.theta_slow) and self.theta_slow >= 0.0):
-            raise IntegralSettingsError("theta_slow", self.theta_slow, "a finite number >= 0")
+            raise SettingError("theta_slow", self.theta_slow, "a finite number >= 0")
         for name in ("theta_fast", "theta_null"):
             value = getattr(self, name)
             if value is None and name == "theta_null":
                 continue
             if not (math.isfinite(value) and value >= self.theta_slow):
-                raise IntegralSettingsError(
+                raise SettingError(
                     name, value, f"a finite number >= theta_slow = {self.theta_slow}"
                 )
         for name in ("lambda_", "threshold", "blend_time", "widening_time"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
-                raise IntegralSettingsError(name, value, "a finite number > 0")
+                raise SettingError(name, value, "a finite number > 0")
         if not 0.0 <= self.mu <= 1.0:
-            raise IntegralSettingsError("mu", self.mu, "a number from 0 to 1")
+            raise SettingError("mu", self.mu, "a number from 0 to 1")
 
     @property
     def null_rate(self) -> float:

@@ -18,8 +18,9 @@ from torque_safety_controller.collision.obstacles import (
     Obstacle,
     make_obstacle,
 )
+from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import RobotDescriptionError
-from viability_bounds_pkg.ros.parameters import Parameter, ParameterError, per_joint
+from viability_bounds_pkg.ros.parameters import Parameter, per_joint
 from viability_bounds_pkg.ros.robot_parameters import locked_joints
 
 HORIZON = 2.0
@@ -152,7 +153,7 @@ def collision_configuration(
         None without collision avoidance; the parameters are checked all the same.
 
     Raises:
-        ParameterError: a value cannot be used.
+        SettingError: a value cannot be used.
     """
     try:
         settings = CollisionSettings(
@@ -163,7 +164,7 @@ def collision_configuration(
         raise _parameter_error(error) from error
     count = values["collision_capsules_per_link"]
     if count < 1:
-        raise ParameterError("collision_capsules_per_link", count, "at least 1")
+        raise SettingError("collision_capsules_per_link", count, "at least 1")
     pairs = tuple(_pair(text) for text in values["collision_pairs"])
     posture = _posture(values, joints, q_min, q_max)
     if not values["collision_avoidance"]:
@@ -196,7 +197,7 @@ def load_collision(
         model: made of it.
 
     Raises:
-        ParameterError: collision geometry that does not load, or a link that there is not.
+        SettingError: collision geometry that does not load, or a link that there is not.
     """
     if config is None:
         return None
@@ -222,16 +223,16 @@ def load_collision(
         raise _parameter_error(error) from error
     except RobotDescriptionError as error:
         allowed = f"a URDF whose collision geometry loads ({error})"
-        raise ParameterError("robot_description", values["robot_description"], allowed) from error
+        raise SettingError("robot_description", values["robot_description"], allowed) from error
 
 
 def _obstacles(values: Mapping[str, Any]) -> tuple[Obstacle, ...]:
     names = values["obstacle_names"]
     if len(set(names)) != len(names) or "" in names:
-        raise ParameterError("obstacle_names", names, "names, each once")
+        raise SettingError("obstacle_names", names, "names, each once")
     if len(values["obstacle_shapes"]) != len(names):
         allowed = f"{len(names)} shapes, one for each of 'obstacle_names'"
-        raise ParameterError("obstacle_shapes", values["obstacle_shapes"], allowed)
+        raise SettingError("obstacle_shapes", values["obstacle_shapes"], allowed)
     columns = []
     for key, each in (("sizes", 3), ("positions", 3), ("orientations", 4)):
         numbers = values[f"obstacle_{key}"]
@@ -239,7 +240,7 @@ def _obstacles(values: Mapping[str, Any]) -> tuple[Obstacle, ...]:
             numbers = np.tile([0.0, 0.0, 0.0, 1.0], len(names))
         if len(numbers) != each * len(names):
             allowed = f"{each * len(names)} numbers, {each} for each of 'obstacle_names'"
-            raise ParameterError(f"obstacle_{key}", numbers, allowed)
+            raise SettingError(f"obstacle_{key}", numbers, allowed)
         columns.append(numbers.reshape(-1, each))
     return tuple(map(make_obstacle, names, values["obstacle_shapes"], *columns))
 
@@ -247,7 +248,7 @@ def _obstacles(values: Mapping[str, Any]) -> tuple[Obstacle, ...]:
 def _pair(text: str) -> tuple[str, str]:
     links = text.split()
     if len(links) != 2:
-        raise ParameterError("collision_pairs", text, "two links, as in 'link_a link_b'")
+        raise SettingError("collision_pairs", text, "two links, as in 'link_a link_b'")
     return links[0], links[1]
 
 
@@ -257,12 +258,12 @@ def _posture(
     if len(values["collision_posture"]):
         posture = per_joint(values, "collision_posture", joints)
         if not ((q_min <= posture) & (posture <= q_max) & np.isfinite(posture)).all():
-            raise ParameterError("collision_posture", posture, "within the position limits")
+            raise SettingError("collision_posture", posture, "within the position limits")
         return posture
     limited = np.isfinite(q_min) & np.isfinite(q_max)
     return np.where(limited, 0.5 * (np.where(limited, q_min, 0.0) + q_max), 0.0)
 
 
-def _parameter_error(error: CollisionError) -> ParameterError:
+def _parameter_error(error: CollisionError) -> SettingError:
     name = _PARAMETER_OF.get(error.field, f"collision_{error.field}")
-    return ParameterError(name, error.value, error.allowed)
+    return SettingError(name, error.value, error.allowed)

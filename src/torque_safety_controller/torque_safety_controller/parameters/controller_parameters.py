@@ -23,10 +23,10 @@ from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.safety.modes import CONTROLS
 from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.tasks import critical_damping
+from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import RobotDescriptionError
 from viability_bounds_pkg.ros.parameters import (
     Parameter,
-    ParameterError,
     joint_names,
     per_joint,
     positive,
@@ -146,21 +146,21 @@ def make_configuration(values: Mapping[str, Any]) -> ControllerConfiguration:
     """Check everything but the URDF, which `load_robot` reads once.
 
     Raises:
-        ParameterError: a value cannot be used.
+        SettingError: a value cannot be used.
     """
     joints = joint_names(values)
     tau_rate_max = np.full(len(joints), np.inf)
     if len(values["torque_rate_max"]):
         tau_rate_max = per_joint(values, "torque_rate_max", joints)
         if not (tau_rate_max > 0).all():
-            raise ParameterError("torque_rate_max", tau_rate_max, "numbers > 0")
+            raise SettingError("torque_rate_max", tau_rate_max, "numbers > 0")
     q_min, q_max = position_limits(values, joints)
     tau_max = all_positive(values, "torque_max", joints)
     if values["qp_solver"] not in SOLVERS:
-        raise ParameterError("qp_solver", values["qp_solver"], f"one of {', '.join(SOLVERS)}")
+        raise SettingError("qp_solver", values["qp_solver"], f"one of {', '.join(SOLVERS)}")
     if values["start_control"] not in CONTROLS:
         allowed = f"one of {', '.join(CONTROLS)}"
-        raise ParameterError("start_control", values["start_control"], allowed)
+        raise SettingError("start_control", values["start_control"], allowed)
     return ControllerConfiguration(
         joints=joints,
         dt=1.0 / positive(values, "rate_hz"),
@@ -227,7 +227,7 @@ def load_robot(values: Mapping[str, Any], node: Node | None) -> LoadedRobot:
         node: listens for the URDF if it comes from a topic.
 
     Raises:
-        ParameterError: a URDF that does not load, or a joint or frame that it does not have.
+        SettingError: a URDF that does not load, or a joint or frame that it does not have.
     """
     urdf = robot_urdf(values, node)
     model = model_from(values, urdf)
@@ -243,14 +243,14 @@ def _with_frame(model: pin.Model, values: Mapping[str, Any], name: str) -> Robot
     try:
         return RobotModel(model, frame, 1.0 / values["rate_hz"])
     except RobotDescriptionError as error:
-        raise ParameterError(name, frame, f"a frame of the URDF ({error})") from error
+        raise SettingError(name, frame, f"a frame of the URDF ({error})") from error
 
 
 def _base_placement(model: pin.Model, frame: str) -> pin.SE3:
     if not model.existFrame(frame):
         known = ", ".join(f.name for f in model.frames if f.parentJoint == 0)
-        raise ParameterError("base_frame", frame, f"a frame fixed to the root: {known}")
+        raise SettingError("base_frame", frame, f"a frame fixed to the root: {known}")
     found = model.frames[model.getFrameId(frame)]
     if found.parentJoint != 0:
-        raise ParameterError("base_frame", frame, "a frame fixed to the root, not a moving one")
+        raise SettingError("base_frame", frame, "a frame fixed to the root, not a moving one")
     return found.placement

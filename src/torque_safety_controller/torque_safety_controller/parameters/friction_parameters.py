@@ -11,9 +11,9 @@ from torque_safety_controller.friction.settings import (
     DEFAULT_STRIBECK_VELOCITY,
     FrictionModel,
     FrictionSettings,
-    FrictionSettingsError,
 )
-from viability_bounds_pkg.ros.parameters import Parameter, ParameterError, per_joint
+from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.ros.parameters import Parameter, per_joint
 
 BUDGET = 0.2
 """Default budget in torque limits."""
@@ -76,7 +76,7 @@ def friction_settings(
         tau_max: torque limits, shape (n,), N m.
 
     Raises:
-        ParameterError: a value cannot be used.
+        SettingError: a value cannot be used.
     """
     n = len(joints)
     scale = values["friction_compensation"]
@@ -88,7 +88,7 @@ def friction_settings(
     given = {name: values[f"friction_model_{name}"] for name in MODEL}
     if scale > 0.0 and not any(len(given[name]) for name in ("coulomb", "static", "viscous")):
         allowed = "0 as long as no friction_model_coulomb, _static or _viscous is given"
-        raise ParameterError("friction_compensation", scale, allowed)
+        raise SettingError("friction_compensation", scale, allowed)
     found = {
         name: per_joint(values, f"friction_model_{name}", joints)
         if len(value)
@@ -101,15 +101,15 @@ def friction_settings(
     if len(values["friction_budget"]):
         budget = per_joint(values, "friction_budget", joints)
         if (budget > tau_max).any():
-            raise ParameterError("friction_budget", budget, "at most torque_max")
+            raise SettingError("friction_budget", budget, "at most torque_max")
     try:
         model = FrictionModel(**found)
-    except FrictionSettingsError as error:
+    except SettingError as error:
         name = f"friction_model_{error.name}"
-        raise ParameterError(name, error.value, error.allowed) from error
+        raise SettingError(name, error.value, error.allowed) from error
     try:
         gain = None if values["friction_gain"] == -1.0 else values["friction_gain"]
         return FrictionSettings(model, budget, scale, values["friction_theta"], gain)
-    except FrictionSettingsError as error:
+    except SettingError as error:
         name = _PARAMETER_OF.get(error.name, f"friction_{error.name}")
-        raise ParameterError(name, error.value, error.allowed) from error
+        raise SettingError(name, error.value, error.allowed) from error

@@ -11,11 +11,11 @@ from torque_safety_controller.additional_torque import MODES, AdditionalSettings
 from torque_safety_controller.integral_feedback.settings import (
     METHODS,
     IntegralSettings,
-    IntegralSettingsError,
 )
 from torque_safety_controller.nullspace.settings import NullspaceSettings
 from torque_safety_controller.parameters.friction_parameters import friction_settings
-from viability_bounds_pkg.ros.parameters import Parameter, ParameterError, per_joint
+from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.ros.parameters import Parameter, per_joint
 
 BUDGET = 0.1
 """Default budget in torque limits: the paper's tau_m."""
@@ -86,20 +86,20 @@ def additional_settings(
         tau_max: torque limits, shape (n,), N m.
 
     Raises:
-        ParameterError: a value cannot be used.
+        SettingError: a value cannot be used.
     """
     mode = values["integral_action"]
     if mode not in MODES:
-        raise ParameterError("integral_action", mode, f"one of {', '.join(MODES)}")
+        raise SettingError("integral_action", mode, f"one of {', '.join(MODES)}")
     rows = task_rows(values)
     if mode == "task" and rows.stop >= len(joints):
         allowed = f"'none' or 'joints': {len(joints)} joints have no null space left of the task"
-        raise ParameterError("integral_action", mode, allowed)
+        raise SettingError("integral_action", mode, allowed)
     budget = BUDGET * tau_max
     if len(values["integral_budget"]):
         budget = per_joint(values, "integral_budget", joints)
         if (budget > tau_max).any():
-            raise ParameterError("integral_budget", budget, "at most torque_max")
+            raise SettingError("integral_budget", budget, "at most torque_max")
     common = {
         "budget": budget,
         "lambda_": values["integral_lambda"],
@@ -124,18 +124,18 @@ def additional_settings(
             DISTURBANCE_MAX * tau_max,
             friction_settings(values, joints, tau_max),
         )
-    except IntegralSettingsError as error:
+    except SettingError as error:
         name = f"integral_{_NAME_OF.get(error.name, error.name)}"
-        raise ParameterError(name, error.value, error.allowed) from error
+        raise SettingError(name, error.value, error.allowed) from error
 
 
 def task_rows(values: Mapping[str, Any]) -> slice:
     """Return which rows of the pose's Jacobian ``integral_task`` names.
 
     Raises:
-        ParameterError: it is unknown.
+        SettingError: it is unknown.
     """
     task = values["integral_task"]
     if task not in TASKS:
-        raise ParameterError("integral_task", task, f"one of {', '.join(TASKS)}")
+        raise SettingError("integral_task", task, f"one of {', '.join(TASKS)}")
     return TASKS[task]

@@ -14,8 +14,9 @@ from torque_safety_controller.contact.dual_compliance import DualSettings
 from torque_safety_controller.contact.interaction import Interaction, InteractionSettings
 from torque_safety_controller.contact.wrench_sensor import SensorSettings, WrenchSensor
 from torque_safety_controller.robot_model import RobotModel
+from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import RobotDescriptionError, inertia_beyond
-from viability_bounds_pkg.ros.parameters import Parameter, ParameterError, positive
+from viability_bounds_pkg.ros.parameters import Parameter, positive
 from viability_bounds_pkg.ros.robot_parameters import locked_joints
 
 _AXES = "x, y, z and about x, y, z of the end effector's axes"
@@ -138,7 +139,7 @@ def sensor_settings(values: Mapping[str, Any]) -> SensorSettings:
     """Return how measurements are taken.
 
     Raises:
-        ParameterError: a value cannot be used.
+        SettingError: a value cannot be used.
     """
     return SensorSettings(positive(values, "ft_filter_hz"), positive(values, "ft_timeout"))
 
@@ -147,23 +148,23 @@ def interaction_settings(values: Mapping[str, Any]) -> InteractionSettings:
     """Return what is done about forces.
 
     Raises:
-        ParameterError: a value cannot be used.
+        SettingError: a value cannot be used.
     """
     directions = _six(values, "force_directions")
     if not np.isin(directions, (0.0, 1.0)).all():
-        raise ParameterError("force_directions", directions, "zeros and ones")
+        raise SettingError("force_directions", directions, "zeros and ones")
     stiffness = _six(values, "force_stiffness")
     if not ((stiffness >= 0.0) & (stiffness <= 1.0)).all():
-        raise ParameterError("force_stiffness", stiffness, "numbers from 0 to 1")
+        raise SettingError("force_stiffness", stiffness, "numbers from 0 to 1")
     for name in ("force_directions", "dual_compliance"):
         if np.any(values[name]) and not values["ft_frame"]:
-            raise ParameterError(name, values[name], "only with a force/torque sensor, 'ft_frame'")
+            raise SettingError(name, values[name], "only with a force/torque sensor, 'ft_frame'")
     weight = values["admittance_weight"]
     frames = _contact_frames(values)
     for frame in values["closed_contacts"]:
         if frame not in frames:
             known = ", ".join(frames) or "none"
-            raise ParameterError(
+            raise SettingError(
                 "closed_contacts", list(values["closed_contacts"]), f"of 'contact_frames': {known}"
             )
     return InteractionSettings(
@@ -196,7 +197,7 @@ def _dual(values: Mapping[str, Any]) -> DualSettings | None:
     force, moment = positive(values, "yield_force"), positive(values, "yield_moment")
     release = positive(values, "yield_release", zero=True)
     if release > 1.0:
-        raise ParameterError("yield_release", release, "a number from 0 to 1")
+        raise SettingError("yield_release", release, "a number from 0 to 1")
     return DualSettings(force, moment, release) if values["dual_compliance"] else None
 
 
@@ -207,7 +208,7 @@ def _speeds(
     if not len(value):
         return default
     if len(value) != 2 or not (np.isfinite(value) & (value > 0.0)).all():
-        raise ParameterError(name, value, "two finite numbers > 0, m/s and rad/s")
+        raise SettingError(name, value, "two finite numbers > 0, m/s and rad/s")
     return float(value[0]), float(value[1])
 
 
@@ -216,7 +217,7 @@ def _six(values: Mapping[str, Any], name: str) -> np.ndarray:
     if not len(value):
         return np.zeros(6)
     if len(value) != 6 or not np.isfinite(value).all():
-        raise ParameterError(name, value, f"six finite numbers: {_AXES}")
+        raise SettingError(name, value, f"six finite numbers: {_AXES}")
     return value
 
 
@@ -235,7 +236,7 @@ def make_interaction(
         settings: of `interaction_settings`.
 
     Raises:
-        ParameterError: a frame that the URDF does not have or that is not where it must be, or
+        SettingError: a frame that the URDF does not have or that is not where it must be, or
             a contact that cannot be.
     """
     sensor = _sensor(values, robot, urdf)
@@ -251,7 +252,7 @@ def make_interaction(
         ]
         if len(on_hand) > 1:
             frames = list(values["contact_frames"])
-            raise ParameterError("contact_frames", frames, "one link that is fixed to the hand")
+            raise SettingError("contact_frames", frames, "one link that is fixed to the hand")
         if on_hand:
             hand = on_hand[0]
             placement = _between(robot.model, robot.frame, contacts.contacts[hand].frame)
@@ -263,17 +264,17 @@ def _sensor(values: Mapping[str, Any], robot: RobotModel, urdf: str) -> WrenchSe
     if not frame:
         return None
     if not model.existFrame(frame, pin.FrameType.BODY):
-        raise ParameterError("ft_frame", frame, "a link of the URDF, or empty")
+        raise SettingError("ft_frame", frame, "a link of the URDF, or empty")
     if _joint_of(model, frame) != _joint_of(model, robot.frame):
-        raise ParameterError("ft_frame", frame, f"a link fixed to {robot.frame!r}")
+        raise SettingError("ft_frame", frame, f"a link fixed to {robot.frame!r}")
     com = values["ft_tool_com"]
     if len(com) not in (0, 3) or not np.isfinite(com).all():
-        raise ParameterError("ft_tool_com", com, "three finite numbers, or none")
+        raise SettingError("ft_tool_com", com, "three finite numbers, or none")
     if values["ft_tool_mass"] == -1.0:
         try:
             tool = inertia_beyond(urdf, frame, locked_joints(values))
         except RobotDescriptionError as error:
-            raise ParameterError("ft_frame", frame, f"a link of the URDF ({error})") from error
+            raise SettingError("ft_frame", frame, f"a link of the URDF ({error})") from error
     else:
         mass = positive(values, "ft_tool_mass", zero=True)
         tool = pin.Inertia(mass, com if len(com) else np.zeros(3), np.zeros((3, 3)))
@@ -293,24 +294,24 @@ def _contacts(values: Mapping[str, Any], model: pin.Model) -> Contacts | None:
     points = _triples(values, "contact_points", named, optional=True)
     normals = _triples(values, "contact_normals", named)
     if not (np.abs(normals).max(axis=1) > 1e-9).all():
-        raise ParameterError("contact_normals", values["contact_normals"], "directions, not zero")
+        raise SettingError("contact_normals", values["contact_normals"], "directions, not zero")
     friction = values["contact_friction"]
     if not len(friction):
         friction = np.zeros(len(named))
     if len(friction) != len(named) or not (np.isfinite(friction) & (friction >= 0.0)).all():
-        raise ParameterError("contact_friction", friction, f"{len(named)} finite numbers >= 0")
+        raise SettingError("contact_friction", friction, f"{len(named)} finite numbers >= 0")
     if values["contact_facets"] < 3:
-        raise ParameterError("contact_facets", values["contact_facets"], "at least 3")
+        raise SettingError("contact_facets", values["contact_facets"], "at least 3")
     contacts = []
     for frame in _contact_frames(values):
         if not model.existFrame(frame):
-            raise ParameterError("contact_frames", list(named), f"frames of the URDF, not {frame}")
+            raise SettingError("contact_frames", list(named), f"frames of the URDF, not {frame}")
         its = [i for i, name in enumerate(named) if name == frame]
         first = its[0]
         for i in its:
             if friction[i] != friction[first] or not np.array_equal(normals[i], normals[first]):
                 allowed = f"the same friction and normal at all points of {frame!r}"
-                raise ParameterError("contact_normals", values["contact_normals"], allowed)
+                raise SettingError("contact_normals", values["contact_normals"], allowed)
         facets = values["contact_facets"]
         contacts.append(Contact(frame, points[its], normals[first], friction[first], facets))
     return Contacts(model, contacts)
@@ -324,7 +325,7 @@ def _triples(
         return np.zeros((len(frames), 3))
     if len(value) != 3 * len(frames) or not np.isfinite(value).all():
         allowed = f"{3 * len(frames)} finite numbers, three for each of 'contact_frames'"
-        raise ParameterError(name, value, allowed)
+        raise SettingError(name, value, allowed)
     return value.reshape(-1, 3)
 
 

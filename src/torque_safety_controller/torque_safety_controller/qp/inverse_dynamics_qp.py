@@ -22,6 +22,7 @@ from torque_safety_controller.qp import active_set, proxqp_solver
 from torque_safety_controller.qp.active_set import FAILED, INFEASIBLE, write_dynamics
 from torque_safety_controller.qp.constraints import Rows
 from torque_safety_controller.tasks.tasks import TaskTerm, WrenchTerm
+from viability_bounds_pkg.exceptions import ArmSafetyError
 
 # Weight of |x|^2 beside the squared relaxation: what it adds to the least is of this order.
 _RELAXED_REGULARISATION = 1e-10
@@ -63,7 +64,7 @@ class Solution(NamedTuple):
     """B rho, shape (n,), N m: the motors give M a + h minus this; None without contacts."""
 
 
-class NoSolutionFound(RuntimeError):
+class NoSolutionFound(ArmSafetyError, RuntimeError):
     """The solver was given values that are not finite, crossed, or absurd."""
 
 

@@ -16,6 +16,8 @@ from enum import Enum
 import numpy as np
 from numpy.typing import ArrayLike
 
+from viability_bounds_pkg.exceptions import ArmSafetyError
+
 TORQUE_TOLERANCE = 0.01
 """By how much of its limit a measured torque may exceed it: the step that is left is no larger."""
 
@@ -39,7 +41,7 @@ class Control(Enum):
     """Torque still, which brings the arm to rest before the drives take it."""
 
 
-class HandoverRefused(ValueError):
+class HandoverRefused(ArmSafetyError, ValueError):
     """The control of the arm stays what it is; the text says why."""
 
 

@@ -18,13 +18,15 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from viability_bounds_pkg.exceptions import ArmSafetyError
+
 Array = NDArray[np.float64]
 
 _STEP = 1e-4
 """Of the difference that stands for Jr', as a share of the segment."""
 
 
-class TrajectoryError(ValueError):
+class TrajectoryError(ArmSafetyError, ValueError):
     """Points that are no trajectory."""
 
 

@@ -419,7 +419,7 @@ def test_interrupt_before_anything_was_found(robot, tmp_path):
     output = tmp_path / "limits.yaml"
     output.write_text("old")
     code = (
-        "import sys\nfrom viability_bounds_pkg import estimate_acceleration_limits as tool\n"
+        "import sys\nfrom viability_bounds_pkg.cli import estimate_acceleration_limits as tool\n"
         "def wait(path):\n    print('READING', flush=True)\n    while True:\n        pass\n"
         "tool.read_robot = wait\nsys.exit(tool.main())\n"
     )

@@ -11,10 +11,10 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
 from viability_bounds_pkg.baselines import naive_bounds
+from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.node.bounds_parameters import TABLE, make_configuration
-from viability_bounds_pkg.ros.parameters import ParameterError
 from viability_bounds_pkg.state_dependent.limits import StateDependentBounds
 from viability_bounds_pkg.torque_margin import tightened, torque_margins
 from viability_bounds_pkg.viability import acceleration_bounds
@@ -282,7 +282,7 @@ def test_limits_and_rates_are_read_only(ros, name, value):
     ],
 )
 def test_it_does_not_start_with_bad_parameters(ros, changed, name, shown):
-    with pytest.raises(ParameterError) as refusal:
+    with pytest.raises(SettingError) as refusal:
         ros.start(BoundsNode, VALUES | changed)
     text = str(refusal.value)
     assert refusal.value.name == name
@@ -395,7 +395,7 @@ def test_state_dependent_limits_are_those_of_the_solver(ros):
 )
 def test_bad_parameters_of_state_dependent_limits(ros, changed, name, shown):
     values = PANDA_VALUES | {"acceleration_limits": "state_dependent"} | changed
-    with pytest.raises(ParameterError) as refusal:
+    with pytest.raises(SettingError) as refusal:
         ros.start(BoundsNode, values)
     assert refusal.value.name == name
     assert shown in str(refusal.value)

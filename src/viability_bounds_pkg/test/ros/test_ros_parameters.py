@@ -7,10 +7,10 @@ import pytest
 from rclpy.node import Node
 from ros_harness import overrides
 
+from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.ros.parameters import (
     NodeParameters,
     Parameter,
-    ParameterError,
     joint_names,
     per_joint,
     positive,
@@ -42,9 +42,9 @@ def make_configuration(values):
     per_joint(values, "limits", joints)
     positive(values, "rate")
     if positive(values, "gain") <= values["offset"]:
-        raise ParameterError("offset", values["offset"], "less than gain")
+        raise SettingError("offset", values["offset"], "less than gain")
     if values["shape"] not in ("round", "flat"):
-        raise ParameterError("shape", values["shape"], "round or flat")
+        raise SettingError("shape", values["shape"], "round or flat")
     return Configuration(values["gain"], values["offset"], values["shape"])
 
 
@@ -163,7 +163,7 @@ def test_parameters_of_others_are_left_alone(ros):
     ],
 )
 def test_a_node_does_not_start_with_bad_values(ros, changed, expected):
-    with pytest.raises(ParameterError) as refusal:
+    with pytest.raises(SettingError) as refusal:
         start(ros, **changed)
     assert str(refusal.value).startswith(expected)
     assert "\n" not in str(refusal.value)
@@ -189,7 +189,7 @@ def test_descriptions_tell_what_may_change(ros):
     ],
 )
 def test_values_are_shown_as_they_are_written(value: Any, shown: str):
-    assert str(ParameterError("p", value, "x")) == f"parameter 'p' is {shown}; allowed: x"
+    assert str(SettingError("p", value, "x")) == f"parameter 'p' is {shown}; allowed: x"
 
 
 @pytest.mark.parametrize(("value", "zero"), [(0.0, True), (1e-300, False), (1e300, True)])
@@ -202,5 +202,5 @@ def test_locked_joints():
     values = {"locked_joints": names, "locked_positions": positions}
     assert locked_joints(values) == {"x": 0.5, "y": -1.0}
     for bad in (positions[:1], np.array([0.5, math.nan]), np.array([0.5, math.inf])):
-        with pytest.raises(ParameterError, match="'locked_positions'"):
+        with pytest.raises(SettingError, match="'locked_positions'"):
             locked_joints(values | {"locked_positions": bad})

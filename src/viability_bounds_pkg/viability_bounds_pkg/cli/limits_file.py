@@ -16,6 +16,7 @@ import pinocchio as pin
 import yaml
 
 from viability_bounds_pkg.estimation.state_space import Array
+from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 
 NODE = "/**/bounds_node"
@@ -28,7 +29,7 @@ DIGITS = 4
 """Significant digits written."""
 
 
-class ParameterFileError(ValueError):
+class ParameterFileError(ArmSafetyError, ValueError):
     """A parameter file that cannot be read or lacks what is needed."""
 
 

@@ -12,10 +12,12 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
+from viability_bounds_pkg.exceptions import ArmSafetyError
+
 Array = NDArray[np.float64]
 
 
-class LimitEstimateError(ValueError):
+class LimitEstimateError(ArmSafetyError, ValueError):
     """Limits cannot be estimated from what was given."""
 
 

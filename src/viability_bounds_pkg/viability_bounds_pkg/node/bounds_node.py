@@ -17,13 +17,14 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from viability_bounds_pkg import viability
+from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.node.bounds_parameters import (
     TABLE,
     BoundsConfiguration,
     make_configuration,
 )
 from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, Verdict
-from viability_bounds_pkg.ros.parameters import NodeParameters, ParameterError
+from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.robot_parameters import load_model
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, run
 
@@ -46,7 +47,7 @@ class BoundsNode(Node):
                 partial(make_configuration, load_model=self._load_model),
                 self._configure,
             )
-        except ParameterError:
+        except SettingError:
             self.destroy_node()
             raise
         config = self._node_parameters.configuration

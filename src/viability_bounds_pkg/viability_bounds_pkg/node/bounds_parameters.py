@@ -12,10 +12,10 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from viability_bounds_pkg import baselines, viability
+from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
 from viability_bounds_pkg.ros.parameters import (
     Parameter,
-    ParameterError,
     joint_names,
     per_joint,
     positive,
@@ -143,18 +143,18 @@ def make_configuration(
         load_model: returns the arm's model, asked for only where it is needed.
 
     Raises:
-        ParameterError: one of them cannot be used.
+        SettingError: one of them cannot be used.
     """
     joints = joint_names(values)
     if values["method"] not in METHODS:
-        raise ParameterError("method", values["method"], f"one of {', '.join(METHODS)}")
+        raise SettingError("method", values["method"], f"one of {', '.join(METHODS)}")
     if values["acceleration_limits"] not in LIMITS:
         allowed = f"one of {', '.join(LIMITS)}"
-        raise ParameterError("acceleration_limits", values["acceleration_limits"], allowed)
+        raise SettingError("acceleration_limits", values["acceleration_limits"], allowed)
     dt = 1.0 / positive(values, "rate_hz")
     factor = positive(values, "bounds_dt_factor")
     if factor < 1.0:
-        raise ParameterError("bounds_dt_factor", factor, ">= 1")
+        raise SettingError("bounds_dt_factor", factor, ">= 1")
     try:
         limits = JointLimits(
             joints,
@@ -186,7 +186,7 @@ def make_configuration(
     except JointLimitsError as error:
         name = PARAMETER_OF[error.field]
         shown = error.value if error.joint is None else f"{error.value} for {error.joint}"
-        raise ParameterError(name, shown, error.allowed) from error
+        raise SettingError(name, shown, error.allowed) from error
     return BoundsConfiguration(
         limits=limits,
         margins=margins,
@@ -209,7 +209,7 @@ def _state_dependent(
 ) -> StateDependentBounds:
     if not values["robot_description"]:
         allowed = "a URDF, for state-dependent acceleration limits"
-        raise ParameterError("robot_description", values["robot_description"], allowed)
+        raise SettingError("robot_description", values["robot_description"], allowed)
     peak = PEAK * np.maximum(-limits.a_min, limits.a_max)
     if len(values["acceleration_peak"]):
         peak = per_joint(values, "acceleration_peak", limits.names)
@@ -231,7 +231,7 @@ def _not_negative(values: Mapping[str, Any], name: str, limits: JointLimits) -> 
         return np.zeros(len(limits))
     value = per_joint(values, name, limits.names)
     if not (np.isfinite(value).all() and (value >= 0.0).all()):
-        raise ParameterError(name, value, "finite numbers >= 0")
+        raise SettingError(name, value, "finite numbers >= 0")
     return value
 
 
@@ -244,14 +244,14 @@ def _margins(values: Mapping[str, Any], limits: JointLimits, dt: float) -> Torqu
     if not (margins.acceleration < braking).all():
         name = "acceleration_disturbance" if disturbance.any() else "acceleration_drift"
         allowed = f"less than what there is to brake with, {braking}, by the margins for the rate"
-        raise ParameterError(name, values[name], allowed)
+        raise SettingError(name, values[name], allowed)
     margins.position[:] += positive(values, "position_margin", zero=True)
     for name, margin, room in (
         ("velocity_max", margins.velocity, limits.v_max),
         ("position_max", margins.position, 0.5 * (limits.q_max - limits.q_min)),
     ):
         if not (margin < room).all():
-            raise ParameterError(
+            raise SettingError(
                 name,
                 values[name],
                 f"more than the margins for acceleration_drift at this rate take: {margin}",

@@ -1,7 +1,7 @@
 """Declare, check and update a node's parameters in one place.
 
 Each node lists its parameters as `Parameter` rows and turns their values into one frozen
-dataclass, its configuration, in a function that raises `ParameterError` for what it cannot
+dataclass, its configuration, in a function that raises `SettingError` for what it cannot
 accept. The same function judges the values at start, where an error ends the node with one
 line, and those set while it runs, where an error refuses the change and the old value stays.
 """
@@ -17,36 +17,12 @@ import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 
+from viability_bounds_pkg.exceptions import SettingError
+
 Configuration = TypeVar("Configuration")
 
 REQUIRED = object()
 """Default of a parameter that has none: the node does not start without a value."""
-
-
-class ParameterError(ValueError):
-    """A parameter value that the node cannot work with.
-
-    Args:
-        name: the parameter.
-        value: what it was set to; None if it was not.
-        allowed: what it may be.
-    """
-
-    def __init__(self, name: str, value: Any, allowed: str) -> None:
-        super().__init__(f"parameter '{name}' is {_show(value)}; allowed: {allowed}")
-        self.name = name
-
-
-def _show(value: Any) -> str:
-    if value is None:
-        return "not set"
-    if isinstance(value, np.ndarray):
-        value = value.tolist()
-    if isinstance(value, str):
-        return repr(value)
-    if isinstance(value, Sequence):
-        return "[" + ", ".join(_show(item) for item in value) + "]"
-    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 @dataclass(frozen=True)
@@ -72,11 +48,11 @@ class Parameter:
         """Return `value` as `kind`.
 
         Raises:
-            ParameterError: the value is missing or of another type.
+            SettingError: the value is missing or of another type.
         """
         if value is None:
             if self.default is REQUIRED:
-                raise ParameterError(self.name, None, self._kind_name())
+                raise SettingError(self.name, None, self._kind_name())
             return self.default
         if self.kind == list[float] and _is_sequence(value) and all(map(_is_number, value)):
             return np.array(value, dtype=float)
@@ -90,7 +66,7 @@ class Parameter:
             return float(value)
         if self.kind in (int, bool, str) and type(value) is self.kind:
             return value
-        raise ParameterError(self.name, value, self._kind_name())
+        raise SettingError(self.name, value, self._kind_name())
 
     def _kind_name(self) -> str:
         if self.kind in (float, int, bool, str):
@@ -115,7 +91,7 @@ class NodeParameters(Generic[Configuration]):
     Args:
         node: the node that declares them.
         table: its parameters.
-        make: turns the values by name into the node's configuration; raises `ParameterError`.
+        make: turns the values by name into the node's configuration; raises `SettingError`.
         on_change: called with the new configuration after live parameters changed.
 
     Attributes:
@@ -123,7 +99,7 @@ class NodeParameters(Generic[Configuration]):
         configuration: what `make` made of them.
 
     Raises:
-        ParameterError: a value is missing, of another type, or refused by `make`.
+        SettingError: a value is missing, of another type, or refused by `make`.
     """
 
     def __init__(
@@ -148,7 +124,7 @@ class NodeParameters(Generic[Configuration]):
     def _judge(self, parameters: Sequence[Any]) -> SetParametersResult:
         try:
             self._make(self._merged(parameters))
-        except ParameterError as error:
+        except SettingError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
@@ -178,13 +154,13 @@ def per_joint(values: Mapping[str, Any], name: str, joints: Sequence[str]) -> np
     """Return parameter `name` as an array of shape (n,), one number a joint.
 
     Raises:
-        ParameterError: another length, or a NaN.
+        SettingError: another length, or a NaN.
     """
     value = values[name]
     if len(value) != len(joints):
-        raise ParameterError(name, value, f"{len(joints)} numbers, one for each of 'joints'")
+        raise SettingError(name, value, f"{len(joints)} numbers, one for each of 'joints'")
     if np.isnan(value).any():
-        raise ParameterError(name, value, "numbers, not NaN")
+        raise SettingError(name, value, "numbers, not NaN")
     return value
 
 
@@ -197,11 +173,11 @@ def positive(values: Mapping[str, Any], name: str, *, zero: bool = False) -> flo
         zero: whether zero is allowed too.
 
     Raises:
-        ParameterError: it is negative, zero where that is not allowed, or not finite.
+        SettingError: it is negative, zero where that is not allowed, or not finite.
     """
     value = values[name]
     if not math.isfinite(value) or value < 0 or (value == 0 and not zero):
-        raise ParameterError(name, value, "a finite number " + (">= 0" if zero else "> 0"))
+        raise SettingError(name, value, "a finite number " + (">= 0" if zero else "> 0"))
     return value
 
 
@@ -209,9 +185,9 @@ def joint_names(values: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the parameter ``joints``: at least one name, none twice.
 
     Raises:
-        ParameterError: it is empty or names a joint twice.
+        SettingError: it is empty or names a joint twice.
     """
     joints = values["joints"]
     if not joints or len(set(joints)) != len(joints) or "" in joints:
-        raise ParameterError("joints", list(joints), "at least one joint name, each once")
+        raise SettingError("joints", list(joints), "at least one joint name, each once")
     return joints

@@ -11,6 +11,7 @@ from rclpy.node import Node
 from rclpy.task import Future
 from std_msgs.msg import String
 
+from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import (
     RobotDescriptionError,
     build_model,
@@ -19,7 +20,6 @@ from viability_bounds_pkg.robot_description import (
 )
 from viability_bounds_pkg.ros.parameters import (
     Parameter,
-    ParameterError,
     joint_names,
     per_joint,
 )
@@ -57,7 +57,7 @@ def robot_urdf(values: Mapping[str, Any], node: Node | None = None) -> str:
             the robot itself, which publishes it.
 
     Raises:
-        ParameterError: there is none.
+        SettingError: there is none.
     """
     source = values["robot_description"]
     try:
@@ -67,7 +67,7 @@ def robot_urdf(values: Mapping[str, Any], node: Node | None = None) -> str:
         check_urdf(text, "robot_description")
         return text
     except RobotDescriptionError as error:
-        raise ParameterError("robot_description", source, f"a URDF ({error})") from error
+        raise SettingError("robot_description", source, f"a URDF ({error})") from error
 
 
 def _urdf_from_topic(node: Node) -> str:
@@ -96,7 +96,7 @@ def load_model(values: Mapping[str, Any], node: Node) -> pin.Model:
         node: listens for the URDF if it comes from a topic.
 
     Raises:
-        ParameterError: a URDF that does not load, a joint that it does not have, or rotor
+        SettingError: a URDF that does not load, a joint that it does not have, or rotor
             inertias that cannot be.
     """
     return model_from(values, robot_urdf(values, node))
@@ -110,7 +110,7 @@ def model_from(values: Mapping[str, Any], urdf: str) -> pin.Model:
         return build_model(urdf, joints, locked_joints(values), rotors)
     except RobotDescriptionError as error:
         name, allowed = _culprit(urdf, joints)
-        raise ParameterError(name, values[name], f"{allowed} ({error})") from error
+        raise SettingError(name, values[name], f"{allowed} ({error})") from error
 
 
 def _culprit(urdf: str, joints: tuple[str, ...]) -> tuple[str, str]:
@@ -130,14 +130,14 @@ def locked_joints(values: Mapping[str, Any]) -> dict[str, float]:
     """Return where joints are locked that are not at zero, rad by name.
 
     Raises:
-        ParameterError: as many positions as joints are not given, or one is not finite.
+        SettingError: as many positions as joints are not given, or one is not finite.
     """
     names, positions = values["locked_joints"], values["locked_positions"]
     if len(names) != len(positions):
         allowed = f"{len(names)} numbers, one for each of 'locked_joints'"
-        raise ParameterError("locked_positions", positions, allowed)
+        raise SettingError("locked_positions", positions, allowed)
     if not np.isfinite(positions).all():
-        raise ParameterError("locked_positions", positions, "finite numbers")
+        raise SettingError("locked_positions", positions, "finite numbers")
     return dict(zip(names, map(float, positions), strict=True))
 
 
@@ -147,12 +147,12 @@ def position_limits(
     """Return ``position_min`` and ``position_max``, shape (n,) each, rad.
 
     Raises:
-        ParameterError: one has the wrong length, or a range is empty.
+        SettingError: one has the wrong length, or a range is empty.
     """
     q_min = per_joint(values, "position_min", joints)
     q_max = per_joint(values, "position_max", joints)
     if not (q_min < q_max).all():
-        raise ParameterError("position_max", q_max, "above position_min everywhere")
+        raise SettingError("position_max", q_max, "above position_min everywhere")
     return q_min, q_max
 
 
@@ -160,11 +160,11 @@ def all_positive(values: Mapping[str, Any], name: str, joints: Sequence[str]) ->
     """Return a parameter of one finite positive number a joint, shape (n,).
 
     Raises:
-        ParameterError: it is something else.
+        SettingError: it is something else.
     """
     value = per_joint(values, name, joints)
     if not (np.isfinite(value).all() and (value > 0).all()):
-        raise ParameterError(name, value, "finite numbers > 0")
+        raise SettingError(name, value, "finite numbers > 0")
     return value
 
 
@@ -172,11 +172,11 @@ def not_negative(values: Mapping[str, Any], name: str, joints: Sequence[str]) ->
     """Return a parameter of one finite number >= 0 a joint, shape (n,); zeros if it is empty.
 
     Raises:
-        ParameterError: it is something else.
+        SettingError: it is something else.
     """
     if not len(values[name]):
         return np.zeros(len(joints))
     value = per_joint(values, name, joints)
     if not (np.isfinite(value).all() and (value >= 0).all()):
-        raise ParameterError(name, value, "finite numbers >= 0")
+        raise SettingError(name, value, "finite numbers >= 0")
     return value

@@ -13,8 +13,8 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 
+from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import RobotDescriptionError
-from viability_bounds_pkg.ros.parameters import ParameterError
 
 try:
     from rclpy.experimental import EventsExecutor
@@ -89,7 +89,7 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
         spin(executor)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    except (ParameterError, RobotDescriptionError) as error:
+    except (SettingError, RobotDescriptionError) as error:
         report_refusal(error)
         return 1
     except Exception:
