@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from viability_bounds_pkg.joint_limits import JointLimits
-from viability_bounds_pkg.viability import BoundsSolver, condition_11
+from viability_bounds_pkg.viability import BoundsSolver, discrete_time_condition
 
 ROOT = Path(__file__).resolve().parents[1]
 ENVIRONMENT = ROOT / ".venv-tsid"
@@ -81,7 +81,7 @@ def _states(limits: list[float], dt: float, count: int, rng: np.random.Generator
 
 def _compare_where_it_holds(name, case, states, theirs) -> None:
     solver, a_max = _solver(case), case[3]
-    assert condition_11(solver.limits, solver.dt).all()
+    assert discrete_time_condition(solver.limits, solver.dt).all()
     lower, upper, viable = solver.bounds(*states)
     error = np.maximum(np.abs(lower - theirs[0]), np.abs(upper - theirs[1])) / (2.0 * a_max)
     outside = ~viable
@@ -97,7 +97,7 @@ def _compare_where_it_holds(name, case, states, theirs) -> None:
 
 def _compare_where_it_fails(name, case, given, found) -> None:
     solver = _solver(case)
-    assert not condition_11(solver.limits, solver.dt).any()
+    assert not discrete_time_condition(solver.limits, solver.dt).any()
     states, theirs = given[f"states:{name}"], found[f"states:{name}"]
     lower, upper, viable = solver.bounds(*states)
     tolerance = 1e-6 * 2.0 * case[3]

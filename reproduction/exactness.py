@@ -41,13 +41,14 @@ from joint_cases import (
     FAST_LOOP,
     ODD_STEPS,
     Case,
+    condition_holds,
     horizon,
     one_joint,
     random_joint,
     states_of,
 )
 
-from viability_bounds_pkg.viability import BoundsSolver, condition_11
+from viability_bounds_pkg.viability import BoundsSolver
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -81,7 +82,7 @@ class Joint(NamedTuple):
 def named_joints(cases: dict[str, Case], seed: int) -> list[Joint]:
     """Return the cases as joints."""
     return [
-        Joint(name, case, bool(condition_11(one_joint(*case[:5]), case[5])[0]), seed + i)
+        Joint(name, case, condition_holds(case), seed + i)
         for i, (name, case) in enumerate(cases.items())
     ]
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 import matplotlib.pyplot as plt
 import numpy as np
+import paper_algorithms
 import yaml
 from chain import ROOT, ChainResult, load_values, run_chain
 from figure import Figure, reproduce, table
@@ -19,7 +20,6 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from viability_bounds_pkg import baselines, viability
 from viability_bounds_pkg.acceleration_limits import estimate_acceleration_limits
 from viability_bounds_pkg.joint_limits import JointLimits
-from viability_bounds_pkg.kernel import paper_algorithms
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from viability_bounds_pkg.joint_limits import JointLimits
-from viability_bounds_pkg.viability import condition_11
+from viability_bounds_pkg.viability import discrete_time_condition
 
 Case = tuple[float, float, float, float, float, float]
 """q_min, q_max, v_max, a_min, a_max, dt."""
@@ -40,6 +40,11 @@ def one_joint(q_min, q_max, v_max, a_min, a_max):
     return JointLimits(["joint"], [q_min], [q_max], [v_max], [a_min], [a_max])
 
 
+def condition_holds(case):
+    """Return whether condition (11) holds for a joint."""
+    return bool(discrete_time_condition(one_joint(*case[:5]), case[5])[0])
+
+
 def column(values):
     return np.asarray(values, dtype=float).reshape(-1, 1)
 
@@ -64,7 +69,7 @@ def random_joint(rng, holds):
         if missing in (2, 3, 4):
             q_max = np.inf
         case = (q_min, q_max, v_max, a_min, a_max, dt)
-        if bool(condition_11(one_joint(*case[:5]), dt)[0]) == holds:
+        if condition_holds(case) == holds:
             return case
 
 

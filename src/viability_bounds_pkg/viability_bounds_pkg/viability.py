@@ -15,47 +15,31 @@ for asymmetric limits, and with an answer for states that are not viable.
 
 from __future__ import annotations
 
-import math
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from viability_bounds_pkg.joint_limits import ROUNDING, JointLimits, JointLimitsError
-from viability_bounds_pkg.kernel.bounds_kernel import make_table, solve
-from viability_bounds_pkg.kernel.braking import Side, highest_speeds, make_side
+from viability_bounds_pkg.kernel.bounds_kernel import AccelerationBounds, solve
 from viability_bounds_pkg.kernel.discrete_kernel import StoppingCurve, stopping_curves
 from viability_bounds_pkg.kernel.discrete_time_condition import (
-    KernelBraking,
     checked_margin,
     checked_step,
-    condition_11,
+    discrete_time_condition,
     kernel_braking,
 )
+from viability_bounds_pkg.kernel.one_sided_limit import JointTable, highest_speeds, make_table
+
+Array = NDArray[np.float64]
 
 __all__ = [
     "AccelerationBounds",
     "BoundsSolver",
     "acceleration_bounds",
-    "condition_11",
+    "discrete_time_condition",
     "viable_velocity_range",
 ]
-
-
-class AccelerationBounds(NamedTuple):
-    """Interval of joint accelerations that keeps the limits.
-
-    Attributes:
-        lower: shape of the state, rad/s^2; ``a_min <= lower <= upper <= a_max``.
-        upper: shape of the state, rad/s^2.
-        viable: shape of the state, bool; False where the joint is outside the kernel, so that
-            a limit is or will be broken whatever is done, and the interval brings it back.
-    """
-
-    lower: NDArray[np.float64]
-    upper: NDArray[np.float64]
-    viable: NDArray[np.bool_]
 
 
 class BoundsSolver:
@@ -77,7 +61,7 @@ class BoundsSolver:
         dt: as given, s.
         exact: shape (n,), bool; False where the kernel is an inner approximation, because
             (11) fails and either a margin or a shorter period is asked for.
-        table: the constants that `bounds_kernel.solve` takes.
+        table: the constants that `solve` takes.
 
     Raises:
         JointLimitsError: `dt`, `margin` or `period` is unusable; the message names the joint.
@@ -98,14 +82,9 @@ class BoundsSolver:
         same = period >= self.dt * (1.0 - ROUNDING)
         margins = checked_margin(margin, limits)
         braking = kernel_braking(limits, self.dt, margins, exact=same)
-        self.exact = np.array(
-            [b.holds or (same and w == 0.0) for b, w in zip(braking, margins, strict=True)]
-        )
-        self._joints = [
-            _joint_sides(limits, j, self.dt, w, braking[j], bool(self.exact[j]))
-            for j, w in enumerate(margins.tolist())
-        ]
-        self.table = make_table(self._joints)
+        self.exact = braking.holds | (same & (margins == 0.0))
+        curved = self.exact & ~braking.holds
+        self.table = _make_table(limits, self.dt, margins, braking.deceleration, curved)
         # The first call compiles; let it be this one and not one in a control loop.
         self.bounds(np.zeros(len(limits)), np.zeros(len(limits)))
 
@@ -124,25 +103,14 @@ class BoundsSolver:
         """
         q = np.asarray(q, dtype=np.float64)
         v = np.asarray(v, dtype=np.float64)
-        n = len(self._joints)
+        n = len(self.limits)
         if q.shape != v.shape or q.ndim not in (1, 2) or q.shape[-1] != n:
             raise ValueError(
                 f"q {q.shape} and v {v.shape} must both have shape ({n},) or (batch, {n})"
             )
-        states = (q.size // n, n)
-        lower, upper = np.empty(q.shape), np.empty(q.shape)
-        viable = np.empty(q.shape, dtype=np.bool_)
-        solve(
-            q.reshape(states),
-            v.reshape(states),
-            *self.table,
-            lower.reshape(states),
-            upper.reshape(states),
-            viable.reshape(states),
-        )
-        return AccelerationBounds(lower, upper, viable)
+        return solve(q, v, self.table)
 
-    def velocity_range(self, q: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def velocity_range(self, q: ArrayLike) -> tuple[Array, Array]:
         """Return the lowest and highest viable velocity at positions `q`.
 
         Args:
@@ -153,11 +121,12 @@ class BoundsSolver:
         """
         q = np.asarray(q, dtype=np.float64)
         lower, upper = np.empty_like(q), np.empty_like(q)
-        for j, (q_min, q_max, _, up, lo) in enumerate(self._joints):
-            above, below = q_max - q[..., j], q[..., j] - q_min
-            outside = (above < 0.0) | (below < 0.0)
-            upper[..., j] = np.where(outside, np.nan, highest_speeds(above, up))
-            lower[..., j] = np.where(outside, np.nan, -highest_speeds(below, lo))
+        above, below = self.limits.q_max - q, q - self.limits.q_min
+        for j, (up, lo) in enumerate(self.table.limits):
+            upper[..., j] = highest_speeds(above[..., j], up, self.table.curves)
+            lower[..., j] = -highest_speeds(below[..., j], lo, self.table.curves)
+        outside = (above < 0.0) | (below < 0.0)
+        lower[outside] = upper[outside] = np.nan
         return lower, upper
 
 
@@ -192,13 +161,15 @@ def acceleration_bounds(
 
 
 @lru_cache(maxsize=32)
-def _solver(limits, dt, margin, period) -> BoundsSolver:
+def _solver(
+    limits: JointLimits, dt: float, margin: tuple[float, ...] | None, period: float | None
+) -> BoundsSolver:
     return BoundsSolver(limits, dt, margin, period)
 
 
 def viable_velocity_range(
     q: ArrayLike, limits: JointLimits, margin: ArrayLike | None = None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Array, Array]:
     """Return the velocities from which the limits can be kept in continuous time: eq. (8)-(10).
 
     Where condition (11) holds this is also the kernel of discrete time; where it does not, ask
@@ -222,34 +193,34 @@ def viable_velocity_range(
     return np.where(outside, np.nan, lower), np.where(outside, np.nan, upper)
 
 
-def _joint_sides(
-    limits: JointLimits, j: int, dt: float, margin: float, braking: KernelBraking, exact: bool
-) -> tuple[float, float, float, Side, Side]:
-    """Return q_min, q_max, the speed that still counts as viable, and both sides of joint j."""
-    q_min, q_max = float(limits.q_min[j]), float(limits.q_max[j])
-    v_max = float(limits.v_max[j])
-    a_min, a_max = float(limits.a_min[j]), float(limits.a_max[j])
-    decelerations = (braking.upper, braking.lower)
-    curves: tuple[StoppingCurve | None, ...] = (None, None)
-    if exact and not braking.holds:
-        curves = stopping_curves(
-            q_max - q_min, v_max * dt, tuple(b * dt * dt for b in decelerations)
-        )
-    largest = max(abs(x) for x in (q_min, q_max, 0.0) if math.isfinite(x))
-    sides = [
-        make_side(
-            dt=dt,
-            braking=b,
-            v_max=v_max,
-            low=low,
-            high=high,
-            margin=margin,
-            tolerance=ROUNDING * (largest + min(v_max * v_max / (2.0 * b), q_max - q_min)),
-            length=q_max - q_min,
-            curve=curve if math.isfinite(limit) else None,
-        )
-        for b, limit, low, high, curve in zip(
-            decelerations, (q_max, q_min), (a_min, -a_max), (a_max, -a_min), curves, strict=True
-        )
-    ]
-    return q_min, q_max, v_max * (1.0 + ROUNDING), *sides
+def _make_table(
+    limits: JointLimits, dt: float, margins: Array, braking: Array, curved: NDArray[np.bool_]
+) -> JointTable:
+    """Return the kernel's table; `braking` is of shape (n, 2), towards upper and lower limit.
+
+    Args:
+        limits: of n joints.
+        dt: step, s.
+        margins: shape (n,), rad/s^2.
+        braking: shape (n, 2), rad/s^2.
+        curved: joints whose kernel is the one of discrete time, shape (n,).
+    """
+    ranges = np.stack([limits.q_max, -limits.q_min], axis=1)
+    length = ranges.sum(axis=1, keepdims=True)
+    v_max = limits.v_max[:, None]
+    largest = np.abs(np.where(np.isfinite(ranges), ranges, 0.0)).max(axis=1, keepdims=True)
+    curves: list[tuple[StoppingCurve | None, StoppingCurve | None]] = [(None, None)] * len(limits)
+    for j in np.flatnonzero(curved):
+        up, lo = (b * dt * dt for b in braking[j].tolist())
+        curves[j] = stopping_curves(float(length[j, 0]), float(limits.v_max[j]) * dt, (up, lo))
+    return make_table(
+        dt=dt,
+        position=ranges,
+        braking=braking,
+        v_max=v_max,
+        low=np.stack([limits.a_min, -limits.a_max], axis=1),
+        high=np.stack([limits.a_max, -limits.a_min], axis=1),
+        margin=margins[:, None],
+        tolerance=ROUNDING * (largest + np.minimum(v_max * v_max / (2.0 * braking), length)),
+        curves=curves,
+    )

@@ -19,8 +19,7 @@ from torque_safety_controller.collision.obstacles import CollisionError
 from torque_safety_controller.collision.row import Law, Step, make_rows
 from torque_safety_controller.qp.constraints import Rows
 from viability_bounds_pkg.kernel.array_checks import both_finite
-from viability_bounds_pkg.kernel.bounds_kernel import make_table
-from viability_bounds_pkg.kernel.braking import make_side
+from viability_bounds_pkg.kernel.one_sided_limit import make_table
 
 Array = NDArray[np.float64]
 
@@ -131,16 +130,13 @@ class CollisionAvoidance:
         self._rows_max = rows_max
         self.settings = settings or CollisionSettings()
         self.model = model
-        side = make_side(
+        table = make_table(
             dt=dt,
+            position=[math.inf, 0.0],
             braking=1.0,
             v_max=_FAST,
             low=-_HARD,
             high=_HARD,
-            margin=0.0,
-            tolerance=0.0,
-            length=math.inf,
-            curve=None,
         )
         most = int(ROWS_OF_KIND[model.pairs.kind].sum()) + 1
         self._count = 0
@@ -148,7 +144,7 @@ class CollisionAvoidance:
         self._rows = make_rows(most, n, len(model.names), len(model.bodies.joint))
         self._fixed = (
             np.minimum(-lower, upper),
-            *make_table([(0.0, math.inf, _FAST, side, side)]),
+            *table,
             Law(*astuple(self.settings), dt),
         )
         self._arm = (model.chain, make_motion(model.chain), self._rows)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from torque_safety_controller.collision.kinematics import point_motion
 from torque_safety_controller.collision.vectors3 import at, compiled, cross, dot, sub
-from viability_bounds_pkg.kernel.bounds_kernel import solve
+from viability_bounds_pkg.kernel.bounds_kernel import joint_bounds
 
 Array = NDArray[np.float64]
 
@@ -60,8 +60,6 @@ class Rows(NamedTuple):
         factor: scratch, shape (4, 3).
         seen: features of the pair that have a row, shape (16, 4).
         count: rows written, and features seen of the pair at hand, shape (2,), int.
-        joint: state and bounds of the virtual joint, shape (4, 1, 1).
-        kept: whether that is viable, shape (1, 1), bool.
     """
 
     G: Array
@@ -79,8 +77,6 @@ class Rows(NamedTuple):
     factor: Array
     seen: Array
     count: NDArray[np.int64]
-    joint: Array
-    kept: NDArray[np.bool_]
 
 
 class Step(NamedTuple):
@@ -91,10 +87,8 @@ class Step(NamedTuple):
         a_upper: shape (n,), rad/s^2.
         disturbance: what comes on top of accelerations that are asked for, shape (n,), rad/s^2.
         a_brake: what each joint can brake with, shape (n,), rad/s^2.
-        ranges: of the table of the virtual joint whose braking is 1, see `bounds_kernel.Table`.
-        sides: of that table.
-        budgets: of that table.
-        speeds: of that table.
+        limits: of the virtual joint whose braking is 1, see `one_sided_limit.JointTable`.
+        curves: of that joint.
         law: of the distances.
     """
 
@@ -102,10 +96,8 @@ class Step(NamedTuple):
     a_upper: Array
     disturbance: Array
     a_brake: Array
-    ranges: Array
-    sides: Array
-    budgets: Array
-    speeds: Array
+    limits: NDArray[np.void]
+    curves: NDArray[np.void]
     law: Law
 
 
@@ -127,8 +119,6 @@ def make_rows(most: int, n: int, pairs: int, capsules: int) -> Rows:
         factor=np.zeros((4, 3)),
         seen=np.zeros((16, 4)),
         count=np.zeros(2, dtype=np.int64),
-        joint=np.zeros((4, 1, 1)),
-        kept=np.zeros((1, 1), dtype=bool),
     )
 
 
@@ -186,7 +176,7 @@ def write_row(pair, d, radius, n, p, joint, o, other, sliding, step, chain, moti
     braking = min(law.braking, law.share * brake)
     braking = max(min(braking, law.share * brake + bias), _LEAST_SHARE * braking, _LEAST_BRAKING)
     room = d - radius - law.margin - law.reserve
-    wanted = _lowest(room, rate, braking, step, rows.joint, rows.kept)
+    wanted = _lowest(room, rate, braking, step)
     if room < 0.0:
         gentle = min(law.braking, law.share * brake) * min(1.0, _largest(G) / _LEVER)
         wanted = min(wanted, _recovery(room, rate, gentle, law))
@@ -246,16 +236,15 @@ def _sliding_term(v, c, count, free, turning, L):
 
 
 @compiled
-def _lowest(room, rate, braking, step, x, kept):
+def _lowest(room, rate, braking, step):
     """Return the lowest acceleration of a distance that keeps it: that of a joint's lower limit.
 
     The virtual joint is measured in units in which its braking is 1, so that one table serves.
     """
-    x[0, 0, 0], x[1, 0, 0] = room / braking, rate / braking
-    ranges, sides, budgets, speeds = step.ranges, step.sides, step.budgets, step.speeds
-    solve(x[0], x[1], ranges, sides, budgets, speeds, x[2], x[3], kept)
+    above, below = step.limits[0, 0], step.limits[0, 1]
+    lower, _, _ = joint_bounds(room / braking, rate / braking, above, below, step.curves)
     law = step.law
-    return max(x[2, 0, 0] * braking, (-law.speed_max - rate) / law.dt)
+    return max(lower * braking, (-law.speed_max - rate) / law.dt)
 
 
 @compiled

@@ -4,6 +4,7 @@ import math
 
 import against_brute_force
 import numpy as np
+import paper_algorithms
 import pytest
 from against_brute_force import EXACT, compare, merged
 from hypothesis import given, settings
@@ -19,45 +20,44 @@ from joint_cases import (
 )
 
 from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
-from viability_bounds_pkg.kernel import paper_algorithms
 from viability_bounds_pkg.kernel.discrete_kernel import stopping_curves
 from viability_bounds_pkg.viability import (
     BoundsSolver,
     acceleration_bounds,
-    condition_11,
+    discrete_time_condition,
     viable_velocity_range,
 )
 
 
 @pytest.mark.parametrize("name", HOLDING)
-def test_condition_11_holds(name):
+def test_discrete_time_condition_holds(name):
     case = HOLDING[name]
     limits = one_joint(*case[:5])
-    assert condition_11(limits, case[5]).all()
+    assert discrete_time_condition(limits, case[5]).all()
     assert BoundsSolver(limits, case[5]).exact.all()
 
 
 @pytest.mark.parametrize("name", FAILING)
-def test_condition_11_fails(name):
+def test_discrete_time_condition_fails(name):
     case = FAILING[name]
-    assert not condition_11(one_joint(*case[:5]), case[5]).any()
+    assert not discrete_time_condition(one_joint(*case[:5]), case[5]).any()
 
 
-def test_condition_11_of_the_paper():
+def test_discrete_time_condition_of_the_paper():
     # v_max >= dt a and q_max - q_min >= dt^2 a, for a = 10 and dt = 0.1.
     def holds(length, v_max):
-        return bool(condition_11(one_joint(0.0, length, v_max, -10.0, 10.0), 0.1)[0])
+        return bool(discrete_time_condition(one_joint(0.0, length, v_max, -10.0, 10.0), 0.1)[0])
 
     assert holds(0.1, 1.0)
     assert not holds(0.0999999, 1.0)
     assert not holds(0.1, 0.9999999)
 
 
-def test_condition_11_with_a_margin():
+def test_discrete_time_condition_with_a_margin():
     # Thrown back at up to (A + W) dt; then only A - W is there to stop with.
     def holds(length, v_max, margin):
         limits = one_joint(0.0, length, v_max, -10.0, 10.0)
-        return bool(condition_11(limits, 0.1, [margin])[0])
+        return bool(discrete_time_condition(limits, 0.1, [margin])[0])
 
     room = 0.5 * 0.1**2 * 12.0 * (1.0 + 12.0 / 8.0)
     assert holds(1.001 * room, 1.201, 2.0)

@@ -1,6 +1,7 @@
 """The bounds keep the limits: in motion, under disturbances, and on the way back from outside."""
 
 import numpy as np
+import paper_algorithms
 import pytest
 from adversary import (
     POLICIES,
@@ -25,8 +26,7 @@ from joint_cases import (
 )
 
 from viability_bounds_pkg.joint_limits import JointLimitsError
-from viability_bounds_pkg.kernel import paper_algorithms
-from viability_bounds_pkg.viability import BoundsSolver, condition_11
+from viability_bounds_pkg.viability import BoundsSolver, discrete_time_condition
 
 LIMITED_ABOVE = {name: case for name, case in CASES.items() if np.isfinite(case[1])}
 CASES = {**CASES, **FAST_LOOP, **ODD_STEPS}
@@ -49,7 +49,7 @@ def test_limits_hold_for_ever(name, policy):
 
 
 @pytest.mark.parametrize("name", FAILING)
-def test_algorithm_3_breaks_the_limits_where_condition_11_fails(name):
+def test_algorithm_3_breaks_the_limits_where_the_discrete_time_condition_fails(name):
     """Which is why there is more to do there, and shows that this harness can tell."""
     case = FAILING[name]
     limits, dt = one_joint(*case[:5]), case[5]
@@ -87,7 +87,7 @@ def test_limits_hold_for_any_shorter_period(name):
         assert seen.worst <= VIOLATION
 
 
-def test_the_exact_kernel_is_for_one_period_where_condition_11_fails():
+def test_the_exact_kernel_is_for_one_period_where_the_discrete_time_condition_fails():
     """So that a shorter period must be told to the solver: it breaks the limits otherwise."""
     case = CASES["hardly affected"]
     limits, dt = one_joint(*case[:5]), case[5]
@@ -172,7 +172,7 @@ def test_every_joint_returns(name, policy, margin):
     run = bring_back(solver, q, v, policy, 3000, rng)
     assert run.stray == 0
     assert max(run.again, run.speed) <= VIOLATION
-    if condition_11(limits, dt, [w]).all():
+    if discrete_time_condition(limits, dt, [w]).all():
         assert run.position <= VIOLATION
 
 

@@ -146,7 +146,7 @@ def test_where_nothing_can_be_shown_it_is_the_worst_case(monkeypatch):
     assert broken[0] <= 1e-5
     assert set(ours.outcomes) == {"worst case"}
     for q, v in ((1.0, 1.0), (2.9, 0.4), (-0.5, -1.0)):
-        ours.start()
+        ours.reset()
         mine, theirs = ours.bounds([q], [v]), worst.bounds([q], [v])
         # Only the input limits differ.
         inside = limits.a_min, limits.a_max

@@ -1,12 +1,10 @@
 """The bounds of one joint state after the other, compiled.
 
-One loop serves a single arm and a batch of a million states. The compiled code is cached beside
-this file, so that only the first start on a machine pays for compiling.
+One loop serves a single arm and a batch of a million states.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from math import floor, sqrt
 from typing import NamedTuple
 
@@ -15,172 +13,179 @@ from numpy.typing import NDArray
 
 from viability_bounds_pkg.compiled import compiled
 from viability_bounds_pkg.joint_limits import ROUNDING
-from viability_bounds_pkg.kernel.braking import Side
+from viability_bounds_pkg.kernel.one_sided_limit import JointTable
 
 Array = NDArray[np.float64]
 
 _WITHIN = 1.0 + ROUNDING
 
 
-class Table(NamedTuple):
-    """The constants of n joints, as the kernel reads them.
+class AccelerationBounds(NamedTuple):
+    """Interval of joint accelerations that keeps the limits.
 
     Attributes:
-        ranges: shape (n, 3): q_min and q_max, rad, and the speed that still counts as viable.
-        sides: shape (n, 2, 15), upper and lower limit: the numbers of `Side`, then of its landing
-            the first node, the number of nodes, the period and the peak.
-        budgets: the nodes' budgets of all landings, rad.
-        speeds: their speeds, rad/s.
+        lower: shape of the state, rad/s^2; ``a_min <= lower <= upper <= a_max``.
+        upper: shape of the state, rad/s^2.
+        viable: shape of the state, bool; False where the joint is outside the kernel, so that
+            a limit is or will be broken whatever is done, and the interval brings it back.
     """
 
-    ranges: Array
-    sides: Array
-    budgets: Array
-    speeds: Array
+    lower: Array
+    upper: Array
+    viable: NDArray[np.bool_]
 
 
-def make_table(joints: Sequence[tuple[float, float, float, Side, Side]]) -> Table:
-    """Return the table of joints, each (q_min, q_max, viable speed, upper side, lower side)."""
-    ranges = np.array([joint[:3] for joint in joints])
-    budgets: list[float] = []
-    speeds: list[float] = []
-    rows = []
-    for _, _, _, *sides in joints:
-        for *numbers, landing in sides:
-            nodes = [len(budgets), 0, 1.0, 0.0]
-            if landing is not None:
-                nodes = [len(budgets), len(landing.budget), landing.period, landing.peak]
-                budgets += landing.budget
-                speeds += landing.speed
-            rows.append([*numbers, *nodes])
-    sides = np.array(rows, dtype=float).reshape(len(joints), 2, -1)
-    return Table(ranges, sides, np.array(budgets, dtype=float), np.array(speeds, dtype=float))
+def solve(q: Array, v: Array, table: JointTable) -> AccelerationBounds:
+    """Return the bounds of states of shape (n,) or (batch, n), rad and rad/s."""
+    n = len(table.limits)
+    states = (q.size // n, n)
+    lower, upper = np.empty(q.shape), np.empty(q.shape)
+    viable = np.empty(q.shape, dtype=np.bool_)
+    _solve(
+        q.reshape(states),
+        v.reshape(states),
+        table.limits,
+        table.curves,
+        lower.reshape(states),
+        upper.reshape(states),
+        viable.reshape(states),
+    )
+    return AccelerationBounds(lower, upper, viable)
 
 
-@compiled
-def _landing_speed(budget, parabola, side, budgets, speeds):
-    """Return the largest end-of-step speed w with ``dt w / 2 + U(w) <= budget``.
+@compiled(error_model="numpy")
+def _solve(
+    q: Array,
+    v: Array,
+    limits: NDArray[np.void],
+    curves: NDArray[np.void],
+    lower: Array,
+    upper: Array,
+    viable: NDArray[np.bool_],
+) -> None:
+    for i in range(len(q)):
+        for j in range(len(limits)):
+            lower[i, j], upper[i, j], viable[i, j] = joint_bounds(
+                q[i, j], v[i, j], limits[j, 0], limits[j, 1], curves
+            )
 
-    `parabola` is the answer if the stopping curve U were the parabola.
+
+@compiled(error_model="numpy")
+def joint_bounds(
+    q: float, v: float, above: np.record, below: np.record, curves: NDArray[np.void]
+) -> tuple[float, float, bool]:
+    """Return the bounds of one joint state and whether it is in the kernel.
+
+    Args:
+        q: rad.
+        v: rad/s.
+        above: upper limit, a `ONE_SIDED_LIMIT`.
+        below: lower limit.
+        curves: of `JointTable`.
+
+    Returns:
+        Lower and upper bound, rad/s^2, and whether the state is viable.
     """
-    first, count, period, peak = int(side[11]), int(side[12]), side[13], side[14]
-    if count == 0 or parabola % period >= peak:
-        return parabola
-    low, high = first, first + count
-    while low < high:
-        middle = (low + high) // 2
-        if budget < budgets[middle]:
-            high = middle
-        else:
-            low = middle + 1
-    if low == first + count:
-        # Only from outside: so fast a joint would need more room than there is in the range. To
-        # come to rest as a step ends it needs chords of the parabola, one for each step.
-        length, per_step = budget / side[0], 2.0 * side[3]
-        steps = floor(0.5 * (sqrt(1.0 + 8.0 * length / per_step) - 1.0))
-        rest = length - 0.5 * per_step * steps * (steps + 1.0)
-        return max(speeds[low - 1], per_step * steps + rest / (steps + 1.0))
-    share = (budget - budgets[low - 1]) / (budgets[low] - budgets[low - 1])
-    return speeds[low - 1] + (speeds[low] - speeds[low - 1]) * share
+    room_above, room_below = above.position - q, below.position + q
+    high, keeps_high = _bound_towards(room_above, v, above, curves)
+    low, keeps_low = _bound_towards(room_below, -v, below, curves)
+    low = -low
+    if low > high:
+        low = high = _settle(room_above, room_below, v, low, high, above)
+    return low, high, keeps_high and keeps_low and abs(v) <= above.v_max * _WITHIN
 
 
-@compiled
-def _bound_towards(room, v, side, budgets, speeds):
+@compiled(error_model="numpy")
+def _bound_towards(
+    room: float, v: float, limit: np.record, curves: NDArray[np.void]
+) -> tuple[float, bool]:
     """Return the largest acceleration towards a limit that keeps it, and whether it can be kept.
 
     Args:
         room: distance to the limit, rad; negative outside.
         v: velocity towards it, rad/s.
-        side: the limit's row of `Table.sides`.
-        budgets: `Table.budgets`.
-        speeds: `Table.speeds`.
+        limit: a `ONE_SIDED_LIMIT`.
+        curves: of `JointTable`.
 
     Returns:
-        Acceleration, rad/s^2, within those of the side whatever the state; and whether the
+        Acceleration, rad/s^2, within those of the limit whatever the state; and whether the
         joint is inside the position limit and can stop before it.
     """
-    dt, half_dt, twice_braking, k, k2 = side[0], side[1], side[2], side[3], side[4]
-    far, v_max, low, high = side[5], side[6], side[7], side[8]
-    margin, tolerance, count = side[9], side[10], side[12]
+    dt = limit.dt
     # Room that is left if the step ends at rest.
-    budget = room - half_dt * v
-    if budget >= far:
-        a = (v_max - v) / dt
+    budget = room - limit.half_dt * v
+    if budget >= limit.free:
+        a = (limit.v_max - v) / dt
     elif budget >= 0.0:
-        c = twice_braking * budget
-        w = c / (k + sqrt(k2 + c))
-        w = _landing_speed(budget, w, side, budgets, speeds)
-        a = (min(w, v_max) - v) / dt
+        a = (min(_end_speed(budget, limit, curves), limit.v_max) - v) / dt
     elif v > 0.0:
         # Stop within the step: eq. (19). Outside, and still leaving: brake.
-        a = -v * (v / (2.0 * room)) if room > 0.0 else low
+        a = -v * (v / (2.0 * room)) if room > 0.0 else limit.low
     else:
         # Outside and on the way back: be on the limit when the step ends.
         a = (2.0 * budget / dt - v) / dt
-    a -= margin
+    a -= limit.margin
     # Written so that a NaN becomes `high`.
-    if not a < high:
-        a = high
-    elif a < low:
-        a = low
-    room += tolerance
+    if not a < limit.high:
+        a = limit.high
+    elif a < limit.low:
+        a = limit.low
+    room += limit.tolerance
     if v <= 0.0:
         return a, room >= 0.0
-    viable = v * v <= twice_braking * room
-    if viable and count > 0.0:
-        budget = min(room + half_dt * v, far)
-        c = twice_braking * budget
-        parabola = c / (k + sqrt(k2 + c))
-        viable = v <= _landing_speed(budget, parabola, side, budgets, speeds) * _WITHIN
+    viable = v * v <= limit.twice_braking * room
+    if viable and limit.points > 0:
+        budget = min(room + limit.half_dt * v, limit.free)
+        viable = v <= _end_speed(budget, limit, curves) * _WITHIN
     return a, viable
 
 
-@compiled
-def _settle(above, below, v, lower, upper, side):
-    """Return the one acceleration left where the two limits contradict each other.
-
-    That happens outside the kernel, or by rounding on its edge. The limit that is still kept
-    is not given up for the one that is broken: a joint on its way back keeps its speed limit,
-    and one that cannot stop in time stops as soon as it can without being thrown against the
-    other limit. The broken one is told by the position or, inside, by the direction of motion.
-    Neither is worth a speed beyond its limit; `side` is the row of the upper one.
-    """
-    if above < 0.0 or (below >= 0.0 and v > 0.0):
-        a = lower
-    elif below < 0.0 or v < 0.0:
-        a = upper
-    else:
-        a = 0.5 * (lower + upper)
-    dt, v_max, a_min, a_max, margin = side[0], side[6], side[7], side[8], side[9]
-    a = max(min(a, (v_max - v) / dt - margin), (-v_max - v) / dt + margin)
-    return max(min(a, a_max), a_min)
+@compiled(error_model="numpy")
+def _end_speed(budget: float, limit: np.record, curves: NDArray[np.void]) -> float:
+    """Return the largest end-of-step speed w with ``dt w / 2 + U(w) <= budget``."""
+    c = limit.twice_braking * budget
+    parabola = c / (limit.k + sqrt(limit.k_squared + c))
+    if limit.points == 0 or parabola % limit.period >= limit.peak:
+        return parabola
+    low, end = limit.first, limit.first + limit.points
+    high = end
+    while low < high:
+        middle = (low + high) // 2
+        if budget < curves[middle].budget:
+            high = middle
+        else:
+            low = middle + 1
+    before = curves[low - 1]
+    if low == end:
+        # Only from outside: so fast a joint would need more room than there is in the range. To
+        # come to rest as a step ends it needs chords of the parabola, one for each step.
+        length, per_step = budget / limit.dt, 2.0 * limit.k
+        steps = floor(0.5 * (sqrt(1.0 + 8.0 * length / per_step) - 1.0))
+        rest = length - 0.5 * per_step * steps * (steps + 1.0)
+        return max(before.speed, per_step * steps + rest / (steps + 1.0))
+    after = curves[low]
+    share = (budget - before.budget) / (after.budget - before.budget)
+    return before.speed + (after.speed - before.speed) * share
 
 
 @compiled(error_model="numpy")
-def solve(q, v, ranges, sides, budgets, speeds, lower, upper, viable):
-    """Fill in the bounds of m states of n joints.
+def _settle(
+    room_above: float, room_below: float, v: float, lower: float, upper: float, limit: np.record
+) -> float:
+    """Return the one acceleration left where the two limits contradict each other.
 
-    Args:
-        q: shape (m, n), rad.
-        v: shape (m, n), rad/s.
-        ranges: of `Table`, as are the three that follow.
-        sides: see `Table`.
-        budgets: see `Table`.
-        speeds: see `Table`.
-        lower: shape (m, n), receives the lower bounds, rad/s^2.
-        upper: shape (m, n), receives the upper bounds, rad/s^2.
-        viable: shape (m, n), bool, receives whether the state is in the kernel.
+    That happens outside the kernel, or by rounding on its edge. The limit that is still kept is
+    not given up for the one that is broken: a joint on its way back keeps its speed limit, and
+    one that cannot stop in time stops as soon as it can without being thrown against the other
+    limit. The broken one is told by the position or, inside, by the direction of motion. The
+    result is also clipped to the velocity limit; `limit` is the upper one.
     """
-    m, n = q.shape
-    for i in range(m):
-        for j in range(n):
-            speed = v[i, j]
-            above, below = ranges[j, 1] - q[i, j], q[i, j] - ranges[j, 0]
-            high, keeps_high = _bound_towards(above, speed, sides[j, 0], budgets, speeds)
-            low, keeps_low = _bound_towards(below, -speed, sides[j, 1], budgets, speeds)
-            low = -low
-            if low > high:
-                low = high = _settle(above, below, speed, low, high, sides[j, 0])
-            lower[i, j] = low
-            upper[i, j] = high
-            viable[i, j] = keeps_high and keeps_low and abs(speed) <= ranges[j, 2]
+    if room_above < 0.0 or (room_below >= 0.0 and v > 0.0):
+        a = lower
+    elif room_below < 0.0 or v < 0.0:
+        a = upper
+    else:
+        a = 0.5 * (lower + upper)
+    dt, v_max, margin = limit.dt, limit.v_max, limit.margin
+    a = max(min(a, (v_max - v) / dt - margin), (-v_max - v) / dt + margin)
+    return max(min(a, limit.high), limit.low)

@@ -1,4 +1,4 @@
-"""Condition (11) of [DelPrete2018]: when the kernel of continuous time is the kernel.
+"""The discrete-time condition (11) of [DelPrete2018]: when braking at full rate is safe.
 
 Asymmetric limits, a margin for disturbances and continuous joints are worked out in
 `docs/bounds.md`. With B_up, B_lo the decelerations that the kernel counts on towards the upper
@@ -24,21 +24,19 @@ from viability_bounds_pkg.joint_limits import (
 
 
 class KernelBraking(NamedTuple):
-    """Decelerations that the kernel of one joint counts on.
+    """Decelerations that the kernel of each joint counts on.
 
     Attributes:
-        upper: towards the upper limit, rad/s^2.
-        lower: towards the lower limit, rad/s^2.
-        holds: whether (11) holds for the full braking; if not, either the braking is reduced
-            or the kernel is not the one of continuous time.
+        deceleration: towards the upper and the lower limit, shape (n, 2), rad/s^2.
+        holds: whether (11) holds for the full braking, shape (n,); if not, either the braking
+            is reduced or the kernel is not the one of continuous time.
     """
 
-    upper: float
-    lower: float
-    holds: bool
+    deceleration: NDArray[np.float64]
+    holds: NDArray[np.bool_]
 
 
-def condition_11(
+def discrete_time_condition(
     limits: JointLimits, dt: float, margin: ArrayLike | None = None
 ) -> NDArray[np.bool_]:
     """Return for which joints one braking step at either end stays inside the limits: eq. (11).
@@ -64,7 +62,7 @@ def condition_11(
 
 def kernel_braking(
     limits: JointLimits, dt: float, margins: NDArray[np.float64], exact: bool
-) -> list[KernelBraking]:
+) -> KernelBraking:
     """Return the decelerations that the kernel of each joint counts on.
 
     Args:
@@ -78,21 +76,20 @@ def kernel_braking(
     Raises:
         JointLimitsError: a margin is too large for any kernel of this form.
     """
-    result = []
+    decelerations, fulfilled = [], []
     for j, w in enumerate(margins.tolist()):
         joint = _joint(limits, j)
         up, lo = joint.braking
-        if _holds(joint, dt, w):
-            result.append(KernelBraking(up - w, lo - w, True))
-        elif exact and w == 0.0:
-            result.append(KernelBraking(up, lo, False))
-        else:
-            reduced = _reduced_braking(joint, dt, w)
-            if reduced is None:
-                allowed = f"must be smaller, or the step of {dt:g} s shorter, to leave any kernel"
-                raise JointLimitsError("margin", limits.names[j], w, allowed)
-            result.append(KernelBraking(*reduced, False))
-    return result
+        holds = _holds(joint, dt, w)
+        pair: tuple[float, float] | None = (up - w, lo - w)
+        if not holds and not (exact and w == 0.0):
+            pair = _reduced_braking(joint, dt, w)
+        if pair is None:
+            allowed = f"must be smaller, or the step of {dt:g} s shorter, to leave any kernel"
+            raise JointLimitsError("margin", limits.names[j], w, allowed)
+        decelerations.append(pair)
+        fulfilled.append(holds)
+    return KernelBraking(np.array(decelerations), np.array(fulfilled))
 
 
 def checked_step(dt: float, field: str = "dt") -> float:

@@ -85,7 +85,7 @@ class BoundsNode(Node):
                 f"method '{config.method}' does not keep the limits; it is for comparison"
             )
             return
-        holds = viability.condition_11(config.limits, config.bounds_dt)
+        holds = viability.discrete_time_condition(config.limits, config.bounds_dt)
         for name, fine in zip(config.limits.names, holds, strict=True):
             if not fine:
                 self.get_logger().warning(
@@ -102,7 +102,7 @@ class BoundsNode(Node):
             if self._state_dependent is not None:
                 elapsed = self._reader.stamp - last
                 if not 0 < elapsed <= self._longest_ns:
-                    self._state_dependent.start()
+                    self._state_dependent.reset()
             bounds = self._solve(self._reader.q, self._reader.v)
             points = self._answer.points
             points[0].accelerations = array("d", bounds.lower.tobytes())

@@ -84,7 +84,9 @@ class BrakingCertificate:
 
 
 @compiled
-def _fill_path(q, v, dq, dv, braking, half_gap, path):
+def _fill_path(
+    q: Array, v: Array, dq: Array, dv: Array, braking: Array, half_gap: float, path: Array
+) -> None:
     """Fill in the states in the middle of equal pieces of a braking path, and their deviations.
 
     Within a piece a joint may stop, or begin to move the other way from the start: then any
@@ -115,7 +117,19 @@ def _fill_path(q, v, dq, dv, braking, half_gap, path):
 
 
 @compiled
-def _within(tau, by_q, by_v, M, v, a, dq, dv, da, half_gap, tau_max):
+def _within(
+    tau: Array,
+    by_q: Array,
+    by_v: Array,
+    M: Array,
+    v: Array,
+    a: Array,
+    dq: Array,
+    dv: Array,
+    da: Array,
+    half_gap: float,
+    tau_max: Array,
+) -> bool:
     """Return whether torques stay within limits around one sample of a path."""
     n = tau.size
     for i in range(n):

@@ -5,7 +5,7 @@ paper calls them conservative and leaves the rest to future work. They play two 
 limits* they are not needed: any acceleration that leads into a viable state is safe, and the
 controller keeps its torque limits anyway. As the *braking* that the viability kernel counts on
 they can be exceeded. Both are done as long as a braking path is known on which torque suffices,
-from every state to which the step may lead; see `braking_certificate`. Where none can be shown,
+from every state to which the step may lead; see `certificate`. Where none can be shown,
 the bounds are those of the worst case. `docs/state_dependent_limits.md` has the derivation.
 """
 
@@ -18,10 +18,16 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError, joint_array
-from viability_bounds_pkg.kernel.bounds_kernel import solve
-from viability_bounds_pkg.state_dependent import reach as braking_reach
+from viability_bounds_pkg.kernel.bounds_kernel import AccelerationBounds, solve
+from viability_bounds_pkg.kernel.one_sided_limit import set_braking
 from viability_bounds_pkg.state_dependent.certificate import BrakingCertificate, Reach
-from viability_bounds_pkg.viability import AccelerationBounds, BoundsSolver
+from viability_bounds_pkg.state_dependent.reach import (
+    available,
+    most_braking,
+    needed_braking,
+    reach_of_step,
+)
+from viability_bounds_pkg.viability import BoundsSolver
 
 Array = NDArray[np.float64]
 
@@ -76,21 +82,17 @@ class StateDependentBounds:
         self._margin = np.zeros(n) if margin is None else np.array(margin, dtype=float)
         self._tolerance = np.full(n, tolerance, dtype=float)
         self._dt, self._period = worst.dt, worst.dt if period is None else float(period)
-        table = worst.table
-        self._table = table._replace(sides=table.sides.copy())
-        self._least = 0.5 * table.sides[:, :, 2]  # braking of the worst case
-        self._most = braking_reach.most_braking(
-            limits, self._peak, self._margin, self._least, table.sides, self._dt
-        )
+        self._table = worst.table
+        self._least = 0.5 * worst.table.limits["twice_braking"]  # braking of the worst case
+        curved = worst.table.limits["points"] > 0
+        self._most = most_braking(limits, self._peak, self._margin, self._least, curved, self._dt)
         self._certificate = BrakingCertificate(model, (1.0 - TORQUE_RESERVE) * self._tau_max)
-        self._needed = np.empty((n, 2))
-        self._reach = np.empty((5, n))
         self._path: Array | None = None
         self._share = 1.0
         self.outcomes: Counter[str] = Counter()
         self._warm_up()
 
-    def start(self) -> None:
+    def reset(self) -> None:
         """Forget the braking path of the last step: the robot was moved, or time has passed."""
         self._path, self._share = None, 1.0
 
@@ -106,8 +108,8 @@ class StateDependentBounds:
             v: shape (n,), rad/s.
         """
         q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
-        limits, needed = self._limits, self._needed
-        low, high, available = braking_reach.available(
+        limits = self._limits
+        low, high, braking = available(
             pin.crba(self._model, self._data, q),
             pin.nonLinearEffects(self._model, self._data, q, v),
             self._tau_max,
@@ -115,12 +117,11 @@ class StateDependentBounds:
             limits.a_max,
             self._peak,
         )
-        urgent = braking_reach.needed_braking(
-            q, v, self._table.ranges, self._least, self._tolerance, needed
-        )
+        needed = needed_braking(q, v, self._table.limits, self._least, self._tolerance)
+        urgent = bool((needed > self._least).any())
         if urgent and (needed > self._most).any():
             return self._worst_case(q, v, low, high)
-        available = np.minimum(available - self._margin[:, None], self._most)
+        braking = np.minimum(braking - self._margin[:, None], self._most)
         worst = limits.a_min, limits.a_max
         wide = low, high
         known = self._share
@@ -131,17 +132,18 @@ class StateDependentBounds:
             (0.0, wide),
             (0.0, worst),
         ):
-            braking = np.maximum(needed, share * available)
-            bounds = self._solve(q, v, braking, *inputs)
-            if self._certified(q, v, bounds, braking):
-                self._path, self._share = self._reach[4].copy(), share
+            used = np.maximum(needed, share * braking)
+            bounds = self._solve(q, v, used, *inputs)
+            reach = self._reach(q, v, bounds, used)
+            if self._certificate.holds(reach):
+                self._path, self._share = reach.braking, share
                 return self._counted("certified", bounds)
         self._share = 0.0
         if self._path is None or not urgent:
             return self._worst_case(q, v, *worst)
-        a = braking_reach.stopping_acceleration(
-            v, self._path, self._period, bounds.lower, bounds.upper
-        )
+        # The acceleration along the known braking path, stopping within the step at most.
+        rate = -np.sign(v) * np.minimum(self._path, np.abs(v) / self._period)
+        a = np.clip(rate, bounds.lower, bounds.upper)
         return self._counted("braking", AccelerationBounds(a, a.copy(), bounds.viable))
 
     def _worst_case(self, q: Array, v: Array, low: Array, high: Array) -> AccelerationBounds:
@@ -149,34 +151,17 @@ class StateDependentBounds:
         bounds = self._solve(q, v, self._least, low, high)
         return self._counted("worst case" if bounds.viable.all() else "outside", bounds)
 
-    def _solve(self, q, v, braking, low, high) -> AccelerationBounds:
-        table, n = self._table, q.size
-        lower, upper, viable = np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_)
-        braking_reach.set_sides(table.sides, braking, self._limits.v_max, low, high, self._dt)
-        states = (1, n)
-        solve(
-            q.reshape(states),
-            v.reshape(states),
-            *table,
-            lower.reshape(states),
-            upper.reshape(states),
-            viable.reshape(states),
-        )
-        return AccelerationBounds(lower, upper, viable)
+    def _solve(
+        self, q: Array, v: Array, braking: Array, low: Array, high: Array
+    ) -> AccelerationBounds:
+        """Return the bounds with other braking, shape (n, 2), and input limits, shape (n,)."""
+        away, towards = np.stack([low, -high], axis=1), np.stack([high, -low], axis=1)
+        set_braking(self._table.limits, braking, away, towards)
+        return solve(q, v, self._table)
 
-    def _certified(self, q, v, bounds, braking) -> bool:
-        horizon = braking_reach.reach_of_step(
-            q,
-            v,
-            bounds.lower,
-            bounds.upper,
-            self._period,
-            self._margin,
-            self._table.ranges,
-            braking,
-            self._reach,
-        )
-        return self._certificate.holds(Reach(*self._reach, horizon))
+    def _reach(self, q: Array, v: Array, bounds: AccelerationBounds, braking: Array) -> Reach:
+        lower, upper = bounds.lower, bounds.upper
+        return Reach(*reach_of_step(q, v, lower, upper, self._period, self._margin, braking))
 
     def _counted(self, outcome: str, bounds: AccelerationBounds) -> AccelerationBounds:
         self.outcomes[outcome] += 1
@@ -186,10 +171,9 @@ class StateDependentBounds:
         """Compile everything now and not in a control loop."""
         rest = np.zeros(len(self._limits))
         bounds = self.bounds(rest, rest)
-        self._certified(rest, rest, bounds, self._least)
+        self._certificate.holds(self._reach(rest, rest, bounds, self._least))
         self._worst_case(rest, rest, self._limits.a_min, self._limits.a_max)
-        braking_reach.stopping_acceleration(rest, rest, self._period, bounds.lower, bounds.upper)
-        self.start()
+        self.reset()
         self.outcomes.clear()
 
 

@@ -1,26 +1,37 @@
-"""Numbers of one step of `state_dependent_limits`, compiled: who needs how much braking."""
+"""Braking needed and available in one step, and where the step may end; compiled."""
 
 from __future__ import annotations
 
 from math import inf
 
 import numpy as np
+from numpy.typing import NDArray
 
 from viability_bounds_pkg.compiled import compiled
+from viability_bounds_pkg.joint_limits import JointLimits
+
+Array = NDArray[np.float64]
 
 
-def most_braking(limits, peak, margin, least, sides, dt):
+def most_braking(
+    limits: JointLimits,
+    peak: Array,
+    margin: Array,
+    least: Array,
+    curved: NDArray[np.bool_],
+    dt: float,
+) -> Array:
     """Return the braking that the kernel may count on at most, shape (n, 2), rad/s^2.
 
     The acceleration asked for stays within `peak`, and condition (11) holds whatever the other
-    side counts on; see `condition_11`. Never less than `least`, the worst case.
+    side counts on; see `discrete_time_condition`. Never less than `least`, the worst case.
 
     Args:
         limits: position and velocity limits.
         peak: shape (n,), rad/s^2.
         margin: shape (n,), rad/s^2.
         least: shape (n, 2), rad/s^2.
-        sides: of `bounds_kernel.Table`.
+        curved: limits whose stopping curve is not a parabola, shape (n, 2).
         dt: step, s.
     """
     length = (limits.q_max - limits.q_min)[:, None]
@@ -32,12 +43,13 @@ def most_braking(limits, peak, margin, least, sides, dt):
     )
     w = margin[:, None]
     most = np.minimum(peak[:, None] - w, x - 2.0 * w)
-    has_curve = sides[:, :, 12] > 0
-    return np.where(has_curve, least, np.maximum(most, least))
+    return np.where(curved, least, np.maximum(most, least))
 
 
 @compiled
-def available(M, h, tau_max, a_min, a_max, peak):
+def available(
+    M: Array, h: Array, tau_max: Array, a_min: Array, a_max: Array, peak: Array
+) -> tuple[Array, Array, Array]:
     """Return acceleration limits and braking that the torque limits leave in this state.
 
     Args:
@@ -71,7 +83,7 @@ def available(M, h, tau_max, a_min, a_max, peak):
 
 
 @compiled
-def needed_towards(room, speed, least, tolerance):
+def _needed_towards(room: float, speed: float, least: float, tolerance: float) -> float:
     """Return the braking with which a joint stops at a limit, but at least that of the worst case.
 
     Args:
@@ -86,44 +98,31 @@ def needed_towards(room, speed, least, tolerance):
 
 
 @compiled
-def needed_braking(q, v, ranges, least, tolerance, needed):
-    """Fill in what each joint needs now, shape (n, 2), and return whether any needs more."""
-    urgent = False
-    for j in range(q.size):
-        above, below = ranges[j, 1] - q[j], q[j] - ranges[j, 0]
-        needed[j, 0] = needed_towards(above, v[j], least[j, 0], tolerance[j])
-        needed[j, 1] = needed_towards(below, -v[j], least[j, 1], tolerance[j])
-        urgent |= needed[j, 0] > least[j, 0] or needed[j, 1] > least[j, 1]
-    return urgent
-
-
-@compiled
-def set_sides(sides, braking, v_max, low, high, dt):
-    """Make the rows of `bounds_kernel.Table.sides` those of other brakings and input limits.
+def needed_braking(
+    q: Array, v: Array, limits: NDArray[np.void], least: Array, tolerance: Array
+) -> Array:
+    """Return the braking that each joint needs now, shape (n, 2), rad/s^2.
 
     Args:
-        sides: shape (n, 2, 15), changed in place.
-        braking: of the kernel, shape (n, 2), rad/s^2.
-        v_max: shape (n,), rad/s.
-        low: input limits, shape (n,), rad/s^2.
-        high: shape (n,), rad/s^2.
-        dt: step, s.
+        q: shape (n,), rad.
+        v: shape (n,), rad/s.
+        limits: of `JointTable`.
+        least: braking of the worst case, shape (n, 2), rad/s^2.
+        tolerance: position that the margins allow for, shape (n,), rad.
     """
-    for j in range(v_max.size):
-        for s in range(2):
-            b = braking[j, s]
-            row = sides[j, s]
-            if row[12] == 0.0:  # else the braking is as it was, and belongs to a stopping curve
-                k = 0.5 * b * dt
-                row[2], row[3], row[4] = 2.0 * b, k, max(k * k, 1e-300)
-                row[5] = 0.5 * dt * v_max[j] + 0.5 * v_max[j] * v_max[j] / b
-            row[7] = low[j] if s == 0 else -high[j]
-            row[8] = high[j] if s == 0 else -low[j]
+    needed = np.empty((q.size, 2))
+    for j in range(q.size):
+        above, below = limits[j, 0].position - q[j], limits[j, 1].position + q[j]
+        needed[j, 0] = _needed_towards(above, v[j], least[j, 0], tolerance[j])
+        needed[j, 1] = _needed_towards(below, -v[j], least[j, 1], tolerance[j])
+    return needed
 
 
 @compiled
-def reach_of_step(q, v, lower, upper, dt, margin, ranges, braking, reach):
-    """Fill in where a step may end and how the joints brake from there.
+def reach_of_step(
+    q: Array, v: Array, lower: Array, upper: Array, dt: float, margin: Array, braking: Array
+) -> tuple[Array, Array, Array, Array, Array, float]:
+    """Return the states in which a step may end and how the joints brake: the fields of `Reach`.
 
     Args:
         q: shape (n,), rad.
@@ -132,34 +131,20 @@ def reach_of_step(q, v, lower, upper, dt, margin, ranges, braking, reach):
         upper: shape (n,), rad/s^2.
         dt: control period, s.
         margin: acceleration kept back, shape (n,), rad/s^2.
-        ranges: of `bounds_kernel.Table`.
         braking: of the kernel in which the bounds keep the joints, shape (n, 2), rad/s^2.
-        reach: shape (5, n), receives middle and deviation of q and v, and the braking, as in
-            `braking_certificate.Reach`.
-
-    Returns:
-        Time until all joints stand still, s.
     """
+    n = q.size
+    q_mid, v_mid, dq, dv, rate = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     horizon = 0.0
-    for j in range(q.size):
+    for j in range(n):
         v_low, v_high = v[j] + lower[j] * dt, v[j] + upper[j] * dt
         q_low, q_high = q[j] + 0.5 * (v[j] + v_low) * dt, q[j] + 0.5 * (v[j] + v_high) * dt
-        reach[0, j], reach[1, j] = 0.5 * (q_low + q_high), 0.5 * (v_low + v_high)
-        reach[2, j] = 0.5 * (q_high - q_low)
-        reach[3, j] = 0.5 * (v_high - v_low) + margin[j] * dt
-        reach[4, j] = margin[j] + braking[j, 0 if v_low + v_high > 0.0 else 1]
+        q_mid[j], v_mid[j] = 0.5 * (q_low + q_high), 0.5 * (v_low + v_high)
+        dq[j] = 0.5 * (q_high - q_low)
+        dv[j] = 0.5 * (v_high - v_low) + margin[j] * dt
+        rate[j] = margin[j] + braking[j, 0 if v_low + v_high > 0.0 else 1]
         if v_low < 0.0 < v_high:
             # Either way is possible: what both limits need is enough for the one that counts.
-            reach[4, j] = margin[j] + min(braking[j, 0], braking[j, 1])
-        horizon = max(horizon, (abs(reach[1, j]) + reach[3, j]) / reach[4, j])
-    return horizon
-
-
-@compiled
-def stopping_acceleration(v, braking, dt, lower, upper):
-    """Return the acceleration along the braking path, inside the bounds, shape (n,), rad/s^2."""
-    a = np.empty(v.size)
-    for j in range(v.size):
-        rate = min(braking[j], abs(v[j]) / dt)
-        a[j] = min(max(-rate if v[j] > 0.0 else rate, lower[j]), upper[j])
-    return a
+            rate[j] = margin[j] + min(braking[j, 0], braking[j, 1])
+        horizon = max(horizon, (abs(v_mid[j]) + dv[j]) / rate[j])
+    return q_mid, v_mid, dq, dv, rate, horizon

@@ -1,4 +1,4 @@
-"""Algorithms 1 to 3 of [DelPrete2018] as printed, for comparison and for the regions of Fig. 3.
+"""Algorithms 1 to 3 of [DelPrete2018] as printed, for comparison and for Fig. 3.
 
 `viability.acceleration_bounds` replaces them: these assume a viable state and condition (11),
 and return conflicting or huge bounds, or a nan, elsewhere. What differs from the print:
