@@ -371,7 +371,7 @@ def test_state_dependent_limits_are_those_of_the_solver(ros):
             period=0.1,
         )
         if stamp == 50:
-            solver.start()
+            solver.reset()
         bounds = solver.bounds(q, v)
         answer = answers[answers.stamps.index(stamp * MS)]
         assert answer == acceleration_limits(
