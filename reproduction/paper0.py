@@ -367,7 +367,7 @@ def algorithm_4() -> Figure:
             "Algorithm 4, N = 1e6",
             "about 5 minutes",
             f"{figure.metrics['sampling_seconds']:.1f} s",
-            "faster, batched; left_s1 has no interval: see config/baxter_left_arm.yaml",
+            "faster; left_s1 has no interval: see config/baxter_left_arm.yaml",
         ),
         (
             "Beyond it: refined search, N = 1e4",

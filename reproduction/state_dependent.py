@@ -53,7 +53,7 @@ def drift(values: dict, limits: str) -> list[float]:
         values["torque_max"],
         1.0 / values["rate_hz"],
     )
-    return (1.05 * found.rate).tolist()
+    return (1.05 * found.jerk).tolist()
 
 
 def main() -> int:

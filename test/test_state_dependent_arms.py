@@ -41,7 +41,7 @@ class Race:
             a_max,
         )
         self.peak = 3.0 * np.maximum(-a_min, a_max)
-        drift = discretisation_margin(
+        jerk = discretisation_margin(
             self.arm.model,
             self.arm.q_min,
             self.arm.q_max,
@@ -51,8 +51,8 @@ class Race:
             self.arm.tau_max,
             DT,
             2000,
-        ).rate
-        self.margins = torque_margins(1.1 * drift, DT)
+        ).jerk
+        self.margins = torque_margins(1.1 * jerk, DT)
         self.tight = tightened(self.limits, self.margins)
 
     def worst_case(self):

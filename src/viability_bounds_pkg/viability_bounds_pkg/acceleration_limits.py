@@ -9,7 +9,7 @@ Using smaller limits than the ones found is always safe. The viability kernel
 with the smaller deceleration, and a torque that gives the larger one gives the smaller one too.
 What is lost is speed near the position limits. `cap` does that, and is wise for light joints
 such as wrists, whose torque would allow hundreds of rad/s^2 that neither the gears nor the
-control period are made for: the drift of the acceleration during a period grows with it (see
+control period are made for: the zero-order hold error of the acceleration grows with it (see
 `discretisation_margin`).
 
 Using larger ones (`overrides`) gives the guarantee up in the states where torque does not suffice.
@@ -24,7 +24,6 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from viability_bounds_pkg.estimation.batch_dynamics import BatchDynamics
 from viability_bounds_pkg.estimation.state_space import Array, LimitEstimateError, StateSpace
 from viability_bounds_pkg.estimation.velocity_scale import (
     USEFUL_ACCELERATION,
@@ -282,6 +281,6 @@ def unavailable_share(
         large for an override that gravity alone forbids.
     """
     q, v = space.states(np.random.default_rng(seed).random((samples, 2 * space.n)))
-    room = acceleration_room(BatchDynamics(model), space, q, v)
+    room = acceleration_room(model, model.createData(), space, q, v)
     wanted = np.stack([limits.a_max, -limits.a_min])
     return np.mean(np.any(room < wanted, axis=1), axis=0)

@@ -1,4 +1,4 @@
-"""What holding a torque for a control step costs, and the margins that pay for it.
+"""Margins on joint limits for the zero-order hold error of a torque command.
 
 The bounds assume constant acceleration within a step; a robot under a constant torque has
 only nearly that. `docs/torque_margin.md` derives the margins below and shows that they keep
@@ -29,25 +29,24 @@ class TorqueMargins(NamedTuple):
     position: NDArray[np.float64]
 
 
-def step_deviations(drift: ArrayLike, dt: float) -> tuple[NDArray, NDArray]:
+def step_deviations(jerk: ArrayLike, dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return how far velocity and position stray from constant acceleration within a step.
 
-    The torque is right for the middle of the step, so that with drift J the acceleration is
+    The torque is right for the middle of the step, so that with jerk J the acceleration is
     off by J (t - dt/2): the velocity by at most J dt^2 / 8, the position by J dt^3 / 12.
 
     Args:
-        drift: greatest rate of change of acceleration under constant torque, shape (n,),
-            rad/s^3.
+        jerk: greatest rate of change of acceleration under held torque, shape (n,), rad/s^3.
         dt: control period, s.
 
     Returns:
         Velocity, rad/s, and position, rad, each of shape (n,).
     """
-    drift = np.asarray(drift, dtype=float)
-    return drift * dt**2 / 8.0, drift * dt**3 / 12.0
+    jerk = np.asarray(jerk, dtype=float)
+    return jerk * dt**2 / 8.0, jerk * dt**3 / 12.0
 
 
-def torque_margins(drift: ArrayLike, dt: float) -> TorqueMargins:
+def torque_margins(jerk: ArrayLike, dt: float) -> TorqueMargins:
     """Return the margins that make up for `step_deviations`.
 
     One half of the acceleration margin, J dt / 36, covers what is left of the error of the mean
@@ -56,11 +55,11 @@ def torque_margins(drift: ArrayLike, dt: float) -> TorqueMargins:
     than the last three steps of braking. In these the error adds up to at most 5 D.
 
     Args:
-        drift: shape (n,), rad/s^3.
+        jerk: under held torque, shape (n,), rad/s^3.
         dt: control period, s.
     """
-    velocity, position = step_deviations(drift, dt)
-    return TorqueMargins(np.asarray(drift, dtype=float) * dt / 18.0, velocity, 5.0 * position)
+    velocity, position = step_deviations(jerk, dt)
+    return TorqueMargins(np.asarray(jerk, dtype=float) * dt / 18.0, velocity, 5.0 * position)
 
 
 def tightened(limits: JointLimits, margins: TorqueMargins) -> JointLimits:

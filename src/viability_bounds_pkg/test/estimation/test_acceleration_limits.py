@@ -14,16 +14,14 @@ from viability_bounds_pkg.acceleration_limits import (
     limits_from_worst_cases,
     unavailable_share,
 )
-from viability_bounds_pkg.estimation.batch_dynamics import BLOCK, BatchDynamics
-from viability_bounds_pkg.estimation.descent import descend
 from viability_bounds_pkg.estimation.discretisation_margin import discretisation_margin
 from viability_bounds_pkg.estimation.state_space import LimitEstimateError, StateSpace
 from viability_bounds_pkg.estimation.velocity_scale import largest_velocity_scale
 from viability_bounds_pkg.estimation.worst_case_search import search_by_sampling, search_refined
 from viability_bounds_pkg.estimation.zero_order_hold import (
-    acceleration_rate,
-    hold_defects,
+    jerk_under_held_torque,
     mid_step_torque,
+    zero_order_hold_error,
 )
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 
@@ -71,31 +69,6 @@ def pendulum(**kwargs):
     return build_model(pendulum_urdf(**kwargs), [f"joint{i}" for i in range(1, links + 1)])
 
 
-def random_tree():
-    """A branching robot with every kind of joint a URDF has, and rotors."""
-    rng = np.random.default_rng(3)
-    model = pin.Model()
-    oblique = np.array([0.6, 0.0, -0.8])
-    joints = [
-        (pin.JointModelPZ(), 0),
-        (pin.JointModelRY(), 1),
-        (pin.JointModelPrismaticUnaligned(oblique), 2),
-        (pin.JointModelRevoluteUnaligned(oblique), 2),
-        (pin.JointModelPX(), 4),
-        (pin.JointModelRZ(), 5),
-        (pin.JointModelRX(), 3),
-    ]
-    for i, (joint, parent) in enumerate(joints):
-        turn = pin.exp3(rng.normal(size=3))
-        placement = pin.SE3(turn, rng.normal(size=3))
-        index = model.addJoint(parent, joint, placement, f"joint{i}")
-        spread = rng.normal(size=(4, 3))
-        inertia = pin.Inertia(1.0 + i, rng.normal(size=3), spread.T @ spread)
-        model.appendBodyToJoint(index, inertia, pin.SE3.Identity())
-    model.armature = np.linspace(0.0, 1.0, model.nv)
-    return model
-
-
 def algorithm_4(model, q, v, tau_max):
     """Lines 6 to 12 of Algorithm 4 as printed, over the states given."""
     data = model.createData()
@@ -107,34 +80,6 @@ def algorithm_4(model, q, v, tau_max):
             upper[j] = min(upper[j], (tau_max[j] - h[j]) / inertia[j, j])
             lower[j] = max(lower[j], (-tau_max[j] - h[j]) / inertia[j, j])
     return lower, upper
-
-
-@pytest.mark.parametrize("make", [baxter, panda, random_tree])
-def test_batch_dynamics_equal_pinocchio(make):
-    model = make()
-    rng = np.random.default_rng(0)
-    count = BLOCK + 40  # more than one block, the last one short
-    q, v = rng.uniform(-2, 2, (count, model.nq)), rng.uniform(-3, 3, (count, model.nv))
-    h, inertia = BatchDynamics(model).torque_terms(q, v)
-    data = model.createData()
-    for i in (0, 1, BLOCK - 1, BLOCK, count - 1):
-        scale = 1.0 + np.abs(h[i]).max()
-        np.testing.assert_allclose(
-            h[i], pin.nonLinearEffects(model, data, q[i], v[i]), atol=1e-12 * scale
-        )
-        np.testing.assert_allclose(inertia[i], pin.crba(model, data, q[i]).diagonal(), rtol=1e-11)
-
-
-def test_batches_and_single_states_agree():
-    model = random_tree()
-    rng = np.random.default_rng(1)
-    q, v = rng.uniform(-2, 2, (100, model.nq)), rng.uniform(-3, 3, (100, model.nv))
-    dynamics = BatchDynamics(model)
-    batch = dynamics.torque_terms(q, v)
-    for i in range(100):
-        alone = dynamics.torque_terms(q[i : i + 1], v[i : i + 1])
-        for whole, single in zip(batch, alone, strict=True):
-            np.testing.assert_allclose(whole[i], single[0], rtol=1e-9, atol=1e-9)
 
 
 def test_sampling_is_algorithm_4():
@@ -230,7 +175,6 @@ def test_search_counts_every_evaluation(monkeypatch):
             return original(*arguments)
 
         monkeypatch.setattr(pin, name, counted)
-    monkeypatch.setattr("viability_bounds_pkg.estimation.batch_dynamics.FEW", 10**9)  # no batches
     model = panda()
     *_, worst = search_refined(model, StateSpace.of(model, *limits_of(model)), 1000, 0)
     assert calls == worst.evaluations <= 1000
@@ -406,30 +350,12 @@ def test_joint_that_moves_nothing_is_named(count):
         estimate_acceleration_limits(model, [-1], [1], [1], [1], count, 0)
 
 
-def test_descent_ends_on_the_bounds_and_uses_curvature():
-    """A quadratic a hundred times steeper in one direction, its minimum outside the cube."""
-    turn = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
-    hessian = turn @ np.diag([1.0, 100.0, 1.0]) @ turn.T
-    centre = np.array([0.3, 0.6, 1.7])
-    visited = []
-
-    def value(x):
-        visited.append((1.0 + 0.5 * (x - centre) @ hessian @ (x - centre), x))
-        return visited[-1][0]
-
-    descend(value, lambda x: hessian @ (x - centre), np.array([0.9, 0.1, 0.2]), 15, 0.0)
-    least, x = min(visited, key=lambda visit: visit[0])
-    np.testing.assert_allclose(x, [0.3, 0.6, 1.0], atol=1e-4)
-    assert least == pytest.approx(1.0 + 0.5 * 0.7**2)
-    assert all(np.all((x >= 0.0) & (x <= 1.0)) for _, x in visited)
-
-
 def test_acceleration_rate_is_the_time_derivative():
     model = panda()
     rng = np.random.default_rng(2)
     q, v = rng.uniform(-1, 1, (3, 7)), rng.uniform(-2, 2, (3, 7))
     a = rng.uniform(-9, 9, (3, 7))
-    tau, rate = acceleration_rate(model, q, v, a)
+    tau, rate = jerk_under_held_torque(model, q, v, a)
     data, step = model.createData(), 1e-5
     for i in range(3):
         later, earlier = (
@@ -439,26 +365,28 @@ def test_acceleration_rate_is_the_time_derivative():
         np.testing.assert_allclose(rate[i], (later - earlier) / (2 * step), rtol=1e-5, atol=1e-4)
 
 
-def test_hold_defects_do_not_depend_on_the_integration_step():
+def test_zero_order_hold_error_do_not_depend_on_the_integration_step():
     model = panda()
     rng = np.random.default_rng(4)
     q, v, a = rng.uniform(-1, 1, (5, 7)), rng.uniform(-2, 2, (5, 7)), rng.uniform(-9, 9, (5, 7))
     tau = mid_step_torque(model, q, v, a, 0.01)
-    coarse = hold_defects(model, q, v, a, tau, 0.01)
-    fine = hold_defects(model, q, v, a, tau, 0.01, substeps=16)
+    coarse = zero_order_hold_error(model, q, v, a, tau, 0.01)
+    fine = zero_order_hold_error(model, q, v, a, tau, 0.01, substeps=16)
     np.testing.assert_allclose(coarse, fine, rtol=2e-3, atol=1e-5)
 
 
-def test_hold_defects_of_a_pendulum_in_closed_form():
-    """Leading orders of the drift: gravity's torque changes as the pendulum swings."""
+def test_zero_order_hold_error_of_a_pendulum_in_closed_form():
+    """Leading orders of the error: gravity's torque changes as the pendulum swings."""
     model = pendulum()
     q, v, a, dt = np.array([[0.4]]), np.array([[2.0]]), np.array([[3.0]]), 1e-3
     rate = GRAVITY / PENDULUM_LENGTH * math.cos(0.4) * 2.0
-    held = hold_defects(model, q, v, a, mid_step_torque(model, q, v, a, dt), dt)[0, :, 0]
+    held = zero_order_hold_error(model, q, v, a, mid_step_torque(model, q, v, a, dt), dt)[0, :, 0]
     assert held[0] == pytest.approx(rate * dt / 2, rel=0.01)
     assert held[1] < 1e-3 * held[0]
     assert held[2] == pytest.approx(rate * dt**3 / 12, rel=0.01)
-    plain = hold_defects(model, q, v, a, mid_step_torque(model, q, v, a, 0.0), dt)[0, :, 0]
+    plain = zero_order_hold_error(model, q, v, a, mid_step_torque(model, q, v, a, 0.0), dt)[
+        0, :, 0
+    ]
     assert plain[0] == pytest.approx(rate * dt, rel=0.01)
     assert plain[1] == pytest.approx(rate * dt / 2, rel=0.01)
     assert plain[2] == pytest.approx(rate * dt**3 / 6, rel=0.01)
@@ -473,20 +401,20 @@ def margin_of(dt, **options):
     )
 
 
-def test_mid_step_torque_halves_the_drift():
+def test_mid_step_torque_halves_the_error():
     margin = margin_of(0.002)
     ratio = margin.mid_step.acceleration / margin.start_of_step.acceleration
     np.testing.assert_allclose(ratio, 0.5, atol=0.05)
-    np.testing.assert_allclose(margin.mid_step.acceleration, margin.rate * 0.001, rtol=0.1)
+    np.testing.assert_allclose(margin.mid_step.acceleration, margin.jerk * 0.001, rtol=0.1)
     assert np.all(margin.mid_step.mean_acceleration < 0.05 * margin.mid_step.acceleration)
     np.testing.assert_allclose(
         margin.start_of_step.mean_acceleration, margin.mid_step.acceleration, rtol=0.1
     )
-    np.testing.assert_allclose(margin.mid_step.position, margin.rate * 0.002**3 / 12, rtol=0.1)
+    np.testing.assert_allclose(margin.mid_step.position, margin.jerk * 0.002**3 / 12, rtol=0.1)
     assert margin.margin is margin.mid_step.acceleration
 
 
-def test_drift_is_of_first_order_in_the_period():
+def test_error_is_of_first_order_in_the_period():
     whole, half = margin_of(0.002), margin_of(0.001)
     np.testing.assert_allclose(half.margin / whole.margin, 0.5, atol=0.03)
 
@@ -500,8 +428,8 @@ def test_margin_is_attained_within_the_limits():
         assert np.all(np.abs(v) <= model.velocityLimit)
         tau = mid_step_torque(model, q, v, a, 0.002)
         assert np.all(np.abs(tau) <= model.effortLimit)
-        defects = hold_defects(model, q, v, a, tau, 0.002)
-        assert defects[0, 0, j] == pytest.approx(held.acceleration[j], rel=1e-9)
+        errors = zero_order_hold_error(model, q, v, a, tau, 0.002)
+        assert errors[0, 0, j] == pytest.approx(held.acceleration[j], rel=1e-9)
 
 
 def test_local_search_finds_worse_than_sampling():

@@ -10,10 +10,10 @@ STEPS = 400
 
 
 def random_case(rng):
-    """Limits of many joints that differ, a step, and drifts that leave something to brake with."""
+    """Limits of many joints that differ, a step, and jerks that leave something to brake with."""
     dt = 10.0 ** rng.uniform(-3.0, -2.0)
     a_min, a_max = -rng.uniform(2.0, 20.0, JOINTS), rng.uniform(2.0, 20.0, JOINTS)
-    drift = rng.uniform(0.0, 0.5, JOINTS) * np.minimum(-a_min, a_max) * 18.0 / dt
+    jerk = rng.uniform(0.0, 0.5, JOINTS) * np.minimum(-a_min, a_max) * 18.0 / dt
     half = rng.uniform(0.3, 3.0, JOINTS)
     limits = JointLimits(
         [f"joint{i}" for i in range(JOINTS)],
@@ -23,13 +23,13 @@ def random_case(rng):
         a_min,
         a_max,
     )
-    return limits, dt, drift
+    return limits, dt, jerk
 
 
-def excess_in_units_of_d(rng, limits, dt, drift, margins, factor):
+def excess_in_units_of_d(rng, limits, dt, jerk, margins, factor):
     """The furthest that any joint goes beyond a limit, an adversary choosing everything."""
-    velocity_error, position_error = step_deviations(drift, dt)
-    mean_error = drift * dt / 36.0
+    velocity_error, position_error = step_deviations(jerk, dt)
+    mean_error = jerk * dt / 36.0
     inner = tightened(limits, margins)
     solver = BoundsSolver(inner, factor * dt, margins.acceleration, period=dt)
     q, v = np.zeros(JOINTS), np.zeros(JOINTS)
@@ -57,30 +57,30 @@ def excess_in_units_of_d(rng, limits, dt, drift, margins, factor):
 @pytest.mark.parametrize("seed", range(4))
 def test_margins_keep_the_limits_against_the_worst_deviations(seed, factor):
     rng = np.random.default_rng(seed)
-    limits, dt, drift = random_case(rng)
-    excess, speed = excess_in_units_of_d(rng, limits, dt, drift, torque_margins(drift, dt), factor)
+    limits, dt, jerk = random_case(rng)
+    excess, speed = excess_in_units_of_d(rng, limits, dt, jerk, torque_margins(jerk, dt), factor)
     assert excess <= -2.0  # in units of the position error of one step
     assert speed <= 1e-12  # rad/s
 
 
 def test_without_the_position_margin_the_limits_break():
     rng = np.random.default_rng(0)
-    limits, dt, drift = random_case(rng)
-    margins = torque_margins(drift, dt)
+    limits, dt, jerk = random_case(rng)
+    margins = torque_margins(jerk, dt)
     margins.position[:] = 0.0
-    excess, _ = excess_in_units_of_d(rng, limits, dt, drift, margins, 1.0)
+    excess, _ = excess_in_units_of_d(rng, limits, dt, jerk, margins, 1.0)
     assert excess > 1.0
 
 
 def test_margins_shrink_with_the_step():
-    drift = np.array([100.0, 2000.0])
-    coarse, fine = torque_margins(drift, 0.01), torque_margins(drift, 0.001)
+    jerk = np.array([100.0, 2000.0])
+    coarse, fine = torque_margins(jerk, 0.01), torque_margins(jerk, 0.001)
     np.testing.assert_allclose(coarse.acceleration / fine.acceleration, 10.0)
     np.testing.assert_allclose(coarse.velocity / fine.velocity, 100.0)
     np.testing.assert_allclose(coarse.position / fine.position, 1000.0)
 
 
-def test_deviations_are_those_of_linear_drift():
+def test_deviations_are_those_of_constant_jerk():
     J, dt = 300.0, 0.01
     t = np.linspace(0.0, dt, 10001)
     velocity = J * (t**2 - t * dt) / 2.0

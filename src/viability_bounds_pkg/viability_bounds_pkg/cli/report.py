@@ -93,8 +93,8 @@ def overlay_text(
     drift = {}
     if margin is not None:
         notes.append(f"acceleration_drift with the torque held for {margin.dt:g} s")
-        # The acceleration is right at the middle of the period: half of it is there to drift.
-        rate = np.maximum(margin.rate, 2.0 * margin.mid_step.acceleration / margin.dt)
-        drift["acceleration_drift"] = round_away_from_zero(rate)
+        # The acceleration is right at the middle of the period: its error grows for half of it.
+        jerk = np.maximum(margin.jerk, 2.0 * margin.mid_step.acceleration / margin.dt)
+        drift["acceleration_drift"] = round_away_from_zero(jerk)
     # Not for all nodes at once: a file that names the node would win over that.
     return overlay(found | drift, notes) + "\n" + overlay(found, [], CONTROLLER)

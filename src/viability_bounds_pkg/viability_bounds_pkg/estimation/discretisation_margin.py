@@ -1,4 +1,4 @@
-"""How far a joint acceleration drifts while the torque is held for one control period.
+"""Worst-case zero-order hold error of joint accelerations over one control period.
 
 A torque-controlled robot receives a torque that is constant for a period `dt`, so that its
 acceleration is not: the inertia and the bias forces of eq. (30) of [DelPrete2018] change on the
@@ -18,15 +18,15 @@ from numpy.typing import ArrayLike
 
 from viability_bounds_pkg.estimation.state_space import Array, LimitEstimateError, StateSpace
 from viability_bounds_pkg.estimation.zero_order_hold import (
-    acceleration_rate,
-    hold_defects,
+    jerk_under_held_torque,
     mid_step_torque,
+    zero_order_hold_error,
 )
 
 
 @dataclass(frozen=True)
-class HoldDefects:
-    """What holding the torque for a period changes, worst case over the states searched.
+class ZeroOrderHoldError:
+    """Worst case over the states searched of motion under held torque against that commanded.
 
     Attributes:
         acceleration: sup over t in [0, dt] of abs(a(t) - a), shape (n,), rad/s^2.
@@ -47,23 +47,23 @@ class HoldDefects:
 
 @dataclass(frozen=True)
 class DiscretisationMargin:
-    """Defects of the two ways to turn an acceleration into the torque held for a period.
+    """Zero-order hold errors of two ways to compute the torque held for a period.
 
     Attributes:
         dt: the control period, s.
         mid_step: with the torque computed at the predicted middle of the period,
             ``rnea(q + v dt/2 + a dt^2/8, v + a dt/2, a)``.
         start_of_step: with the torque computed at the start, ``rnea(q, v, a)``.
-        rate: sup of abs(da/dt) while a torque is held, shape (n,), rad/s^3: for a short period
-            the drift is this times `dt` for the plain law, half of it for the mid-step law.
+        jerk: sup of abs(da/dt) under held torque, shape (n,), rad/s^3: for a short period the
+            error is this times `dt` for the plain law, half of it for the mid-step law.
         samples: how many random states were drawn.
         accepted: how many of them asked for a torque within the limits at once.
     """
 
     dt: float
-    mid_step: HoldDefects
-    start_of_step: HoldDefects
-    rate: Array
+    mid_step: ZeroOrderHoldError
+    start_of_step: ZeroOrderHoldError
+    jerk: Array
     samples: int
     accepted: int
 
@@ -88,15 +88,15 @@ def discretisation_margin(
     starts: int = 32,
     rounds: int = 12,
 ) -> DiscretisationMargin:
-    """Return the worst acceleration drift of a torque held for `dt`, for both torque laws.
+    """Return the worst zero-order hold error over a period `dt`, for both torque laws.
 
     States and accelerations are drawn within their limits; those that ask for a torque beyond
     `tau_max` are skipped, as the controller does not command them. Random sampling in 3 n
     dimensions stays far below the supremum (by a factor of two and more for seven joints), so
-    that a coordinate search goes on from the worst ones: first on the rate of change of the
-    acceleration, to which the drift is proportional for a short `dt` and which costs a tenth,
-    then on the defects themselves. The result still bounds the true supremum from below; other
-    seeds and more `starts` show how firm it is (a few percent for the arms tried).
+    that a coordinate search goes on from the worst ones: first on the jerk, to which the error
+    is proportional for a short `dt` and which costs a tenth, then on the errors themselves. The
+    result still bounds the true supremum from below; other seeds and more `starts` show how
+    firm it is (a few percent for the arms tried).
 
     Args:
         model: the robot, one degree of freedom a joint, n of them.
@@ -129,45 +129,45 @@ def discretisation_margin(
     upper = np.concatenate([space.q_max, space.v_max, a_max])
     rng = np.random.default_rng(seed)
     unit = rng.random((samples, 3 * n))
-    # The drift grows with speed and acceleration: every other sample has them all at a limit.
+    # The jerk grows with speed and acceleration: every other sample has them all at a limit.
     unit[::2, n:] = np.round(unit[::2, n:])
     points = lower + unit * (upper - lower)
 
-    def allowed_rate(points: Array) -> Array:
-        tau, rate = acceleration_rate(model, *np.split(points, 3, axis=1))
-        return np.where(np.all(np.abs(tau) <= space.tau_max, axis=1)[:, None], abs(rate), -np.inf)
+    def allowed_jerk(points: Array) -> Array:
+        tau, jerk = jerk_under_held_torque(model, *np.split(points, 3, axis=1))
+        return np.where(np.all(np.abs(tau) <= space.tau_max, axis=1)[:, None], abs(jerk), -np.inf)
 
-    rates = allowed_rate(points)
-    accepted = int(np.count_nonzero(np.isfinite(rates[:, 0])))
+    jerks = allowed_jerk(points)
+    accepted = int(np.count_nonzero(np.isfinite(jerks[:, 0])))
     if not accepted:
         raise LimitEstimateError(
             f"none of {samples} sampled states and accelerations is within the torque limits; "
             "narrow a_min and a_max"
         )
-    followed, fastest = climb(allowed_rate, points, rates, lower, upper, starts, rounds, rng)
+    followed, fastest = climb(allowed_jerk, points, jerks, lower, upper, starts, rounds, rng)
     laws = []
     for lead in (dt, 0.0):  # how far ahead the torque looks
 
-        def defects_of(points: Array, lead: float = lead) -> Array:
+        def errors_of(points: Array, lead: float = lead) -> Array:
             q, v, a = np.split(points, 3, axis=1)
             tau = mid_step_torque(model, q, v, a, lead)
             allowed = np.all(np.abs(tau) <= space.tau_max, axis=1)
-            defects = np.full((len(points), 3 * n), -np.inf)
-            defects[allowed] = hold_defects(
+            errors = np.full((len(points), 3 * n), -np.inf)
+            errors[allowed] = zero_order_hold_error(
                 model, q[allowed], v[allowed], a[allowed], tau[allowed], dt
             ).reshape(-1, 3 * n)
-            return defects
+            return errors
 
         # A state on the torque limit at its start may be beyond it in mid-step: keep others.
         begin = np.concatenate([followed, points[: max(100, samples // 10)]])
         best, worst = climb(
-            defects_of, begin, defects_of(begin), lower, upper, 1, min(rounds, 2), rng
+            errors_of, begin, errors_of(begin), lower, upper, 1, min(rounds, 2), rng
         )
-        drift, mean, position = worst.reshape(3, n)
+        acceleration, mean, position = worst.reshape(3, n)
         q, v, a = np.split(best[:n], 3, axis=1)
-        laws.append(HoldDefects(drift, mean, position, q, v, a))
-    rate = fastest.reshape(-1, n).max(axis=0)
-    return DiscretisationMargin(dt, laws[0], laws[1], rate, samples, accepted)
+        laws.append(ZeroOrderHoldError(acceleration, mean, position, q, v, a))
+    jerk = fastest.reshape(-1, n).max(axis=0)
+    return DiscretisationMargin(dt, laws[0], laws[1], jerk, samples, accepted)
 
 
 def climb(

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from viability_bounds_pkg.estimation.batch_dynamics import BatchDynamics
 from viability_bounds_pkg.estimation.state_space import Array, LimitEstimateError, StateSpace
-from viability_bounds_pkg.estimation.worst_case_search import search_refined
+from viability_bounds_pkg.estimation.worst_case_search import search_refined, torque_terms
 
 USEFUL_ACCELERATION = 1.0
 """What a suggested velocity scale leaves each joint at least, either way, rad/s^2."""
@@ -89,9 +88,9 @@ def _scale_allowed(
     model: pin.Model, space: StateSpace, q: Array, v: Array, required: float, counted: Array
 ) -> VelocityScale:
     """Return the least scale that one of the states, each of shape (batch, n), allows."""
-    dynamics = BatchDynamics(model)
-    h, inertia = dynamics.torque_terms(q, v)
-    gravity, _ = dynamics.torque_terms(q, np.zeros_like(v))
+    data = model.createData()
+    h, inertia = torque_terms(model, data, q, v)
+    gravity, _ = torque_terms(model, data, q, np.zeros_like(v))
     sign = np.array([1.0, -1.0])[:, None, None]
     # Up and down: tau_max - sign (gravity + s^2 (h - gravity)) >= M required.
     slack = space.tau_max - sign * gravity - inertia * required

@@ -14,9 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
+from scipy.optimize import minimize
 
-from viability_bounds_pkg.estimation.batch_dynamics import BatchDynamics
-from viability_bounds_pkg.estimation.descent import descend
 from viability_bounds_pkg.estimation.state_space import Array, LimitEstimateError, StateSpace
 
 CHUNK = 2**13
@@ -31,8 +30,11 @@ SAMPLED_SHARE = 0.25
 SEARCH_STEPS = 30
 """Steps of one local search; most end on a corner of the box before."""
 
-ENOUGH = 1e-3
+ENOUGH = 1e-4
 """A step that tightens a limit by less than this part ends a local search; others begin."""
+
+CORRECTIONS = 20
+"""Steps from which a local search (L-BFGS-B) estimates curvature."""
 
 PATIENCE = 25
 """Rounds of local searches without any gain after which the refined search ends."""
@@ -73,14 +75,36 @@ class WorstCases:
     history: tuple[HistoryEntry, ...]
 
 
-def acceleration_room(dynamics: BatchDynamics, space: StateSpace, q: Array, v: Array) -> Array:
+def torque_terms(model: pin.Model, data: pin.Data, q: Array, v: Array) -> tuple[Array, Array]:
+    """Return the bias forces and the diagonal of the inertia matrix of a batch of states.
+
+    Args:
+        model: the robot.
+        data: of `model`.
+        q: positions, shape (batch, n), rad.
+        v: velocities, shape (batch, n), rad/s.
+
+    Returns:
+        h, shape (batch, n), N m, and the diagonal of M, rotors included, shape (batch, n), kg m^2.
+    """
+    h, inertia = np.empty(q.shape), np.empty(q.shape)
+    for i in range(len(q)):
+        inertia[i] = pin.crba(model, data, q[i]).diagonal()
+        h[i] = pin.nonLinearEffects(model, data, q[i], v[i])
+    return h, inertia
+
+
+def acceleration_room(
+    model: pin.Model, data: pin.Data, space: StateSpace, q: Array, v: Array
+) -> Array:
     """Return how far each joint can accelerate up and down with the others at constant speed.
 
     Lines 9 and 10 of Algorithm 4: ``(tau_max - h) / M[j, j]`` and ``(tau_max + h) / M[j, j]``,
     the second being -a_min, so that less is worse for both.
 
     Args:
-        dynamics: of the robot.
+        model: the robot.
+        data: of `model`.
         space: torque limits.
         q: positions, shape (batch, n), rad.
         v: velocities, shape (batch, n), rad/s.
@@ -91,9 +115,9 @@ def acceleration_room(dynamics: BatchDynamics, space: StateSpace, q: Array, v: A
     Raises:
         LimitEstimateError: a joint that moves no inertia.
     """
-    h, inertia = dynamics.torque_terms(q, v)
+    h, inertia = torque_terms(model, data, q, v)
     if inertia.min() < NO_INERTIA:
-        joint = dynamics.model.names[1 + int(np.argmin(inertia.min(axis=0)))]
+        joint = model.names[1 + int(np.argmin(inertia.min(axis=0)))]
         raise LimitEstimateError(
             f"joint {joint} moves no inertia (M[j, j] = {inertia.min():.3g}): "
             "the URDF needs a mass and an inertia on the links it carries"
@@ -172,11 +196,11 @@ def search_by_sampling(
     if samples < 1:
         raise LimitEstimateError(f"samples must be at least 1, is {samples}")
     rng = np.random.default_rng(seed)
-    dynamics = BatchDynamics(model)
+    data = model.createData()
     tracker = _Tracker(space.n)
     for size in _chunks(samples):
         q, v = space.states(rng.random((size, 2 * space.n)))
-        tracker.update(acceleration_room(dynamics, space, q, v), q, v)
+        tracker.update(acceleration_room(model, data, space, q, v), q, v)
         if tracker.evaluations == samples or tracker.evaluations.bit_count() == 1:
             tracker.record()
         yield tracker.snapshot()
@@ -189,8 +213,8 @@ def search_refined(
 
     Every other sample has all velocities at their limits, because h is quadratic in v and its
     extremes lie mostly there. (A Sobol sequence in place of independent samples made no
-    difference: 14 dimensions are too many for a few thousand points to fill.) Searches with the
-    analytic derivatives of the inverse dynamics (`descend`) then start from the worst samples,
+    difference: 14 dimensions are too many for a few thousand points to fill.) Local searches with
+    the analytic derivatives of the inverse dynamics (L-BFGS-B) then start from the worst samples,
     the very worst of each joint and side first, until the evaluations are spent or `PATIENCE`
     rounds over all limits bring nothing.
 
@@ -209,7 +233,7 @@ def search_refined(
     if evaluations < 1:
         raise LimitEstimateError(f"samples must be at least 1, is {evaluations}")
     n = space.n
-    dynamics = BatchDynamics(model)
+    data = model.createData()
     tracker = _Tracker(n)
     count = 2 ** max(int(evaluations * SAMPLED_SHARE).bit_length() - 1, 0)
     rng = np.random.default_rng(seed)
@@ -219,7 +243,7 @@ def search_refined(
         corner = (tracker.evaluations + np.arange(size)) % 2 == 1
         unit[corner, n:] = np.round(unit[corner, n:])
         q, v = space.states(unit)
-        room = acceleration_room(dynamics, space, q, v)
+        room = acceleration_room(model, data, space, q, v)
         tracker.update(room, q, v)
         tracker.record()
         points.append(unit)
@@ -231,12 +255,12 @@ def search_refined(
     for ranks in order:
         before = tracker.room.copy()
         for limit, start in enumerate(ranks):
-            _descend(dynamics, space, tracker, unit[start], *divmod(limit, n), evaluations)
+            _descend(model, data, space, tracker, unit[start], *divmod(limit, n), evaluations)
             yield tracker.snapshot()
         if tracker.evaluations >= 1.2 * tracker.history[-1].evaluations:
             tracker.record()
         idle = 0 if np.any(tracker.room < before - 1e-6 * np.abs(before)) else idle + 1
-        if tracker.evaluations >= evaluations or idle == PATIENCE:
+        if tracker.evaluations + 2 > evaluations or idle == PATIENCE:
             break
     tracker.record()
     yield tracker.snapshot()
@@ -247,7 +271,8 @@ class _Spent(Exception):
 
 
 def _descend(
-    dynamics: BatchDynamics,
+    model: pin.Model,
+    data: pin.Data,
     space: StateSpace,
     tracker: _Tracker,
     start: Array,
@@ -258,7 +283,8 @@ def _descend(
     """Minimise one joint's room on one side from `start`; every state met feeds the tracker.
 
     Args:
-        dynamics: of the robot.
+        model: the robot.
+        data: of `model`.
         space: the box searched.
         tracker: what has been found; updated.
         start: a point of the unit cube, shape (2 n,).
@@ -266,34 +292,28 @@ def _descend(
         joint: index of the joint.
         evaluations: the count of the tracker at which to stop.
     """
-    n = space.n
-    data = dynamics.model.createData()
     sign = 1.0 - 2.0 * side
     width = np.concatenate([space.q_max - space.q_min, 2.0 * space.v_max])
-    last_room = np.inf
 
-    def room(unit: Array) -> float:
-        nonlocal last_room
-        if tracker.evaluations >= evaluations:
+    def room_and_slope(unit: Array) -> tuple[float, Array]:
+        if tracker.evaluations + 2 > evaluations:
             raise _Spent
         q, v = space.states(unit[None])
-        rooms = acceleration_room(dynamics, space, q, v)
+        rooms = acceleration_room(model, data, space, q, v)
         tracker.update(rooms, q, v)
-        last_room = float(rooms[0, side, joint])
-        return last_room
-
-    def slope(unit: Array) -> Array:
-        if tracker.evaluations >= evaluations:
-            raise _Spent
+        tracker.evaluations += 1
+        room = float(rooms[0, side, joint])
         # With a = sign * room, row j of M a + h stays at sign * tau_max as the state moves:
         # M[j, j] d(room) = -sign * d(M a + h)_j at constant a.
-        tracker.evaluations += 1
-        q, v = space.states(unit[None])
-        a = np.zeros(n)
-        a[joint] = sign * last_room
-        by_q, by_v, inertia = pin.computeRNEADerivatives(dynamics.model, data, q[0], v[0], a)
+        a = np.zeros(space.n)
+        a[joint] = sign * room
+        by_q, by_v, inertia = pin.computeRNEADerivatives(model, data, q[0], v[0], a)
         change = np.concatenate([by_q[joint], by_v[joint]]) * width
-        return -sign * change / inertia[joint, joint]
+        return room, -sign * change / inertia[joint, joint]
 
+    options = {"maxiter": SEARCH_STEPS, "ftol": ENOUGH, "maxcor": CORRECTIONS}
+    bounds = [(0.0, 1.0)] * len(start)
     with contextlib.suppress(_Spent):
-        descend(room, slope, start, SEARCH_STEPS, ENOUGH)
+        minimize(
+            room_and_slope, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options
+        )

@@ -1,4 +1,4 @@
-"""What becomes of an acceleration while the torque computed for it is held for a period."""
+"""The zero-order hold error: how motion differs from constant acceleration under held torque."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import pinocchio as pin
 from viability_bounds_pkg.estimation.state_space import Array
 
 SUBSTEPS = 2
-"""Runge-Kutta steps a period: its error, of order (dt / SUBSTEPS)^5, is far below the defects."""
+"""Runge-Kutta steps a period: their own error is of order (dt / SUBSTEPS)^5."""
 
 
 def mid_step_torque(model: pin.Model, q: Array, v: Array, a: Array, dt: float) -> Array:
     """Return the torque for `a` at the middle of a period in which `a` is constant.
 
-    Holding it, the acceleration is too small by about half a period's drift at the start and too
-    large by as much at the end, and right on average to second order in `dt`.
+    Holding it, the acceleration is off by about half a period times the jerk at the start and,
+    the other way, at the end, and right on average to second order in `dt`.
 
     Args:
         model: the robot.
@@ -31,8 +31,8 @@ def mid_step_torque(model: pin.Model, q: Array, v: Array, a: Array, dt: float) -
     return _inverse_dynamics(model, q_mid, v + 0.5 * dt * a, a)
 
 
-def acceleration_rate(model: pin.Model, q: Array, v: Array, a: Array) -> tuple[Array, Array]:
-    """Return the torque for `a` and how fast the acceleration changes while it is held.
+def jerk_under_held_torque(model: pin.Model, q: Array, v: Array, a: Array) -> tuple[Array, Array]:
+    """Return the torque for `a` and the jerk while it is held.
 
     The time derivative of ``M a + h = tau`` at constant tau: ``M da/dt`` is
     ``-(dtau/dq v + dtau/dv a)``, with the partial derivatives of the inverse dynamics.
@@ -44,7 +44,7 @@ def acceleration_rate(model: pin.Model, q: Array, v: Array, a: Array) -> tuple[A
         a: accelerations, shape (batch, n), rad/s^2.
 
     Returns:
-        Torques, shape (batch, n), N m, and rates, shape (batch, n), rad/s^3.
+        Torques, shape (batch, n), N m, and jerks, shape (batch, n), rad/s^3.
     """
     data = model.createData()
     tau, drive = np.empty_like(q), np.empty_like(q)
@@ -56,13 +56,13 @@ def acceleration_rate(model: pin.Model, q: Array, v: Array, a: Array) -> tuple[A
     return tau, -np.linalg.solve(inertia, drive[..., None])[..., 0]
 
 
-def hold_defects(
+def zero_order_hold_error(
     model: pin.Model, q: Array, v: Array, a: Array, tau: Array, dt: float, substeps: int = SUBSTEPS
 ) -> Array:
-    """Integrate ``M a + h = tau`` with `tau` held and return the three defects of `HoldDefects`.
+    """Integrate ``M a + h = tau`` with `tau` held; return the errors of `ZeroOrderHoldError`.
 
     Classical Runge-Kutta; a(t) is looked at where the integrator's steps begin and end, which
-    includes both ends of the period, where the drift, linear in time to first order, is largest.
+    includes both ends of the period, where the error, linear in time to first order, is largest.
 
     Args:
         model: the robot.
@@ -74,11 +74,11 @@ def hold_defects(
         substeps: integration steps.
 
     Returns:
-        Defects of acceleration, mean acceleration and position, shape (batch, 3, n).
+        Errors of acceleration, mean acceleration and position, shape (batch, 3, n).
     """
     step = dt / substeps
     q_now, v_now = q, v
-    drift = np.zeros_like(q)
+    error = np.zeros_like(q)
     for _ in range(substeps):
         a_1 = _forward_dynamics(model, q_now, v_now, tau)
         v_2 = v_now + 0.5 * step * a_1
@@ -87,13 +87,13 @@ def hold_defects(
         a_3 = _forward_dynamics(model, q_now + 0.5 * step * v_2, v_3, tau)
         v_4 = v_now + step * a_3
         a_4 = _forward_dynamics(model, q_now + step * v_3, v_4, tau)
-        drift = np.maximum(drift, np.abs(a_1 - a))
+        error = np.maximum(error, np.abs(a_1 - a))
         q_now = q_now + step / 6 * (v_now + 2 * v_2 + 2 * v_3 + v_4)
         v_now = v_now + step / 6 * (a_1 + 2 * a_2 + 2 * a_3 + a_4)
-    drift = np.maximum(drift, np.abs(_forward_dynamics(model, q_now, v_now, tau) - a))
+    error = np.maximum(error, np.abs(_forward_dynamics(model, q_now, v_now, tau) - a))
     mean = np.abs((v_now - v) / dt - a)
     position = np.abs(q_now - q - dt * v - 0.5 * dt**2 * a)
-    return np.stack([drift, mean, position], axis=1)
+    return np.stack([error, mean, position], axis=1)
 
 
 def _inverse_dynamics(model: pin.Model, q: Array, v: Array, a: Array) -> Array:

@@ -71,12 +71,12 @@ def available(
     low, high, braking = np.empty(n), np.empty(n), np.empty((n, 2))
     for j in range(n):
         spread = 0.0
-        drift = 0.0
+        free = 0.0
         for i in range(n):
             spread += abs(inverse[j, i]) * tau_max[i]
-            drift -= inverse[j, i] * h[i]
-        high[j] = min(peak[j], max(a_max[j], drift + spread))
-        low[j] = -min(peak[j], max(-a_min[j], spread - drift))
+            free -= inverse[j, i] * h[i]
+        high[j] = min(peak[j], max(a_max[j], free + spread))
+        low[j] = -min(peak[j], max(-a_min[j], spread - free))
         braking[j, 0] = (tau_max[j] + h[j]) / M[j, j]
         braking[j, 1] = (tau_max[j] - h[j]) / M[j, j]
     return low, high, braking
