@@ -128,11 +128,12 @@ def available_torque(tau_max: ArrayLike, torque_reserve: ArrayLike) -> Array:
     Raises:
         LimitEstimateError: the reserve is negative, or leaves nothing.
     """
-    tau_max = np.asarray(tau_max, dtype=float)
+    tau_max = np.asarray(tau_max, dtype=np.float64)
     reserve = np.broadcast_to(np.asarray(torque_reserve, dtype=float), tau_max.shape)
     if not np.all((reserve >= 0) & (reserve < tau_max)):
         raise LimitEstimateError("torque_reserve must be at least zero and below tau_max")
-    return tau_max - reserve
+    left: Array = tau_max - reserve
+    return left
 
 
 def estimate_acceleration_limits(
@@ -283,4 +284,5 @@ def unavailable_share(
     q, v = space.states(np.random.default_rng(seed).random((samples, 2 * space.n)))
     room = acceleration_room(model, model.createData(), space, q, v)
     wanted = np.stack([limits.a_max, -limits.a_min])
-    return np.mean(np.any(room < wanted, axis=1), axis=0)
+    share: Array = np.mean(np.any(room < wanted, axis=1), axis=0)
+    return share

@@ -16,6 +16,8 @@ clipped to the acceleration limits and, if they still cross, both set to their m
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -147,7 +149,9 @@ def rubrecht_bounds(
     return _to_reach(v, rubrecht_velocity_range(q, limits, dt), limits, dt)
 
 
-def _velocity_range(q: ArrayLike, limits: JointLimits, towards) -> tuple[Array, Array]:
+def _velocity_range(
+    q: ArrayLike, limits: JointLimits, towards: Callable[[Array, Array], Array]
+) -> tuple[Array, Array]:
     q = np.asarray(q, dtype=np.float64)
     upper = towards(limits.q_max - q, -limits.a_min)
     lower = -towards(q - limits.q_min, limits.a_max)

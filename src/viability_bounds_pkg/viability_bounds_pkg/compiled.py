@@ -12,7 +12,7 @@ import hashlib
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, overload
 
 from numba import njit
 from numba.core.caching import FunctionCache
@@ -23,7 +23,11 @@ _NOT_CALLED = {"node", "nodes", "ros", "parameters", "cli", "tools", "__pycache_
 """Folders that compiled functions never call: the maths does not import them."""
 
 
-def compiled(function: F | None = None, **options: Any) -> Any:
+@overload
+def compiled(function: F) -> F: ...
+@overload
+def compiled(*, error_model: str) -> Callable[[F], F]: ...
+def compiled(function: Any = None, **options: Any) -> Any:
     """Compile a function at its first call with Numba, and keep the result for later processes.
 
     Args:
@@ -41,7 +45,7 @@ class _SourceCache(FunctionCache):
     """Numba's cache of one function, which also looks at the sources around it."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        super().__init__(function)
+        super().__init__(function)  # type: ignore[no-untyped-call]
         file = self._cache_file
         # When this stamp differs from the one in the cache, Numba drops what is there.
         file._source_stamp = (file._source_stamp, _digest(function.__module__.partition(".")[0]))

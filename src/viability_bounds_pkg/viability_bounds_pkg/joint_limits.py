@@ -25,7 +25,7 @@ class JointLimitsError(ArmSafetyError, ValueError):
         allowed: what would have been accepted.
     """
 
-    def __init__(self, field: str, joint: str | None, value: object, allowed: str):
+    def __init__(self, field: str, joint: str | None, value: object, allowed: str) -> None:
         self.field = field
         self.joint = joint
         self.value = value
@@ -59,7 +59,7 @@ class JointLimits:
     a_min: NDArray[np.float64]
     a_max: NDArray[np.float64]
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         names = _checked_names(self.names)
         object.__setattr__(self, "names", names)
         for field in ("q_min", "q_max", "v_max", "a_min", "a_max"):

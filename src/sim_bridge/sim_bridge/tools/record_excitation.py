@@ -32,7 +32,6 @@ from viability_bounds_pkg.cli.limits_file import (
     node_parameters,
     write_whole,
 )
-from viability_bounds_pkg.exceptions import SettingError
 
 
 def _share(text: str) -> float:
@@ -134,8 +133,7 @@ def record(
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the tool; return its exit code: 0, 1 for an error, 2 for usage, 130 for an interrupt."""
     options = _parse(arguments)
-    errors = (ParameterFileError, SettingError, ExcitationError)
-    return run_tool("record_excitation", lambda: _run(options), errors)
+    return run_tool("record_excitation", lambda: _run(options))
 
 
 if __name__ == "__main__":

@@ -28,7 +28,6 @@ from viability_bounds_pkg.cli.limits_file import (
     read_robot,
     write_whole,
 )
-from viability_bounds_pkg.robot_description import RobotDescriptionError
 
 NODE = "/**/controller_node"
 """The node whose parameters the friction is."""
@@ -120,8 +119,7 @@ def _rounded(values: np.ndarray) -> np.ndarray:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the tool; return its exit code: 0, 1 for an error, 2 for usage, 130 for an interrupt."""
     options = _parse(arguments)
-    errors = (ParameterFileError, RecordingError, RobotDescriptionError)
-    return run_tool("identify_friction", lambda: _run(options), errors)
+    return run_tool("identify_friction", lambda: _run(options))
 
 
 if __name__ == "__main__":

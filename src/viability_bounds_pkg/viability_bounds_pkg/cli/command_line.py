@@ -7,6 +7,8 @@ import sys
 from collections.abc import Callable
 from typing import NoReturn
 
+from viability_bounds_pkg.exceptions import ArmSafetyError
+
 INTERRUPTED = 130
 """Exit code of a program ended by SIGINT, as shells report it."""
 
@@ -27,17 +29,16 @@ def positive(text: str) -> float:
     return value
 
 
-def run_tool(name: str, tool: Callable[[], int], errors: tuple[type[Exception], ...]) -> int:
+def run_tool(name: str, tool: Callable[[], int]) -> int:
     """Run a tool; return its exit code: its own, 1 for an error, 130 for an interrupt.
 
     Args:
         name: of the tool.
         tool: returns its exit code.
-        errors: that are the user's to mend, besides those of the operating system.
     """
     try:
         return tool()
-    except (*errors, OSError) as error:
+    except (ArmSafetyError, OSError) as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

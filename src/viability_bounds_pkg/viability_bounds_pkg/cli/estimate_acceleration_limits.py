@@ -39,7 +39,6 @@ from viability_bounds_pkg.estimation.discretisation_margin import (
 )
 from viability_bounds_pkg.estimation.state_space import Array, LimitEstimateError, StateSpace
 from viability_bounds_pkg.estimation.worst_case_search import WorstCases
-from viability_bounds_pkg.robot_description import RobotDescriptionError
 
 
 def _count(text: str) -> int:
@@ -246,8 +245,7 @@ def _origin(options: argparse.Namespace, worst: WorstCases, interrupted: bool) -
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the tool; return its exit code: 0, 1 for an error, 2 for usage, 130 for an interrupt."""
     options = _parse(arguments)
-    errors = (LimitEstimateError, ParameterFileError, RobotDescriptionError)
-    return run_tool("estimate_acceleration_limits", lambda: _run(options), errors)
+    return run_tool("estimate_acceleration_limits", lambda: _run(options))
 
 
 if __name__ == "__main__":

@@ -81,26 +81,26 @@ def read_robot(path: Path) -> Robot:
     _check_limits(urdf, parameters["robot_description"])
     rotor_inertia = _numbers(parameters, "rotor_inertia", len(joints), path)
     model = build_model(urdf, joints, locked_positions, rotor_inertia)
-    limits = {}
-    for key, from_urdf in (
-        ("position_min", model.lowerPositionLimit),
-        ("position_max", model.upperPositionLimit),
-        ("velocity_max", model.velocityLimit),
-        ("torque_max", model.effortLimit),
-    ):
-        limits[key] = _numbers(parameters, key, len(joints), path)
-        if limits[key] is not None:
-            continue
-        limits[key] = np.array(from_urdf)
-        if key.startswith("position"):
-            continue
+
+    def limit(key: str, from_urdf: Array) -> Array:
+        given = _numbers(parameters, key, len(joints), path)
+        if given is not None:
+            return given
         for joint, value in zip(joints, from_urdf, strict=True):
-            if not (math.isfinite(value) and value > 0):
+            if not key.startswith("position") and not (math.isfinite(value) and value > 0):
                 raise ParameterFileError(
                     f"{path}: joint {joint} has no limit in the URDF to use: "
                     f"parameter '{key}' is missing"
                 )
-    return Robot(model, *limits.values())
+        return np.array(from_urdf)
+
+    return Robot(
+        model,
+        limit("position_min", model.lowerPositionLimit),
+        limit("position_max", model.upperPositionLimit),
+        limit("velocity_max", model.velocityLimit),
+        limit("torque_max", model.effortLimit),
+    )
 
 
 def _check_limits(urdf: str, source: str) -> None:

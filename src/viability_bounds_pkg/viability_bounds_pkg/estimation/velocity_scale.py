@@ -65,7 +65,7 @@ def largest_velocity_scale(
     names = list(model.names)[1:]
     counted = np.array([name not in ignore for name in names])
     q, v = space.states(np.random.default_rng(seed).random((max(samples, 1), 2 * space.n)))
-    found = VelocityScale(1.0, None, *np.full((2, space.n), np.nan), np.nan)
+    found = _unlimited(space.n)
     for attempt in range(20):
         found = min(
             found, _scale_allowed(model, space, q, v, required, counted), key=lambda f: f.scale
@@ -84,6 +84,11 @@ def largest_velocity_scale(
     return found
 
 
+def _unlimited(n: int) -> VelocityScale:
+    nothing = np.full(n, np.nan)
+    return VelocityScale(1.0, None, nothing, nothing, np.nan)
+
+
 def _scale_allowed(
     model: pin.Model, space: StateSpace, q: Array, v: Array, required: float, counted: Array
 ) -> VelocityScale:
@@ -100,7 +105,7 @@ def _scale_allowed(
     square = np.where(counted, square, np.inf)
     least = square.min()
     if not least < 1.0:
-        return VelocityScale(1.0, None, *np.full((2, space.n), np.nan), np.nan)
+        return _unlimited(space.n)
     # Where several states allow nothing, name the one whose weight is the most beyond.
     rank = np.where(square == least, slack / inertia, np.inf)
     _, row, j = np.unravel_index(np.argmin(rank), rank.shape)

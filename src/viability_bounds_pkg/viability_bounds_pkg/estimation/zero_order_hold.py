@@ -53,7 +53,7 @@ def jerk_under_held_torque(model: pin.Model, q: Array, v: Array, a: Array) -> tu
         by_q, by_v, inertia[i] = pin.computeRNEADerivatives(model, data, q_i, v_i, a_i)
         tau[i] = data.tau
         drive[i] = by_q @ v_i + by_v @ a_i
-    return tau, -np.linalg.solve(inertia, drive[..., None])[..., 0]
+    return tau, -np.asarray(np.linalg.solve(inertia, drive[..., None])[..., 0], dtype=float)
 
 
 def zero_order_hold_error(

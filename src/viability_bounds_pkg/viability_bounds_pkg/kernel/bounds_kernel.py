@@ -144,7 +144,7 @@ def _bound_towards(
 def _end_speed(budget: float, limit: np.record, curves: NDArray[np.void]) -> float:
     """Return the largest end-of-step speed w with ``dt w / 2 + U(w) <= budget``."""
     c = limit.twice_braking * budget
-    parabola = c / (limit.k + sqrt(limit.k_squared + c))
+    parabola: float = c / (limit.k + sqrt(limit.k_squared + c))
     if limit.points == 0 or parabola % limit.period >= limit.peak:
         return parabola
     low, end = limit.first, limit.first + limit.points
@@ -162,10 +162,12 @@ def _end_speed(budget: float, limit: np.record, curves: NDArray[np.void]) -> flo
         length, per_step = budget / limit.dt, 2.0 * limit.k
         steps = floor(0.5 * (sqrt(1.0 + 8.0 * length / per_step) - 1.0))
         rest = length - 0.5 * per_step * steps * (steps + 1.0)
-        return max(before.speed, per_step * steps + rest / (steps + 1.0))
+        braked: float = max(before.speed, per_step * steps + rest / (steps + 1.0))
+        return braked
     after = curves[low]
     share = (budget - before.budget) / (after.budget - before.budget)
-    return before.speed + (after.speed - before.speed) * share
+    speed: float = before.speed + (after.speed - before.speed) * share
+    return speed
 
 
 @compiled(error_model="numpy")
@@ -188,4 +190,5 @@ def _settle(
         a = 0.5 * (lower + upper)
     dt, v_max, margin = limit.dt, limit.v_max, limit.margin
     a = max(min(a, (v_max - v) / dt - margin), (-v_max - v) / dt + margin)
-    return max(min(a, limit.high), limit.low)
+    clipped: float = max(min(a, limit.high), limit.low)
+    return clipped

@@ -121,7 +121,8 @@ class _Joint(NamedTuple):
             updated = [_stopping_room(grids[i], backs[i]) for i in (0, 1)]
             change = max(float(np.max(rooms[i] - updated[i])) for i in (0, 1))
             rooms = updated
-            curves = tuple(self.curve(i, grids[i], backs[i], rooms[i]) for i in (0, 1))
+            first, second = (self.curve(i, grids[i], backs[i], rooms[i]) for i in (0, 1))
+            curves = (first, second)
             if change <= CONVERGED * slow:
                 break
         return curves

@@ -172,7 +172,7 @@ def _room_at_full_speed(limit: np.record, curve: StoppingCurve, last: float) -> 
 
 def highest_speeds(room: Array, limit: np.record, curves: NDArray[np.void]) -> Array:
     """Return the highest viable speed towards a limit, rad/s, where `room` >= 0 is left."""
-    speed = np.sqrt(limit["twice_braking"] * np.maximum(room, 0.0))
+    speed: Array = np.sqrt(limit["twice_braking"] * np.maximum(room, 0.0))
     v_max = limit["v_max"]
     if limit["points"]:
         curve = curves[limit["first"] : limit["first"] + limit["points"]]
