@@ -8,11 +8,20 @@ setup(
     name=PACKAGE,
     version="0.1.0",
     packages=find_packages(exclude=["test"]),
+    package_data={PACKAGE: ["py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
     ],
-    install_requires=["setuptools"],
+    python_requires=">=3.10",
+    install_requires=[
+        "daqp>=0.7",
+        "numpy>=1.26",
+        "pin>=3",
+        "proxsuite>=0.6",
+        "tqdm>=4",
+        "viability_bounds_pkg",
+    ],
     zip_safe=True,
     maintainer="The viability bounds authors",
     maintainer_email="maintainers@viability-bounds.example.org",
@@ -20,7 +29,7 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "controller_node = torque_safety_controller.node.controller_node:main",
+            "controller_node = torque_safety_controller.cli.ros_program:controller_node",
             "identify_friction = torque_safety_controller.cli.identify_friction:main",
         ],
     },

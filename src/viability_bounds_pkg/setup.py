@@ -8,11 +8,20 @@ setup(
     name=PACKAGE,
     version="0.1.0",
     packages=find_packages(exclude=["test"]),
+    package_data={PACKAGE: ["py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
     ],
-    install_requires=["setuptools"],
+    python_requires=">=3.10",
+    install_requires=[
+        "numba>=0.59",
+        "numpy>=1.26",
+        "pin>=3",
+        "PyYAML>=6",
+        "scipy>=1.11",
+        "tqdm>=4",
+    ],
     zip_safe=True,
     maintainer="The viability bounds authors",
     maintainer_email="maintainers@viability-bounds.example.org",
@@ -20,7 +29,7 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "bounds_node = viability_bounds_pkg.node.bounds_node:main",
+            "bounds_node = viability_bounds_pkg.cli.ros_program:bounds_node",
             "estimate_acceleration_limits = "
             "viability_bounds_pkg.cli.estimate_acceleration_limits:main",
         ],

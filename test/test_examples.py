@@ -1,0 +1,33 @@
+"""Every example runs, keeps every limit, and says so."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+SAYS = {
+    "bounds_alone": r"exact bounds 0\.0e\+00, naive bounds [1-9]",
+    "chain_of_nodes": r"positions at most 0 rad beyond their\nlimits, speeds 0 rad/s",
+    "controller_without_ros": r"rad, .* rad/s, .* N m inside\njoints at rest on a limit: \['",
+    "limits_from_urdf": r"torque does not suffice: 0 of 5000",
+}
+
+
+def test_every_example_is_run_here():
+    assert {path.stem for path in EXAMPLES.glob("*.py")} == set(SAYS)
+
+
+@pytest.mark.parametrize("name", SAYS)
+def test_example(name):
+    ended = subprocess.run(
+        [sys.executable, EXAMPLES / f"{name}.py"],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    assert re.search(SAYS[name], ended.stdout), ended.stdout
