@@ -10,10 +10,10 @@ import numpy as np
 import pinocchio as pin
 import yaml
 
-from sim_bridge.bullet.joint_friction import Gears
+from sim_bridge.bullet.client import pybullet, silenced
+from sim_bridge.bullet.joint_friction import JointFriction
 from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.bullet.obstacles import Obstacle
-from sim_bridge.bullet.quiet_pybullet import pybullet, silenced
 from sim_bridge.bullet.robot import BulletRobot
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 
@@ -28,7 +28,7 @@ SOLVERS = {
 
 
 class Configured:
-    """A robot of ``config/`` and its gears; arrays of shape (n,)."""
+    """A robot of ``config/`` and its joint friction; arrays of shape (n,)."""
 
     def __init__(self, name: str) -> None:
         content = yaml.safe_load((ROOT / "config" / f"{name}.yaml").read_text())
@@ -48,15 +48,15 @@ class Configured:
         )
 
     def robot(
-        self, body: dict[str, object] | None = None, *, masses: bool = False, **gears: object
+        self, body: dict[str, object] | None = None, *, masses: bool = False, **friction: object
     ) -> BulletRobot:
-        """Return a simulated robot with such gears; `body` is what `BulletBody` takes."""
+        """Return a simulated robot with such joint friction; `body` is what `BulletBody` takes."""
         robot = BulletRobot(
             self.urdf,
             self.joints,
             locked_positions=self.locked,
             physics_dt=H,
-            gears=Gears(len(self.joints), **gears),
+            joint_friction=JointFriction(len(self.joints), **friction),
             mass_scales=self.masses if masses else None,
             **(body or {}),
         )
@@ -95,7 +95,7 @@ def cost_of_pressing(arm: Configured, robot: BulletRobot) -> tuple[float, int, f
     model = build_model(arm.urdf, arm.joints, arm.locked)
     data, frame = model.createData(), model.getFrameId(arm.hand)
     robot.reset(arm.q, zero)
-    hand = robot.link_pose(arm.hand)[0]
+    hand = robot.link_pose(arm.hand).translation
     low = hand - [0.0, 0.0, 0.3]
     robot.add_obstacle(Obstacle("table", "box", [0.4, 0.4, 0.1], low))
     for _ in range(4000):
@@ -111,16 +111,16 @@ def cost_of_pressing(arm: Configured, robot: BulletRobot) -> tuple[float, int, f
     return 1e6 * best, len(robot.contacts()), robot.contact_force()[0]
 
 
-def surroundings(arm: Configured, gears: dict[str, object]) -> None:
+def surroundings(arm: Configured, friction: dict[str, object]) -> None:
     """Measure and print what shapes, a sensor and obstacles cost."""
     print(f"\nmicroseconds a physics step of {arm.name}")
     cases = {"without shapes": {"collisions": False}, "with shapes": {}}
     if arm.sensor:
         cases["with a sensor, in each step"] = {"sensor_frame": arm.sensor}
     for case, body in cases.items():
-        with closing(arm.robot(body, **gears)) as robot:
+        with closing(arm.robot(body, **friction)) as robot:
             print(f"  {case:30s} {cost(arm, robot):6.1f}")
-    with closing(arm.robot(**gears)) as robot:
+    with closing(arm.robot(**friction)) as robot:
         robot.reset(arm.q, np.zeros(len(arm.joints)))
         for count in (1, 10):
             for i in range(count):
@@ -186,8 +186,8 @@ def main() -> None:
         "friction": arm.friction,
         "rotors and friction": {"rotor_inertia": arm.rotors, **arm.friction},
     }
-    for case, gears in cases.items():
-        with closing(arm.robot(**gears)) as robot:
+    for case, friction in cases.items():
+        with closing(arm.robot(**friction)) as robot:
             print(f"  {'':16s} with {case:24s} {cost(arm, robot):6.1f}")
     everything = {"rotor_inertia": arm.rotors, "torque_bias": 0.1, **arm.friction}
     with closing(arm.robot(masses=True, **everything)) as robot:
@@ -209,8 +209,8 @@ def main() -> None:
             f"  {name:20s} {took:6.1f} us, error {error:.1e} of the friction,"
             f" a held joint creeps at {creep:.1e} rad/s"
         )
-    for name, gears in (("panda", {}), (arm.name, everything)):
-        surroundings(Configured(name), gears)
+    for name, friction in (("panda", {}), (arm.name, everything)):
+        surroundings(Configured(name), friction)
 
 
 if __name__ == "__main__":

@@ -56,13 +56,7 @@ class DirectLoop:
         bullet = self._values("bullet_node", bullet_parameters.TABLE)
         config = bullet_parameters.make_configuration(bullet)
         self.robot = bullet_parameters.make_robot(config, bullet)
-        self.robot.monitor = LimitMonitor(
-            config.q_min,
-            config.q_max,
-            config.v_max,
-            config.tau_max,
-            torque_tolerance=1e-9 * float(config.tau_max.max()),
-        )
+        self.robot.monitor = LimitMonitor(config.q_min, config.q_max, config.v_max, config.tau_max)
         self.config = config
         self.model = build_model(
             read_urdf(bullet["robot_description"]),

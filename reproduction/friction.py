@@ -130,10 +130,10 @@ def push_elbow(changes: dict[str, float], share: float) -> tuple[float, float]:
     loop = start({"integral_action": "task"}, share)
     loop.change(**changes)
     loop.run(1.0)
-    before = loop.robot.link_pose(ELBOW)[0]
+    before = loop.robot.link_pose(ELBOW).translation
     loop.robot.apply_wrench(ELBOW, PUSH, (0.0, 0.0, 0.0))
     samples = loop.run(PUSHED)
-    after = loop.robot.link_pose(ELBOW)[0]
+    after = loop.robot.link_pose(ELBOW).translation
     return float(np.linalg.norm(after - before)), float(distance(samples).max())
 
 

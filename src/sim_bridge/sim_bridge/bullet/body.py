@@ -1,4 +1,4 @@
-"""The body of a robot in a PyBullet world: its links, and all that acts on them but motors."""
+"""The links of a robot in a PyBullet world, with external wrenches, obstacles and a sensor."""
 
 from __future__ import annotations
 
@@ -7,19 +7,22 @@ from collections.abc import Mapping, Sequence
 from xml.etree.ElementTree import fromstring
 
 import numpy as np
-from numpy.typing import ArrayLike
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
 
-from sim_bridge.bullet.force_torque_sensor import ForceTorqueSensor, Push
-from sim_bridge.bullet.obstacles import Contact, ContactMaterial, Obstacle
+from sim_bridge.bullet.force_torque_sensor import ForceTorqueSensor
+from sim_bridge.bullet.obstacles import Contact, ContactMaterial, LinkWrench, Obstacle
 from sim_bridge.bullet.vectors import finite_vector
 from sim_bridge.bullet.world import BulletWorld
 from sim_bridge.urdf.links import carried_links
 from sim_bridge.urdf.preparation import FramePlacement, prepare_urdf
 from viability_bounds_pkg.robot_description import RobotDescriptionError
 
+Array = NDArray[np.float64]
+
 
 class BulletBody:
-    """The links of a robot fixed to the ground, alone in a world but for obstacles.
+    """The links of a robot fixed to the ground, in a world of its own with obstacles.
 
     Args:
         urdf_text: the URDF.
@@ -28,16 +31,14 @@ class BulletBody:
         locked_positions: where other joints are locked, rad or m; those left out are at zero.
         gravity: acceleration of gravity in the base frame, m/s^2.
         mass_scales: factors for mass and inertia of links, by name.
-        mechanical_stops: stop joints hard at their position limits.
-        visuals: load the visual shapes, for cameras.
         collisions: load the collision shapes, meshes as their convex hulls, for contacts.
-        material: of obstacles; hard, with a friction of 0.5, by default.
-        sensor_frame: link that is a force/torque sensor; none if empty.
-        rotor_inertias: as `prepare_urdf` has them.
+        material: of obstacles; stiff, with a friction of 0.5, by default.
+        sensor_frame: link that is a force/torque sensor; no sensor if empty.
+        rotor_inertias: of `prepare_urdf`.
 
     Attributes:
         description: URDF, moving joints, and where others are locked.
-        client_id: PyBullet's physics client, for cameras.
+        client_id: PyBullet's physics client.
         body_id: the robot in that client.
 
     Raises:
@@ -54,8 +55,6 @@ class BulletBody:
         locked_positions: Mapping[str, float] | None = None,
         gravity: ArrayLike = (0.0, 0.0, -9.81),
         mass_scales: Mapping[str, float] | None = None,
-        mechanical_stops: bool = False,
-        visuals: bool = False,
         collisions: bool = True,
         material: ContactMaterial | None = None,
         sensor_frame: str = "",
@@ -65,29 +64,27 @@ class BulletBody:
             raise ValueError(f"physics_dt must be positive and finite, not {physics_dt}")
         self.joints, self.physics_dt = tuple(joints), physics_dt
         self.description = urdf_text, self.joints, dict(locked_positions or {})
-        gravity = finite_vector("gravity", gravity, 3)
+        gravity_vector = finite_vector("gravity", gravity, 3)
         prepared = prepare_urdf(
             urdf_text,
             joints,
             locked_positions,
-            visuals=visuals,
             collisions=collisions,
-            mechanical_stops=mechanical_stops,
             apart=carried_links(fromstring(urdf_text), sensor_frame) if sensor_frame else (),
             mass_scales=mass_scales,
             rotor_inertias=rotor_inertias,
         )
         self._frames = prepared.frames
-        self._shapeless = "; ".join(prepared.missing) if collisions else "none was asked for"
-        self._wrenches: dict[str, tuple[FramePlacement, list[float], list[float]]] = {}
+        self._missing_shapes = "; ".join(prepared.missing) if collisions else "not loaded"
+        self._wrenches: dict[str, LinkWrench] = {}
         self._world = BulletWorld(
             prepared,
             self.joints,
             physics_dt,
-            gravity.tolist(),
+            gravity_vector.tolist(),
             material or ContactMaterial(),
         )
-        self._sensor = None
+        self._sensor: ForceTorqueSensor | None = None
         if sensor_frame:
             self._sensor = ForceTorqueSensor(
                 urdf_text,
@@ -95,13 +92,13 @@ class BulletBody:
                 self.joints,
                 locked_positions,
                 mass_scales,
-                gravity,
+                gravity_vector,
                 physics_dt,
             )
         self.client_id, self.body_id = self._world.client_id, self._world.body_id
 
     def apply_wrench(self, link: str, force: ArrayLike, torque: ArrayLike) -> None:
-        """Push on a link, from the next physics step until `clear_wrenches`.
+        """Apply a wrench to a link, from the next physics step until `clear_wrenches`.
 
         Wrenches on several links add up; a new one on the same link replaces the old.
 
@@ -111,34 +108,40 @@ class BulletBody:
             force: shape (3,), N, in world-aligned axes.
             torque: shape (3,), N m, in world-aligned axes.
         """
-        frame = self._frame(link)
-        force, torque = finite_vector("force", force, 3), finite_vector("torque", torque, 3)
-        self._wrenches[link] = frame, force.tolist(), torque.tolist()
+        self._frame(link)  # or it raises
+        self._wrenches[link] = LinkWrench(
+            link, None, finite_vector("force", force, 3), finite_vector("torque", torque, 3)
+        )
+
+    def _apply_wrenches(self) -> None:
+        """Let the wrenches act in the next physics step."""
+        for wrench in self._wrenches.values():
+            self._world.apply_wrench(self._frames[wrench.link], wrench)
 
     def clear_wrenches(self, link: str | None = None) -> None:
-        """Take the wrench on `link` off, or all wrenches."""
+        """Remove the wrench on `link`, or all wrenches."""
         if link is None:
             self._wrenches.clear()
         else:
             self._wrenches.pop(link, None)
 
     def add_obstacle(self, obstacle: Obstacle) -> None:
-        """Put an obstacle into the world, in place of the one of its name if there is one.
+        """Add an obstacle, replacing the one of its name if there is one.
 
         Raises:
-            RobotDescriptionError: the robot's collision shapes are not all there.
-            ObstacleError: the robot is where it should be.
+            RobotDescriptionError: collision shapes of the robot are missing.
+            ObstacleError: it overlaps the robot.
         """
-        if self._shapeless:
-            raise RobotDescriptionError(f"collision shapes are missing: {self._shapeless}")
+        if self._missing_shapes:
+            raise RobotDescriptionError(f"collision shapes are missing: {self._missing_shapes}")
         self._world.obstacles.add(obstacle)
 
     def remove_obstacle(self, name: str) -> bool:
-        """Take an obstacle out of the world; return whether there was one of that name."""
+        """Remove an obstacle; return whether there was one of that name."""
         return self._world.obstacles.remove(name)
 
     def clear_obstacles(self) -> None:
-        """Take all obstacles out of the world."""
+        """Remove all obstacles."""
         self._world.obstacles.clear()
 
     @property
@@ -147,20 +150,20 @@ class BulletBody:
         return self._world.obstacles.present
 
     def contacts(self) -> list[Contact]:
-        """Return where obstacles pushed on the robot in the last physics step."""
+        """Return the contact points with obstacles in the last physics step."""
         return self._world.obstacles.contacts()
 
     def contact_force(self) -> tuple[float, float]:
         """Return the largest force of an obstacle, N: in the last step, and since the reset."""
         return self._world.obstacles.force, self._world.obstacles.force_max
 
-    def sensor_wrench(self) -> np.ndarray:
-        """Return what the force/torque sensor felt in the last physics step.
+    def sensor_wrench(self) -> Array:
+        """Return what the force/torque sensor measured in the last physics step.
 
         Returns:
-            Force, N, and moment, N m, on the sensor of all that is mounted on it: contacts and
-            pushes, weight and inertia; at the origin of `sensor_frame`, in its axes, shape (6,).
-            Right after a reset it is what it would feel if nothing accelerated.
+            Force, N, and moment, N m, on the sensor of all links beyond it: contacts, external
+            wrenches, weight and inertia; at the origin of `sensor_frame`, in its axes, shape (6,).
+            After a reset it is that of zero accelerations.
 
         Raises:
             ValueError: there is no sensor.
@@ -169,23 +172,22 @@ class BulletBody:
             raise ValueError("the robot has no force/torque sensor")
         return self._sensor.wrench.copy()
 
-    def _feel(self, q: np.ndarray, v: np.ndarray, v_next: np.ndarray) -> None:
-        """Let the sensor feel a step from (q, v) to v_next; see `ForceTorqueSensor`."""
-        pushes = [Push(link, None, *wrench[1:]) for link, wrench in self._wrenches.items()]
-        pushes += [Push(*force) for force in self._world.obstacles.forces()]
-        self._sensor.update(q, v, v_next, pushes)
+    def _measure(self, q: Array, v: Array, v_next: Array) -> None:
+        """Update the sensor, if there is one, by a step from (q, v) to v_next."""
+        if self._sensor is None:
+            return
+        wrenches = [*self._wrenches.values(), *self._world.obstacles.wrenches()]
+        self._sensor.update(q, v, v_next, wrenches)
 
-    def link_pose(self, link: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return where a link is, by PyBullet's own joint positions.
+    def link_pose(self, link: str) -> pin.SE3:
+        """Return the pose of any link of the URDF in the frame of its root link.
 
-        Returns:
-            Position, shape (3,), m, and orientation, shape (4,), a quaternion x, y, z, w, of
-            any link of the URDF in the frame of its root link.
+        It is PyBullet's, at PyBullet's own joint positions.
         """
         return self._world.pose(self._frame(link))
 
     def close(self) -> None:
-        """Leave the physics world; after that the robot is of no more use."""
+        """Disconnect from PyBullet; the robot cannot be used afterwards."""
         self._world.close()
 
     def _frame(self, link: str) -> FramePlacement:

@@ -1,36 +1,51 @@
 """Coulomb friction between a link and an obstacle.
 
 The two are connected by a bristle: a spring of deflection s along the surface, with a little
-damping, that gives way where Coulomb's law ends what it can bear,
+damping, that slips where its force reaches Coulomb's limit,
 
     s+ = s + h v_t,   f = -(k s+ + d v_t),   |f| <= mu N:   else  f = mu N f / |f|,  s+ = -f / k,
 
-with v_t the velocity along the surface and N the pressure, both of the last physics step. At
+with v_t the velocity along the surface and N the normal force, both of the last physics step. At
 rest it holds as stiction does; in motion f opposes v_t with mu N in any direction.
 
-The force is explicit, which is stable for links of more than about k h^2 / 4 + d h / 2; see
-`Bristle` for the values, which let the weakest feel as if they weighed 30 g.
+The force is explicit, which is stable for links of more than about k h^2 / 4 + d h / 2; the values
+of `Bristle` make that 30 g.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from viability_bounds_pkg.compiled import compiled
+
+Array = NDArray[Any]
 
 _STIFFNESS_MASS = 0.02  # k h^2, kg
 _DAMPING_MASS = 0.05  # d h, kg
 
 
+CONTACT_POINT = np.dtype(
+    [
+        ("position", np.float64, 3),  # on the link, m
+        ("normal", np.float64, 3),  # from the obstacle to the link
+        ("pressure", np.float64),  # normal force, N
+    ]
+)
+"""A point where a link touches an obstacle."""
+
+
 class Bristle:
-    """What holds one link on one obstacle.
+    """The friction contact between one link and one obstacle.
 
     Args:
         physics_dt: the physics step h, s.
         stiffness: of the obstacle, N/m, which k does not exceed.
 
     Attributes:
-        force: on the link in the step to come, shape (3,), N.
+        force: on the link in the next step, shape (3,), N.
         point: where it acts, the centre of pressure, shape (3,), m.
     """
 
@@ -41,14 +56,13 @@ class Bristle:
         self._deflection = np.zeros(3)
         self.force, self.point = np.zeros((2, 3))
 
-    def update(self, points: np.ndarray, motion: np.ndarray, friction: float) -> None:
-        """Find the force in the step to come from what happened in the last.
+    def update(self, points: Array, motion: Array, friction: float) -> None:
+        """Compute force and point in the next step from contacts and motion in the last.
 
         Args:
-            points: where the link is touched, shape (m, 7): position, m, direction from the
-                obstacle to the link, pressure, N.
-            motion: of the link, shape (9,): centre, m, its velocity, m/s, angular velocity,
-                rad/s.
+            points: where the link is touched, shape (m,), of `CONTACT_POINT`.
+            motion: of the link, shape (3, 3): centre of mass, m, its velocity, m/s, angular
+                velocity, rad/s.
             friction: Coulomb's coefficient.
         """
         _update(
@@ -65,17 +79,28 @@ class Bristle:
 
 
 @compiled
-def _update(points, motion, friction, dt, stiffness, damping, s, force, point):
+def _update(
+    points: Array,
+    motion: Array,
+    friction: float,
+    dt: float,
+    stiffness: float,
+    damping: float,
+    s: Array,
+    force: Array,
+    point: Array,
+) -> None:
+    centre, velocity, angular_velocity = motion
     normal = np.zeros(3)
     pressure = 0.0
     point[:] = 0.0
-    for row in points:
-        pressure += row[6]
-        point += row[6] * row[:3]
-        normal += row[6] * row[3:6]
+    for contact in points:
+        pressure += contact.pressure
+        point += contact.pressure * contact.position
+        normal += contact.pressure * contact.normal
     point /= pressure
     normal /= np.sqrt(normal @ normal)
-    v = motion[3:6] + np.cross(motion[6:], point - motion[:3])
+    v = velocity + np.cross(angular_velocity, point - centre)
     v -= (v @ normal) * normal
     s -= (s @ normal) * normal  # the surface may have turned
     s += dt * v

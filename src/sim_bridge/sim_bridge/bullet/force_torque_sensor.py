@@ -1,38 +1,34 @@
-"""What a force/torque sensor of a robot feels.
+"""The wrench that a force/torque sensor of a robot measures.
 
-Newton and Euler for all that the sensor carries, in a physics step from (q, v) to v+: the
-arm's force on it, weight, contacts and pushes make up its change of momentum,
+The Newton-Euler equations of all links beyond the sensor, in a physics step from (q, v) to v+: the
+arm's force on them, weight, contacts and external wrenches equal their change of momentum,
 
-    -w + sum I g + sum f = sum (I a + v x* I v),    a made of (v+ - v) / h,
+    -w + sum I g + sum f = sum (I a + v x* I v),    a = (v+ - v) / h  at each joint,
 
-so that w, what it does to the arm, follows from the motion, exactly as in the equations of motion
-that PyBullet solves. How PyBullet carries the force through its joints does not matter.
+so that w, their wrench on the arm, follows from the motion, exactly as in the equations of motion
+that PyBullet solves. How PyBullet transmits the force through its joints does not matter.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
-from xml.etree.ElementTree import Element, SubElement, fromstring, tostring
+from xml.etree.ElementTree import SubElement, fromstring, tostring
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
-from sim_bridge.urdf.links import carried_links, links_beyond, scale_masses
+from sim_bridge.bullet.obstacles import LinkWrench
+from sim_bridge.urdf.links import carried_links, link_at, links_beyond, scale_masses
 from viability_bounds_pkg.robot_description import build_model, kinematic_order
 
-
-class Push(NamedTuple):
-    """A wrench on a link of the robot, in world axes."""
-
-    link: str
-    point: np.ndarray | None  # where the force acts, shape (3,), m; None: the link's origin
-    force: Sequence[float]  # shape (3,), N
-    torque: Sequence[float] = (0.0, 0.0, 0.0)  # shape (3,), N m
+Array = NDArray[np.float64]
 
 
 class ForceTorqueSensor:
-    """A sensor that is a link of the robot: it feels what that link carries, but not itself.
+    """A sensor that is a link of the robot: it measures the load beyond that link.
+
+    The link's own weight and inertia are not measured.
 
     Args:
         urdf_text: the URDF.
@@ -44,7 +40,7 @@ class ForceTorqueSensor:
         physics_dt: the physics step h, s.
 
     Attributes:
-        wrench: force, N, and moment, N m, of what the sensor carries on it, shape (6,).
+        wrench: force, N, and moment, N m, of the load on the sensor, shape (6,).
 
     Raises:
         RobotDescriptionError: there is no such link, or it carries nothing.
@@ -57,15 +53,15 @@ class ForceTorqueSensor:
         joints: Sequence[str],
         locked_positions: Mapping[str, float] | None,
         mass_scales: Mapping[str, float] | None,
-        gravity: Sequence[float],
+        gravity: Array,
         physics_dt: float,
     ) -> None:
         root = fromstring(urdf_text)
         scale_masses(root, mass_scales or {})
         locked = dict(locked_positions or {})
         self._beyond = {x for link in carried_links(root, frame) for x in links_beyond(root, link)}
-        # Joints of the sensor become joints of the model, whose forces it tells.
-        mounts = [joint for joint in root.findall("joint") if _parent(joint) == frame]
+        # The joints on the sensor become joints of the model, which computes their forces.
+        mounts = [joint for joint in root.findall("joint") if link_at(joint, "parent") == frame]
         names = {joint.get("name", "") for joint in mounts}
         for joint in mounts:
             if joint.get("type") == "fixed":
@@ -73,28 +69,26 @@ class ForceTorqueSensor:
                 SubElement(joint, "limit", effort="0", velocity="0")
         text = tostring(root, encoding="unicode")
         order = kinematic_order(text, [*joints, *(names - set(joints))])
-        still = {name: locked.pop(name, 0.0) for name in names - set(joints)}
+        fixed = {name: locked.pop(name, 0.0) for name in names - set(joints)}
         self._model = model = build_model(text, order, locked)
-        model.gravity.linear = np.array(gravity)
+        model.gravity.linear = gravity
         self._data = model.createData()
         self._frame = model.getFrameId(frame, pin.FrameType.BODY)
         self._mounts = [model.getJointId(name) for name in names]
-        self._q = np.array([still.get(name, 0.0) for name in order])
+        self._q = np.array([fixed.get(name, 0.0) for name in order])
         self._v, self._a = np.zeros((2, len(order)))
         self._moving = [order.index(name) for name in joints]
         self._dt = physics_dt
-        self.wrench = np.zeros(6)
+        self.wrench: Array = np.zeros(6)
 
-    def update(
-        self, q: np.ndarray, v: np.ndarray, v_next: np.ndarray, pushes: Iterable[Push]
-    ) -> None:
-        """Feel a physics step.
+    def update(self, q: Array, v: Array, v_next: Array, wrenches: Iterable[LinkWrench]) -> None:
+        """Compute the wrench in a physics step.
 
         Args:
             q: PyBullet's own positions at its beginning, shape (n,), rad.
             v: velocities at its beginning, shape (n,), rad/s.
             v_next: velocities at its end, shape (n,), rad/s.
-            pushes: all that pushed on the robot in it.
+            wrenches: all external wrenches on the robot in it.
         """
         model, data = self._model, self._data
         self._q[self._moving], self._v[self._moving] = q, v
@@ -102,19 +96,15 @@ class ForceTorqueSensor:
         pin.rnea(model, data, self._q, self._v, self._a)
         pin.updateGlobalPlacements(model, data)
         sensor = pin.updateFramePlacement(model, data, self._frame)
-        felt = pin.Force.Zero()
+        measured = pin.Force.Zero()
         for mount in self._mounts:
-            felt -= sensor.actInv(data.oMi[mount].act(data.f[mount]))
-        for push in pushes:
-            if push.link in self._beyond:
-                point = push.point
+            measured -= sensor.actInv(data.oMi[mount].act(data.f[mount]))
+        for wrench in wrenches:
+            if wrench.link in self._beyond:
+                point = wrench.point
                 if point is None:
-                    link = model.getFrameId(push.link, pin.FrameType.BODY)
+                    link = model.getFrameId(wrench.link, pin.FrameType.BODY)
                     point = pin.updateFramePlacement(model, data, link).translation
-                force = np.array(push.force)
-                felt += sensor.actInv(pin.Force(force, np.cross(point, force) + push.torque))
-        self.wrench = felt.vector
-
-
-def _parent(joint: Element) -> str:
-    return joint.find("parent").get("link", "")
+                moment = np.cross(point, wrench.force) + wrench.torque
+                measured += sensor.actInv(pin.Force(wrench.force, moment))
+        self.wrench = measured.vector

@@ -1,60 +1,62 @@
-"""What the gears of a robot add to its joints: friction, rotor inertia, and a torque bias.
+"""Friction, rotor inertia and torque bias of a robot's joints.
 
-A joint behind a gear of ratio N, its motor commanded tau, obeys
+A joint behind a gear of ratio N, with motor torque tau, obeys
 
     (M + I) a + h = tau + b - f(v) + contact,    I = N^2 times the inertia of the rotor,
 
-with a bias b of the torque that the motor does not know of, and a friction f that follows
-Stribeck's curve with v_s its velocity, and is whatever holds the joint while it stands:
+with an error b of the motor's torque, and a friction f that follows Stribeck's curve with
+Stribeck velocity v_s, and takes any value up to F_s at rest:
 
     f(v) = sign(v) L(v) + d v,    L(v) = F_c + (F_s - F_c) exp(-(v / v_s)^2),
     |f(0)| <= L(0) = F_s.
 
 Each physics step of length h takes the friction at its end, so that it neither chatters nor
-drives: the impulse of dry friction, at most h L(v_k), is the one that stops the joint, if there is
-one; only the limit L is that of the speed v_k at the beginning. Viscous friction is implicit
-too, without anything to solve: with -h d v_k+1 on the right,
+accelerates the joint: the impulse of dry friction, at most h L(v_k), is the one that stops the
+joint, if there is one; only the limit L is that of the velocity v_k at the beginning. Viscous
+friction is implicit too, without anything to solve: with -h d v_k+1 on the right,
 
     (M + I) (v_k+1 - v_k) = ... - h d v_k+1
     <=>  (M + I + h d) (v_k+1 - v_k) = ... - h d v_k,
 
-it is an explicit torque and a little more inertia of the rotor, stable for every d.
+it is an explicit torque and a slightly larger inertia of the rotor, stable for every d.
 
 PyBullet knows no rotors. Each becomes a link of its own that turns about an axis fixed to the
-ground, coupled to its joint by a gear constraint of ratio one: its energy is I v^2 / 2, as I on
-the diagonal of M has it, and nothing else acts on it (a rotor carried along by the arm would add
-gyroscopic torques of I / N, which Pinocchio's armature leaves out too). Dry friction is a
-motor that asks for zero velocity with limited torque. Constraints, motors and contacts are one
-linear complementarity problem, so that an impact meets the rotor and the friction as well.
+ground, coupled to its joint by a gear constraint of ratio one: its energy is I v^2 / 2, like that
+of I on the diagonal of M, and nothing else acts on it (a rotor carried by the arm would add
+gyroscopic torques of I / N, which Pinocchio's armature neglects too). Dry friction is a
+motor with velocity target zero and limited torque. Constraints, motors and contacts are one
+linear complementarity problem, so that an impact acts on rotor and friction as well.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from sim_bridge.bullet.vectors import finite_vector, not_negative_vector
 from viability_bounds_pkg.compiled import compiled
+
+Array = NDArray[np.float64]
 
 DEFAULT_STRIBECK_VELOCITY = 0.01
 """rad/s."""
 
 
-class Gears:
-    """Friction, rotors and biases of n joints. Arguments are scalars or of shape (n,).
+class JointFriction:
+    """Friction, rotors and torque biases of n joints. Arguments are scalars or of shape (n,).
 
     Args:
         n: number of joints.
         friction_coulomb: dry friction of a moving joint F_c, N m.
-        friction_static: what it takes to move a joint at rest F_s, N m; by default F_c.
+        friction_static: torque that moves a joint at rest F_s, N m; by default F_c.
         friction_viscous: d, N m s/rad.
-        stribeck_velocity: v_s at which dry friction has come down from F_s to F_c but for 1/e
+        stribeck_velocity: v_s at which dry friction has decreased from F_s to F_c but for 1/e
             of the difference, rad/s.
-        torque_bias: b, torque that the motors give beyond what they were told, N m.
+        torque_bias: b, torque of the motors in addition to the commanded one, N m.
         rotor_inertia: I, as seen from the joint, kg m^2.
 
     Raises:
-        ValueError: a wrong shape, a number that is not finite, a negative one (save the bias),
+        ValueError: a wrong shape, a number that is not finite, a negative one (except the bias),
             stiction below Coulomb friction, a Stribeck velocity of zero.
     """
 
@@ -93,20 +95,20 @@ class Gears:
 
     @property
     def ideal(self) -> bool:
-        """Whether they add nothing at all."""
+        """Whether there is no friction, bias or rotor at all."""
         added = (self.friction_static, self.friction_viscous, self.torque_bias, self.rotor_inertia)
         return not any(x.any() for x in added)
 
-    def simulated_inertia(self, dt: float) -> np.ndarray:
+    def simulated_inertia(self, dt: float) -> Array:
         """Return the inertias I + h d of the rotors in a simulation, shape (n,), kg m^2."""
         return self.rotor_inertia + dt * self.friction_viscous
 
-    def loads(self, v: np.ndarray, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return what acts on the joints in a physics step that begins with velocity `v`.
+    def loads(self, v: Array, tau: Array) -> tuple[Array, Array]:
+        """Return torques and friction limits of a physics step that begins with velocity `v`.
 
         Args:
             v: shape (n,), rad/s.
-            tau: what the motors were told, shape (n,), N m.
+            tau: commanded torques, shape (n,), N m.
 
         Returns:
             The torque ``tau + b - d v`` and the limit L(v) of dry friction, shape (n,) each,
@@ -117,14 +119,14 @@ class Gears:
 
 
 @compiled
-def _loads(v, tau, parameters, out):
+def _loads(v: Array, tau: Array, parameters: Array, out: Array) -> None:
     bias, viscous, coulomb, excess, stribeck = parameters
     for j in range(v.size):
         out[0, j] = tau[j] + bias[j] - viscous[j] * v[j]
         out[1, j] = coulomb[j] + excess[j] * np.exp(-((v[j] / stribeck[j]) ** 2))
 
 
-def _per_joint(name: str, value: ArrayLike, n: int, *, signed: bool = False) -> np.ndarray:
-    """Return a number or n of them as n finite ones of the caller's own, or raise `ValueError`."""
+def _per_joint(name: str, value: ArrayLike, n: int, *, signed: bool = False) -> Array:
+    """Return a number or n of them as a new array of n finite ones, or raise `ValueError`."""
     value = np.full(n, value) if np.ndim(value) == 0 else value
     return np.array((finite_vector if signed else not_negative_vector)(name, value, n))

@@ -1,47 +1,40 @@
-"""The judge of a run: how close each joint came to its limits, and by how much it broke them.
+"""Records how close each joint came to its limits, and by how much it violated them.
 
-It only looks: nothing it finds feeds back into the robot. It is fed at every physics step, so
-that nothing hides between two control steps.
+Nothing that it finds affects the robot. It is updated at every physics step, so that violations
+between two control steps are seen.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+_TORQUE_ROUNDING = 1e-9
+"""Share of a torque limit: motor torques are clipped at exactly the limits, but may be sums."""
 
 
 class LimitMonitor:
     """Extremes of position, velocity and torque of n joints, against their limits.
 
-    An update keeps the extremes and no more, which makes it cheap; all that is reported is
-    derived from them when asked. A value that is not a number counts as a violation.
+    An update only keeps the extremes; all that is reported is derived from them on request. A
+    value that is not a number counts as a violation.
 
     Args:
         q_min: lower position limits, shape (n,), rad; may be -inf.
         q_max: upper position limits, shape (n,), rad; may be inf.
         v_max: velocity limits, shape (n,), rad/s.
         tau_max: torque limits, shape (n,), N m.
-        position_tolerance: how far, in rad, a position may be over before
-            `first_violation_step` takes note; what is reported is always the whole violation.
-        velocity_tolerance: the same for velocities, rad/s.
-        torque_tolerance: the same for torques, N m.
 
     Raises:
         ValueError: shapes differ, an interval is empty or a limit not positive.
     """
 
     def __init__(
-        self,
-        q_min: ArrayLike,
-        q_max: ArrayLike,
-        v_max: ArrayLike,
-        tau_max: ArrayLike,
-        *,
-        position_tolerance: float = 0.0,
-        velocity_tolerance: float = 0.0,
-        torque_tolerance: float = 0.0,
+        self, q_min: ArrayLike, q_max: ArrayLike, v_max: ArrayLike, tau_max: ArrayLike
     ) -> None:
-        limits = [np.array(x, dtype=float) for x in (q_min, q_max, v_max, tau_max)]
+        limits: list[Array] = [np.array(x, dtype=float) for x in (q_min, q_max, v_max, tau_max)]
         if limits[0].ndim != 1 or any(x.shape != limits[0].shape for x in limits):
             shapes = ", ".join(str(x.shape) for x in limits)
             raise ValueError(f"limits must all have one shape (n,), not {shapes}")
@@ -50,28 +43,16 @@ class LimitMonitor:
             raise ValueError(f"q_min must be below q_max: {self._q_min} and {self._q_max}")
         if not (np.all(self._v_max > 0.0) and np.all(self._tau_max > 0.0)):
             raise ValueError("v_max and tau_max must be positive")
-        # Row by row q, v, tau, and the same negated: every limit is then an upper one, and one
-        # maximum and one comparison serve all six.
-        n = self._q_min.size
-        self._sample = np.empty((2, 3, n))
-        self._peak = np.empty((2, 3, n))
-        self._over = np.empty((2, 3, n), dtype=bool)
-        q, v, tau = position_tolerance, velocity_tolerance, torque_tolerance
-        self._bound = np.array(
-            [
-                [self._q_max + q, self._v_max + v, self._tau_max + tau],
-                [q - self._q_min, self._v_max + v, self._tau_max + tau],
-            ]
-        )
+        # q, v, tau, and the same negated: one maximum serves the limits on both sides.
+        self._sample = np.empty((2, 3, self._q_min.size))
+        self._peak: Array = np.empty_like(self._sample)
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything seen so far."""
+        """Forget all updates."""
         self._peak.fill(-np.inf)
-        self._steps = 0
-        self._first: int | None = None
 
-    def update(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> None:
+    def update(self, q: Array, v: Array, tau: Array) -> None:
         """Take one physics step into account.
 
         Args:
@@ -86,43 +67,42 @@ class LimitMonitor:
         values[2] = tau
         np.negative(values, out=sample[1])
         np.maximum(self._peak, sample, out=self._peak)  # a NaN stays
-        if self._first is None:
-            np.less_equal(self._peak, self._bound, out=self._over)
-            if not self._over.all():
-                self._first = self._steps
-        self._steps += 1
 
     @property
-    def steps(self) -> int:
-        """Number of updates since the last reset."""
-        return self._steps
+    def violated(self) -> bool:
+        """Whether any limit was violated; a torque by more than rounding."""
+        within = (
+            (self.max_position_violation <= 0.0)
+            & (self.max_velocity_violation <= 0.0)
+            & (self.max_torque_ratio <= 1.0 + _TORQUE_ROUNDING)
+        )
+        return not bool(within.all())
 
     @property
-    def first_violation_step(self) -> int | None:
-        """Index, from 0, of the update that first went over a limit plus its tolerance."""
-        return self._first
+    def closest_to_q_min(self) -> Array:
+        """Least distance kept from the lower limits, shape (n,), rad; negative when violated."""
+        distance: Array = -self._peak[1, 0] - self._q_min
+        return distance
 
     @property
-    def closest_to_q_min(self) -> np.ndarray:
-        """Least distance kept from the lower limits, shape (n,), rad; negative when broken."""
-        return -self._peak[1, 0] - self._q_min
+    def closest_to_q_max(self) -> Array:
+        """Least distance kept from the upper limits, shape (n,), rad; negative when violated."""
+        distance: Array = self._q_max - self._peak[0, 0]
+        return distance
 
     @property
-    def closest_to_q_max(self) -> np.ndarray:
-        """Least distance kept from the upper limits, shape (n,), rad; negative when broken."""
-        return self._q_max - self._peak[0, 0]
-
-    @property
-    def max_position_violation(self) -> np.ndarray:
-        """Farthest beyond either position limit, shape (n,), rad; 0 where never broken."""
+    def max_position_violation(self) -> Array:
+        """Farthest beyond either position limit, shape (n,), rad; 0 where never violated."""
         return np.maximum(-np.minimum(self.closest_to_q_min, self.closest_to_q_max), 0.0)
 
     @property
-    def max_velocity_violation(self) -> np.ndarray:
-        """Greatest excess of speed, shape (n,), rad/s; 0 where never broken."""
-        return np.maximum(self._peak[:, 1].max(axis=0) - self._v_max, 0.0)
+    def max_velocity_violation(self) -> Array:
+        """Greatest excess of speed, shape (n,), rad/s; 0 where never violated."""
+        excess: Array = np.maximum(self._peak[:, 1].max(axis=0) - self._v_max, 0.0)
+        return excess
 
     @property
-    def max_torque_ratio(self) -> np.ndarray:
-        """Greatest absolute torque over its limit, shape (n,); above 1 where broken."""
-        return np.maximum(self._peak[:, 2].max(axis=0), 0.0) / self._tau_max
+    def max_torque_ratio(self) -> Array:
+        """Greatest absolute torque over its limit, shape (n,); above 1 where violated."""
+        ratio: Array = np.maximum(self._peak[:, 2].max(axis=0), 0.0) / self._tau_max
+        return ratio

@@ -1,21 +1,22 @@
-"""Obstacles in a PyBullet world, and what they do to the robot in it.
+"""Obstacles in a PyBullet world, and their forces on the robot in it.
 
-An obstacle is hard, but not rigid: rigid ones would leave open how hard a robot with friction in
-its joints presses on them, and the solver, for which one solution is as good as another, would
-jump about between them. Its surface has no mass and moves by x against a spring and a damper,
+An obstacle is stiff, but not rigid: contact forces between rigid ones and a robot with friction in
+its joints would not be unique, and the solver would jump between solutions. The obstacle's surface
+has no mass and moves by x against a spring and a damper,
 
     F = k x+ + d v+,    x+ = x + h v+,
 
-with F the force of the robot: it is implicit and thus stable however stiff it is. PyBullet
+with F the force of the robot: it is implicit and thus stable for every stiffness. PyBullet
 moves a body of mass m by m (v+ - v) = h (F + f), which is the same for
 
     m = h d + h^2 k,    f = -k x - (d + h k) v.
 
-Along the surface PyBullet lets the robot slide: its Dantzig solver replaces the cone of Coulomb's
-law by a box, whose size is that of the pressure without friction. `contact_friction` has that law.
+Along the surface PyBullet's contacts are frictionless: its Dantzig solver replaces the cone of
+Coulomb's law by a box, whose size is that of the pressure without friction. `contact_friction` has
+that law.
 
-Four points under a flat hand are one more than it takes, and Dantzig's solver finds no solution.
-It does when there is some softness in all constraints; it is far too little to be noticed.
+Dantzig's solver finds no solution for four points under a flat hand, one more than is needed. It
+does when all constraints have some softness, here far too little to be noticed.
 """
 
 from __future__ import annotations
@@ -24,10 +25,19 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sim_bridge.bullet.contact_friction import Bristle
-from sim_bridge.bullet.obstacles import Contact, ContactMaterial, Obstacle, ObstacleError
-from sim_bridge.bullet.quiet_pybullet import pybullet
+from sim_bridge.bullet.client import BulletClient, pybullet
+from sim_bridge.bullet.contact_friction import CONTACT_POINT, Bristle
+from sim_bridge.bullet.obstacles import (
+    Contact,
+    ContactMaterial,
+    LinkWrench,
+    Obstacle,
+    ObstacleError,
+)
+
+Array = NDArray[Any]
 
 _OVERLAP_MAX = 1e-3  # m, with the robot, of an obstacle that is new
 _RELEASED = 1e-9  # m; a surface that is nearer to its place is put there
@@ -36,16 +46,15 @@ _INERTIA = 1e15  # kg m^2: surfaces do not turn
 _SOFTNESS = 1e-11  # m/s of all constraints for each N (rad/s, N m), while there are obstacles
 
 
-class LinkForce(NamedTuple):
-    """A force on a link of the robot."""
+class _Touching(NamedTuple):
+    """The indices of a link and of an obstacle that touch each other."""
 
-    link: str
-    point: np.ndarray  # shape (3,), m
-    force: np.ndarray  # shape (3,), N
+    link: int
+    body: int
 
 
 class _Surface:
-    """An obstacle in the world."""
+    """The body of an obstacle."""
 
     def __init__(self, obstacle: Obstacle, body: int) -> None:
         self.obstacle, self.body = obstacle, body
@@ -57,7 +66,7 @@ class BulletObstacles:
     """The obstacles of one robot.
 
     Args:
-        bullet: PyBullet's functions, bound to a physics client.
+        bullet: the physics client.
         body: the robot in that client.
         links: names of its links, by PyBullet's indices.
         material: of the obstacles.
@@ -71,7 +80,7 @@ class BulletObstacles:
 
     def __init__(
         self,
-        bullet: Any,
+        bullet: BulletClient,
         body: int,
         links: Mapping[int, str],
         material: ContactMaterial,
@@ -84,13 +93,13 @@ class BulletObstacles:
         self._hold = [-self._mass * x for x in gravity]
         self._surfaces: dict[str, _Surface] = {}
         self._by_body: dict[int, _Surface] = {}
-        # By link and body of the obstacle, of those in touch.
-        self._bristles: dict[tuple[int, int], Bristle] = {}
-        self._points: dict[tuple[int, int], np.ndarray] = {}
+        self._bristles: dict[_Touching, Bristle] = {}
+        self._points: dict[_Touching, Array] = {}
+        self._friction: dict[_Touching, LinkWrench] = {}
         self.force = self.force_max = 0.0
-        self._friction: list[tuple[tuple[int, int], LinkForce]] = []
 
     def __len__(self) -> int:
+        """Return the number of obstacles."""
         return len(self._surfaces)
 
     @property
@@ -99,10 +108,10 @@ class BulletObstacles:
         return {name: surface.obstacle for name, surface in self._surfaces.items()}
 
     def add(self, obstacle: Obstacle) -> None:
-        """Put an obstacle into the world, in place of the one of its name if there is one.
+        """Add an obstacle, replacing the one of its name if there is one.
 
         Raises:
-            ObstacleError: the robot is there.
+            ObstacleError: it overlaps the robot.
         """
         bullet = self._bullet
         self.remove(obstacle.name)
@@ -126,7 +135,7 @@ class BulletObstacles:
         surface = _Surface(obstacle, body)
         self._surfaces[obstacle.name] = self._by_body[body] = surface
         near = bullet.getClosestPoints(self._body, body, 0.0)
-        overlap = -min((point[8] for point in near), default=0.0)
+        overlap = -min((point[8] for point in near), default=0.0)  # the signed distance
         if overlap > _OVERLAP_MAX:
             self.remove(obstacle.name)
             raise ObstacleError(
@@ -134,13 +143,13 @@ class BulletObstacles:
             )
 
     def remove(self, name: str) -> bool:
-        """Take an obstacle out of the world; return whether there was one of that name."""
+        """Remove an obstacle; return whether there was one of that name."""
         surface = self._surfaces.pop(name, None)
         if surface is None:
             return False
         del self._by_body[surface.body]
         self.force = 0.0
-        for key in [key for key in self._bristles if key[1] == surface.body]:
+        for key in [key for key in self._bristles if key.body == surface.body]:
             del self._bristles[key]
             self._points.pop(key, None)
         self._bullet.removeBody(surface.body)
@@ -149,43 +158,40 @@ class BulletObstacles:
         return True
 
     def clear(self) -> None:
-        """Take all obstacles out of the world."""
+        """Remove all obstacles."""
         for name in list(self._surfaces):
             self.remove(name)
 
     def before_step(self) -> None:
-        """Let springs, dampers and friction act in the step to come."""
-        bullet = self._bullet
-        k, c = (
-            self._material.stiffness,
-            self._material.damping + self._dt * self._material.stiffness,
-        )
-        touched = {body for _, body in self._bristles}
+        """Apply the forces of springs, dampers and friction in the next step."""
+        bullet, material = self._bullet, self._material
+        k, c = material.stiffness, material.damping + self._dt * material.stiffness
+        touched = {key.body for key in self._bristles}
         for surface in self._by_body.values():
-            body, place, force = surface.body, surface.place, self._hold
+            body, place = surface.body, surface.place
+            push: Sequence[float] = self._hold
             if surface.moved:
                 place, _ = bullet.getBasePositionAndOrientation(body)
                 v, _ = bullet.getBaseVelocity(body)
                 x = [a - b for a, b in zip(place, surface.place, strict=True)]
                 if body not in touched and max(map(abs, x)) < _RELEASED:
                     self._put_back(surface)
-                    x = v = (0.0, 0.0, 0.0)
-                force = [f - k * s - c * w for f, s, w in zip(force, x, v, strict=True)]
-            bullet.applyExternalForce(body, -1, force, place, pybullet.WORLD_FRAME)
+                    x = v = [0.0, 0.0, 0.0]
+                push = [f - k * s - c * w for f, s, w in zip(push, x, v, strict=True)]
+            bullet.applyExternalForce(body, -1, push, place, pybullet.WORLD_FRAME)
         self._friction.clear()
         for key, bristle in self._bristles.items():
-            link, _ = key
-            state = bullet.getLinkState(self._body, link, 1, 1)  # kinematics of now
-            motion = np.array((*state[0], *state[6], *state[7]))
-            bristle.update(self._points[key], motion, self._material.friction)
+            centre, *_, v, omega = bullet.getLinkState(self._body, key.link, 1, 1)
+            motion = np.array((*centre, *v, *omega)).reshape(3, 3)
+            bristle.update(self._points[key], motion, material.friction)
             force, point = bristle.force.copy(), bristle.point.copy()
             bullet.applyExternalForce(
-                self._body, link, force.tolist(), point.tolist(), pybullet.WORLD_FRAME
+                self._body, key.link, force.tolist(), point.tolist(), pybullet.WORLD_FRAME
             )
-            self._friction.append((key, LinkForce(self._links[link], point, force)))
+            self._friction[key] = LinkWrench(self._links[key.link], point, force)
 
     def reset(self) -> None:
-        """Let go of the robot, and forget how hard it was pushed."""
+        """Release the robot, and reset the largest force."""
         self.force = self.force_max = 0.0
         self._bristles.clear()
         self._points.clear()
@@ -202,47 +208,50 @@ class BulletObstacles:
         surface.moved = False
 
     def after_step(self) -> None:
-        """See where the robot was touched in the step."""
-        rows: dict[tuple[int, int], list[tuple[float, ...]]] = {}
-        for point in self._bullet.getContactPoints(self._body):
-            if point[9] > 0.0 and point[2] in self._by_body:
-                rows.setdefault((point[3], point[2]), []).append((*point[5], *point[7], point[9]))
-        self._points = {key: np.array(value) for key, value in rows.items()}
+        """Read the contacts of the step."""
+        found: dict[_Touching, list[tuple[Any, ...]]] = {}
+        for contact in self._bullet.getContactPoints(self._body):
+            _, _, body, link, _, position, _, normal, _, pressure, *_ = contact
+            if pressure > 0.0 and body in self._by_body:
+                row = (*position, *normal, pressure)
+                found.setdefault(_Touching(link, body), []).append(row)
+        self._points = {
+            key: np.array(rows).view(CONTACT_POINT)[:, 0] for key, rows in found.items()
+        }
         known = self._bristles
         self._bristles = {
-            key: known.get(key) or Bristle(self._dt, self._material.stiffness) for key in rows
+            key: known.get(key) or Bristle(self._dt, self._material.stiffness) for key in found
         }
-        total: dict[int, np.ndarray] = {}
+        total: dict[int, Array] = {}
         for key, points in self._points.items():
-            total[key[1]] = total.get(key[1], 0.0) + points[:, 6] @ points[:, 3:6]
-            self._by_body[key[1]].moved = True
-        for (_, body), friction in self._friction:
-            total[body] = total.get(body, 0.0) + friction.force
+            total[key.body] = total.get(key.body, 0.0) + points["pressure"] @ points["normal"]
+            self._by_body[key.body].moved = True
+        for key, friction in self._friction.items():
+            total[key.body] = total.get(key.body, 0.0) + friction.force
         self.force = max((float(np.linalg.norm(force)) for force in total.values()), default=0.0)
         self.force_max = max(self.force, self.force_max)
 
-    def forces(self) -> list[LinkForce]:
-        """Return all that acted on the robot in the last physics step."""
-        pressures = [
-            LinkForce(self._links[link], row[:3], row[6] * row[3:6])
-            for (link, _), rows in self._points.items()
-            for row in rows
+    def wrenches(self) -> list[LinkWrench]:
+        """Return all wrenches of obstacles on the robot in the last physics step."""
+        contacts = [
+            LinkWrench(self._links[key.link], position, pressure * normal)
+            for key, points in self._points.items()
+            for position, normal, pressure in points
         ]
-        return pressures + [force for _, force in self._friction]
+        return contacts + list(self._friction.values())
 
     def contacts(self) -> list[Contact]:
-        """Return where the robot was touched in the last physics step."""
+        """Return the contact points of the last physics step."""
         found = []
-        friction = dict(self._friction)
-        for key, rows in self._points.items():
-            link, body = key
-            along = friction[key].force if key in friction else np.zeros(3)
-            for row in rows:
-                position, normal, pressure = row[:3], row[3:6], row[6]
-                # The friction acts at the centre of pressure, as if it were shared out like this.
-                force = pressure * normal + pressure / rows[:, 6].sum() * along
-                name = self._by_body[body].obstacle.name
-                found.append(Contact(self._links[link], name, position, normal, force))
+        for key, points in self._points.items():
+            link, name = self._links[key.link], self._by_body[key.body].obstacle.name
+            friction = self._friction.get(key)
+            along = np.zeros(3) if friction is None else friction.force
+            # The friction acts at the centre of pressure, as if distributed like this.
+            whole = points["pressure"].sum()
+            for position, normal, pressure in points:
+                force = pressure * normal + pressure / whole * along
+                found.append(Contact(link, name, position, normal, force))
         return found
 
 

@@ -1,4 +1,4 @@
-"""Things in the simulated world that a robot may touch, and where it touches them."""
+"""Obstacles, their material, and the forces and contacts between them and a robot."""
 
 from __future__ import annotations
 
@@ -7,85 +7,97 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from sim_bridge.bullet.vectors import finite_vector
 from viability_bounds_pkg.exceptions import ArmSafetyError
 
+Array = NDArray[np.float64]
+
 SHAPES = ("box", "sphere", "cylinder")
-_ROUND = {"sphere": (0, 1, 2), "cylinder": (0, 1)}  # axes along which they are equally large
-_SIZE_MIN, _SIZE_MAX = 1e-3, 1e3  # m; beyond them PyBullet's collision detection is off
+_ROUND = {"sphere": (0, 1, 2), "cylinder": (0, 1)}  # axes along which the sizes are equal
+_SIZE_MIN, _SIZE_MAX = 1e-3, 1e3  # m; beyond them PyBullet's collision detection is wrong
 
 
 class ObstacleError(ArmSafetyError, ValueError):
-    """An obstacle that cannot be."""
+    """An obstacle with invalid properties, or one that overlaps the robot."""
 
 
-@dataclass(frozen=True, eq=False)
 class Obstacle:
-    """A thing that stands still, whatever pushes on it.
+    """A fixed solid in the world of a robot.
 
     Args:
-        name: tells it from the others; not empty.
+        name: identifies it; not empty.
         shape: box, sphere or cylinder, the last along its z axis.
         size: lengths or diameters along its own axes, as the `scale` of an RViz marker, shape
-            (3,), m, from 1 mm to 1 km; those of what is round must be equal.
+            (3,), m, from 1 mm to 1 km; equal along the axes of a circular section.
         position: of its centre in the frame of the robot's root link, shape (3,), m.
         orientation: in that frame, quaternion x, y, z, w, shape (4,), of any length but zero; it
-            is kept with length one.
+            is stored with length one.
 
     Raises:
-        ObstacleError: one of them is none of this.
+        ObstacleError: one of them is invalid.
     """
 
-    name: str
-    shape: str
-    size: np.ndarray
-    position: np.ndarray
-    orientation: np.ndarray = (0.0, 0.0, 0.0, 1.0)
-
-    def __post_init__(self) -> None:
-        """Check, and turn sequences into arrays."""
-        if not self.name:
+    def __init__(
+        self,
+        name: str,
+        shape: str,
+        size: ArrayLike,
+        position: ArrayLike,
+        orientation: ArrayLike = (0.0, 0.0, 0.0, 1.0),
+    ) -> None:
+        if not name:
             raise ObstacleError("an obstacle needs a name")
-        if self.shape not in SHAPES:
-            raise self._error(f"its shape is {self.shape!r}, none of {', '.join(SHAPES)}")
+        self.name, self.shape = name, shape
+        if shape not in SHAPES:
+            raise self._error(f"its shape is {shape!r}, none of {', '.join(SHAPES)}")
         try:
-            for field, count in (("size", 3), ("position", 3), ("orientation", 4)):
-                vector = finite_vector(field, getattr(self, field), count)
-                object.__setattr__(self, field, vector)
+            self.size = finite_vector("size", size, 3)
+            self.position = finite_vector("position", position, 3)
+            self.orientation = finite_vector("orientation", orientation, 4)
         except (ValueError, TypeError) as error:
             raise self._error(str(error)) from error
         if np.any(self.size < _SIZE_MIN) or np.any(self.size > _SIZE_MAX):
             raise self._error(f"its size is {self.size.tolist()} m, not 1 mm to 1 km")
-        if len({float(self.size[axis]) for axis in _ROUND.get(self.shape, ())}) > 1:
-            raise self._error(f"a {self.shape} is round, not {self.size.tolist()} m")
+        if len({float(self.size[axis]) for axis in _ROUND.get(shape, ())}) > 1:
+            raise self._error(f"a {shape} is round, not {self.size.tolist()} m")
         length = math.hypot(*self.orientation)
         if not (1e-6 < length < 1e6):
             raise self._error(f"its orientation {self.orientation.tolist()} is no quaternion")
-        object.__setattr__(self, "orientation", self.orientation / length)
+        self.orientation = self.orientation / length
 
     def _error(self, reason: str) -> ObstacleError:
         return ObstacleError(f"obstacle {self.name!r}: {reason}")
 
 
-class Contact(NamedTuple):
-    """A point where the robot touches an obstacle, in the frame of the robot's root link."""
+class LinkWrench(NamedTuple):
+    """An external wrench on a link of the robot, in world axes."""
 
-    link: str  # of the links that move as one with the one that touches, the first
+    link: str
+    point: Array | None  # where the force acts, shape (3,), m; None: the link's origin
+    force: Array  # shape (3,), N
+    torque: Array = np.zeros(3)  # shape (3,), N m
+
+
+class Contact(NamedTuple):
+    """A contact point between robot and obstacle, in the frame of the robot's root link."""
+
+    link: str  # the first of those that move as one with the touching one
     obstacle: str
-    position: np.ndarray  # of the point on the robot, shape (3,), m
-    normal: np.ndarray  # from the obstacle to the robot, shape (3,)
-    force: np.ndarray  # of the obstacle on the robot, shape (3,), N
+    position: Array  # of the point on the robot, shape (3,), m
+    normal: Array  # from the obstacle to the robot, shape (3,)
+    force: Array  # of the obstacle on the robot, shape (3,), N
 
 
 @dataclass(frozen=True)
 class ContactMaterial:
-    """How obstacles feel.
+    """Friction, stiffness and damping of obstacles.
 
     Args:
         friction: Coulomb's coefficient.
-        stiffness: how much an obstacle as a whole resists being pressed, N/m.
-        damping: the same of its speed, N s/m.
+        stiffness: of an obstacle as a whole against displacement, N/m.
+        damping: against its velocity, N s/m.
 
     Raises:
         ValueError: one of them is not finite, the stiffness not positive, another one negative.
@@ -96,7 +108,7 @@ class ContactMaterial:
     damping: float = 600.0
 
     def __post_init__(self) -> None:
-        """Check."""
+        """Check the values."""
         for name, low in (("friction", True), ("stiffness", False), ("damping", True)):
             value = getattr(self, name)
             if not (math.isfinite(value) and (value > 0.0 or (low and value == 0.0))):

@@ -1,4 +1,4 @@
-"""Position control as motor drives do it: a cascade of loops in each joint, by itself.
+"""Position control by the drive of each joint: a cascade of position and velocity loops.
 
     v_ref = v_des + kappa (q_des - q), at most the speed limit,
     tau   = k (v_ref - v) + z,    z' = (k / T) (v_ref - v),
@@ -6,12 +6,12 @@
 
 a proportional loop for position around a proportional-integral one for velocity, fast enough for
 the inertia and stiff enough for the friction, which grows with tau_max. The torque is clipped to
-what the motor has, and z does not run away meanwhile. Within a small window around the goal z
-rests, as it does in real drives, or else stiction would make it hunt for ever.
+the motor's limit, and z does not wind up meanwhile. Within a small window around the goal z is
+held, as in real drives; otherwise stiction would cause a limit cycle.
 
-Drives close their loops ten times faster than a physics step. Stiff loops sampled at the physics
-rate are unstable as soon as the joints' inertias are coupled; this one therefore uses what it
-expects at the end of the step ([Tan2011]), v + h a and q + h v + h^2 a / 2. With the error e,
+Real drives close their loops ten times faster than a physics step. Stiff loops sampled at the
+physics rate are unstable when the joints' inertias are coupled; this one therefore uses the state
+predicted for the end of the step ([Tan2011]), v + h a and q + h v + h^2 a / 2. With the error e,
 
     e = v_des + kappa (q_des - q - h v) - v,    tau = k e + z - P a,    P = h k (1 + kappa h / 2),
 
@@ -19,8 +19,8 @@ as long as the speed limit is not active (then P = h k), and with M a + b = tau,
 
     (M + P) a = k e + z - b.
 
-The drive takes over without a jump: z starts where, with nothing to correct, tau is the torque
-that was there before, z = tau + P a with M a = tau - b.
+The transfer to the drive is bumpless: z is initialised so that, with zero error, tau is the torque
+applied before, z = tau + P a with M a = tau - b.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from sim_bridge.bullet.joint_friction import Gears
+from sim_bridge.bullet.joint_friction import JointFriction
 from viability_bounds_pkg.robot_description import build_model, kinematic_order
 
 Array = NDArray[np.float64]
@@ -46,18 +46,18 @@ INTEGRAL_TIME = 4.0 / VELOCITY_BANDWIDTH
 """T, s: both poles of the velocity loop at omega_v / 2."""
 
 FULL_TORQUE_ERROR = 0.01
-"""e_full at which the drive uses all its torque at the latest, rad."""
+"""e_full, at which the drive reaches its torque limit, rad."""
 
 WINDOW = 2e-4
-"""How near to a goal at rest is near enough for the integral, rad."""
+"""Distance from a goal at rest within which the integral is held, rad."""
 
 
 class PositionDrive:
     """The drives of n joints; arrays of shape (n,) in the order of `joints`.
 
     Args:
-        model: the robot with its rotors; it sets the gains, and what else is taken from it
-            stands in for the faster loops of a drive.
+        model: the robot with its rotors; for the gains, and for the prediction that replaces
+            the faster loops of a real drive.
         joints: the model's joints in the caller's order.
         dt: time between two calls of `torque`, s.
     """
@@ -65,16 +65,16 @@ class PositionDrive:
     def __init__(self, model: pin.Model, joints: Sequence[str], dt: float) -> None:
         self._model, self._data, self._dt = model, model.createData(), dt
         self._order = [list(joints).index(name) for name in model.names[1:]]
-        self._z = np.zeros(model.nv)  # in the model's order, as all that is inside
+        self._z = np.zeros(model.nv)  # in the model's order, as all arrays inside
 
-    def start(self, q: Array, v: Array, tau_max: Array, tau: Array | None) -> None:
-        """Take over.
+    def reset(self, q: Array, v: Array, tau_max: Array, tau: Array | None) -> None:
+        """Initialise the integral for a bumpless transfer.
 
         Args:
             q: position, rad.
             v: velocity, rad/s.
             tau_max: torque limits, N m.
-            tau: the torque of the motors until now, N m; None for what holds the robot up.
+            tau: the torque of the motors until now, N m; None for the bias forces.
         """
         M, bias, k = self._dynamics(q[self._order], v[self._order], tau_max[self._order])
         tau = bias if tau is None else tau[self._order]
@@ -89,9 +89,9 @@ class PositionDrive:
         Args:
             q: position, rad.
             v: velocity, rad/s.
-            q_des: where to be at the end of the step, rad.
-            v_des: how fast to pass there, rad/s.
-            v_max: the drive does not ask for more speed, rad/s.
+            q_des: position at the end of the step, rad.
+            v_des: velocity there, rad/s.
+            v_max: limit of the reference velocity, rad/s.
             tau_max: torque limits, N m.
         """
         q, v, q_des, v_des, v_max, tau_max = np.stack((q, v, q_des, v_des, v_max, tau_max))[
@@ -106,9 +106,9 @@ class PositionDrive:
         u = k * error + self._z
         tau = u - P * np.linalg.solve(M + np.diag(P), u - bias)
         clipped = np.clip(tau, -tau_max, tau_max)
-        resting = (np.abs(q_des - q) < WINDOW) & (v_des == 0.0)
-        runaway = (tau - clipped) * error > 0.0
-        self._z += np.where(resting | runaway, 0.0, (h / INTEGRAL_TIME) * k * error)
+        arrived = (np.abs(q_des - q) < WINDOW) & (v_des == 0.0)
+        winding_up = (tau - clipped) * error > 0.0
+        self._z += np.where(arrived | winding_up, 0.0, (h / INTEGRAL_TIME) * k * error)
         output = np.empty_like(clipped)
         output[self._order] = clipped
         return output
@@ -125,7 +125,7 @@ def make_drive(
     urdf: str,
     joints: Sequence[str],
     locked_positions: Mapping[str, float] | None,
-    gears: Gears,
+    joint_friction: JointFriction,
     dt: float,
 ) -> PositionDrive:
     """Return the drives of a robot's `joints`, whatever their order.
@@ -134,6 +134,6 @@ def make_drive(
         RobotDescriptionError: as `build_model` does.
     """
     order = kinematic_order(urdf, joints)
-    rotors = dict(zip(joints, gears.rotor_inertia, strict=True))
+    rotors = dict(zip(joints, joint_friction.rotor_inertia, strict=True))
     model = build_model(urdf, order, locked_positions, [rotors[joint] for joint in order])
     return PositionDrive(model, joints, dt)

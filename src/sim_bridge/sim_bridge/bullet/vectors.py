@@ -1,20 +1,22 @@
-"""Checks of arrays that callers pass."""
+"""Checks of array arguments."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
 
 
-def finite_vector(name: str, value: ArrayLike, size: int) -> np.ndarray:
+def finite_vector(name: str, value: ArrayLike, size: int) -> Array:
     """Return `value` as an array of `size` finite numbers, or raise `ValueError`."""
     array = np.asarray(value, dtype=float)
     if array.shape != (size,) or not np.isfinite(array).all():
-        raise ValueError(f"{name} must be {size} finite numbers, not {value}")
+        raise ValueError(f"{name} must be {size} finite numbers, not {value!r}")
     return array
 
 
-def not_negative_vector(name: str, value: ArrayLike, size: int) -> np.ndarray:
+def not_negative_vector(name: str, value: ArrayLike, size: int) -> Array:
     """Return `value` as an array of `size` finite numbers >= 0, or raise `ValueError`."""
     array = finite_vector(name, value, size)
     if np.any(array < 0.0):

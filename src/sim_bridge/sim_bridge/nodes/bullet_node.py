@@ -64,14 +64,7 @@ class BulletNode(Node):
             self.destroy_node()
             raise
         self._config = config
-        self._monitor = LimitMonitor(
-            config.q_min,
-            config.q_max,
-            config.v_max,
-            config.tau_max,
-            # The simulated motors are clipped at exactly their limits; the sum is not exact.
-            torque_tolerance=1e-9 * float(config.tau_max.max()),
-        )
+        self._monitor = LimitMonitor(config.q_min, config.q_max, config.v_max, config.tau_max)
         self._robot.monitor = self._monitor
         self._dt_ns = round(1e9 * config.dt)
         self._paused = config.start_paused
@@ -273,7 +266,7 @@ class BulletNode(Node):
             "lower_clearance_rad": monitor.closest_to_q_min,
             "upper_clearance_rad": monitor.closest_to_q_max,
         }
-        if monitor.first_violation_step is not None:
+        if monitor.violated:
             return DiagnosticStatus.ERROR, "a limit was broken", values
         if self._paused:
             return DiagnosticStatus.OK, "paused", values

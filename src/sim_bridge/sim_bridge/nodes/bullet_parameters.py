@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from sim_bridge.bullet.joint_friction import DEFAULT_STRIBECK_VELOCITY, Gears
+from sim_bridge.bullet.joint_friction import DEFAULT_STRIBECK_VELOCITY, JointFriction
 from sim_bridge.bullet.obstacles import ContactMaterial
 from sim_bridge.bullet.robot import BulletRobot
 from sim_bridge.nodes.ft_sensor import SENSOR_TABLE, SensorConfiguration, sensor_configuration
@@ -131,7 +131,7 @@ class BulletConfiguration:
     q_max: np.ndarray
     v_max: np.ndarray
     tau_max: np.ndarray
-    gears: Gears
+    joint_friction: JointFriction
     mass_scales: dict[str, float]
     q_start: np.ndarray
     dt: float
@@ -171,7 +171,7 @@ def make_configuration(values: Mapping[str, Any]) -> BulletConfiguration:
         q_max=q_max,
         v_max=all_positive(values, "velocity_max", joints),
         tau_max=all_positive(values, "torque_max", joints),
-        gears=_gears(values, joints),
+        joint_friction=_joint_friction(values, joints),
         mass_scales=_mass_scales(values),
         q_start=q_start,
         dt=dt,
@@ -192,7 +192,7 @@ def make_configuration(values: Mapping[str, Any]) -> BulletConfiguration:
     )
 
 
-def _gears(values: Mapping[str, Any], joints: tuple[str, ...]) -> Gears:
+def _joint_friction(values: Mapping[str, Any], joints: tuple[str, ...]) -> JointFriction:
     coulomb = not_negative(values, "friction_coulomb", joints)
     static = coulomb
     if len(values["friction_static"]):
@@ -207,7 +207,7 @@ def _gears(values: Mapping[str, Any], joints: tuple[str, ...]) -> Gears:
         bias = per_joint(values, "torque_bias", joints)
         if not np.isfinite(bias).all():
             raise SettingError("torque_bias", bias, "finite numbers")
-    return Gears(
+    return JointFriction(
         len(joints),
         friction_coulomb=coulomb,
         friction_static=static,
@@ -242,7 +242,7 @@ def make_robot(config: BulletConfiguration, values: Mapping[str, Any]) -> Bullet
             config.joints,
             locked_positions=config.locked,
             physics_dt=config.dt / config.substeps,
-            gears=config.gears,
+            joint_friction=config.joint_friction,
             mass_scales=config.mass_scales,
             material=config.material,
             sensor_frame=config.sensor.frame,

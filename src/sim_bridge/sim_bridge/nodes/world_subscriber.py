@@ -8,12 +8,12 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
+import pinocchio as pin
 from geometry_msgs.msg import WrenchStamped
 from rclpy.node import Node
 from visualization_msgs.msg import Marker, MarkerArray
 
 from sim_bridge.bullet.obstacles import Obstacle, ObstacleError
-from sim_bridge.bullet.quiet_pybullet import pybullet
 from sim_bridge.bullet.robot import BulletRobot
 from viability_bounds_pkg.robot_description import RobotDescriptionError
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, stamp_to_ns
@@ -144,7 +144,7 @@ class WorldInbox:
         if not frame:
             return partial(robot.add_obstacle, given)
         robot.link_pose(frame)  # or it raises
-        return lambda: robot.add_obstacle(_placed(given, *robot.link_pose(frame)))
+        return lambda: robot.add_obstacle(_placed(given, robot.link_pose(frame)))
 
     def _remove(self, name: str) -> None:
         if not self._robot.remove_obstacle(name):
@@ -155,9 +155,8 @@ class WorldInbox:
         self._logger.warning(f"{topic} refused: {error}")
 
 
-def _placed(obstacle: Obstacle, position, orientation) -> Obstacle:
-    """Return an obstacle given in a frame that is there in the root's frame, in the latter."""
-    placement = pybullet.multiplyTransforms(
-        position, orientation, obstacle.position, obstacle.orientation
-    )
-    return Obstacle(obstacle.name, obstacle.shape, obstacle.size, *placement)
+def _placed(obstacle: Obstacle, frame: pin.SE3) -> Obstacle:
+    """Return an obstacle given in a frame as one given in the frame's parent."""
+    position = frame.act(obstacle.position)
+    orientation = pin.Quaternion(frame.rotation) * pin.Quaternion(obstacle.orientation)
+    return Obstacle(obstacle.name, obstacle.shape, obstacle.size, position, orientation.coeffs())

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_bridge.bullet.quiet_pybullet import pybullet
+from sim_bridge.bullet.client import pybullet
 from sim_bridge.bullet.robot import BulletRobot
 from sim_bridge.scenario.events import EnableTorque, Event, PoseGoal, TrajectoryGoal
 from sim_bridge.scenario.pose_path import angle_between, sample

@@ -1,19 +1,15 @@
-"""Pictures of a robot and of the obstacles around it, without a display."""
+"""Renders a robot and the obstacles around it, without a display."""
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping, Sequence
-from contextlib import closing
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sim_bridge.bullet.client import BulletClient
+from sim_bridge.bullet.client import BulletClient, pybullet, silenced
 from sim_bridge.bullet.obstacle_bodies import shape_arguments
 from sim_bridge.bullet.obstacles import Obstacle
-from sim_bridge.bullet.quiet_pybullet import pybullet, silenced
 from sim_bridge.bullet.robot import BulletRobot
 from sim_bridge.bullet.vectors import finite_vector
 from sim_bridge.urdf.preparation import prepare_urdf
@@ -35,13 +31,13 @@ _LIGHT = {
 
 
 class Camera:
-    """Renders a robot with its meshes, in a PyBullet world of its own: the robot's is not touched.
+    """Renders a robot with its meshes, in a PyBullet world of its own.
 
-    Call `close` after use; `contextlib.closing` does.
+    The robot's world is not changed. Call `close` after use; `contextlib.closing` does.
 
     Args:
-        robot: as it is and will be.
-        floor: height of a plate to stand on, m; none by default.
+        robot: its present state and obstacles are rendered.
+        floor: height of a floor plate, m; none by default.
         colors: red, green, blue, 0 to 1, of obstacles, by name.
 
     Raises:
@@ -58,12 +54,9 @@ class Camera:
         self._robot, self._colors = robot, dict(colors or {})
         prepared = prepare_urdf(*robot.description, visuals=True)
         self._bullet = bullet = BulletClient()
-        with tempfile.TemporaryDirectory() as directory, silenced(1), silenced(2):
-            path = Path(directory) / "robot.urdf"
-            path.write_text(prepared.text, encoding="utf-8")
-            self._body = body = bullet.loadURDF(str(path), useFixedBase=True)
-        infos = [bullet.getJointInfo(body, i) for i in range(bullet.getNumJoints(body))]
-        indices = {info[1].decode(): info[0] for info in infos}
+        with silenced(1), silenced(2):
+            self._body = body = bullet.load_urdf(prepared.text)
+        indices = {info.name: info.id for info in bullet.joint_infos(body)}
         self._joints = [indices[name] for name in robot.joints]
         for shape in bullet.getVisualShapeData(body):
             # Mirrored meshes would be seen from inside.
@@ -71,7 +64,7 @@ class Camera:
         self._shown: dict[str, tuple[Obstacle, int]] = {}
         if floor is not None:
             plate = Obstacle("floor", "box", [3.0, 3.0, 0.04], [0.0, 0.0, floor - 0.02])
-            self._make(plate, _FLOOR_COLOR)
+            self._add_body(plate, _FLOOR_COLOR)
 
     def snapshot(
         self,
@@ -82,14 +75,14 @@ class Camera:
         q: ArrayLike | None = None,
         angle: float = 40.0,
     ) -> np.ndarray:
-        """Return a picture.
+        """Render a picture.
 
         Args:
-            eye: where the camera is, in the frame of the robot's root link, shape (3,), m.
-            target: where it looks, shape (3,), m.
+            eye: position of the camera in the frame of the robot's root link, shape (3,), m.
+            target: point in the middle of the picture, shape (3,), m.
             size: width and height, pixels.
             q: positions of the joints, shape (n,), rad; those of the robot by default.
-            angle: that the picture covers from top to bottom, degrees.
+            angle: vertical field of view, degrees.
 
         Returns:
             Red, green and blue, shape (height, width, 3), uint8.
@@ -99,7 +92,7 @@ class Camera:
         positions = finite_vector("q", joints, len(self._joints)).tolist()
         for joint, position in zip(self._joints, positions, strict=True):
             bullet.resetJointState(self._body, joint, position)
-        self._follow_obstacles()
+        self._update_obstacles()
         eye, target = finite_vector("eye", eye, 3), finite_vector("target", target, 3)
         width, height = (_OVERSAMPLING * pixels for pixels in size)
         image = bullet.getCameraImage(
@@ -117,7 +110,7 @@ class Camera:
         blocks = picture.reshape(size[1], _OVERSAMPLING, size[0], _OVERSAMPLING, 3)
         return blocks.mean(axis=(1, 3)).round().astype(np.uint8)
 
-    def _follow_obstacles(self) -> None:
+    def _update_obstacles(self) -> None:
         """Show the obstacles that the robot's world has now."""
         present = self._robot.obstacles
         for name, (shown, body) in list(self._shown.items()):
@@ -127,9 +120,9 @@ class Camera:
         for name, obstacle in present.items():
             if name not in self._shown:
                 color = self._colors.get(name, _OBSTACLE_COLOR)
-                self._shown[name] = obstacle, self._make(obstacle, color)
+                self._shown[name] = obstacle, self._add_body(obstacle, color)
 
-    def _make(self, obstacle: Obstacle, color: Sequence[float]) -> int:
+    def _add_body(self, obstacle: Obstacle, color: Sequence[float]) -> int:
         arguments = shape_arguments(obstacle)
         if "height" in arguments:
             arguments["length"] = arguments.pop("height")
@@ -139,13 +132,5 @@ class Camera:
         )
 
     def close(self) -> None:
-        """Leave the world of pictures."""
+        """Disconnect from PyBullet; the camera cannot be used afterwards."""
         self._bullet.disconnect()
-
-
-def snapshot(
-    robot: BulletRobot, eye: ArrayLike, target: ArrayLike, size: tuple[int, int] = (800, 600)
-) -> np.ndarray:
-    """Return one picture of `robot`; `Camera.snapshot` has the details, and is faster for more."""
-    with closing(Camera(robot)) as camera:
-        return camera.snapshot(eye, target, size)

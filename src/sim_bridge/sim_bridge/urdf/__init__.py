@@ -1,1 +1,5 @@
-"""Robot descriptions made ready for PyBullet."""
+"""Robot descriptions rewritten for PyBullet."""
+
+from sim_bridge.urdf.preparation import FramePlacement, PreparedUrdf, prepare_urdf
+
+__all__ = ["FramePlacement", "PreparedUrdf", "prepare_urdf"]

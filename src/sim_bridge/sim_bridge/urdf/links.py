@@ -1,4 +1,4 @@
-"""What the links of a URDF weigh, and what shapes they have."""
+"""Masses, shapes and children of the links of a URDF."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from collections.abc import Mapping
 from copy import deepcopy
 from xml.etree.ElementTree import Element, SubElement
 
-import numpy as np
+import pinocchio as pin
 
 from sim_bridge.urdf.geometry import number_text, origin_attributes, read_numbers, transform_of
 from viability_bounds_pkg.robot_description import RobotDescriptionError, resolve_uri
 
 
 def scale_masses(root: Element, scales: Mapping[str, float]) -> None:
-    """Let links of the URDF `root` weigh more or less; their inertias follow.
+    """Scale mass and inertia of links of the URDF `root`.
 
     Raises:
         RobotDescriptionError: an unknown link, or one scaled by other than a finite positive
@@ -33,15 +33,15 @@ def scale_masses(root: Element, scales: Mapping[str, float]) -> None:
 
 
 def placed_shapes(
-    link: Element, kind: str, placement: np.ndarray, missing: list[str] | None = None
+    link: Element, kind: str, placement: pin.SE3, missing: list[str] | None = None
 ) -> list[Element]:
-    """Return the shapes of `link` as shapes of the body that it sits on.
+    """Return the shapes of `link` as shapes of the body that it is part of.
 
     Args:
         link: of a URDF.
         kind: visual or collision.
-        placement: of the link on the body, shape (4, 4).
-        missing: takes the meshes that cannot be found, whose shapes are left out.
+        placement: of the link on the body.
+        missing: receives the meshes that cannot be found, whose shapes are left out.
 
     Raises:
         RobotDescriptionError: a mesh cannot be found, and `missing` is None.
@@ -52,7 +52,7 @@ def placed_shapes(
         origin = shape.find("origin")
         if origin is None:
             origin = SubElement(shape, "origin")
-        origin.attrib = origin_attributes(placement @ transform_of(origin))
+        origin.attrib = origin_attributes(placement * transform_of(origin))
         try:
             for mesh in shape.iter("mesh"):
                 mesh.set("filename", str(resolve_uri(mesh.get("filename", "")).resolve()))
@@ -76,13 +76,14 @@ def carried_links(root: Element, link: str) -> list[str]:
         raise RobotDescriptionError(f"unknown link {link!r}; the URDF has: {', '.join(known)}")
     carried = _children(root).get(link)
     if not carried:
-        raise RobotDescriptionError(f"link {link!r} carries nothing that could be felt")
+        raise RobotDescriptionError(f"link {link!r} carries no other link to measure")
     return carried
 
 
 def links_beyond(root: Element, link: str) -> set[str]:
-    """Return `link` and all links of the URDF `root` that it carries, directly or not."""
-    children, beyond, pending = _children(root), set(), [link]
+    """Return `link` and all its descendants in the URDF `root`."""
+    children, pending = _children(root), [link]
+    beyond: set[str] = set()
     while pending:
         name = pending.pop()
         beyond.add(name)
@@ -93,6 +94,12 @@ def links_beyond(root: Element, link: str) -> set[str]:
 def _children(root: Element) -> dict[str, list[str]]:
     children: dict[str, list[str]] = {}
     for joint in root.findall("joint"):
-        parent, child = (joint.find(end).get("link", "") for end in ("parent", "child"))
+        parent, child = (link_at(joint, end) for end in ("parent", "child"))
         children.setdefault(parent, []).append(child)
     return children
+
+
+def link_at(joint: Element, end: str) -> str:
+    """Return the name of the link at the "parent" or "child" `end` of a joint; may be empty."""
+    element = joint.find(end)
+    return "" if element is None else element.get("link", "")

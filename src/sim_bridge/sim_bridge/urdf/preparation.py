@@ -1,20 +1,19 @@
-"""A URDF made ready for PyBullet, so that its dynamics equal Pinocchio's reduced model.
+"""Rewrites a URDF so that its dynamics in PyBullet equal Pinocchio's reduced model.
 
-PyBullet reads a URDF in ways that silently change the dynamics; nothing is left to that here:
+PyBullet reads a URDF in ways that silently change the dynamics. Each is prevented here:
 
-- a link without ``<inertial>`` would weigh 1 kg: every link made here has one;
-- inertia tensors would be diagonalised to a relative 1e-6 only, and one that breaks the
+- a link without ``<inertial>`` would have a mass of 1 kg: every link made here has one;
+- inertia tensors would be diagonalised to a relative 1e-6 only, and one that violates the
   triangle inequality, if only by rounding as a flat link's may, would become zero: the text
   has the principal axes and stand-ins for the moments, which the caller sets after loading;
 - joint damping and friction, and joint stops, would act: they are removed.
 
-Links that do not move against each other become one, with the sum of their inertias: PyBullet
-steps every link, fixed or not, and a humanoid becomes as fast as its arm.
-`PreparedUrdf.frames` remembers where each of the original links went.
+Links that do not move relative to each other become one, with the sum of their inertias:
+PyBullet steps every link, fixed or not, and a humanoid becomes as fast as its arm.
+`PreparedUrdf.frames` says where each of the original links is.
 
-What a URDF cannot say is added on request: rotors that gears will couple to the joints
-(`sim_bridge.bullet.joint_friction` has the reasons), and links that weigh other than the URDF
-believes.
+On request it adds what a URDF cannot express: rotors that gears will couple to the joints
+(`sim_bridge.bullet.joint_friction` has the reasons), and scaled masses of links.
 """
 
 from __future__ import annotations
@@ -27,55 +26,54 @@ from typing import NamedTuple
 from xml.etree.ElementTree import Element, ParseError, SubElement, fromstring, tostring
 
 import numpy as np
+import pinocchio as pin
 
 from sim_bridge.urdf.geometry import (
+    Array,
     joint_axis,
     number_text,
     origin_attributes,
-    point_inertia,
     read_numbers,
-    roll_pitch_yaw,
     transform_of,
 )
-from sim_bridge.urdf.links import placed_shapes, scale_masses
+from sim_bridge.urdf.links import link_at, placed_shapes, scale_masses
 from viability_bounds_pkg.robot_description import RobotDescriptionError
 
 _MOVABLE = ("revolute", "continuous", "prismatic")
 # PyBullet makes no stop where lower > upper.
 _NO_STOP = {"lower": "1", "upper": "-1", "effort": "0", "velocity": "0"}
+# The caller sets the moments of inertia after loading.
+_STAND_IN = {"ixx": "1", "ixy": "0", "ixz": "0", "iyy": "1", "iyz": "0", "izz": "1"}
 
 
 class FramePlacement(NamedTuple):
-    """Where a link of the original URDF sits: on which link left, and where on it.
+    """A link of the original URDF as a frame of the link that it became part of.
 
-    Relative to the link's principal frame: centre of mass and principal axes. PyBullet reports
-    that in double precision, but URDF frames in single precision.
+    Relative to that link's principal frame: centre of mass and principal axes. PyBullet reports
+    it in double precision, but URDF frames in single precision.
     """
 
     link: str
-    position: np.ndarray  # shape (3,), m
-    orientation: np.ndarray  # shape (4,), quaternion x, y, z, w
+    placement: pin.SE3
 
 
 @dataclass(frozen=True)
 class PreparedUrdf:
-    """A URDF for PyBullet, and what it takes to use it."""
+    """A URDF for PyBullet, with the inertias that are to be set after loading it."""
 
     text: str  # without any joints but those asked for
     frames: Mapping[str, FramePlacement]  # of every link of the original URDF
-    principal_inertias: Mapping[str, np.ndarray]  # to set for each link left, shape (3,), kg m^2
+    principal_inertias: Mapping[str, Array]  # to set for each link left, shape (3,), kg m^2
     rotors: Mapping[str, str]  # the joint of the rotor that belongs to a joint, where there is one
     missing: Sequence[str]  # meshes of collision shapes that cannot be found and are left out
 
 
 @dataclass
 class _Body:
-    """Links that move as one, gathered in the frame of the first of them."""
+    """Links that move as one, in the frame of the first of them."""
 
     name: str
-    mass: float = 0.0
-    moment: np.ndarray = field(default_factory=lambda: np.zeros(3))  # mass times centre of mass
-    inertia: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))  # about the frame
+    inertia: pin.Inertia = field(default_factory=pin.Inertia.Zero)
     shapes: list[Element] = field(default_factory=list)
 
 
@@ -86,7 +84,6 @@ def prepare_urdf(
     *,
     visuals: bool = False,
     collisions: bool = False,
-    mechanical_stops: bool = False,
     apart: Collection[str] = (),
     mass_scales: Mapping[str, float] | None = None,
     rotor_inertias: Mapping[str, float] | None = None,
@@ -100,7 +97,6 @@ def prepare_urdf(
             at zero. Mimic joints are joints like any other here, as they are in Pinocchio.
         visuals: keep the visual shapes; the files they name are looked up.
         collisions: keep the collision shapes of what moves.
-        mechanical_stops: keep the position limits as hard stops, which hide violations.
         apart: links that do not become one with those that carry them, even if they are fixed.
         mass_scales: factors for mass and inertia of links, by name.
         rotor_inertias: for each of `joints` that gets a rotor, its inertia, kg m^2 (kg for a
@@ -134,27 +130,26 @@ def prepare_urdf(
 
     missing: list[str] = []
     bodies = [_Body(roots[0])]
-    placed: dict[str, tuple[_Body, np.ndarray]] = {}
-    pending = [(roots[0], bodies[0], np.eye(4))]
+    placed: dict[str, tuple[_Body, pin.SE3]] = {}
+    pending = [(roots[0], bodies[0], pin.SE3.Identity())]
     while pending:
         name, body, placement = pending.pop()
         placed[name] = body, placement
-        _add_inertia(body, links[name], placement)
+        body.inertia += _inertia(links[name], placement)
         if visuals:
             body.shapes += placed_shapes(links[name], "visual", placement)
         if collisions and body is not bodies[0]:  # what stands still meets nothing
             body.shapes += placed_shapes(links[name], "collision", placement, missing)
         for joint in outgoing.get(name, ()):
             child = _linked(joint, "child", links)
-            origin = placement @ transform_of(joint.find("origin"))
+            origin = placement * transform_of(joint.find("origin"))
             moves = joint.get("name") in joints
             if not moves:
-                origin = origin @ _locked_motion(joint, locked.get(joint.get("name", ""), 0.0))
+                origin = origin * _locked_motion(joint, locked.get(joint.get("name", ""), 0.0))
             if moves or child in apart:
-                stops = mechanical_stops and moves
-                output.append(_joint_between(joint, moves, body.name, child, origin, stops))
+                output.append(_joint_between(joint, moves, body.name, child, origin))
                 bodies.append(_Body(child))
-                pending.append((child, bodies[-1], np.eye(4)))
+                pending.append((child, bodies[-1], pin.SE3.Identity()))
             else:
                 pending.append((child, body, origin))
 
@@ -162,14 +157,15 @@ def prepare_urdf(
     bodies[0] = _Body(roots[0], shapes=bodies[0].shapes)
     principal = {body.name: _append_link(output, body) for body in bodies}
     frames = {
-        name: _frame(body.name, np.linalg.solve(principal[body.name][0], placement))
+        name: FramePlacement(body.name, principal[body.name][0].actInv(placement))
         for name, (body, placement) in placed.items()
     }
     inertias = {name: moments for name, (_, moments) in principal.items()}
-    rotors = {joint: f"{joint} rotor" for joint in rotor_inertias or {}}
-    for joint, rotor in rotors.items():
+    rotors = {}
+    for joint_name, inertia in (rotor_inertias or {}).items():
+        rotors[joint_name] = rotor = f"{joint_name} rotor"
         _append_rotor(output, bodies[0].name, rotor)
-        inertias[rotor] = np.full(3, rotor_inertias[joint])
+        inertias[rotor] = np.full(3, inertia)
     return PreparedUrdf(tostring(output, encoding="unicode"), frames, inertias, rotors, missing)
 
 
@@ -192,42 +188,41 @@ def _check_joints(root: Element, joints: Sequence[str], locked: Mapping[str, flo
 
 
 def _linked(joint: Element, end: str, links: Mapping[str, object]) -> str:
-    """Return the link at the 'parent' or 'child' `end` of `joint`."""
-    element = joint.find(end)
-    name = "" if element is None else element.get("link", "")
+    """Return the link at the "parent" or "child" `end` of `joint`."""
+    name = link_at(joint, end)
     if name not in links:
         raise RobotDescriptionError(f"joint {joint.get('name')!r}: no {end} link {name!r}")
     return name
 
 
-def _add_inertia(body: _Body, link: Element, placement: np.ndarray) -> None:
-    """Add the inertia of `link` placed on `body`."""
+def _inertia(link: Element, placement: pin.SE3) -> pin.Inertia:
+    """Return the inertia of `link` placed on a body, in the body's frame."""
+    total = pin.Inertia.Zero()
     for inertial in link.findall("inertial"):
-        frame = placement @ transform_of(inertial.find("origin"))
-        rotation, centre = frame[:3, :3], frame[:3, 3]
         mass = read_numbers(inertial.find("mass"), "value", 1)[0]
         xx, xy, xz, yy, yz, zz = (
             read_numbers(inertial.find("inertia"), name, 1)[0]
             for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
         )
-        own = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        body.mass += mass
-        body.moment += mass * centre
-        body.inertia += rotation @ own @ rotation.T + point_inertia(mass, centre)
+        moments = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        try:
+            own = pin.Inertia(mass, np.zeros(3), moments)
+        except RuntimeError as error:
+            raise RobotDescriptionError(f"link {link.get('name')!r}: {error}") from error
+        total += (placement * transform_of(inertial.find("origin"))).act(own)
+    return total
 
 
-def _append_link(output: Element, body: _Body) -> tuple[np.ndarray, np.ndarray]:
-    """Add `body` to the URDF; return its principal frame, shape (4, 4), and moments (3,)."""
-    frame = np.eye(4)
-    frame[:3, 3] = centre = body.moment / body.mass if body.mass else np.zeros(3)
-    moments, axes = np.linalg.eigh(body.inertia - point_inertia(body.mass, centre))
+def _append_link(output: Element, body: _Body) -> tuple[pin.SE3, Array]:
+    """Add `body` to the URDF; return its principal frame and moments, shape (3,)."""
+    moments, axes = np.linalg.eigh(body.inertia.inertia)
     axes[:, 2] *= np.sign(np.linalg.det(axes))  # eigenvectors may come left-handed
-    frame[:3, :3] = axes
+    frame = pin.SE3(axes, body.inertia.lever)
     link = SubElement(output, "link", name=body.name)
     inertial = SubElement(link, "inertial")
     SubElement(inertial, "origin", origin_attributes(frame))
-    SubElement(inertial, "mass", value=number_text([body.mass]))
-    SubElement(inertial, "inertia", ixx="1", ixy="0", ixz="0", iyy="1", iyz="0", izz="1")
+    SubElement(inertial, "mass", value=number_text([body.inertia.mass]))
+    SubElement(inertial, "inertia", _STAND_IN)
     link.extend(body.shapes)
     return frame, moments
 
@@ -236,7 +231,7 @@ def _append_rotor(output: Element, base: str, name: str) -> None:
     """Add a rotor that turns against `base`; the caller sets its inertia, as for all links."""
     inertial = SubElement(SubElement(output, "link", name=name), "inertial")
     SubElement(inertial, "mass", value="1")
-    SubElement(inertial, "inertia", ixx="1", ixy="0", ixz="0", iyy="1", iyz="0", izz="1")
+    SubElement(inertial, "inertia", _STAND_IN)
     joint = SubElement(output, "joint", name=name, type="revolute")
     SubElement(joint, "parent", link=base)
     SubElement(joint, "child", link=name)
@@ -244,17 +239,8 @@ def _append_rotor(output: Element, base: str, name: str) -> None:
     SubElement(joint, "limit", _NO_STOP)
 
 
-def _frame(link: str, transform: np.ndarray) -> FramePlacement:
-    """Return the frame that `transform`, shape (4, 4), places on `link`."""
-    half = 0.5 * np.array(roll_pitch_yaw(transform))
-    (sr, sp, sy), (cr, cp, cy) = np.sin(half), np.cos(half)
-    x, y, z = sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy
-    w = cr * cp * cy + sr * sp * sy
-    return FramePlacement(link, transform[:3, 3], np.array([x, y, z, w]))
-
-
 def _joint_between(
-    joint: Element, moves: bool, parent: str, child: str, origin: np.ndarray, stops: bool
+    joint: Element, moves: bool, parent: str, child: str, origin: pin.SE3
 ) -> Element:
     """Return `joint` placed at `origin` on `parent`, without friction, damping or mimicry."""
     kind = "prismatic" if joint.get("type") == "prismatic" else "revolute"
@@ -265,21 +251,15 @@ def _joint_between(
     if not moves:
         return result
     SubElement(result, "axis", xyz=number_text(joint_axis(joint)))
-    limit = joint.find("limit")
-    if stops and limit is not None and joint.get("type") != "continuous":
-        result.append(deepcopy(limit))
-    else:
-        SubElement(result, "limit", _NO_STOP)
+    SubElement(result, "limit", _NO_STOP)
     return result
 
 
-def _locked_motion(joint: Element, position: float) -> np.ndarray:
-    """Return the transform, shape (4, 4), that `joint` makes at `position` (rad or m)."""
-    motion = np.eye(4)
+def _locked_motion(joint: Element, position: float) -> pin.SE3:
+    """Return the transform that `joint` makes at `position` (rad or m)."""
+    if position == 0.0:  # fixed joints need no axis
+        return pin.SE3.Identity()
+    motion = position * joint_axis(joint)
     if joint.get("type") == "prismatic":
-        motion[:3, 3] = position * joint_axis(joint)
-    elif position != 0.0:  # Rodrigues: R = I + sin(q) K + (1 - cos(q)) K^2
-        x, y, z = joint_axis(joint)
-        skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        motion[:3, :3] += math.sin(position) * skew + (1.0 - math.cos(position)) * skew @ skew
-    return motion
+        return pin.SE3(np.eye(3), motion)
+    return pin.SE3(pin.exp3(motion), np.zeros(3))

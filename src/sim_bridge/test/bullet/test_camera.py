@@ -8,7 +8,7 @@ from ros_harness import read_config
 
 from sim_bridge.bullet.obstacles import Obstacle
 from sim_bridge.bullet.robot import BulletRobot
-from sim_bridge.tools.camera import Camera, snapshot
+from sim_bridge.tools.camera import Camera
 from viability_bounds_pkg.robot_description import read_urdf
 
 CONFIG = read_config("panda", "bullet_node")
@@ -66,7 +66,7 @@ def test_the_robot_and_its_obstacles_are_seen_where_they_are(robot, camera):
     # The hand: the picture changes there when it moves, and not at the foot.
     bent = camera.snapshot(EYE, TARGET, SIZE, q=Q + [0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0])
     differs = np.abs(bent.astype(int) - bare).max(axis=2) > 20
-    row, column = np.round(pixel(robot.link_pose("panda_hand")[0])).astype(int)
+    row, column = np.round(pixel(robot.link_pose("panda_hand").translation)).astype(int)
     assert differs[row - 2 : row + 3, column - 2 : column + 3].any()
     row, column = np.round(pixel(np.array([0.0, 0.0, 0.1]))).astype(int)
     assert not differs[row - 2 : row + 3, column - 2 : column + 3].any()
@@ -78,7 +78,8 @@ def test_pictures_do_not_touch_the_robots_world(robot):
         robot.reset(Q, np.full(7, 0.2))
         robot.step(np.ones(7), 20)
         if seen:
-            snapshot(robot, EYE, TARGET, (32, 24))
+            with closing(Camera(robot)) as camera:
+                camera.snapshot(EYE, TARGET, (32, 24))
         robot.step(np.ones(7), 20)
         states.append(robot.state())
     np.testing.assert_array_equal(np.stack(states[0]), np.stack(states[1]))

@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 from ros_harness import read_config
 
-from sim_bridge.bullet.joint_friction import Gears
+from sim_bridge.bullet.joint_friction import JointFriction
 from sim_bridge.bullet.obstacles import Obstacle
 from sim_bridge.bullet.robot import BulletRobot
 from viability_bounds_pkg.robot_description import (
@@ -26,7 +26,7 @@ FOREARM = {"panda": "panda_link5", "talos_left_arm": "arm_left_5_link"}
 def make(name, physics_dt=1e-3, sensor=None, **options):
     config = CONFIG[name]
     n = len(config["joints"])
-    gears = Gears(
+    joint_friction = JointFriction(
         n,
         friction_coulomb=config.get("friction_coulomb", 0.0),
         rotor_inertia=config.get("rotor_inertia", 0.0),
@@ -37,7 +37,7 @@ def make(name, physics_dt=1e-3, sensor=None, **options):
             config["joints"],
             physics_dt=physics_dt,
             locked_positions=locked(config),
-            gears=gears,
+            joint_friction=joint_friction,
             sensor_frame=SENSOR[name] if sensor is None else sensor,
             **options,
         )
@@ -52,8 +52,7 @@ def locked(config):
 
 
 def rotation(robot, link):
-    x, y, z, w = robot.link_pose(link)[1]
-    return pin.Quaternion(w, x, y, z).toRotationMatrix()
+    return robot.link_pose(link).rotation
 
 
 def weight(robot, name):
@@ -115,13 +114,13 @@ def test_in_motion_it_feels_the_change_of_momentum(sensor, beyond):
 
         for pushed in (False, True):
             robot.reset(rng.uniform(-1.0, 1.0, 7), rng.uniform(-1.0, 1.0, 7))
-            place, axes = robot.link_pose(sensor)[0], rotation(robot, sensor)
+            place, axes = robot.link_pose(sensor).translation, rotation(robot, sensor)
             before, load = momentum(place)
             if pushed:
                 force, torque = np.array([3.0, -5.0, 7.0]), np.array([0.1, 0.2, -0.3])
                 robot.apply_wrench("panda_leftfinger", force, torque)
                 robot.apply_wrench("panda_link1", 9.0 * force, torque)
-                arm = robot.link_pose("panda_leftfinger")[0] - place
+                arm = robot.link_pose("panda_leftfinger").translation - place
                 load += np.hstack([force, torque + np.cross(arm, force)])
             robot.step(rng.uniform(-5.0, 5.0, 7))
             expected = load - (momentum(place)[0] - before) / h
@@ -137,7 +136,7 @@ def test_pushes_and_contacts_beyond_are_felt_and_others_are_not():
         q = np.array(CONFIG[name]["start_positions"])
         robot.reset(q, np.zeros(n))
         free, axes = weight(robot, name), rotation(robot, SENSOR[name])
-        place = robot.link_pose(SENSOR[name])[0]
+        place = robot.link_pose(SENSOR[name]).translation
         limits = np.full(n, 500.0)
         force = np.array([5.0, -10.0, 8.0])
         robot.apply_wrench(FOREARM[name], force, np.zeros(3))
@@ -146,18 +145,18 @@ def test_pushes_and_contacts_beyond_are_felt_and_others_are_not():
         robot.clear_wrenches(FOREARM[name])
         robot.apply_wrench(HAND[name], force, [0.1, 0.0, 0.2])
         robot.brake(100, limits)
-        moment = np.cross(robot.link_pose(HAND[name])[0] - place, force) + [0.1, 0.0, 0.2]
+        moment = np.cross(robot.link_pose(HAND[name]).translation - place, force) + [0.1, 0.0, 0.2]
         felt = np.hstack([axes.T @ force, axes.T @ moment])
         np.testing.assert_allclose(robot.sensor_wrench() - free, felt, atol=1e-6)
         robot.clear_wrenches()
         # A ball of 10 cm comes to touch the hand from below, and a table that pushes.
-        hand = robot.link_pose("gripper_left_fingertip_3_link")[0]
+        hand = robot.link_pose("gripper_left_fingertip_3_link").translation
         robot.add_obstacle(Obstacle("ball", "sphere", [0.1] * 3, hand + [0.0, 0.0, -0.09]))
         robot.step(np.zeros(n), 400)
         robot.brake(200, limits)
         contacts = robot.contacts()
         assert {contact.link for contact in contacts} == {"wrist_left_ft_tool_link"}
-        place, axes = robot.link_pose(SENSOR[name])[0], rotation(robot, SENSOR[name])
+        place, axes = robot.link_pose(SENSOR[name]).translation, rotation(robot, SENSOR[name])
         force = sum(contact.force for contact in contacts)
         moment = sum(np.cross(contact.position - place, contact.force) for contact in contacts)
         assert np.linalg.norm(force) > 5.0
@@ -180,7 +179,7 @@ def test_a_sensor_does_not_change_the_motion(name):
 
 @pytest.mark.parametrize(
     ("sensor", "match"),
-    [("wing", "unknown link 'wing'"), ("panda_leftfinger", "carries nothing")],
+    [("wing", "unknown link 'wing'"), ("panda_leftfinger", "carries no other link")],
 )
 def test_a_sensor_that_cannot_be_is_refused(sensor, match):
     with pytest.raises(RobotDescriptionError, match=match), make("panda", sensor=sensor):

@@ -1,4 +1,4 @@
-"""Gears against the equations they stand for, and in contact with the world."""
+"""Joint friction and rotors against their equations for, and in contact with the world."""
 
 from contextlib import closing
 from xml.etree import ElementTree
@@ -8,7 +8,7 @@ import pinocchio as pin
 import pybullet
 import pytest
 
-from sim_bridge.bullet.joint_friction import Gears
+from sim_bridge.bullet.joint_friction import JointFriction
 from sim_bridge.bullet.robot import BulletRobot
 from viability_bounds_pkg.robot_description import (
     RobotDescriptionError,
@@ -43,20 +43,20 @@ def single_joint(gravity=(0.0, 0.0, 0.0), physics_dt=H, **options):
             ["joint"],
             physics_dt=physics_dt,
             gravity=gravity,
-            gears=Gears(1, **options),
+            joint_friction=JointFriction(1, **options),
         )
     )
 
 
 def talos(scales=None, gravity=(0.0, 0.0, -9.81), **options):
-    gears = Gears(N, **options)
+    joint_friction = JointFriction(N, **options)
     return closing(
         BulletRobot(
             read_urdf(TALOS),
             JOINTS,
             physics_dt=H,
             gravity=gravity,
-            gears=gears,
+            joint_friction=joint_friction,
             mass_scales=scales,
         )
     )
@@ -105,8 +105,10 @@ def test_rotors_of_prismatic_joints_and_of_some_joints_only():
         <axis xyz="1 0 1"/><limit lower="0" upper="1" effort="1" velocity="1"/></joint></robot>"""
     for rotors in ([0.0, 3.0], [0.7, 0.0], [0.7, 3.0]):
         model = build_model(urdf, ["turn", "slide"], rotor_inertia=rotors)
-        gears = Gears(2, rotor_inertia=rotors)
-        with closing(BulletRobot(urdf, ["turn", "slide"], physics_dt=H, gears=gears)) as robot:
+        joint_friction = JointFriction(2, rotor_inertia=rotors)
+        with closing(
+            BulletRobot(urdf, ["turn", "slide"], physics_dt=H, joint_friction=joint_friction)
+        ) as robot:
             q, v, tau = np.array([0.3, 0.2]), np.array([1.0, -0.5]), np.array([2.0, 9.0])
             reset_raw(robot, q, v)
             robot.step(tau)
@@ -256,9 +258,13 @@ def test_motion_against_friction_by_an_independent_integration(model):
 
     errors = []
     for physics_dt in (1e-3, 5e-4):
-        gears = Gears(N, friction_coulomb=coulomb, friction_viscous=viscous, rotor_inertia=ROTORS)
+        joint_friction = JointFriction(
+            N, friction_coulomb=coulomb, friction_viscous=viscous, rotor_inertia=ROTORS
+        )
         with closing(
-            BulletRobot(read_urdf(TALOS), JOINTS, physics_dt=physics_dt, gears=gears)
+            BulletRobot(
+                read_urdf(TALOS), JOINTS, physics_dt=physics_dt, joint_friction=joint_friction
+            )
         ) as robot:
             robot.reset(start, v0)
             for k in range(round(duration / physics_dt)):
@@ -318,7 +324,7 @@ def test_heavier_links_move_as_if_the_urdf_said_so():
             assert np.abs(nominal - expected).max() > 1e-2
 
 
-def test_pushes_are_felt_through_the_gears(model):
+def test_pushes_are_felt_through_rotors_and_friction(model):
     data = model.createData()
     with talos(rotor_inertia=ROTORS) as robot:
         reset_raw(robot, Q, np.zeros(N))
@@ -398,10 +404,12 @@ def test_stiction_bears_what_lies_on_the_arm():
                 assert robot.state().q[0] > 1e-2
 
 
-def test_gears_that_add_nothing_change_nothing():
+def test_friction_of_zero_changes_nothing():
     states = []
-    for gears in (None, Gears(N), Gears(N, stribeck_velocity=2.0)):
-        with closing(BulletRobot(read_urdf(TALOS), JOINTS, physics_dt=H, gears=gears)) as robot:
+    for joint_friction in (None, JointFriction(N), JointFriction(N, stribeck_velocity=2.0)):
+        with closing(
+            BulletRobot(read_urdf(TALOS), JOINTS, physics_dt=H, joint_friction=joint_friction)
+        ) as robot:
             robot.reset(Q, np.full(N, 0.3))
             robot.step(np.ones(N), 50)
             robot.brake(20, TAU_MAX)
@@ -428,15 +436,15 @@ def test_the_solver_is_chosen_in_silence(capfd):
         ({"rotor_inertia": [0.1, -0.1]}, "rotor_inertia"),
     ],
 )
-def test_gears_that_cannot_be_are_refused(options, match):
+def test_invalid_friction_is_refused(options, match):
     with pytest.raises(ValueError, match=match):
-        Gears(2, **options)
+        JointFriction(2, **options)
 
 
 def test_robots_that_cannot_be_are_refused():
     urdf = read_urdf(TALOS)
-    with pytest.raises(ValueError, match="9 joints, but 3 gears"):
-        BulletRobot(urdf, JOINTS, physics_dt=H, gears=Gears(3))
+    with pytest.raises(ValueError, match="that of 3 joints, not of 9"):
+        BulletRobot(urdf, JOINTS, physics_dt=H, joint_friction=JointFriction(3))
     for scales, match in (
         ({"wing": 1.1}, "unknown link 'wing'.*torso_2_link"),
         ({"torso_2_link": 0.0}, "'torso_2_link' cannot be scaled by 0"),

@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 from ros_harness import read_config
 
-from sim_bridge.bullet.joint_friction import Gears
+from sim_bridge.bullet.joint_friction import JointFriction
 from sim_bridge.bullet.obstacles import ContactMaterial, Obstacle, ObstacleError
 from sim_bridge.bullet.robot import BulletRobot
 from viability_bounds_pkg.robot_description import (
@@ -35,7 +35,7 @@ def model():
 
 def talos(friction=1.0, **options):
     """The configured arm, its friction scaled."""
-    gears = Gears(
+    joint_friction = JointFriction(
         N,
         friction_coulomb=friction * np.array(CONFIG["friction_coulomb"]),
         friction_static=friction * STICTION,
@@ -44,7 +44,14 @@ def talos(friction=1.0, **options):
         rotor_inertia=CONFIG["rotor_inertia"],
     )
     return closing(
-        BulletRobot(URDF, JOINTS, physics_dt=H, locked_positions=LOCKED, gears=gears, **options)
+        BulletRobot(
+            URDF,
+            JOINTS,
+            physics_dt=H,
+            locked_positions=LOCKED,
+            joint_friction=joint_friction,
+            **options,
+        )
     )
 
 
@@ -53,11 +60,11 @@ def table(height):
 
 
 def contact_torques(model, data, q, forces):
-    """Return what forces (link, point, force) are to the joints, shape (n,), N m."""
+    """Return the joint torques of forces on links, shape (n,), N m."""
     pin.computeJointJacobians(model, data, q)
     pin.updateFramePlacements(model, data)
     tau = np.zeros(model.nv)
-    for link, point, force in forces:
+    for link, point, force, *_ in forces:
         frame = model.getFrameId(link)
         J = pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED)
         arm = point - data.oMf[frame].translation
@@ -95,7 +102,7 @@ def floor(height):
     return Obstacle("floor", "box", [9.0, 9.0, 0.1], [0.0, 0.0, height - 0.05])
 
 
-def gantry(axes, gears=None, gravity=(0.0, 0.0, 0.0), **options):
+def gantry(axes, joint_friction=None, gravity=(0.0, 0.0, 0.0), **options):
     urdf = '<robot name="gantry"><link name="base"/>'
     for i, axis in enumerate(axes):
         parent = f"link{i - 1}" if i else "base"
@@ -108,7 +115,12 @@ def gantry(axes, gears=None, gravity=(0.0, 0.0, 0.0), **options):
     joints = [f"joint{i}" for i in range(3)]
     return closing(
         BulletRobot(
-            urdf + "</robot>", joints, physics_dt=H, gravity=gravity, gears=gears, **options
+            urdf + "</robot>",
+            joints,
+            physics_dt=H,
+            gravity=gravity,
+            joint_friction=joint_friction,
+            **options,
         )
     )
 
@@ -116,11 +128,13 @@ def gantry(axes, gears=None, gravity=(0.0, 0.0, 0.0), **options):
 STRAIGHT, SKEW = np.eye(3), np.array([[1.0, 0.0, 0.5], [0.3, 1.0, 0.0], [-0.6, 0.2, 1.0]])
 
 
-@pytest.mark.parametrize("gears", [None, Gears(3, rotor_inertia=0.3)], ids=["plain", "gears"])
+@pytest.mark.parametrize(
+    "joint_friction", [None, JointFriction(3, rotor_inertia=0.3)], ids=["plain", "rotors"]
+)
 @pytest.mark.parametrize("axes", [STRAIGHT, SKEW], ids=["straight", "skew"])
 @pytest.mark.parametrize("angle", [0.0, 0.4, 2.0])
-def test_sliding_friction_is_coulombs_in_every_direction(gears, axes, angle):
-    with gantry(axes, gears) as robot:
+def test_sliding_friction_is_coulombs_in_every_direction(joint_friction, axes, angle):
+    with gantry(axes, joint_friction) as robot:
         directions = axes / np.linalg.norm(axes, axis=1)[:, None]  # velocity = directions.T v
         robot.add_obstacle(floor(-0.0501))
         push = directions @ np.array([0.0, 0.0, -20.0])
@@ -139,7 +153,7 @@ def test_sliding_friction_is_coulombs_in_every_direction(gears, axes, angle):
 
 
 def test_it_sticks_below_the_limit_and_slides_above():
-    with gantry(STRAIGHT, Gears(3, rotor_inertia=0.3)) as robot:
+    with gantry(STRAIGHT, JointFriction(3, rotor_inertia=0.3)) as robot:
         robot.add_obstacle(floor(-0.0501))
         robot.step([0.0, 0.0, -20.0], 100)
         robot.step([7.0, -6.5, -20.0], 1000)  # 9.6 N of 10 N
@@ -178,7 +192,7 @@ def pressed(request, model):
     material = ContactMaterial(stiffness=2e4, damping=300.0) if request.param == "soft" else None
     with talos(friction=0.0, material=material) as robot:
         robot.reset(Q, np.zeros(N))
-        height = robot.link_pose(HAND)[0][2] - 0.3
+        height = robot.link_pose(HAND).translation[2] - 0.3
         robot.add_obstacle(table(height))
         tau = press(robot, model, [0.0, 0.0, -100.0], 3000)
         yield robot, height, tau, (material or ContactMaterial()).stiffness
@@ -208,8 +222,8 @@ def test_what_it_feels_is_what_moves_it(model):
     viscous = np.array(CONFIG["friction_viscous"])
     with talos(friction=0.0) as robot:
         robot.reset(Q, np.zeros(N))
-        elbow = robot.link_pose("arm_left_4_link")[0]
-        robot.add_obstacle(table(robot.link_pose(HAND)[0][2] - 0.31))
+        elbow = robot.link_pose("arm_left_4_link").translation
+        robot.add_obstacle(table(robot.link_pose(HAND).translation[2] - 0.31))
         pole = Obstacle("pole", "cylinder", [0.05, 0.05, 1.0], elbow + [0.2, 0.0, 0.0])
         robot.add_obstacle(pole)
         touched = set()
@@ -219,7 +233,7 @@ def test_what_it_feels_is_what_moves_it(model):
             force = [40.0, 30.0 * np.sin(0.01 * k), -40.0]
             tau = hand_push(model, data, q, np.array(force))
             robot.step(tau)
-            forces = robot._world.obstacles.forces()
+            forces = robot._world.obstacles.wrenches()
             touched |= {contact.obstacle for contact in robot.contacts()}
             v_next = robot.state().v
             pin.computeJointJacobians(model, data, q)
@@ -233,7 +247,7 @@ def test_friction_in_the_joints_leaves_the_force_steady_and_within_what_it_bears
     data = model.createData()
     with talos() as robot:
         robot.reset(Q, np.zeros(N))
-        robot.add_obstacle(table(robot.link_pose(HAND)[0][2] - 0.3))
+        robot.add_obstacle(table(robot.link_pose(HAND).translation[2] - 0.3))
         press(robot, model, [0.0, 0.0, -100.0], 1500)
         forces = []
         for _ in range(200):
@@ -289,7 +303,7 @@ def test_obstacles_are_replaced_and_removed():
 def test_the_same_contacts_give_the_same_numbers():
     runs = []
     for _ in range(2):
-        with gantry(SKEW, Gears(3, rotor_inertia=0.3, friction_coulomb=1.0)) as robot:
+        with gantry(SKEW, JointFriction(3, rotor_inertia=0.3, friction_coulomb=1.0)) as robot:
             robot.add_obstacle(floor(-0.051))
             robot.step([6.0, 9.0, -30.0], 300)
             runs.append(np.hstack([*robot.state(), total(robot.contacts())]))
@@ -341,7 +355,7 @@ def test_a_robot_without_its_shapes_moves_but_meets_no_obstacles():
       <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>{mesh}</link>
       <joint name="joint" type="continuous"><parent link="base"/><child link="arm"/></joint>
       </robot>"""
-    for options, match in (({}, r"no/such\.stl"), ({"collisions": False}, "none was asked for")):
+    for options, match in (({}, r"no/such\.stl"), ({"collisions": False}, "not loaded")):
         with closing(BulletRobot(urdf, ["joint"], physics_dt=H, **options)) as robot:
             robot.step([1.0])
             with pytest.raises(RobotDescriptionError, match=match):

@@ -221,7 +221,7 @@ def test_positions_are_held_for_the_time_out_and_then_braked(ros):
     np.testing.assert_allclose(robot.q, Q, rtol=0.0, atol=1e-3)
 
 
-def test_gears_and_masses_reach_the_robot(ros):
+def test_joint_friction_and_masses_reach_the_robot(ros):
     friction = [1.0, 1.0, 1.0, 1.0, 0.5, 0.5, 0.5]
     robot = Robot(
         ros,
@@ -234,13 +234,13 @@ def test_gears_and_masses_reach_the_robot(ros):
         mass_scale_links=["panda_link4"],
         mass_scales=[1.2],
     )
-    gears = robot.node._config.gears
-    np.testing.assert_array_equal(gears.friction_coulomb, friction)
-    np.testing.assert_array_equal(gears.friction_static, 2.0 * np.array(friction))
-    np.testing.assert_array_equal(gears.friction_viscous, 0.1)
-    np.testing.assert_array_equal(gears.stribeck_velocity, 0.02)
-    np.testing.assert_array_equal(gears.torque_bias, [0.1, 0.0, 0.0, 0.0, 0.0, 0.0, -0.1])
-    np.testing.assert_array_equal(gears.rotor_inertia, 0.1)
+    simulated = robot.node._config.joint_friction
+    np.testing.assert_array_equal(simulated.friction_coulomb, friction)
+    np.testing.assert_array_equal(simulated.friction_static, 2.0 * np.array(friction))
+    np.testing.assert_array_equal(simulated.friction_viscous, 0.1)
+    np.testing.assert_array_equal(simulated.stribeck_velocity, 0.02)
+    np.testing.assert_array_equal(simulated.torque_bias, [0.1, 0.0, 0.0, 0.0, 0.0, 0.0, -0.1])
+    np.testing.assert_array_equal(simulated.rotor_inertia, 0.1)
     assert robot.node._config.mass_scales == {"panda_link4": 1.2}
     # Less than the stiction, though wrong by the mass error and more: it stays where it is.
     robot.step(times=50)
@@ -261,10 +261,10 @@ def test_talos_stands_still_by_its_friction_alone(ros):
         read_urdf(values["robot_description"]), values["joints"], locked, values["rotor_inertia"]
     )
     q, tau_max = np.array(values["start_positions"]), np.array(values["torque_max"])
-    gears, masses = node._config.gears, node._config.mass_scales
-    np.testing.assert_allclose(gears.friction_coulomb, 0.1 * tau_max)
-    np.testing.assert_array_less(gears.friction_coulomb, gears.friction_static)
-    np.testing.assert_array_equal(gears.rotor_inertia, model.armature)
+    simulated, masses = node._config.joint_friction, node._config.mass_scales
+    np.testing.assert_allclose(simulated.friction_coulomb, 0.1 * tau_max)
+    np.testing.assert_array_less(simulated.friction_coulomb, simulated.friction_static)
+    np.testing.assert_array_equal(simulated.rotor_inertia, model.armature)
     assert set(masses.values()) == {1.1}
     room = np.minimum(q - values["position_min"], np.array(values["position_max"]) - q)
     assert room.min() > 0.3
@@ -278,7 +278,7 @@ def test_talos_stands_still_by_its_friction_alone(ros):
 
 def test_without_stiction_of_its_own_a_joint_has_that_of_coulomb(ros):
     robot = Robot(ros, friction_coulomb=[1.0] * 7)
-    np.testing.assert_array_equal(robot.node._config.gears.friction_static, 1.0)
+    np.testing.assert_array_equal(robot.node._config.joint_friction.friction_static, 1.0)
 
 
 def test_reset_brings_it_back_to_the_start_at_rest(ros):
@@ -485,7 +485,7 @@ def test_contacts_are_felt_by_motion_sensor_and_diagnostics(ros):
     robot = Robot(ros, obstacle_stiffness=1e5, ft_bias=[], ft_noise=[])
     felt = ros.listen(WrenchStamped, "ft_wrench")
     arm = robot.node._robot
-    finger = arm.link_pose("panda_leftfinger")[0]
+    finger = arm.link_pose("panda_leftfinger").translation
     floor = Marker(ns="floor", type=Marker.CUBE)
     floor.header.frame_id = VALUES["base_frame"]
     floor.scale.x = floor.scale.y = floor.scale.z = 0.2
