@@ -5,7 +5,8 @@
 #
 # With ROS 2 Jazzy sourced, it makes .venv on top of that (system site packages) and adds what is
 # missing. Without, it installs the Jazzy wheels into .venv. Then it builds the three packages
-# with colcon. What is done already is not done again.
+# with colcon, and compiles what Numba would otherwise compile at the first start of a node. What
+# is done already is not done again.
 
 _setup() {
     local root python venv stamp wanted inputs
@@ -43,6 +44,7 @@ _setup() {
     _build || return 1
     # shellcheck disable=SC1091
     source "$root/install/local_setup.bash"
+    _compile
 }
 
 _install() {
@@ -108,12 +110,27 @@ _build() {
     printf '%s' "$now" >"$built"
 }
 
+_compile() {
+    local compiled="$root/install/.compiled" now
+    now="$(find "$root/src" "$root/config" "$root/scripts/compile.py" \
+        -path '*/test/*' -prune -o \( -name '*.py' -o -name '*.yaml' \) -print0 |
+        LC_ALL=C sort -z | xargs -0 sha256sum | cat - "$stamp" | sha256sum)"
+    if [ "$(cat "$compiled" 2>/dev/null)" = "$now" ]; then
+        return 0
+    fi
+    if ! PYTHONPATH="$root/reproduction:${PYTHONPATH:-}" python "$root/scripts/compile.py"; then
+        echo "setup: compiling ahead failed; the nodes compile when they start" >&2
+        return 0
+    fi
+    printf '%s' "$now" >"$compiled"
+}
+
 # One at a time: two shells may source this at once.
 exec {_lock}>"$(dirname "${BASH_SOURCE[0]}")/../.setup.lock"
 flock "$_lock"
 _setup
 _status=$?
 exec {_lock}>&-
-unset -f _setup _install _install_pybullet _build
+unset -f _setup _install _install_pybullet _build _compile
 unset _lock
 (exit $_status)

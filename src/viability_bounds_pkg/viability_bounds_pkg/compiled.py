@@ -7,17 +7,22 @@ source that a compiled function may call has changed.
 
 from __future__ import annotations
 
+import fcntl
 import functools
 import hashlib
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
 from numba import njit
-from numba.core.caching import FunctionCache
+from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+_functions: list[Any] = []
 
 _NOT_CALLED = {"node", "nodes", "ros", "parameters", "cli", "tools", "__pycache__"}
 """Folders that compiled functions never call: the maths does not import them."""
@@ -38,7 +43,23 @@ def compiled(function: Any = None, **options: Any) -> Any:
         return functools.partial(compiled, **options)
     dispatcher = njit(**options)(function)
     dispatcher._cache = _SourceCache(function)
+    _functions.append(dispatcher)
     return dispatcher
+
+
+def compiled_functions() -> tuple[Any, ...]:
+    """Return every compiled function of the modules imported so far."""
+    return tuple(_functions)
+
+
+def is_kept(function: Any) -> bool:
+    """Return whether code of a compiled function is kept that was made of the present sources."""
+    return bool(function._cache._cache_file._load_index())
+
+
+def compilations() -> int:
+    """Return how often this process had to compile a function, because nothing was kept."""
+    return sum(sum(function.stats.cache_misses.values()) for function in _functions)
 
 
 class _SourceCache(FunctionCache):
@@ -46,9 +67,43 @@ class _SourceCache(FunctionCache):
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)  # type: ignore[no-untyped-call]
-        file = self._cache_file
+        own = self._impl.locator.get_source_stamp()
         # When this stamp differs from the one in the cache, Numba drops what is there.
-        file._source_stamp = (file._source_stamp, _digest(function.__module__.partition(".")[0]))
+        stamp = own, _digest(function.__module__.partition(".")[0])
+        self._cache_file = _LockedFile(self._cache_path, self._impl.filename_base, stamp)
+
+
+class _LockedFile(IndexDataCacheFile):
+    """The files of one function, which one process at a time writes.
+
+    Numba's own may mix up the code of two processes that compile the same function at the same
+    time, and keep an index of old code when the process ends between two writes.
+    """
+
+    def load(self, key: Any) -> Any:
+        if not Path(self._index_path).exists():
+            return None
+        with self._lock(write=False):
+            return super().load(key)
+
+    def save(self, key: Any, data: Any) -> None:
+        with self._lock(write=True):
+            overloads = self._load_index()
+            if not overloads:
+                self.flush()  # an index of older sources names files that are now overwritten
+            taken = set(overloads.values())
+            unused = (
+                name for i in itertools.count(1) if (name := self._data_name(i)) not in taken
+            )
+            name = overloads.setdefault(key, next(unused))
+            self._save_data(name, data)
+            self._save_index(overloads)
+
+    @contextmanager
+    def _lock(self, *, write: bool) -> Iterator[None]:
+        with open(Path(self._cache_path, ".compiled.lock"), "ab") as file:
+            fcntl.flock(file, fcntl.LOCK_EX if write else fcntl.LOCK_SH)
+            yield
 
 
 @functools.cache

@@ -2,7 +2,12 @@
 
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+
+import pytest
+
+from viability_bounds_pkg.compiled import _LockedFile
 
 PACKAGE = Path(__file__).resolve().parents[2]
 
@@ -56,3 +61,30 @@ def test_importing_writes_nothing_and_changes_no_setting(tmp_path):
         check=True,
     )
     assert not [path for path in cache.rglob("*") if path.is_file()]
+
+
+def test_what_is_kept_at_the_same_time_is_not_mixed_up(tmp_path):
+    def keep(key):
+        file = _LockedFile(tmp_path, "function", "sources")
+        file.save(key, {"code": key})
+
+    with ThreadPoolExecutor(16) as pool:
+        list(pool.map(keep, range(100)))
+    file = _LockedFile(tmp_path, "function", "sources")
+    assert [file.load(key) for key in range(100)] == [{"code": key} for key in range(100)]
+
+
+def test_code_of_other_sources_is_not_run_when_writing_was_interrupted(tmp_path, monkeypatch):
+    old, new = (_LockedFile(tmp_path, "function", sources) for sources in ("old", "new"))
+    old.save("types", "old code")
+
+    def interrupted(name, data):
+        save(name, data)
+        raise KeyboardInterrupt
+
+    save = new._save_data
+    monkeypatch.setattr(new, "_save_data", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        new.save("types", "new code")
+    assert new.load("types") is None
+    assert old.load("types") is None

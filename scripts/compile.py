@@ -1,0 +1,86 @@
+"""Compiles ahead what the nodes and tools use, so that no start has to wait for it.
+
+Part of `setup.sh`. The robots of `config/` play a few control steps with everything switched on:
+each function is compiled for the types it is called with there, and Numba keeps the results. What
+is kept from the same sources is not compiled again.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Event, Thread
+from typing import Any
+
+import numpy as np
+import yaml
+from direct import DirectLoop
+
+from sim_bridge.bullet.obstacles import Obstacle
+from torque_safety_controller.anti_windup import project_to_limits
+from torque_safety_controller.node.limits import LimitsReader
+from viability_bounds_pkg.compiled import compilations, compiled_functions, is_kept
+from viability_bounds_pkg.ros.messages import JointStateReader
+
+CONFIG = Path(__file__).resolve().parent.parent / "config"
+TABLE = Obstacle("table", "box", (0.2, 0.6, 0.1), (0.30702, 0.0, 0.42237), (0.0, 0.0, 0.0, 1.0))
+"""5 mm below Panda's fingertips at its start."""
+
+
+def main() -> None:
+    """Compile everything, and say how far it is."""
+    (wall,) = yaml.safe_load((CONFIG / "obstacles" / "panda_wall.yaml").read_text()).values()
+    with progress():
+        for path in sorted(CONFIG.glob("*.yaml")):
+            play(path.stem, {})
+        play("panda", {"acceleration_limits": "state_dependent", **wall["ros__parameters"]})
+        touch()
+        LimitsReader(["joint"])
+        JointStateReader(["joint"])
+        project_to_limits(np.zeros(1), np.zeros(1), np.ones(1))
+
+
+def play(robot: str, changes: dict[str, Any]) -> None:
+    """Play some control steps with each kind of integral action."""
+    loop = DirectLoop(robot, changes)
+    for mode in ("joints", "task", "none"):
+        loop.change(integral_action=mode)
+        loop.run(2.0 * loop.dt)
+
+
+def touch() -> None:
+    """Let an arm without torque fall on a table."""
+    loop = DirectLoop("panda")
+    loop.robot.add_obstacle(TABLE)
+    for _ in range(100):
+        loop.robot.step(np.zeros(loop.model.nv), loop.config.substeps)
+
+
+@contextmanager
+def progress() -> Iterator[None]:
+    """Show on stderr how many functions are compiled."""
+    functions, done = compiled_functions(), Event()
+    terminal = sys.stderr.isatty()
+
+    def show() -> None:
+        # Lines that overwrite each other, or few.
+        while not done.wait(0.2 if terminal else 5.0):
+            if compilations():
+                text = f"setup: compiling {sum(map(is_kept, functions))} of {len(functions)} ..."
+                print(text, end="\r" if terminal else "\n", file=sys.stderr, flush=True)
+
+    thread = Thread(target=show)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+        if compilations():
+            print(f"setup: compiled {compilations()} functions      ", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

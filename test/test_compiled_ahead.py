@@ -1,0 +1,78 @@
+"""Set-up compiles everything, so that neither starts of nodes nor control steps have to."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parent.parent
+CONFIG = ROOT / "config"
+PACKAGES = ("viability_bounds_pkg", "torque_safety_controller", "sim_bridge")
+OBSTACLES = yaml.safe_load((CONFIG / "obstacles" / "panda_wall.yaml").read_text())
+
+NOT_KEPT = """
+import importlib, pkgutil, sys
+from viability_bounds_pkg.compiled import compiled_functions, is_kept
+
+for name in sys.argv[1:]:
+    package = importlib.import_module(name)
+    for module in pkgutil.walk_packages(package.__path__, f"{name}."):
+        importlib.import_module(module.name)
+assert len(compiled_functions()) > 20
+for function in compiled_functions():
+    if not is_kept(function):
+        print(function)
+"""
+
+COMPILED_BY_NODES = """
+import sys, yaml
+from chain import load_values, run_chain
+from viability_bounds_pkg.compiled import compilations, compiled_functions
+
+values = load_values(sys.argv[1]) | yaml.safe_load(sys.argv[2])
+run_chain(values, {"duration": 0.02, "events": []}, {})
+for function in compiled_functions():
+    for types in function.stats.cache_misses:
+        print(function, *types)
+"""
+
+
+def run(*arguments):
+    paths = [*(ROOT / "src" / name for name in PACKAGES), ROOT / "reproduction"]
+    result = subprocess.run(
+        [sys.executable, *arguments],
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(map(str, [*paths, *sys.path]))},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout.strip()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def set_up():
+    """Do what setup.sh does: nothing if it was done."""
+    run("scripts/compile.py")
+
+
+def test_every_compiled_function_is_kept():
+    assert run("-c", NOT_KEPT, *PACKAGES) == ""
+
+
+@pytest.mark.parametrize(
+    ("robot", "changes"),
+    [
+        ("baxter_left_arm", {}),
+        ("panda", {}),
+        ("talos_left_arm", {}),
+        ("baxter_left_arm", {"acceleration_limits": "state_dependent", "integral_action": "task"}),
+        ("panda", OBSTACLES["/**/controller_node"]["ros__parameters"]),
+    ],
+)
+def test_nodes_compile_nothing(robot, changes):
+    assert run("-c", COMPILED_BY_NODES, robot, yaml.safe_dump(changes)) == ""
