@@ -153,7 +153,7 @@ def make_configuration(values: Mapping[str, Any]) -> BulletConfiguration:
         SettingError: a value cannot be used.
     """
     joints = joint_names(values)
-    urdf = robot_urdf(values)
+    urdf = robot_urdf(values["robot_description"])
     if values["clock"] not in CLOCKS:
         raise SettingError("clock", values["clock"], f"one of {', '.join(CLOCKS)}")
     if values["command_timeout"] < 1:

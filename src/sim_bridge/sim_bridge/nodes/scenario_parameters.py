@@ -82,7 +82,7 @@ def make_configuration(values: Mapping[str, Any]) -> ScenarioConfiguration:
     q_min, q_max = position_limits(values, joints)
     return ScenarioConfiguration(
         name=values["robot_name"],
-        urdf=robot_urdf(values),
+        urdf=robot_urdf(values["robot_description"]),
         joints=joints,
         locked=locked_joints(values),
         base_frame=values["base_frame"],

@@ -49,8 +49,8 @@ class ControllerNode(Node):
             self._node_parameters = NodeParameters(
                 self, TABLE, make_configuration, self._configure
             )
-            values, config = self._node_parameters.values, self._node_parameters.configuration
-            self._controller, base = make_controller(values, config, self)
+            config = self._node_parameters.configuration
+            self._controller, base = make_controller(config, self)
         except SettingError:
             self.destroy_node()
             raise

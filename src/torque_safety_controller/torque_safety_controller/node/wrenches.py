@@ -58,7 +58,7 @@ class WrenchInbox:
         node.create_service(Trigger, "~/tare_ft_sensor", self._on_tare)
 
     def _on_measured(self, message: WrenchStamped) -> None:
-        frame, wanted = message.header.frame_id, self._config.ft_frame
+        frame, wanted = message.header.frame_id, self._config.interaction.ft_frame
         try:
             if frame not in ("", wanted):
                 raise WrenchError(f"frame_id is '{frame}'; allowed: '{wanted}' or empty")
