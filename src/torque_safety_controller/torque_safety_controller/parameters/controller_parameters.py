@@ -57,7 +57,7 @@ TABLE = (
         "limits of the rate of torque, N m/s; none if empty",
         default=np.zeros(0),
         per_joint=True,
-        note="> 0",
+        note="all > 0",
     ),
     Parameter("rate_hz", float, "rate of the control loop, Hz", within=above(0.0, 1e4)),
     Parameter(
@@ -77,7 +77,7 @@ TABLE = (
         "weight of the pose task; 0: no pose task",
         default=1.0,
         live=True,
-        within=Range(0.0, 1e6),
+        within=Range(0.0, 1e5),
     ),
     Parameter(
         "posture_kp",
@@ -100,7 +100,7 @@ TABLE = (
         "weight of the posture task",
         default=1e-3,
         live=True,
-        within=above(0.0, 1e6),
+        within=above(0.0, 1e5),
     ),
     Parameter(
         "posture_in_null_space",
@@ -164,7 +164,7 @@ TABLE = (
         float,
         "age of a goal before HOLD, s; 0: never",
         default=0.0,
-        within=Range(0.0, 1e6),
+        within=Range(0.0, 1e5),
     ),
     Parameter(
         "ros2_control_topic",

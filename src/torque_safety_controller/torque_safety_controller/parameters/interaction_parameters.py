@@ -71,7 +71,6 @@ TABLE = (
         np.zeros(0),
         live=True,
         length=6,
-        within=Range(0.0, 1.0),
         note="zeros and ones",
     ),
     Parameter(

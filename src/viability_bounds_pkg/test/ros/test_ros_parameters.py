@@ -14,7 +14,6 @@ from viability_bounds_pkg.ros.parameters import (
     Parameter,
     Range,
     above,
-    positive,
 )
 from viability_bounds_pkg.ros.robot_parameters import locked_joints
 
@@ -215,11 +214,6 @@ def test_descriptions_tell_what_may_change_and_to_what(ros):
 )
 def test_values_are_shown_as_they_are_written(value: Any, shown: str):
     assert str(SettingError("p", value, "x")) == f"parameter 'p' is {shown}; allowed: x"
-
-
-@pytest.mark.parametrize(("value", "zero"), [(0.0, True), (1e-300, False), (1e300, True)])
-def test_positive_takes(value, zero):
-    assert positive({"p": value}, "p", zero=zero) == value
 
 
 def test_locked_joints():

@@ -61,6 +61,7 @@ class Range:
         return text if self.special is None else f"{text}, or {self.special:g}"
 
 
+FINITE = Range(-math.inf, math.inf)
 POSITIVE = Range(0.0, math.inf, without=0.0)
 NOT_NEGATIVE = Range(0.0, math.inf)
 NEGATIVE = Range(-math.inf, 0.0, without=0.0)
@@ -130,7 +131,7 @@ class Parameter:
         elif self.kind in (float, int) and self.within is not None:
             text = f"{_SCALARS[self.kind]} {self.within}"
         elif self.kind == list[float]:
-            numbers = "numbers" if self.within is None else f"finite numbers {self.within}"
+            numbers = "numbers" if self.within is None else f"finite numbers {self.within}".strip()
             if self.length is not None:
                 text = f"{self.length} {numbers}"
             elif self.per_joint:
@@ -319,23 +320,6 @@ def given_or(
     """Return the numbers of parameter `name`, or `default` where there are none."""
     value: NDArray[np.float64] = values[name]
     return value if len(value) else default
-
-
-def positive(values: Mapping[str, Any], name: str, *, zero: bool = False) -> float:
-    """Return the scalar parameter `name`, checked to be finite and positive.
-
-    Args:
-        values: parameter values by name.
-        name: which of them.
-        zero: whether zero is allowed too.
-
-    Raises:
-        SettingError: it is negative, zero where that is not allowed, or not finite.
-    """
-    value = values[name]
-    if not math.isfinite(value) or value < 0 or (value == 0 and not zero):
-        raise SettingError(name, value, "a finite number " + (">= 0" if zero else "> 0"))
-    return value
 
 
 def joint_names(values: Mapping[str, Any]) -> tuple[str, ...]:

@@ -24,6 +24,7 @@ from viability_bounds_pkg.ros.parameters import (
     NOT_NEGATIVE,
     POSITIVE,
     Parameter,
+    given_or,
     joint_names,
     per_joint,
 )
@@ -109,7 +110,7 @@ def robot_configuration(values: Mapping[str, Any]) -> RobotConfiguration:
         SettingError: a value cannot be used.
     """
     joints = joint_names(values)
-    rotors = not_negative(values, "rotor_inertia", joints)
+    rotors = given_or(values, "rotor_inertia", np.zeros(len(joints)))
     return RobotConfiguration(values["robot_description"], joints, locked_joints(values), rotors)
 
 
@@ -211,29 +212,3 @@ def position_limits(values: Mapping[str, Any], joints: Sequence[str]) -> tuple[A
     if not (q_min < q_max).all():
         raise SettingError("position_max", q_max, "above position_min everywhere")
     return q_min, q_max
-
-
-def all_positive(values: Mapping[str, Any], name: str, joints: Sequence[str]) -> Array:
-    """Return a parameter of one finite positive number a joint, shape (n,).
-
-    Raises:
-        SettingError: it is something else.
-    """
-    value = per_joint(values, name, joints)
-    if not (np.isfinite(value).all() and (value > 0).all()):
-        raise SettingError(name, value, "finite numbers > 0")
-    return value
-
-
-def not_negative(values: Mapping[str, Any], name: str, joints: Sequence[str]) -> Array:
-    """Return a parameter of one finite number >= 0 a joint, shape (n,); zeros if it is empty.
-
-    Raises:
-        SettingError: it is something else.
-    """
-    if not len(values[name]):
-        return np.zeros(len(joints))
-    value = per_joint(values, name, joints)
-    if not (np.isfinite(value).all() and (value >= 0).all()):
-        raise SettingError(name, value, "finite numbers >= 0")
-    return value
