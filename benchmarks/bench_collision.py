@@ -32,6 +32,7 @@ from torque_safety_controller.parameters import controller_parameters
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.node import bounds_parameters
 from viability_bounds_pkg.robot_description import build_model, read_urdf
+from viability_bounds_pkg.ros.parameters import read_values
 
 ROOT = Path(__file__).resolve().parent.parent
 STATES = 1000
@@ -80,8 +81,7 @@ class Robot:
 
     def controller(self, collision: CollisionAvoidance | None) -> Controller:
         """Return the controller that its parameter file describes."""
-        table = controller_parameters.TABLE
-        values = {row.name: row.coerce(self.values.get(row.name)) for row in table}
+        values = read_values(controller_parameters.TABLE, self.values)
         config = controller_parameters.make_configuration(values)
         controller = Controller(
             RobotModel(self.model, config.end_effector_frame, config.dt),
@@ -97,8 +97,7 @@ class Robot:
 
     def bounds(self):
         """Return the function from a state to bounds that its parameter file describes."""
-        table = bounds_parameters.TABLE
-        values = {row.name: row.coerce(self.values.get(row.name)) for row in table}
+        values = read_values(bounds_parameters.TABLE, self.values)
         return bounds_parameters.make_configuration(values, lambda _: self.model).solve
 
     def states(self, speed: float = 1.0) -> list[tuple[np.ndarray, ...]]:

@@ -21,11 +21,10 @@ from direct import DirectLoop  # noqa: E402
 
 FORCES = {
     "ft_frame": "wrist_left_ft_link",
-    "ft_tool_mass": 0.0,
-    "contact_frames": ("wrist_left_ft_tool_link",),
-    "contact_points": np.array([0.0, 0.0, -0.18]),
-    "contact_normals": np.array([0.0, 0.0, 1.0]),
-    "contact_friction": np.array([0.5]),
+    "ft_tool": (0.0, 0.0, 0.0, 0.0),
+    "contacts": (
+        "{frame: wrist_left_ft_tool_link, point: [0, 0, -0.18], normal: [0, 0, 1], friction: 0.5}",
+    ),
     "force_directions": np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]),
 }
 PUSH = np.array([3.0, -2.0, 8.0, 0.1, 0.1, 0.1])

@@ -7,6 +7,7 @@ runs in which something is to happen at an exact step, and for many of them.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,11 +19,18 @@ from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.nodes import bullet_parameters
 from sim_bridge.nodes.ft_sensor import ForceTorqueReading
 from torque_safety_controller.controller import Step
-from torque_safety_controller.node import assembly as ros_controller_assembly
-from torque_safety_controller.parameters import controller_parameters
+from torque_safety_controller.node import assembly
+from torque_safety_controller.parameters.controller_parameters import (
+    TABLE,
+    ControllerConfiguration,
+    make_configuration,
+)
 from viability_bounds_pkg.node import bounds_parameters
 from viability_bounds_pkg.robot_description import build_model, read_urdf
-from viability_bounds_pkg.ros.parameters import Parameter
+from viability_bounds_pkg.ros.parameters import Parameter, read_values
+
+FRICTION = {"friction_theta": "theta", "friction_gain": "gain"}
+"""Settings of the friction compensation that may be changed here, and that no parameter is for."""
 
 
 class Sample(NamedTuple):
@@ -41,7 +49,7 @@ class DirectLoop:
 
     Args:
         robot: name of a file in ``config/``.
-        changed: parameters that differ from it, by name.
+        changed: parameters that differ from it, by name; and `FRICTION`.
 
     Attributes:
         robot: in PyBullet.
@@ -69,9 +77,7 @@ class DirectLoop:
         )
         self.limits = bounds.limits
         self._bounds = bounds.solve
-        values = self._values("controller_node", controller_parameters.TABLE)
-        made = controller_parameters.make_configuration(values)
-        self.controller, _ = ros_controller_assembly.make_controller(values, made)
+        self.controller, _ = assembly.make_controller(self._controller_configuration())
         self.sensing = True
         self._sensor = None
         interaction = self.controller.interaction
@@ -88,14 +94,22 @@ class DirectLoop:
         for section in ("/**", f"/**/{node}"):
             given |= self._file.get(section, {}).get("ros__parameters", {})
         given |= self._changed
-        return {row.name: row.coerce(given.get(row.name)) for row in table}
+        return read_values(table, given)
+
+    def _controller_configuration(self) -> ControllerConfiguration:
+        """Return what the controller node would be made of."""
+        values = self._values("controller_node", TABLE)
+        made = make_configuration(values)
+        chosen = {
+            field: self._changed[name] for name, field in FRICTION.items() if name in self._changed
+        }
+        friction = replace(made.additional.friction, **chosen)
+        return replace(made, additional=replace(made.additional, friction=friction))
 
     def change(self, **parameters: Any) -> None:
         """Change live parameters of the controller, as a running node would."""
         self._changed |= parameters
-        values = self._values("controller_node", controller_parameters.TABLE)
-        made = controller_parameters.make_configuration(values)
-        ros_controller_assembly.configure(self.controller, made)
+        assembly.configure(self.controller, self._controller_configuration())
 
     @property
     def dt(self) -> float:

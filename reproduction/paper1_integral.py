@@ -24,9 +24,9 @@ ELBOW = 5
 HAND = "wrist_left_ft_tool_link"
 # Section IV-A: lambda = 2, tau_m = 0.1 of the torque limits, theta 0.1 and 100 1/s, mu = 0.5.
 PAPER: dict[str, Any] = {"integral_lambda": 2.0, "integral_budget": []}
-PRINTED = PAPER | {"integral_as_printed": True}
-UNLIMITED = PRINTED | {"integral_anti_windup": "none"}
-PLAIN = UNLIMITED | {"integral_theta_slow": 0.0, "integral_mu": 0.0}
+PRINTED = PAPER | {"integral_anti_windup": "paper"}
+UNLIMITED = PAPER | {"integral_anti_windup": "none"}
+PLAIN = UNLIMITED | {"integral_leak": [0.0, 100.0, 0.0]}
 # Pushes in world axes, N: to the side, and down.
 PUSHES = ((0.0, -60.0, 0.0), (0.0, 0.0, -100.0))
 AWAY = 0.01  # m
@@ -237,8 +237,7 @@ def ablation() -> Figure:
         "no integral": {"integral_action": "none"},
         "plain integral": PLAIN,
         "leaky (12)-(14)": UNLIMITED,
-        "leaky, clip": PRINTED | {"integral_anti_windup": "clip"},
-        "leaky, (10)": PRINTED | {"integral_anti_windup": "scaling"},
+        "leaky, (10)": PAPER | {"integral_anti_windup": "scaling"},
         "leaky, (11) as printed": PRINTED,
         "leaky, (11), whole torque": PAPER,
         "the same, the file's values": {},
@@ -327,8 +326,7 @@ class Disturbed:
         elif kind == 2:
             loop.change(
                 integral_lambda=float(rng.choice([2.0, 10.0, 100.0])),
-                integral_theta_slow=float(rng.choice([0.0, 0.1, 1.0])),
-                integral_mu=float(rng.uniform(0.0, 1.0)),
+                integral_leak=[float(rng.choice([0.0, 0.1, 1.0])), 100.0, float(rng.uniform())],
                 integral_action=str(rng.choice(["none", "joints", "joints", "task"])),
                 integral_budget=(rng.uniform(0.05, 0.3) * loop.config.tau_max).tolist(),
             )

@@ -138,10 +138,7 @@ def test_pressed_against_an_obstacle_an_arm_stays_at_rest():
 def test_an_arm_that_overlaps_an_obstacle_at_start_moves_out(shape, size, position, depth):
     known = {
         "collision_avoidance": True,
-        "obstacle_names": ["thing"],
-        "obstacle_shapes": [shape],
-        "obstacle_sizes": size,
-        "obstacle_positions": position,
+        "obstacles": [f"{{name: thing, shape: {shape}, size: {size}, position: {position}}}"],
     }
     loop = DirectLoop("panda", known)
     distances, _ = play(loop, 2.0)
@@ -216,11 +213,10 @@ def test_distances_that_contradict_each_other_give_way_before_the_joints_bounds(
     """Between a floor and a ceiling that both overlap the hand."""
     known = {
         "collision_avoidance": True,
-        "obstacle_names": ["floor", "ceiling"],
-        "obstacle_shapes": ["half_space", "half_space"],
-        "obstacle_sizes": [0.0] * 6,
-        "obstacle_positions": [0.0, 0.0, 0.54, 0.0, 0.0, 0.64],
-        "obstacle_orientations": [0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0],
+        "obstacles": [
+            "{name: floor, shape: half_space, position: [0, 0, 0.54]}",
+            f"{{name: ceiling, shape: half_space, position: [0, 0, 0.64], rpy: [{np.pi}, 0, 0]}}",
+        ],
     }
     loop = DirectLoop("panda", known)
     relaxed = 0

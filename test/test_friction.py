@@ -18,6 +18,7 @@ from torque_safety_controller.friction.identification import friction_model, ide
 from torque_safety_controller.friction.joint_recording import Recording
 from torque_safety_controller.tasks.tasks import critical_damping
 from viability_bounds_pkg.cli.limits_file import read_robot
+from viability_bounds_pkg.ros.parameters import read_values
 
 ROBOT = "talos_left_arm"
 GIVEN = read_config(ROBOT, "bullet_node")
@@ -30,7 +31,7 @@ THETA = 3.0  # 1/s, the default
 @pytest.fixture(scope="module")
 def found():
     """The friction found in 36 s of motion of arms 10% heavier than the model."""
-    values = {row.name: row.coerce(GIVEN.get(row.name)) for row in bullet_parameters.TABLE}
+    values = read_values(bullet_parameters.TABLE, GIVEN)
     config = bullet_parameters.make_configuration(values)
     assert set(GIVEN["mass_scales"]) == {1.1}
     motion = excitation(

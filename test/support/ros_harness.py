@@ -86,6 +86,11 @@ class Heard(list):
         return [stamp_to_ns(message.header.stamp) for message in self]
 
 
+def names_parameter(reason: str, name: str) -> bool:
+    """Return whether a refusal names the parameter: rclpy's, of a range, or this project's."""
+    return reason.startswith((f"parameter '{name}' is ", f"Parameter {name} out of range"))
+
+
 class RosHarness:
     """A private context with nodes in it.
 

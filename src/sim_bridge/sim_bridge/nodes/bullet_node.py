@@ -22,17 +22,13 @@ from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.nodes.bullet_parameters import TABLE, make_configuration, make_robot
 from sim_bridge.nodes.ft_sensor import ForceTorquePublisher
 from sim_bridge.nodes.joint_command import CommandError, JointCommand, TorqueCommand, read_command
+from sim_bridge.nodes.topics import CLOCK, PAUSE, RESET
 from sim_bridge.nodes.world_subscriber import WorldInbox
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.ros.messages import Diagnostics
 from viability_bounds_pkg.ros.parameters import NodeParameters
-from viability_bounds_pkg.ros.runtime import (
-    CONTROL_QOS,
-    LATCHED_QOS,
-    run,
-    set_stamp,
-    stamp_to_ns,
-)
+from viability_bounds_pkg.ros.runtime import run, set_stamp, stamp_to_ns
+from viability_bounds_pkg.ros.topics import JOINT_COMMANDS, JOINT_STATES, ROBOT_DESCRIPTION
 
 _RETRY_PERIOD = 0.2
 _LATENCIES_KEPT = 100_000
@@ -79,15 +75,15 @@ class BulletNode(Node):
         self._restart()
 
         self._state = JointState(name=list(config.joints))
-        self._state_publisher = self.create_publisher(JointState, "joint_states", CONTROL_QOS)
+        self._state_publisher = JOINT_STATES.publisher(self)
         self._clock_publisher = None
         if config.publish_clock:
-            self._clock_publisher = self.create_publisher(ClockMessage, "/clock", CONTROL_QOS)
-        description = self.create_publisher(String, "robot_description", LATCHED_QOS)
+            self._clock_publisher = CLOCK.publisher(self)
+        description = ROBOT_DESCRIPTION.publisher(self)
         description.publish(String(data=config.urdf))
-        self.create_subscription(JointState, "joint_commands", self._on_command, CONTROL_QOS)
-        self.create_service(Trigger, "~/reset", self._on_reset)
-        self.create_service(SetBool, "~/pause", self._on_pause)
+        JOINT_COMMANDS.subscription(self, self._on_command)
+        RESET.serve(self, self._on_reset)
+        PAUSE.serve(self, self._on_pause)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         if not config.lockstep:
             self.create_timer(config.dt, self._tick, clock=steady)

@@ -16,16 +16,18 @@ from sim_bridge.nodes.ft_sensor import SENSOR_TABLE, SensorConfiguration, sensor
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import RobotDescriptionError
 from viability_bounds_pkg.ros.parameters import (
+    FINITE,
+    NOT_NEGATIVE,
+    POSITIVE,
     Parameter,
+    Range,
+    above,
+    given_or,
     joint_names,
-    per_joint,
-    positive,
 )
 from viability_bounds_pkg.ros.robot_parameters import (
     ROBOT_TABLE,
-    all_positive,
     locked_joints,
-    not_negative,
     position_limits,
     robot_urdf,
 )
@@ -35,16 +37,41 @@ _MATERIAL = ContactMaterial()
 
 TABLE = (
     *ROBOT_TABLE,
-    Parameter("velocity_max", list[float], "speed limits that are watched, rad/s"),
-    Parameter("start_positions", list[float], "positions at start and after reset, rad"),
-    Parameter("rate_hz", float, "rate of the control loop, Hz"),
-    Parameter("physics_step_max", float, "longest physics step, s", default=0.001),
-    Parameter("clock", str, f"one of: {', '.join(CLOCKS)}", default="real_time"),
+    Parameter(
+        "velocity_max",
+        list[float],
+        "speed limits that are watched, rad/s",
+        per_joint=True,
+        within=POSITIVE,
+    ),
+    Parameter(
+        "start_positions",
+        list[float],
+        "positions at start and after reset, rad",
+        per_joint=True,
+        within=FINITE,
+    ),
+    Parameter("rate_hz", float, "rate of the control loop, Hz", within=above(0.0, 1e4)),
+    Parameter(
+        "physics_step_max",
+        float,
+        "longest physics step, s",
+        default=0.001,
+        within=above(0.0, 1.0),
+    ),
+    Parameter(
+        "clock",
+        str,
+        "real_time: a period lasts its time on the wall clock; lockstep: until its command comes",
+        default="real_time",
+        choices=CLOCKS,
+    ),
     Parameter(
         "command_timeout",
         int,
         "control periods that the last command is held for before the robot brakes",
         default=5,
+        within=Range(1, 1000),
     ),
     Parameter("start_paused", bool, "wait for the pause service before moving", default=False),
     Parameter(
@@ -53,6 +80,7 @@ TABLE = (
         "robot time after which it pauses by itself, s since it began to move; 0: never",
         default=0.0,
         live=True,
+        within=Range(0.0, 1e5),
     ),
     Parameter("publish_clock", bool, "publish /clock", default=False),
     Parameter(
@@ -60,18 +88,25 @@ TABLE = (
         list[float],
         "dry friction of moving joints, N m; none if empty",
         default=np.zeros(0),
+        per_joint=True,
+        within=NOT_NEGATIVE,
     ),
     Parameter(
         "friction_static",
         list[float],
         "dry friction of joints at rest, N m; that of moving ones if empty",
         default=np.zeros(0),
+        per_joint=True,
+        within=NOT_NEGATIVE,
+        note="at least friction_coulomb",
     ),
     Parameter(
         "friction_viscous",
         list[float],
         "friction that grows with speed, N m s/rad; none if empty",
         default=np.zeros(0),
+        per_joint=True,
+        within=NOT_NEGATIVE,
     ),
     Parameter(
         "stribeck_velocity",
@@ -79,42 +114,59 @@ TABLE = (
         "speed at which static has become Coulomb friction but for 1/e of the difference, rad/s; "
         f"{DEFAULT_STRIBECK_VELOCITY} if empty",
         default=np.zeros(0),
+        per_joint=True,
+        within=POSITIVE,
     ),
     Parameter(
         "torque_bias",
         list[float],
-        "torque that the motors give beyond what they are told and report, N m; none if empty",
+        "torque of the motors beyond what is commanded and reported, N m; none if empty",
         default=np.zeros(0),
+        per_joint=True,
+        within=FINITE,
     ),
     Parameter(
-        "mass_scale_links", list[str], "links that weigh other than the URDF says", default=()
+        "mass_scale_links",
+        list[str],
+        "links with another mass than in the URDF",
+        default=(),
+        note="each once",
     ),
     Parameter(
         "mass_scales",
         list[float],
         "factors for their masses and inertias",
         default=np.zeros(0),
+        within=POSITIVE,
+        note="one for each of 'mass_scale_links'",
     ),
     Parameter(
-        "external_wrench_timeout", float, "how long a push lasts, s of robot time", default=0.5
+        "external_wrench_timeout",
+        float,
+        "how long a push lasts, s of robot time",
+        default=0.5,
+        within=above(0.0, 3600.0),
     ),
     Parameter(
         "obstacle_friction",
         float,
         "Coulomb's coefficient between robot and obstacles",
         default=_MATERIAL.friction,
+        within=Range(0.0, 10.0),
     ),
     Parameter(
         "obstacle_stiffness",
         float,
-        "how much an obstacle resists being pressed, N/m",
+        "stiffness of obstacles, N/m; 2e5: 0.5 mm at 100 N",
         default=_MATERIAL.stiffness,
+        within=above(0.0, 1e9),
     ),
     Parameter(
         "obstacle_damping",
         float,
-        "the same of the speed of being pressed, N s/m",
+        "damping of obstacles, N s/m",
         default=_MATERIAL.damping,
+        within=Range(0.0, 1e9),
     ),
     *SENSOR_TABLE,
 )
@@ -153,68 +205,52 @@ def make_configuration(values: Mapping[str, Any]) -> BulletConfiguration:
         SettingError: a value cannot be used.
     """
     joints = joint_names(values)
-    urdf = robot_urdf(values)
-    if values["clock"] not in CLOCKS:
-        raise SettingError("clock", values["clock"], f"one of {', '.join(CLOCKS)}")
-    if values["command_timeout"] < 1:
-        raise SettingError("command_timeout", values["command_timeout"], "at least 1")
-    dt = 1.0 / positive(values, "rate_hz")
+    urdf = robot_urdf(values["robot_description"])
+    dt = 1.0 / values["rate_hz"]
     q_min, q_max = position_limits(values, joints)
-    q_start = per_joint(values, "start_positions", joints)
-    if not np.isfinite(q_start).all():
-        raise SettingError("start_positions", q_start, "finite numbers")
     return BulletConfiguration(
         urdf=urdf,
         joints=joints,
         locked=locked_joints(values),
         q_min=q_min,
         q_max=q_max,
-        v_max=all_positive(values, "velocity_max", joints),
-        tau_max=all_positive(values, "torque_max", joints),
+        v_max=values["velocity_max"],
+        tau_max=values["torque_max"],
         joint_friction=_joint_friction(values, joints),
         mass_scales=_mass_scales(values),
-        q_start=q_start,
+        q_start=values["start_positions"],
         dt=dt,
         # The rounding keeps 1 kHz with steps of 1 ms from becoming two steps of 0.5 ms.
-        substeps=max(1, int(np.ceil(dt / positive(values, "physics_step_max") - 1e-9))),
+        substeps=max(1, int(np.ceil(dt / values["physics_step_max"] - 1e-9))),
         lockstep=values["clock"] == "lockstep",
         command_timeout=values["command_timeout"],
         start_paused=values["start_paused"],
-        pause_after=positive(values, "pause_after", zero=True),
+        pause_after=values["pause_after"],
         publish_clock=values["publish_clock"],
-        external_wrench_timeout=positive(values, "external_wrench_timeout"),
+        external_wrench_timeout=values["external_wrench_timeout"],
         material=ContactMaterial(
-            positive(values, "obstacle_friction", zero=True),
-            positive(values, "obstacle_stiffness"),
-            positive(values, "obstacle_damping", zero=True),
+            values["obstacle_friction"],
+            values["obstacle_stiffness"],
+            values["obstacle_damping"],
         ),
         sensor=sensor_configuration(values),
     )
 
 
 def _joint_friction(values: Mapping[str, Any], joints: tuple[str, ...]) -> JointFriction:
-    coulomb = not_negative(values, "friction_coulomb", joints)
-    static = coulomb
-    if len(values["friction_static"]):
-        static = not_negative(values, "friction_static", joints)
-        if not (static >= coulomb).all():
-            raise SettingError("friction_static", static, "at least friction_coulomb everywhere")
-    stribeck = DEFAULT_STRIBECK_VELOCITY
-    if len(values["stribeck_velocity"]):
-        stribeck = all_positive(values, "stribeck_velocity", joints)
-    bias = values["torque_bias"]
-    if len(bias):
-        bias = per_joint(values, "torque_bias", joints)
-        if not np.isfinite(bias).all():
-            raise SettingError("torque_bias", bias, "finite numbers")
+    zero = np.zeros(len(joints))
+    coulomb = given_or(values, "friction_coulomb", zero)
+    static = given_or(values, "friction_static", coulomb)
+    if not (static >= coulomb).all():
+        raise SettingError("friction_static", static, "at least friction_coulomb everywhere")
     return JointFriction(
         len(joints),
         friction_coulomb=coulomb,
         friction_static=static,
-        friction_viscous=not_negative(values, "friction_viscous", joints),
-        stribeck_velocity=stribeck,
-        torque_bias=bias if len(bias) else 0.0,
-        rotor_inertia=not_negative(values, "rotor_inertia", joints),
+        friction_viscous=given_or(values, "friction_viscous", zero),
+        stribeck_velocity=given_or(values, "stribeck_velocity", zero + DEFAULT_STRIBECK_VELOCITY),
+        torque_bias=given_or(values, "torque_bias", zero),
+        rotor_inertia=given_or(values, "rotor_inertia", zero),
     )
 
 
@@ -225,8 +261,6 @@ def _mass_scales(values: Mapping[str, Any]) -> dict[str, float]:
     if len(links) != len(scales):
         allowed = f"{len(links)} numbers, one for each of 'mass_scale_links'"
         raise SettingError("mass_scales", scales, allowed)
-    if not (np.isfinite(scales).all() and (scales > 0).all()):
-        raise SettingError("mass_scales", scales, "finite numbers > 0")
     return dict(zip(links, map(float, scales), strict=True))
 
 

@@ -12,8 +12,15 @@ from rclpy.node import Node
 
 from sim_bridge.bullet.robot import BulletRobot
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.ros.parameters import Parameter
-from viability_bounds_pkg.ros.runtime import CONTROL_QOS, set_stamp
+from viability_bounds_pkg.ros.parameters import (
+    FINITE,
+    NOT_NEGATIVE,
+    Parameter,
+    Range,
+    given_or,
+)
+from viability_bounds_pkg.ros.runtime import set_stamp
+from viability_bounds_pkg.ros.topics import FT_WRENCH
 
 SENSOR_TABLE = (
     Parameter("ft_frame", str, "link that is a force/torque sensor; none if empty", default=""),
@@ -22,14 +29,18 @@ SENSOR_TABLE = (
         list[float],
         "what the sensor adds, force and moment, N and N m; none if empty",
         default=np.zeros(0),
+        length=6,
+        within=FINITE,
     ),
     Parameter(
         "ft_noise",
         list[float],
         "standard deviation of its noise, force and moment, N and N m; none if empty",
         default=np.zeros(0),
+        length=6,
+        within=NOT_NEGATIVE,
     ),
-    Parameter("ft_seed", int, "of that noise", default=0),
+    Parameter("ft_seed", int, "seed of that noise", default=0, within=Range(0, 2**31 - 1)),
 )
 
 
@@ -57,20 +68,10 @@ def sensor_configuration(values: Mapping[str, Any]) -> SensorConfiguration:
         SettingError: a value cannot be used.
     """
     for name in ("ft_bias", "ft_noise"):
-        value = values[name]
-        if not len(value):
-            continue
-        if not values["ft_frame"]:
-            raise SettingError(name, value, "only with a force/torque sensor, 'ft_frame'")
-        if len(value) != 6 or not np.isfinite(value).all():
-            raise SettingError(name, value, "6 finite numbers")
-    bias, noise = (
-        values[name] if len(values[name]) else np.zeros(6) for name in ("ft_bias", "ft_noise")
-    )
-    if (noise < 0.0).any():
-        raise SettingError("ft_noise", noise, "not negative")
-    if values["ft_seed"] < 0:
-        raise SettingError("ft_seed", values["ft_seed"], "at least 0")
+        if len(values[name]) and not values["ft_frame"]:
+            allowed = "only with a force/torque sensor, 'ft_frame'"
+            raise SettingError(name, values[name], allowed)
+    bias, noise = (given_or(values, name, np.zeros(6)) for name in ("ft_bias", "ft_noise"))
     return SensorConfiguration(values["ft_frame"], bias, noise, values["ft_seed"])
 
 
@@ -109,7 +110,7 @@ class ForceTorquePublisher:
         self._reading = ForceTorqueReading(robot, config)
         self._message = WrenchStamped()
         self._message.header.frame_id = config.frame
-        self._publisher = node.create_publisher(WrenchStamped, "ft_wrench", CONTROL_QOS)
+        self._publisher = FT_WRENCH.publisher(node)
 
     def restart(self) -> None:
         """Begin the noise anew."""

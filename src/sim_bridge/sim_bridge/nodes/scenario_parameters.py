@@ -12,27 +12,27 @@ from sim_bridge.scenario.events import PostureGoal, WrenchGoal
 from sim_bridge.scenario.fields import ScenarioError
 from sim_bridge.scenario.scenario import Scenario, load_scenario
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.ros.parameters import Parameter, joint_names, positive
+from viability_bounds_pkg.ros.parameters import POSITIVE, Parameter, above, joint_names
 from viability_bounds_pkg.ros.robot_parameters import (
     ROBOT_TABLE,
-    all_positive,
     locked_joints,
     position_limits,
     robot_urdf,
 )
 
 TABLE = (
-    Parameter("robot_name", str, "what the report calls the robot", default="robot"),
+    Parameter("robot_name", str, "name of the robot in the report", default="robot"),
     *ROBOT_TABLE,
-    Parameter("base_frame", str, "frame of pose goals"),
+    Parameter("base_frame", str, "frame of pose goals; fixed to the URDF's root"),
     Parameter("end_effector_frame", str, "frame that pose goals move"),
-    Parameter("velocity_max", list[float], "speed limits, rad/s"),
-    Parameter("scenario", str, "YAML file that says what happens when"),
+    Parameter("velocity_max", list[float], "speed limits, rad/s", per_joint=True, within=POSITIVE),
+    Parameter("scenario", str, "YAML file of the scenario"),
     Parameter(
         "ready_timeout",
         float,
-        "how long the other nodes may take to be there, s; at their first start they compile",
+        "how long the other nodes may take to start, s",
         default=180.0,
+        within=above(0.0, 3600.0),
     ),
 )
 
@@ -82,15 +82,15 @@ def make_configuration(values: Mapping[str, Any]) -> ScenarioConfiguration:
     q_min, q_max = position_limits(values, joints)
     return ScenarioConfiguration(
         name=values["robot_name"],
-        urdf=robot_urdf(values),
+        urdf=robot_urdf(values["robot_description"]),
         joints=joints,
         locked=locked_joints(values),
         base_frame=values["base_frame"],
         end_effector_frame=values["end_effector_frame"],
         q_min=q_min,
         q_max=q_max,
-        v_max=all_positive(values, "velocity_max", joints),
-        tau_max=all_positive(values, "torque_max", joints),
+        v_max=values["velocity_max"],
+        tau_max=values["torque_max"],
         scenario=scenario,
-        ready_timeout=positive(values, "ready_timeout"),
+        ready_timeout=values["ready_timeout"],
     )

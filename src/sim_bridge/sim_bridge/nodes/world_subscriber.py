@@ -15,8 +15,9 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from sim_bridge.bullet.obstacles import Obstacle, ObstacleError
 from sim_bridge.bullet.robot import BulletRobot
+from sim_bridge.nodes.topics import EXTERNAL_WRENCH, OBSTACLES
 from viability_bounds_pkg.robot_description import RobotDescriptionError
-from viability_bounds_pkg.ros.runtime import GOAL_QOS, stamp_to_ns
+from viability_bounds_pkg.ros.runtime import stamp_to_ns
 
 _NO_PUSH = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 _SHAPES = {Marker.CUBE: "box", Marker.SPHERE: "sphere", Marker.CYLINDER: "cylinder"}
@@ -58,8 +59,8 @@ class WorldInbox:
         self._push_timeout = round(1e9 * push_timeout)
         self._pending: list[_Change] = []
         self.pushed: dict[str, int] = {}
-        node.create_subscription(WrenchStamped, "external_wrench", self._on_wrench, GOAL_QOS)
-        node.create_subscription(MarkerArray, "obstacles", self._on_obstacles, GOAL_QOS)
+        EXTERNAL_WRENCH.subscription(node, self._on_wrench)
+        OBSTACLES.subscription(node, self._on_obstacles)
 
     def __len__(self) -> int:
         """How many messages wait for their time."""

@@ -6,7 +6,7 @@ import pinocchio as pin
 import pytest
 from arms import load_arm
 from geometry_msgs.msg import WrenchStamped
-from ros_harness import ROOT, joint_state, read_config
+from ros_harness import ROOT, joint_state, names_parameter, read_config
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -590,7 +590,7 @@ def test_the_first_period_after_a_pause_is_a_whole_one(ros):
         ({"rate_hz": -1.0}, "rate_hz", "> 0"),
         ({"physics_step_max": math.nan}, "physics_step_max", "nan"),
         ({"clock": "cuckoo"}, "clock", "real_time, lockstep"),
-        ({"command_timeout": 0}, "command_timeout", "at least 1"),
+        ({"command_timeout": 0}, "command_timeout", ">= 1"),
         ({"command_timeout": 1.5}, "command_timeout", "a whole number"),
         ({"pause_after": -1.0}, "pause_after", ">= 0"),
         ({"external_wrench_timeout": 0.0}, "external_wrench_timeout", "> 0"),
@@ -630,8 +630,8 @@ def test_the_first_period_after_a_pause_is_a_whole_one(ros):
         ({"ft_frame": ""}, "ft_bias", "only with"),
         ({"ft_bias": [1.0] * 3}, "ft_bias", "6 finite numbers"),
         ({"ft_noise": [math.inf] * 6}, "ft_noise", "6 finite numbers"),
-        ({"ft_noise": [-0.1] * 6}, "ft_noise", "not negative"),
-        ({"ft_seed": -1}, "ft_seed", "at least 0"),
+        ({"ft_noise": [-0.1] * 6}, "ft_noise", ">= 0"),
+        ({"ft_seed": -1}, "ft_seed", ">= 0"),
     ],
 )
 def test_it_does_not_start_with_bad_parameters(ros, changed, name, shown):
@@ -645,7 +645,7 @@ def test_it_does_not_start_with_bad_parameters(ros, changed, name, shown):
 
 def test_a_bad_time_to_pause_is_refused_while_it_runs(ros):
     robot = Robot(ros)
-    assert ros.refuses("bullet_node", pause_after=-1.0).startswith("parameter 'pause_after' is -1")
+    assert names_parameter(ros.refuses("bullet_node", pause_after=-1.0), "pause_after")
     assert "read-only" in ros.refuses("bullet_node", rate_hz=100.0)
     robot.step(times=3)
 

@@ -1,6 +1,7 @@
 import numpy as np
 import pinocchio as pin
 import pytest
+import yaml
 from collision_arm import panda
 from ros_harness import read_config
 
@@ -11,21 +12,20 @@ from torque_safety_controller.parameters.collision_parameters import TABLE, load
 from torque_safety_controller.parameters.controller_parameters import make_configuration
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import read_urdf
+from viability_bounds_pkg.ros.parameters import read_values
 
 PANDA = read_config("panda", "controller_node")
-TURNED = [0.0, 0.0, np.sin(0.4), np.cos(0.4)]
-THINGS = {
-    "obstacle_names": ["table", "ball", "pole", "floor"],
-    "obstacle_shapes": ["box", "sphere", "cylinder", "half_space"],
-    "obstacle_sizes": [0.4, 1.0, 0.05, 0.2, 0.2, 0.2, 0.06, 0.06, 1.0, 0.0, 0.0, 0.0],
-    "obstacle_positions": [0.7, 0.0, 0.2, 0.5, 0.3, 0.5, 0.4, -0.4, 0.5, 0.0, 0.0, -0.1],
-    "obstacle_orientations": [*TURNED, *[0.0, 0.0, 0.0, 1.0] * 3],
-}
+THINGS = [
+    "{name: table, shape: box, size: [0.4, 1, 5e-2], position: [0.7, 0, 0.2], rpy: [0, 0, 0.8]}",
+    "{name: ball, shape: sphere, size: [0.2, 0.2, 0.2], position: [0.5, 0.3, 0.5]}",
+    "{name: pole, shape: cylinder, size: [0.06, 0.06, 1.0], position: [0.4, -0.4, 0.5]}",
+    "{name: floor, shape: half_space, position: [0.0, 0.0, -0.1]}",
+]
 
 
 def values(**changes):
     given = PANDA | {"collision_avoidance": True} | changes
-    return {row.name: row.coerce(given.get(row.name)) for row in controller_parameters.TABLE}
+    return read_values(controller_parameters.TABLE, given)
 
 
 def configuration(**changes):
@@ -34,9 +34,9 @@ def configuration(**changes):
 
 def load(**changes):
     arm = panda()[0]
-    given = values(**changes)
-    config = make_configuration(given).collision
-    return load_collision(given, config, read_urdf(PANDA["robot_description"]), arm.model)
+    config = make_configuration(values(**changes))
+    urdf = read_urdf(PANDA["robot_description"])
+    return load_collision(config.collision, config.robot, urdf, arm.model)
 
 
 def test_off_by_default_and_then_nothing_is_loaded():
@@ -51,16 +51,16 @@ def test_defaults_are_those_of_the_settings():
 
 @pytest.mark.parametrize("name", [f.name for f in TABLE if f.kind is float])
 def test_each_setting_arrives(name):
-    settings = configuration(**{"collision_influence": 0.9, name: 0.7}).settings
-    assert getattr(settings, name.removeprefix("collision_")) == 0.7
+    settings = configuration(**{name: 0.07}).settings
+    assert getattr(settings, name.removeprefix("collision_")) == 0.07
 
 
 def test_obstacles_become_shapes_in_the_base_frame():
-    avoidance = load(**THINGS)
+    avoidance = load(obstacles=THINGS)
     bodies = avoidance.model.bodies
     np.testing.assert_allclose(bodies.box_half, [[0.2, 0.5, 0.025]])
     np.testing.assert_allclose(bodies.box_centre, [[0.7, 0.0, 0.2]])
-    expected = pin.Quaternion(np.array(TURNED)).toRotationMatrix()
+    expected = pin.utils.rotate("z", 0.8)
     np.testing.assert_allclose(bodies.box_axes[0], expected, atol=1e-12)
     ball, pole = bodies.start[-2:], bodies.start[-1:] + bodies.segment[-1:]
     np.testing.assert_allclose(ball[0], [0.5, 0.3, 0.5], atol=1e-12)
@@ -82,26 +82,19 @@ def test_pairs_are_those_listed_or_those_chosen_at_the_posture_given():
     middle = load(collision_posture=None)
     assert "panda_hand - panda_link5" in middle.model.left_out["near at start"]
     # What is asked to be kept further apart is left out sooner.
-    wide = load(collision_margin=0.08, collision_influence=0.2)
+    wide = load(collision_margin=0.08)
     assert len(wide.model.left_out["near at start"]) > 1
 
 
-def test_capsules_and_acceleration_limits_arrive():
-    one = load(collision_capsules_per_link=1)
-    assert {len(capsules) for capsules in one.model.capsules.values()} == {1}
+def test_acceleration_limits_arrive():
     config = configuration()
     np.testing.assert_array_equal(config.a_min, PANDA["acceleration_min"])
     np.testing.assert_array_equal(config.a_max, PANDA["acceleration_max"])
 
 
 def test_what_an_arm_is_mounted_on_is_left_out_and_said_to_be():
-    top = {
-        "obstacle_names": ["top"],
-        "obstacle_shapes": ["box"],
-        "obstacle_sizes": [1.0, 1.0, 0.1],
-        "obstacle_positions": [0.2, 0.0, 0.15],
-    }
-    model = load(**top).model
+    top = "{name: top, shape: box, size: [1.0, 1.0, 0.1], position: [0.2, 0.0, 0.15]}"
+    model = load(obstacles=[top]).model
     assert "panda_link1 - top" in model.left_out["near always"]
     assert "panda_hand - top" in model.names
 
@@ -110,31 +103,66 @@ def test_what_an_arm_is_mounted_on_is_left_out_and_said_to_be():
     ("changes", "name"),
     [
         ({"collision_margin": -0.1}, "collision_margin"),
-        ({"collision_margin": 0.2}, "collision_influence"),
-        ({"collision_reserve": float("nan")}, "collision_reserve"),
-        ({"collision_braking": 0.0}, "collision_braking"),
-        ({"collision_braking_share": 1.5}, "collision_braking_share"),
+        ({"collision_margin": 0.2}, "collision_margin"),
+        ({"collision_margin": float("nan")}, "collision_margin"),
+        ({"collision_speed_max": 0.0}, "collision_speed_max"),
         ({"collision_speed_max": float("inf")}, "collision_speed_max"),
-        ({"collision_capsules_per_link": 0}, "collision_capsules_per_link"),
         ({"collision_pairs": ["panda_hand"]}, "collision_pairs"),
         ({"collision_posture": [0.0] * 6}, "collision_posture"),
         ({"collision_posture": [9.0] * 7}, "collision_posture"),
         ({"acceleration_min": None}, "acceleration_min"),
-        ({"obstacle_names": ["table", "table", "pole", "floor"]}, "obstacle_names"),
-        ({"obstacle_shapes": ["box"]}, "obstacle_shapes"),
-        ({"obstacle_shapes": ["box", "sphere", "cone", "half_space"]}, "obstacle_shapes"),
-        ({"obstacle_sizes": [1.0] * 11}, "obstacle_sizes"),
-        ({"obstacle_sizes": [0.4, 1.0, 0.0, *[1.0] * 9]}, "obstacle_sizes"),
-        ({"obstacle_sizes": [0.4, 1.0, 0.1, 1.0, 2.0, *[1.0] * 7]}, "obstacle_sizes"),
-        ({"obstacle_positions": None}, "obstacle_positions"),
-        ({"obstacle_positions": [float("nan")] * 12}, "obstacle_positions"),
-        ({"obstacle_orientations": [0.0] * 16}, "obstacle_orientations"),
     ],
 )
 def test_what_cannot_be_is_refused_by_the_name_of_the_parameter(changes, name):
     with pytest.raises(SettingError) as error:
-        configuration(**THINGS | changes)
+        configuration(obstacles=THINGS, **changes)
     assert error.value.name == name
+
+
+BOX = {"name": "box", "shape": "box", "size": [1, 1, 1], "position": [0, 0, 1], "rpy": [0, 0, 0]}
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "allowed"),
+    [
+        ("name", None, "a string"),
+        ("name", "ball", "a name that no other obstacle has"),
+        ("name", 7, "a string"),
+        ("shape", None, "a string"),
+        ("shape", "cone", "one of box, sphere, cylinder, half_space"),
+        ("size", None, "3 finite numbers"),
+        ("size", [1.0, 1.0], "3 finite numbers"),
+        ("size", [0.4, 1.0, 0.0], "positive"),
+        ("size", 1.0, "3 finite numbers"),
+        ("position", None, "3 finite numbers"),
+        ("position", [0.0, 0.0, float("nan")], "3 finite numbers"),
+        ("position", [0.0, True, 0.0], "3 finite numbers"),
+        ("rpy", ["a", "b", "c"], "3 finite numbers"),
+    ],
+)
+def test_what_cannot_be_of_an_obstacle_is_refused_by_entry_and_field(field, value, allowed):
+    given = {k: v for k, v in (BOX | {field: value}).items() if v is not None}
+    with pytest.raises(SettingError) as error:
+        configuration(obstacles=[*THINGS, yaml.safe_dump(given, default_flow_style=True)])
+    assert error.value.name == f"obstacles[4].{field}"
+    assert str(error.value.value) == str(value)
+    assert allowed in error.value.allowed
+
+
+@pytest.mark.parametrize("text", ["", "box", "[1, 2]", "{name: a", "{name: a, colour: red}"])
+def test_what_is_no_obstacle_is_refused(text):
+    with pytest.raises(
+        SettingError, match="a YAML mapping with the fields name, shape, "
+    ) as error:
+        configuration(obstacles=[text])
+    assert error.value.name == "obstacles[0]"
+
+
+def test_the_diameters_of_a_round_obstacle_are_the_same():
+    for shape, size in (("sphere", [1.0, 2.0, 1.0]), ("cylinder", [1.0, 2.0, 1.0])):
+        with pytest.raises(SettingError, match="a positive diameter") as error:
+            configuration(obstacles=[str(BOX | {"shape": shape, "size": size})])
+        assert error.value.name == "obstacles[0].size"
 
 
 @pytest.mark.parametrize(
@@ -143,7 +171,7 @@ def test_what_cannot_be_is_refused_by_the_name_of_the_parameter(changes, name):
         ({"collision_pairs": ["panda_hand nowhere"]}, "collision_pairs"),
         ({"collision_pairs": ["panda_hand panda_link7"]}, "collision_pairs"),
         ({"acceleration_max": [-1.0] * 7}, "acceleration_max"),
-        (THINGS | {"obstacle_names": ["panda_hand", "ball", "pole", "floor"]}, "obstacle_names"),
+        ({"obstacles": [THINGS[1].replace("ball", "panda_hand")]}, "obstacles"),
     ],
 )
 def test_what_the_robot_does_not_have_is_refused_by_the_name_of_the_parameter(changes, name):
@@ -153,8 +181,8 @@ def test_what_the_robot_does_not_have_is_refused_by_the_name_of_the_parameter(ch
 
 
 def test_the_parameters_are_checked_even_while_it_is_off():
-    with pytest.raises(SettingError, match="obstacle_shapes"):
-        configuration(collision_avoidance=False, obstacle_names=["table"])
+    with pytest.raises(SettingError, match="shape"):
+        configuration(collision_avoidance=False, obstacles=["{name: table}"])
 
 
 def test_all_shapes_can_be_made():

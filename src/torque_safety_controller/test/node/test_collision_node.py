@@ -16,10 +16,9 @@ VALUES = read_config("panda", NODE) | {
     "bounds_timeout": 20.0,
     "state_timeout": 40.0,
     "collision_avoidance": True,
-    "obstacle_names": ["ball"],
-    "obstacle_shapes": ["sphere"],
-    "obstacle_sizes": [0.2, 0.2, 0.2],
-    "obstacle_positions": [0.42, 0.0, 0.6],
+    "obstacles": [
+        "{name: ball, shape: sphere, size: [0.2, 0.2, 0.2], position: [0.42, 0.0, 0.6]}"
+    ],
 }
 JOINTS = VALUES["joints"]
 AWAY = ARM.q_start + np.array([1.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])

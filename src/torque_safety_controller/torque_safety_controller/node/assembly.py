@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pinocchio as pin
 
@@ -21,19 +20,18 @@ if TYPE_CHECKING:
 
 
 def make_controller(
-    values: Mapping[str, Any], config: ControllerConfiguration, node: Node | None = None
+    config: ControllerConfiguration, node: Node | None = None
 ) -> tuple[Controller, pin.SE3]:
     """Return a controller, warmed up, and the placement of the base frame.
 
     Args:
-        values: parameter values by name.
-        config: made of them by `make_configuration`.
+        config: checked parameters.
         node: listens for the URDF if it comes from a topic.
 
     Raises:
-        SettingError: something that only the URDF could tell is wrong.
+        SettingError: parameters that do not fit the URDF.
     """
-    robot, base, urdf = load_robot(values, node)
+    robot, base, urdf = load_robot(config, node)
     controller = Controller(
         robot,
         config.tau_max,
@@ -41,8 +39,8 @@ def make_controller(
         config.tau_rate_max,
         AdditionalTorque(config.additional, config.task_rows),
         config.qp_solver,
-        load_collision(values, config.collision, urdf, robot.model),
-        make_interaction(values, robot, urdf, config.interaction),
+        load_collision(config.collision, config.robot, urdf, robot.model),
+        make_interaction(config.interaction, config.robot, robot, urdf),
     )
     controller.warm_up()
     return controller, base
@@ -53,6 +51,6 @@ def configure(controller: Controller, config: ControllerConfiguration) -> None:
     controller.gains = config.gains
     controller.additional.settings = config.additional
     if controller.interaction is not None:
-        controller.interaction.settings = config.interaction
+        controller.interaction.settings = config.interaction.settings
         if controller.interaction.sensor is not None:
-            controller.interaction.sensor.settings = config.sensor
+            controller.interaction.sensor.settings = config.interaction.sensor

@@ -21,6 +21,7 @@ from torque_safety_controller.node.controller_report import LEVELS, StepRecord
 from torque_safety_controller.node.goals import GoalInbox
 from torque_safety_controller.node.joint_commands import JointCommands
 from torque_safety_controller.node.limits import LimitsReader
+from torque_safety_controller.node.topics import ENABLE_TORQUE
 from torque_safety_controller.node.wrenches import WrenchInbox
 from torque_safety_controller.parameters.controller_parameters import (
     TABLE,
@@ -32,7 +33,8 @@ from torque_safety_controller.safety.modes import Mode, ModeKeeper
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, Verdict
 from viability_bounds_pkg.ros.parameters import NodeParameters
-from viability_bounds_pkg.ros.runtime import CONTROL_QOS, run
+from viability_bounds_pkg.ros.runtime import run
+from viability_bounds_pkg.ros.topics import ACCELERATION_LIMITS, JOINT_STATES
 
 
 class ControllerNode(Node):
@@ -49,8 +51,8 @@ class ControllerNode(Node):
             self._node_parameters = NodeParameters(
                 self, TABLE, make_configuration, self._configure
             )
-            values, config = self._node_parameters.values, self._node_parameters.configuration
-            self._controller, base = make_controller(values, config, self)
+            config = self._node_parameters.configuration
+            self._controller, base = make_controller(config, self)
         except SettingError:
             self.destroy_node()
             raise
@@ -72,12 +74,10 @@ class ControllerNode(Node):
         self._collision = CollisionReport(self.get_logger(), self._controller.collision)
 
         self._commands = JointCommands(self, config.joints, config.ros2_control_topic)
-        self.create_subscription(JointState, "joint_states", self._on_state, CONTROL_QOS)
-        self.create_subscription(
-            JointTrajectory, "acceleration_limits", self._on_limits, CONTROL_QOS
-        )
-        self.create_service(SetBool, "~/enable_torque", self._on_enable_torque)
-        # Watchdogs must bark when time itself, as the clock topic tells it, stands still.
+        JOINT_STATES.subscription(self, self._on_state)
+        ACCELERATION_LIMITS.subscription(self, self._on_limits)
+        ENABLE_TORQUE.serve(self, self._on_enable_torque)
+        # Use the steady clock, so that watchdogs fire when /clock stops.
         self._watchdog = self.create_timer(
             min(config.bounds_timeout, config.state_timeout) / 4,
             self._watch,

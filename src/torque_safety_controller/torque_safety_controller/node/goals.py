@@ -14,6 +14,7 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from torque_safety_controller.controller import Controller
+from torque_safety_controller.node.topics import TARGET_POSE, TARGET_POSTURE, TARGET_TRAJECTORY
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.tasks.pose_trajectory import (
     PoseTrajectory,
@@ -21,7 +22,8 @@ from torque_safety_controller.tasks.pose_trajectory import (
     TrajectoryPoint,
 )
 from viability_bounds_pkg.exceptions import ArmSafetyError
-from viability_bounds_pkg.ros.runtime import GOAL_QOS, stamp_to_ns
+from viability_bounds_pkg.ros.runtime import stamp_to_ns
+from viability_bounds_pkg.ros.topics import Topic
 
 _QUATERNION_TOLERANCE = 1e-3
 
@@ -171,11 +173,9 @@ class GoalInbox(GoalQueue):
         super().__init__()
         self._controller, self._config, self._base = controller, config, base
         self._logger = node.get_logger()
-        node.create_subscription(PoseStamped, "target_pose", self._on_pose, GOAL_QOS)
-        node.create_subscription(JointState, "target_posture", self._on_posture, GOAL_QOS)
-        node.create_subscription(
-            MultiDOFJointTrajectory, "target_trajectory", self._on_trajectory, GOAL_QOS
-        )
+        TARGET_POSE.subscription(node, self._on_pose)
+        TARGET_POSTURE.subscription(node, self._on_posture)
+        TARGET_TRAJECTORY.subscription(node, self._on_trajectory)
         self._trajectory: PoseTrajectory | None = None
         self._begin = 0
         self._taken = controller.goals.taken
@@ -201,7 +201,7 @@ class GoalInbox(GoalQueue):
         try:
             pose = pose_from_message(message, self._config.base_frame)
         except GoalRefused as error:
-            return self.refuse("target_pose", error)
+            return self.refuse(TARGET_POSE, error)
         self.add(message, lambda: self._rest_at(self._base * pose))
 
     def _rest_at(self, pose: pin.SE3) -> None:
@@ -215,7 +215,7 @@ class GoalInbox(GoalQueue):
                 message, config.base_frame, config.end_effector_frame, self._base
             )
         except GoalRefused as error:
-            return self.refuse("target_trajectory", error)
+            return self.refuse(TARGET_TRAJECTORY, error)
         self.add(message, lambda: self._follow(trajectory, stamp_to_ns(message.header.stamp)))
 
     def _follow(self, trajectory: PoseTrajectory, begin: int) -> None:
@@ -227,10 +227,10 @@ class GoalInbox(GoalQueue):
         try:
             q_des = posture_from_message(message, config.joints, config.q_min, config.q_max)
         except GoalRefused as error:
-            return self.refuse("target_posture", error)
+            return self.refuse(TARGET_POSTURE, error)
         self.add(message, lambda: self._controller.set_posture_goal(q_des))
 
-    def refuse(self, topic: str, error: GoalRefused) -> None:
+    def refuse(self, topic: Topic, error: GoalRefused) -> None:
         """Count and log a goal that cannot be followed."""
-        self.refused[topic] += 1
-        self._logger.warning(f"{topic} refused: {error}")
+        self.refused[topic.name] += 1
+        self._logger.warning(f"{topic.name} refused: {error}")

@@ -11,7 +11,8 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from viability_bounds_pkg.ros.runtime import CONTROL_QOS
+from torque_safety_controller.node.topics import ROS2_CONTROL_EFFORTS
+from viability_bounds_pkg.ros.topics import JOINT_COMMANDS
 
 
 class JointCommands:
@@ -29,12 +30,10 @@ class JointCommands:
             name=list(joints), velocity=array("d", np.zeros(len(joints)).tobytes())
         )
         self._last = self._torques
-        self._publisher = node.create_publisher(JointState, "joint_commands", CONTROL_QOS)
+        self._publisher = JOINT_COMMANDS.publisher(node)
         self._efforts = None
         if ros2_control_topic:
-            self._efforts = node.create_publisher(
-                Float64MultiArray, ros2_control_topic, CONTROL_QOS
-            )
+            self._efforts = ROS2_CONTROL_EFFORTS.publisher(node, ros2_control_topic)
 
     def torque(self, tau: np.ndarray, stamp: Any) -> None:
         """Send torques, shape (n,), N m, for the state with `stamp`."""

@@ -14,8 +14,9 @@ from std_srvs.srv import Trigger
 from torque_safety_controller.contact.interaction import Compliance, Interaction
 from torque_safety_controller.contact.wrench_sensor import WrenchError
 from torque_safety_controller.node.goals import GoalInbox, GoalRefused
+from torque_safety_controller.node.topics import TARE_FT_SENSOR, TARGET_WRENCH
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS
+from viability_bounds_pkg.ros.topics import FT_WRENCH
 
 
 def wrench_of(message: WrenchStamped) -> np.ndarray:
@@ -51,14 +52,14 @@ class WrenchInbox:
         self._logger = node.get_logger()
         self.refused: Counter[str] = Counter()
         self._changes = 0
-        node.create_subscription(WrenchStamped, "target_wrench", self._on_target, GOAL_QOS)
+        TARGET_WRENCH.subscription(node, self._on_target)
         if interaction is None or interaction.sensor is None:
             return
-        node.create_subscription(WrenchStamped, "ft_wrench", self._on_measured, CONTROL_QOS)
-        node.create_service(Trigger, "~/tare_ft_sensor", self._on_tare)
+        FT_WRENCH.subscription(node, self._on_measured)
+        TARE_FT_SENSOR.serve(node, self._on_tare)
 
     def _on_measured(self, message: WrenchStamped) -> None:
-        frame, wanted = message.header.frame_id, self._config.ft_frame
+        frame, wanted = message.header.frame_id, self._config.interaction.ft_frame
         try:
             if frame not in ("", wanted):
                 raise WrenchError(f"frame_id is '{frame}'; allowed: '{wanted}' or empty")
@@ -82,7 +83,7 @@ class WrenchInbox:
             if frame not in allowed:
                 raise GoalRefused(f"frame_id is '{frame}'; allowed: {allowed[1:]} or empty")
         except GoalRefused as error:
-            self._goals.refuse("target_wrench", error)
+            self._goals.refuse(TARGET_WRENCH, error)
             return
         rotation = self._base.rotation if frame == config.base_frame else None
         self._goals.add(message, lambda: self._apply(wrench, rotation))
@@ -90,7 +91,7 @@ class WrenchInbox:
     def _apply(self, wrench: np.ndarray, rotation: np.ndarray | None) -> None:
         if not self._interaction.settings.directions.any():
             error = GoalRefused("no direction of 'force_directions' is set")
-            self._goals.refuse("target_wrench", error)
+            self._goals.refuse(TARGET_WRENCH, error)
             return
         self._interaction.set_target(wrench, rotation)
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from torque_safety_controller.collision.avoidance import CollisionAvoidance, CollisionSettings
 from torque_safety_controller.collision.geometry import load_geometry
@@ -18,36 +19,29 @@ from torque_safety_controller.collision.obstacles import (
     Obstacle,
     make_obstacle,
 )
+from torque_safety_controller.parameters.entries import Entry
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import RobotDescriptionError
-from viability_bounds_pkg.ros.parameters import Parameter, per_joint
-from viability_bounds_pkg.ros.robot_parameters import locked_joints
+from viability_bounds_pkg.ros.parameters import (
+    NEGATIVE,
+    POSITIVE,
+    Parameter,
+    Range,
+    above,
+    per_joint,
+)
+from viability_bounds_pkg.ros.robot_parameters import RobotConfiguration
+
+Array = NDArray[np.float64]
 
 HORIZON = 2.0
-"""Control periods that an acceleration is counted on for, as in the bounds: no chatter."""
+"""Control periods that an acceleration is assumed to last, as in the bounds: no chatter."""
 
-_BEYOND = 0.003  # m; beyond margin and reserve, nearer than which pairs are in each other's way
+_BEYOND = 0.003  # m; beyond margin and reserve, pairs nearer than this are too near from the start
 _NEAR = 0.028  # m; beyond margin and reserve, pairs that never come nearer need no guard
 
-_SETTINGS = {
-    "margin": "distance kept between links and to obstacles, m",
-    "reserve": "kept on top of it for what changes within a step, m",
-    "braking": "deceleration that a distance counts on at most, m/s^2",
-    "braking_share": "share of what the joints can do along a distance that it counts on, up to "
-    "collision_braking, 0 to 1",
-    "speed_max": "greatest speed of approach, m/s",
-    "recovery_speed": "speed at which what is nearer than the margin is parted, m/s",
-    "influence": "distance beyond which nothing is looked at that does not approach fast, m",
-}
-
-_OBSTACLES = {
-    "sizes": "full lengths along their own axes, three for each, m, as in a Marker: edges; "
-    "diameters; diameter, diameter and height along z; of a half_space anything",
-    "positions": "of their centres in base_frame, three for each, m; of a half_space a point on "
-    "its surface",
-    "orientations": "of their axes, four for each: x, y, z, w; those of base_frame if empty; of a "
-    "half_space z points out of it",
-}
+_DEFAULTS = CollisionSettings()
+_OBSTACLE_FIELDS = ("name", "shape", "size", "position", "rpy")
 
 TABLE = (
     Parameter(
@@ -56,15 +50,26 @@ TABLE = (
         "whether links keep away from each other and from the obstacles below",
         default=False,
     ),
-    *(
-        Parameter(f"collision_{field.name}", float, _SETTINGS[field.name], default=field.default)
-        for field in fields(CollisionSettings)
+    Parameter(
+        "collision_margin",
+        float,
+        "distance kept between links and to obstacles, m",
+        default=_DEFAULTS.margin,
+        within=Range(0.0, 0.09),
+    ),
+    Parameter(
+        "collision_speed_max",
+        float,
+        "largest speed of approach, m/s",
+        default=_DEFAULTS.speed_max,
+        within=above(0.0, 10.0),
     ),
     Parameter(
         "collision_pairs",
         list[str],
-        "pairs of links to keep apart, each 'link_a link_b'; chosen automatically if empty",
+        "pairs of links to keep apart; chosen automatically if empty",
         default=(),
+        note="each two links, as in 'link_a link_b'",
     ),
     Parameter(
         "collision_posture",
@@ -72,43 +77,38 @@ TABLE = (
         "for the automatic choice, a posture free of collisions, rad: what is nearer there than "
         "the margin is not kept apart; the middle of the position limits if empty",
         default=np.zeros(0),
-    ),
-    Parameter(
-        "collision_capsules_per_link", int, "capsules that stand for a link at most", default=3
+        per_joint=True,
+        note="within the position limits",
     ),
     Parameter(
         "acceleration_min",
         list[float],
-        "for collision_avoidance: lower acceleration limits, rad/s^2, < 0",
+        "for collision_avoidance: lower acceleration limits, rad/s^2",
         default=np.zeros(0),
+        per_joint=True,
+        within=NEGATIVE,
     ),
     Parameter(
         "acceleration_max",
         list[float],
-        "for collision_avoidance: upper acceleration limits, rad/s^2, > 0",
+        "for collision_avoidance: upper acceleration limits, rad/s^2",
         default=np.zeros(0),
+        per_joint=True,
+        within=POSITIVE,
     ),
-    Parameter("obstacle_names", list[str], "obstacles to keep away from", default=()),
     Parameter(
-        "obstacle_shapes", list[str], f"for each of them one of {', '.join(SHAPES)}", default=()
-    ),
-    *(
-        Parameter(f"obstacle_{name}", list[float], text, default=np.zeros(0))
-        for name, text in _OBSTACLES.items()
+        "obstacles",
+        list[str],
+        "obstacles to keep away from, fixed in base_frame: position of the centre, of a "
+        "half_space a point on its surface, m; rpy, rotations about the fixed axes x, y, z, rad, "
+        "0 if left out, a half_space is where z < 0; size, m, as in a Marker: edges of a box, "
+        "diameter three times of a sphere, diameter, diameter and height along z of a cylinder, "
+        "nothing of a half_space",
+        default=(),
+        note="each a YAML mapping '{name: wall, shape: box, size: [x, y, z], position: [x, y, z], "
+        f"rpy: [r, p, y]}}' with another name; shape is one of {', '.join(SHAPES)}",
     ),
 )
-
-_PARAMETER_OF = {
-    "a_min": "acceleration_min",
-    "a_max": "acceleration_max",
-    "q_start": "collision_posture",
-    "name": "obstacle_names",
-    "shape": "obstacle_shapes",
-    "size": "obstacle_sizes",
-    "position": "obstacle_positions",
-    "orientation": "obstacle_orientations",
-    "base_frame": "base_frame",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,27 +119,29 @@ class CollisionConfiguration:
         settings: distances and speeds.
         pairs: of links to keep apart; None to choose them automatically.
         posture: free of collisions, rad.
-        capsules_per_link: at most.
-        q_min: position limits, rad: within them links are looked for in each other's way.
+        q_min: position limits, rad: postures within them are searched for links that can touch.
         q_max: rad.
         a_min: acceleration limits, rad/s^2.
         a_max: rad/s^2.
         obstacles: in the base frame.
+        base_frame: in which obstacles are.
+        dt: how long an acceleration is assumed to last, s.
     """
 
     settings: CollisionSettings
     pairs: tuple[tuple[str, str], ...] | None
-    posture: np.ndarray
-    capsules_per_link: int
-    q_min: np.ndarray
-    q_max: np.ndarray
-    a_min: np.ndarray
-    a_max: np.ndarray
+    posture: Array
+    q_min: Array
+    q_max: Array
+    a_min: Array
+    a_max: Array
     obstacles: tuple[Obstacle, ...]
+    base_frame: str
+    dt: float
 
 
 def collision_configuration(
-    values: Mapping[str, Any], joints: Sequence[str], q_min: np.ndarray, q_max: np.ndarray
+    values: Mapping[str, Any], joints: Sequence[str], q_min: Array, q_max: Array
 ) -> CollisionConfiguration | None:
     """Check everything but what the URDF decides, which `load_collision` needs.
 
@@ -155,44 +157,35 @@ def collision_configuration(
     Raises:
         SettingError: a value cannot be used.
     """
-    try:
-        settings = CollisionSettings(
-            *(values[f"collision_{field.name}"] for field in fields(CollisionSettings))
-        )
-        obstacles = _obstacles(values)
-    except CollisionError as error:
-        raise _parameter_error(error) from error
-    count = values["collision_capsules_per_link"]
-    if count < 1:
-        raise SettingError("collision_capsules_per_link", count, "at least 1")
+    obstacles = _obstacles(values["obstacles"])
     pairs = tuple(_pair(text) for text in values["collision_pairs"])
-    posture = _posture(values, joints, q_min, q_max)
+    posture = _posture(values, q_min, q_max)
     if not values["collision_avoidance"]:
         return None
     return CollisionConfiguration(
-        settings=settings,
+        settings=CollisionSettings(
+            margin=values["collision_margin"], speed_max=values["collision_speed_max"]
+        ),
         pairs=pairs or None,
         posture=posture,
-        capsules_per_link=count,
         q_min=q_min,
         q_max=q_max,
         a_min=per_joint(values, "acceleration_min", joints),
         a_max=per_joint(values, "acceleration_max", joints),
         obstacles=obstacles,
+        base_frame=values["base_frame"],
+        dt=HORIZON / values["rate_hz"],
     )
 
 
 def load_collision(
-    values: Mapping[str, Any],
-    config: CollisionConfiguration | None,
-    urdf: str,
-    model: pin.Model,
+    config: CollisionConfiguration | None, robot: RobotConfiguration, urdf: str, model: pin.Model
 ) -> CollisionAvoidance | None:
     """Return the collision avoidance of an arm, or None without one.
 
     Args:
-        values: parameter values by name.
-        config: made of them.
+        config: of `collision_configuration`.
+        robot: which arm it is.
         urdf: text of the URDF.
         model: made of it.
 
@@ -203,46 +196,49 @@ def load_collision(
         return None
     limited = model.copy()
     limited.lowerPositionLimit, limited.upperPositionLimit = config.q_min, config.q_max
-    settings = config.settings
-    kept = settings.margin + settings.reserve
+    kept = config.settings.margin + config.settings.reserve
     try:
-        geometry = load_geometry(urdf, model, locked_joints(values))
+        geometry = load_geometry(urdf, model, robot.locked)
+    except RobotDescriptionError as error:
+        allowed = f"a URDF whose collision geometry loads ({error})"
+        raise SettingError("robot_description", robot.description, allowed) from error
+    try:
         collision = build_collision_model(
             limited,
             geometry,
             config.posture,
             config.obstacles,
             config.pairs,
-            values["base_frame"],
-            config.capsules_per_link,
-            Pruning(clearance=kept + _BEYOND, near=kept + _NEAR),
+            config.base_frame,
+            pruning=Pruning(clearance=kept + _BEYOND, near=kept + _NEAR),
         )
-        dt = HORIZON / values["rate_hz"]
-        return CollisionAvoidance(collision, config.a_min, config.a_max, dt, settings)
     except CollisionError as error:
-        raise _parameter_error(error) from error
-    except RobotDescriptionError as error:
-        allowed = f"a URDF whose collision geometry loads ({error})"
-        raise SettingError("robot_description", values["robot_description"], allowed) from error
+        # The only fields that the URDF decides: names that links have, and links that it has not.
+        name = "obstacles" if error.field == "name" else f"collision_{error.field}"
+        raise SettingError(name, error.value, error.allowed) from error
+    return CollisionAvoidance(collision, config.a_min, config.a_max, config.dt, config.settings)
 
 
-def _obstacles(values: Mapping[str, Any]) -> tuple[Obstacle, ...]:
-    names = values["obstacle_names"]
-    if len(set(names)) != len(names) or "" in names:
-        raise SettingError("obstacle_names", names, "names, each once")
-    if len(values["obstacle_shapes"]) != len(names):
-        allowed = f"{len(names)} shapes, one for each of 'obstacle_names'"
-        raise SettingError("obstacle_shapes", values["obstacle_shapes"], allowed)
-    columns = []
-    for key, each in (("sizes", 3), ("positions", 3), ("orientations", 4)):
-        numbers = values[f"obstacle_{key}"]
-        if key == "orientations" and not len(numbers):
-            numbers = np.tile([0.0, 0.0, 0.0, 1.0], len(names))
-        if len(numbers) != each * len(names):
-            allowed = f"{each * len(names)} numbers, {each} for each of 'obstacle_names'"
-            raise SettingError(f"obstacle_{key}", numbers, allowed)
-        columns.append(numbers.reshape(-1, each))
-    return tuple(map(make_obstacle, names, values["obstacle_shapes"], *columns))
+def _obstacles(texts: Sequence[str]) -> tuple[Obstacle, ...]:
+    obstacles: dict[str, Obstacle] = {}
+    for index, text in enumerate(texts):
+        entry = Entry("obstacles", index, text, _OBSTACLE_FIELDS)
+        name, shape = entry.text("name"), entry.text("shape")
+        if name in obstacles:
+            raise entry.refused("name", "a name that no other obstacle has")
+        no_size = (0.0, 0.0, 0.0) if shape == "half_space" else None
+        rotation = pin.rpy.rpyToMatrix(entry.vector("rpy", (0.0, 0.0, 0.0)))
+        try:
+            obstacles[name] = make_obstacle(
+                name,
+                shape,
+                entry.vector("size", no_size),
+                entry.vector("position"),
+                pin.Quaternion(rotation).coeffs(),
+            )
+        except CollisionError as error:
+            raise entry.refused(error.field, error.allowed) from error
+    return tuple(obstacles.values())
 
 
 def _pair(text: str) -> tuple[str, str]:
@@ -252,18 +248,11 @@ def _pair(text: str) -> tuple[str, str]:
     return links[0], links[1]
 
 
-def _posture(
-    values: Mapping[str, Any], joints: Sequence[str], q_min: np.ndarray, q_max: np.ndarray
-) -> np.ndarray:
-    if len(values["collision_posture"]):
-        posture = per_joint(values, "collision_posture", joints)
+def _posture(values: Mapping[str, Any], q_min: Array, q_max: Array) -> Array:
+    posture: Array = values["collision_posture"]
+    if len(posture):
         if not ((q_min <= posture) & (posture <= q_max) & np.isfinite(posture)).all():
             raise SettingError("collision_posture", posture, "within the position limits")
         return posture
     limited = np.isfinite(q_min) & np.isfinite(q_max)
     return np.where(limited, 0.5 * (np.where(limited, q_min, 0.0) + q_max), 0.0)
-
-
-def _parameter_error(error: CollisionError) -> SettingError:
-    name = _PARAMETER_OF.get(error.field, f"collision_{error.field}")
-    return SettingError(name, error.value, error.allowed)

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from torque_safety_controller.additional_torque import AdditionalSettings
-from torque_safety_controller.contact.interaction import InteractionSettings
-from torque_safety_controller.contact.wrench_sensor import SensorSettings
 from torque_safety_controller.parameters import (
     collision_parameters,
     friction_parameters,
     integral_parameters,
     interaction_parameters,
 )
+from torque_safety_controller.parameters.collision_parameters import CollisionConfiguration
+from torque_safety_controller.parameters.interaction_parameters import InteractionConfiguration
 from torque_safety_controller.qp.inverse_dynamics_qp import SOLVERS
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.safety.modes import CONTROLS
@@ -25,22 +26,26 @@ from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.tasks import critical_damping
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import RobotDescriptionError
-from viability_bounds_pkg.ros.parameters import (
-    Parameter,
-    joint_names,
-    per_joint,
-    positive,
-)
+from viability_bounds_pkg.ros.parameters import Parameter, Range, above, given_or
 from viability_bounds_pkg.ros.robot_parameters import (
     ROBOT_TABLE,
-    all_positive,
-    model_from,
+    RobotConfiguration,
+    load_model,
     position_limits,
+    robot_configuration,
     robot_urdf,
 )
 
 if TYPE_CHECKING:
     from rclpy.node import Node
+
+Array = NDArray[np.float64]
+
+CRITICAL = -1.0
+"""Of ``pose_kd`` and ``posture_kd``: critical damping."""
+
+OFF = -1.0
+"""Of ``disturbance_time``: disturbances are not estimated."""
 
 TABLE = (
     *ROBOT_TABLE,
@@ -51,14 +56,52 @@ TABLE = (
         list[float],
         "limits of the rate of torque, N m/s; none if empty",
         default=np.zeros(0),
+        per_joint=True,
+        note="all > 0",
     ),
-    Parameter("rate_hz", float, "rate of the control loop, Hz"),
-    Parameter("pose_kp", float, "stiffness of the pose task, 1/s^2", live=True),
-    Parameter("pose_kd", float, "its damping, 1/s; -1: critical", default=-1.0, live=True),
-    Parameter("pose_weight", float, "its weight; 0: no pose task", default=1.0, live=True),
-    Parameter("posture_kp", float, "stiffness of the posture task, 1/s^2", live=True),
-    Parameter("posture_kd", float, "its damping, 1/s; -1: critical", default=-1.0, live=True),
-    Parameter("posture_weight", float, "its weight, > 0", default=1e-3, live=True),
+    Parameter("rate_hz", float, "rate of the control loop, Hz", within=above(0.0, 1e4)),
+    Parameter(
+        "pose_kp", float, "stiffness of the pose task, 1/s^2", live=True, within=Range(0.0, 1e5)
+    ),
+    Parameter(
+        "pose_kd",
+        float,
+        "damping of the pose task, 1/s; -1: critical, 2 sqrt(kp)",
+        default=CRITICAL,
+        live=True,
+        within=above(0.0, 1e4, special=CRITICAL),
+    ),
+    Parameter(
+        "pose_weight",
+        float,
+        "weight of the pose task; 0: no pose task",
+        default=1.0,
+        live=True,
+        within=Range(0.0, 1e5),
+    ),
+    Parameter(
+        "posture_kp",
+        float,
+        "stiffness of the posture task, 1/s^2",
+        live=True,
+        within=Range(0.0, 1e5),
+    ),
+    Parameter(
+        "posture_kd",
+        float,
+        "damping of the posture task, 1/s; -1: critical, 2 sqrt(kp)",
+        default=CRITICAL,
+        live=True,
+        within=above(0.0, 1e4, special=CRITICAL),
+    ),
+    Parameter(
+        "posture_weight",
+        float,
+        "weight of the posture task",
+        default=1e-3,
+        live=True,
+        within=above(0.0, 1e5),
+    ),
     Parameter(
         "posture_in_null_space",
         bool,
@@ -66,20 +109,29 @@ TABLE = (
         default=True,
         live=True,
     ),
-    Parameter("hold_kd", float, "damping in HOLD, 1/s", default=20.0, live=True),
+    Parameter(
+        "hold_kd",
+        float,
+        "damping in HOLD, 1/s",
+        default=20.0,
+        live=True,
+        within=Range(0.0, 1e4),
+    ),
     Parameter(
         "qp_solver",
         str,
-        f"one of {', '.join(SOLVERS)}; proxqp takes several times as long",
+        "solver of the QP; proxqp takes several times as long",
         default="active_set",
+        choices=tuple(SOLVERS),
     ),
     Parameter(
         "disturbance_time",
         float,
-        "time constant with which what disturbs the accelerations is learned and kept out of "
-        "the bounds, s; -1: not at all",
-        default=-1.0,
+        "time constant with which the error of the accelerations is estimated, to tighten the "
+        "bounds by it, s; -1: not at all",
+        default=OFF,
         live=True,
+        within=Range(0.0, 10.0, special=OFF),
     ),
     *integral_parameters.TABLE,
     *friction_parameters.TABLE,
@@ -88,9 +140,9 @@ TABLE = (
     Parameter(
         "start_control",
         str,
-        f"one of {', '.join(CONTROLS)}: what the robot is commanded by until enable_torque is "
-        "called",
+        "what the robot is commanded by until enable_torque is called",
         default="torque",
+        choices=CONTROLS,
     ),
     Parameter(
         "bounds_timeout",
@@ -98,14 +150,22 @@ TABLE = (
         "how long a state waits for its acceleration limits, or a usable state for another, "
         "before HOLD, s",
         default=0.05,
+        within=above(0.0, 3600.0),
     ),
     Parameter(
         "state_timeout",
         float,
         "how long without a usable joint state before STOPPED, s",
         default=0.5,
+        within=above(0.0, 3600.0),
     ),
-    Parameter("goal_timeout", float, "age of a goal before HOLD, s; 0: never", default=0.0),
+    Parameter(
+        "goal_timeout",
+        float,
+        "age of a goal before HOLD, s; 0: never",
+        default=0.0,
+        within=Range(0.0, 1e5),
+    ),
     Parameter(
         "ros2_control_topic",
         str,
@@ -115,55 +175,55 @@ TABLE = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ControllerConfiguration:
     """Checked parameters of the controller node; arrays of shape (n,) in `joints` order."""
 
-    joints: tuple[str, ...]
+    robot: RobotConfiguration
     dt: float
-    q_min: np.ndarray
-    q_max: np.ndarray
-    tau_max: np.ndarray
-    tau_rate_max: np.ndarray
+    q_min: Array
+    q_max: Array
+    tau_max: Array
+    tau_rate_max: Array
     base_frame: str
     end_effector_frame: str
     gains: Gains
     qp_solver: str
     additional: AdditionalSettings
     task_rows: slice
-    ft_frame: str
-    sensor: SensorSettings
-    interaction: InteractionSettings
-    collision: collision_parameters.CollisionConfiguration | None
+    interaction: InteractionConfiguration
+    collision: CollisionConfiguration | None
     start_control: str
     bounds_timeout: float
     state_timeout: float
     goal_timeout: float
     ros2_control_topic: str
 
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the n joints."""
+        return self.robot.joints
+
 
 def make_configuration(values: Mapping[str, Any]) -> ControllerConfiguration:
     """Check everything but the URDF, which `load_robot` reads once.
 
+    Args:
+        values: of `TABLE`, by name, as `read_values` returns them.
+
     Raises:
-        SettingError: a value cannot be used.
+        SettingError: values that do not fit together.
     """
-    joints = joint_names(values)
-    tau_rate_max = np.full(len(joints), np.inf)
-    if len(values["torque_rate_max"]):
-        tau_rate_max = per_joint(values, "torque_rate_max", joints)
-        if not (tau_rate_max > 0).all():
-            raise SettingError("torque_rate_max", tau_rate_max, "numbers > 0")
+    robot = robot_configuration(values)
+    joints = robot.joints
+    tau_rate_max = given_or(values, "torque_rate_max", np.full(len(joints), np.inf))
+    if not (tau_rate_max > 0).all():
+        raise SettingError("torque_rate_max", tau_rate_max, "numbers > 0")
     q_min, q_max = position_limits(values, joints)
-    tau_max = all_positive(values, "torque_max", joints)
-    if values["qp_solver"] not in SOLVERS:
-        raise SettingError("qp_solver", values["qp_solver"], f"one of {', '.join(SOLVERS)}")
-    if values["start_control"] not in CONTROLS:
-        allowed = f"one of {', '.join(CONTROLS)}"
-        raise SettingError("start_control", values["start_control"], allowed)
+    tau_max = values["torque_max"]
     return ControllerConfiguration(
-        joints=joints,
-        dt=1.0 / positive(values, "rate_hz"),
+        robot=robot,
+        dt=1.0 / values["rate_hz"],
         q_min=q_min,
         q_max=q_max,
         tau_max=tau_max,
@@ -174,35 +234,24 @@ def make_configuration(values: Mapping[str, Any]) -> ControllerConfiguration:
         qp_solver=values["qp_solver"],
         additional=integral_parameters.additional_settings(values, joints, tau_max),
         task_rows=integral_parameters.task_rows(values),
-        ft_frame=values["ft_frame"],
-        sensor=interaction_parameters.sensor_settings(values),
-        interaction=interaction_parameters.interaction_settings(values),
+        interaction=interaction_parameters.interaction_configuration(values),
         collision=collision_parameters.collision_configuration(values, joints, q_min, q_max),
         start_control=values["start_control"],
-        bounds_timeout=positive(values, "bounds_timeout"),
-        state_timeout=positive(values, "state_timeout"),
-        goal_timeout=positive(values, "goal_timeout", zero=True),
+        bounds_timeout=values["bounds_timeout"],
+        state_timeout=values["state_timeout"],
+        goal_timeout=values["goal_timeout"],
         ros2_control_topic=values["ros2_control_topic"],
     )
 
 
 def _gains(values: Mapping[str, Any]) -> Gains:
-    gains = {
-        name: positive(values, name, zero=name != "posture_weight")
-        for name in ("pose_kp", "pose_weight", "posture_kp", "posture_weight", "hold_kd")
-    }
+    gains = {field.name: values[field.name] for field in fields(Gains) if field.name in values}
     for task in ("pose", "posture"):
-        name = f"{task}_kd"
-        kd = values[name]
-        gains[name] = (
-            critical_damping(gains[f"{task}_kp"]) if kd == -1.0 else positive(values, name)
-        )
-    time = values["disturbance_time"]
-    if time == -1.0:
+        if gains[f"{task}_kd"] == CRITICAL:
+            gains[f"{task}_kd"] = critical_damping(gains[f"{task}_kp"])
+    if gains["disturbance_time"] == OFF:
         gains["disturbance_time"] = None
-    else:
-        gains["disturbance_time"] = positive(values, "disturbance_time", zero=True)
-    return Gains(**gains, posture_in_null_space=values["posture_in_null_space"])
+    return Gains(**gains)
 
 
 class LoadedRobot(NamedTuple):
@@ -219,31 +268,25 @@ class LoadedRobot(NamedTuple):
     urdf: str
 
 
-def load_robot(values: Mapping[str, Any], node: Node | None) -> LoadedRobot:
+def load_robot(config: ControllerConfiguration, node: Node | None = None) -> LoadedRobot:
     """Read the URDF, once, and return what is made of it.
 
     Args:
-        values: parameter values by name.
+        config: checked parameters.
         node: listens for the URDF if it comes from a topic.
 
     Raises:
         SettingError: a URDF that does not load, or a joint or frame that it does not have.
     """
-    urdf = robot_urdf(values, node)
-    model = model_from(values, urdf)
-    return LoadedRobot(
-        _with_frame(model, values, "end_effector_frame"),
-        _base_placement(model, values["base_frame"]),
-        urdf,
-    )
-
-
-def _with_frame(model: pin.Model, values: Mapping[str, Any], name: str) -> RobotModel:
-    frame = values[name]
+    urdf = robot_urdf(config.robot.description, node)
+    model = load_model(config.robot, urdf)
+    frame = config.end_effector_frame
     try:
-        return RobotModel(model, frame, 1.0 / values["rate_hz"])
+        robot = RobotModel(model, frame, config.dt)
     except RobotDescriptionError as error:
-        raise SettingError(name, frame, f"a frame of the URDF ({error})") from error
+        allowed = f"a frame of the URDF ({error})"
+        raise SettingError("end_effector_frame", frame, allowed) from error
+    return LoadedRobot(robot, _base_placement(model, config.base_frame), urdf)
 
 
 def _base_placement(model: pin.Model, frame: str) -> pin.SE3:

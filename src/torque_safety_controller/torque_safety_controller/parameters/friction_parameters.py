@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torque_safety_controller.friction.settings import (
     DEFAULT_STRIBECK_VELOCITY,
@@ -13,103 +14,75 @@ from torque_safety_controller.friction.settings import (
     FrictionSettings,
 )
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.ros.parameters import Parameter, per_joint
+from viability_bounds_pkg.ros.parameters import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    Parameter,
+    Range,
+    given_or,
+)
+
+Array = NDArray[np.float64]
 
 BUDGET = 0.2
-"""Default budget in torque limits."""
+"""Largest torque that is compensated, in torque limits."""
 
 MODEL = {
-    "coulomb": "dry friction of moving joints, N m",
+    "coulomb": "dry friction of moving joints, N m; none if empty",
     "static": "dry friction of joints at rest, N m; that of moving ones if empty",
     "viscous": "friction that grows with speed, N m s/rad; none if empty",
     "stribeck_velocity": "speed at which static has become Coulomb friction but for 1/e of the "
     f"difference, rad/s; {DEFAULT_STRIBECK_VELOCITY:g} if empty",
 }
-"""What the controller believes of each joint's friction; `identify_friction` finds it."""
+"""Friction model of each joint; `identify_friction` finds it."""
 
 TABLE = (
     Parameter(
         "friction_compensation",
         float,
-        "share of the friction model that is compensated, 0 (off) to 1",
+        "share of the friction model that is compensated; 0: off",
         default=0.0,
         live=True,
+        within=Range(0.0, 1.0),
     ),
     *(
-        Parameter(f"friction_model_{name}", list[float], text, default=np.zeros(0), live=True)
+        Parameter(
+            f"friction_model_{name}",
+            list[float],
+            text,
+            default=np.zeros(0),
+            live=True,
+            per_joint=True,
+            within=POSITIVE if name == "stribeck_velocity" else NOT_NEGATIVE,
+        )
         for name, text in MODEL.items()
-    ),
-    Parameter(
-        "friction_budget",
-        list[float],
-        f"most that is compensated, N m; {BUDGET:g} of torque_max if empty",
-        default=np.zeros(0),
-        live=True,
-    ),
-    Parameter(
-        "friction_theta",
-        float,
-        "rate at which the reference velocity returns to the measured one, 1/s",
-        default=3.0,
-        live=True,
-    ),
-    Parameter(
-        "friction_gain",
-        float,
-        "gain of the reference velocity, 1/s; -1: what the control rate allows",
-        default=-1.0,
-        live=True,
     ),
 )
 
-_PARAMETER_OF = {"scale": "friction_compensation", "theta": "friction_theta"}
 
-
-def friction_settings(
-    values: Mapping[str, Any], joints: Sequence[str], tau_max: np.ndarray
-) -> FrictionSettings:
+def friction_settings(values: Mapping[str, Any], tau_max: Array) -> FrictionSettings:
     """Return the settings of the friction compensation.
 
     Args:
         values: parameter values by name.
-        joints: names of the n joints.
         tau_max: torque limits, shape (n,), N m.
 
     Raises:
-        SettingError: a value cannot be used.
+        SettingError: values that do not fit together.
     """
-    n = len(joints)
     scale = values["friction_compensation"]
-    defaults = {
-        "coulomb": np.zeros(n),
-        "viscous": np.zeros(n),
-        "stribeck_velocity": np.full(n, DEFAULT_STRIBECK_VELOCITY),
-    }
-    given = {name: values[f"friction_model_{name}"] for name in MODEL}
-    if scale > 0.0 and not any(len(given[name]) for name in ("coulomb", "static", "viscous")):
+    names = [f"friction_model_{name}" for name in ("coulomb", "static", "viscous")]
+    if scale > 0.0 and not any(len(values[name]) for name in names):
         allowed = "0 as long as no friction_model_coulomb, _static or _viscous is given"
         raise SettingError("friction_compensation", scale, allowed)
-    found = {
-        name: per_joint(values, f"friction_model_{name}", joints)
-        if len(value)
-        else defaults.get(name)
-        for name, value in given.items()
-    }
-    if found["static"] is None:
-        found["static"] = found["coulomb"]
-    budget = BUDGET * tau_max
-    if len(values["friction_budget"]):
-        budget = per_joint(values, "friction_budget", joints)
-        if (budget > tau_max).any():
-            raise SettingError("friction_budget", budget, "at most torque_max")
-    try:
-        model = FrictionModel(**found)
-    except SettingError as error:
-        name = f"friction_model_{error.name}"
-        raise SettingError(name, error.value, error.allowed) from error
-    try:
-        gain = None if values["friction_gain"] == -1.0 else values["friction_gain"]
-        return FrictionSettings(model, budget, scale, values["friction_theta"], gain)
-    except SettingError as error:
-        name = _PARAMETER_OF.get(error.name, f"friction_{error.name}")
-        raise SettingError(name, error.value, error.allowed) from error
+    zero = np.zeros_like(tau_max)
+    coulomb = given_or(values, "friction_model_coulomb", zero)
+    static = given_or(values, "friction_model_static", coulomb)
+    if (static < coulomb).any():
+        allowed = "at least friction_model_coulomb everywhere"
+        raise SettingError("friction_model_static", static, allowed)
+    viscous = given_or(values, "friction_model_viscous", zero)
+    speed = zero + DEFAULT_STRIBECK_VELOCITY
+    speed = given_or(values, "friction_model_stribeck_velocity", speed)
+    model = FrictionModel(coulomb, static, viscous, speed)
+    return FrictionSettings(model, BUDGET * tau_max, scale)

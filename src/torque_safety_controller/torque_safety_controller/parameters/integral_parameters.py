@@ -6,16 +6,21 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torque_safety_controller.additional_torque import MODES, AdditionalSettings
-from torque_safety_controller.integral_feedback.settings import (
-    METHODS,
-    IntegralSettings,
-)
+from torque_safety_controller.integral_feedback.settings import IntegralSettings
 from torque_safety_controller.nullspace.settings import NullspaceSettings
 from torque_safety_controller.parameters.friction_parameters import friction_settings
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.ros.parameters import Parameter, per_joint
+from viability_bounds_pkg.ros.parameters import (
+    NOT_NEGATIVE,
+    Parameter,
+    above,
+    given_or,
+)
+
+Array = NDArray[np.float64]
 
 BUDGET = 0.1
 """Default budget in torque limits: the paper's tau_m."""
@@ -26,14 +31,18 @@ DISTURBANCE_MAX = 2.0
 TASKS = {"pose": slice(0, 6), "position": slice(0, 3)}
 """Rows of the pose's Jacobian that are a task of integral action ``task``."""
 
+METHODS = ("none", "scaling", "paper", "qp")
+"""Anti-windup of the joints: none; (10) or (11) as [Benallegue2021] prints them, that is for K s
+only, with the integrators left alone and (13); or for the whole torque, integrators included."""
+
 TABLE = (
     Parameter(
         "integral_action",
         str,
-        f"one of {', '.join(MODES)}: none; all joints stiff; or the task stiff and its null "
-        "space compliant",
+        "none; joints: all joints stiff; task: the task stiff and its null space compliant",
         default="none",
         live=True,
+        choices=MODES,
     ),
     Parameter(
         "integral_budget",
@@ -41,42 +50,51 @@ TABLE = (
         f"limits of the additional torque, N m; {BUDGET:g} of torque_max if empty",
         default=np.zeros(0),
         live=True,
+        per_joint=True,
+        within=NOT_NEGATIVE,
+        note="at most torque_max",
     ),
-    Parameter("integral_lambda", float, "gain, K = lambda diag(M), 1/s", default=2.0, live=True),
     Parameter(
-        "integral_theta_slow", float, "rate of slow forgetting, 1/s", default=0.1, live=True
+        "integral_lambda",
+        float,
+        "gain, K = lambda diag(M), 1/s",
+        default=2.0,
+        live=True,
+        within=above(0.0, 1e3),
     ),
     Parameter(
-        "integral_theta_fast", float, "rate of fast forgetting, 1/s", default=100.0, live=True
+        "integral_leak",
+        list[float],
+        "leak rates theta_s and theta_f of the slow and the fast integrator, 1/s, and the share "
+        "mu of the fast one",
+        default=(0.1, 100.0, 0.5),
+        live=True,
+        length=3,
+        within=NOT_NEGATIVE,
+        note="[theta_s, theta_f, mu] with theta_f >= theta_s and mu <= 1",
     ),
-    Parameter("integral_mu", float, "share of the fast memory, 0 to 1", default=0.5, live=True),
     Parameter(
         "integral_anti_windup",
         str,
-        f"for joints: one of {', '.join(METHODS)}; qp is eq. (11)",
+        "for joints: how the torque is limited: not at all (none); K s only and the integrators "
+        "left alone, as printed, by (10) (scaling) or (11) (paper); all of it by (11), and the "
+        "integrators with it (qp)",
         default="qp",
         live=True,
-    ),
-    Parameter(
-        "integral_as_printed",
-        bool,
-        "limit K s only and leave the integrators as they are, as the paper does",
-        default=False,
-        live=True,
+        choices=METHODS,
     ),
     Parameter(
         "integral_task",
         str,
-        f"for task: one of {', '.join(TASKS)}; what is stiff of the end effector",
+        "for task: what of the end effector is stiff",
         default="pose",
+        choices=tuple(TASKS),
     ),
 )
 
-_NAME_OF = {"lambda_": "lambda"}
-
 
 def additional_settings(
-    values: Mapping[str, Any], joints: Sequence[str], tau_max: np.ndarray
+    values: Mapping[str, Any], joints: Sequence[str], tau_max: Array
 ) -> AdditionalSettings:
     """Return the settings of the additional torque.
 
@@ -86,56 +104,42 @@ def additional_settings(
         tau_max: torque limits, shape (n,), N m.
 
     Raises:
-        SettingError: a value cannot be used.
+        SettingError: values that do not fit together.
     """
     mode = values["integral_action"]
-    if mode not in MODES:
-        raise SettingError("integral_action", mode, f"one of {', '.join(MODES)}")
-    rows = task_rows(values)
-    if mode == "task" and rows.stop >= len(joints):
+    null_space = task_rows(values).stop < len(joints)
+    if mode == "task" and not null_space:
         allowed = f"'none' or 'joints': {len(joints)} joints have no null space left of the task"
         raise SettingError("integral_action", mode, allowed)
-    budget = BUDGET * tau_max
-    if len(values["integral_budget"]):
-        budget = per_joint(values, "integral_budget", joints)
-        if (budget > tau_max).any():
-            raise SettingError("integral_budget", budget, "at most torque_max")
-    common = {
-        "budget": budget,
-        "lambda_": values["integral_lambda"],
-        "theta_slow": values["integral_theta_slow"],
-        "theta_fast": values["integral_theta_fast"],
-        "mu": values["integral_mu"],
-    }
-    as_printed = values["integral_as_printed"]
-    try:
-        return AdditionalSettings(
-            mode,
-            IntegralSettings(
-                **common,
-                anti_windup=values["integral_anti_windup"],
-                whole_torque=not as_printed,
-                correct_state=not as_printed,
-                paper_form=as_printed,
-            ),
-            NullspaceSettings(**common, keep_integral=as_printed)
-            if rows.stop < len(joints)
-            else None,
-            DISTURBANCE_MAX * tau_max,
-            friction_settings(values, joints, tau_max),
-        )
-    except SettingError as error:
-        name = f"integral_{_NAME_OF.get(error.name, error.name)}"
-        raise SettingError(name, error.value, error.allowed) from error
+    budget = given_or(values, "integral_budget", BUDGET * tau_max)
+    if (budget > tau_max).any():
+        raise SettingError("integral_budget", budget, "at most torque_max")
+    slow, fast, mu = leak = values["integral_leak"]
+    if fast < slow or mu > 1.0:
+        raise SettingError("integral_leak", leak, "theta_f >= theta_s and mu <= 1")
+    gain, method = values["integral_lambda"], values["integral_anti_windup"]
+    printed, paper = method != "qp", method == "paper"
+    return AdditionalSettings(
+        mode,
+        IntegralSettings(
+            budget,
+            gain,
+            slow,
+            fast,
+            mu,
+            anti_windup="qp" if paper else method,
+            whole_torque=not printed,
+            correct_state=not printed,
+            paper_form=printed,
+        ),
+        NullspaceSettings(budget, gain, slow, fast, mu, keep_integral=paper)
+        if null_space
+        else None,
+        DISTURBANCE_MAX * tau_max,
+        friction_settings(values, tau_max),
+    )
 
 
 def task_rows(values: Mapping[str, Any]) -> slice:
-    """Return which rows of the pose's Jacobian ``integral_task`` names.
-
-    Raises:
-        SettingError: it is unknown.
-    """
-    task = values["integral_task"]
-    if task not in TASKS:
-        raise SettingError("integral_task", task, f"one of {', '.join(TASKS)}")
-    return TASKS[task]
+    """Return which rows of the pose's Jacobian ``integral_task`` names."""
+    return TASKS[values["integral_task"]]

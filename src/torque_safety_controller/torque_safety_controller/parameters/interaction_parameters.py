@@ -3,43 +3,66 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from torque_safety_controller.contact.admittance import AdmittanceGains
 from torque_safety_controller.contact.contacts import Contact, Contacts
 from torque_safety_controller.contact.dual_compliance import DualSettings
 from torque_safety_controller.contact.interaction import Interaction, InteractionSettings
 from torque_safety_controller.contact.wrench_sensor import SensorSettings, WrenchSensor
+from torque_safety_controller.parameters.entries import Entry
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import RobotDescriptionError, inertia_beyond
-from viability_bounds_pkg.ros.parameters import Parameter, positive
-from viability_bounds_pkg.ros.robot_parameters import locked_joints
+from viability_bounds_pkg.ros.parameters import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    Parameter,
+    Range,
+    above,
+    given_or,
+)
+from viability_bounds_pkg.ros.robot_parameters import RobotConfiguration
+
+Array = NDArray[np.float64]
 
 _AXES = "x, y, z and about x, y, z of the end effector's axes"
+
+_DEFAULTS = InteractionSettings()
+_DUAL = DualSettings()
+_CONTACT_FIELDS = ("frame", "point", "normal", "friction")
 
 TABLE = (
     Parameter("ft_frame", str, "link of the wrist's force/torque sensor; none if empty", ""),
     Parameter(
-        "ft_tool_mass",
-        float,
-        "mass beyond the sensor, kg; -1: as the URDF says, centre of mass included",
-        -1.0,
-    ),
-    Parameter(
-        "ft_tool_com",
+        "ft_tool",
         list[float],
-        "centre of that mass in the sensor's axes, m; the sensor's origin if empty",
+        "mass beyond the sensor, kg, and its centre in the sensor's axes, m; as the URDF says if "
+        "empty",
         np.zeros(0),
+        length=4,
+        note="[mass, x, y, z] with mass >= 0",
     ),
     Parameter(
-        "ft_filter_hz", float, "cut-off frequency of the wrench's filter, Hz", 30.0, live=True
+        "ft_filter_hz",
+        float,
+        "cut-off frequency of the wrench's filter, Hz",
+        30.0,
+        live=True,
+        within=above(0.0, 1e4),
     ),
     Parameter(
-        "ft_timeout", float, "how long without a wrench before force control ends, s", 0.05, True
+        "ft_timeout",
+        float,
+        "how long without a wrench before force control ends, s",
+        0.05,
+        live=True,
+        within=above(0.0, 60.0),
     ),
     Parameter(
         "force_directions",
@@ -47,83 +70,80 @@ TABLE = (
         f"1 where target_wrench is exerted, 0 elsewhere: {_AXES}; nowhere if empty",
         np.zeros(0),
         live=True,
+        length=6,
+        note="zeros and ones",
     ),
     Parameter(
         "force_stiffness",
         list[float],
-        "share of pose_kp that is left there, 0 to 1, six numbers; none of it if empty",
+        f"share of pose_kp that is left there: {_AXES}; none of it if empty",
         np.zeros(0),
         live=True,
+        length=6,
+        within=Range(0.0, 1.0),
     ),
-    Parameter("admittance_force_kp", float, "gain of (27), m/s^2 per N", 5e-3, live=True),
-    Parameter("admittance_force_kd", float, "gain of (27), m/s^2 per N/s", 1e-7, live=True),
-    Parameter("admittance_moment_kp", float, "gain of (27), rad/s^2 per N m", 5e-3, live=True),
-    Parameter("admittance_moment_kd", float, "gain of (27), rad/s^2 per N m/s", 1e-7, live=True),
+    Parameter(
+        "admittance_kp",
+        list[float],
+        "gains Kp of (27) for forces, m/s^2 per N, and moments, rad/s^2 per N m",
+        (_DEFAULTS.gains.force_kp, _DEFAULTS.gains.moment_kp),
+        live=True,
+        length=2,
+        within=NOT_NEGATIVE,
+    ),
     Parameter(
         "admittance_speed_max",
         list[float],
-        "speeds at which the hand looks for what it is to press on, m/s and rad/s; 0.01 and 0.05 "
-        "if empty",
-        np.zeros(0),
+        "speeds at which the hand approaches what it is to press on, m/s and rad/s",
+        (0.01, 0.05),
         live=True,
-    ),
-    Parameter(
-        "admittance_weight", float, "weight of the task; -1: that of the pose task", -1.0, True
-    ),
-    Parameter("wrench_weight", float, "weight of a wrench task, > 0", 10.0, live=True),
-    Parameter(
-        "wrench_time", float, "time constant of going over to a new target wrench, s", 0.1, True
+        length=2,
+        within=POSITIVE,
     ),
     Parameter(
         "dual_compliance",
         bool,
-        "whether the hand yields to who pulls at it, and stays where it is let go",
+        "whether the hand yields to wrenches above yield_threshold, and stays where it is when "
+        "they end",
         default=False,
         live=True,
     ),
-    Parameter("yield_force", float, "force above which it does, N", 10.0, live=True),
-    Parameter("yield_moment", float, "moment above which it does, N m", 2.0, live=True),
-    Parameter("yield_release", float, "share of both below which it stops", 0.5, live=True),
-    Parameter("yield_force_kp", float, "how easily it is led, m/s^2 per N", 0.1, live=True),
-    Parameter("yield_moment_kp", float, "how easily, rad/s^2 per N m", 1.0, live=True),
+    Parameter(
+        "yield_threshold",
+        list[float],
+        "force, N, and moment, N m, above which the hand yields; it stops below half of both",
+        (_DUAL.force, _DUAL.moment),
+        live=True,
+        length=2,
+        within=POSITIVE,
+    ),
+    Parameter(
+        "yield_kp",
+        list[float],
+        "acceleration by which the hand yields, m/s^2 per N and rad/s^2 per N m",
+        (_DEFAULTS.yielding_gains.force_kp, _DEFAULTS.yielding_gains.moment_kp),
+        live=True,
+        length=2,
+        within=NOT_NEGATIVE,
+    ),
     Parameter(
         "yield_speed_max",
         list[float],
-        "speeds at which it is led at most, m/s and rad/s; 0.25 and 1 if empty",
-        np.zeros(0),
+        "speeds at which it yields at most, m/s and rad/s",
+        (_DEFAULTS.yielding_gains.speed_max, _DEFAULTS.yielding_gains.turn_max),
         live=True,
+        length=2,
+        within=POSITIVE,
     ),
     Parameter(
-        "contact_frames",
+        "contacts",
         list[str],
-        "links that the QP may use contact forces of, one for each point",
+        "points at which the QP may use contact forces, in the axes of the link frame: point, m, "
+        "its origin if left out; normal, direction in which the environment pushes; friction, "
+        "Coulomb's coefficient, 0 if left out; points of one link are one contact",
         default=(),
-    ),
-    Parameter(
-        "contact_points",
-        list[float],
-        "where they touch, three for each point, in the link's axes, m; their origins if empty",
-        np.zeros(0),
-    ),
-    Parameter(
-        "contact_normals",
-        list[float],
-        "where the environment pushes to, three for each point, in the link's axes",
-        np.zeros(0),
-    ),
-    Parameter(
-        "contact_friction",
-        list[float],
-        "coefficient of friction at each point; none if empty",
-        np.zeros(0),
-    ),
-    Parameter("contact_facets", int, "edges of a friction pyramid, at least 3", 4),
-    Parameter(
-        "contact_force_step",
-        float,
-        "by how much the force counted on at the hand may exceed the measured one, N",
-        0.5,
-        live=True,
+        note="each a YAML mapping '{frame: link, point: [x, y, z], normal: [x, y, z], "
+        "friction: 0.3}'; normal and friction are the same at all points of a link",
     ),
     Parameter(
         "closed_contacts",
@@ -131,116 +151,139 @@ TABLE = (
         "links but the hand that are in contact at present",
         default=(),
         live=True,
+        note="frames of 'contacts'",
     ),
 )
 
 
-def sensor_settings(values: Mapping[str, Any]) -> SensorSettings:
-    """Return how measurements are taken.
+class ContactPoint(NamedTuple):
+    """One entry of ``contacts``.
+
+    Attributes:
+        label: of the entry, in errors.
+        frame: name of the link.
+        point: in its axes, shape (3,), m.
+        normal: direction in which the environment pushes, shape (3,).
+        friction: coefficient.
+    """
+
+    label: str
+    frame: str
+    point: Array
+    normal: Array
+    friction: float
+
+
+@dataclass(frozen=True, eq=False)
+class InteractionConfiguration:
+    """Checked parameters of forces.
+
+    Attributes:
+        settings: what is done about forces.
+        sensor: how measurements are taken.
+        ft_frame: link of the sensor; empty for none.
+        tool: mass beyond the sensor, kg, and its centre, m, shape (4,); None: as the URDF says.
+        points: of contacts.
+    """
+
+    settings: InteractionSettings
+    sensor: SensorSettings
+    ft_frame: str
+    tool: Array | None
+    points: tuple[ContactPoint, ...]
+
+
+def interaction_configuration(values: Mapping[str, Any]) -> InteractionConfiguration:
+    """Check everything but what the URDF decides, which `make_interaction` needs.
 
     Raises:
         SettingError: a value cannot be used.
     """
-    return SensorSettings(positive(values, "ft_filter_hz"), positive(values, "ft_timeout"))
-
-
-def interaction_settings(values: Mapping[str, Any]) -> InteractionSettings:
-    """Return what is done about forces.
-
-    Raises:
-        SettingError: a value cannot be used.
-    """
-    directions = _six(values, "force_directions")
-    if not np.isin(directions, (0.0, 1.0)).all():
-        raise SettingError("force_directions", directions, "zeros and ones")
-    stiffness = _six(values, "force_stiffness")
-    if not ((stiffness >= 0.0) & (stiffness <= 1.0)).all():
-        raise SettingError("force_stiffness", stiffness, "numbers from 0 to 1")
-    for name in ("force_directions", "dual_compliance"):
-        if np.any(values[name]) and not values["ft_frame"]:
-            raise SettingError(name, values[name], "only with a force/torque sensor, 'ft_frame'")
-    weight = values["admittance_weight"]
-    frames = _contact_frames(values)
-    for frame in values["closed_contacts"]:
-        if frame not in frames:
-            known = ", ".join(frames) or "none"
-            raise SettingError(
-                "closed_contacts", list(values["closed_contacts"]), f"of 'contact_frames': {known}"
-            )
-    return InteractionSettings(
-        directions=directions == 1.0,
-        stiffness=stiffness,
-        gains=AdmittanceGains(
-            *(
-                positive(values, f"admittance_{name}", zero=True)
-                for name in ("force_kp", "force_kd", "moment_kp", "moment_kd")
-            ),
-            *_speeds(values, "admittance_speed_max", (0.01, 0.05)),
-        ),
-        weight=None if weight == -1.0 else positive(values, "admittance_weight"),
-        wrench_weight=positive(values, "wrench_weight"),
-        wrench_time=positive(values, "wrench_time"),
-        force_step=positive(values, "contact_force_step"),
-        closed=tuple(frames.index(frame) for frame in values["closed_contacts"]),
-        dual=_dual(values),
-        yielding_gains=AdmittanceGains(
-            positive(values, "yield_force_kp", zero=True),
-            0.0,
-            positive(values, "yield_moment_kp", zero=True),
-            0.0,
-            *_speeds(values, "yield_speed_max", (0.25, 1.0)),
-        ),
+    tool = values["ft_tool"] if len(values["ft_tool"]) else None
+    if tool is not None and not (np.isfinite(tool).all() and tool[0] >= 0.0):
+        raise SettingError("ft_tool", tool, "4 finite numbers [mass, x, y, z] with mass >= 0")
+    points = _contact_points(values["contacts"])
+    return InteractionConfiguration(
+        settings=_settings(values, [*_by_frame(points)]),
+        sensor=SensorSettings(values["ft_filter_hz"], values["ft_timeout"]),
+        ft_frame=values["ft_frame"],
+        tool=tool,
+        points=points,
     )
 
 
-def _dual(values: Mapping[str, Any]) -> DualSettings | None:
-    force, moment = positive(values, "yield_force"), positive(values, "yield_moment")
-    release = positive(values, "yield_release", zero=True)
-    if release > 1.0:
-        raise SettingError("yield_release", release, "a number from 0 to 1")
-    return DualSettings(force, moment, release) if values["dual_compliance"] else None
+def _settings(values: Mapping[str, Any], frames: Sequence[str]) -> InteractionSettings:
+    for name in ("force_directions", "dual_compliance"):
+        if np.any(values[name]) and not values["ft_frame"]:
+            raise SettingError(name, values[name], "only with a force/torque sensor, 'ft_frame'")
+    directions = given_or(values, "force_directions", np.zeros(6))
+    if not np.isin(directions, (0.0, 1.0)).all():
+        raise SettingError("force_directions", directions, "zeros and ones")
+    for frame in values["closed_contacts"]:
+        if frame not in frames:
+            allowed = f"frames of 'contacts': {', '.join(frames) or 'none'}"
+            raise SettingError("closed_contacts", values["closed_contacts"], allowed)
+    force, moment = values["yield_threshold"]
+    return InteractionSettings(
+        directions=directions == 1.0,
+        stiffness=given_or(values, "force_stiffness", np.zeros(6)),
+        gains=_gains(values, "admittance", _DEFAULTS.gains),
+        closed=tuple(frames.index(frame) for frame in values["closed_contacts"]),
+        dual=DualSettings(force, moment) if values["dual_compliance"] else None,
+        yielding_gains=_gains(values, "yield", _DEFAULTS.yielding_gains),
+    )
 
 
-def _speeds(
-    values: Mapping[str, Any], name: str, default: tuple[float, float]
-) -> tuple[float, float]:
-    value = values[name]
-    if not len(value):
-        return default
-    if len(value) != 2 or not (np.isfinite(value) & (value > 0.0)).all():
-        raise SettingError(name, value, "two finite numbers > 0, m/s and rad/s")
-    return float(value[0]), float(value[1])
+def _gains(values: Mapping[str, Any], prefix: str, default: AdmittanceGains) -> AdmittanceGains:
+    force_kp, moment_kp = values[f"{prefix}_kp"]
+    speed_max, turn_max = values[f"{prefix}_speed_max"]
+    return replace(
+        default, force_kp=force_kp, moment_kp=moment_kp, speed_max=speed_max, turn_max=turn_max
+    )
 
 
-def _six(values: Mapping[str, Any], name: str) -> np.ndarray:
-    value = values[name]
-    if not len(value):
-        return np.zeros(6)
-    if len(value) != 6 or not np.isfinite(value).all():
-        raise SettingError(name, value, f"six finite numbers: {_AXES}")
-    return value
+def _contact_points(texts: Sequence[str]) -> tuple[ContactPoint, ...]:
+    points: list[ContactPoint] = []
+    for index, text in enumerate(texts):
+        entry = Entry("contacts", index, text, _CONTACT_FIELDS)
+        frame, normal = entry.text("frame"), entry.vector("normal")
+        friction = entry.number("friction", 0.0, NOT_NEGATIVE)
+        if np.abs(normal).max() <= 1e-9:
+            raise entry.refused("normal", "a direction, not zero")
+        for other in points:
+            if other.frame == frame and not np.array_equal(other.normal, normal):
+                raise entry.refused("normal", f"the same at all points of {frame!r}")
+            if other.frame == frame and other.friction != friction:
+                raise entry.refused("friction", f"the same at all points of {frame!r}")
+        point = entry.vector("point", (0.0, 0.0, 0.0))
+        points.append(ContactPoint(f"contacts[{index}]", frame, point, normal, friction))
+    return tuple(points)
+
+
+def _by_frame(points: Sequence[ContactPoint]) -> dict[str, list[ContactPoint]]:
+    """Return the points of each link; several points of one link are one contact."""
+    links: dict[str, list[ContactPoint]] = {}
+    for point in points:
+        links.setdefault(point.frame, []).append(point)
+    return links
 
 
 def make_interaction(
-    values: Mapping[str, Any],
-    robot: RobotModel,
-    urdf: str,
-    settings: InteractionSettings,
+    config: InteractionConfiguration, arm: RobotConfiguration, robot: RobotModel, urdf: str
 ) -> Interaction | None:
     """Return what handles forces; None where there is neither a sensor nor a contact.
 
     Args:
-        values: parameter values by name.
-        robot: model of the arm.
+        config: of `interaction_configuration`.
+        arm: which robot it is.
+        robot: its model.
         urdf: text of its URDF.
-        settings: of `interaction_settings`.
 
     Raises:
-        SettingError: a frame that the URDF does not have or that is not where it must be, or
-            a contact that cannot be.
+        SettingError: a frame that the URDF does not have or that is not where it must be.
     """
-    sensor = _sensor(values, robot, urdf)
-    contacts = _contacts(values, robot.model)
+    sensor = _sensor(config, arm, robot, urdf)
+    contacts = _contacts(config.points, robot.model)
     if sensor is None and contacts is None:
         return None
     hand, placement = None, None
@@ -251,86 +294,48 @@ def make_interaction(
             if _joint_of(robot.model, contact.frame) == _joint_of(robot.model, robot.frame)
         ]
         if len(on_hand) > 1:
-            frames = list(values["contact_frames"])
-            raise SettingError("contact_frames", frames, "one link that is fixed to the hand")
+            frames = [contacts.contacts[index].frame for index in on_hand]
+            raise SettingError("contacts", frames, "one link that is fixed to the hand")
         if on_hand:
             hand = on_hand[0]
             placement = _between(robot.model, robot.frame, contacts.contacts[hand].frame)
-    return Interaction(sensor, contacts, hand, placement, settings)
+    return Interaction(sensor, contacts, hand, placement, config.settings)
 
 
-def _sensor(values: Mapping[str, Any], robot: RobotModel, urdf: str) -> WrenchSensor | None:
-    frame, model = values["ft_frame"], robot.model
+def _sensor(
+    config: InteractionConfiguration, arm: RobotConfiguration, robot: RobotModel, urdf: str
+) -> WrenchSensor | None:
+    frame, model = config.ft_frame, robot.model
     if not frame:
         return None
     if not model.existFrame(frame, pin.FrameType.BODY):
         raise SettingError("ft_frame", frame, "a link of the URDF, or empty")
     if _joint_of(model, frame) != _joint_of(model, robot.frame):
         raise SettingError("ft_frame", frame, f"a link fixed to {robot.frame!r}")
-    com = values["ft_tool_com"]
-    if len(com) not in (0, 3) or not np.isfinite(com).all():
-        raise SettingError("ft_tool_com", com, "three finite numbers, or none")
-    if values["ft_tool_mass"] == -1.0:
+    if config.tool is not None:
+        tool = pin.Inertia(config.tool[0], config.tool[1:], np.zeros((3, 3)))
+    else:
         try:
-            tool = inertia_beyond(urdf, frame, locked_joints(values))
+            tool = inertia_beyond(urdf, frame, arm.locked)
         except RobotDescriptionError as error:
             raise SettingError("ft_frame", frame, f"a link of the URDF ({error})") from error
-    else:
-        mass = positive(values, "ft_tool_mass", zero=True)
-        tool = pin.Inertia(mass, com if len(com) else np.zeros(3), np.zeros((3, 3)))
     placement = _between(model, robot.frame, frame)
-    return WrenchSensor(placement, tool, model.gravity.linear, sensor_settings(values))
+    return WrenchSensor(placement, tool, model.gravity.linear, config.sensor)
 
 
-def _contact_frames(values: Mapping[str, Any]) -> list[str]:
-    """Return the links in contact, each once; several points of one link are one contact."""
-    return list(dict.fromkeys(values["contact_frames"]))
-
-
-def _contacts(values: Mapping[str, Any], model: pin.Model) -> Contacts | None:
-    named = values["contact_frames"]
-    if not named:
-        return None
-    points = _triples(values, "contact_points", named, optional=True)
-    normals = _triples(values, "contact_normals", named)
-    if not (np.abs(normals).max(axis=1) > 1e-9).all():
-        raise SettingError("contact_normals", values["contact_normals"], "directions, not zero")
-    friction = values["contact_friction"]
-    if not len(friction):
-        friction = np.zeros(len(named))
-    if len(friction) != len(named) or not (np.isfinite(friction) & (friction >= 0.0)).all():
-        raise SettingError("contact_friction", friction, f"{len(named)} finite numbers >= 0")
-    if values["contact_facets"] < 3:
-        raise SettingError("contact_facets", values["contact_facets"], "at least 3")
+def _contacts(points: Sequence[ContactPoint], model: pin.Model) -> Contacts | None:
     contacts = []
-    for frame in _contact_frames(values):
-        if not model.existFrame(frame):
-            raise SettingError("contact_frames", list(named), f"frames of the URDF, not {frame}")
-        its = [i for i, name in enumerate(named) if name == frame]
+    for frame, its in _by_frame(points).items():
         first = its[0]
-        for i in its:
-            if friction[i] != friction[first] or not np.array_equal(normals[i], normals[first]):
-                allowed = f"the same friction and normal at all points of {frame!r}"
-                raise SettingError("contact_normals", values["contact_normals"], allowed)
-        facets = values["contact_facets"]
-        contacts.append(Contact(frame, points[its], normals[first], friction[first], facets))
-    return Contacts(model, contacts)
-
-
-def _triples(
-    values: Mapping[str, Any], name: str, frames: Sequence[str], *, optional: bool = False
-) -> np.ndarray:
-    value = values[name]
-    if optional and not len(value):
-        return np.zeros((len(frames), 3))
-    if len(value) != 3 * len(frames) or not np.isfinite(value).all():
-        allowed = f"{3 * len(frames)} finite numbers, three for each of 'contact_frames'"
-        raise SettingError(name, value, allowed)
-    return value.reshape(-1, 3)
+        if not model.existFrame(frame):
+            raise SettingError(f"{first.label}.frame", frame, "a frame of the URDF")
+        places = np.array([each.point for each in its])
+        contacts.append(Contact(frame, places, first.normal, first.friction))
+    return Contacts(model, contacts) if contacts else None
 
 
 def _joint_of(model: pin.Model, frame: str) -> int:
-    return model.frames[model.getFrameId(frame)].parentJoint
+    return int(model.frames[model.getFrameId(frame)].parentJoint)
 
 
 def _between(model: pin.Model, frame: str, other: str) -> pin.SE3:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 import time
 from array import array
-from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -25,8 +24,13 @@ from viability_bounds_pkg.node.bounds_parameters import (
 )
 from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, Verdict
 from viability_bounds_pkg.ros.parameters import NodeParameters
-from viability_bounds_pkg.ros.robot_parameters import load_model
-from viability_bounds_pkg.ros.runtime import CONTROL_QOS, run
+from viability_bounds_pkg.ros.robot_parameters import (
+    RobotConfiguration,
+    load_model,
+    robot_urdf,
+)
+from viability_bounds_pkg.ros.runtime import run
+from viability_bounds_pkg.ros.topics import ACCELERATION_LIMITS, JOINT_STATES
 
 
 class BoundsNode(Node):
@@ -61,17 +65,15 @@ class BoundsNode(Node):
         self._answer = JointTrajectory(
             joint_names=list(joints), points=[JointTrajectoryPoint(), JointTrajectoryPoint()]
         )
-        self._publisher = self.create_publisher(
-            JointTrajectory, "acceleration_limits", CONTROL_QOS
-        )
-        self.create_subscription(JointState, "joint_states", self._on_state, CONTROL_QOS)
+        self._publisher = ACCELERATION_LIMITS.publisher(self)
+        JOINT_STATES.subscription(self, self._on_state)
         self._diagnostics = Diagnostics(self, self._report)
         self._warn_of_affected_joints(config)
 
-    def _load_model(self, values: Mapping[str, Any]) -> pin.Model:
+    def _load_model(self, robot: RobotConfiguration) -> pin.Model:
         """Return the model, loaded once: parameters that change it are read-only."""
         if self._model is None:
-            self._model = load_model(values, self)
+            self._model = load_model(robot, robot_urdf(robot.description, self))
         return self._model
 
     def _configure(self, config: BoundsConfiguration) -> None:

@@ -13,25 +13,37 @@ from numpy.typing import NDArray
 
 from viability_bounds_pkg import baselines, viability
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
+from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.ros.parameters import (
+    NEGATIVE,
+    NOT_NEGATIVE,
+    POSITIVE,
     Parameter,
+    Range,
+    above,
+    given_or,
     joint_names,
     per_joint,
-    positive,
 )
-from viability_bounds_pkg.ros.robot_parameters import ROBOT_TABLE, all_positive
+from viability_bounds_pkg.ros.robot_parameters import (
+    ROBOT_TABLE,
+    RobotConfiguration,
+    position_limits,
+    robot_configuration,
+)
 from viability_bounds_pkg.state_dependent.limits import StateDependentBounds
 from viability_bounds_pkg.torque_margin import TorqueMargins, tightened, torque_margins
 
-RIVALS = {
+Array = NDArray[np.float64]
+
+BASELINES = {
     "naive": baselines.naive_bounds,
     "decre": baselines.decre_bounds,
     "rubrecht": baselines.rubrecht_bounds,
 }
 """Methods to compare with that need no settings of their own."""
 
-METHODS = ("exact", *RIVALS, "damper")
+METHODS = ("exact", *BASELINES, "damper")
 LIMITS = ("worst_case", "state_dependent")
 PEAK = 3.0
 """Default of ``acceleration_peak``, in limits of the worst case."""
@@ -44,22 +56,38 @@ TABLE = (
         replace(row, default=_OPTIONAL[row.name]) if row.name in _OPTIONAL else row
         for row in ROBOT_TABLE
     ),
-    Parameter("velocity_max", list[float], "speed limits, rad/s"),
-    Parameter("acceleration_min", list[float], "lower acceleration limits, rad/s^2, < 0"),
-    Parameter("acceleration_max", list[float], "upper acceleration limits, rad/s^2, > 0"),
+    Parameter("velocity_max", list[float], "speed limits, rad/s", per_joint=True, within=POSITIVE),
+    Parameter(
+        "acceleration_min",
+        list[float],
+        "lower acceleration limits, rad/s^2",
+        per_joint=True,
+        within=NEGATIVE,
+    ),
+    Parameter(
+        "acceleration_max",
+        list[float],
+        "upper acceleration limits, rad/s^2",
+        per_joint=True,
+        within=POSITIVE,
+    ),
     Parameter(
         "acceleration_drift",
         list[float],
-        "how fast the acceleration changes while a torque is held, rad/s^3; the bounds keep "
-        "back what follows from it at this rate",
+        "how fast the acceleration changes while a torque is held, rad/s^3; the bounds are "
+        "tightened by what follows from it at this rate; 0 if empty",
         default=np.zeros(0),
+        per_joint=True,
+        within=NOT_NEGATIVE,
     ),
     Parameter(
         "acceleration_disturbance",
         list[float],
-        "how much more than commanded the joints may accelerate by what no model knows, friction, "
-        "payloads, pushes, rad/s^2; kept back from the braking and from the bounds",
+        "how much more than commanded the joints may accelerate by what the model does not know, "
+        "friction, payloads, pushes, rad/s^2; the bounds are tightened by it; 0 if empty",
         default=np.zeros(0),
+        per_joint=True,
+        within=NOT_NEGATIVE,
     ),
     Parameter(
         "position_margin",
@@ -67,14 +95,16 @@ TABLE = (
         "how much further inside the position limits to keep the joints, rad: what the robot or "
         "its sensors may be off",
         default=0.0,
+        within=Range(0.0, 1.0),
     ),
-    Parameter("rate_hz", float, "rate of the control loop, Hz"),
+    Parameter("rate_hz", float, "rate of the control loop, Hz", within=above(0.0, 1e4)),
     Parameter(
         "bounds_dt_factor",
         float,
-        "horizon of the bounds in control periods; 2 takes the chatter out",
+        "horizon of the bounds in control periods; 2 avoids chatter",
         default=2.0,
         live=True,
+        within=Range(1.0, 1e3),
     ),
     Parameter(
         "acceleration_limits",
@@ -82,39 +112,47 @@ TABLE = (
         "for method exact: worst_case, or state_dependent, which exceeds the limits above where "
         "the torque limits allow it; needs robot_description and torque_max",
         default="worst_case",
+        choices=LIMITS,
     ),
     Parameter(
         "acceleration_peak",
         list[float],
-        f"what state_dependent never exceeds, rad/s^2; {PEAK:g} times the limits above if empty",
+        f"largest acceleration that state_dependent allows, rad/s^2; {PEAK:g} times the limits "
+        "above if empty",
         default=np.zeros(0),
+        per_joint=True,
+        within=POSITIVE,
     ),
-    Parameter("method", str, f"one of: {', '.join(METHODS)}", default="exact", live=True),
+    Parameter(
+        "method",
+        str,
+        "how bounds are computed: exact keeps the limits; the others are for comparison",
+        default="exact",
+        live=True,
+        choices=METHODS,
+    ),
     Parameter(
         "damper_influence",
         float,
         "for method damper: distance to a limit from which on it acts, rad",
         default=0.2,
+        within=above(0.0, 10.0),
     ),
-    Parameter("damper_gain", float, "for method damper: speed allowed there, rad/s", default=1.0),
     Parameter(
-        "state_timeout", float, "silence after which older stamps are taken again, s", default=0.5
+        "damper_gain",
+        float,
+        "for method damper: speed allowed there, rad/s",
+        default=1.0,
+        within=above(0.0, 1e3),
+    ),
+    Parameter(
+        "state_timeout",
+        float,
+        "silence after which older stamps are accepted again, s",
+        default=0.5,
+        within=above(0.0, 3600.0),
     ),
 )
-
-PARAMETER_OF = {
-    "names": "joints",
-    "q_min": "position_min",
-    "q_max": "position_max",
-    "v_max": "velocity_max",
-    "a_min": "acceleration_min",
-    "a_max": "acceleration_max",
-    "margin": "acceleration_drift",
-    "dt": "bounds_dt_factor",
-    "period": "rate_hz",
-    "peak": "acceleration_peak",
-    "tau_max": "torque_max",
-}
 
 
 @dataclass(frozen=True)
@@ -128,72 +166,62 @@ class BoundsConfiguration:
     bounds_dt: float
     method: str
     state_timeout: float
-    solve: Callable[[NDArray, NDArray], viability.AccelerationBounds]
+    solve: Callable[[Array, Array], viability.AccelerationBounds]
     state_dependent: StateDependentBounds | None
     """Whose method `solve` is, with state-dependent limits."""
 
 
 def make_configuration(
-    values: Mapping[str, Any], load_model: Callable[[Mapping[str, Any]], pin.Model]
+    values: Mapping[str, Any], load_model: Callable[[RobotConfiguration], pin.Model]
 ) -> BoundsConfiguration:
     """Check parameter values and make what the node runs on of them.
 
     Args:
-        values: parameter values by name.
+        values: of `TABLE`, by name, as `read_values` returns them.
         load_model: returns the arm's model, asked for only where it is needed.
 
     Raises:
-        SettingError: one of them cannot be used.
+        SettingError: values that do not fit together.
     """
     joints = joint_names(values)
-    if values["method"] not in METHODS:
-        raise SettingError("method", values["method"], f"one of {', '.join(METHODS)}")
-    if values["acceleration_limits"] not in LIMITS:
-        allowed = f"one of {', '.join(LIMITS)}"
-        raise SettingError("acceleration_limits", values["acceleration_limits"], allowed)
-    dt = 1.0 / positive(values, "rate_hz")
-    factor = positive(values, "bounds_dt_factor")
-    if factor < 1.0:
-        raise SettingError("bounds_dt_factor", factor, ">= 1")
-    try:
-        limits = JointLimits(
-            joints,
-            *(
-                per_joint(values, PARAMETER_OF[field], joints)
-                for field in ("q_min", "q_max", "v_max", "a_min", "a_max")
-            ),
+    dt = 1.0 / values["rate_hz"]
+    horizon = values["bounds_dt_factor"] * dt
+    q_min, q_max = position_limits(values, joints)
+    limits = JointLimits(
+        joints,
+        q_min,
+        q_max,
+        values["velocity_max"],
+        values["acceleration_min"],
+        values["acceleration_max"],
+    )
+    margins = _margins(values, limits, dt)
+    method = values["method"]
+    state_dependent = None
+    solve: Callable[[Array, Array], viability.AccelerationBounds]
+    if method == "exact" and values["acceleration_limits"] == "state_dependent":
+        state_dependent = _state_dependent(values, load_model, limits, margins, horizon, dt)
+        solve = state_dependent.bounds
+    elif method == "exact":
+        inner = tightened(limits, margins)
+        solve = viability.BoundsSolver(inner, horizon, margins.acceleration, period=dt).bounds
+    elif method == "damper":
+        solve = partial(
+            baselines.damper_bounds,
+            limits=limits,
+            dt=horizon,
+            influence=values["damper_influence"],
+            gain=values["damper_gain"],
         )
-        margins = _margins(values, limits, dt)
-        method = values["method"]
-        state_dependent = None
-        if method == "exact" and values["acceleration_limits"] == "state_dependent":
-            state_dependent = _state_dependent(values, load_model, limits, margins, factor, dt)
-            solve = state_dependent.bounds
-        elif method == "exact":
-            inner = tightened(limits, margins)
-            solver = viability.BoundsSolver(inner, factor * dt, margins.acceleration, period=dt)
-            solve = solver.bounds
-        elif method == "damper":
-            solve = partial(
-                baselines.damper_bounds,
-                limits=limits,
-                dt=factor * dt,
-                influence=positive(values, "damper_influence"),
-                gain=positive(values, "damper_gain"),
-            )
-        else:
-            solve = partial(RIVALS[method], limits=limits, dt=factor * dt)
-    except JointLimitsError as error:
-        name = PARAMETER_OF[error.field]
-        shown = error.value if error.joint is None else f"{error.value} for {error.joint}"
-        raise SettingError(name, shown, error.allowed) from error
+    else:
+        solve = partial(BASELINES[method], limits=limits, dt=horizon)
     return BoundsConfiguration(
         limits=limits,
         margins=margins,
         control_dt=dt,
-        bounds_dt=factor * dt,
-        method=values["method"],
-        state_timeout=positive(values, "state_timeout"),
+        bounds_dt=horizon,
+        method=method,
+        state_timeout=values["state_timeout"],
         solve=solve,
         state_dependent=state_dependent,
     )
@@ -201,51 +229,44 @@ def make_configuration(
 
 def _state_dependent(
     values: Mapping[str, Any],
-    load_model: Callable[[Mapping[str, Any]], pin.Model],
+    load_model: Callable[[RobotConfiguration], pin.Model],
     limits: JointLimits,
     margins: TorqueMargins,
-    factor: float,
+    horizon: float,
     dt: float,
 ) -> StateDependentBounds:
     if not values["robot_description"]:
         allowed = "a URDF, for state-dependent acceleration limits"
         raise SettingError("robot_description", values["robot_description"], allowed)
-    peak = PEAK * np.maximum(-limits.a_min, limits.a_max)
-    if len(values["acceleration_peak"]):
-        peak = per_joint(values, "acceleration_peak", limits.names)
+    worst = np.maximum(-limits.a_min, limits.a_max)
+    peak = given_or(values, "acceleration_peak", PEAK * worst)
+    if (peak < worst).any():
+        allowed = f"at least that of the worst case, {worst}"
+        raise SettingError("acceleration_peak", peak, allowed)
     return StateDependentBounds(
-        load_model(values),
+        load_model(robot_configuration(values)),
         tightened(limits, margins),
-        all_positive(values, "torque_max", limits.names),
+        per_joint(values, "torque_max", limits.names),
         peak,
-        factor * dt,
+        horizon,
         margins.acceleration,
         dt,
         margins.position,
     )
 
 
-def _not_negative(values: Mapping[str, Any], name: str, limits: JointLimits) -> np.ndarray:
-    """Return a parameter of one number a joint, shape (n,), zeros if it is empty."""
-    if not len(values[name]):
-        return np.zeros(len(limits))
-    value = per_joint(values, name, limits.names)
-    if not (np.isfinite(value).all() and (value >= 0.0).all()):
-        raise SettingError(name, value, "finite numbers >= 0")
-    return value
-
-
 def _margins(values: Mapping[str, Any], limits: JointLimits, dt: float) -> TorqueMargins:
     """Return what to keep back for the drift of acceleration and for the robot itself."""
-    margins = torque_margins(_not_negative(values, "acceleration_drift", limits), dt)
-    disturbance = _not_negative(values, "acceleration_disturbance", limits)
+    zero = np.zeros(len(limits))
+    margins = torque_margins(given_or(values, "acceleration_drift", zero), dt)
+    disturbance = given_or(values, "acceleration_disturbance", zero)
     margins.acceleration[:] += disturbance
     braking = np.minimum(-limits.a_min, limits.a_max)
     if not (margins.acceleration < braking).all():
         name = "acceleration_disturbance" if disturbance.any() else "acceleration_drift"
         allowed = f"less than what there is to brake with, {braking}, by the margins for the rate"
         raise SettingError(name, values[name], allowed)
-    margins.position[:] += positive(values, "position_margin", zero=True)
+    margins.position[:] += values["position_margin"]
     for name, margin, room in (
         ("velocity_max", margins.velocity, limits.v_max),
         ("position_max", margins.position, 0.5 * (limits.q_max - limits.q_min)),

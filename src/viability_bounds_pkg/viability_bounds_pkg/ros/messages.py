@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import Enum
+from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from viability_bounds_pkg.kernel.array_checks import both_finite
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
+from viability_bounds_pkg.ros.topics import DIAGNOSTICS
+
+Report = Callable[[], tuple[bytes, str, dict[str, Any]]]
+"""Returns level, message and values of a status."""
 
 
 class Verdict(Enum):
@@ -80,8 +86,8 @@ class JointStateReader:
         both_finite(self.q, self.v)  # compiled now, not when the first message comes
         self._guard = StampGuard(reset_after)
         self._names: list[str] | None = None
-        self._index: np.ndarray | None = None
-        self._accepted: tuple[JointState, np.ndarray | None] | None = None
+        self._index: NDArray[np.intp] | None = None
+        self._accepted: tuple[JointState, NDArray[np.intp] | None] | None = None
 
     def read(self, message: JointState, now: float) -> Verdict:
         """Take a message that arrived at `now`, in s on the steady clock."""
@@ -111,7 +117,7 @@ class JointStateReader:
         self._guard.accept(stamp, now)
         return Verdict.NEW
 
-    def effort(self) -> np.ndarray | None:
+    def effort(self) -> NDArray[np.float64] | None:
         """Return the torque of the motors in the last accepted message, shape (n,), N m.
 
         None where it does not tell, for each joint, a finite number.
@@ -150,11 +156,11 @@ class Diagnostics:
         period: seconds between two messages.
     """
 
-    def __init__(self, node: Node, report, period: float = 0.5) -> None:
+    def __init__(self, node: Node, report: Report, period: float = 0.5) -> None:
         self._report = report
         self._node = node
-        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        # Also while time, as the clock topic tells it, stands still.
+        self._publisher = DIAGNOSTICS.publisher(node)
+        # The steady clock, so that it is sent when /clock stops, too.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = node.create_timer(period, self.publish, clock=steady)
 
@@ -173,7 +179,7 @@ class Diagnostics:
         self._publisher.publish(array)
 
 
-def _text(value) -> str:
+def _text(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.9g}"
     if isinstance(value, np.ndarray):

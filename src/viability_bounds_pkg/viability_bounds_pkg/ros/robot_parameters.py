@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.task import Future
 from std_msgs.msg import String
@@ -19,28 +21,64 @@ from viability_bounds_pkg.robot_description import (
     read_urdf,
 )
 from viability_bounds_pkg.ros.parameters import (
+    NOT_NEGATIVE,
+    POSITIVE,
     Parameter,
+    given_or,
     joint_names,
     per_joint,
 )
-from viability_bounds_pkg.ros.runtime import LATCHED_QOS, make_executor
+from viability_bounds_pkg.ros.runtime import make_executor
+from viability_bounds_pkg.ros.topics import ROBOT_DESCRIPTION
+
+Array = NDArray[np.float64]
 
 ROBOT_TABLE = (
     Parameter("robot_description", str, "URDF: path, package:// URI, or 'topic': from that topic"),
-    Parameter("joints", list[str], "joints that move, base to tip, in the order of all arrays"),
+    Parameter(
+        "joints",
+        list[str],
+        "joints that move, base to tip, in the order of all arrays",
+        note="at least one name, each once",
+    ),
     Parameter("locked_joints", list[str], "other joints that are not at zero", default=()),
-    Parameter("locked_positions", list[float], "where they are, rad", default=np.zeros(0)),
-    Parameter("position_min", list[float], "lower position limits, rad"),
-    Parameter("position_max", list[float], "upper position limits, rad"),
-    Parameter("torque_max", list[float], "torque limits of the motors, N m"),
+    Parameter(
+        "locked_positions",
+        list[float],
+        "where they are, rad",
+        default=np.zeros(0),
+        note="one for each of 'locked_joints'",
+    ),
+    Parameter(
+        "position_min",
+        list[float],
+        "lower position limits, rad; -.inf for continuous joints",
+        per_joint=True,
+    ),
+    Parameter(
+        "position_max",
+        list[float],
+        "upper position limits, rad; .inf for continuous joints",
+        per_joint=True,
+        note="above position_min",
+    ),
+    Parameter(
+        "torque_max",
+        list[float],
+        "torque limits of the motors, N m",
+        per_joint=True,
+        within=POSITIVE,
+    ),
     Parameter(
         "rotor_inertia",
         list[float],
         "inertia of the rotors as seen from the joints, kg m^2; none if empty",
         default=np.zeros(0),
+        per_joint=True,
+        within=NOT_NEGATIVE,
     ),
 )
-
+"""What says which robot it is."""
 
 TOPIC = "topic"
 """Value of ``robot_description`` that asks for what the topic of that name carries."""
@@ -48,18 +86,45 @@ TOPIC = "topic"
 _TOPIC_TIMEOUT = 10.0
 
 
-def robot_urdf(values: Mapping[str, Any], node: Node | None = None) -> str:
+@dataclass(frozen=True, eq=False)
+class RobotConfiguration:
+    """Checked parameters of `ROBOT_TABLE`, but for limits.
+
+    Attributes:
+        description: where the URDF comes from.
+        joints: names of the n joints.
+        locked: where joints are locked that are not at zero, rad by name.
+        rotor_inertia: as seen from the joints, shape (n,), kg m^2.
+    """
+
+    description: str
+    joints: tuple[str, ...]
+    locked: dict[str, float]
+    rotor_inertia: Array
+
+
+def robot_configuration(values: Mapping[str, Any]) -> RobotConfiguration:
+    """Return which robot the parameters describe.
+
+    Raises:
+        SettingError: a value cannot be used.
+    """
+    joints = joint_names(values)
+    rotors = given_or(values, "rotor_inertia", np.zeros(len(joints)))
+    return RobotConfiguration(values["robot_description"], joints, locked_joints(values), rotors)
+
+
+def robot_urdf(source: str, node: Node | None = None) -> str:
     """Return the text of the URDF that ``robot_description`` names.
 
     Args:
-        values: parameter values by name.
+        source: value of that parameter.
         node: not in an executor yet; listens if the URDF is to come from the topic. None for
             the robot itself, which publishes it.
 
     Raises:
         SettingError: there is none.
     """
-    source = values["robot_description"]
     try:
         if source != TOPIC or node is None:
             return read_urdf(source)
@@ -77,7 +142,7 @@ def _urdf_from_topic(node: Node) -> str:
         if not received.done():
             received.set_result(message.data)
 
-    subscription = node.create_subscription(String, "robot_description", take, LATCHED_QOS)
+    subscription = ROBOT_DESCRIPTION.subscription(node, take)
     executor = make_executor(node.context)
     executor.add_node(node)
     executor.spin_until_future_complete(received, timeout_sec=_TOPIC_TIMEOUT)
@@ -85,45 +150,38 @@ def _urdf_from_topic(node: Node) -> str:
     node.destroy_subscription(subscription)
     if not received.done():
         raise RobotDescriptionError(f"nothing on the topic for {_TOPIC_TIMEOUT:g} s")
-    return received.result()
+    return str(received.result())
 
 
-def load_model(values: Mapping[str, Any], node: Node) -> pin.Model:
-    """Return the model of the arm that the parameters of `ROBOT_TABLE` describe.
+def load_model(config: RobotConfiguration, urdf: str) -> pin.Model:
+    """Return the model of the arm.
 
     Args:
-        values: parameter values by name.
-        node: listens for the URDF if it comes from a topic.
+        config: which robot it is.
+        urdf: text of its URDF.
 
     Raises:
-        SettingError: a URDF that does not load, a joint that it does not have, or rotor
-            inertias that cannot be.
+        SettingError: a URDF that does not load, or a joint that it does not have.
     """
-    return model_from(values, robot_urdf(values, node))
-
-
-def model_from(values: Mapping[str, Any], urdf: str) -> pin.Model:
-    """Return the model of the arm from the text of its URDF; see `load_model`."""
-    joints = joint_names(values)
-    rotors = not_negative(values, "rotor_inertia", joints)
     try:
-        return build_model(urdf, joints, locked_joints(values), rotors)
+        return build_model(urdf, config.joints, config.locked, config.rotor_inertia)
     except RobotDescriptionError as error:
-        name, allowed = _culprit(urdf, joints)
-        raise SettingError(name, values[name], f"{allowed} ({error})") from error
+        name, value, allowed = _culprit(config, urdf)
+        raise SettingError(name, value, f"{allowed} ({error})") from error
 
 
-def _culprit(urdf: str, joints: tuple[str, ...]) -> tuple[str, str]:
-    """Return which parameter keeps a model from being built, and what it may be."""
-    for name, allowed, chosen in (
-        ("robot_description", "a URDF", ()),
-        ("joints", "joints of the URDF, base to tip", joints),
+def _culprit(config: RobotConfiguration, urdf: str) -> tuple[str, Any, str]:
+    """Return which parameter keeps a model from being built, its value, and what it may be."""
+    joints = config.joints
+    for name, value, allowed, chosen in (
+        ("robot_description", config.description, "a URDF", ()),
+        ("joints", joints, "joints of the URDF, base to tip", joints),
     ):
         try:
             build_model(urdf, chosen)
         except RobotDescriptionError:
-            return name, allowed
-    return "locked_joints", "other joints of the URDF"
+            return name, value, allowed
+    return "locked_joints", tuple(config.locked), "other joints of the URDF"
 
 
 def locked_joints(values: Mapping[str, Any]) -> dict[str, float]:
@@ -141,9 +199,7 @@ def locked_joints(values: Mapping[str, Any]) -> dict[str, float]:
     return dict(zip(names, map(float, positions), strict=True))
 
 
-def position_limits(
-    values: Mapping[str, Any], joints: Sequence[str]
-) -> tuple[np.ndarray, np.ndarray]:
+def position_limits(values: Mapping[str, Any], joints: Sequence[str]) -> tuple[Array, Array]:
     """Return ``position_min`` and ``position_max``, shape (n,) each, rad.
 
     Raises:
@@ -151,32 +207,8 @@ def position_limits(
     """
     q_min = per_joint(values, "position_min", joints)
     q_max = per_joint(values, "position_max", joints)
+    if np.isposinf(q_min).any():
+        raise SettingError("position_min", q_min, "numbers below .inf")
     if not (q_min < q_max).all():
         raise SettingError("position_max", q_max, "above position_min everywhere")
     return q_min, q_max
-
-
-def all_positive(values: Mapping[str, Any], name: str, joints: Sequence[str]) -> np.ndarray:
-    """Return a parameter of one finite positive number a joint, shape (n,).
-
-    Raises:
-        SettingError: it is something else.
-    """
-    value = per_joint(values, name, joints)
-    if not (np.isfinite(value).all() and (value > 0).all()):
-        raise SettingError(name, value, "finite numbers > 0")
-    return value
-
-
-def not_negative(values: Mapping[str, Any], name: str, joints: Sequence[str]) -> np.ndarray:
-    """Return a parameter of one finite number >= 0 a joint, shape (n,); zeros if it is empty.
-
-    Raises:
-        SettingError: it is something else.
-    """
-    if not len(values[name]):
-        return np.zeros(len(joints))
-    value = per_joint(values, name, joints)
-    if not (np.isfinite(value).all() and (value >= 0).all()):
-        raise SettingError(name, value, "finite numbers >= 0")
-    return value

@@ -8,6 +8,8 @@ import sys
 from collections.abc import Callable
 
 import rclpy
+from builtin_interfaces.msg import Time
+from numba.core.event import TimingListener, install_listener
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -32,11 +34,11 @@ LATCHED_QOS = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
-"""Sent once, received by whoever comes later: robot_description."""
+"""Sent once, received also by subscribers that come later: robot_description."""
 
 _SIGNAL_CHECK_PERIOD = 0.2
 
-_LONGEST_GOODBYE = 5
+_LEAVE_TIMEOUT = 5
 """How long a node may take to leave the graph, s."""
 
 
@@ -76,14 +78,22 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
         return 1
     node = None
     try:
-        node = make_node()
+        compiling = TimingListener()
+        with install_listener("numba:compile", compiling):
+            node = make_node()
+        if compiling.done:
+            node.get_logger().warning(
+                f"compiling took {compiling.duration:.1f} s of the start, which scripts/setup.sh "
+                "does ahead: no compiled code of these sources was kept"
+            )
         executor = make_executor()
         if EventsExecutor is None:
             node.get_logger().warning(
                 "rclpy has no EventsExecutor; the single-threaded one adds about 2 ms a cycle"
             )
         executor.add_node(node)
-        # What exists by now stays: keep the collector from walking it in the control loop.
+        # What exists by now lives until the end: the collector need not visit it in the control
+        # loop.
         gc.collect()
         gc.freeze()
         spin(executor)
@@ -103,13 +113,13 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
 
 
 def leave(node: Node | None) -> None:
-    """Take a node down, and ROS with it, at the end of a process; from its main thread.
+    """Destroy a node and shut ROS down at the end of a process; call it from the main thread.
 
-    When another process leaves at the same moment, Fast DDS 2.14 may wait for itself for ever,
-    and no Python runs any more. So the system ends the process if this takes too long.
+    When another process leaves at the same moment, Fast DDS 2.14 may wait for ever inside a call,
+    so that no Python code runs any more. So the system ends the process if this takes too long.
     """
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
-    signal.alarm(_LONGEST_GOODBYE)
+    signal.alarm(_LEAVE_TIMEOUT)
     if node is not None:
         node.destroy_node()
     rclpy.try_shutdown()
@@ -123,11 +133,11 @@ def report_refusal(error: Exception) -> None:
     print(f"error: {' '.join(reason.split())}", file=sys.stderr)
 
 
-def stamp_to_ns(stamp) -> int:
+def stamp_to_ns(stamp: Time) -> int:
     """Return a ``builtin_interfaces/Time`` in nanoseconds."""
     return stamp.sec * 1_000_000_000 + stamp.nanosec
 
 
-def set_stamp(stamp, nanoseconds: int) -> None:
+def set_stamp(stamp: Time, nanoseconds: int) -> None:
     """Write `nanoseconds` into a ``builtin_interfaces/Time``."""
     stamp.sec, stamp.nanosec = divmod(nanoseconds, 1_000_000_000)

@@ -1,0 +1,180 @@
+"""Write docs/parameters.md and docs/topics.md from the tables that the nodes use.
+
+python scripts/make_reference.py
+python scripts/make_reference.py --check    # say which page is stale, write nothing
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+
+from sim_bridge.nodes import bullet_parameters, scenario_parameters
+from sim_bridge.nodes import topics as bullet_topics
+from torque_safety_controller.node import topics as controller_topics
+from torque_safety_controller.parameters import controller_parameters
+from viability_bounds_pkg.node import bounds_parameters
+from viability_bounds_pkg.ros.parameters import REQUIRED, Parameter
+from viability_bounds_pkg.ros.topics import SHARED_TOPICS, OfferedService, Topic
+
+ROOT = Path(__file__).resolve().parent.parent
+TABLES: dict[str, Sequence[Parameter]] = {
+    "bounds_node": bounds_parameters.TABLE,
+    "controller_node": controller_parameters.TABLE,
+    "bullet_node": bullet_parameters.TABLE,
+    "scenario_node": scenario_parameters.TABLE,
+}
+TOPICS: tuple[Topic, ...] = (*SHARED_TOPICS, *controller_topics.TOPICS, *bullet_topics.TOPICS)
+SERVICES: tuple[OfferedService, ...] = (*controller_topics.SERVICES, *bullet_topics.SERVICES)
+_HEAD = "<!-- Made by scripts/make_reference.py: change the tables in the code instead. -->\n"
+_TYPES = {
+    float: "double",
+    int: "integer",
+    bool: "bool",
+    str: "string",
+    list[float]: "double array",
+    list[str]: "string array",
+}
+
+
+def parameters_page() -> str:
+    """Return the text of docs/parameters.md."""
+    heads = ("parameter", "type", "default", "allowed", "live", "description")
+    text = f"""{_HEAD}
+# Parameters
+
+`ros2 param describe <node> <parameter>` shows the same. Arrays with one number for each joint are
+in the order of `joints`; an array that may be empty may be left out. A value that is not allowed
+stops a node at start with one line that names the parameter, the value and what is allowed. *Live*
+parameters can change while the node runs, where such a value is refused; all others are read-only.
+Whole numbers are accepted where a double is expected.
+"""
+    shared = [row.name for row in TABLES["controller_node"] if _is_shared(row.name)]
+    rows = {row.name: row for row in TABLES["controller_node"]}
+    text += "\n## Shared\n\nParameters of several nodes with the same meaning.\n\n"
+    body = []
+    for name in shared:
+        row = rows[name]
+        nodes = ", ".join(_short(node) for node, table in TABLES.items() if _has(table, name))
+        description = f"{row.description} ({nodes})"
+        body.append((*_cells(row)[:-1], description))
+    text += _table(heads, body)
+    for node, table in TABLES.items():
+        own = [row for row in table if row.name not in shared]
+        text += f"\n## {node}\n\n" + _table(heads, map(_cells, own))
+    return text
+
+
+def topics_page() -> str:
+    """Return the text of docs/topics.md."""
+    text = f"""{_HEAD}
+# Topics and services
+
+Control streams are best effort with depth 1, so that the newest message wins; goals are reliable.
+A robot of your own takes the place of `bullet_node`.
+
+## Topics
+
+"""
+    heads = ("topic", "type", "from", "to", "quality of service", "meaning")
+    text += _table(
+        heads,
+        (
+            (
+                f"`{topic.name}`",
+                _type_name(topic.message),
+                ", ".join(topic.source),
+                ", ".join(topic.sink),
+                _quality(topic),
+                topic.meaning,
+            )
+            for topic in TOPICS
+        ),
+    )
+    text += "\n## Services\n\n"
+    text += _table(
+        ("service", "type", "meaning"),
+        ((f"`{s.server}/{s.name}`", _type_name(s.kind), s.meaning) for s in SERVICES),
+    )
+    return text
+
+
+PAGES = {"docs/parameters.md": parameters_page, "docs/topics.md": topics_page}
+
+
+def _has(table: Sequence[Parameter], name: str) -> bool:
+    return any(row.name == name for row in table)
+
+
+def _is_shared(name: str) -> bool:
+    """Return whether all nodes that have a parameter mean the same by it."""
+    rows = [row for table in TABLES.values() for row in table if row.name == name]
+    return len(rows) > 1 and len({(row.description, row.constraints) for row in rows}) == 1
+
+
+def _short(node: str) -> str:
+    return node.removesuffix("_node")
+
+
+def _cells(row: Parameter) -> tuple[str, ...]:
+    live = "live" if row.live else ""
+    allowed = row.constraints
+    return f"`{row.name}`", _TYPES[row.kind], _default(row), allowed, live, row.description
+
+
+def _default(row: Parameter) -> str:
+    if row.default is REQUIRED:
+        return "required"
+    if row.optional or row.default == "":
+        return "empty"
+    if isinstance(row.default, tuple | list | np.ndarray):
+        return f"[{', '.join(f'{item:g}' for item in row.default)}]"
+    return f"{row.default:g}" if isinstance(row.default, float) else str(row.default).lower()
+
+
+def _type_name(message: type) -> str:
+    return f"{message.__module__.split('.')[0]}/{message.__name__}"
+
+
+def _quality(topic: Topic) -> str:
+    reliable = topic.qos.reliability == ReliabilityPolicy.RELIABLE
+    latched = topic.qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    kind = ("reliable" if reliable else "best effort") + (", transient local" if latched else "")
+    return f"{kind}, depth {topic.qos.depth}"
+
+
+def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "".join(f"| {' | '.join(map(_escaped, line))} |\n" for line in lines)
+
+
+def _escaped(cell: str) -> str:
+    return cell.replace("|", "\\|").replace("<", "&lt;") if "`" not in cell else cell
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Write the pages, or check them; return the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--check", action="store_true", help="only say which page is stale")
+    check = parser.parse_args(arguments).check
+    stale = 0
+    for name, make in PAGES.items():
+        path, text = ROOT / name, make()
+        if path.exists() and path.read_text(encoding="utf-8") == text:
+            continue
+        stale += 1
+        if check:
+            print(f"{name} is stale: python scripts/make_reference.py", file=sys.stderr)
+        else:
+            path.write_text(text, encoding="utf-8")
+            print(f"{name} written")
+    return int(check and stale > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,47 @@
+"""Topics and services of the robot node that no other package needs."""
+
+from __future__ import annotations
+
+from geometry_msgs.msg import WrenchStamped
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import SetBool, Trigger
+from visualization_msgs.msg import MarkerArray
+
+from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS
+from viability_bounds_pkg.ros.topics import USER, OfferedService, Topic
+
+_NODE = "bullet_node"
+
+OBSTACLES = Topic(
+    "obstacles",
+    MarkerArray,
+    GOAL_QOS,
+    (USER, "scenario_node"),
+    (_NODE,),
+    "obstacles in the simulated world that the controller does not know: boxes, spheres and "
+    "cylinders; a stamp in the future takes effect then",
+)
+EXTERNAL_WRENCH = Topic(
+    "external_wrench",
+    WrenchStamped,
+    GOAL_QOS,
+    (USER, "scenario_node"),
+    (_NODE,),
+    "a push in world axes at the origin of the link `frame_id`, N and N m; one for each link; a "
+    "stamp in the future takes effect then",
+)
+CLOCK = Topic(
+    "/clock",
+    Clock,
+    CONTROL_QOS,
+    (_NODE,),
+    (USER,),
+    "robot time; only with `publish_clock`",
+)
+TOPICS = (OBSTACLES, EXTERNAL_WRENCH, CLOCK)
+
+RESET = OfferedService(
+    "reset", Trigger, _NODE, "puts the robot at its start configuration, at rest"
+)
+PAUSE = OfferedService("pause", SetBool, _NODE, "stops robot time (true) or lets it go on (false)")
+SERVICES = (RESET, PAUSE)

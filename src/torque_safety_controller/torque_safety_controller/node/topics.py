@@ -1,0 +1,81 @@
+"""Topics and services of the controller node that no other package needs."""
+
+from __future__ import annotations
+
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import SetBool, Trigger
+from trajectory_msgs.msg import MultiDOFJointTrajectory
+
+from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS
+from viability_bounds_pkg.ros.topics import USER, OfferedService, Topic
+
+_NODE = "controller_node"
+
+TARGET_POSE = Topic(
+    "target_pose",
+    PoseStamped,
+    GOAL_QOS,
+    (USER, "scenario_node"),
+    (_NODE,),
+    "end-effector goal in `base_frame`; a stamp in the future takes effect then",
+)
+TARGET_POSTURE = Topic(
+    "target_posture",
+    JointState,
+    GOAL_QOS,
+    (USER, "scenario_node"),
+    (_NODE,),
+    "joint goal, matched by name, rad; a stamp in the future takes effect then",
+)
+TARGET_TRAJECTORY = Topic(
+    "target_trajectory",
+    MultiDOFJointTrajectory,
+    GOAL_QOS,
+    (USER, "scenario_node"),
+    (_NODE,),
+    "poses of the end effector over time, with velocities and accelerations to feed forward, in "
+    "`base_frame`; one transform in each point",
+)
+TARGET_WRENCH = Topic(
+    "target_wrench",
+    WrenchStamped,
+    GOAL_QOS,
+    (USER, "scenario_node"),
+    (_NODE,),
+    "wrench that the hand exerts in `force_directions`, N and N m; axes of the end effector (or "
+    "empty) or of `base_frame`",
+)
+ROS2_CONTROL_EFFORTS = Topic(
+    "<ros2_control_topic>",
+    Float64MultiArray,
+    CONTROL_QOS,
+    (_NODE,),
+    (USER,),
+    "the efforts of `joint_commands` in `joints` order, for effort controllers of ros2_control; "
+    "the parameter `ros2_control_topic` names the topic; silent in position control",
+)
+TOPICS = (
+    TARGET_POSE,
+    TARGET_POSTURE,
+    TARGET_TRAJECTORY,
+    TARGET_WRENCH,
+    ROS2_CONTROL_EFFORTS,
+)
+
+ENABLE_TORQUE = OfferedService(
+    "enable_torque",
+    SetBool,
+    _NODE,
+    "hands over from position to torque control without a step in torque (true), and back "
+    "(false), or says why not",
+)
+TARE_FT_SENSOR = OfferedService(
+    "tare_ft_sensor",
+    Trigger,
+    _NODE,
+    "takes the present measurement as the sensor's bias; call it with the hand free; only where "
+    "`ft_frame` is set",
+)
+SERVICES = (ENABLE_TORQUE, TARE_FT_SENSOR)

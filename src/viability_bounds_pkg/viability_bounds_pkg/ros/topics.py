@@ -1,0 +1,136 @@
+"""Topics and services: each declared once, for its nodes and for the reference pages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import WrenchStamped
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rclpy.service import Service
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from trajectory_msgs.msg import JointTrajectory
+
+from viability_bounds_pkg.ros.runtime import CONTROL_QOS, LATCHED_QOS
+
+USER = "user"
+"""Stands for nodes of others."""
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic.
+
+    Attributes:
+        name: as the nodes use it.
+        message: its type.
+        qos: that this project's nodes publish and subscribe with.
+        source: nodes that publish it.
+        sink: nodes that subscribe to it.
+        meaning: of its messages, with units.
+    """
+
+    name: str
+    message: type
+    qos: QoSProfile
+    source: tuple[str, ...]
+    sink: tuple[str, ...]
+    meaning: str
+
+    def publisher(self, node: Node, name: str | None = None) -> Publisher:
+        """Return a publisher; `name` is for topics that a parameter names."""
+        return node.create_publisher(self.message, name or self.name, self.qos)
+
+    def subscription(self, node: Node, callback: Callable[[Any], None]) -> Subscription:
+        """Return a subscription."""
+        return node.create_subscription(self.message, self.name, callback, self.qos)
+
+
+@dataclass(frozen=True)
+class OfferedService:
+    """A service.
+
+    Attributes:
+        name: without that of the node.
+        kind: its type.
+        server: node that offers it.
+        meaning: of a call.
+    """
+
+    name: str
+    kind: type
+    server: str
+    meaning: str
+
+    def serve(self, node: Node, callback: Callable[[Any, Any], Any]) -> Service:
+        """Offer the service."""
+        return node.create_service(self.kind, f"~/{self.name}", callback)
+
+
+JOINT_STATES = Topic(
+    "joint_states",
+    JointState,
+    CONTROL_QOS,
+    ("bullet_node",),
+    ("bounds_node", "controller_node", "scenario_node"),
+    "positions, rad, and velocities, rad/s; `effort` is the torque of the motors, N m; joints in "
+    "any order, further joints are ignored; the stamp names the control step",
+)
+ACCELERATION_LIMITS = Topic(
+    "acceleration_limits",
+    JointTrajectory,
+    CONTROL_QOS,
+    ("bounds_node",),
+    ("controller_node", "scenario_node"),
+    "`points[0].accelerations` lower, `points[1].accelerations` upper, rad/s²; stamp of the state "
+    "they answer",
+)
+JOINT_COMMANDS = Topic(
+    "joint_commands",
+    JointState,
+    CONTROL_QOS,
+    ("controller_node",),
+    ("bullet_node", "scenario_node"),
+    "`effort` in N m; or `position` (and `velocity`) without effort: position control by the "
+    "drives; stamp of the state they answer",
+)
+FT_WRENCH = Topic(
+    "ft_wrench",
+    WrenchStamped,
+    CONTROL_QOS,
+    ("bullet_node",),
+    ("controller_node", "scenario_node"),
+    "what the wrist's sensor measures, tool and bias included, in the axes of `ft_frame`, N and "
+    "N m; positive is what acts on the arm; only where `ft_frame` is set",
+)
+ROBOT_DESCRIPTION = Topic(
+    "robot_description",
+    String,
+    LATCHED_QOS,
+    ("bullet_node",),
+    ("bounds_node", "controller_node"),
+    "the URDF; read at start where the parameter `robot_description` is `topic`",
+)
+DIAGNOSTICS = Topic(
+    "/diagnostics",
+    DiagnosticArray,
+    QoSProfile(depth=10),
+    ("bounds_node", "controller_node", "bullet_node"),
+    ("scenario_node",),
+    "mode and why, refused messages by reason, margins, latency, solver, closest approach",
+)
+SHARED_TOPICS = (
+    JOINT_STATES,
+    ACCELERATION_LIMITS,
+    JOINT_COMMANDS,
+    FT_WRENCH,
+    ROBOT_DESCRIPTION,
+    DIAGNOSTICS,
+)
+"""Topics between nodes of different packages."""
