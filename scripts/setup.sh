@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# Makes the environment that everything here runs in, and enters it. Source it:
+# Creates the environment for all other scripts, and activates it. Source it:
 #
 #     source scripts/setup.sh
 #
-# With ROS 2 Jazzy sourced, it makes .venv on top of that (system site packages) and adds what is
-# missing. Without, it installs the Jazzy wheels into .venv. Then it builds the three packages
-# with colcon. What is done already is not done again.
+# If ROS 2 Jazzy is sourced, .venv is created on top of it (system site packages) and missing packages
+# are added. Otherwise the Jazzy wheels are installed into .venv. Then the three packages are built
+# with colcon. Steps that are already done are skipped.
 
 _setup() {
     local root python venv stamp wanted inputs
@@ -28,7 +28,7 @@ _setup() {
         return 1
     fi
 
-    # What an installation depends on; when any of it changes, it is made again.
+    # The inputs of an installation; when one of them changes, it is repeated.
     stamp="$venv/.installed"
     inputs="$(cat "$root/requirements/common.txt" "$root/requirements/$ros.txt" \
         "$root/requirements/constraints.txt"; echo "$ros"; "$python" --version)"
@@ -62,7 +62,7 @@ _install() {
     fi
     cp "$root/requirements/constraints.txt" "$venv/constraints.txt"
     if [ "$ros" = sourced ]; then
-        # ROS' message packages are compiled for the NumPy of the system: keep to that one.
+        # ROS' message packages are compiled for the system's NumPy, so that version is kept.
         local numpy
         numpy="$("$python" -c 'import numpy; print(numpy.__version__)')" || return 1
         sed -i "s/^numpy==.*/numpy==$numpy/" "$venv/constraints.txt"
@@ -91,7 +91,7 @@ _install_pybullet() {
 }
 
 _build() {
-    # Symlinks: only what colcon itself writes needs building again.
+    # Sources are symlinked, so only changes of these files need a new build.
     local built="$root/install/.built" now
     now="$(cat "$root"/src/*/setup.py "$root"/src/*/setup.cfg "$root"/src/*/package.xml \
         "$root/colcon.meta" "$stamp" | sha256sum | cut -d' ' -f1) $root"

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Runs the tests, setting itself up first. Arguments go to pytest:
+# Sets up what is needed and runs the tests. Arguments are passed to pytest:
 #
 #     bash scripts/test.sh                  all of them
 #     bash scripts/test.sh -k viability     some of them
@@ -10,7 +10,7 @@ set +u
 source "$root/scripts/setup.sh"
 set -u
 cd "$root"
-# A graph of its own, which no other node on this machine or network sees.
+# A ROS domain of its own, so that other nodes do not interfere.
 export ROS_DOMAIN_ID="${ROS_DOMAIN_ID:-$((1 + $$ % 100))}"
 export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
 exec python -m pytest "$@"
