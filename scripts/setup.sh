@@ -3,9 +3,9 @@
 #
 #     source scripts/setup.sh
 #
-# If ROS 2 Jazzy is sourced, .venv is created on top of it (system site packages) and missing packages
-# are added. Otherwise the Jazzy wheels are installed into .venv. Then the three packages are built
-# with colcon. Steps that are already done are skipped.
+# With ROS 2 Jazzy sourced, it makes .venv on top of that (system site packages) and adds what is
+# missing. Without, it installs the Jazzy wheels into .venv. Then it builds the three packages
+# with colcon. What is done already is not done again.
 
 _setup() {
     local root python venv stamp wanted inputs

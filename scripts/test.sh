@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Sets up what is needed and runs the tests. Arguments are passed to pytest:
+# Runs the tests, setting itself up first. Arguments go to pytest:
 #
 #     bash scripts/test.sh                  all of them
 #     bash scripts/test.sh -k viability     some of them
