@@ -93,3 +93,4 @@ def test_the_parameter_is_that_of_the_controller(examples):
     row = examples["row"]
     (real,) = (each for each in TABLE if each.name == row.name)
     assert (row.kind, row.default, row.live) == (real.kind, real.default, real.live)
+    assert row.within == real.within
