@@ -1,4 +1,4 @@
-"""Figures 10 and 11 of [Benallegue2021]: a curve among poles that nobody told the robot of."""
+"""Figures 10 and 11 of [Benallegue2021]: a curve among poles that the controller does not know."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ POLES = (
     _pole("upper pole", "x", (0.40, 0.36, 0.44), 0.25),
     _pole("lower pole", "y", (0.42, 0.0, 0.28), 0.2),
 )
-# Where the null space cannot go far: a joint of the wrist comes to its limit.
+# Little room in the null space: a joint of the wrist reaches its limit.
 UPRIGHT = _pole("upright pole", "z", (0.40, 0.40, 0.5), 1.2)
 
 
@@ -190,7 +190,7 @@ def figure_10() -> Figure:
 
 
 def adverse() -> Figure:
-    """A pole that the null space cannot give way to."""
+    """A pole to which the null space cannot yield."""
     figure = Figure("paper1-adverse-pole")
     found = {name: judge(draw(changed, [UPRIGHT], 2)) for name, changed in MODES.items()}
     for name, each in found.items():
@@ -205,7 +205,7 @@ def adverse() -> Figure:
             "An upright pole at the left, where the null space has little room, 2 turns",
             "-",
             f"without: {told[0]}; with: {told[1]}",
-            "for comparison: not every pole is given way to" if kept else "DIFFERS",
+            "for comparison: the null space cannot yield to every pole" if kept else "DIFFERS",
         )
     )
     figure.save(None)
@@ -232,7 +232,7 @@ def _rows(found: dict[tuple[str, str], dict[str, float]]) -> list[tuple[str, str
     good = all(each["hand_m"] < 0.02 and each["within_limits"] for each in both)
     rows.append(
         (
-            f"Fig. 10, 11: {TURNS} turns of a circle of 40 cm in the y-z plane, nothing there",
+            f"Fig. 10, 11: {TURNS} turns of a circle of 40 cm in the y-z plane, without poles",
             "-",
             f"without: {_told(both[0])}; with: {_told(both[1])}",
             "under 2 cm" if good else "DIFFERS",

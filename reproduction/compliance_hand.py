@@ -17,7 +17,7 @@ from torque_safety_controller.tasks.pose_trajectory import PoseTrajectory, Traje
 
 DUAL = {"integral_action": "task", "dual_compliance": True}
 PULL = np.array([20.0, 0.0, 0.0])  # N
-ELBOW_PUSH = np.array([60.0, 72.0, 37.0])  # N; the null space gives way there
+ELBOW_PUSH = np.array([60.0, 72.0, 37.0])  # N; the null space yields there
 TARE = 0.5  # s
 FORCE = 10.0  # N
 GAP = 0.005  # m, from the fingertips to the table
@@ -153,7 +153,7 @@ def dual(figure: Figure) -> None:
     numbers = figure.metrics
     figure.rows = [
         (
-            "9",
+            "Fig. 9",
             "the hand stays when the arm is pushed",
             f"elbow pushed with {np.linalg.norm(ELBOW_PUSH):.0f} N: hand within "
             f"{1e3 * numbers['hand_while_elbow_pushed_m']:.1f} mm, a joint moves by "
@@ -166,9 +166,9 @@ def dual(figure: Figure) -> None:
             ),
         ),
         (
-            "9",
+            "Fig. 9",
             "moved freely when the hand itself is; its new place is kept",
-            f"{PULL[0]:.0f} N lead it by {1e3 * numbers['hand_led_m']:.0f} mm in 2 s; kept within "
+            f"{PULL[0]:.0f} N move it by {1e3 * numbers['hand_led_m']:.0f} mm in 2 s; kept within "
             f"{1e3 * numbers['kept_after_release_m']:.1f} mm when let go, "
             f"{1e3 * numbers['kept_while_elbow_pushed_again_m']:.1f} mm when the elbow is pushed "
             "again",
@@ -310,7 +310,7 @@ def pressing(figure: Figure) -> None:
         }
     figure.rows = [
         (
-            "(27)",
+            "Eq. (27)",
             "force control, not shown",
             f"{name}, {note}, presses with {FORCE:.0f} N: at most {numbers['most_n']:.1f} N; "
             f"within {100 * numbers['error_standing']:.1f} % standing, "

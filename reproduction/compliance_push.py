@@ -1,4 +1,4 @@
-"""Figures 6 to 8 of [Benallegue2021]: pushed at the hand and at the elbow, and let go."""
+"""Figures 6 to 8 of [Benallegue2021]: pushed at the hand and at the elbow, and released."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MODES = {
 RAMP = 0.3  # s, in which a person's push grows
 HAND_FORCE, ELBOW_FORCE = 50.0, 100.0  # N
 ACTIVE = {"friction_compensation": 0.7, "friction_theta": 100.0, "friction_gain": 300.0}
-"""Friction compensated by 70% the way the joint moves: docs/friction.md, "Which theta?"."""
+"""70% of the friction compensated in the direction of motion: docs/friction.md, "Which theta?"."""
 
 
 class Push(NamedTuple):
@@ -111,7 +111,7 @@ def weakest_direction(loop: DirectLoop, link: str) -> tuple[np.ndarray, float]:
 def course(
     loop: DirectLoop, hand: float, elbow: float, axes: str = "xyz", held: float = 1.5
 ) -> tuple[Push, ...]:
-    """Return pushes on the hand, there and back along each axis, and then on the elbow.
+    """Return pushes on the hand, in both directions along each axis, and then on the elbow.
 
     Args:
         loop: the arm.
@@ -223,7 +223,7 @@ def figure_6() -> Figure:
     )
     figure.rows += [
         (
-            f"Fig. 6, 7, 8: elbow pushed with {ELBOW_FORCE:.0f} N for 3 s, there and back "
+            f"Fig. 6, 7, 8: elbow pushed with {ELBOW_FORCE:.0f} N for 3 s, in both directions "
             f"(stiction alone holds {least:.0f} N)",
             "hardly moves, with a lot of resistance; much easier to move with null-space "
             "compliance, some force is still required",
@@ -233,7 +233,7 @@ def figure_6() -> Figure:
             "agrees" if ratio >= 3.0 and held and limits else "DIFFERS",
         ),
         (
-            f"Fig. 6: hand pushed with {HAND_FORCE:.0f} N along x, y, z, there and back",
+            f"Fig. 6: hand pushed with {HAND_FORCE:.0f} N along x, y, z, in both directions",
             "stiff without, also stiff with",
             f"{1e3 * lacking['steady_m']:.2f} mm without, {1e3 * with_it['steady_m']:.2f} mm "
             f"with, mean of the last 0.3 s of all six pushes; on the way "

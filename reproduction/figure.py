@@ -1,4 +1,4 @@
-"""What one figure of a paper came to: picture, data, metrics, and rows of the table."""
+"""Results for one figure of a paper: picture, data, metrics, and rows of the table."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RESULTS = ROOT / "results"
 
 @dataclass
 class Figure:
-    """What one figure of the paper came to.
+    """Results for one figure of the paper.
 
     Attributes:
         name: folder under results/.

@@ -115,7 +115,7 @@ def figure_3() -> Figure:
             "Fig. 3: regions by active upper bound",
             "six regions: unreachable, not viable, and four bounds",
             shown,
-            "agrees: all six are there" if present else "DIFFERS: a region is missing",
+            "agrees: all six are present" if present else "DIFFERS: a region is missing",
         )
     )
     figure.save(picture)
@@ -305,13 +305,13 @@ def figure_5() -> Figure:
             "Fig. 5a: naive, 2 dt",
             "elbow hits its lower bound at 0.36 s at -1.4 rad/s",
             f"at {m['naive_2dt_impact_time_s']:.2f} s at {m['naive_2dt_impact_rad_s']:.2f} rad/s",
-            "agrees in kind; poses and acceleration limits are not in the paper",
+            "agrees qualitatively; poses and acceleration limits are not in the paper",
         ),
         (
             "Fig. 5: naive, 20 dt",
             "still hits, at 0.3 rad/s",
             f"at {abs(m['naive_20dt_impact_rad_s']):.2f} rad/s",
-            "agrees in kind" if gentler and m["naive_20dt_impact_rad_s"] < 0 else "DIFFERS",
+            "agrees qualitatively" if gentler and m["naive_20dt_impact_rad_s"] < 0 else "DIFFERS",
         ),
         (
             "Fig. 5b: exact, 2 dt",
@@ -393,13 +393,13 @@ FIGURES: dict[str, Callable[[], Figure]] = {
 def write_document(figures: list[Figure]) -> None:
     """Write docs/reproduction.md."""
     (ROOT / "docs" / "reproduction.md").write_text(
-        "# What the paper reports, and what came out\n\n"
-        "Written by `bash scripts/reproduce.sh paper0`; do not edit. [DelPrete2018] through the\n"
+        "# Results beside the paper: bounds\n\n"
+        "Written by `bash scripts/reproduce.sh paper0`; do not edit. [DelPrete2018] with the\n"
         "real nodes, in lockstep; pictures and data are under `results/`.\n\n"
         f"{table(figures)}\n\n"
         "Fig. 5: the paper does not give its poses. Here the arm starts with the elbow at 0.446\n"
         "rad and the goal is a pose that the elbow can hold at 0.084 rad, 0.13 rad inside its\n"
-        "limit: the way there, not the goal, leads over the limit. Acceleration limits are those\n"
+        "limit: the path, not the goal, leads beyond the limit. Acceleration limits are those\n"
         "of `config/baxter_left_arm.yaml`; the exact bounds also keep its torque margins.\n"
     )
 

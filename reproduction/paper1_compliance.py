@@ -45,23 +45,23 @@ PARTS: dict[str, Callable[[], Figure]] = {
     "switching": switching,
     "press": press,
 }
-PAGE = """# Compliance: what the paper reports, and what came out
+PAGE = """# Results beside the paper: compliance
 
 Written by `bash scripts/reproduce.sh paper1-compliance`; do not edit.
 [Benallegue2021] on TALOS' torso and left arm at 1 kHz, with friction, rotors and mass errors,
 parameters as in `config/talos_left_arm.yaml`, which has the paper's gains of pose and posture;
-"without" is integral action `joints`, "with" is `task`. Forces grow within 0.3 s. Pictures and
+"without" is integral action `joints`, "with" is `task`. Forces rise within 0.3 s. Pictures and
 data are under `results/`.
 
 {table}
 
 ![Elbow pushed, without and with null-space compliance](images/compliance.png)
 
-Above without, below with null-space compliance; the cross is where the elbow was.
+Above without, below with null-space compliance; the cross marks the initial place of the elbow.
 
 ![Curve among poles](images/poles.png)
 
-At the start, and where the poles press hardest in each of three turns. Red: the reference.
+At the start, and at the largest pole force in each of three turns. Red: the reference.
 
 [Benallegue2021]: references.md
 """

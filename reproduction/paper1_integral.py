@@ -1,4 +1,4 @@
-"""Figures 3 and 5 of [Benallegue2021], an ablation of the integral action, and how it endures.
+"""Figures 3 and 5 of [Benallegue2021], an ablation of the integral action, and an endurance run.
 
 bash scripts/reproduce.sh paper1-integral              all of it, and docs/reproduction_integral.md
 bash scripts/reproduce.sh paper1-integral fig5         one part
@@ -423,7 +423,7 @@ def tables(figures: list[Figure]) -> str:
 def write_document(figures: list[Figure]) -> None:
     """Write docs/reproduction_integral.md."""
     (ROOT / "docs" / "reproduction_integral.md").write_text(
-        "# Integral action: what the paper reports, and what came out\n\n"
+        "# Results beside the paper: integral action\n\n"
         "Written by `bash scripts/reproduce.sh paper1-integral`; do not edit.\n"
         "[Benallegue2021] on TALOS' torso and left arm at 1 kHz, with friction, rotors and\n"
         "mass errors; pictures and data are under `results/`.\n\n"

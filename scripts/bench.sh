@@ -1,14 +1,14 @@
 #!/usr/bin/env bash
-# Measures, and prints what it measured. Ratios compare what ran in turns in one process.
+# Measures run times and prints them. Ratios compare programs that run in turns in one process.
 #
-#     bash scripts/bench.sh chain     state -> limits -> command against empty relays
+#     bash scripts/bench.sh chain     from state to command through both nodes, against empty relays
 #     bash scripts/bench.sh step      one controller step, part by part
 #     bash scripts/bench.sh bounds    acceleration bounds: one arm, and batches; with --tsid
-#                                     also beside TSID's, which is installed into .venv-tsid
+#                                     also TSID's, which is installed into .venv-tsid
 #     bash scripts/bench.sh robot     physics steps of the simulated robot, and their accuracy
 #     bash scripts/bench.sh collision pairs of shapes, and controller steps with and without them
-#     bash scripts/bench.sh antiwindup  limits on the integral torque, and the solver's way
-#     bash scripts/bench.sh compliance  controller steps with all that compliance adds
+#     bash scripts/bench.sh antiwindup  limits on the integral torque, in closed form and by a solver
+#     bash scripts/bench.sh compliance  controller steps with integral action, sensor and contacts
 set -eu
 root="$(cd "$(dirname "$0")/.." && pwd)"
 name="${1:-}"

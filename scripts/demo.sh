@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# An arm driven at its limits: three nodes, a scenario, a verdict. Sets itself up.
+# Simulates an arm that is driven to its limits, and checks the limits. Sets up what it needs.
 set -eu
 usage() {
     cat <<'USAGE'
@@ -8,15 +8,15 @@ usage: bash scripts/demo.sh [robot] [scenario] [--bounds exact|naive] [--rate HZ
 
   robot        a parameter file in config/ that has a scenario: baxter_left_arm (default), panda,
                talos_left_arm
-  scenario     what config/scenarios/<robot>_<scenario>.yaml describes, or a file of your own,
+  scenario     the name in config/scenarios/<robot>_<scenario>.yaml, or the path of a file,
                see docs/scenarios.md (default: demo)
-  --bounds     how acceleration limits are computed; naive breaks the limits (default: exact)
+  --bounds     how acceleration limits are computed; naive violates the limits (default: exact)
   --rate       control rate in Hz (default: the robot's own)
-  --lockstep   each step waits for its command, as fast as the machine can; repeatable
+  --lockstep   the simulation waits for each command: as fast as the machine can, and repeatable
   --params     a second parameter file, such as config/obstacles/panda_wall.yaml
   --out        where figure, data and metrics go (default: results/demo)
 
-Exits with 0 when no limit was broken, 1 when one was, 2 when it could not run.
+Exits with 0 when no limit was violated, 1 when one was, 2 when it could not run.
 USAGE
 }
 
@@ -67,7 +67,7 @@ set +u # ROS' own set-up scripts use unset variables
 source "$root/scripts/setup.sh"
 set -u
 
-# A graph of its own: other robots and other demos on this machine or network stay out of it.
+# A ROS domain of its own, so that other robots and demos do not interfere.
 export ROS_DOMAIN_ID="${ROS_DOMAIN_ID:-$((1 + $$ % 100))}"
 export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
 
@@ -76,7 +76,7 @@ overrides=()
 overrides+=(-p "clock:=$clock" -p "bounds_node:method:=$bounds" -p start_paused:=true)
 [ -z "$rate" ] || overrides+=(-p "rate_hz:=$rate")
 if [ "$clock" = lockstep ]; then
-    # The robot waits: a busy machine must not look like a dead node.
+    # The robot waits for the nodes, so long time-outs are safe and a busy machine causes none.
     overrides+=(-p bounds_timeout:=5.0 -p state_timeout:=10.0)
 fi
 

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# The friction of a robot's joints, from a recording of its motion or, without one, from a motion
-# in simulation. Sets itself up.
+# Identifies the friction of a robot's joints from a recording of its motion or, without one, from a
+# motion in simulation. Sets up what it needs.
 set -eu
 usage() {
     cat <<'USAGE'
@@ -8,8 +8,8 @@ usage: bash scripts/identify_friction.sh [robot] [-o FILE] [--recording FILE]
 
   robot         a parameter file in config/ (default: talos_left_arm)
   -o            parameter file to write (default: results/friction/<robot>.yaml)
-  --recording   of the robot (.npz: t, q, v, tau); by default one is made in simulation and kept
-                beside the parameter file
+  --recording   recorded motion of the robot (.npz: t, q, v, tau); by default one is made in
+                simulation and kept next to the parameter file
 USAGE
 }
 

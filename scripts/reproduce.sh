@@ -1,14 +1,15 @@
 #!/usr/bin/env bash
-# Reproduces what a paper shows, into results/, and prints a table beside the paper's numbers.
+# Reproduces the figures of a paper, writes them to results/, and prints a table with the paper's
+# numbers and ours.
 #
 #     bash scripts/reproduce.sh paper0             all its figures, and docs/reproduction.md
 #     bash scripts/reproduce.sh paper0 fig5        one of them
 #     bash scripts/reproduce.sh paper1-integral    the second paper: handover, anti-windup, endurance
-#     bash scripts/reproduce.sh paper1-compliance  pushes, poles in the way, the hand led and pressing
-#     bash scripts/reproduce.sh state_dependent    Baxter reaches faster, with limits by state
+#     bash scripts/reproduce.sh paper1-compliance  pushes, poles, yielding and pressing hand
+#     bash scripts/reproduce.sh state_dependent    Baxter with state-dependent acceleration limits
 #     bash scripts/reproduce.sh friction           TALOS with friction compensation
-#     bash scripts/reproduce.sh exactness          the bounds against brute force (half an hour)
-#     bash scripts/reproduce.sh all                all but the last
+#     bash scripts/reproduce.sh exactness          the bounds compared with brute force (30 min)
+#     bash scripts/reproduce.sh all                all of the above except exactness
 set -eu
 root="$(cd "$(dirname "$0")/.." && pwd)"
 what="${1:-all}"

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Makes the environment that everything here runs in, and enters it. Source it:
+# Creates the environment for all other scripts, and activates it. Source it:
 #
 #     source scripts/setup.sh
 #
@@ -29,7 +29,7 @@ _setup() {
         return 1
     fi
 
-    # What an installation depends on; when any of it changes, it is made again.
+    # The inputs of an installation; when one of them changes, it is repeated.
     stamp="$venv/.installed"
     inputs="$(cat "$root/requirements/common.txt" "$root/requirements/$ros.txt" \
         "$root/requirements/constraints.txt"; echo "$ros"; "$python" --version)"
@@ -64,7 +64,7 @@ _install() {
     fi
     cp "$root/requirements/constraints.txt" "$venv/constraints.txt"
     if [ "$ros" = sourced ]; then
-        # ROS' message packages are compiled for the NumPy of the system: keep to that one.
+        # ROS' message packages are compiled for the system's NumPy, so that version is kept.
         local numpy
         numpy="$("$python" -c 'import numpy; print(numpy.__version__)')" || return 1
         sed -i "s/^numpy==.*/numpy==$numpy/" "$venv/constraints.txt"
@@ -93,7 +93,7 @@ _install_pybullet() {
 }
 
 _build() {
-    # Symlinks: only what colcon itself writes needs building again.
+    # Sources are symlinked, so only changes of these files need a new build.
     local built="$root/install/.built" now
     now="$(cat "$root"/src/*/setup.py "$root"/src/*/setup.cfg "$root"/src/*/package.xml \
         "$root/colcon.meta" "$stamp" | sha256sum | cut -d' ' -f1) $root"

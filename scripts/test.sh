@@ -10,7 +10,7 @@ set +u
 source "$root/scripts/setup.sh"
 set -u
 cd "$root"
-# A graph of its own, which no other node on this machine or network sees.
+# A ROS domain of its own, so that other nodes do not interfere.
 export ROS_DOMAIN_ID="${ROS_DOMAIN_ID:-$((1 + $$ % 100))}"
 export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
 exec python -m pytest "$@"

@@ -57,13 +57,23 @@ def test_command_runs(command):
     assert result.returncode == 0, result.stdout + result.stderr
 
 
+def console():
+    return "\n".join(re.findall(r"```console\n(.*?)```", README, re.DOTALL))
+
+
 def test_console_blocks_name_executables_that_exist():
-    shown = re.findall(r"ros2 run (\w+) (\w+)", README)
+    shown = re.findall(r"ros2 run (\w+) (\w+)", console())
     assert shown
     for package, executable in shown:
         assert (ROOT / "install" / package / "lib" / package / executable).exists()
 
 
-def test_links_lead_somewhere():
-    for target in re.findall(r"\]\(([^)#]+)\)", README):
-        assert (ROOT / target).exists(), target
+def test_console_blocks_name_files_that_exist():
+    shown = re.findall(r"(?:\./|config/|examples/)[\w/.]+", console())
+    assert shown
+    for name in shown:
+        assert (ROOT / name).exists(), name
+
+
+def test_it_is_short():
+    assert len(README.splitlines()) <= 200

@@ -122,7 +122,7 @@ def test_energy_decreases_at_the_rate_of_the_theory(arm, with_coriolis):
 
 
 def test_two_rates_lose_energy_as_derived(arm):
-    """docs/integral_action.md, "Two rates": the rate of W, the sum of both energies."""
+    """docs/integral_action.md, "Two leak rates": the rate of W, the sum of both energies."""
     dynamics, n = Dynamics(arm), arm.n
     mu, theta_f, theta_s = 0.4, 9.0, 0.5
 

@@ -1,0 +1,94 @@
+"""What the pages link to and name exists."""
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGES = "viability_bounds_pkg|torque_safety_controller|sim_bridge"
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("**/*.md")])
+FOLDERS = (
+    ".ci",
+    "benchmarks",
+    "config",
+    "docs",
+    "examples",
+    "reproduction",
+    "scripts",
+    "src",
+    "test",
+)
+FILES = {
+    path.relative_to(ROOT).as_posix()
+    for folder in FOLDERS
+    for path in (ROOT / folder).rglob("*")
+    if "__pycache__" not in path.parts
+} | {path.name for path in ROOT.iterdir()}
+
+
+def anchors(page):
+    """Return the anchors of a page's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", each.lower()).replace(" ", "-") for each in headings}
+
+
+def links(page):
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    found = re.findall(r"\]\(([^)]+)\)", text)
+    found += re.findall(r"^\[[^\]]+\]: (\S+)$", text, re.MULTILINE)
+    return {each for each in found if "://" not in each}
+
+
+def module_exists(name):
+    """Return whether a dotted name begins with a module of the project and a name in it."""
+    path, *rest = ROOT / "src" / name.split(".")[0], *name.split(".")
+    while rest and (path / rest[0]).is_dir():
+        path /= rest.pop(0)
+    if rest and (path / f"{rest[0]}.py").exists():
+        path /= f"{rest.pop(0)}.py"
+    if not rest:
+        return True
+    source = path if path.suffix else path / "__init__.py"
+    return bool(re.search(rf"\b{rest[0]}\b", source.read_text()))
+
+
+def name_of(page):
+    return page.relative_to(ROOT).as_posix()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_links_lead_somewhere(page):
+    for link in links(page):
+        target, _, anchor = link.partition("#")
+        file = page.parent / target if target else page
+        assert file.exists(), link
+        if anchor:
+            assert anchor in anchors(file), link
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_files_and_modules_that_are_named_exist(page):
+    for name in re.findall(r"`([^`\n]+)`", page.read_text()):
+        if re.fullmatch(r"[\w./-]+\.(py|sh|md)", name):
+            assert any(f"/{each}".endswith(f"/{name}") for each in FILES), name
+        if re.fullmatch(rf"({PACKAGES})(\.\w+)+", name):
+            assert module_exists(name), name
+
+
+def test_every_page_is_in_the_index():
+    index = (ROOT / "docs" / "README.md").read_text()
+    for page in (ROOT / "docs").glob("*.md"):
+        assert page.name == "README.md" or f"]({page.name})" in index, page.name
+
+
+def test_release_has_one_version():
+    released = re.findall(
+        r"^## \[(\d[\d.]*)\] - (\S+)$", (ROOT / "CHANGELOG.md").read_text(), re.M
+    )
+    version, date = released[0]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert (citation["version"], citation["date-released"]) == (version, date)
+    for package in PACKAGES.split("|"):
+        assert f"<version>{version}<" in (ROOT / "src" / package / "package.xml").read_text()
