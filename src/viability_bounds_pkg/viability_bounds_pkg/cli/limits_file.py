@@ -7,6 +7,7 @@ import os
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from decimal import Context
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -184,23 +185,10 @@ def overlay(parameters: Mapping[str, Array], notes: Sequence[str], node: str = N
     return "\n".join(lines) + "\n"
 
 
-def round_towards_zero(values: Array) -> Array:
-    """Return `values` with `DIGITS` significant digits, never larger in magnitude."""
-    return np.array([_rounded(value, math.floor) for value in values])
-
-
-def round_away_from_zero(values: Array) -> Array:
-    """Return `values` with `DIGITS` significant digits, never smaller in magnitude."""
-    return np.array([_rounded(value, math.ceil) for value in values])
-
-
-def _rounded(value: float, towards: Any) -> float:
-    if value == 0.0:
-        return 0.0
-    places = DIGITS - 1 - math.floor(math.log10(abs(value)))
-    # Half a unit in the 9th digit: 3.0 must not become 2.999 for a rounding error in the scaling.
-    scaled = round(abs(value) * 10.0**places, 9 - DIGITS)
-    return math.copysign(float(f"{towards(scaled)}e{-places}"), value)
+def rounded(values: Array, rounding: str) -> Array:
+    """Return `values` with `DIGITS` significant digits, by a rounding mode of `decimal`."""
+    context = Context(DIGITS, rounding)
+    return np.array([float(context.create_decimal(repr(value))) for value in values.tolist()])
 
 
 def check_writable(path: Path) -> None:
