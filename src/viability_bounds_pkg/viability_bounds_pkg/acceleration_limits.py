@@ -46,7 +46,7 @@ DEFAULT_SAMPLES = {"sampling": 1_000_000, "refined": 10_000}
 
 @dataclass(frozen=True)
 class AccelerationLimits:
-    """Limits to use, and what they rest on.
+    """Estimated acceleration limits and the worst cases they rest on.
 
     Attributes:
         names: joints.
@@ -64,7 +64,7 @@ class AccelerationLimits:
 
 
 class EmptyIntervalError(LimitEstimateError):
-    """In some state the torque cannot both accelerate and decelerate a joint.
+    """The torque limits leave a joint no acceleration interval in some state.
 
     Attributes:
         joint: its name.

@@ -1,4 +1,4 @@
-"""The robot's parameter file that limits are estimated from, and the one they are written to."""
+"""Reads a robot's parameter file and writes the file with the estimated limits."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def read_robot(path: Path) -> Robot:
 
 
 def _check_limits(urdf: str, source: str) -> None:
-    """Raise where a limit that every URDF must give is missing: the parser names it less well."""
+    """Raise where a URDF lacks an effort or velocity limit: Pinocchio does not name the joint."""
     for joint in ElementTree.fromstring(urdf).iter("joint"):
         if joint.get("type") not in ("revolute", "prismatic"):
             continue
@@ -209,7 +209,7 @@ def check_writable(path: Path) -> None:
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
-    """Write `content` to `path` so that at any time the old or the new file is there, complete.
+    """Write a file atomically: at any time the old or the new one is there, complete.
 
     Raises:
         OSError: the file cannot be written; what was there before still is.

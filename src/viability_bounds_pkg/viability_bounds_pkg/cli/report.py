@@ -1,4 +1,4 @@
-"""What the estimate of acceleration limits found, for people and for the bounds node to read."""
+"""Printed report of the estimated limits, and their parameter file for the nodes."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ def report_search(names: Sequence[str], worst: WorstCases) -> None:
 def report_limits(
     limits: AccelerationLimits, unavailable: Array, margin: ZeroOrderHoldError | None
 ) -> None:
-    """Print the limits to use, where each comes from, and what holding the torque costs.
+    """Print the limits to use, where each comes from, and the zero-order hold error.
 
     Args:
         limits: what to use.
         unavailable: share of states in which torque does not allow them, shape (n,).
-        margin: what holding the torque costs, if that was searched.
+        margin: the zero-order hold error, if that was searched.
     """
     found = limits.worst
     for j, name in enumerate(limits.names):
