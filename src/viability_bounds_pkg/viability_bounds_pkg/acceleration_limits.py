@@ -46,7 +46,7 @@ DEFAULT_SAMPLES = {"sampling": 1_000_000, "refined": 10_000}
 
 @dataclass(frozen=True)
 class AccelerationLimits:
-    """Limits to use, and what they rest on.
+    """Estimated acceleration limits and the worst cases they rest on.
 
     Attributes:
         names: joints.
@@ -64,7 +64,7 @@ class AccelerationLimits:
 
 
 class EmptyIntervalError(LimitEstimateError):
-    """In some state the torque cannot both accelerate and decelerate a joint.
+    """The torque limits leave a joint no acceleration interval in some state.
 
     Attributes:
         joint: its name.
@@ -149,7 +149,6 @@ def estimate_acceleration_limits(
     torque_reserve: ArrayLike = 0.0,
     overrides: Mapping[str, tuple[float, float]] | None = None,
     cap: ArrayLike | None = None,
-    progress: Callable[[WorstCases], None] | None = None,
 ) -> AccelerationLimits:
     """Return worst-case acceleration limits: Algorithm 4 of [DelPrete2018].
 
@@ -175,7 +174,6 @@ def estimate_acceleration_limits(
         overrides: limits (a_min, a_max) of joints to use instead of what is found, rad/s^2.
         cap: the greatest magnitude of the limits of the other joints, scalar or shape (n,),
             rad/s^2; infinite for none.
-        progress: called now and then with what was found so far.
 
     Raises:
         EmptyIntervalError: a joint without override is left no interval.
@@ -187,9 +185,7 @@ def estimate_acceleration_limits(
         samples = DEFAULT_SAMPLES[method]
     space = StateSpace.of(model, q_min, q_max, v_max, available_torque(tau_max, torque_reserve))
     check_adjustments(model, overrides, cap)
-    for worst in SEARCHES[method](model, space, samples, seed):
-        if progress is not None:
-            progress(worst)
+    *_, worst = SEARCHES[method](model, space, samples, seed)
     return limits_from_worst_cases(model, space, worst, overrides, cap)
 
 

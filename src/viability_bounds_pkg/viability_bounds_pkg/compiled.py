@@ -1,4 +1,4 @@
-"""The decorator for functions that Numba compiles, and whose compiled code is kept.
+"""Decorator for Numba functions, with a cache on disk that notices changed callees.
 
 Numba keeps compiled code until the file of the function changes. It does not notice that a
 function which is called, in another file, has changed. Here what is kept counts only while no

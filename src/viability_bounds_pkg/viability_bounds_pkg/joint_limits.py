@@ -1,4 +1,4 @@
-"""The limits of a set of joints, checked once so that nothing after needs to check again."""
+"""Position, velocity and acceleration limits of joints, checked when they are made."""
 
 from __future__ import annotations
 

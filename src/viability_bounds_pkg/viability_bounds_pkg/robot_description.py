@@ -1,4 +1,4 @@
-"""Where a robot description comes from, and the Pinocchio model made of it.
+"""Finds a robot description and builds its Pinocchio model.
 
 A URDF is named by a file path or by a ``package://`` URI. Packages are looked up where ROS 2
 looks (``AMENT_PREFIX_PATH``, ``ROS_PACKAGE_PATH``) and where the ``example-robot-data`` wheel

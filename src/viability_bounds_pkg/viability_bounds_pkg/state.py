@@ -1,4 +1,4 @@
-"""The state of an arm: where its joints are and how fast they move."""
+"""The state of an arm: joint positions and velocities."""
 
 from __future__ import annotations
 

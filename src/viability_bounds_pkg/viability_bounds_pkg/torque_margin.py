@@ -16,7 +16,7 @@ from viability_bounds_pkg.joint_limits import JointLimits
 
 
 class TorqueMargins(NamedTuple):
-    """What the bounds must keep back, each of shape (n,).
+    """Margins that the bounds keep to the limits, each of shape (n,).
 
     Attributes:
         acceleration: off the braking and the bounds, rad/s^2.
@@ -30,7 +30,7 @@ class TorqueMargins(NamedTuple):
 
 
 def step_deviations(jerk: ArrayLike, dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return how far velocity and position stray from constant acceleration within a step.
+    """Return the largest deviation from constant acceleration within a step.
 
     The torque is right for the middle of the step, so that with jerk J the acceleration is
     off by J (t - dt/2): the velocity by at most J dt^2 / 8, the position by J dt^3 / 12.

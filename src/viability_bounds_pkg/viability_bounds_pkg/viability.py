@@ -43,7 +43,7 @@ __all__ = [
 
 
 class BoundsSolver:
-    """Acceleration bounds of one robot, with everything that does not depend on the state.
+    """Acceleration bounds of one robot; what does not depend on the state is precomputed.
 
     Args:
         limits: of n joints.

@@ -18,7 +18,6 @@ from torque_safety_controller.collision.model import CollisionModel
 from torque_safety_controller.collision.obstacles import CollisionError
 from torque_safety_controller.collision.row import Law, Step, make_rows
 from torque_safety_controller.qp.constraints import Rows
-from viability_bounds_pkg.kernel.array_checks import both_finite
 from viability_bounds_pkg.kernel.one_sided_limit import make_table
 
 Array = NDArray[np.float64]
@@ -214,9 +213,10 @@ class CollisionAvoidance:
         Returns:
             None in a state that is not finite, which the QP refuses.
         """
-        if not both_finite(q, v):
+        if not (np.isfinite(q).all() and np.isfinite(v).all()):
             return None
-        if not both_finite(a_lower, a_upper):  # infinite, or for the QP to refuse
+        # Infinite, or for the QP to refuse.
+        if not (np.isfinite(a_lower).all() and np.isfinite(a_upper).all()):
             a_lower, a_upper = (
                 np.nan_to_num(bound, posinf=_FAST, neginf=-_FAST) for bound in (a_lower, a_upper)
             )

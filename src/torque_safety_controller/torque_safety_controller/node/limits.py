@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 from trajectory_msgs.msg import JointTrajectory
 
-from viability_bounds_pkg.kernel.array_checks import both_finite, in_order
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 
 
@@ -27,7 +26,6 @@ class LimitsReader:
         self.stamp = -1
         self.refused: Counter[str] = Counter()
         self._joints = list(joints)
-        in_order(self.lower, self.upper)  # compiled now, not when the first message comes
 
     def read(self, message: JointTrajectory) -> bool:
         """Take a message; return whether it was accepted."""
@@ -43,9 +41,9 @@ class LimitsReader:
                 return self._refuse("missing joint")
             index = [where[joint] for joint in self._joints]
             lower, upper = lower[index], upper[index]
-        if not both_finite(lower, upper):
+        if not (np.isfinite(lower).all() and np.isfinite(upper).all()):
             return self._refuse("not finite")
-        if not in_order(lower, upper):
+        if not (lower <= upper).all():
             return self._refuse("lower above upper")
         self.lower, self.upper = lower, upper
         self.stamp = stamp_to_ns(message.header.stamp)

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+from decimal import ROUND_DOWN, ROUND_UP
 from pathlib import Path
 
 import numpy as np
@@ -499,8 +500,8 @@ def test_a_link_keeps_pointing_to_the_file_written(tmp_path):
 
 def test_written_numbers_err_to_the_safe_side():
     values = np.array([3.0, -3.0, 5.08769, -5.08769, 0.00123456, 1741.837, 15.0, 0.3, 0.0])
-    down = limits_file.round_towards_zero(values)
-    up = limits_file.round_away_from_zero(values)
+    down = limits_file.rounded(values, ROUND_DOWN)
+    up = limits_file.rounded(values, ROUND_UP)
     np.testing.assert_array_equal(
         down, [3.0, -3.0, 5.087, -5.087, 0.001234, 1741.0, 15.0, 0.3, 0.0]
     )

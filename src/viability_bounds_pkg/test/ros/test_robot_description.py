@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from viability_bounds_pkg.cli.limits_file import ParameterFileError, read_robot
-from viability_bounds_pkg.estimation.batch_dynamics import FEW, BatchDynamics
+from viability_bounds_pkg.estimation.worst_case_search import torque_terms
 from viability_bounds_pkg.robot_description import (
     RobotDescriptionError,
     build_model,
@@ -44,13 +44,13 @@ def test_rotors_are_on_the_diagonal_of_the_inertia_matrix(urdf):
         np.testing.assert_allclose(pin.nonLinearEffects(with_rotors, data, q, v), h, atol=1e-12)
 
 
-@pytest.mark.parametrize("count", [FEW, FEW + 1])  # state by state, and in a batch
-def test_batches_see_the_rotors(urdf, count):
+def test_the_estimate_counts_the_rotors(urdf):
     rng = np.random.default_rng(2)
-    q, v = rng.uniform(-2.0, 2.0, (2, count, 7))
-    h, inertia = BatchDynamics(build_model(urdf, JOINTS, None, ROTORS)).torque_terms(q, v)
-    bare_h, bare = BatchDynamics(build_model(urdf, JOINTS)).torque_terms(q, v)
-    np.testing.assert_allclose(inertia - bare, np.tile(ROTORS, (count, 1)), atol=1e-13)
+    q, v = rng.uniform(-2.0, 2.0, (2, 30, 7))
+    with_rotors, without = build_model(urdf, JOINTS, None, ROTORS), build_model(urdf, JOINTS)
+    h, inertia = torque_terms(with_rotors, with_rotors.createData(), q, v)
+    bare_h, bare = torque_terms(without, without.createData(), q, v)
+    np.testing.assert_allclose(inertia - bare, np.tile(ROTORS, (30, 1)), atol=1e-13)
     np.testing.assert_allclose(h, bare_h, atol=1e-12)
 
 

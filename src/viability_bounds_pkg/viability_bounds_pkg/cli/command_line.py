@@ -1,4 +1,4 @@
-"""What command line tools have in common: errors and interrupts in one line, and exit codes."""
+"""Shared by command line tools: errors and interrupts in one line, exit codes."""
 
 from __future__ import annotations
 

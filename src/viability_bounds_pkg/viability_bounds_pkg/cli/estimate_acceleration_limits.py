@@ -34,7 +34,7 @@ from viability_bounds_pkg.cli.limits_file import (
 )
 from viability_bounds_pkg.cli.report import overlay_text, report_limits, report_search
 from viability_bounds_pkg.estimation.discretisation_margin import (
-    DiscretisationMargin,
+    ZeroOrderHoldError,
     discretisation_margin,
 )
 from viability_bounds_pkg.estimation.state_space import Array, LimitEstimateError, StateSpace
@@ -159,7 +159,7 @@ def _search(
 
 def _margin(
     robot: Robot, space: StateSpace, limits: AccelerationLimits, options: argparse.Namespace
-) -> tuple[DiscretisationMargin | None, bool]:
+) -> tuple[ZeroOrderHoldError | None, bool]:
     """Return the margin, None if interrupted, and whether it was interrupted."""
     try:
         print("searching for the worst drift of a held torque ...", flush=True)

@@ -1,4 +1,4 @@
-"""The robot's parameter file that limits are estimated from, and the one they are written to."""
+"""Reads a robot's parameter file and writes the file with the estimated limits."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import os
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from decimal import Context
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -104,7 +105,7 @@ def read_robot(path: Path) -> Robot:
 
 
 def _check_limits(urdf: str, source: str) -> None:
-    """Raise where a limit that every URDF must give is missing: the parser names it less well."""
+    """Raise where a URDF lacks an effort or velocity limit: Pinocchio does not name the joint."""
     for joint in ElementTree.fromstring(urdf).iter("joint"):
         if joint.get("type") not in ("revolute", "prismatic"):
             continue
@@ -184,23 +185,10 @@ def overlay(parameters: Mapping[str, Array], notes: Sequence[str], node: str = N
     return "\n".join(lines) + "\n"
 
 
-def round_towards_zero(values: Array) -> Array:
-    """Return `values` with `DIGITS` significant digits, never larger in magnitude."""
-    return np.array([_rounded(value, math.floor) for value in values])
-
-
-def round_away_from_zero(values: Array) -> Array:
-    """Return `values` with `DIGITS` significant digits, never smaller in magnitude."""
-    return np.array([_rounded(value, math.ceil) for value in values])
-
-
-def _rounded(value: float, towards: Any) -> float:
-    if value == 0.0:
-        return 0.0
-    places = DIGITS - 1 - math.floor(math.log10(abs(value)))
-    # Half a unit in the 9th digit: 3.0 must not become 2.999 for a rounding error in the scaling.
-    scaled = round(abs(value) * 10.0**places, 9 - DIGITS)
-    return math.copysign(float(f"{towards(scaled)}e{-places}"), value)
+def rounded(values: Array, rounding: str) -> Array:
+    """Return `values` with `DIGITS` significant digits, by a rounding mode of `decimal`."""
+    context = Context(DIGITS, rounding)
+    return np.array([float(context.create_decimal(repr(value))) for value in values.tolist()])
 
 
 def check_writable(path: Path) -> None:
@@ -221,7 +209,7 @@ def check_writable(path: Path) -> None:
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
-    """Write `content` to `path` so that at any time the old or the new file is there, complete.
+    """Write a file atomically: at any time the old or the new one is there, complete.
 
     Raises:
         OSError: the file cannot be written; what was there before still is.

@@ -1,8 +1,9 @@
-"""What the estimate of acceleration limits found, for people and for the bounds node to read."""
+"""Printed report of the estimated limits, and their parameter file for the nodes."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from decimal import ROUND_DOWN, ROUND_UP
 
 import numpy as np
 
@@ -10,10 +11,9 @@ from viability_bounds_pkg.acceleration_limits import AccelerationLimits
 from viability_bounds_pkg.cli.limits_file import (
     CONTROLLER,
     overlay,
-    round_away_from_zero,
-    round_towards_zero,
+    rounded,
 )
-from viability_bounds_pkg.estimation.discretisation_margin import DiscretisationMargin
+from viability_bounds_pkg.estimation.discretisation_margin import ZeroOrderHoldError
 from viability_bounds_pkg.estimation.state_space import Array
 from viability_bounds_pkg.estimation.worst_case_search import WorstCases
 
@@ -38,14 +38,14 @@ def report_search(names: Sequence[str], worst: WorstCases) -> None:
 
 
 def report_limits(
-    limits: AccelerationLimits, unavailable: Array, margin: DiscretisationMargin | None
+    limits: AccelerationLimits, unavailable: Array, margin: ZeroOrderHoldError | None
 ) -> None:
-    """Print the limits to use, where each comes from, and what holding the torque costs.
+    """Print the limits to use, where each comes from, and the zero-order hold error.
 
     Args:
         limits: what to use.
         unavailable: share of states in which torque does not allow them, shape (n,).
-        margin: what holding the torque costs, if that was searched.
+        margin: the zero-order hold error, if that was searched.
     """
     found = limits.worst
     for j, name in enumerate(limits.names):
@@ -60,12 +60,11 @@ def report_limits(
     if margin is None:
         return
     print(f"\nwith the torque held for {margin.dt:g} s, at most:")
-    held = margin.mid_step
     for j, name in enumerate(limits.names):
         print(
-            f"{name}: acceleration off by {held.acceleration[j]:.3g} rad/s^2 "
-            f"({margin.start_of_step.acceleration[j]:.3g} with the torque of the start), "
-            f"its mean by {held.mean_acceleration[j]:.3g}, position by {held.position[j]:.2g} rad"
+            f"{name}: acceleration off by {margin.acceleration[j]:.3g} rad/s^2, "
+            f"its mean by {margin.mean_acceleration[j]:.3g}, "
+            f"position by {margin.position[j]:.2g} rad"
         )
 
 
@@ -74,7 +73,7 @@ def _vector(values: Array) -> str:
 
 
 def overlay_text(
-    limits: AccelerationLimits, margin: DiscretisationMargin | None, origin: Sequence[str]
+    limits: AccelerationLimits, margin: ZeroOrderHoldError | None, origin: Sequence[str]
 ) -> str:
     """Return the parameter file with the limits, rounded to the safe side.
 
@@ -87,14 +86,14 @@ def overlay_text(
     if limits.overridden:
         notes.append(f"set by hand: {', '.join(sorted(limits.overridden))}")
     found = {
-        "acceleration_min": round_towards_zero(limits.a_min),
-        "acceleration_max": round_towards_zero(limits.a_max),
+        "acceleration_min": rounded(limits.a_min, ROUND_DOWN),
+        "acceleration_max": rounded(limits.a_max, ROUND_DOWN),
     }
     drift = {}
     if margin is not None:
         notes.append(f"acceleration_drift with the torque held for {margin.dt:g} s")
         # The acceleration is right at the middle of the period: its error grows for half of it.
-        jerk = np.maximum(margin.jerk, 2.0 * margin.mid_step.acceleration / margin.dt)
-        drift["acceleration_drift"] = round_away_from_zero(jerk)
+        jerk = np.maximum(margin.jerk, 2.0 * margin.acceleration / margin.dt)
+        drift["acceleration_drift"] = rounded(jerk, ROUND_UP)
     # Not for all nodes at once: a file that names the node would win over that.
     return overlay(found | drift, notes) + "\n" + overlay(found, [], CONTROLLER)

@@ -28,7 +28,12 @@ from viability_bounds_pkg.estimation.zero_order_hold import (
 class ZeroOrderHoldError:
     """Worst case over the states searched of motion under held torque against that commanded.
 
+    The torque is the one for the predicted middle of the period, see `mid_step_torque`.
+
     Attributes:
+        dt: the control period, s.
+        jerk: sup of abs(da/dt) under held torque, shape (n,), rad/s^3: for a short period the
+            error of the acceleration is half of this times `dt`.
         acceleration: sup over t in [0, dt] of abs(a(t) - a), shape (n,), rad/s^2.
         mean_acceleration: sup of abs((v(dt) - v) / dt - a), shape (n,), rad/s^2.
         position: sup of abs(q(dt) - q - v dt - a dt^2 / 2), shape (n,), rad.
@@ -37,40 +42,14 @@ class ZeroOrderHoldError:
         a: the acceleration asked for there, shape (n, n), rad/s^2.
     """
 
+    dt: float
+    jerk: Array
     acceleration: Array
     mean_acceleration: Array
     position: Array
     q: Array
     v: Array
     a: Array
-
-
-@dataclass(frozen=True)
-class DiscretisationMargin:
-    """Zero-order hold errors of two ways to compute the torque held for a period.
-
-    Attributes:
-        dt: the control period, s.
-        mid_step: with the torque computed at the predicted middle of the period,
-            ``rnea(q + v dt/2 + a dt^2/8, v + a dt/2, a)``.
-        start_of_step: with the torque computed at the start, ``rnea(q, v, a)``.
-        jerk: sup of abs(da/dt) under held torque, shape (n,), rad/s^3: for a short period the
-            error is this times `dt` for the plain law, half of it for the mid-step law.
-        samples: how many random states were drawn.
-        accepted: how many of them asked for a torque within the limits at once.
-    """
-
-    dt: float
-    mid_step: ZeroOrderHoldError
-    start_of_step: ZeroOrderHoldError
-    jerk: Array
-    samples: int
-    accepted: int
-
-    @property
-    def margin(self) -> Array:
-        """What to keep back from the acceleration limits, shape (n,), rad/s^2."""
-        return self.mid_step.acceleration
 
 
 def discretisation_margin(
@@ -87,8 +66,8 @@ def discretisation_margin(
     *,
     starts: int = 32,
     rounds: int = 12,
-) -> DiscretisationMargin:
-    """Return the worst zero-order hold error over a period `dt`, for both torque laws.
+) -> ZeroOrderHoldError:
+    """Return the worst zero-order hold error over a period `dt`.
 
     States and accelerations are drawn within their limits; those that ask for a torque beyond
     `tau_max` are skipped, as the controller does not command them. Random sampling in 3 n
@@ -138,36 +117,29 @@ def discretisation_margin(
         return np.where(np.all(np.abs(tau) <= space.tau_max, axis=1)[:, None], abs(jerk), -np.inf)
 
     jerks = allowed_jerk(points)
-    accepted = int(np.count_nonzero(np.isfinite(jerks[:, 0])))
-    if not accepted:
+    if not np.isfinite(jerks).any():
         raise LimitEstimateError(
             f"none of {samples} sampled states and accelerations is within the torque limits; "
             "narrow a_min and a_max"
         )
     followed, fastest = climb(allowed_jerk, points, jerks, lower, upper, starts, rounds, rng)
-    laws = []
-    for lead in (dt, 0.0):  # how far ahead the torque looks
 
-        def errors_of(points: Array, lead: float = lead) -> Array:
-            q, v, a = np.split(points, 3, axis=1)
-            tau = mid_step_torque(model, q, v, a, lead)
-            allowed = np.all(np.abs(tau) <= space.tau_max, axis=1)
-            errors = np.full((len(points), 3 * n), -np.inf)
-            errors[allowed] = zero_order_hold_error(
-                model, q[allowed], v[allowed], a[allowed], tau[allowed], dt
-            ).reshape(-1, 3 * n)
-            return errors
+    def allowed_errors(points: Array) -> Array:
+        q, v, a = np.split(points, 3, axis=1)
+        tau = mid_step_torque(model, q, v, a, dt)
+        allowed = np.all(np.abs(tau) <= space.tau_max, axis=1)
+        errors = np.full((len(points), 3 * n), -np.inf)
+        errors[allowed] = zero_order_hold_error(
+            model, q[allowed], v[allowed], a[allowed], tau[allowed], dt
+        ).reshape(-1, 3 * n)
+        return errors
 
-        # A state on the torque limit at its start may be beyond it in mid-step: keep others.
-        begin = np.concatenate([followed, points[: max(100, samples // 10)]])
-        best, worst = climb(
-            errors_of, begin, errors_of(begin), lower, upper, 1, min(rounds, 2), rng
-        )
-        acceleration, mean, position = worst.reshape(3, n)
-        q, v, a = np.split(best[:n], 3, axis=1)
-        laws.append(ZeroOrderHoldError(acceleration, mean, position, q, v, a))
+    # A state on the torque limit at its start may be beyond it in mid-step: keep others.
+    begin = np.concatenate([followed, points[: max(100, samples // 10)]])
+    errors = allowed_errors(begin)
+    best, worst = climb(allowed_errors, begin, errors, lower, upper, 1, min(rounds, 2), rng)
     jerk = fastest.reshape(-1, n).max(axis=0)
-    return DiscretisationMargin(dt, laws[0], laws[1], jerk, samples, accepted)
+    return ZeroOrderHoldError(dt, jerk, *worst.reshape(3, n), *np.split(best[:n], 3, axis=1))
 
 
 def climb(

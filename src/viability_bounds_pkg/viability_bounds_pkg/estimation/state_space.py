@@ -1,4 +1,4 @@
-"""The robot states a worst case is searched over.
+"""The box of robot states in which worst cases are searched.
 
 Shared by `acceleration_limits` (Algorithm 4 of [DelPrete2018]) and `discretisation_margin`.
 """

@@ -1,4 +1,4 @@
-"""How much slower a robot must be for its torque limits to leave every joint an interval."""
+"""Largest velocity scale at which torque leaves every joint an acceleration interval."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def largest_velocity_scale(
         )
         if found.scale == 0.0:
             break
-        # A hair below, or the states already known would be found once more.
+        # Slightly below, or the states already known would be found once more.
         scale = found.scale * (1.0 - 1e-4 if attempt else 1.0)
         scaled = StateSpace(space.q_min, space.q_max, scale * space.v_max, space.tau_max)
         *_, worst = search_refined(model, scaled, max(samples, 1), seed + attempt)

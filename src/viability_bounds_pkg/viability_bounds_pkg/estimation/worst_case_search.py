@@ -136,7 +136,7 @@ class _Tracker:
         self.history: list[HistoryEntry] = []
 
     def update(self, room: Array, q: Array, v: Array) -> None:
-        """Take in rooms, shape (batch, 2, n), of states, each of shape (batch, n)."""
+        """Compare rooms, shape (batch, 2, n), of states (batch, n) with the least."""
         self.evaluations += len(room)
         row = np.argmin(room, axis=0)
         least = np.take_along_axis(room, row[None], axis=0)[0]
@@ -267,7 +267,7 @@ def search_refined(
 
 
 class _Spent(Exception):
-    """No evaluations are left."""
+    """The evaluations allowed are used up."""
 
 
 def _descend(

@@ -1,4 +1,4 @@
-"""The bounds of one joint state after the other, compiled.
+"""Compiled evaluation of the acceleration bounds, joint by joint.
 
 One loop serves a single arm and a batch of a million states.
 """
@@ -91,7 +91,7 @@ def joint_bounds(
     low, keeps_low = _bound_towards(room_below, -v, below, curves)
     low = -low
     if low > high:
-        low = high = _settle(room_above, room_below, v, low, high, above)
+        low = high = _resolve_conflict(room_above, room_below, v, low, high, above)
     return low, high, keeps_high and keeps_low and abs(v) <= above.v_max * _WITHIN
 
 
@@ -171,10 +171,10 @@ def _end_speed(budget: float, limit: np.record, curves: NDArray[np.void]) -> flo
 
 
 @compiled(error_model="numpy")
-def _settle(
+def _resolve_conflict(
     room_above: float, room_below: float, v: float, lower: float, upper: float, limit: np.record
 ) -> float:
-    """Return the one acceleration left where the two limits contradict each other.
+    """Return the one acceleration to use where the bounds of the two limits contradict.
 
     That happens outside the kernel, or by rounding on its edge. The limit that is still kept is
     not given up for the one that is broken: a joint on its way back keeps its speed limit, and

@@ -22,6 +22,8 @@ from viability_bounds_pkg.joint_limits import (
     joint_array,
 )
 
+Array = NDArray[np.float64]
+
 
 class KernelBraking(NamedTuple):
     """Decelerations that the kernel of each joint counts on.
@@ -32,7 +34,7 @@ class KernelBraking(NamedTuple):
             is reduced or the kernel is not the one of continuous time.
     """
 
-    deceleration: NDArray[np.float64]
+    deceleration: Array
     holds: NDArray[np.bool_]
 
 
@@ -55,14 +57,10 @@ def discrete_time_condition(
     Raises:
         JointLimitsError: `dt` or `margin` is unusable in itself.
     """
-    dt = checked_step(dt)
-    margins = checked_margin(margin, limits)
-    return np.array([_holds(_joint(limits, j), dt, w) for j, w in enumerate(margins)])
+    return _holds(limits, checked_step(dt), checked_margin(margin, limits))
 
 
-def kernel_braking(
-    limits: JointLimits, dt: float, margins: NDArray[np.float64], exact: bool
-) -> KernelBraking:
+def kernel_braking(limits: JointLimits, dt: float, margins: Array, exact: bool) -> KernelBraking:
     """Return the decelerations that the kernel of each joint counts on.
 
     Args:
@@ -76,20 +74,16 @@ def kernel_braking(
     Raises:
         JointLimitsError: a margin is too large for any kernel of this form.
     """
-    decelerations, fulfilled = [], []
-    for j, w in enumerate(margins.tolist()):
-        joint = _joint(limits, j)
-        up, lo = joint.braking
-        holds = _holds(joint, dt, w)
-        pair: tuple[float, float] | None = (up - w, lo - w)
-        if not holds and not (exact and w == 0.0):
-            pair = _reduced_braking(joint, dt, w)
-        if pair is None:
+    w = margins[:, None]
+    holds = _holds(limits, dt, margins)
+    deceleration = np.stack([-limits.a_min, limits.a_max], axis=1) - w
+    for j in np.flatnonzero(~holds & ~(exact & (margins == 0.0))):
+        reduced = _reduced_braking(limits, int(j), dt, float(margins[j]))
+        if reduced is None:
             allowed = f"must be smaller, or the step of {dt:g} s shorter, to leave any kernel"
-            raise JointLimitsError("margin", limits.names[j], w, allowed)
-        decelerations.append(pair)
-        fulfilled.append(holds)
-    return KernelBraking(np.array(decelerations), np.array(fulfilled))
+            raise JointLimitsError("margin", limits.names[j], float(margins[j]), allowed)
+        deceleration[j] = reduced
+    return KernelBraking(deceleration, holds)
 
 
 def checked_step(dt: float, field: str = "dt") -> float:
@@ -107,7 +101,7 @@ def checked_step(dt: float, field: str = "dt") -> float:
     return value
 
 
-def checked_margin(margin: ArrayLike | None, limits: JointLimits) -> NDArray[np.float64]:
+def checked_margin(margin: ArrayLike | None, limits: JointLimits) -> Array:
     """Return the margin of each joint, shape (n,), rad/s^2, zeros for None.
 
     Raises:
@@ -127,52 +121,38 @@ def checked_margin(margin: ArrayLike | None, limits: JointLimits) -> NDArray[np.
     return margins
 
 
-class _Joint(NamedTuple):
-    length: float
-    v_max: float
-    braking: tuple[float, float]
-    """Towards the upper and the lower limit."""
-    ends: tuple[tuple[float, float], ...]
-    """Towards each limit that exists: braking, and braking towards the opposite one."""
-
-
-def _joint(limits: JointLimits, j: int) -> _Joint:
-    up, lo = -float(limits.a_min[j]), float(limits.a_max[j])
-    ends = []
-    if limits.q_max[j] < math.inf:
-        ends.append((up, lo))
-    if limits.q_min[j] > -math.inf:
-        ends.append((lo, up))
-    length = float(limits.q_max[j] - limits.q_min[j])
-    return _Joint(length, float(limits.v_max[j]), (up, lo), tuple(ends))
-
-
-def _holds(joint: _Joint, dt: float, w: float) -> bool:
-    if not joint.ends:
-        return w * dt <= joint.v_max
-    for braking, opposite in joint.ends:
+def _holds(limits: JointLimits, dt: float, margins: Array) -> NDArray[np.bool_]:
+    """Return whether (11) holds for full braking, shape (n,)."""
+    w = margins[:, None]
+    full = np.stack([-limits.a_min, limits.a_max], axis=1)
+    exists = np.isfinite(np.stack([limits.q_max, limits.q_min], axis=1))
+    with np.errstate(over="ignore"):  # steps of any length
         # Speed at the end of a step whose braking was needed only at its beginning.
-        back = (braking + w) * dt
-        if back > joint.v_max * (1.0 + ROUNDING):
-            return False
-        room = 0.5 * dt * back * (1.0 + (braking + w) / (opposite - w))
-        if room > joint.length * (1.0 + ROUNDING):
-            return False
-    return True
+        back = (full + w) * dt
+        room = 0.5 * dt * back * (1.0 + (full + w) / (full[:, ::-1] - w))
+    v_max, length = limits.v_max, limits.q_max - limits.q_min
+    slow = back <= (v_max * (1.0 + ROUNDING))[:, None]
+    fits = room <= (length * (1.0 + ROUNDING))[:, None]
+    bounded = ((slow & fits) | ~exists).all(axis=1)
+    return np.where(exists.any(axis=1), bounded, margins * dt <= v_max)
 
 
-def _reduced_braking(joint: _Joint, dt: float, w: float) -> tuple[float, float] | None:
-    """Return braking towards the upper and lower limit with which (11) holds, or None.
+def _reduced_braking(
+    limits: JointLimits, j: int, dt: float, w: float
+) -> tuple[float, float] | None:
+    """Return braking of joint j towards both limits with which (11) holds, or None.
 
     First the largest B for both: the position part is B^2 + (3 W - L / dt^2) B + 2 W^2 <= 0.
     Where the weaker side cannot use more, the stronger is then given what (11) leaves it, which
     only makes (11) easier for the weaker one.
     """
-    if not joint.ends:
+    q_min, q_max = float(limits.q_min[j]), float(limits.q_max[j])
+    if math.isinf(q_min) and math.isinf(q_max):
         return None
-    fastest = joint.v_max / dt - 2.0 * w
-    b = min(*joint.braking, fastest + w) - w
-    steps = joint.length / dt / dt
+    full = (-float(limits.a_min[j]), float(limits.a_max[j]))
+    fastest = float(limits.v_max[j]) / dt - 2.0 * w
+    b = min(*full, fastest + w) - w
+    steps = (q_max - q_min) / dt / dt
     spare = steps - 3.0 * w
     if spare < math.inf:
         root = spare * spare - 8.0 * w * w
@@ -188,5 +168,5 @@ def _reduced_braking(joint: _Joint, dt: float, w: float) -> tuple[float, float] 
     stronger = (
         4.0 * steps / (1.0 + math.sqrt(1.0 + 8.0 * steps / b)) if steps < math.inf else steps
     )
-    stronger = max(b, min(stronger - 2.0 * w, fastest, max(joint.braking) - w))
-    return (stronger, b) if joint.braking[0] > joint.braking[1] else (b, stronger)
+    stronger = max(b, min(stronger - 2.0 * w, fastest, max(full) - w))
+    return (stronger, b) if full[0] > full[1] else (b, stronger)

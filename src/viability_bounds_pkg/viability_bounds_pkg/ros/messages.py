@@ -15,7 +15,6 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
-from viability_bounds_pkg.kernel.array_checks import both_finite
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import DIAGNOSTICS
 
@@ -83,7 +82,6 @@ class JointStateReader:
         self.stamp = -1
         self.refused: Counter[str] = Counter()
         self._joints = tuple(joints)
-        both_finite(self.q, self.v)  # compiled now, not when the first message comes
         self._guard = StampGuard(reset_after)
         self._names: list[str] | None = None
         self._index: NDArray[np.intp] | None = None
@@ -105,7 +103,7 @@ class JointStateReader:
         q, v = np.array(message.position), np.array(message.velocity)
         if self._index is not None:
             q, v = q[self._index], v[self._index]
-        if not both_finite(q, v):
+        if not (np.isfinite(q).all() and np.isfinite(v).all()):
             return self._refuse("not finite")
         if verdict is Verdict.REPEAT:
             if np.array_equal(q, self.q) and np.array_equal(v, self.v):

@@ -1,4 +1,4 @@
-"""Whether the motors can brake an arm from wherever the next step may leave it.
+"""Checks that the motors can brake an arm from every state the next step may reach.
 
 `state_dependent_limits` lets joints be faster than the worst-case braking allows. That is safe as
 long as there is a way out: a braking path, each joint slowing down at a constant rate from the
