@@ -14,10 +14,11 @@ from figure import Figure
 from paper1_integral import hand
 
 from sim_bridge.bullet.obstacles import Obstacle
-from torque_safety_controller.tasks.pose_trajectory import PoseTrajectory, circle
+from viability_bounds_pkg.pose_trajectory import PoseTrajectory, circle
 
 # Where a circle of 0.4 m in the y-z plane stays far from all limits for several turns.
 START = [-0.33, 0.22, -1.06, 1.44, 0.08, -1.43, 0.67, -0.21, 0.04]  # rad
+PLANE = [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]  # from the lowest point towards y
 DIAMETER, PERIOD, TURNS = 0.4, 8.0, 3  # m, s
 SETTLING = 0.5  # s
 _SIDE = np.sqrt(0.5)
@@ -88,7 +89,9 @@ def draw(
     for pole in poles:
         loop.robot.add_obstacle(pole)
     loop.run(SETTLING)
-    trajectory = PoseTrajectory(circle(loop.pose(), DIAMETER, period, turns))
+    trajectory = PoseTrajectory(
+        circle(loop.pose(), 0.5 * DIAMETER, PLANE, period=period, turns=turns)
+    )
     begin = loop.t
     due = sorted((switches or {}).items())
     goals, forces, touched = [], [], set()

@@ -13,7 +13,7 @@ from direct import DirectLoop
 from figure import Figure, verdict
 
 from sim_bridge.bullet.obstacles import Obstacle
-from torque_safety_controller.tasks.pose_trajectory import PoseTrajectory, TrajectoryPoint
+from viability_bounds_pkg.pose_trajectory import PoseTrajectory, TrajectoryPoint
 
 DUAL = {"integral_action": "task", "dual_compliance": True}
 PULL = np.array([20.0, 0.0, 0.0])  # N
@@ -236,12 +236,11 @@ def press(
     x, y, z = start.translation
     table = (x, y, z - hand.reach - GAP - 0.05)
     loop.robot.add_obstacle(Obstacle("table", "box", (0.2, 0.6, 0.1), table, (0.0, 0.0, 0.0, 1.0)))
-    rest = np.zeros(6)
     end = pin.SE3(start.rotation, start.translation + SLIDE)
     way = PoseTrajectory(
         [
-            TrajectoryPoint(0.0, start, rest, rest),
-            TrajectoryPoint(slide[1] - slide[0], end, rest, rest),
+            TrajectoryPoint(0.0, start),
+            TrajectoryPoint(slide[1] - slide[0], end),
         ]
     )
     rows = []

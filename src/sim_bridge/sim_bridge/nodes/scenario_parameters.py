@@ -1,58 +1,30 @@
-"""The scenario node's parameters: the table, and their checks."""
+"""The scenario node's parameters and their checks."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
+from sim_bridge.nodes.arm_parameters import ARM_TABLE, arm_settings
 from sim_bridge.scenario.events import PostureGoal, WrenchGoal
 from sim_bridge.scenario.fields import ScenarioError
-from sim_bridge.scenario.scenario import Scenario, load_scenario
+from sim_bridge.scenario.scenario import ScenarioConfiguration, load_scenario
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.ros.parameters import Parameter, joint_names, positive
-from viability_bounds_pkg.ros.robot_parameters import (
-    ROBOT_TABLE,
-    all_positive,
-    locked_joints,
-    position_limits,
-    robot_urdf,
-)
 
 TABLE = (
     Parameter("robot_name", str, "what the report calls the robot", default="robot"),
-    *ROBOT_TABLE,
+    *ARM_TABLE,
     Parameter("base_frame", str, "frame of pose goals"),
     Parameter("end_effector_frame", str, "frame that pose goals move"),
-    Parameter("velocity_max", list[float], "speed limits, rad/s"),
-    Parameter("scenario", str, "YAML file that says what happens when"),
+    Parameter("scenario", str, "YAML file with the events"),
     Parameter(
         "ready_timeout",
         float,
-        "how long the other nodes may take to be there, s; at their first start they compile",
+        "time in which the other nodes must start, s; at their first start they compile",
         default=180.0,
     ),
 )
-
-
-@dataclass(frozen=True)
-class ScenarioConfiguration:
-    """Checked parameters of the scenario node."""
-
-    name: str
-    urdf: str
-    joints: tuple[str, ...]
-    locked: dict[str, float]
-    base_frame: str
-    end_effector_frame: str
-    q_min: np.ndarray
-    q_max: np.ndarray
-    v_max: np.ndarray
-    tau_max: np.ndarray
-    scenario: Scenario
-    ready_timeout: float
 
 
 def make_configuration(values: Mapping[str, Any]) -> ScenarioConfiguration:
@@ -79,18 +51,11 @@ def make_configuration(values: Mapping[str, Any]) -> ScenarioConfiguration:
                 f"one in those of {event.frame!r}"
             )
             raise SettingError("scenario", values["scenario"], allowed)
-    q_min, q_max = position_limits(values, joints)
     return ScenarioConfiguration(
+        **arm_settings(values),
         name=values["robot_name"],
-        urdf=robot_urdf(values),
-        joints=joints,
-        locked=locked_joints(values),
         base_frame=values["base_frame"],
         end_effector_frame=values["end_effector_frame"],
-        q_min=q_min,
-        q_max=q_max,
-        v_max=all_positive(values, "velocity_max", joints),
-        tau_max=all_positive(values, "torque_max", joints),
         scenario=scenario,
         ready_timeout=positive(values, "ready_timeout"),
     )

@@ -1,12 +1,12 @@
-"""A motion from which the friction of every joint can be told, whatever the masses are.
+"""A motion from which the friction of every joint can be identified, independent of masses.
 
 All joints move at once, in parts of whole periods of cosines,
 
     q_i(t) = q_start_i + (A_i / 2) (1 - cos(2 pi k_i t / T)),
 
-which begin and end at rest. Played backward each part is the same motion: every state of the arm
-is passed with each velocity and its opposite, at the same acceleration. What rigid bodies need is
-then the same and friction the opposite.
+which begin and end at rest. Each part is symmetric in time: every configuration is passed with a
+velocity and its opposite, at the same acceleration. The torques of rigid-body dynamics are then
+equal, those of friction opposite.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ PARTS = ((10.0, 0.04, np.inf), (16.0, 0.15, np.inf), (10.0, np.inf, 1.0))
 """Duration T, s; greatest speed, rad/s; and greatest frequency, 1/s."""
 
 ROOM = 0.9
-"""Share of the way to a position limit that is used."""
+"""Share of the distance to a position limit that is used."""
 
 
 class ExcitationError(ArmSafetyError, ValueError):
-    """The joints have no room for the motion."""
+    """The motion does not fit into the limits of the joints."""
 
 
 def excitation(
@@ -47,7 +47,7 @@ def excitation(
 
     Args:
         joints: names of the n joints.
-        q_start: where it begins and ends, shape (n,), rad.
+        q_start: positions at start and end, shape (n,), rad.
         q_min: lower position limits, shape (n,), rad; may be -inf.
         q_max: upper position limits, shape (n,), rad; may be inf.
         v_max: velocity limits, shape (n,), rad/s.
@@ -56,7 +56,7 @@ def excitation(
         speed: greatest share of `v_max`.
 
     Raises:
-        ExcitationError: a joint starts outside its limits or hardly can move.
+        ExcitationError: a joint starts outside its limits or too near to both.
     """
     room = np.maximum(q_max - q_start, q_start - q_min)
     for joint, q, low, high, most in zip(joints, q_start, q_min, q_max, room, strict=True):

@@ -334,7 +334,7 @@ def test_a_push_moves_it_until_it_times_out(ros):
     robot.step(times=24)
     assert np.abs(robot.v).max() > 1e-3
     robot.step(times=10)
-    assert not robot.node._world.pushed
+    assert not robot.node._world.wrench_ends
     speeds = [np.abs(np.array(s.velocity)).max() for s in robot.states[-5:]]
     assert max(speeds) - min(speeds) < 1e-3  # nothing pushes any more
 
@@ -346,7 +346,7 @@ def test_a_new_push_takes_the_place_of_the_old_on_its_link(ros):
     robot.step(times=10)
     speed = np.abs(robot.v).max()
     assert speed > 1e-3
-    assert set(robot.node._world.pushed) == {"panda_link4", "panda_link6"}
+    assert set(robot.node._world.wrench_ends) == {"panda_link4", "panda_link6"}
     robot.push("panda_link4", 0.0)
     robot.push("panda_link6", -1.0)  # what the other has done
     robot.step(times=10)

@@ -15,12 +15,12 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.tasks.pose_trajectory import (
+from viability_bounds_pkg.exceptions import ArmSafetyError
+from viability_bounds_pkg.pose_trajectory import (
     PoseTrajectory,
     TrajectoryError,
     TrajectoryPoint,
 )
-from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, stamp_to_ns
 
 _QUATERNION_TOLERANCE = 1e-3
