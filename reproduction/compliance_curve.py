@@ -8,10 +8,16 @@ from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
-from compliance_push import MODES, ROBOT, off, within_limits
-from direct import DirectLoop, Sample, column
+from compliance_push import MODES, ROBOT
+from direct import (
+    DirectLoop,
+    Sample,
+    column,
+    hand_errors,
+    hand_places,
+    within_limits,
+)
 from figure import Figure
-from paper1_integral import hand
 
 from sim_bridge.bullet.obstacles import Obstacle
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory, circle
@@ -110,7 +116,7 @@ def draw(
     return Drawn(
         samples,
         np.array(goals),
-        hand(loop, samples),
+        hand_places(loop, samples),
         np.array(forces),
         frozenset(touched),
         loop,
@@ -119,7 +125,7 @@ def draw(
 
 def judge(run: Drawn) -> dict[str, float]:
     """Return what a run amounts to."""
-    place, turn = off(run.samples)
+    place, turn = hand_errors(run.samples)
     touching = run.forces > 0.0
     result = {
         "hand_m": float(place.max()),
@@ -300,7 +306,7 @@ def switching() -> Figure:
     figure = Figure("paper1-switching")
     run = draw({"integral_action": "joints"}, turns=1, period=6.0, switches=SWITCHES)
     found = steps_at(run, SWITCHES)
-    place, _ = off(run.samples)
+    place, _ = hand_errors(run.samples)
     at, beside = (max(values) for values in zip(*found, strict=True))
     figure.metrics = {
         "largest_step_share": at,

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import matplotlib.pyplot as plt
 import numpy as np
 import pinocchio as pin
-from compliance_push import ELBOW, HAND, RAMP, ROBOT, within_limits
-from direct import DirectLoop
+from compliance_push import ELBOW, HAND, RAMP, ROBOT
+from direct import DirectLoop, within_limits
 from figure import Figure, verdict
 
 from sim_bridge.bullet.obstacles import Obstacle
@@ -23,7 +23,7 @@ FORCE = 10.0  # N
 GAP = 0.005  # m, from the fingertips to the table
 
 
-class Hand(NamedTuple):
+class PressingHand(NamedTuple):
     """A hand that points down, to press with."""
 
     robot: str
@@ -35,14 +35,14 @@ class Hand(NamedTuple):
     """Of the fingertips from the end effector's frame, m."""
 
 
-PANDA = Hand(
+PANDA = PressingHand(
     "panda",
     {"pose_kp": 400.0, "pose_kd": 40.0, "integral_action": "task", "integral_lambda": 50.0},
     1.0,
     0.1129,
 )
 # By inverse kinematics, in the middle of its ranges; with its friction known and compensated.
-TALOS = Hand(
+TALOS = PressingHand(
     ROBOT,
     {
         "integral_action": "task",
@@ -227,7 +227,7 @@ class Pressed(NamedTuple):
 
 
 def press(
-    hand: Hand = PANDA, duration: float = 7.5, slide: tuple[float, float] = (3.0, 6.0)
+    hand: PressingHand = PANDA, duration: float = 7.5, slide: tuple[float, float] = (3.0, 6.0)
 ) -> Pressed:
     """Let a hand find a table, press on it and slide along it."""
     loop = DirectLoop(hand.robot, hand.changed)

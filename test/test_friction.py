@@ -43,7 +43,7 @@ def found():
     )
     with closing(bullet_parameters.make_robot(config, values)) as robot:
         recorded, monitor = record(robot, config, *motion)
-    assert monitor.first_violation_step is None
+    assert not monitor.violated
     model = read_robot(CONFIG / f"{ROBOT}.yaml").model
     fits = list(identify(model, Recording(**recorded)))
     assert [fit.notes for fit in fits] == [[]] * N

@@ -1,4 +1,4 @@
-"""The robot node's parameters, their checks, and the robot made from them."""
+"""The robot node's parameters: the table, their checks, and the robot made of them."""
 
 from __future__ import annotations
 
@@ -8,26 +8,35 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from sim_bridge.bullet.joint_friction import DEFAULT_STRIBECK_VELOCITY, JointFriction
 from sim_bridge.bullet.obstacles import ContactMaterial
 from sim_bridge.bullet.robot import BulletRobot
-from sim_bridge.nodes.arm_parameters import ARM_TABLE, arm_settings
 from sim_bridge.nodes.ft_sensor import SENSOR_TABLE, SensorConfiguration, sensor_configuration
 from sim_bridge.urdf.arm import ConfiguredArm
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import RobotDescriptionError
-from viability_bounds_pkg.ros.parameters import Parameter, per_joint, positive
-from viability_bounds_pkg.ros.robot_parameters import all_positive, not_negative
-
-Array = NDArray[np.float64]
+from viability_bounds_pkg.ros.parameters import (
+    Parameter,
+    joint_names,
+    per_joint,
+    positive,
+)
+from viability_bounds_pkg.ros.robot_parameters import (
+    ROBOT_TABLE,
+    all_positive,
+    locked_joints,
+    not_negative,
+    position_limits,
+    robot_urdf,
+)
 
 CLOCKS = ("real_time", "lockstep")
 _MATERIAL = ContactMaterial()
 
 TABLE = (
-    *ARM_TABLE,
+    *ROBOT_TABLE,
+    Parameter("velocity_max", list[float], "speed limits that are watched, rad/s"),
     Parameter("start_positions", list[float], "positions at start and after reset, rad"),
     Parameter("rate_hz", float, "rate of the control loop, Hz"),
     Parameter("physics_step_max", float, "longest physics step, s", default=0.001),
@@ -35,14 +44,14 @@ TABLE = (
     Parameter(
         "command_timeout",
         int,
-        "control periods without a new command before the robot brakes",
+        "control periods that the last command is held for before the robot brakes",
         default=5,
     ),
     Parameter("start_paused", bool, "wait for the pause service before moving", default=False),
     Parameter(
         "pause_after",
         float,
-        "robot time after which it pauses by itself, s from the start of motion; 0: never",
+        "robot time after which it pauses by itself, s since it began to move; 0: never",
         default=0.0,
         live=True,
     ),
@@ -68,28 +77,27 @@ TABLE = (
     Parameter(
         "stribeck_velocity",
         list[float],
-        "speed at which 1/e of the difference from static to Coulomb friction is left, rad/s; "
+        "speed at which static has become Coulomb friction but for 1/e of the difference, rad/s; "
         f"{DEFAULT_STRIBECK_VELOCITY} if empty",
         default=np.zeros(0),
     ),
     Parameter(
         "torque_bias",
         list[float],
-        "error of the motors' torque, neither commanded nor reported, N m; none if empty",
+        "torque that the motors give beyond what they are told and report, N m; none if empty",
         default=np.zeros(0),
     ),
-    Parameter("mass_scale_links", list[str], "links with scaled mass and inertia", default=()),
+    Parameter(
+        "mass_scale_links", list[str], "links that weigh other than the URDF says", default=()
+    ),
     Parameter(
         "mass_scales",
         list[float],
-        "factors for the masses and inertias of these links",
+        "factors for their masses and inertias",
         default=np.zeros(0),
     ),
     Parameter(
-        "external_wrench_timeout",
-        float,
-        "duration of an external wrench, s of robot time",
-        default=0.5,
+        "external_wrench_timeout", float, "how long a push lasts, s of robot time", default=0.5
     ),
     Parameter(
         "obstacle_friction",
@@ -100,13 +108,13 @@ TABLE = (
     Parameter(
         "obstacle_stiffness",
         float,
-        "stiffness of an obstacle as a whole, N/m",
+        "how much an obstacle resists being pressed, N/m",
         default=_MATERIAL.stiffness,
     ),
     Parameter(
         "obstacle_damping",
         float,
-        "damping of an obstacle as a whole, N s/m",
+        "the same of the speed of being pressed, N s/m",
         default=_MATERIAL.damping,
     ),
     *SENSOR_TABLE,
@@ -119,7 +127,7 @@ class BulletConfiguration(ConfiguredArm):
 
     joint_friction: JointFriction
     mass_scales: dict[str, float]
-    q_start: Array
+    q_start: np.ndarray
     dt: float
     substeps: int
     lockstep: bool
@@ -138,18 +146,25 @@ def make_configuration(values: Mapping[str, Any]) -> BulletConfiguration:
     Raises:
         SettingError: a value cannot be used.
     """
-    arm = arm_settings(values)
-    joints = arm["joints"]
+    joints = joint_names(values)
+    urdf = robot_urdf(values)
     if values["clock"] not in CLOCKS:
         raise SettingError("clock", values["clock"], f"one of {', '.join(CLOCKS)}")
     if values["command_timeout"] < 1:
         raise SettingError("command_timeout", values["command_timeout"], "at least 1")
     dt = 1.0 / positive(values, "rate_hz")
+    q_min, q_max = position_limits(values, joints)
     q_start = per_joint(values, "start_positions", joints)
     if not np.isfinite(q_start).all():
         raise SettingError("start_positions", q_start, "finite numbers")
     return BulletConfiguration(
-        **arm,
+        urdf=urdf,
+        joints=joints,
+        locked=locked_joints(values),
+        q_min=q_min,
+        q_max=q_max,
+        v_max=all_positive(values, "velocity_max", joints),
+        tau_max=all_positive(values, "torque_max", joints),
         joint_friction=_joint_friction(values, joints),
         mass_scales=_mass_scales(values),
         q_start=q_start,
@@ -178,7 +193,7 @@ def _joint_friction(values: Mapping[str, Any], joints: tuple[str, ...]) -> Joint
         static = not_negative(values, "friction_static", joints)
         if not (static >= coulomb).all():
             raise SettingError("friction_static", static, "at least friction_coulomb everywhere")
-    stribeck: ArrayLike = DEFAULT_STRIBECK_VELOCITY
+    stribeck: Any = DEFAULT_STRIBECK_VELOCITY
     if len(values["stribeck_velocity"]):
         stribeck = all_positive(values, "stribeck_velocity", joints)
     bias = values["torque_bias"]

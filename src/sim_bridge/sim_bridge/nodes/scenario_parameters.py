@@ -5,23 +5,30 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from sim_bridge.nodes.arm_parameters import ARM_TABLE, arm_settings
 from sim_bridge.scenario.events import PostureGoal, WrenchGoal
 from sim_bridge.scenario.fields import ScenarioError
 from sim_bridge.scenario.scenario import ScenarioConfiguration, load_scenario
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.ros.parameters import Parameter, joint_names, positive
+from viability_bounds_pkg.ros.robot_parameters import (
+    ROBOT_TABLE,
+    all_positive,
+    locked_joints,
+    position_limits,
+    robot_urdf,
+)
 
 TABLE = (
     Parameter("robot_name", str, "what the report calls the robot", default="robot"),
-    *ARM_TABLE,
+    *ROBOT_TABLE,
     Parameter("base_frame", str, "frame of pose goals"),
     Parameter("end_effector_frame", str, "frame that pose goals move"),
-    Parameter("scenario", str, "YAML file with the events"),
+    Parameter("velocity_max", list[float], "speed limits, rad/s"),
+    Parameter("scenario", str, "YAML file that says what happens when"),
     Parameter(
         "ready_timeout",
         float,
-        "time in which the other nodes must start, s; at their first start they compile",
+        "how long the other nodes may take to be there, s; at their first start they compile",
         default=180.0,
     ),
 )
@@ -51,11 +58,18 @@ def make_configuration(values: Mapping[str, Any]) -> ScenarioConfiguration:
                 f"one in those of {event.frame!r}"
             )
             raise SettingError("scenario", values["scenario"], allowed)
+    q_min, q_max = position_limits(values, joints)
     return ScenarioConfiguration(
-        **arm_settings(values),
         name=values["robot_name"],
+        urdf=robot_urdf(values),
+        joints=joints,
+        locked=locked_joints(values),
         base_frame=values["base_frame"],
         end_effector_frame=values["end_effector_frame"],
+        q_min=q_min,
+        q_max=q_max,
+        v_max=all_positive(values, "velocity_max", joints),
+        tau_max=all_positive(values, "torque_max", joints),
         scenario=scenario,
         ready_timeout=positive(values, "ready_timeout"),
     )

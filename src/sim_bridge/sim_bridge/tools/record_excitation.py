@@ -100,7 +100,7 @@ def _run(options: argparse.Namespace) -> int:
             f"limits were broken by {names}: move less far or less fast; nothing written"
         )
     file = io.BytesIO()
-    np.savez_compressed(file, **recorded)
+    np.savez_compressed(file, joints=np.array(config.joints), **recorded)
     write_whole(options.output, file.getvalue())
     print(
         f"{recorded['t'][-1]:.0f} s of motion written to {options.output}; torque at most "
@@ -129,7 +129,6 @@ def record(
         robot.move(q_des, v_des, config.tau_max, config.v_max, config.substeps)
         states.append(robot.state())
     recorded = {
-        "joints": np.array(config.joints),
         "t": config.dt * np.arange(1, len(q) + 1),
         "q": np.array([state.q for state in states]),
         "v": np.array([state.v for state in states]),

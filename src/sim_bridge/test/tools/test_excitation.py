@@ -168,12 +168,12 @@ def test_what_cannot_be_done_is_told_in_one_line(call, tmp_path, arguments, code
 INTERRUPTIBLE = """
 import os, signal, sys
 from sim_bridge.tools import record_excitation as tool
-class Robot(tool.BulletRobot):
+class InterruptedRobot(tool.BulletRobot):
     def move(self, *arguments):
         os.kill(os.getpid(), signal.SIGINT)
         super().move(*arguments)
 from sim_bridge.nodes import bullet_parameters
-bullet_parameters.BulletRobot = Robot
+bullet_parameters.BulletRobot = InterruptedRobot
 sys.exit(tool.main())
 """
 
