@@ -33,14 +33,7 @@ def found():
     values = {row.name: row.coerce(GIVEN.get(row.name)) for row in bullet_parameters.TABLE}
     config = bullet_parameters.make_configuration(values)
     assert set(GIVEN["mass_scales"]) == {1.1}
-    motion = excitation(
-        config.joints,
-        config.q_start,
-        config.q_min,
-        config.q_max,
-        config.v_max,
-        config.dt,
-    )
+    motion = excitation(config, config.q_start, config.dt)
     with closing(bullet_parameters.make_robot(config, values)) as robot:
         recorded, monitor = record(robot, config, *motion)
     assert not monitor.violated

@@ -11,11 +11,10 @@ equal, those of friction opposite.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_bridge.urdf.arm import ConfiguredArm
 from viability_bounds_pkg.exceptions import ArmSafetyError
 
 Array = NDArray[np.float64]
@@ -32,11 +31,8 @@ class ExcitationError(ArmSafetyError, ValueError):
 
 
 def excitation(
-    joints: Sequence[str],
+    arm: ConfiguredArm,
     q_start: Array,
-    q_min: Array,
-    q_max: Array,
-    v_max: Array,
     dt: float,
     amplitude: float = 0.6,
     speed: float = 0.5,
@@ -46,20 +42,18 @@ def excitation(
     Each joint moves to the side on which it has more room.
 
     Args:
-        joints: names of the n joints.
+        arm: its n joints and their limits; position limits may be infinite.
         q_start: positions at start and end, shape (n,), rad.
-        q_min: lower position limits, shape (n,), rad; may be -inf.
-        q_max: upper position limits, shape (n,), rad; may be inf.
-        v_max: velocity limits, shape (n,), rad/s.
         dt: period, s.
         amplitude: greatest A, rad.
-        speed: greatest share of `v_max`.
+        speed: greatest share of the velocity limits.
 
     Raises:
         ExcitationError: a joint starts outside its limits or too near to both.
     """
+    q_min, q_max, v_max = arm.q_min, arm.q_max, arm.v_max
     room = np.maximum(q_max - q_start, q_start - q_min)
-    for joint, q, low, high, most in zip(joints, q_start, q_min, q_max, room, strict=True):
+    for joint, q, low, high, most in zip(arm.joints, q_start, q_min, q_max, room, strict=True):
         if not low <= q <= high:
             raise ExcitationError(f"joint {joint} starts at {q:g}, outside its limits")
         if ROOM * most < 0.05:

@@ -79,16 +79,7 @@ def _run(options: argparse.Namespace) -> int:
     given = node_parameters(options.parameters, "/**/bullet_node")
     values = {row.name: row.coerce(given.get(row.name)) for row in TABLE}
     config = make_configuration(values)
-    motion = excitation(
-        config.joints,
-        config.q_start,
-        config.q_min,
-        config.q_max,
-        config.v_max,
-        config.dt,
-        options.amplitude,
-        options.speed,
-    )
+    motion = excitation(config, config.q_start, config.dt, options.amplitude, options.speed)
     with closing(make_robot(config, values)) as robot:
         recorded, monitor = record(robot, config, *motion)
     broken = np.flatnonzero(
