@@ -17,7 +17,7 @@ from rclpy.parameter import Parameter
 from sim_bridge.nodes.bullet_node import BulletNode
 from sim_bridge.nodes.scenario_node import ScenarioNode
 from sim_bridge.nodes.scenario_play import play
-from sim_bridge.scenario.recording import Run
+from sim_bridge.scenario.recording import RecordedRun
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 
@@ -33,7 +33,7 @@ class ChainResult:
         robot: the robot's last diagnostics, by key: it saw every physics step.
     """
 
-    run: Run
+    run: RecordedRun
     robot: dict[str, str]
 
     def vector(self, key: str) -> np.ndarray:

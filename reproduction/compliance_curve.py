@@ -8,16 +8,23 @@ from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
-from compliance_push import MODES, ROBOT, off, within_limits
-from direct import DirectLoop, Sample, column
+from compliance_push import MODES, ROBOT
+from direct import (
+    DirectLoop,
+    Sample,
+    column,
+    hand_errors,
+    hand_places,
+    within_limits,
+)
 from figure import Figure
-from paper1_integral import hand
 
 from sim_bridge.bullet.obstacles import Obstacle
-from torque_safety_controller.tasks.pose_trajectory import PoseTrajectory, circle
+from viability_bounds_pkg.pose_trajectory import PoseTrajectory, circle
 
 # Where a circle of 0.4 m in the y-z plane stays far from all limits for several turns.
 START = [-0.33, 0.22, -1.06, 1.44, 0.08, -1.43, 0.67, -0.21, 0.04]  # rad
+PLANE = [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]  # from the lowest point towards y
 DIAMETER, PERIOD, TURNS = 0.4, 8.0, 3  # m, s
 SETTLING = 0.5  # s
 _SIDE = np.sqrt(0.5)
@@ -88,7 +95,9 @@ def draw(
     for pole in poles:
         loop.robot.add_obstacle(pole)
     loop.run(SETTLING)
-    trajectory = PoseTrajectory(circle(loop.pose(), DIAMETER, period, turns))
+    trajectory = PoseTrajectory(
+        circle(loop.pose(), 0.5 * DIAMETER, PLANE, period=period, turns=turns)
+    )
     begin = loop.t
     due = sorted((switches or {}).items())
     goals, forces, touched = [], [], set()
@@ -107,7 +116,7 @@ def draw(
     return Drawn(
         samples,
         np.array(goals),
-        hand(loop, samples),
+        hand_places(loop, samples),
         np.array(forces),
         frozenset(touched),
         loop,
@@ -116,7 +125,7 @@ def draw(
 
 def judge(run: Drawn) -> dict[str, float]:
     """Return what a run amounts to."""
-    place, turn = off(run.samples)
+    place, turn = hand_errors(run.samples)
     touching = run.forces > 0.0
     result = {
         "hand_m": float(place.max()),
@@ -297,7 +306,7 @@ def switching() -> Figure:
     figure = Figure("paper1-switching")
     run = draw({"integral_action": "joints"}, turns=1, period=6.0, switches=SWITCHES)
     found = steps_at(run, SWITCHES)
-    place, _ = off(run.samples)
+    place, _ = hand_errors(run.samples)
     at, beside = (max(values) for values in zip(*found, strict=True))
     figure.metrics = {
         "largest_step_share": at,

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import matplotlib.pyplot as plt
 import numpy as np
 import pinocchio as pin
-from compliance_push import ELBOW, HAND, RAMP, ROBOT, within_limits
-from direct import DirectLoop
+from compliance_push import ELBOW, HAND, RAMP, ROBOT
+from direct import DirectLoop, within_limits
 from figure import Figure, verdict
 
 from sim_bridge.bullet.obstacles import Obstacle
-from torque_safety_controller.tasks.pose_trajectory import PoseTrajectory, TrajectoryPoint
+from viability_bounds_pkg.pose_trajectory import PoseTrajectory, TrajectoryPoint
 
 DUAL = {"integral_action": "task", "dual_compliance": True}
 PULL = np.array([20.0, 0.0, 0.0])  # N
@@ -23,7 +23,7 @@ FORCE = 10.0  # N
 GAP = 0.005  # m, from the fingertips to the table
 
 
-class Hand(NamedTuple):
+class PressingHand(NamedTuple):
     """A hand that points down, to press with."""
 
     robot: str
@@ -35,14 +35,14 @@ class Hand(NamedTuple):
     """Of the fingertips from the end effector's frame, m."""
 
 
-PANDA = Hand(
+PANDA = PressingHand(
     "panda",
     {"pose_kp": 400.0, "pose_kd": 40.0, "integral_action": "task", "integral_lambda": 50.0},
     1.0,
     0.1129,
 )
 # By inverse kinematics, in the middle of its ranges; with its friction known and compensated.
-TALOS = Hand(
+TALOS = PressingHand(
     ROBOT,
     {
         "integral_action": "task",
@@ -227,7 +227,7 @@ class Pressed(NamedTuple):
 
 
 def press(
-    hand: Hand = PANDA, duration: float = 7.5, slide: tuple[float, float] = (3.0, 6.0)
+    hand: PressingHand = PANDA, duration: float = 7.5, slide: tuple[float, float] = (3.0, 6.0)
 ) -> Pressed:
     """Let a hand find a table, press on it and slide along it."""
     loop = DirectLoop(hand.robot, hand.changed)
@@ -236,12 +236,11 @@ def press(
     x, y, z = start.translation
     table = (x, y, z - hand.reach - GAP - 0.05)
     loop.robot.add_obstacle(Obstacle("table", "box", (0.2, 0.6, 0.1), table, (0.0, 0.0, 0.0, 1.0)))
-    rest = np.zeros(6)
     end = pin.SE3(start.rotation, start.translation + SLIDE)
     way = PoseTrajectory(
         [
-            TrajectoryPoint(0.0, start, rest, rest),
-            TrajectoryPoint(slide[1] - slide[0], end, rest, rest),
+            TrajectoryPoint(0.0, start),
+            TrajectoryPoint(slide[1] - slide[0], end),
         ]
     )
     rows = []

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cache
 from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pinocchio as pin
-from direct import DirectLoop, Sample, column
+from direct import DirectLoop, Sample, column, hand_errors, within_limits
 from figure import Figure
 
 ROBOT = "talos_left_arm"
@@ -25,7 +25,7 @@ ACTIVE = {"friction_compensation": 0.7, "friction_theta": 100.0, "friction_gain"
 """70% of the friction compensated in the direction of motion: docs/friction.md, "Which theta?"."""
 
 
-class Push(NamedTuple):
+class TimedForce(NamedTuple):
     """A force on a link for some time."""
 
     name: str
@@ -42,7 +42,7 @@ class Pushed(NamedTuple):
     """What pushes did to an arm."""
 
     samples: tuple[Sample, ...]
-    pushes: tuple[Push, ...]
+    pushes: tuple[TimedForce, ...]
     loop: DirectLoop
 
     @property
@@ -56,30 +56,14 @@ class Pushed(NamedTuple):
         q = column(self.samples, "q")
         return q - q[0]
 
-    def during(self, push: Push, rest: float = 0.0) -> slice:
+    def during(self, push: TimedForce, rest: float = 0.0) -> slice:
         """Return the steps of a push and some seconds more."""
         first = round(push.begin / self.loop.dt)
         return slice(first, round((push.end + rest) / self.loop.dt))
 
-    def named(self, *names: str) -> list[Push]:
+    def named(self, *names: str) -> list[TimedForce]:
         """Return the pushes whose names begin with one of `names`."""
         return [push for push in self.pushes if push.name.startswith(names)]
-
-
-def off(samples: Sequence[Sample]) -> tuple[np.ndarray, np.ndarray]:
-    """Return how far the hand was off its goal at each step, m and rad, shape (N,) each."""
-    error = column(tuple(samples), "error")
-    return np.linalg.norm(error[:, :3], axis=1), np.linalg.norm(error[:, 3:], axis=1)
-
-
-def within_limits(loop: DirectLoop) -> bool:
-    """Return whether no joint passed a limit of position, speed or torque in the simulator."""
-    monitor = loop.robot.monitor
-    return (
-        not monitor.max_position_violation.any()
-        and not monitor.max_velocity_violation.any()
-        and monitor.max_torque_ratio.max() <= 1.0 + 1e-9
-    )
 
 
 def weakest_direction(loop: DirectLoop, link: str) -> tuple[np.ndarray, float]:
@@ -110,8 +94,8 @@ def weakest_direction(loop: DirectLoop, link: str) -> tuple[np.ndarray, float]:
 
 def course(
     loop: DirectLoop, hand: float, elbow: float, axes: str = "xyz", held: float = 1.5
-) -> tuple[Push, ...]:
-    """Return pushes on the hand, in both directions along each axis, and then on the elbow.
+) -> tuple[TimedForce, ...]:
+    """Return pushes on the hand, there and back along each axis, and then on the elbow.
 
     Args:
         loop: the arm.
@@ -125,11 +109,11 @@ def course(
     for axis in axes if hand else "":
         for sign, name in ((1.0, "+"), (-1.0, "-")):
             force = sign * hand * np.eye(3)["xyz".index(axis)]
-            pushes.append(Push(f"{name}{axis}", HAND, force, t, t + held))
+            pushes.append(TimedForce(f"{name}{axis}", HAND, force, t, t + held))
             t += held + pause
     direction, _ = weakest_direction(loop, ELBOW)
     for sign, name in ((1.0, "elbow"), (-1.0, "elbow, back")):
-        pushes.append(Push(name, ELBOW, sign * elbow * direction, t, t + 2.0 * held))
+        pushes.append(TimedForce(name, ELBOW, sign * elbow * direction, t, t + 2.0 * held))
         t += 2.0 * held + pause
     return tuple(pushes)
 
@@ -159,7 +143,7 @@ def push(
 
 def judge(run: Pushed) -> dict[str, float]:
     """Return what a run amounts to: motion of the null space, and what the hand did."""
-    place, turn = off(run.samples)
+    place, turn = hand_errors(run.samples)
     pushes = run.named("elbow")
     elbow = slice(run.during(pushes[0]).start, len(run.samples))
     moved = np.abs(run.angles[elbow] - run.angles[elbow][0]).max(axis=0)

@@ -6,7 +6,7 @@ runs in which something is to happen at an exact step, and for many of them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -187,3 +187,30 @@ class DirectLoop:
 def column(samples: tuple[Sample, ...], name: str) -> np.ndarray:
     """Return one field of all samples as an array."""
     return np.array([getattr(sample, name) for sample in samples])
+
+
+def hand_places(loop: DirectLoop, samples: tuple[Sample, ...]) -> np.ndarray:
+    """Return where the hand was, shape (N, 3), m."""
+    data = loop.model.createData()
+    frame = loop.model.getFrameId(loop.controller.robot.frame)
+    places = np.empty((len(samples), 3))
+    for k, sample in enumerate(samples):
+        pin.framesForwardKinematics(loop.model, data, sample.q)
+        places[k] = data.oMf[frame].translation
+    return places
+
+
+def hand_errors(samples: Sequence[Sample]) -> tuple[np.ndarray, np.ndarray]:
+    """Return how far the hand was off its goal at each step, m and rad, shape (N,) each."""
+    error = column(tuple(samples), "error")
+    return np.linalg.norm(error[:, :3], axis=1), np.linalg.norm(error[:, 3:], axis=1)
+
+
+def distance(samples: tuple[Sample, ...]) -> np.ndarray:
+    """Return the distance of the hand from its goal at each step, m."""
+    return hand_errors(samples)[0]
+
+
+def within_limits(loop: DirectLoop) -> bool:
+    """Return whether no joint passed a limit of position, speed or torque in the simulator."""
+    return not loop.robot.monitor.violated

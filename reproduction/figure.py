@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import matplotlib
@@ -43,6 +43,20 @@ class Figure:
             plt.close(picture)
         np.savez_compressed(directory / "data.npz", **self.data)
         (directory / "metrics.json").write_text(json.dumps(self.metrics, indent=2) + "\n")
+
+
+def joint_axes(joints: Sequence[str], x: str, y: str) -> tuple[plt.Figure, np.ndarray]:
+    """Return a picture with axes for each of 7 joints, labelled `x` and `y`."""
+    picture, axes = plt.subplots(2, 4, figsize=(14, 6), sharex=True, layout="constrained")
+    axes[1, 3].set_visible(False)
+    for axis, joint in zip(axes.flat, joints, strict=False):
+        axis.set_title(joint)
+        axis.grid(alpha=0.3)
+    for axis in axes[:, 0]:
+        axis.set_ylabel(y)
+    for axis in axes[1, :3]:
+        axis.set_xlabel(x)
+    return picture, axes.flat[: len(joints)]
 
 
 def table(

@@ -14,7 +14,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 import pinocchio as pin
-from direct import DirectLoop, Sample, column
+from direct import DirectLoop, column, distance, hand_places
 from figure import Figure, table
 
 ROBOT = "talos_left_arm"
@@ -50,11 +50,6 @@ def start(changed: dict[str, Any], share: float) -> DirectLoop:
     loop = DirectLoop(ROBOT, changed)
     loop.change(**believed(loop, share))
     return loop
-
-
-def distance(samples: tuple[Sample, ...]) -> np.ndarray:
-    """Return the distance of the hand from its goal at each step, m."""
-    return np.linalg.norm(column(samples, "error")[:, :3], axis=1)
 
 
 def judge(loop: DirectLoop) -> float:
@@ -98,13 +93,7 @@ def circle(loop: DirectLoop) -> np.ndarray:
         loop.controller.set_pose_goal(pin.SE3(home.rotation, home.translation + offset))
 
     samples = loop.run(1.5 * PERIOD, each)
-    data = loop.model.createData()
-    frame = loop.model.getFrameId(loop.controller.robot.frame)
-    places = np.empty((len(samples), 3))
-    for k, sample in enumerate(samples):
-        pin.framesForwardKinematics(loop.model, data, sample.q)
-        places[k] = data.oMf[frame].translation
-    return places
+    return hand_places(loop, samples)
 
 
 def switched() -> tuple[float, float]:

@@ -14,7 +14,7 @@ import numpy as np
 import paper_algorithms
 import yaml
 from chain import ROOT, ChainResult, load_values, run_chain
-from figure import Figure, reproduce, table
+from figure import Figure, joint_axes, reproduce, table
 from matplotlib.colors import BoundaryNorm, ListedColormap
 
 from viability_bounds_pkg import baselines, viability
@@ -332,7 +332,7 @@ def algorithm_4() -> Figure:
     joints = values["joints"]
     model = build_model(read_urdf(values["robot_description"]), joints)
     limits = [values[key] for key in ("position_min", "position_max", "velocity_max")]
-    picture, axes = plt.subplots(2, 4, figsize=(14, 6), sharex=True, layout="constrained")
+    picture, axes = joint_axes(joints, "evaluations N", "smallest limit found [rad/s²]")
     found = {}
     for method, samples in (("sampling", 1_000_000), ("refined", 10_000)):
         start = time.perf_counter()
@@ -349,16 +349,9 @@ def algorithm_4() -> Figure:
         tightest = np.array([np.minimum(entry.a_max, -entry.a_min) for entry in worst.history])
         found[method] = tightest[-1]
         figure.data[method] = np.column_stack([evaluations, tightest])
-        for j, axis in enumerate(axes.flat[: len(joints)]):
+        for j, axis in enumerate(axes):
             axis.semilogx(evaluations, tightest[:, j], marker=".", label=method)
-            axis.set_title(joints[j])
-            axis.grid(alpha=0.3)
-    axes[0, 0].legend()
-    axes[1, 3].set_visible(False)
-    for axis in axes[:, 0]:
-        axis.set_ylabel("smallest limit found [rad/s²]")
-    for axis in axes[1, :3]:
-        axis.set_xlabel("evaluations N")
+    axes[0].legend()
     tighter = bool((found["refined"] <= found["sampling"]).all())
     share = float(np.delete(found["refined"] / found["sampling"], joints.index("left_s1")).min())
     figure.metrics |= {"refined_is_tighter": tighter, "smallest_ratio": share}

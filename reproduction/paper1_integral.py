@@ -16,7 +16,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pinocchio as pin
 from chain import ROOT
-from direct import DirectLoop, Sample, column
+from direct import DirectLoop, column, distance, hand_places
 from figure import Figure, reproduce, table
 
 ROBOT = "talos_left_arm"
@@ -35,22 +35,6 @@ AWAY = 0.01  # m
 def goal(loop: DirectLoop, start: pin.SE3, offset: tuple[float, ...]) -> None:
     """Send the hand to a place near `start`, without turning it."""
     loop.controller.set_pose_goal(pin.SE3(start.rotation, start.translation + np.array(offset)))
-
-
-def hand(loop: DirectLoop, samples: tuple[Sample, ...]) -> np.ndarray:
-    """Return where the hand was, shape (N, 3), m."""
-    data = loop.model.createData()
-    frame = loop.model.getFrameId(loop.controller.robot.frame)
-    places = np.empty((len(samples), 3))
-    for k, sample in enumerate(samples):
-        pin.framesForwardKinematics(loop.model, data, sample.q)
-        places[k] = data.oMf[frame].translation
-    return places
-
-
-def distance(samples: tuple[Sample, ...]) -> np.ndarray:
-    """Return the distance of the hand from its goal at each step, m."""
-    return np.linalg.norm(column(samples, "error")[:, :3], axis=1)
 
 
 def figure_3() -> Figure:
@@ -112,7 +96,7 @@ def push(changed: dict[str, Any], force: tuple[float, ...], seconds: float = 5.0
     pushed = loop.run(seconds)
     loop.robot.clear_wrenches()
     released = loop.run(4.0)
-    places = hand(loop, released) - target
+    places = hand_places(loop, released) - target
     direction = places[0] / np.linalg.norm(places[0])
     far = np.flatnonzero(np.linalg.norm(places, axis=1) > AWAY)
     budget = loop.controller.additional.settings.joints.budget

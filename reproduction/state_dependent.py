@@ -8,10 +8,9 @@ to decide: to two postures, one of them near limits, and back.
 
 from __future__ import annotations
 
-import matplotlib.pyplot as plt
 import numpy as np
 from chain import ChainResult, load_values, run_chain
-from figure import Figure, table
+from figure import Figure, joint_axes, table
 
 from viability_bounds_pkg.estimation.discretisation_margin import discretisation_margin
 from viability_bounds_pkg.node.bounds_parameters import PEAK
@@ -63,7 +62,7 @@ def main() -> int:
     names = ("to the side", "folded", "back to the start")
     figure = Figure("state_dependent")
     joints = values["joints"]
-    picture, axes = plt.subplots(2, 4, figsize=(14, 6), sharex=True, layout="constrained")
+    picture, axes = joint_axes(joints, "time [s]", "position [rad]")
     times, fine = {}, True
     for limits in ("worst_case", "state_dependent"):
         result = play(values, goals, limits)
@@ -88,19 +87,12 @@ def main() -> int:
             arrived = float(run.t[during][last] - k * PAUSE)
             times[limits].append(arrived if last < far.size - 1 else float("inf"))
             figure.metrics[f"{limits}_{names[k].replace(' ', '_')}_s"] = times[limits][-1]
-        for j, axis in enumerate(axes.flat[: len(joints)]):
+        for j, axis in enumerate(axes):
             axis.plot(run.t, run.q[:, j], label=limits.replace("_", " "))
-            axis.set_title(joints[j])
-    for j, axis in enumerate(axes.flat[: len(joints)]):
+    for j, axis in enumerate(axes):
         for k, goal in enumerate(goals):
             axis.plot([k * PAUSE, (k + 1) * PAUSE], [goal[j]] * 2, "k:", linewidth=1.0)
-        axis.grid(alpha=0.3)
-    axes[0, 0].legend()
-    axes[1, 3].set_visible(False)
-    for axis in axes[:, 0]:
-        axis.set_ylabel("position [rad]")
-    for axis in axes[1, :3]:
-        axis.set_xlabel("time [s]")
+    axes[0].legend()
     for name, usual, ours in zip(
         names, times["worst_case"], times["state_dependent"], strict=True
     ):

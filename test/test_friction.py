@@ -34,17 +34,10 @@ def found():
     values = read_values(bullet_parameters.TABLE, GIVEN)
     config = bullet_parameters.make_configuration(values)
     assert set(GIVEN["mass_scales"]) == {1.1}
-    motion = excitation(
-        config.joints,
-        config.q_start,
-        config.q_min,
-        config.q_max,
-        config.v_max,
-        config.dt,
-    )
+    motion = excitation(config, config.q_start, config.dt)
     with closing(bullet_parameters.make_robot(config, values)) as robot:
         recorded, monitor = record(robot, config, *motion)
-    assert monitor.first_violation_step is None
+    assert not monitor.violated
     model = read_robot(CONFIG / f"{ROBOT}.yaml").model
     fits = list(identify(model, Recording(**recorded)))
     assert [fit.notes for fit in fits] == [[]] * N

@@ -10,11 +10,12 @@ from ros_harness import CONFIG
 
 from sim_bridge.bullet.obstacles import Obstacle
 from sim_bridge.nodes.scenario_sender import ScenarioRefused
-from torque_safety_controller.tasks.pose_trajectory import PoseTrajectory, circle
+from viability_bounds_pkg.pose_trajectory import PoseTrajectory, circle
 
 ROBOT = "panda"
 DURATION = 0.9
 GAIN = 200.0  # 1/s^2
+PLANE = [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]  # from the lowest point towards y
 BEGIN, DIAMETER, PERIOD = 0.1, 0.1, 0.7  # of the circle, s, m
 PUSHES = {"panda_link4": (0.2, 0.4, (0.0, 20.0, 0.0)), "panda_link6": (0.3, 0.5, (0.0, 0.0, 9.0))}
 """From, to, s, and force, N: they overlap."""
@@ -49,7 +50,7 @@ def play_directly():
     """Return the samples of a loop without messages, and how often the box was touched."""
     loop = DirectLoop(ROBOT)
     start = loop.pose()
-    trajectory = PoseTrajectory(circle(start, DIAMETER, PERIOD, 1))
+    trajectory = PoseTrajectory(circle(start, 0.5 * DIAMETER, PLANE, period=PERIOD))
     touched = []
 
     def before(t):

@@ -24,7 +24,7 @@ the maximum being at r = a h^2 / 8: 2 microrad for 15 rad/s^2 at 1 kHz.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -58,10 +58,9 @@ class BulletRobot(BulletBody):
     finite, `RobotDescriptionError` for a link that the URDF does not have.
 
     Args:
-        urdf_text, joints, physics_dt, locked_positions: as of `BulletBody`; all arrays are in the
-            order of the n `joints`.
+        urdf_text, joints, physics_dt: as of `BulletBody`; all arrays are in the order of `joints`.
         joint_friction: friction, rotors and torque biases of the joints; none by default.
-        body: further options of `BulletBody`: gravity, shapes, obstacles, masses, a sensor.
+        body: further options of `BulletBody`: locked joints, gravity, obstacles, masses, a sensor.
 
     Attributes:
         monitor: updated at every physics step, unless None.
@@ -77,7 +76,6 @@ class BulletRobot(BulletBody):
         joints: Sequence[str],
         *,
         physics_dt: float,
-        locked_positions: Mapping[str, float] | None = None,
         joint_friction: JointFriction | None = None,
         **body: Any,
     ) -> None:
@@ -91,7 +89,6 @@ class BulletRobot(BulletBody):
             urdf_text,
             joints,
             physics_dt=physics_dt,
-            locked_positions=locked_positions,
             rotor_inertias={joint: inertia for joint, inertia in inertias if inertia > 0.0},
             **body,
         )
@@ -101,9 +98,7 @@ class BulletRobot(BulletBody):
         self._q, self._v, self._motor_torque = np.zeros((3, n))
         self._brakes = np.zeros(n)
         # Made when first needed, because it needs a model.
-        self._make_drive = partial(
-            make_drive, urdf_text, self.joints, locked_positions, friction, physics_dt
-        )
+        self._make_drive = partial(make_drive, *self.description, friction, physics_dt)
         self._drive: PositionDrive | None = None
         self._driving = False
         self._stepped = False  # since the last reset

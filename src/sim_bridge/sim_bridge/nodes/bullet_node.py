@@ -1,4 +1,4 @@
-"""The robot node: plays an arm with torque- and position-controlled motors over topics."""
+"""The robot node: simulates an arm with torque- and position-controlled motors."""
 
 from __future__ import annotations
 
@@ -21,9 +21,15 @@ from std_srvs.srv import SetBool, Trigger
 from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.nodes.bullet_parameters import TABLE, make_configuration, make_robot
 from sim_bridge.nodes.ft_sensor import ForceTorquePublisher
-from sim_bridge.nodes.joint_command import CommandError, JointCommand, TorqueCommand, read_command
+from sim_bridge.nodes.joint_command import (
+    CommandError,
+    JointCommand,
+    PositionCommand,
+    TorqueCommand,
+    read_command,
+)
 from sim_bridge.nodes.topics import CLOCK, PAUSE, RESET
-from sim_bridge.nodes.world_subscriber import WorldInbox
+from sim_bridge.nodes.world_subscriber import WorldSubscriber
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.ros.messages import Diagnostics
 from viability_bounds_pkg.ros.parameters import NodeParameters
@@ -32,20 +38,21 @@ from viability_bounds_pkg.ros.topics import JOINT_COMMANDS, JOINT_STATES, ROBOT_
 
 _RETRY_PERIOD = 0.2
 _LATENCIES_KEPT = 100_000
+_CONTROL = {type(None): "brakes", TorqueCommand: "torque", PositionCommand: "position"}
 
 
 class BulletNode(Node):
-    """An arm: publishes ``joint_states``, obeys ``joint_commands``.
+    """An arm that publishes ``joint_states`` and follows ``joint_commands``.
 
-    A command with efforts sets the torques of the motors. One with positions, and perhaps
-    velocities, but no efforts leaves it to the motors' own drives to bring the joints there and
-    hold them. It may change from one to the next.
+    A command with efforts sets the torques of the motors. One without efforts sets the positions,
+    and optionally the velocities, that the motors' own drives control. Each command may be of
+    either kind.
 
-    With ``clock: real_time`` each control period lasts its time on the wall clock. A command
-    that comes within the period of the state it answers acts during that period; when none
-    does, the last one is held, and after ``command_timeout`` periods the robot brakes. With
-    ``clock: lockstep`` a period ends when the command with its stamp has come, however long
-    that takes.
+    With ``clock: real_time`` each control period has its duration on the wall clock. A command
+    that comes within the period of the state with its stamp acts during that period; without one
+    the last command is held, and after ``command_timeout`` periods the robot brakes. With
+    ``clock: lockstep`` a period ends when the command with its stamp has come, without a limit of
+    time.
 
     The robot's brakes are on until the first command.
     """
@@ -64,11 +71,13 @@ class BulletNode(Node):
         self._robot.monitor = self._monitor
         self._dt_ns = round(1e9 * config.dt)
         self._paused = config.start_paused
-        # In lockstep robot time is its own, from one period on: zero means "no stamp".
+        # In lockstep robot time starts at one period: a stamp of zero means "no stamp".
         self._stamp = 0 if config.lockstep else self.get_clock().now().nanoseconds
         self._advanced = True
         self._refused: Counter[str] = Counter()
-        self._world = WorldInbox(self, self._robot, config.external_wrench_timeout, self._refused)
+        self._world = WorldSubscriber(
+            self, self._robot, config.external_wrench_timeout, self._refused
+        )
         self._ft_publisher = None
         if config.sensor.frame:
             self._ft_publisher = ForceTorquePublisher(self, self._robot, config.sensor)
@@ -92,7 +101,7 @@ class BulletNode(Node):
         self._next_state()
 
     def _restart(self) -> None:
-        """Put the robot at its start and all counts to zero; robot time goes on."""
+        """Reset the robot and all counts; robot time continues."""
         config = self._config
         n = len(config.joints)
         self._world.clear()
@@ -102,7 +111,7 @@ class BulletNode(Node):
         self._monitor.reset()
         self._command: JointCommand | None = None
         self._missed_in_row = self._missed = self._braked = 0
-        self._periods = self._pause_at = 0
+        self._periods = 0
         self._plan_pause()
         self._torque_ratio = 0.0
         self._refused.clear()
@@ -110,14 +119,14 @@ class BulletNode(Node):
         self._started_at, self._played = time.monotonic(), 0
 
     def _plan_pause(self) -> None:
-        """Find the period at which to pause, as `pause_after` says; counted from now."""
+        """Compute the period at which to pause, `pause_after` from now."""
         periods = round(self._node_parameters.configuration.pause_after / self._config.dt)
-        self._pause_at = self._periods + periods if periods else math.inf
+        self._pause_at: float = self._periods + periods if periods else math.inf
 
-    # The course of time
+    # Control periods
 
     def _next_state(self) -> None:
-        """Begin a control period: publish the state at its start."""
+        """Begin a control period and publish the state at its start."""
         self._stamp += self._dt_ns
         self._advanced = False
         q, v, tau = self._robot.state()
@@ -128,13 +137,13 @@ class BulletNode(Node):
         set_stamp(state.header.stamp, self._stamp)
         if self._clock_publisher is not None:
             self._clock_publisher.publish(ClockMessage(clock=state.header.stamp))
-        if self._ft_publisher is not None:  # first, for who waits for both
+        if self._ft_publisher is not None:  # first: subscribers use it with the state
             self._ft_publisher.publish(self._stamp)
         self._published_at = time.monotonic()
         self._state_publisher.publish(state)
 
     def _advance(self) -> None:
-        """Play the current period to its end, under the last command or the brakes."""
+        """Simulate the current period under the last command or the brakes."""
         config = self._config
         self._world.apply_due(self._stamp)
         if self._command is None:
@@ -143,7 +152,8 @@ class BulletNode(Node):
         elif isinstance(self._command, TorqueCommand):
             self._robot.step(self._command.tau, config.substeps)
         else:
-            self._robot.move(*self._command, config.tau_max, config.v_max, config.substeps)
+            q, v = self._command
+            self._robot.move(q, v, config.tau_max, config.v_max, config.substeps)
         self._periods += 1
         self._advanced = True
         if self._periods >= self._pause_at:
@@ -151,7 +161,7 @@ class BulletNode(Node):
             self._pause()
 
     def _tick(self) -> None:
-        """End a period of the wall clock and begin the next."""
+        """End a period in real time and begin the next."""
         if self._paused:
             return
         if not self._advanced:
@@ -171,7 +181,7 @@ class BulletNode(Node):
         self._diagnostics.publish()
 
     def _retry(self) -> None:
-        """Send the state again if the chain lost it, or does not listen yet."""
+        """Publish the state again: it may have been lost, or there was no subscriber yet."""
         waiting = self._paused or (self._config.lockstep and not self._advanced)
         if waiting and time.monotonic() - self._published_at > _RETRY_PERIOD:
             if self._ft_publisher is not None:
@@ -197,11 +207,11 @@ class BulletNode(Node):
         if isinstance(command, TorqueCommand):
             tau, tau_max = command.tau, self._config.tau_max
             self._torque_ratio = max(self._torque_ratio, float(np.max(np.abs(tau) / tau_max)))
-            # The drives do not exceed their limits, whatever they are told.
+            # The motors do not exceed their limits, whatever the command.
             command = TorqueCommand(np.clip(tau, -tau_max, tau_max))
         self._command = command
         self._advance()
-        # When it pauses itself, the next state waits too: time stands still for all.
+        # After a pause by itself the next state is not published: time stops for all nodes.
         if self._config.lockstep and not self._paused:
             self._next_state()
 
@@ -219,8 +229,8 @@ class BulletNode(Node):
             self._paused = False
             self._started_at, self._played = time.monotonic(), self._periods
             self._plan_pause()
-            # A new stamp: what was answered during the pause answered old goals. In real time
-            # it comes with the next tick, so that the first period is a whole one.
+            # A new stamp: commands that came during the pause are for old goals. In real time it
+            # comes with the next tick, so that the first period is a whole one.
             self._advanced = True
             if self._config.lockstep:
                 self._next_state()
@@ -241,7 +251,7 @@ class BulletNode(Node):
         values = {
             "clock": "lockstep" if self._config.lockstep else "real_time",
             "paused": self._paused,
-            "control": "brakes" if self._command is None else self._command.control,
+            "control": _CONTROL[type(self._command)],
             "stamp_ns": self._stamp,
             "period_s": self._config.dt,
             "periods": self._periods,
@@ -271,14 +281,14 @@ class BulletNode(Node):
         return DiagnosticStatus.OK, "running", values
 
     def destroy_node(self) -> None:
-        """Leave the physics world too."""
+        """Disconnect from the physics engine too."""
         if hasattr(self, "_robot"):
             self._robot.close()
         super().destroy_node()
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the robot node until it is told to stop."""
+    """Run the robot node until it is shut down."""
     return run(BulletNode, args)
 
 

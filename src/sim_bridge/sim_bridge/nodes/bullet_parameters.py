@@ -13,6 +13,7 @@ from sim_bridge.bullet.joint_friction import DEFAULT_STRIBECK_VELOCITY, JointFri
 from sim_bridge.bullet.obstacles import ContactMaterial
 from sim_bridge.bullet.robot import BulletRobot
 from sim_bridge.nodes.ft_sensor import SENSOR_TABLE, SensorConfiguration, sensor_configuration
+from sim_bridge.urdf.arm import ConfiguredArm
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import RobotDescriptionError
 from viability_bounds_pkg.ros.parameters import (
@@ -173,16 +174,9 @@ TABLE = (
 
 
 @dataclass(frozen=True)
-class BulletConfiguration:
+class BulletConfiguration(ConfiguredArm):
     """Checked parameters of the robot node; arrays of shape (n,) in `joints` order."""
 
-    urdf: str
-    joints: tuple[str, ...]
-    locked: dict[str, float]
-    q_min: np.ndarray
-    q_max: np.ndarray
-    v_max: np.ndarray
-    tau_max: np.ndarray
     joint_friction: JointFriction
     mass_scales: dict[str, float]
     q_start: np.ndarray
@@ -287,7 +281,7 @@ def make_robot(config: BulletConfiguration, values: Mapping[str, Any]) -> Bullet
 
 
 def _culprit(config: BulletConfiguration) -> tuple[str, str]:
-    """Return which parameter keeps the robot from being made, and what it may be."""
+    """Return the parameter that prevents the robot, and its allowed values."""
     root = ElementTree.fromstring(config.urdf)
     joints = {joint.get("name") for joint in root.iter("joint")}
     if not joints >= set(config.joints):

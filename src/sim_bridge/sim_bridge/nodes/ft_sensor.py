@@ -1,4 +1,4 @@
-"""The simulated force/torque sensor's topic, with the bias and noise of a real one."""
+"""The topic of the simulated force/torque sensor, with bias and noise."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import WrenchStamped
+from numpy.typing import NDArray
 from rclpy.node import Node
 
 from sim_bridge.bullet.robot import BulletRobot
@@ -22,12 +23,14 @@ from viability_bounds_pkg.ros.parameters import (
 from viability_bounds_pkg.ros.runtime import set_stamp
 from viability_bounds_pkg.ros.topics import FT_WRENCH
 
+Array = NDArray[np.float64]
+
 SENSOR_TABLE = (
     Parameter("ft_frame", str, "link that is a force/torque sensor; none if empty", default=""),
     Parameter(
         "ft_bias",
         list[float],
-        "what the sensor adds, force and moment, N and N m; none if empty",
+        "bias of the sensor, force and moment, N and N m; none if empty",
         default=np.zeros(0),
         length=6,
         within=FINITE,
@@ -46,18 +49,18 @@ SENSOR_TABLE = (
 
 @dataclass(frozen=True)
 class SensorConfiguration:
-    """A sensor.
+    """A force/torque sensor.
 
-    Args:
+    Attributes:
         frame: its link; empty if there is none.
-        bias: what it adds, force and moment, shape (6,), N and N m.
-        noise: standard deviation of what it adds in each control period, likewise.
+        bias: force and moment, shape (6,), N and N m.
+        noise: standard deviation of force and moment, shape (6,), N and N m.
         seed: of the noise.
     """
 
     frame: str
-    bias: np.ndarray
-    noise: np.ndarray
+    bias: Array
+    noise: Array
     seed: int
 
 
@@ -76,7 +79,7 @@ def sensor_configuration(values: Mapping[str, Any]) -> SensorConfiguration:
 
 
 class ForceTorqueReading:
-    """What the sensor of a robot says: what it feels, a bias and noise.
+    """The reading of a robot's sensor: the simulated wrench, bias and noise.
 
     Args:
         robot: with a sensor.
@@ -88,11 +91,11 @@ class ForceTorqueReading:
         self.restart()
 
     def restart(self) -> None:
-        """Begin the noise anew."""
+        """Restart the noise from its seed."""
         self._random = np.random.default_rng(self._config.seed)
 
-    def read(self) -> np.ndarray:
-        """Return force and moment, shape (6,), N and N m, with other noise each time."""
+    def read(self) -> Array:
+        """Return force and moment, shape (6,), N and N m, with new noise."""
         noise = self._config.noise * self._random.standard_normal(6)
         return self._robot.sensor_wrench() + self._config.bias + noise
 
@@ -113,16 +116,16 @@ class ForceTorquePublisher:
         self._publisher = FT_WRENCH.publisher(node)
 
     def restart(self) -> None:
-        """Begin the noise anew."""
+        """Restart the noise from its seed."""
         self._reading.restart()
 
     def publish(self, stamp: int) -> None:
-        """Publish what is felt at `stamp`, ns."""
+        """Publish a reading with `stamp`, ns."""
         message = self._message
         set_stamp(message.header.stamp, stamp)
         force, torque = message.wrench.force, message.wrench.torque
-        felt = self._reading.read().tolist()
-        force.x, force.y, force.z, torque.x, torque.y, torque.z = felt
+        wrench = self._reading.read().tolist()
+        force.x, force.y, force.z, torque.x, torque.y, torque.z = wrench
         self._publisher.publish(message)
 
     def repeat(self) -> None:

@@ -1,4 +1,4 @@
-"""What a ``joint_commands`` message asks a robot for."""
+"""The command of a ``joint_commands`` message."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 class CommandError(ArmSafetyError, ValueError):
-    """A command that cannot be obeyed; its text is the reason, in a few words."""
+    """An invalid command; the text is the reason, in a few words."""
 
 
 class TorqueCommand(NamedTuple):
@@ -22,26 +22,22 @@ class TorqueCommand(NamedTuple):
 
     tau: Array
 
-    control = "torque"
-
 
 class PositionCommand(NamedTuple):
-    """Where the drives are to be, rad, and how fast to pass there, rad/s; shape (n,) each."""
+    """Desired positions, rad, and velocities, rad/s, of the drives, shape (n,) each."""
 
     q: Array
     v: Array
-
-    control = "position"
 
 
 JointCommand = TorqueCommand | PositionCommand
 
 
 def read_command(message: JointState, joints: list[str]) -> JointCommand:
-    """Return what `message` asks of `joints`; further joints in it are ignored.
+    """Return the command for `joints`; further joints in the message are ignored.
 
-    Efforts make it a torque command, whatever else it says. Without, positions make it a position
-    command; velocities may be left out and are zero then.
+    With efforts it is a torque command, and positions and velocities are ignored. Without efforts
+    it is a position command; missing velocities are zero.
 
     Raises:
         CommandError: sizes do not match, a joint is missing, a number is not finite.

@@ -1,4 +1,4 @@
-"""Hears what the nodes of a chain say, and keeps what a recording is made of."""
+"""Subscribes to the topics of robot, bounds and controller, and records them."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ _RECORDING_QOS = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.BEST_EFF
 
 
 class RunListener:
-    """Listens to robot, bounds and controller.
+    """Records the messages of robot, bounds and controller.
 
     Args:
         node: subscribes.
-        joints: whose states are kept, in this order.
+        joints: joints to record, in this order.
 
     Attributes:
-        recorder: has the states and what belongs to them.
+        recorder: the recording.
         stamp: of the last state, ns.
         q: its positions, shape (n,), rad; None before the first.
         answered: stamp of the last command, ns; -1 before the first.
-        diagnostics: the last of each node, values by key, by node name.
+        diagnostics: the last ones of each node, values by key, by node name.
     """
 
     def __init__(self, node: Node, joints: Sequence[str]) -> None:

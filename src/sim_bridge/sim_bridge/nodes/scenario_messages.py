@@ -1,10 +1,11 @@
-"""What a scenario's events are on topics and at services."""
+"""The messages and service calls of a scenario's events."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+import pinocchio as pin
 from geometry_msgs.msg import PoseStamped, Transform, Twist, WrenchStamped
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
@@ -26,44 +27,47 @@ from sim_bridge.scenario.events import (
     TrajectoryGoal,
     TriggerCall,
 )
-from sim_bridge.scenario.pose_path import PathPoint
 from sim_bridge.scenario.scenario import Scenario
+from viability_bounds_pkg.pose_trajectory import TrajectoryPoint
 from viability_bounds_pkg.ros.runtime import set_stamp
 
-_NOTHING = (0.0, 0.0, 0.0)
+_ZERO = (0.0, 0.0, 0.0)
 _SHAPES = {"box": Marker.CUBE, "sphere": Marker.SPHERE, "cylinder": Marker.CYLINDER}
 
 
-class Request(NamedTuple):
+class ServiceRequest(NamedTuple):
     """A call of a service."""
 
     service: str
     kind: Any
+    """Service type."""
     content: Any
 
 
-RESET = Request("bullet_node/reset", Trigger, Trigger.Request())
-"""Puts the robot at its start."""
+RESET = ServiceRequest("bullet_node/reset", Trigger, Trigger.Request())
+"""Sets the robot to its start configuration."""
 
 
-class Letter(NamedTuple):
-    """A message, where it goes, and when it is to take effect."""
+class ScheduledMessage(NamedTuple):
+    """A message that takes effect at its stamp."""
 
     topic: str
-    message: Any
+    content: Any
     header: Header
-    """Where in the message its stamp is."""
+    """The header in the content that carries the stamp."""
     delay: int
-    """From the scenario's beginning, ns."""
+    """Stamp from the scenario's start, ns."""
 
 
-def to_controller(scenario: Scenario, base_frame: str, end_effector_frame: str) -> list[Letter]:
+def to_controller(
+    scenario: Scenario, base_frame: str, end_effector_frame: str
+) -> list[ScheduledMessage]:
     """Return the goals, in order of time.
 
     Args:
-        scenario: whose goals.
+        scenario: its goals are returned.
         base_frame: of poses.
-        end_effector_frame: what they move; of wrenches that name no frame.
+        end_effector_frame: that poses and trajectories move; of wrenches without a frame.
     """
     return [
         _goal(event, base_frame, end_effector_frame)
@@ -72,46 +76,46 @@ def to_controller(scenario: Scenario, base_frame: str, end_effector_frame: str) 
     ]
 
 
-def to_robot(scenario: Scenario, base_frame: str) -> list[Letter]:
+def to_robot(scenario: Scenario, base_frame: str) -> list[ScheduledMessage]:
     """Return pushes, their ends, and obstacles in the base frame, in order of time."""
     pushes = [event for event in scenario.events if isinstance(event, Push)]
-    # Ends first: where one push follows another at once, that which begins is to stay.
-    letters = [_push(push, push.time + push.duration, _NOTHING, _NOTHING) for push in pushes]
-    letters += [_push(push, push.time, push.force, push.torque) for push in pushes]
-    letters += [
+    # Ends first: where one push directly follows another, the new one must remain.
+    messages = [_push(push, push.time + push.duration, _ZERO, _ZERO) for push in pushes]
+    messages += [_push(push, push.time, push.force, push.torque) for push in pushes]
+    messages += [
         _obstacle(event, base_frame)
         for event in scenario.events
         if isinstance(event, AddObstacle | RemoveObstacle)
     ]
-    return sorted(letters, key=lambda letter: letter.delay)
+    return sorted(messages, key=lambda each: each.delay)
 
 
-def to_service(event: ServiceEvent) -> Request:
-    """Return the call that an event stands for."""
+def to_service(event: ServiceEvent) -> ServiceRequest:
+    """Return the service call of an event."""
     if isinstance(event, EnableTorque):
-        return Request(
+        return ServiceRequest(
             "controller_node/enable_torque", SetBool, SetBool.Request(data=event.enable)
         )
     if isinstance(event, TriggerCall):
-        return Request(event.service, Trigger, Trigger.Request())
+        return ServiceRequest(event.service, Trigger, Trigger.Request())
     return change_parameters(event.node, event.values)
 
 
-def change_parameters(node: str, values: Any) -> Request:
+def change_parameters(node: str, values: Any) -> ServiceRequest:
     """Return the call that sets parameters of a node, values by name."""
     parameters = [Parameter(key, value=value).to_parameter_msg() for key, value in values.items()]
-    return Request(
+    return ServiceRequest(
         f"{node}/set_parameters", SetParameters, SetParameters.Request(parameters=parameters)
     )
 
 
-def pause(data: bool) -> Request:
-    """Return the call that pauses the robot, or lets it go on."""
-    return Request("bullet_node/pause", SetBool, SetBool.Request(data=data))
+def pause(data: bool) -> ServiceRequest:
+    """Return the call that pauses or resumes the robot."""
+    return ServiceRequest("bullet_node/pause", SetBool, SetBool.Request(data=data))
 
 
-def refusals(request: Request, response: Any) -> Iterator[str]:
-    """Return why a call, or parts of it, were refused; nothing if they were not."""
+def refusals(request: ServiceRequest, response: Any) -> Iterator[str]:
+    """Yield the reasons for which a call, or a part of it, was refused."""
     if request.kind is SetParameters:
         for parameter, result in zip(request.content.parameters, response.results, strict=True):
             if not result.successful:
@@ -124,7 +128,7 @@ def _delay(time: float) -> int:
     return round(1e9 * time)
 
 
-def _goal(event: Goal, base_frame: str, end_effector_frame: str) -> Letter:
+def _goal(event: Goal, base_frame: str, end_effector_frame: str) -> ScheduledMessage:
     if isinstance(event, PoseGoal):
         message = PoseStamped()
         message.header.frame_id = base_frame
@@ -138,24 +142,25 @@ def _goal(event: Goal, base_frame: str, end_effector_frame: str) -> Letter:
         topic = "target_posture"
     elif isinstance(event, TrajectoryGoal):
         message = MultiDOFJointTrajectory(
-            joint_names=[end_effector_frame], points=[_point(point) for point in event.points]
+            joint_names=[end_effector_frame],
+            points=[_point(point) for point in event.trajectory.points],
         )
         message.header.frame_id = base_frame
         topic = "target_trajectory"
     else:
         message = _wrench(event.frame or end_effector_frame, event.force, event.torque)
         topic = "target_wrench"
-    return Letter(topic, message, message.header, _delay(event.time))
+    return ScheduledMessage(topic, message, message.header, _delay(event.time))
 
 
-def _point(point: PathPoint) -> MultiDOFJointTrajectoryPoint:
+def _point(point: TrajectoryPoint) -> MultiDOFJointTrajectoryPoint:
     transform, velocity, acceleration = Transform(), Twist(), Twist()
     p, o = transform.translation, transform.rotation
-    p.x, p.y, p.z = point.position
-    o.x, o.y, o.z, o.w = point.orientation
-    v, a = velocity.linear, acceleration.linear
-    v.x, v.y, v.z = point.velocity
-    a.x, a.y, a.z = point.acceleration
+    p.x, p.y, p.z = point.pose.translation.tolist()
+    o.x, o.y, o.z, o.w = pin.Quaternion(point.pose.rotation).coeffs().tolist()
+    v, a = velocity.linear, acceleration.linear  # nothing in a scenario file turns at a point
+    v.x, v.y, v.z = point.velocity[:3].tolist()
+    a.x, a.y, a.z = point.acceleration[:3].tolist()
     message = MultiDOFJointTrajectoryPoint(
         transforms=[transform], velocities=[velocity], accelerations=[acceleration]
     )
@@ -172,12 +177,14 @@ def _wrench(frame: str, force: tuple[float, ...], torque: tuple[float, ...]) -> 
     return message
 
 
-def _push(push: Push, time: float, force: tuple[float, ...], torque: tuple[float, ...]) -> Letter:
+def _push(
+    push: Push, time: float, force: tuple[float, ...], torque: tuple[float, ...]
+) -> ScheduledMessage:
     message = _wrench(push.link, force, torque)
-    return Letter("external_wrench", message, message.header, _delay(time))
+    return ScheduledMessage("external_wrench", message, message.header, _delay(time))
 
 
-def _obstacle(event: AddObstacle | RemoveObstacle, base_frame: str) -> Letter:
+def _obstacle(event: AddObstacle | RemoveObstacle, base_frame: str) -> ScheduledMessage:
     marker = Marker(action=Marker.DELETE)
     if isinstance(event, RemoveObstacle):
         marker.ns = event.name
@@ -190,4 +197,6 @@ def _obstacle(event: AddObstacle | RemoveObstacle, base_frame: str) -> Letter:
         s.x, s.y, s.z = obstacle.size.tolist()
         marker.color.a = 1.0  # or RViz shows nothing
     marker.header.frame_id = base_frame
-    return Letter("obstacles", MarkerArray(markers=[marker]), marker.header, _delay(event.time))
+    return ScheduledMessage(
+        "obstacles", MarkerArray(markers=[marker]), marker.header, _delay(event.time)
+    )

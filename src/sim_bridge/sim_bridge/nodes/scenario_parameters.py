@@ -1,16 +1,13 @@
-"""The scenario node's parameters: the table, and their checks."""
+"""The scenario node's parameters and their checks."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
-
-import numpy as np
 
 from sim_bridge.scenario.events import PostureGoal, WrenchGoal
 from sim_bridge.scenario.fields import ScenarioError
-from sim_bridge.scenario.scenario import Scenario, load_scenario
+from sim_bridge.scenario.scenario import ScenarioConfiguration, load_scenario
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.ros.parameters import POSITIVE, Parameter, above, joint_names
 from viability_bounds_pkg.ros.robot_parameters import (
@@ -35,24 +32,6 @@ TABLE = (
         within=above(0.0, 3600.0),
     ),
 )
-
-
-@dataclass(frozen=True)
-class ScenarioConfiguration:
-    """Checked parameters of the scenario node."""
-
-    name: str
-    urdf: str
-    joints: tuple[str, ...]
-    locked: dict[str, float]
-    base_frame: str
-    end_effector_frame: str
-    q_min: np.ndarray
-    q_max: np.ndarray
-    v_max: np.ndarray
-    tau_max: np.ndarray
-    scenario: Scenario
-    ready_timeout: float
 
 
 def make_configuration(values: Mapping[str, Any]) -> ScenarioConfiguration:

@@ -1,4 +1,4 @@
-"""Runs a scenario to its end."""
+"""Runs a scenario to its end, and writes the report."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ _SHOW_PERIOD = 0.5
 
 
 def play(node: ScenarioNode, others: Sequence[Node] = (), *, quiet: bool = False) -> None:
-    """Run the scenario to its end, showing a live line.
+    """Run the scenario to its end and print its state.
 
     Args:
         node: the scenario.
         others: nodes to run in the same process.
-        quiet: show nothing.
+        quiet: print nothing.
 
     Raises:
-        TimeoutError: the other nodes did not come up, or stopped answering.
-        ScenarioRefused: another node refused what the scenario asks of it.
-        ExternalShutdownException: told to stop before the end.
+        TimeoutError: the other nodes did not start, or stopped answering.
+        ScenarioRefused: another node refused a message or call of the scenario.
+        ExternalShutdownException: shut down before the end.
     """
     executor = make_executor(node.context)
     for each in (node, *others):
@@ -41,8 +41,8 @@ def play(node: ScenarioNode, others: Sequence[Node] = (), *, quiet: bool = False
     while not node.done and rclpy.ok(context=node.context):
         executor.spin_once(timeout_sec=0.1)
         now = time.monotonic()
-        if (node.heard.stamp, node.phase) != progress:
-            progress, moved_at = (node.heard.stamp, node.phase), now
+        if (node.listener.stamp, node.phase) != progress:
+            progress, moved_at = (node.listener.stamp, node.phase), now
         elif now - moved_at > node.config.ready_timeout:
             phase = node.phase.name.lower().replace("_", " ")
             awaited = ": there is no " + ", no ".join(node.awaited()) if node.awaited() else ""
@@ -61,7 +61,7 @@ def play(node: ScenarioNode, others: Sequence[Node] = (), *, quiet: bool = False
 
 
 def main(args: list[str] | None = None) -> int:
-    """Play a scenario; with ``--out DIRECTORY`` also record and judge it.
+    """Play a scenario; with ``--out DIRECTORY`` also write its report.
 
     Returns:
         0 when no limit was broken, 1 when one was, 2 when the scenario could not be played.
@@ -81,7 +81,7 @@ def main(args: list[str] | None = None) -> int:
             return 0
         from sim_bridge.scenario.report import write_report  # matplotlib takes a second to import
 
-        bounds = node.heard.diagnostics["bounds_node"]
+        bounds = node.listener.diagnostics["bounds_node"]
         kept = write_report(out, node.config, node.recorded_run(), node.robot, bounds)
         return 0 if kept else 1
     except (TimeoutError, ScenarioRefused) as error:

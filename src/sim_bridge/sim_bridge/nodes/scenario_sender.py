@@ -1,4 +1,4 @@
-"""Sends what a scenario sends: messages ahead of their time, and calls of services."""
+"""Publishes scheduled messages before their time, and calls services in order."""
 
 from __future__ import annotations
 
@@ -6,62 +6,64 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 
 from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.task import Future
 
-from sim_bridge.nodes.scenario_messages import Letter, Request, refusals
+from sim_bridge.nodes.scenario_messages import ScheduledMessage, ServiceRequest, refusals
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp
 
-_AT_ONCE = GOAL_QOS.depth - 2
-"""How many messages may be on their way: a reader keeps no more than its depth."""
+_IN_FLIGHT_MAX = GOAL_QOS.depth - 2
+"""Messages sent but not yet reported as received: a reader's queue is that long."""
 
 
 class ScenarioRefused(ArmSafetyError, RuntimeError):
-    """Another node does not do what the scenario asks; its text says which and why."""
+    """Another node refused a message or call of the scenario; the text says which and why."""
 
 
-class Outbox:
-    """Messages for one receiver, sent ahead in portions that it can take.
+class ScheduledPublisher:
+    """Publishes messages for one receiver before their time, as its queue permits.
 
     Args:
         node: publishes them.
-        letters: in order of time.
+        messages: in order of time.
     """
 
-    def __init__(self, node: Node, letters: Sequence[Letter]) -> None:
-        self._publishers = {}
-        for letter in letters:
-            if letter.topic not in self._publishers:
-                self._publishers[letter.topic] = node.create_publisher(
-                    type(letter.message), letter.topic, GOAL_QOS
+    def __init__(self, node: Node, messages: Sequence[ScheduledMessage]) -> None:
+        self._publishers: dict[str, Publisher] = {}
+        for message in messages:
+            if message.topic not in self._publishers:
+                self._publishers[message.topic] = node.create_publisher(
+                    type(message.content), message.topic, GOAL_QOS
                 )
-        self._letters = letters
+        self._messages = messages
         self._sent = 0
 
-    def unheard(self) -> list[str]:
-        """Return the topics that nobody listens to."""
+    def without_subscriber(self) -> list[str]:
+        """Return the topics without a subscriber."""
         return [
             topic for topic, out in self._publishers.items() if not out.get_subscription_count()
         ]
 
     def proceed(self, first: int, pending: int) -> bool:
-        """Send what there is room for.
+        """Publish the messages that the receiver has room for.
 
         Args:
-            first: stamp of the scenario's beginning, ns.
-            pending: how many messages the receiver says that it keeps for later.
+            first: stamp of the scenario's start, ns.
+            pending: number of messages that the receiver reports as waiting for their time.
 
         Returns:
-            Whether it has all of them.
+            Whether it has received all of them.
         """
-        portion = self._letters[self._sent : pending + _AT_ONCE]
-        for letter in portion:
-            set_stamp(letter.header.stamp, first + letter.delay)
-            self._publishers[letter.topic].publish(letter.message)
+        portion = self._messages[self._sent : pending + _IN_FLIGHT_MAX]
+        for message in portion:
+            set_stamp(message.header.stamp, first + message.delay)
+            self._publishers[message.topic].publish(message.content)
         self._sent += len(portion)
-        return pending >= len(self._letters)
+        return pending >= len(self._messages)
 
 
-class Caller:
+class ServiceCaller:
     """Calls services one after the other.
 
     Args:
@@ -69,29 +71,29 @@ class Caller:
         requests: calls that will be made, as far as they are known.
     """
 
-    def __init__(self, node: Node, requests: Iterable[Request]) -> None:
+    def __init__(self, node: Node, requests: Iterable[ServiceRequest]) -> None:
         self._clients = {
             request.service: node.create_client(request.kind, request.service)
             for request in requests
         }
-        self._waiting: deque[tuple[str, Request]] = deque()
-        self._answer = None
+        self._waiting: deque[tuple[str, ServiceRequest]] = deque()
+        self._answer: Future | None = None
 
     def missing(self) -> list[str]:
-        """Return the services that are not there."""
+        """Return the services that are not available."""
         return [name for name, client in self._clients.items() if not client.service_is_ready()]
 
-    def add(self, when: str, request: Request) -> None:
-        """Call a service after those that were added before; `when` is told if it is refused."""
+    def add(self, when: str, request: ServiceRequest) -> None:
+        """Call a service after those added before; `when` is part of the error of a refusal."""
         self._waiting.append((when, request))
 
     def drop(self) -> None:
-        """Forget the calls that have not been answered."""
+        """Discard the calls that have not been answered."""
         self._waiting.clear()
         self._answer = None
 
     def proceed(self) -> bool:
-        """Go on; return whether all calls have been answered.
+        """Make the next call when the last is answered; return whether all have been.
 
         Raises:
             ScenarioRefused: one was refused.
@@ -111,5 +113,5 @@ class Caller:
 
     @property
     def awaited(self) -> list[str]:
-        """The service that has not answered, if there is one."""
+        """The answer that is missing, if any."""
         return [f"answer of {self._waiting[0][1].service}"] if self._waiting else []

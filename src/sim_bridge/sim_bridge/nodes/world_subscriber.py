@@ -1,4 +1,4 @@
-"""What befalls a simulated robot: pushes and obstacles from messages, at the time they name."""
+"""Applies external wrenches and obstacles from messages at their time stamps."""
 
 from __future__ import annotations
 
@@ -19,79 +19,76 @@ from sim_bridge.nodes.topics import EXTERNAL_WRENCH, OBSTACLES
 from viability_bounds_pkg.robot_description import RobotDescriptionError
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 
-_NO_PUSH = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 _SHAPES = {Marker.CUBE: "box", Marker.SPHERE: "sphere", Marker.CYLINDER: "cylinder"}
-_REASONS = (RobotDescriptionError, ObstacleError, ValueError)
+_REFUSED = (RobotDescriptionError, ObstacleError, ValueError)
 
 
 class _Change(NamedTuple):
-    """Something that is to happen to the world."""
+    """A change of the simulated world at a stamp, ns."""
 
     stamp: int
     topic: str
     link: str
-    """That is pushed, or the empty string."""
+    """The link of an external wrench, or the empty string."""
     apply: Callable[[], object]
 
 
-class WorldInbox:
-    """Takes ``external_wrench`` and ``obstacles`` for a robot.
+class WorldSubscriber:
+    """Subscribes to ``external_wrench`` and ``obstacles``, and applies them to a robot's world.
 
-    A stamp of zero, or one that has passed, takes effect with the next control period; one
-    ahead with the first period that begins then or after.
+    A message with a stamp of zero or in the past takes effect in the next control period, others
+    in the first period that begins at or after their stamp.
 
     Args:
-        node: listens and logs what is refused.
-        robot: what it happens to.
-        push_timeout: how long a push lasts unless another message for its link has come or is
-            waiting for its time, s of robot time.
-        refused: counts the messages that were refused, by topic.
+        node: subscribes, and logs refused messages.
+        robot: that the wrenches and obstacles act on.
+        wrench_timeout: duration of a wrench unless another message for its link has come or waits
+            for its time, s of robot time.
+        refused: counts the refused messages by topic.
 
     Attributes:
-        pushed: until when each link is pushed unless a message says otherwise, ns.
+        wrench_ends: when the wrench on each link ends unless another message comes, ns.
     """
 
     def __init__(
-        self, node: Node, robot: BulletRobot, push_timeout: float, refused: Counter[str]
+        self, node: Node, robot: BulletRobot, wrench_timeout: float, refused: Counter[str]
     ) -> None:
         self._logger = node.get_logger()
         self._robot, self._refused = robot, refused
-        self._push_timeout = round(1e9 * push_timeout)
+        self._wrench_timeout = round(1e9 * wrench_timeout)
         self._pending: list[_Change] = []
-        self.pushed: dict[str, int] = {}
+        self.wrench_ends: dict[str, int] = {}
         EXTERNAL_WRENCH.subscription(node, self._on_wrench)
         OBSTACLES.subscription(node, self._on_obstacles)
 
     def __len__(self) -> int:
-        """How many messages wait for their time."""
+        """Return the number of messages that wait for their time."""
         return len(self._pending)
 
     def clear(self) -> None:
-        """Take all pushes and obstacles away, and forget what was to come."""
+        """Remove all wrenches and obstacles, and discard the waiting messages."""
         self._pending.clear()
-        self.pushed.clear()
+        self.wrench_ends.clear()
         self._robot.clear_wrenches()
         self._robot.clear_obstacles()
 
     def apply_due(self, stamp: int) -> None:
-        """Do what is due in the control period that begins at `stamp`, ns."""
+        """Apply the changes that are due in the control period that begins at `stamp`, ns."""
         while self._pending and self._pending[0].stamp <= stamp:
             change = self._pending.pop(0)
             try:
                 change.apply()
-            except _REASONS as error:
+            except _REFUSED as error:
                 self._refuse(change.topic, error)
             if change.link:
-                self.pushed[change.link] = stamp + self._push_timeout
-        if not self.pushed:
+                self.wrench_ends[change.link] = stamp + self._wrench_timeout
+        if not self.wrench_ends:
             return
         planned = {change.link for change in self._pending}
-        for link, until in list(self.pushed.items()):
-            if stamp >= until and link not in planned:
-                self._robot.apply_wrench(link, *_NO_PUSH)
-                del self.pushed[link]
-        if not self.pushed:
-            self._robot.clear_wrenches()
+        for link, end in list(self.wrench_ends.items()):
+            if stamp >= end and link not in planned:
+                self._robot.clear_wrenches(link)
+                del self.wrench_ends[link]
 
     def _add(self, change: _Change) -> None:
         self._pending.append(change)
@@ -102,29 +99,30 @@ class WorldInbox:
         f, t = message.wrench.force, message.wrench.torque
         force, torque = (f.x, f.y, f.z), (t.x, t.y, t.z)
         try:
-            self._robot.link_pose(link)
+            self._robot.link_pose(link)  # or it raises
             if not all(map(math.isfinite, force + torque)):
                 raise ValueError("it is not finite")
-        except _REASONS as error:
-            return self._refuse("external_wrench", error)
+        except _REFUSED as error:
+            self._refuse("external_wrench", error)
+            return
         stamp = stamp_to_ns(message.header.stamp)
-        push = partial(self._robot.apply_wrench, link, force, torque)
-        self._add(_Change(stamp, "external_wrench", link, push))
+        apply = partial(self._robot.apply_wrench, link, force, torque)
+        self._add(_Change(stamp, "external_wrench", link, apply))
 
     def _on_obstacles(self, message: MarkerArray) -> None:
         for marker in message.markers:
             try:
                 apply = self._obstacle_change(marker)
-            except _REASONS as error:
+            except _REFUSED as error:
                 self._refuse("obstacles", error)
                 continue
             self._add(_Change(stamp_to_ns(marker.header.stamp), "obstacles", "", apply))
 
     def _obstacle_change(self, marker: Marker) -> Callable[[], object]:
-        """Return what a marker asks for.
+        """Return the change that a marker describes.
 
         Raises:
-            ObstacleError: an action or a shape that there is not, or numbers that cannot be.
+            ObstacleError: an unknown action or shape, or an invalid obstacle.
             RobotDescriptionError: a frame that the robot does not have.
         """
         robot, name = self._robot, marker.ns

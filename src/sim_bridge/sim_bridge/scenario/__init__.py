@@ -1,1 +1,22 @@
-"""Scenarios: what happens when, and the report of a run."""
+"""Scenarios, the recording of a run, and its report.
+
+`write_report` is not exported here: it imports matplotlib, which takes a second.
+"""
+
+from sim_bridge.scenario.events import Event, read_event
+from sim_bridge.scenario.fields import ScenarioError
+from sim_bridge.scenario.pose_reference import pose_errors, pose_reference
+from sim_bridge.scenario.recording import RecordedRun, Recorder
+from sim_bridge.scenario.scenario import Scenario, load_scenario
+
+__all__ = [
+    "Event",
+    "RecordedRun",
+    "Recorder",
+    "Scenario",
+    "ScenarioError",
+    "load_scenario",
+    "pose_errors",
+    "pose_reference",
+    "read_event",
+]

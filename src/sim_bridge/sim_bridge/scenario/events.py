@@ -1,13 +1,14 @@
-"""What may happen in a scenario: one class for each kind of entry, and how it is read."""
+"""The events of a scenario: a class for each kind of entry, and its reader."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from sim_bridge.bullet.obstacles import SHAPES, Obstacle, ObstacleError
 from sim_bridge.scenario.fields import (
+    Fields,
     ScenarioError,
     name,
     number,
@@ -16,8 +17,8 @@ from sim_bridge.scenario.fields import (
     refuse,
     vector,
 )
-from sim_bridge.scenario.pose_path import PathPoint
-from sim_bridge.scenario.trajectory import read_points
+from sim_bridge.scenario.trajectory import read_trajectory
+from viability_bounds_pkg.pose_trajectory import PoseTrajectory
 
 _ZERO = [0.0, 0.0, 0.0]
 _UPRIGHT = [0.0, 0.0, 0.0, 1.0]
@@ -44,15 +45,15 @@ class PostureGoal:
 
 @dataclass(frozen=True)
 class TrajectoryGoal:
-    """A path of the end effector in the base frame that begins at `time`."""
+    """A trajectory of the end effector in the base frame that begins at `time`."""
 
     time: float
-    points: tuple[PathPoint, ...]
+    trajectory: PoseTrajectory
 
 
 @dataclass(frozen=True)
 class WrenchGoal:
-    """A wrench that the end effector is to exert from `time` on."""
+    """The desired wrench of the end effector on its environment from `time` on."""
 
     time: float
     force: tuple[float, ...]
@@ -60,12 +61,12 @@ class WrenchGoal:
     torque: tuple[float, ...]
     """N m."""
     frame: str
-    """In whose axes; empty for the end effector's."""
+    """Frame whose axes it is given in; empty for the end effector's."""
 
 
 @dataclass(frozen=True)
 class Push:
-    """A wrench on a link, world-aligned, from `time` on for `duration` seconds."""
+    """An external wrench on a link, in world axes, from `time` on for `duration` seconds."""
 
     time: float
     duration: float
@@ -78,7 +79,7 @@ class Push:
 
 @dataclass(frozen=True)
 class AddObstacle:
-    """A thing in the robot's world that the controller is not told of."""
+    """An obstacle in the robot's world; the controller does not know of it."""
 
     time: float
     obstacle: Obstacle
@@ -87,7 +88,7 @@ class AddObstacle:
 
 @dataclass(frozen=True)
 class RemoveObstacle:
-    """The end of an obstacle."""
+    """The removal of an obstacle."""
 
     time: float
     name: str
@@ -95,7 +96,7 @@ class RemoveObstacle:
 
 @dataclass(frozen=True)
 class EnableTorque:
-    """The controller's service ``enable_torque``: torque control, or position control."""
+    """A call of the controller's ``enable_torque``: torque or position control."""
 
     time: float
     enable: bool
@@ -119,16 +120,16 @@ class TriggerCall:
 
 
 Goal = PoseGoal | PostureGoal | TrajectoryGoal | WrenchGoal
-"""What the controller is sent ahead."""
+"""Sent to the controller before their time."""
 WorldEvent = Push | AddObstacle | RemoveObstacle
-"""What the robot is sent ahead."""
+"""Sent to the robot before their time."""
 ServiceEvent = EnableTorque | ParameterChange | TriggerCall
-"""What takes effect at once, and is asked for when its time has come."""
+"""Services that take effect at once, called at their time."""
 Event = Goal | WorldEvent | ServiceEvent
 
 
 def read_event(entry: Any, where: str) -> Event:
-    """Return the event that an entry of the file stands for.
+    """Return the event that an entry of the file describes.
 
     Raises:
         ScenarioError: the entry is unknown, malformed or out of range.
@@ -145,7 +146,7 @@ def read_event(entry: Any, where: str) -> Event:
     return _KINDS[kind](time, content, where)
 
 
-def _pose(time: float, fields: dict, where: str) -> PoseGoal:
+def _pose(time: float, fields: Fields, where: str) -> PoseGoal:
     only(fields, ("position", "orientation"), where)
     return PoseGoal(
         time,
@@ -154,17 +155,17 @@ def _pose(time: float, fields: dict, where: str) -> PoseGoal:
     )
 
 
-def _posture(time: float, fields: dict, where: str) -> PostureGoal:
+def _posture(time: float, fields: Fields, where: str) -> PostureGoal:
     return PostureGoal(
         time, {str(k): number(v, f"{where}.{k}", negative=True) for k, v in fields.items()}
     )
 
 
-def _trajectory(time: float, fields: dict, where: str) -> TrajectoryGoal:
-    return TrajectoryGoal(time, read_points(fields, where))
+def _trajectory(time: float, fields: Fields, where: str) -> TrajectoryGoal:
+    return TrajectoryGoal(time, read_trajectory(fields, where))
 
 
-def _wrench(time: float, fields: dict, where: str) -> WrenchGoal:
+def _wrench(time: float, fields: Fields, where: str) -> WrenchGoal:
     only(fields, ("force", "torque", "frame"), where)
     frame = fields.get("frame", "")
     if not isinstance(frame, str):
@@ -172,21 +173,21 @@ def _wrench(time: float, fields: dict, where: str) -> WrenchGoal:
     return WrenchGoal(time, *_force_and_torque(fields, where), frame)
 
 
-def _push(time: float, fields: dict, where: str) -> Push:
+def _push(time: float, fields: Fields, where: str) -> Push:
     only(fields, ("link", "duration", "force", "torque"), where)
     link = name(fields.get("link"), f"{where}.link", "the name of a link")
     duration = number(fields.get("duration"), f"{where}.duration")
     return Push(time, duration, link, *_force_and_torque(fields, where))
 
 
-def _force_and_torque(fields: dict, where: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _force_and_torque(fields: Fields, where: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
     return (
         vector(fields.get("force", _ZERO), 3, f"{where}.force"),
         vector(fields.get("torque", _ZERO), 3, f"{where}.torque"),
     )
 
 
-def _obstacle(time: float, fields: dict, where: str) -> AddObstacle:
+def _obstacle(time: float, fields: Fields, where: str) -> AddObstacle:
     only(fields, ("name", "shape", "size", "position", "orientation"), where)
     obstacle = (
         name(fields.get("name"), f"{where}.name", "a name"),
@@ -201,7 +202,7 @@ def _obstacle(time: float, fields: dict, where: str) -> AddObstacle:
         raise ScenarioError(f"{where}: {error}") from None
 
 
-def _remove_obstacle(time: float, fields: dict, where: str) -> RemoveObstacle:
+def _remove_obstacle(time: float, fields: Fields, where: str) -> RemoveObstacle:
     only(fields, ("name",), where)
     return RemoveObstacle(time, name(fields.get("name"), f"{where}.name", "a name"))
 
@@ -212,7 +213,7 @@ def _enable_torque(time: float, value: Any, where: str) -> EnableTorque:
     return EnableTorque(time, value)
 
 
-def _parameters(time: float, fields: dict, where: str) -> ParameterChange:
+def _parameters(time: float, fields: Fields, where: str) -> ParameterChange:
     only(fields, ("node", "values"), where)
     node = name(fields.get("node"), f"{where}.node", "the name of a node")
     values = fields.get("values")
@@ -224,7 +225,7 @@ def _parameters(time: float, fields: dict, where: str) -> ParameterChange:
 
 
 def _parameter(value: Any, where: str) -> Any:
-    """Return a value that a ROS parameter can have; a list of numbers as one of floats."""
+    """Return a valid value of a ROS parameter; a list of numbers as one of floats."""
     if isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, list) and value:
@@ -235,7 +236,7 @@ def _parameter(value: Any, where: str) -> Any:
     raise refuse(where, value, "true, false, a number, a string, or a list of numbers or strings")
 
 
-def _call(time: float, fields: dict, where: str) -> TriggerCall:
+def _call(time: float, fields: Fields, where: str) -> TriggerCall:
     only(fields, ("service", "type"), where)
     if fields.get("type", "trigger") != "trigger":
         raise refuse(f"{where}.type", fields["type"], "trigger")
@@ -244,7 +245,7 @@ def _call(time: float, fields: dict, where: str) -> TriggerCall:
     )
 
 
-_KINDS = {
+_KINDS: dict[str, Callable[[float, Any, str], Event]] = {
     "pose": _pose,
     "posture": _posture,
     "trajectory": _trajectory,

@@ -1,4 +1,4 @@
-"""Checks of what a scenario file says; each refusal names the entry and what is allowed."""
+"""Checks of the entries of a scenario file; each error names the entry and what is allowed."""
 
 from __future__ import annotations
 
@@ -8,27 +8,29 @@ from typing import Any
 
 from viability_bounds_pkg.exceptions import ArmSafetyError
 
+Fields = dict[str, Any]
+
 _QUATERNION_TOLERANCE = 1e-3
 
 
 class ScenarioError(ArmSafetyError, ValueError):
-    """A scenario file that cannot be played."""
+    """An invalid scenario file."""
 
 
 def refuse(where: str, value: Any, allowed: str) -> ScenarioError:
-    """Return the error of an entry that has a value that it may not have."""
+    """Return the error of an entry with an invalid value."""
     return ScenarioError(f"{where} is {value!r}; allowed: {allowed}")
 
 
-def only(fields: dict, allowed: Sequence[str], where: str) -> None:
+def only(fields: Fields, allowed: Sequence[str], where: str) -> None:
     """Refuse fields that are not `allowed`."""
     unknown = [str(key) for key in fields if key not in allowed]
     if unknown:
         raise ScenarioError(f"{where} has {', '.join(unknown)}; allowed: {', '.join(allowed)}")
 
 
-def one_of(fields: dict, keys: Sequence[str], where: str) -> str:
-    """Return which one of `keys` is given; refuse none and several."""
+def one_of(fields: Fields, keys: Sequence[str], where: str) -> str:
+    """Return the only one of `keys` that is given; refuse none and several."""
     given = [key for key in keys if key in fields]
     if len(given) != 1:
         has = " and ".join(given) or "none of them"
@@ -37,14 +39,14 @@ def one_of(fields: dict, keys: Sequence[str], where: str) -> str:
 
 
 def name(value: Any, where: str, what: str) -> str:
-    """Return a string that is not empty; `what` it names is said when it is not."""
+    """Return a string that is not empty; `what` it stands for is part of the error."""
     if not isinstance(value, str) or not value:
         raise refuse(where, value, what)
     return value
 
 
 def number(value: Any, where: str, *, zero: bool = False, negative: bool = False) -> float:
-    """Return a finite number, > 0 unless told otherwise."""
+    """Return a finite number; > 0 unless zero or negative ones are allowed."""
     sign = "" if negative else " >= 0" if zero else " > 0"
     if (
         not _is_finite(value)
@@ -65,12 +67,12 @@ def vector(value: Any, size: int, where: str) -> tuple[float, ...]:
 
 
 def quaternion(value: Any, where: str) -> tuple[float, ...]:
-    """Return a unit quaternion x, y, z, w."""
+    """Return a quaternion x, y, z, w of length one, which the entry has nearly."""
     result = vector(value, 4, where)
     norm = math.hypot(*result)
     if abs(norm - 1.0) > _QUATERNION_TOLERANCE:
         raise ScenarioError(f"{where} has norm {norm:g}; allowed: 1 within 0.001")
-    return result
+    return tuple(component / norm for component in result)
 
 
 def _is_finite(value: Any) -> bool:

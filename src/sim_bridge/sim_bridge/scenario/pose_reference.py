@@ -1,26 +1,24 @@
-"""Where a scenario wants the end effector, and how far it was from there."""
+"""The reference of the end effector in a scenario, and the distance of a recorded run from it."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 
-from sim_bridge.bullet.client import pybullet
 from sim_bridge.bullet.robot import BulletRobot
 from sim_bridge.scenario.events import EnableTorque, Event, PoseGoal, TrajectoryGoal
-from sim_bridge.scenario.pose_path import angle_between, sample
-from sim_bridge.scenario.recording import Run
+from sim_bridge.scenario.recording import RecordedRun
 
 Array = NDArray[np.float64]
 
 
 def pose_reference(events: Iterable[Event], t: Array) -> Array:
-    """Return where the end effector is to be, as the scenario says, in the base frame.
+    """Return the pose that the scenario asks of the end effector, in the base frame.
 
-    Compliance, on purpose, and collision avoidance may keep the arm from there.
+    The end effector of a compliant arm, or of one that avoids collisions, may be elsewhere.
 
     Args:
         events: in order of time.
@@ -42,28 +40,28 @@ def pose_reference(events: Iterable[Event], t: Array) -> Array:
             reference[now] = [*event.position, *event.orientation]
         elif torque and isinstance(event, TrajectoryGoal):
             for i in now:
-                reference[i] = np.concatenate(sample(event.points, t[i] - event.time))
+                reference[i] = pin.SE3ToXYZQUAT(event.trajectory.sample(t[i] - event.time)[0])
     return reference
 
 
 def pose_errors(
-    robot: BulletRobot, base_frame: str, frame: str, run: Run, reference: Array
+    robot: BulletRobot, base_frame: str, frame: str, run: RecordedRun, reference: Array
 ) -> Array:
     """Return distance and angle to the reference, shape (N, 2), m and rad; NaN without one.
 
     Args:
-        robot: moved through the recorded states.
+        robot: set to the recorded states.
         base_frame: frame that the reference is given in.
         frame: the end effector's.
         run: recorded states.
-        reference: where it was to be, shape (N, 7), as from `pose_reference`.
+        reference: shape (N, 7), of `pose_reference`.
     """
     errors = np.full((len(run.t), 2), np.nan)
     base = robot.link_pose(base_frame)
     rest = np.zeros(len(run.joints))
     for i in np.flatnonzero(np.isfinite(reference[:, 0])):
         robot.reset(run.q[i], rest)
-        position, orientation = robot.link_pose(frame)
-        wanted = pybullet.multiplyTransforms(*base, reference[i, :3], reference[i, 3:])
-        errors[i] = math.dist(position, wanted[0]), angle_between(orientation, wanted[1])
+        pose, desired = robot.link_pose(frame), base * pin.XYZQUATToSE3(reference[i])
+        turn = pin.log3(pose.rotation.T @ desired.rotation)
+        errors[i] = np.linalg.norm(desired.translation - pose.translation), np.linalg.norm(turn)
     return errors

@@ -1,10 +1,11 @@
-"""The report of a run: a table, a verdict, a figure, and the numbers behind them."""
+"""The report of a run: table, verdict, figure, data and metrics."""
 
 from __future__ import annotations
 
 import json
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -12,29 +13,38 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_bridge.bullet.robot import BulletRobot
 from sim_bridge.scenario.events import TrajectoryGoal
 from sim_bridge.scenario.pose_reference import pose_errors, pose_reference
-from sim_bridge.scenario.recording import Run
+from sim_bridge.scenario.recording import RecordedRun
+from sim_bridge.scenario.scenario import ScenarioConfiguration
+
+Array = NDArray[np.float64]
+Metrics = dict[str, Any]
 
 TOLERANCE = 1e-9
-"""What counts as a violation, rad, rad/s and share of the torque limit: rounding does not."""
+"""Of a violation, rad, rad/s and share of the torque limit: excludes rounding."""
 
 _RECORDED = ("t", "q", "v", "a_lower", "a_upper", "tau", "ft_wrench")
 
 
 def write_report(
-    directory: Path, config, run: Run, robot: dict[str, str], bounds: dict[str, str]
+    directory: Path,
+    config: ScenarioConfiguration,
+    run: RecordedRun,
+    robot: dict[str, str],
+    bounds: dict[str, str],
 ) -> bool:
     """Write ``figure.png``, ``data.npz`` and ``metrics.json``; print a table and the verdict.
 
     Args:
-        directory: where to; made if it is not there.
-        config: the scenario node's configuration.
-        run: what was recorded.
-        robot: the robot's last diagnostics, by key: it saw every physics step.
-        bounds: the bounds node's.
+        directory: created if it does not exist.
+        config: scenario and arm.
+        run: the recording.
+        robot: the robot's last diagnostics, by key; they cover every physics step.
+        bounds: the bounds node's last diagnostics.
 
     Returns:
         Whether every limit was kept.
@@ -53,12 +63,12 @@ def write_report(
     )
     (directory / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
     _draw(directory / "figure.png", config, run, errors, metrics)
-    _print_table(config, metrics)
+    _print_table(metrics)
     print(f"figure, data and metrics are in {directory}")
-    return metrics["limits_kept"]
+    return bool(metrics["limits_kept"])
 
 
-def _errors(config, run: Run, reference: np.ndarray) -> np.ndarray:
+def _errors(config: ScenarioConfiguration, run: RecordedRun, reference: Array) -> Array:
     """Return the pose error of each state, shape (N, 2), m and rad; NaN without a reference.
 
     The robot's own forward kinematics are PyBullet's, which share nothing with the
@@ -70,28 +80,32 @@ def _errors(config, run: Run, reference: np.ndarray) -> np.ndarray:
         return pose_errors(robot, config.base_frame, config.end_effector_frame, run, reference)
 
 
-def _floats(robot: dict[str, str], key: str) -> np.ndarray:
+def _floats(robot: dict[str, str], key: str) -> Array:
     return np.array([float(item) for item in robot[key].split()])
 
 
 def _or_none(value: float) -> float | None:
-    """Return what JSON has a word for: without a pose goal there is no error."""
+    """Return None, which JSON has, for NaN: without a pose goal there is no error."""
     return float(value) if np.isfinite(value) else None
 
 
-def _trajectory_error(config, run: Run, errors: np.ndarray) -> float:
+def _trajectory_error(config: ScenarioConfiguration, run: RecordedRun, errors: Array) -> float:
     """Return the largest distance to a trajectory while it lasted, m; NaN if there was none."""
     worst = np.nan
     for event in config.scenario.events:
         if isinstance(event, TrajectoryGoal):
-            during = (run.t >= event.time) & (run.t <= event.time + event.points[-1].time)
+            during = (run.t >= event.time) & (run.t <= event.time + event.trajectory.duration)
             worst = np.fmax(worst, np.fmax.reduce(errors[during, 0], initial=np.nan))
     return worst
 
 
 def _metrics(
-    config, run: Run, robot: dict[str, str], errors: np.ndarray, bounds: dict[str, str]
-) -> dict:
+    config: ScenarioConfiguration,
+    run: RecordedRun,
+    robot: dict[str, str],
+    errors: Array,
+    bounds: dict[str, str],
+) -> Metrics:
     position = _floats(robot, "position_violation_rad")
     velocity = _floats(robot, "velocity_violation_rad_s")
     ratio = max(float(robot["commanded_torque_ratio_max"]), _floats(robot, "torque_ratio").max())
@@ -138,7 +152,7 @@ def _metrics(
     }
 
 
-def _print_table(config, metrics: dict) -> None:
+def _print_table(metrics: Metrics) -> None:
     print()
     width = max(map(len, metrics["joints"]))
     print(f"{'joint':<{width}}  to lower limit  to upper limit  top speed  top torque")
@@ -158,7 +172,7 @@ def _print_table(config, metrics: dict) -> None:
     if metrics["max_trajectory_error_m"] is not None:
         print(f"off the trajectory: {1e3 * metrics['max_trajectory_error_m']:.3f} mm at most")
     if metrics["max_contact_force_n"]:
-        print(f"obstacles pushed on the arm with {metrics['max_contact_force_n']:.1f} N at most")
+        print(f"contact force with obstacles: {metrics['max_contact_force_n']:.1f} N at most")
     print(
         f"{metrics['steps']} control periods, {metrics['deadline_misses']} deadlines missed, "
         f"command latency {metrics['latency_p50_us']:.0f} us (median), "
@@ -182,8 +196,10 @@ def _print_table(config, metrics: dict) -> None:
     print(f"VERDICT: limits were BROKEN: {'; '.join(filter(None, broken))}.")
 
 
-def _draw(path: Path, config, run: Run, errors: np.ndarray, metrics: dict) -> None:
-    """Draw the joint that came nearest to a limit in detail, and all joints in proportion."""
+def _draw(
+    path: Path, config: ScenarioConfiguration, run: RecordedRun, errors: Array, metrics: Metrics
+) -> None:
+    """Draw the joint nearest to a limit in detail, and all joints relative to their limits."""
     clearance = np.minimum(run.q - config.q_min, config.q_max - run.q).min(axis=0)
     j = int(np.argmin(clearance))
     t = run.t

@@ -1,4 +1,4 @@
-"""A scenario: a timeline of goals, pushes, obstacles and calls, read from YAML and checked."""
+"""A scenario: goals, pushes, obstacles and service calls over time, read from YAML."""
 
 from __future__ import annotations
 
@@ -9,19 +9,39 @@ import yaml
 
 from sim_bridge.scenario.events import AddObstacle, Event, Push, RemoveObstacle, read_event
 from sim_bridge.scenario.fields import ScenarioError, number, refuse
+from sim_bridge.urdf.arm import ConfiguredArm
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """What happens when; all times in seconds of robot time from the start.
+    """Events over time; all times in seconds of robot time from the start.
 
     Attributes:
-        duration: when it is over.
+        duration: its end.
         events: in order of time.
     """
 
     duration: float
     events: tuple[Event, ...]
+
+
+@dataclass(frozen=True)
+class ScenarioConfiguration(ConfiguredArm):
+    """A scenario and the arm that plays it.
+
+    Attributes:
+        name: of the robot.
+        base_frame: of pose goals.
+        end_effector_frame: frame that pose goals move.
+        scenario: its events.
+        ready_timeout: how long the other nodes may take to start or to answer, s.
+    """
+
+    name: str
+    base_frame: str
+    end_effector_frame: str
+    scenario: Scenario
+    ready_timeout: float
 
 
 def load_scenario(path: str | Path) -> Scenario:
@@ -55,7 +75,7 @@ def load_scenario(path: str | Path) -> Scenario:
 
 
 def _check_pushes(events: list[Event]) -> None:
-    """Refuse pushes of the same link that overlap: the robot holds one for each."""
+    """Refuse pushes of the same link that overlap: the robot keeps one for each link."""
     until: dict[str, float] = {}
     for push in (event for event in events if isinstance(event, Push)):
         if push.time < until.get(push.link, 0.0) - 1e-9:
@@ -67,15 +87,15 @@ def _check_pushes(events: list[Event]) -> None:
 
 
 def _check_obstacles(events: list[Event]) -> None:
-    """Refuse to remove what is not there."""
-    there: set[str] = set()
+    """Refuse to remove obstacles that do not exist."""
+    present: set[str] = set()
     for event in events:
         if isinstance(event, AddObstacle):
-            there.add(event.obstacle.name)
+            present.add(event.obstacle.name)
         elif isinstance(event, RemoveObstacle):
-            if event.name not in there:
-                known = ", ".join(sorted(there)) or "none"
+            if event.name not in present:
+                known = ", ".join(sorted(present)) or "none"
                 raise ScenarioError(
                     f"remove_obstacle at {event.time:g} s names {event.name!r}; there are: {known}"
                 )
-            there.remove(event.name)
+            present.remove(event.name)

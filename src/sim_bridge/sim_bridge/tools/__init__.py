@@ -1,1 +1,1 @@
-"""Tools that move the simulated robot."""
+"""Command line tools and a camera for the simulated robot."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from sim_bridge.bullet.client import BulletClient, pybullet, silenced
 from sim_bridge.bullet.obstacle_bodies import shape_arguments
@@ -74,7 +74,7 @@ class Camera:
         *,
         q: ArrayLike | None = None,
         angle: float = 40.0,
-    ) -> np.ndarray:
+    ) -> NDArray[np.uint8]:
         """Render a picture.
 
         Args:
@@ -108,7 +108,7 @@ class Camera:
         sky = np.linspace(_SKY_TOP, _SKY_BOTTOM, height)[:, None, :]
         picture = np.where(nothing[:, :, None], sky, picture)
         blocks = picture.reshape(size[1], _OVERSAMPLING, size[0], _OVERSAMPLING, 3)
-        return blocks.mean(axis=(1, 3)).round().astype(np.uint8)
+        return np.round(blocks.mean(axis=(1, 3))).astype(np.uint8)
 
     def _update_obstacles(self) -> None:
         """Show the obstacles that the robot's world has now."""
@@ -127,9 +127,10 @@ class Camera:
         if "height" in arguments:
             arguments["length"] = arguments.pop("height")
         shape = self._bullet.createVisualShape(**arguments, rgbaColor=(*color, 1.0))
-        return self._bullet.createMultiBody(
+        body: int = self._bullet.createMultiBody(
             0.0, -1, shape, obstacle.position.tolist(), obstacle.orientation.tolist()
         )
+        return body
 
     def close(self) -> None:
         """Disconnect from PyBullet; the camera cannot be used afterwards."""

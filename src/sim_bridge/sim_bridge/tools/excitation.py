@@ -1,21 +1,20 @@
-"""A motion from which the friction of every joint can be told, whatever the masses are.
+"""A motion from which the friction of every joint can be identified, independent of masses.
 
 All joints move at once, in parts of whole periods of cosines,
 
     q_i(t) = q_start_i + (A_i / 2) (1 - cos(2 pi k_i t / T)),
 
-which begin and end at rest. Played backward each part is the same motion: every state of the arm
-is passed with each velocity and its opposite, at the same acceleration. What rigid bodies need is
-then the same and friction the opposite.
+which begin and end at rest. Each part is symmetric in time: every configuration is passed with a
+velocity and its opposite, at the same acceleration. The torques of rigid-body dynamics are then
+equal, those of friction opposite.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_bridge.urdf.arm import ConfiguredArm
 from viability_bounds_pkg.exceptions import ArmSafetyError
 
 Array = NDArray[np.float64]
@@ -24,19 +23,16 @@ PARTS = ((10.0, 0.04, np.inf), (16.0, 0.15, np.inf), (10.0, np.inf, 1.0))
 """Duration T, s; greatest speed, rad/s; and greatest frequency, 1/s."""
 
 ROOM = 0.9
-"""Share of the way to a position limit that is used."""
+"""Share of the distance to a position limit that is used."""
 
 
 class ExcitationError(ArmSafetyError, ValueError):
-    """The joints have no room for the motion."""
+    """The motion does not fit into the limits of the joints."""
 
 
 def excitation(
-    joints: Sequence[str],
+    arm: ConfiguredArm,
     q_start: Array,
-    q_min: Array,
-    q_max: Array,
-    v_max: Array,
     dt: float,
     amplitude: float = 0.6,
     speed: float = 0.5,
@@ -46,20 +42,18 @@ def excitation(
     Each joint moves to the side on which it has more room.
 
     Args:
-        joints: names of the n joints.
-        q_start: where it begins and ends, shape (n,), rad.
-        q_min: lower position limits, shape (n,), rad; may be -inf.
-        q_max: upper position limits, shape (n,), rad; may be inf.
-        v_max: velocity limits, shape (n,), rad/s.
+        arm: its n joints and their limits; position limits may be infinite.
+        q_start: positions at start and end, shape (n,), rad.
         dt: period, s.
         amplitude: greatest A, rad.
-        speed: greatest share of `v_max`.
+        speed: greatest share of the velocity limits.
 
     Raises:
-        ExcitationError: a joint starts outside its limits or hardly can move.
+        ExcitationError: a joint starts outside its limits or too near to both.
     """
+    q_min, q_max, v_max = arm.q_min, arm.q_max, arm.v_max
     room = np.maximum(q_max - q_start, q_start - q_min)
-    for joint, q, low, high, most in zip(joints, q_start, q_min, q_max, room, strict=True):
+    for joint, q, low, high, most in zip(arm.joints, q_start, q_min, q_max, room, strict=True):
         if not low <= q <= high:
             raise ExcitationError(f"joint {joint} starts at {q:g}, outside its limits")
         if ROOM * most < 0.05:

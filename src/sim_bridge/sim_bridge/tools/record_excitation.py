@@ -1,7 +1,7 @@
-"""Command line tool: a simulated robot's joints move so that their friction can be identified.
+"""Command line tool: records a motion of the simulated robot for friction identification.
 
-The drives of the robot in a parameter file follow the motion of `excitation`; what the robot
-reports of it, position, velocity and motor torque, is written as a recording.
+The drives of the robot in a parameter file follow the motion of `excitation`; the reported
+positions, velocities and motor torques are written as a recording.
 """
 
 from __future__ import annotations
@@ -12,8 +12,10 @@ import sys
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from sim_bridge.bullet.limit_monitor import LimitMonitor
@@ -32,6 +34,8 @@ from viability_bounds_pkg.cli.limits_file import (
     node_parameters,
     write_whole,
 )
+
+Array = NDArray[np.float64]
 
 
 def _share(text: str) -> float:
@@ -74,16 +78,7 @@ def _run(options: argparse.Namespace) -> int:
     given = node_parameters(options.parameters, "/**/bullet_node")
     values = {row.name: row.coerce(given.get(row.name)) for row in TABLE}
     config = make_configuration(values)
-    motion = excitation(
-        config.joints,
-        config.q_start,
-        config.q_min,
-        config.q_max,
-        config.v_max,
-        config.dt,
-        options.amplitude,
-        options.speed,
-    )
+    motion = excitation(config, config.q_start, config.dt, options.amplitude, options.speed)
     with closing(make_robot(config, values)) as robot:
         recorded, monitor = record(robot, config, *motion)
     broken = np.flatnonzero(
@@ -105,29 +100,31 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def record(
-    robot: BulletRobot, config: BulletConfiguration, q: np.ndarray, v: np.ndarray
-) -> tuple[dict[str, np.ndarray], LimitMonitor]:
-    """Let the drives follow a motion; return what the robot reported, and the judge of it.
+    robot: BulletRobot, config: BulletConfiguration, q: Array, v: Array
+) -> tuple[dict[str, Any], LimitMonitor]:
+    """Let the drives follow a motion; return the recording and its limit monitor.
 
     Args:
         robot: of `config`.
         config: of the robot.
-        q: where to be after each control period, shape (N, n), rad.
-        v: how fast, shape (N, n), rad/s.
+        q: positions after each control period, shape (N, n), rad.
+        v: velocities there, shape (N, n), rad/s.
     """
     monitor = LimitMonitor(config.q_min, config.q_max, config.v_max, config.tau_max)
     robot.monitor = monitor
     robot.reset(q[0], np.zeros(q.shape[1]))
     states = []
     # With no terminal to draw on there is no bar.
-    for target in tqdm(zip(q, v, strict=True), total=len(q), unit=" periods", disable=None):
-        robot.move(*target, config.tau_max, config.v_max, config.substeps)
+    for q_des, v_des in tqdm(zip(q, v, strict=True), total=len(q), unit=" periods", disable=None):
+        robot.move(q_des, v_des, config.tau_max, config.v_max, config.substeps)
         states.append(robot.state())
-    columns = {"q": "q", "v": "v", "tau": "motor_torque"}
     recorded = {
-        key: np.array([getattr(state, name) for state in states]) for key, name in columns.items()
+        "t": config.dt * np.arange(1, len(q) + 1),
+        "q": np.array([state.q for state in states]),
+        "v": np.array([state.v for state in states]),
+        "tau": np.array([state.motor_torque for state in states]),
     }
-    return {"t": config.dt * np.arange(1, len(q) + 1)} | recorded, monitor
+    return recorded, monitor
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

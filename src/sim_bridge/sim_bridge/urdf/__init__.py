@@ -1,5 +1,6 @@
-"""Robot descriptions rewritten for PyBullet."""
+"""Arms of robot descriptions, and descriptions rewritten for PyBullet."""
 
+from sim_bridge.urdf.arm import ConfiguredArm
 from sim_bridge.urdf.preparation import FramePlacement, PreparedUrdf, prepare_urdf
 
-__all__ = ["FramePlacement", "PreparedUrdf", "prepare_urdf"]
+__all__ = ["ConfiguredArm", "FramePlacement", "PreparedUrdf", "prepare_urdf"]

@@ -25,7 +25,7 @@ Q = np.array(VALUES["start_positions"])
 PERIOD = 2_000_000  # ns, of the configured 500 Hz
 
 
-class Robot:
+class RobotProbe:
     """The node, and what a controller sees and sends."""
 
     def __init__(self, ros, **changes):
@@ -90,7 +90,7 @@ class Robot:
 
 
 def test_each_command_with_the_right_stamp_moves_time_by_one_period(ros):
-    robot = Robot(ros)
+    robot = RobotProbe(ros)
     first = robot.stamp
     assert first == PERIOD
     robot.step(times=5)
@@ -100,7 +100,7 @@ def test_each_command_with_the_right_stamp_moves_time_by_one_period(ros):
 
 
 def test_an_unanswered_state_is_sent_again_and_nothing_moves(ros):
-    robot = Robot(ros)
+    robot = RobotProbe(ros)
     ros.wait_until(lambda: len(robot.states) >= 3, "repeats")
     assert set(robot.states.stamps) == {PERIOD}
 
@@ -126,7 +126,7 @@ def test_an_unanswered_state_is_sent_again_and_nothing_moves(ros):
     ],
 )
 def test_commands_that_cannot_be_obeyed_are_dropped_and_counted(ros, reason, send):
-    robot = Robot(ros)
+    robot = RobotProbe(ros)
     robot.step(times=3)
     stamp = robot.stamp
     send(robot)
@@ -136,7 +136,7 @@ def test_commands_that_cannot_be_obeyed_are_dropped_and_counted(ros, reason, sen
 
 
 def test_names_may_come_in_any_order(ros):
-    robot = Robot(ros)
+    robot = RobotProbe(ros)
     order = [3, 1, 6, 0, 2, 5, 4]
     for _ in range(20):
         stamp, tau = robot.stamp, robot.gravity()
@@ -146,7 +146,7 @@ def test_names_may_come_in_any_order(ros):
 
 
 def test_torque_beyond_the_limits_is_clipped_and_reported(ros):
-    robot = Robot(ros)
+    robot = RobotProbe(ros)
     robot.step(3.0 * np.array(VALUES["torque_max"]))
     robot.step()
     ros.wait_until(lambda: float(robot.reported("commanded_torque_ratio_max") or 0.0) > 2.9)
@@ -155,14 +155,14 @@ def test_torque_beyond_the_limits_is_clipped_and_reported(ros):
 
 
 def test_effort_is_the_torque_that_the_motors_gave(ros):
-    robot = Robot(ros)
+    robot = RobotProbe(ros)
     tau = robot.gravity() + 0.5
     robot.step(tau)
     np.testing.assert_allclose(robot.states[-1].effort, tau, rtol=1e-12)
 
 
 def test_other_joints_in_a_command_are_ignored(ros):
-    robot = Robot(ros)
+    robot = RobotProbe(ros)
     stamp, tau = robot.stamp, robot.gravity()
     robot.send(stamp, [math.nan, *tau], ["other", *JOINTS])
     ros.wait_until(lambda: robot.stamp > stamp, "the next state")
@@ -170,7 +170,7 @@ def test_other_joints_in_a_command_are_ignored(ros):
 
 
 def test_positions_are_held_by_the_drives(ros):
-    robot = Robot(ros)
+    robot = RobotProbe(ros)
     robot.move(Q, times=30)
     np.testing.assert_allclose(robot.q, Q, rtol=0.0, atol=1e-3)
     np.testing.assert_allclose(robot.states[-1].effort, robot.gravity(), atol=0.05)
@@ -183,7 +183,7 @@ def test_positions_are_held_by_the_drives(ros):
 
 
 def test_positions_may_come_in_any_order_and_with_velocities(ros):
-    robot = Robot(ros)
+    robot = RobotProbe(ros)
     order = [3, 1, 6, 0, 2, 5, 4]
     speed = np.linspace(0.05, 0.1, 7)
     for k in range(100):
@@ -196,7 +196,7 @@ def test_positions_may_come_in_any_order_and_with_velocities(ros):
 
 
 def test_control_changes_at_any_time_without_a_jump(ros):
-    robot = Robot(ros)
+    robot = RobotProbe(ros)
     robot.step(times=5)
     tau = np.array(robot.states[-1].effort)
     q, v = robot.q, robot.v
@@ -210,7 +210,7 @@ def test_control_changes_at_any_time_without_a_jump(ros):
 
 
 def test_positions_are_held_for_the_time_out_and_then_braked(ros):
-    robot = Robot(ros, clock="real_time", rate_hz=100.0, command_timeout=3)
+    robot = RobotProbe(ros, clock="real_time", rate_hz=100.0, command_timeout=3)
     ros.wait_until(
         lambda: robot.reported("control") == "position",
         each=lambda: robot.send(robot.stamp, q=Q),
@@ -223,7 +223,7 @@ def test_positions_are_held_for_the_time_out_and_then_braked(ros):
 
 def test_joint_friction_and_masses_reach_the_robot(ros):
     friction = [1.0, 1.0, 1.0, 1.0, 0.5, 0.5, 0.5]
-    robot = Robot(
+    robot = RobotProbe(
         ros,
         friction_coulomb=friction,
         friction_static=[2.0 * f for f in friction],
@@ -277,12 +277,12 @@ def test_talos_stands_still_by_its_friction_alone(ros):
 
 
 def test_without_stiction_of_its_own_a_joint_has_that_of_coulomb(ros):
-    robot = Robot(ros, friction_coulomb=[1.0] * 7)
+    robot = RobotProbe(ros, friction_coulomb=[1.0] * 7)
     np.testing.assert_array_equal(robot.node._config.joint_friction.friction_static, 1.0)
 
 
 def test_reset_brings_it_back_to_the_start_at_rest(ros):
-    robot = Robot(ros)
+    robot = RobotProbe(ros)
     robot.push("panda_link4", 50.0)
     robot.step(robot.gravity() + 1.0, times=30)
     assert np.abs(robot.q - Q).max() > 1e-4
@@ -301,7 +301,7 @@ def test_reset_brings_it_back_to_the_start_at_rest(ros):
 
 
 def test_pause_stops_time_and_resuming_asks_anew(ros):
-    robot = Robot(ros)
+    robot = RobotProbe(ros)
     robot.step(times=2)
     ros.call(SetBool, "bullet_node/pause", SetBool.Request(data=True))
     robot.await_reported("paused", "True")
@@ -315,7 +315,7 @@ def test_pause_stops_time_and_resuming_asks_anew(ros):
 
 
 def test_it_pauses_itself_after_the_time_asked_for(ros):
-    robot = Robot(ros, start_paused=True)
+    robot = RobotProbe(ros, start_paused=True)
     ros.accepts("bullet_node", pause_after=0.02)
     ros.call(SetBool, "bullet_node/pause", SetBool.Request(data=False))
     for _ in range(10):
@@ -329,24 +329,24 @@ def test_it_pauses_itself_after_the_time_asked_for(ros):
 
 
 def test_a_push_moves_it_until_it_times_out(ros):
-    robot = Robot(ros, external_wrench_timeout=0.05)
+    robot = RobotProbe(ros, external_wrench_timeout=0.05)
     robot.push("panda_link4", 30.0)
     robot.step(times=24)
     assert np.abs(robot.v).max() > 1e-3
     robot.step(times=10)
-    assert not robot.node._world.pushed
+    assert not robot.node._world.wrench_ends
     speeds = [np.abs(np.array(s.velocity)).max() for s in robot.states[-5:]]
     assert max(speeds) - min(speeds) < 1e-3  # nothing pushes any more
 
 
 def test_a_new_push_takes_the_place_of_the_old_on_its_link(ros):
-    robot = Robot(ros, external_wrench_timeout=5.0)
+    robot = RobotProbe(ros, external_wrench_timeout=5.0)
     robot.push("panda_link4", 30.0)
     robot.push("panda_link6", 1.0)
     robot.step(times=10)
     speed = np.abs(robot.v).max()
     assert speed > 1e-3
-    assert set(robot.node._world.pushed) == {"panda_link4", "panda_link6"}
+    assert set(robot.node._world.wrench_ends) == {"panda_link4", "panda_link6"}
     robot.push("panda_link4", 0.0)
     robot.push("panda_link6", -1.0)  # what the other has done
     robot.step(times=10)
@@ -359,7 +359,7 @@ def test_a_new_push_takes_the_place_of_the_old_on_its_link(ros):
 
 
 def test_a_push_sent_ahead_begins_and_ends_with_its_stamps(ros):
-    robot = Robot(ros, external_wrench_timeout=3 * PERIOD * 1e-9)
+    robot = RobotProbe(ros, external_wrench_timeout=3 * PERIOD * 1e-9)
     begin, end = robot.stamp + 5 * PERIOD, robot.stamp + 15 * PERIOD
     robot.push("panda_link4", 0.0, end)
     robot.push("panda_link4", 30.0, begin)
@@ -375,7 +375,7 @@ def test_a_push_sent_ahead_begins_and_ends_with_its_stamps(ros):
 
 
 def test_obstacles_come_and_go_with_their_stamps(ros):
-    robot = Robot(ros)
+    robot = RobotProbe(ros)
     obstacles = ros.talk(MarkerArray, "obstacles", GOAL_QOS)
 
     def marker(name, stamp, action=Marker.ADD, kind=Marker.CUBE, frame="panda_link0"):
@@ -409,7 +409,7 @@ def test_obstacles_come_and_go_with_their_stamps(ros):
 
 
 def test_obstacles_that_cannot_be_are_dropped_and_counted(ros):
-    robot = Robot(ros)
+    robot = RobotProbe(ros)
     obstacles = ros.talk(MarkerArray, "obstacles", GOAL_QOS)
     markers = []
     for change in (
@@ -438,7 +438,7 @@ def test_obstacles_that_cannot_be_are_dropped_and_counted(ros):
 
 @pytest.mark.parametrize(("link", "force"), [("no_such_link", 1.0), ("panda_link4", math.nan)])
 def test_a_push_that_cannot_be_is_refused(ros, link, force):
-    robot = Robot(ros)
+    robot = RobotProbe(ros)
     pushes = ros.talk(WrenchStamped, "external_wrench", GOAL_QOS)
     push = WrenchStamped()
     push.header.frame_id = link
@@ -450,7 +450,7 @@ def test_a_push_that_cannot_be_is_refused(ros, link, force):
 
 
 def test_the_sensor_is_published_for_each_state_with_bias_and_seeded_noise(ros):
-    robot = Robot(ros, ft_seed=3)
+    robot = RobotProbe(ros, ft_seed=3)
     felt = ros.listen(WrenchStamped, "ft_wrench")
     ros.hears("ft_wrench")
 
@@ -482,7 +482,7 @@ def test_the_sensor_is_published_for_each_state_with_bias_and_seeded_noise(ros):
 
 
 def test_contacts_are_felt_by_motion_sensor_and_diagnostics(ros):
-    robot = Robot(ros, obstacle_stiffness=1e5, ft_bias=[], ft_noise=[])
+    robot = RobotProbe(ros, obstacle_stiffness=1e5, ft_bias=[], ft_noise=[])
     felt = ros.listen(WrenchStamped, "ft_wrench")
     arm = robot.node._robot
     finger = arm.link_pose("panda_leftfinger").translation
@@ -511,7 +511,7 @@ def test_contacts_are_felt_by_motion_sensor_and_diagnostics(ros):
 
 def test_robot_description_and_clock_are_published(ros):
     clocks = ros.listen(Clock, "/clock")
-    robot = Robot(ros, publish_clock=True)
+    robot = RobotProbe(ros, publish_clock=True)
     late = ros.listen(String, "robot_description", LATCHED_QOS)
     ros.wait_until(lambda: late)
     assert "<robot" in late[0].data
@@ -520,7 +520,7 @@ def test_robot_description_and_clock_are_published(ros):
 
 
 def test_in_real_time_it_keeps_its_rate_and_brakes_without_commands(ros):
-    robot = Robot(ros, clock="real_time", rate_hz=100.0, command_timeout=3)
+    robot = RobotProbe(ros, clock="real_time", rate_hz=100.0, command_timeout=3)
     # Not one command yet: the brakes hold it, and no deadline has been missed.
     ros.wait_until(lambda: int(robot.reported("braked_periods") or 0) > 10)
     assert robot.reported("deadline_misses") == "0"
@@ -543,7 +543,7 @@ def test_in_real_time_it_keeps_its_rate_and_brakes_without_commands(ros):
 
 def test_the_first_period_after_a_pause_is_a_whole_one(ros):
     """Resumed anywhere between two ticks, a robot leaves time to answer before the next."""
-    robot = Robot(ros, clock="real_time", rate_hz=5.0)
+    robot = RobotProbe(ros, clock="real_time", rate_hz=5.0)
     known = {"stamp": 0}
 
     def answer():
@@ -644,14 +644,14 @@ def test_it_does_not_start_with_bad_parameters(ros, changed, name, shown):
 
 
 def test_a_bad_time_to_pause_is_refused_while_it_runs(ros):
-    robot = Robot(ros)
+    robot = RobotProbe(ros)
     assert names_parameter(ros.refuses("bullet_node", pause_after=-1.0), "pause_after")
     assert "read-only" in ros.refuses("bullet_node", rate_hz=100.0)
     robot.step(times=3)
 
 
 def test_a_broken_limit_is_an_error_in_diagnostics(ros):
-    robot = Robot(ros)
+    robot = RobotProbe(ros)
     for _ in range(400):
         robot.step(robot.gravity() + np.array([0.0] * 6 + [6.0]))
         if np.abs(robot.v[6]) > VALUES["velocity_max"][6] + 0.1:

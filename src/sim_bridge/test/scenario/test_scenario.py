@@ -2,6 +2,7 @@ import re
 from pathlib import Path
 from typing import get_args
 
+import numpy as np
 import pytest
 
 from sim_bridge.scenario.events import (
@@ -105,13 +106,20 @@ events:
 """
     # About z, x points to where the angle is zero.
     circles = [
-        load_scenario(write(tmp_path, text.replace("PLANE", plane))).events[0].points
+        load_scenario(write(tmp_path, text.replace("PLANE", plane))).events[0].trajectory.points
         for plane in ("plane: [x, y]", "normal: [0, 0, 2]")
     ]
     for a, b in zip(*circles, strict=True):
-        assert a.position == pytest.approx(b.position)
-        assert a.velocity == pytest.approx(b.velocity)
-    assert circles[0][0].position == pytest.approx((1.2, 2.0, 3.0))
+        np.testing.assert_allclose(a.pose.homogeneous, b.pose.homogeneous)
+        np.testing.assert_allclose(a.velocity, b.velocity, atol=1e-15)
+    np.testing.assert_allclose(circles[0][0].pose.translation, [1.2, 2.0, 3.0])
+    # A quarter of a turn later in angle, seen from where it begins.
+    later = text.replace("centre: [1, 2, 3]", "start: [1, 2, 3], phase: 1.5707963267948966")
+    points = load_scenario(write(tmp_path, later.replace("PLANE", "plane: [x, y]")))
+    points = points.events[0].trajectory.points
+    np.testing.assert_allclose(points[0].pose.translation, [1.0, 2.0, 3.0], atol=1e-15)
+    half = points[len(points) // 2].pose.translation
+    np.testing.assert_allclose(half, [1.0, 1.6, 3.0], atol=1e-12)
 
 
 CIRCLE = "centre: [0, 0, 0], radius: 1, plane: [y, z], period: 1, orientation: [0, 0, 0, 1]"
@@ -131,13 +139,13 @@ BOX = "name: a, shape: box, size: [1, 1, 1], position: [0, 0, 0]"
         (
             "trajectory",
             f"{{points: [{{time: 1, {POINT}}}, {{time: 1, {POINT}}}]}}",
-            "points[1].time is 1.0; allowed: more than 1",
+            "trajectory.points[1].time is 1; allowed: more than 1",
         ),
         (
             "trajectory",
             f"{{points: [{{time: 0, {POINT}}}, "
             "{time: 1, position: [0, 0, 0], orientation: [1, 0, 0, 0]}]}",
-            "points[1].orientation is half a turn",
+            "trajectory.points[1] is turned by 3.14 rad from the last one",
         ),
         ("trajectory", f"{{circle: {{{CIRCLE}, radius: -1}}}}", "circle.radius"),
         ("trajectory", f"{{circle: {{{CIRCLE}, diameter: 1}}}}", "radius and diameter"),

@@ -17,6 +17,7 @@ import sim_bridge
 import viability_bounds_pkg
 from sim_bridge.tools.excitation import PARTS, ROOM, ExcitationError, excitation
 from sim_bridge.tools.record_excitation import main
+from sim_bridge.urdf.arm import ConfiguredArm
 from torque_safety_controller.friction.joint_recording import load_recording
 
 PACKAGES = [
@@ -33,7 +34,8 @@ DT = 2e-3
 
 
 def motion(q_start=START, q_min=Q_MIN, q_max=Q_MAX, **options):
-    return excitation(JOINTS, q_start, q_min, q_max, V_MAX, DT, **options)
+    arm = ConfiguredArm("", JOINTS, {}, q_min, q_max, V_MAX, np.array(PANDA["torque_max"]))
+    return excitation(arm, q_start, DT, **options)
 
 
 def parts(array):
@@ -120,7 +122,7 @@ def test_a_recording_is_what_the_robot_reported(short, call, tmp_path):
     assert (code, errors) == (0, "")
     assert re.search(rf"1 s of motion written to {output}; torque at most 0\.\d\d", out)
     recording = load_recording(output, JOINTS)
-    q, v = excitation(JOINTS, START, Q_MIN, Q_MAX, V_MAX, DT, speed=0.3)
+    q, v = motion(speed=0.3)
     np.testing.assert_allclose(np.diff(recording.t), DT)
     np.testing.assert_allclose(recording.q, q, atol=5e-3)
     np.testing.assert_allclose(recording.v[50:], v[50:], atol=0.05)
@@ -168,12 +170,12 @@ def test_what_cannot_be_done_is_told_in_one_line(call, tmp_path, arguments, code
 INTERRUPTIBLE = """
 import os, signal, sys
 from sim_bridge.tools import record_excitation as tool
-class Robot(tool.BulletRobot):
+class InterruptedRobot(tool.BulletRobot):
     def move(self, *arguments):
         os.kill(os.getpid(), signal.SIGINT)
         super().move(*arguments)
 from sim_bridge.nodes import bullet_parameters
-bullet_parameters.BulletRobot = Robot
+bullet_parameters.BulletRobot = InterruptedRobot
 sys.exit(tool.main())
 """
 

@@ -17,10 +17,11 @@ from trajectory_msgs.msg import (
 
 from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.node.goals import GoalRefused, trajectory_from_message
-from torque_safety_controller.tasks.pose_trajectory import PoseTrajectory, circle
+from viability_bounds_pkg.pose_trajectory import PoseTrajectory, circle
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp
 
 MS = 1_000_000
+PLANE = [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]  # from the lowest point towards y
 BASE = pin.SE3(pin.utils.rotate("z", 0.7), np.array([0.1, 0.2, 0.3]))
 
 
@@ -50,7 +51,7 @@ def message_of(points, stamp=0, frame="base", joint_names=()) -> MultiDOFJointTr
 
 
 def test_what_is_read_is_what_was_sent():
-    points = circle(pin.SE3.Random(), 0.4, 2.0, 1, 12)
+    points = circle(pin.SE3.Random(), 0.2, PLANE, period=2.0, points_per_turn=12)
     read = trajectory_from_message(message_of(points), "base", "hand", BASE)
     meant = PoseTrajectory(points)
     for t in np.linspace(0.0, 2.0, 15):
@@ -63,7 +64,7 @@ def test_what_is_read_is_what_was_sent():
 
 
 def changed(edit):
-    message = message_of(circle(pin.SE3.Identity(), 0.4, 2.0, 1, 4))
+    message = message_of(circle(pin.SE3.Identity(), 0.2, PLANE, period=2.0, points_per_turn=4))
     edit(message)
     return message
 
@@ -77,8 +78,11 @@ def changed(edit):
         (lambda m: m.points[1].velocities.append(Twist()), r"points\[1\] must have"),
         (lambda m: setattr(m.points[2].velocities[0].linear, "x", math.nan), "not finite"),
         (lambda m: setattr(m.points[2].transforms[0].rotation, "w", 3.0), "norm"),
-        (lambda m: setattr(m.points[2].time_from_start, "sec", 0), "grow"),
-        (lambda m: m.points.clear(), "no points"),
+        (
+            lambda m: setattr(m.points[2].time_from_start, "sec", 0),
+            r"points\[2\].time is",
+        ),
+        (lambda m: m.points.clear(), "at least one point"),
     ],
 )
 def test_what_cannot_be_followed_is_refused(edit, reason):
@@ -110,7 +114,7 @@ def test_it_is_followed_in_the_robots_time(ros):
     robot = arm.robot(0.0)
     robot.update(q, v, v)
     start = robot.pose.copy()
-    points = circle(start, 0.1, 0.02, 1, 8)
+    points = circle(start, 0.05, PLANE, period=0.02, points_per_turn=8)
     meant = PoseTrajectory(points)
     goals.publish(message_of(points, stamp=20 * MS, frame=""))
     ros.wait_until(lambda: ros.reported("controller_node", "goals_pending") == "1", "the goal")

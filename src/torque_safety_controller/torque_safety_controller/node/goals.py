@@ -16,12 +16,12 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.node.topics import TARGET_POSE, TARGET_POSTURE, TARGET_TRAJECTORY
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.tasks.pose_trajectory import (
+from viability_bounds_pkg.exceptions import ArmSafetyError
+from viability_bounds_pkg.pose_trajectory import (
     PoseTrajectory,
     TrajectoryError,
     TrajectoryPoint,
 )
-from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import Topic
 
