@@ -49,7 +49,8 @@ def make_controller(
 def configure(controller: Controller, config: ControllerConfiguration) -> None:
     """Change what may change while the controller runs."""
     controller.gains = config.gains
-    controller.additional.settings = config.additional
+    if controller.additional is not None:
+        controller.additional.settings = config.additional
     if controller.interaction is not None:
         controller.interaction.settings = config.interaction.settings
         if controller.interaction.sensor is not None:

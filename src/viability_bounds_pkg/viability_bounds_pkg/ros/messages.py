@@ -93,14 +93,14 @@ class JointStateReader:
         """Take a message that arrived at `now`, in s on the steady clock."""
         stamp = stamp_to_ns(message.header.stamp)
         if stamp == 0:
-            # All of them would have this one, and the first answer would serve for ever.
+            # Later messages would have the same, and be taken for repeats of the first.
             return self._refuse("no stamp")
         verdict = self._guard.check(stamp, now)
         if verdict is Verdict.REFUSED:
             return self._refuse("old stamp")
         if message.name != self._names and not self._match(message.name):
             return self._refuse("missing joint")
-        if not len(message.position) == len(message.velocity) == len(self._names):
+        if not len(message.position) == len(message.velocity) == len(message.name):
             return self._refuse("wrong size")
         q, v = np.array(message.position), np.array(message.velocity)
         if self._index is not None:
