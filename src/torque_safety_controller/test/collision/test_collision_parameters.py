@@ -8,7 +8,10 @@ from ros_harness import read_config
 from torque_safety_controller.collision.avoidance import CollisionSettings
 from torque_safety_controller.collision.obstacles import SHAPES, make_obstacle
 from torque_safety_controller.parameters import controller_parameters
-from torque_safety_controller.parameters.collision_parameters import TABLE, load_collision
+from torque_safety_controller.parameters.collision_parameters import (
+    COLLISION_TABLE,
+    load_collision,
+)
 from torque_safety_controller.parameters.controller_parameters import make_configuration
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import read_urdf
@@ -49,7 +52,7 @@ def test_defaults_are_those_of_the_settings():
     assert configuration().settings == CollisionSettings()
 
 
-@pytest.mark.parametrize("name", [f.name for f in TABLE if f.kind is float])
+@pytest.mark.parametrize("name", [f.name for f in COLLISION_TABLE if f.kind is float])
 def test_each_setting_arrives(name):
     settings = configuration(**{name: 0.07}).settings
     assert getattr(settings, name.removeprefix("collision_")) == 0.07

@@ -1,4 +1,4 @@
-"""A controller made of its parameters, and changed with them."""
+"""Makes the controller from its configuration, and applies live changes."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def make_controller(
 
 
 def configure(controller: Controller, config: ControllerConfiguration) -> None:
-    """Change what may change while the controller runs."""
+    """Apply the live parameters to a running controller."""
     controller.gains = config.gains
     if controller.additional is not None:
         controller.additional.settings = config.additional

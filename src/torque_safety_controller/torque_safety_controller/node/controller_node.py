@@ -18,11 +18,11 @@ from torque_safety_controller.controller import Step
 from torque_safety_controller.node.assembly import configure, make_controller
 from torque_safety_controller.node.collision_report import CollisionReport
 from torque_safety_controller.node.controller_report import LEVELS, StepRecord
-from torque_safety_controller.node.goals import GoalInbox
+from torque_safety_controller.node.goals import GoalSubscriber
 from torque_safety_controller.node.joint_commands import JointCommands
 from torque_safety_controller.node.limits import LimitsReader
 from torque_safety_controller.node.topics import ENABLE_TORQUE
-from torque_safety_controller.node.wrenches import WrenchInbox
+from torque_safety_controller.node.wrenches import WrenchSubscriber
 from torque_safety_controller.parameters.controller_parameters import (
     TABLE,
     ControllerConfiguration,
@@ -62,8 +62,10 @@ class ControllerNode(Node):
         )
         self._states = JointStateReader(config.joints, config.state_timeout)
         self._limits = LimitsReader(config.joints)
-        self._goals = GoalInbox(self, self._controller, config, base)
-        self._wrenches = WrenchInbox(self, self._controller.interaction, self._goals, config, base)
+        self._goals = GoalSubscriber(self, self._controller, config, base)
+        self._wrenches = WrenchSubscriber(
+            self, self._controller.interaction, self._goals, config, base
+        )
         self._modes = ModeKeeper()
         self._goal_at = time.monotonic()
         self._message_at = self._state_at = self._waiting_since = -np.inf
@@ -116,9 +118,9 @@ class ControllerNode(Node):
             self._hold(message.header.stamp)
 
     def _begin(self, verdict: Verdict) -> None:
-        """Forget the past: the robot was silent, or started over."""
+        """Start anew: the robot was silent, or restarted."""
         if verdict is Verdict.NEW and self._limits.stamp == self._answered_stamp:
-            self._limits.stamp = -1  # of another run, in which stamps may have been the same
+            self._limits.stamp = -1  # from before the restart; its stamps may come again
         self._answered_stamp = -1
         self._waiting_since = self._state_at
         self._controller.start(self._states.q)
@@ -130,7 +132,7 @@ class ControllerNode(Node):
         if self._limits.stamp == self._states.stamp != self._answered_stamp:
             self._track(message.header.stamp)
         elif self._limits.stamp == self._states.stamp:
-            # They are alive again, but this state was answered in HOLD already.
+            # Limits come again, but this state has been answered in HOLD already.
             self._bounds_lost = False
 
     def _track(self, stamp: Any) -> None:
@@ -244,7 +246,8 @@ class ControllerNode(Node):
 
     def _limits_follow(self, stamp: int) -> bool:
         """Return whether acceleration limits keep up with the state with this stamp, ns."""
-        apart = 1e-9 * abs(stamp - self._limits.stamp)  # those of another run may lie ahead
+        # After a restart of the robot, earlier limits may have later stamps.
+        apart = 1e-9 * abs(stamp - self._limits.stamp)
         return self._limits.stamp >= 0 and apart <= self._config.bounds_timeout
 
     # Watchdogs
@@ -270,7 +273,7 @@ class ControllerNode(Node):
             now - self._state_at > config.bounds_timeout
             and now - self._message_at < config.bounds_timeout
         ):
-            # States come but cannot be used: keep gravity off the arm until STOPPED.
+            # States come but cannot be used: compensate gravity until STOPPED.
             if self._handover.by_drives:
                 self._hold_position(self._message_stamp)
                 return

@@ -15,7 +15,7 @@ from std_srvs.srv import Trigger
 
 from torque_safety_controller.contact.interaction import Compliance, Interaction
 from torque_safety_controller.contact.wrench_sensor import WrenchError, WrenchSensor
-from torque_safety_controller.node.goals import GoalInbox, GoalRefused
+from torque_safety_controller.node.goals import GoalRefused, GoalSubscriber
 from torque_safety_controller.node.topics import TARE_FT_SENSOR, TARGET_WRENCH
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from viability_bounds_pkg.ros.topics import FT_WRENCH
@@ -29,12 +29,12 @@ def wrench_of(message: WrenchStamped) -> Array:
     return np.array([force.x, force.y, force.z, torque.x, torque.y, torque.z])
 
 
-class WrenchInbox:
-    """Takes ``ft_wrench`` and ``target_wrench``; serves ``~/tare_ft_sensor``.
+class WrenchSubscriber:
+    """Subscribes to ``ft_wrench`` and ``target_wrench``; serves ``~/tare_ft_sensor``.
 
     Args:
         node: listens and logs what is refused.
-        interaction: is given what comes; None for an arm that handles no forces.
+        interaction: receives measurements and targets; None for an arm that handles no forces.
         goals: keeps targets until they are due.
         config: names the frames.
         base: placement of the base frame in the URDF's root frame.
@@ -47,7 +47,7 @@ class WrenchInbox:
         self,
         node: Node,
         interaction: Interaction | None,
-        goals: GoalInbox,
+        goals: GoalSubscriber,
         config: ControllerConfiguration,
         base: pin.SE3,
     ) -> None:
@@ -120,7 +120,7 @@ class WrenchInbox:
         return response
 
     def note(self) -> None:
-        """Log what has changed of what is done about forces."""
+        """Log a change of the compliance state."""
         interaction = self._interaction
         if interaction is None or interaction.changes == self._changes:
             return
@@ -134,7 +134,7 @@ class WrenchInbox:
 
     @property
     def trouble(self) -> str:
-        """What is wrong at present, or empty."""
+        """Present problem in words, empty if there is none."""
         interaction = self._interaction
         if interaction is None or interaction.state is not Compliance.SILENT:
             return ""

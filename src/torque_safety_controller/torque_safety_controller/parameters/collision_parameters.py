@@ -44,7 +44,7 @@ _DEFAULTS = CollisionSettings()
 _OBSTACLE_FIELDS = ("name", "shape", "size", "position", "rpy")
 _EQUAL = {"cylinder": 2, "sphere": 3}  # of the numbers of a size, how many are one diameter
 
-TABLE = (
+COLLISION_TABLE = (
     Parameter(
         "collision_avoidance",
         bool,

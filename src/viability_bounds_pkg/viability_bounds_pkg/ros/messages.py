@@ -24,22 +24,22 @@ Report = Callable[[], tuple[bytes, str, dict[str, Any]]]
 
 
 class Verdict(Enum):
-    """What a message turned out to be."""
+    """Result of reading a message."""
 
     NEW = 1
     """Accepted: the arrays hold its values."""
     REPEAT = 2
-    """The stamp of the last accepted message again: a robot that asks once more."""
+    """The stamp and the values of the last accepted message: the robot repeats its state."""
     REFUSED = 3
     """Dropped and counted; the arrays hold what they held."""
 
 
 class StampGuard:
-    """Lets stamps only grow, yet does not lock out a source that started over.
+    """Accepts only growing stamps, but also those of a source that has restarted.
 
     A robot or simulation that restarts counts time from the beginning again, and one corrupt
-    stamp may lie far in the future. After `reset_after` seconds without an accepted stamp,
-    whatever comes is taken as a new beginning.
+    stamp may lie far in the future. After `reset_after` seconds without an accepted stamp, any
+    stamp is accepted.
     """
 
     def __init__(self, reset_after: float) -> None:
@@ -56,7 +56,7 @@ class StampGuard:
         return Verdict.NEW
 
     def may_start_over(self, now: float) -> bool:
-        """Return whether the source has been silent for so long that any stamp will do."""
+        """Return whether the source has been silent for so long that any stamp is accepted."""
         return now - self._accepted_at >= self._reset_after
 
     def accept(self, stamp: int, now: float) -> None:
