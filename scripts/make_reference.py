@@ -54,16 +54,13 @@ stops a node at start with one line that names the parameter, the value and what
 parameters can change while the node runs, where such a value is refused; all others are read-only.
 Whole numbers are accepted where a double is expected.
 """
-    shared = [row.name for row in TABLES["controller_node"] if _is_shared(row.name)]
-    rows = {row.name: row for row in TABLES["controller_node"]}
+    rows = {row.name: row for table in TABLES.values() for row in table}
+    shared = [name for name in rows if _is_shared(name)]
     text += "\n## Shared\n\nParameters of several nodes with the same meaning.\n\n"
-    body = []
-    for name in shared:
-        row = rows[name]
-        nodes = ", ".join(_short(node) for node, table in TABLES.items() if _has(table, name))
-        description = f"{row.description} ({nodes})"
-        body.append((*_cells(row)[:-1], description))
-    text += _table(heads, body)
+    text += _table(
+        ("parameter", "nodes", *heads[1:]),
+        ((f"`{name}`", _nodes(name), *_cells(rows[name])[1:]) for name in shared),
+    )
     for node, table in TABLES.items():
         own = [row for row in table if row.name not in shared]
         text += f"\n## {node}\n\n" + _table(heads, map(_cells, own))
@@ -107,18 +104,16 @@ A robot of your own takes the place of `bullet_node`.
 PAGES = {"docs/parameters.md": parameters_page, "docs/topics.md": topics_page}
 
 
-def _has(table: Sequence[Parameter], name: str) -> bool:
-    return any(row.name == name for row in table)
-
-
 def _is_shared(name: str) -> bool:
-    """Return whether all nodes that have a parameter mean the same by it."""
-    rows = [row for table in TABLES.values() for row in table if row.name == name]
-    return len(rows) > 1 and len({(row.description, row.constraints) for row in rows}) == 1
+    """Return whether several nodes have a parameter and all mean the same by it."""
+    cells = [_cells(row) for table in TABLES.values() for row in table if row.name == name]
+    return len(cells) > 1 and len(set(cells)) == 1
 
 
-def _short(node: str) -> str:
-    return node.removesuffix("_node")
+def _nodes(name: str) -> str:
+    """Return which nodes have a parameter, without the end of their names."""
+    having = (node for node, table in TABLES.items() if any(row.name == name for row in table))
+    return ", ".join(node.removesuffix("_node") for node in having)
 
 
 def _cells(row: Parameter) -> tuple[str, ...]:

@@ -41,7 +41,7 @@ TABLE = (
     Parameter(
         "velocity_max",
         list[float],
-        "speed limits that are watched, rad/s",
+        "speed limits, rad/s",
         per_joint=True,
         within=POSITIVE,
     ),

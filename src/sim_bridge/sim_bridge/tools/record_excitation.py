@@ -34,6 +34,7 @@ from viability_bounds_pkg.cli.limits_file import (
     node_parameters,
     write_whole,
 )
+from viability_bounds_pkg.ros.parameters import read_values
 
 Array = NDArray[np.float64]
 
@@ -76,7 +77,7 @@ def _run(options: argparse.Namespace) -> int:
     if options.output.resolve() == options.parameters.resolve():
         raise ParameterFileError(f"{options.output} is read, and cannot be written too")
     given = node_parameters(options.parameters, "/**/bullet_node")
-    values = {row.name: row.coerce(given.get(row.name)) for row in TABLE}
+    values = read_values(TABLE, given)
     config = make_configuration(values)
     motion = excitation(config, config.q_start, config.dt, options.amplitude, options.speed)
     with closing(make_robot(config, values)) as robot:

@@ -8,7 +8,10 @@ from ros_harness import read_config
 from torque_safety_controller.collision.avoidance import CollisionSettings
 from torque_safety_controller.collision.obstacles import SHAPES, make_obstacle
 from torque_safety_controller.parameters import controller_parameters
-from torque_safety_controller.parameters.collision_parameters import TABLE, load_collision
+from torque_safety_controller.parameters.collision_parameters import (
+    COLLISION_TABLE,
+    load_collision,
+)
 from torque_safety_controller.parameters.controller_parameters import make_configuration
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import read_urdf
@@ -49,7 +52,7 @@ def test_defaults_are_those_of_the_settings():
     assert configuration().settings == CollisionSettings()
 
 
-@pytest.mark.parametrize("name", [f.name for f in TABLE if f.kind is float])
+@pytest.mark.parametrize("name", [f.name for f in COLLISION_TABLE if f.kind is float])
 def test_each_setting_arrives(name):
     settings = configuration(**{name: 0.07}).settings
     assert getattr(settings, name.removeprefix("collision_")) == 0.07
@@ -103,7 +106,7 @@ def test_what_an_arm_is_mounted_on_is_left_out_and_said_to_be():
     ("changes", "name"),
     [
         ({"collision_margin": -0.1}, "collision_margin"),
-        ({"collision_margin": 0.2}, "collision_margin"),
+        ({"collision_margin": 0.6}, "collision_margin"),
         ({"collision_margin": float("nan")}, "collision_margin"),
         ({"collision_speed_max": 0.0}, "collision_speed_max"),
         ({"collision_speed_max": float("inf")}, "collision_speed_max"),
@@ -132,7 +135,7 @@ BOX = {"name": "box", "shape": "box", "size": [1, 1, 1], "position": [0, 0, 1], 
         ("shape", "cone", "one of box, sphere, cylinder, half_space"),
         ("size", None, "3 finite numbers"),
         ("size", [1.0, 1.0], "3 finite numbers"),
-        ("size", [0.4, 1.0, 0.0], "positive"),
+        ("size", [0.4, 1.0, 0.0], "3 finite numbers > 0"),
         ("size", 1.0, "3 finite numbers"),
         ("position", None, "3 finite numbers"),
         ("position", [0.0, 0.0, float("nan")], "3 finite numbers"),
@@ -160,7 +163,7 @@ def test_what_is_no_obstacle_is_refused(text):
 
 def test_the_diameters_of_a_round_obstacle_are_the_same():
     for shape, size in (("sphere", [1.0, 2.0, 1.0]), ("cylinder", [1.0, 2.0, 1.0])):
-        with pytest.raises(SettingError, match="a positive diameter") as error:
+        with pytest.raises(SettingError, match="the same diameter [23] times") as error:
             configuration(obstacles=[str(BOX | {"shape": shape, "size": size})])
         assert error.value.name == "obstacles[0].size"
 
@@ -171,7 +174,7 @@ def test_the_diameters_of_a_round_obstacle_are_the_same():
         ({"collision_pairs": ["panda_hand nowhere"]}, "collision_pairs"),
         ({"collision_pairs": ["panda_hand panda_link7"]}, "collision_pairs"),
         ({"acceleration_max": [-1.0] * 7}, "acceleration_max"),
-        ({"obstacles": [THINGS[1].replace("ball", "panda_hand")]}, "obstacles"),
+        ({"obstacles": [THINGS[1].replace("ball", "panda_hand")]}, "obstacles[0].name"),
     ],
 )
 def test_what_the_robot_does_not_have_is_refused_by_the_name_of_the_parameter(changes, name):

@@ -21,7 +21,10 @@ from torque_safety_controller.controller import Controller, Gains
 from torque_safety_controller.friction.settings import FrictionModel, FrictionSettings
 from torque_safety_controller.integral_feedback.settings import IntegralSettings
 from torque_safety_controller.node.controller_node import ControllerNode
-from torque_safety_controller.parameters.friction_parameters import TABLE, friction_settings
+from torque_safety_controller.parameters.friction_parameters import (
+    FRICTION_TABLE,
+    friction_settings,
+)
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.ros.parameters import read_values
 from viability_bounds_pkg.ros.robot_parameters import ROBOT_TABLE
@@ -137,7 +140,7 @@ def test_what_comes_after_a_gap_or_a_jump_does_not_kick():
 
 
 def values(**changed):
-    return read_values((*ROBOT_TABLE, *TABLE), read_config("panda", NODE) | changed)
+    return read_values((*ROBOT_TABLE, *FRICTION_TABLE), read_config("panda", NODE) | changed)
 
 
 def test_defaults_are_off():

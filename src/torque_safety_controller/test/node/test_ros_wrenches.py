@@ -229,6 +229,57 @@ def test_a_wrong_parameter_is_named(changed, named):
     assert error.value.name == named
 
 
+def test_each_parameter_reaches_the_settings():
+    interaction = build(
+        admittance_kp=[0.2, 0.03],
+        admittance_speed_max=[0.1, 0.4],
+        yield_threshold=[3.0, 4.0],
+        yield_kp=[5.0, 6.0],
+        yield_speed_max=[0.7, 0.8],
+        force_stiffness=[0.0, 0.1, 0.2, 0.3, 0.4, 1.0],
+        ft_filter_hz=9.0,
+        ft_timeout=0.5,
+    ).interaction
+    settings = interaction.settings
+    gains, led = settings.gains, settings.yielding_gains
+    assert (gains.force_kp, gains.moment_kp, gains.speed_max, gains.turn_max) == (
+        0.2,
+        0.03,
+        0.1,
+        0.4,
+    )
+    assert (led.force_kp, led.moment_kp, led.speed_max, led.turn_max) == (5.0, 6.0, 0.7, 0.8)
+    assert (settings.dual.force, settings.dual.moment) == (3.0, 4.0)
+    np.testing.assert_array_equal(settings.directions, [0, 0, 1, 0, 0, 0])
+    np.testing.assert_array_equal(settings.stiffness, [0.0, 0.1, 0.2, 0.3, 0.4, 1.0])
+    assert (interaction.sensor.settings.filter_hz, interaction.sensor.settings.timeout) == (
+        9.0,
+        0.5,
+    )
+    assert build(dual_compliance=False).interaction.settings.dual is None
+
+
+def test_what_a_tool_weighs_is_that_of_the_parameter_or_of_the_urdf():
+    """At rest, a sensor that feels the tool's weight measures no wrench of the environment."""
+
+    def left(tool, mass, lever):
+        controller = build(ft_tool=tool, ft_filter_hz=1e4)
+        robot, sensor = controller.robot, controller.interaction.sensor
+        robot.update(ARM.q_start, np.zeros(ARM.n), np.zeros(ARM.n))
+        rotation = robot.pose.rotation @ sensor.placement.rotation
+        weight = rotation.T @ (mass * robot.model.gravity.linear)
+        felt = np.r_[weight, np.cross(lever, weight)]
+        for _ in range(50):
+            sensor.receive(felt)
+            sensor.update(robot.pose.rotation, 0.002)
+        return np.abs(sensor.wrench).max()
+
+    assert left([1.5, 0.0, 0.1, 0.2], 1.5, [0.0, 0.1, 0.2]) < 1e-6
+    assert left([1.5, 0.0, 0.1, 0.2], 1.0, [0.0, 0.1, 0.2]) > 1.0
+    assert left([0.0, 0.0, 0.0, 0.0], 0.0, [0.0, 0.0, 0.0]) < 1e-6
+    assert left([], 0.0, [0.0, 0.0, 0.0]) > 1.0
+
+
 def test_points_of_one_link_are_one_contact():
     corners = [[x, y, 0.1] for x in (-0.02, 0.02) for y in (-0.01, 0.01)]
     controller = build(

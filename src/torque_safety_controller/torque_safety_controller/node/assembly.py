@@ -1,4 +1,4 @@
-"""A controller made of its parameters, and changed with them."""
+"""Makes the controller from its configuration, and applies live changes."""
 
 from __future__ import annotations
 
@@ -47,9 +47,10 @@ def make_controller(
 
 
 def configure(controller: Controller, config: ControllerConfiguration) -> None:
-    """Change what may change while the controller runs."""
+    """Apply the live parameters to a running controller."""
     controller.gains = config.gains
-    controller.additional.settings = config.additional
+    if controller.additional is not None:
+        controller.additional.settings = config.additional
     if controller.interaction is not None:
         controller.interaction.settings = config.interaction.settings
         if controller.interaction.sensor is not None:

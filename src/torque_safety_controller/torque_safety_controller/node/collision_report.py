@@ -1,4 +1,4 @@
-"""What the controller node says of its collision avoidance: in the log, and in /diagnostics."""
+"""Log messages and diagnostics of the collision avoidance."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ _MEANING = {
     "near always": "as they are near each other in all postures",
 }
 
-_SLIGHT = 1e-3  # m; less than this inside the margin is no news
+_SLIGHT = 1e-3  # m; violations of the margin below this are not reported
 
 
 class CollisionReport:
-    """Watches the distances of each step; says at start what is guarded and what is not.
+    """Monitors the distances of each step; logs at start which pairs are kept apart.
 
     Args:
         logger: of the node.
         avoidance: None if there is none.
 
     Attributes:
-        too_near: what is nearer than the margin now, in words; empty if nothing is.
+        too_near: pair that is nearer than the margin now, in words; empty if none is.
     """
 
     def __init__(self, logger: RcutilsLogger, avoidance: CollisionAvoidance | None) -> None:

@@ -11,18 +11,17 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
-from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
 from torque_safety_controller.controller import Step
 from torque_safety_controller.node.assembly import configure, make_controller
 from torque_safety_controller.node.collision_report import CollisionReport
 from torque_safety_controller.node.controller_report import LEVELS, StepRecord
-from torque_safety_controller.node.goals import GoalInbox
+from torque_safety_controller.node.goals import GoalSubscriber
 from torque_safety_controller.node.joint_commands import JointCommands
 from torque_safety_controller.node.limits import LimitsReader
-from torque_safety_controller.node.topics import ENABLE_TORQUE
-from torque_safety_controller.node.wrenches import WrenchInbox
+from torque_safety_controller.node.torque_switch import TorqueSwitch
+from torque_safety_controller.node.wrenches import WrenchSubscriber
 from torque_safety_controller.parameters.controller_parameters import (
     TABLE,
     ControllerConfiguration,
@@ -62,8 +61,10 @@ class ControllerNode(Node):
         )
         self._states = JointStateReader(config.joints, config.state_timeout)
         self._limits = LimitsReader(config.joints)
-        self._goals = GoalInbox(self, self._controller, config, base)
-        self._wrenches = WrenchInbox(self, self._controller.interaction, self._goals, config, base)
+        self._goals = GoalSubscriber(self, self._controller, config, base)
+        self._wrenches = WrenchSubscriber(
+            self, self._controller.interaction, self._goals, config, base
+        )
         self._modes = ModeKeeper()
         self._goal_at = time.monotonic()
         self._message_at = self._state_at = self._waiting_since = -np.inf
@@ -76,7 +77,15 @@ class ControllerNode(Node):
         self._commands = JointCommands(self, config.joints, config.ros2_control_topic)
         JOINT_STATES.subscription(self, self._on_state)
         ACCELERATION_LIMITS.subscription(self, self._on_limits)
-        ENABLE_TORQUE.serve(self, self._on_enable_torque)
+        TorqueSwitch(
+            self,
+            config,
+            self._handover,
+            self._states,
+            self._limits,
+            silence=lambda: time.monotonic() - self._state_at,
+            on_torque=self._expect_bounds,
+        )
         # Use the steady clock, so that watchdogs fire when /clock stops.
         self._watchdog = self.create_timer(
             min(config.bounds_timeout, config.state_timeout) / 4,
@@ -116,9 +125,9 @@ class ControllerNode(Node):
             self._hold(message.header.stamp)
 
     def _begin(self, verdict: Verdict) -> None:
-        """Forget the past: the robot was silent, or started over."""
+        """Start anew: the robot was silent, or restarted."""
         if verdict is Verdict.NEW and self._limits.stamp == self._answered_stamp:
-            self._limits.stamp = -1  # of another run, in which stamps may have been the same
+            self._limits.stamp = -1  # from before the restart; its stamps may come again
         self._answered_stamp = -1
         self._waiting_since = self._state_at
         self._controller.start(self._states.q)
@@ -130,7 +139,7 @@ class ControllerNode(Node):
         if self._limits.stamp == self._states.stamp != self._answered_stamp:
             self._track(message.header.stamp)
         elif self._limits.stamp == self._states.stamp:
-            # They are alive again, but this state was answered in HOLD already.
+            # Limits come again, but this state has been answered in HOLD already.
             self._bounds_lost = False
 
     def _track(self, stamp: Any) -> None:
@@ -221,31 +230,8 @@ class ControllerNode(Node):
         self.get_logger().error(self._handover.reason)
         self._enter(Mode.POSITION, self._handover.reason)
 
-    def _on_enable_torque(
-        self, request: SetBool.Request, response: SetBool.Response
-    ) -> SetBool.Response:
-        states, silence = self._states, time.monotonic() - self._state_at
-        config = self._config
-        try:
-            if request.data:
-                fresh = silence < config.bounds_timeout
-                follow = self._limits_follow(states.stamp)
-                self._handover.to_torque(states.q, states.effort(), fresh, follow)
-                self._bounds_lost = False
-                response.message = "torque control begins with the next state"
-            else:
-                self._handover.to_position(states.q, states.v, silence < config.state_timeout)
-                response.message = "position control begins when the arm is at rest"
-            response.success = True
-        except HandoverRefused as error:
-            response.message = str(error)
-            self.get_logger().warning(f"enable_torque refused: {error}")
-        return response
-
-    def _limits_follow(self, stamp: int) -> bool:
-        """Return whether acceleration limits keep up with the state with this stamp, ns."""
-        apart = 1e-9 * abs(stamp - self._limits.stamp)  # those of another run may lie ahead
-        return self._limits.stamp >= 0 and apart <= self._config.bounds_timeout
+    def _expect_bounds(self) -> None:
+        self._bounds_lost = False
 
     # Watchdogs
 
@@ -270,7 +256,7 @@ class ControllerNode(Node):
             now - self._state_at > config.bounds_timeout
             and now - self._message_at < config.bounds_timeout
         ):
-            # States come but cannot be used: keep gravity off the arm until STOPPED.
+            # States come but cannot be used: compensate gravity until STOPPED.
             if self._handover.by_drives:
                 self._hold_position(self._message_stamp)
                 return

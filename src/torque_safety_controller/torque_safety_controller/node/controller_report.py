@@ -1,4 +1,4 @@
-"""What the controller node says of itself in /diagnostics."""
+"""Statistics of the control steps for /diagnostics."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ LEVELS = {
 }
 
 _LATENCIES_KEPT = 4096
-_SLIGHT = 1e-3  # rad/s^2; by less than this bounds give way beside distances that do
+_SLIGHT = 1e-3  # rad/s^2; smaller relaxations of bounds come with those of distances
 
 
 class StepRecord:
-    """Counts steps and keeps what was noteworthy about them.
+    """Counts steps, failures and relaxations, and keeps latencies.
 
     Args:
         n: number of joints.

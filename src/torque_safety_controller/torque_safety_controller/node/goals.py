@@ -1,4 +1,4 @@
-"""Goals from messages: checked, and kept until their time has come."""
+"""Goals from messages: checked, and kept until the time of their stamps."""
 
 from __future__ import annotations
 
@@ -157,8 +157,8 @@ class GoalQueue:
         return due
 
 
-class GoalInbox(GoalQueue):
-    """Takes goals for `controller` from ``target_pose``, ``_posture`` and ``_trajectory``.
+class GoalSubscriber(GoalQueue):
+    """Subscribes to ``target_pose``, ``target_posture`` and ``target_trajectory``.
 
     Args:
         node: listens and logs what is refused.

@@ -1,4 +1,4 @@
-"""What the controller node tells the robot: torques, or positions for the robot's own drives."""
+"""Commands to the robot: torques, or positions for the robot's own drives."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from viability_bounds_pkg.ros.topics import JOINT_COMMANDS
 
 
 class JointCommands:
-    """Publishes ``joint_commands``, and torques where ros2_control listens too.
+    """Publishes ``joint_commands``, and torques for ros2_control where that is asked for.
 
     Args:
         node: the publishing node.
@@ -48,7 +48,7 @@ class JointCommands:
         self.again(stamp)
 
     def again(self, stamp: Any) -> None:
-        """Send what was sent last, torques or positions: the robot asks once more."""
+        """Send the last command again, torques or positions, because a state was repeated."""
         self._last.header.stamp = stamp
         self._publisher.publish(self._last)
         if self._efforts is not None and self._last is self._torques:

@@ -3,34 +3,38 @@
 from __future__ import annotations
 
 from collections import Counter
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 from geometry_msgs.msg import WrenchStamped
+from numpy.typing import NDArray
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from torque_safety_controller.contact.interaction import Compliance, Interaction
-from torque_safety_controller.contact.wrench_sensor import WrenchError
-from torque_safety_controller.node.goals import GoalInbox, GoalRefused
+from torque_safety_controller.contact.wrench_sensor import WrenchError, WrenchSensor
+from torque_safety_controller.node.goals import GoalRefused, GoalSubscriber
 from torque_safety_controller.node.topics import TARE_FT_SENSOR, TARGET_WRENCH
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from viability_bounds_pkg.ros.topics import FT_WRENCH
 
+Array = NDArray[np.float64]
 
-def wrench_of(message: WrenchStamped) -> np.ndarray:
+
+def wrench_of(message: WrenchStamped) -> Array:
     """Return the numbers of a message, shape (6,), N and N m."""
     force, torque = message.wrench.force, message.wrench.torque
     return np.array([force.x, force.y, force.z, torque.x, torque.y, torque.z])
 
 
-class WrenchInbox:
-    """Takes ``ft_wrench`` and ``target_wrench``; serves ``~/tare_ft_sensor``.
+class WrenchSubscriber:
+    """Subscribes to ``ft_wrench`` and ``target_wrench``; serves ``~/tare_ft_sensor``.
 
     Args:
         node: listens and logs what is refused.
-        interaction: is given what comes; None for an arm that handles no forces.
+        interaction: receives measurements and targets; None for an arm that handles no forces.
         goals: keeps targets until they are due.
         config: names the frames.
         base: placement of the base frame in the URDF's root frame.
@@ -43,7 +47,7 @@ class WrenchInbox:
         self,
         node: Node,
         interaction: Interaction | None,
-        goals: GoalInbox,
+        goals: GoalSubscriber,
         config: ControllerConfiguration,
         base: pin.SE3,
     ) -> None:
@@ -55,15 +59,16 @@ class WrenchInbox:
         TARGET_WRENCH.subscription(node, self._on_target)
         if interaction is None or interaction.sensor is None:
             return
-        FT_WRENCH.subscription(node, self._on_measured)
-        TARE_FT_SENSOR.serve(node, self._on_tare)
+        sensor = interaction.sensor
+        FT_WRENCH.subscription(node, partial(self._on_measured, sensor))
+        TARE_FT_SENSOR.serve(node, partial(self._on_tare, interaction, sensor))
 
-    def _on_measured(self, message: WrenchStamped) -> None:
+    def _on_measured(self, sensor: WrenchSensor, message: WrenchStamped) -> None:
         frame, wanted = message.header.frame_id, self._config.interaction.ft_frame
         try:
             if frame not in ("", wanted):
                 raise WrenchError(f"frame_id is '{frame}'; allowed: '{wanted}' or empty")
-            self._interaction.sensor.receive(wrench_of(message))
+            sensor.receive(wrench_of(message))
         except WrenchError as error:
             reason = str(error)
             self.refused[reason] += 1
@@ -71,9 +76,9 @@ class WrenchInbox:
                 self._logger.warning(f"ft_wrench refused: {reason}")
 
     def _on_target(self, message: WrenchStamped) -> None:
-        config = self._config
+        config, interaction = self._config, self._interaction
         try:
-            if self._interaction is None or self._interaction.sensor is None:
+            if interaction is None or interaction.sensor is None:
                 raise GoalRefused("there is no force/torque sensor, 'ft_frame'")
             wrench = wrench_of(message)
             if not np.isfinite(wrench).all():
@@ -86,22 +91,27 @@ class WrenchInbox:
             self._goals.refuse(TARGET_WRENCH, error)
             return
         rotation = self._base.rotation if frame == config.base_frame else None
-        self._goals.add(message, lambda: self._apply(wrench, rotation))
+        self._goals.add(message, lambda: self._apply(interaction, wrench, rotation))
 
-    def _apply(self, wrench: np.ndarray, rotation: np.ndarray | None) -> None:
-        if not self._interaction.settings.directions.any():
+    def _apply(self, interaction: Interaction, wrench: Array, rotation: Array | None) -> None:
+        if not interaction.settings.directions.any():
             error = GoalRefused("no direction of 'force_directions' is set")
             self._goals.refuse(TARGET_WRENCH, error)
             return
-        self._interaction.set_target(wrench, rotation)
+        interaction.set_target(wrench, rotation)
 
-    def _on_tare(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        interaction = self._interaction
+    def _on_tare(
+        self,
+        interaction: Interaction,
+        sensor: WrenchSensor,
+        _: Trigger.Request,
+        response: Trigger.Response,
+    ) -> Trigger.Response:
         if interaction.state in (Compliance.FORCE, Compliance.YIELDING):
             response.message = "refused: the hand is in contact"
             return response
         try:
-            bias = interaction.sensor.tare()
+            bias = sensor.tare()
         except WrenchError as error:
             response.message = f"refused: {error}"
             return response
@@ -110,7 +120,7 @@ class WrenchInbox:
         return response
 
     def note(self) -> None:
-        """Log what has changed of what is done about forces."""
+        """Log a change of the compliance state."""
         interaction = self._interaction
         if interaction is None or interaction.changes == self._changes:
             return
@@ -124,7 +134,7 @@ class WrenchInbox:
 
     @property
     def trouble(self) -> str:
-        """What is wrong at present, or empty."""
+        """Present problem in words, empty if there is none."""
         interaction = self._interaction
         if interaction is None or interaction.state is not Compliance.SILENT:
             return ""

@@ -42,8 +42,9 @@ _NEAR = 0.028  # m; beyond margin and reserve, pairs that never come nearer need
 
 _DEFAULTS = CollisionSettings()
 _OBSTACLE_FIELDS = ("name", "shape", "size", "position", "rpy")
+_EQUAL = {"cylinder": 2, "sphere": 3}  # of the numbers of a size, how many are one diameter
 
-TABLE = (
+COLLISION_TABLE = (
     Parameter(
         "collision_avoidance",
         bool,
@@ -55,7 +56,7 @@ TABLE = (
         float,
         "distance kept between links and to obstacles, m",
         default=_DEFAULTS.margin,
-        within=Range(0.0, 0.09),
+        within=Range(0.0, 0.5),
     ),
     Parameter(
         "collision_speed_max",
@@ -194,6 +195,9 @@ def load_collision(
     """
     if config is None:
         return None
+    for index, obstacle in enumerate(config.obstacles):
+        if model.existFrame(obstacle.name, pin.FrameType.BODY):
+            raise SettingError(f"obstacles[{index}].name", obstacle.name, "no name of a link")
     limited = model.copy()
     limited.lowerPositionLimit, limited.upperPositionLimit = config.q_min, config.q_max
     kept = config.settings.margin + config.settings.reserve
@@ -212,10 +216,8 @@ def load_collision(
             config.base_frame,
             pruning=Pruning(clearance=kept + _BEYOND, near=kept + _NEAR),
         )
-    except CollisionError as error:
-        # The only fields that the URDF decides: names that links have, and links that it has not.
-        name = "obstacles" if error.field == "name" else f"collision_{error.field}"
-        raise SettingError(name, error.value, error.allowed) from error
+    except CollisionError as error:  # the rest has been checked
+        raise SettingError("collision_pairs", error.value, error.allowed) from error
     return CollisionAvoidance(collision, config.a_min, config.a_max, config.dt, config.settings)
 
 
@@ -226,18 +228,14 @@ def _obstacles(texts: Sequence[str]) -> tuple[Obstacle, ...]:
         name, shape = entry.text("name"), entry.text("shape")
         if name in obstacles:
             raise entry.refused("name", "a name that no other obstacle has")
-        no_size = (0.0, 0.0, 0.0) if shape == "half_space" else None
+        if shape not in SHAPES:
+            raise entry.refused("shape", f"one of {', '.join(SHAPES)}")
+        size = np.zeros(3) if shape == "half_space" else entry.vector("size", within=POSITIVE)
+        if len(set(size[: _EQUAL.get(shape, 1)])) > 1:
+            raise entry.refused("size", f"the same diameter {_EQUAL[shape]} times")
         rotation = pin.rpy.rpyToMatrix(entry.vector("rpy", (0.0, 0.0, 0.0)))
-        try:
-            obstacles[name] = make_obstacle(
-                name,
-                shape,
-                entry.vector("size", no_size),
-                entry.vector("position"),
-                pin.Quaternion(rotation).coeffs(),
-            )
-        except CollisionError as error:
-            raise entry.refused(error.field, error.allowed) from error
+        orientation = pin.Quaternion(rotation).coeffs()
+        obstacles[name] = make_obstacle(name, shape, size, entry.vector("position"), orientation)
     return tuple(obstacles.values())
 
 

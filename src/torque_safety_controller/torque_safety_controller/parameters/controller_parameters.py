@@ -11,14 +11,22 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from torque_safety_controller.additional_torque import AdditionalSettings
-from torque_safety_controller.parameters import (
-    collision_parameters,
-    friction_parameters,
-    integral_parameters,
-    interaction_parameters,
+from torque_safety_controller.parameters.collision_parameters import (
+    COLLISION_TABLE,
+    CollisionConfiguration,
+    collision_configuration,
 )
-from torque_safety_controller.parameters.collision_parameters import CollisionConfiguration
-from torque_safety_controller.parameters.interaction_parameters import InteractionConfiguration
+from torque_safety_controller.parameters.friction_parameters import FRICTION_TABLE
+from torque_safety_controller.parameters.integral_parameters import (
+    INTEGRAL_TABLE,
+    additional_settings,
+    task_rows,
+)
+from torque_safety_controller.parameters.interaction_parameters import (
+    INTERACTION_TABLE,
+    InteractionConfiguration,
+    interaction_configuration,
+)
 from torque_safety_controller.qp.inverse_dynamics_qp import SOLVERS
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.safety.modes import CONTROLS
@@ -133,10 +141,10 @@ TABLE = (
         live=True,
         within=Range(0.0, 10.0, special=OFF),
     ),
-    *integral_parameters.TABLE,
-    *friction_parameters.TABLE,
-    *interaction_parameters.TABLE,
-    *collision_parameters.TABLE,
+    *INTEGRAL_TABLE,
+    *FRICTION_TABLE,
+    *INTERACTION_TABLE,
+    *COLLISION_TABLE,
     Parameter(
         "start_control",
         str,
@@ -232,10 +240,10 @@ def make_configuration(values: Mapping[str, Any]) -> ControllerConfiguration:
         end_effector_frame=values["end_effector_frame"],
         gains=_gains(values),
         qp_solver=values["qp_solver"],
-        additional=integral_parameters.additional_settings(values, joints, tau_max),
-        task_rows=integral_parameters.task_rows(values),
-        interaction=interaction_parameters.interaction_configuration(values),
-        collision=collision_parameters.collision_configuration(values, joints, q_min, q_max),
+        additional=additional_settings(values, joints, tau_max),
+        task_rows=task_rows(values),
+        interaction=interaction_configuration(values),
+        collision=collision_configuration(values, joints, q_min, q_max),
         start_control=values["start_control"],
         bounds_timeout=values["bounds_timeout"],
         state_timeout=values["state_timeout"],

@@ -10,7 +10,7 @@ import yaml
 from numpy.typing import NDArray
 
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.ros.parameters import Range
+from viability_bounds_pkg.ros.parameters import FINITE, Range
 
 Array = NDArray[np.float64]
 
@@ -64,16 +64,19 @@ class Entry:
             raise self.refused(field, f"a finite number {within}")
         return value
 
-    def vector(self, field: str, default: Sequence[float] | None = None) -> Array:
-        """Return three finite numbers, shape (3,), or `default` where they are missing.
+    def vector(
+        self, field: str, default: Sequence[float] | None = None, within: Range = FINITE
+    ) -> Array:
+        """Return three numbers, shape (3,), or `default` where they are missing.
 
         Raises:
-            SettingError: they are missing and there is no default, or something else.
+            SettingError: they are missing and there is no default, something else, or out of
+                range.
         """
         value = self._values.get(field, default)
         numbers = list(map(_number, value)) if isinstance(value, list | tuple) else []
-        if len(numbers) != 3 or not np.isfinite(numbers).all():
-            raise self.refused(field, "3 finite numbers")
+        if len(numbers) != 3 or not all(number in within for number in numbers):
+            raise self.refused(field, f"3 finite numbers {within}".strip())
         return np.array(numbers)
 
 

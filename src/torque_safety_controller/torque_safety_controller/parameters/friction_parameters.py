@@ -36,7 +36,7 @@ MODEL = {
 }
 """Friction model of each joint; `identify_friction` finds it."""
 
-TABLE = (
+FRICTION_TABLE = (
     Parameter(
         "friction_compensation",
         float,

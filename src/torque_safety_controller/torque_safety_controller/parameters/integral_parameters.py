@@ -35,7 +35,7 @@ METHODS = ("none", "scaling", "paper", "qp")
 """Anti-windup of the joints: none; (10) or (11) as [Benallegue2021] prints them, that is for K s
 only, with the integrators left alone and (13); or for the whole torque, integrators included."""
 
-TABLE = (
+INTEGRAL_TABLE = (
     Parameter(
         "integral_action",
         str,

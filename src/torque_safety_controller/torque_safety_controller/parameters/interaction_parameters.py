@@ -37,7 +37,7 @@ _DEFAULTS = InteractionSettings()
 _DUAL = DualSettings()
 _CONTACT_FIELDS = ("frame", "point", "normal", "friction")
 
-TABLE = (
+INTERACTION_TABLE = (
     Parameter("ft_frame", str, "link of the wrist's force/torque sensor; none if empty", ""),
     Parameter(
         "ft_tool",

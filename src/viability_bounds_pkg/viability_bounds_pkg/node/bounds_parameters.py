@@ -74,8 +74,8 @@ TABLE = (
     Parameter(
         "acceleration_drift",
         list[float],
-        "how fast the acceleration changes while a torque is held, rad/s^3; the bounds are "
-        "tightened by what follows from it at this rate; 0 if empty",
+        "largest jerk under held torque, rad/s^3; the bounds are tightened by the error that it "
+        "causes within a control period; 0 if empty",
         default=np.zeros(0),
         per_joint=True,
         within=NOT_NEGATIVE,

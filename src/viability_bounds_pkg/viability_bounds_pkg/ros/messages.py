@@ -23,22 +23,22 @@ Report = Callable[[], tuple[bytes, str, dict[str, Any]]]
 
 
 class Verdict(Enum):
-    """What a message turned out to be."""
+    """Result of reading a message."""
 
     NEW = 1
     """Accepted: the arrays hold its values."""
     REPEAT = 2
-    """The stamp of the last accepted message again: a robot that asks once more."""
+    """The stamp and the values of the last accepted message: the robot repeats its state."""
     REFUSED = 3
     """Dropped and counted; the arrays hold what they held."""
 
 
 class StampGuard:
-    """Lets stamps only grow, yet does not lock out a source that started over.
+    """Accepts only growing stamps, but also those of a source that has restarted.
 
     A robot or simulation that restarts counts time from the beginning again, and one corrupt
-    stamp may lie far in the future. After `reset_after` seconds without an accepted stamp,
-    whatever comes is taken as a new beginning.
+    stamp may lie far in the future. After `reset_after` seconds without an accepted stamp, any
+    stamp is accepted.
     """
 
     def __init__(self, reset_after: float) -> None:
@@ -55,7 +55,7 @@ class StampGuard:
         return Verdict.NEW
 
     def may_start_over(self, now: float) -> bool:
-        """Return whether the source has been silent for so long that any stamp will do."""
+        """Return whether the source has been silent for so long that any stamp is accepted."""
         return now - self._accepted_at >= self._reset_after
 
     def accept(self, stamp: int, now: float) -> None:
@@ -91,14 +91,14 @@ class JointStateReader:
         """Take a message that arrived at `now`, in s on the steady clock."""
         stamp = stamp_to_ns(message.header.stamp)
         if stamp == 0:
-            # All of them would have this one, and the first answer would serve for ever.
+            # Later messages would have the same, and be taken for repeats of the first.
             return self._refuse("no stamp")
         verdict = self._guard.check(stamp, now)
         if verdict is Verdict.REFUSED:
             return self._refuse("old stamp")
         if message.name != self._names and not self._match(message.name):
             return self._refuse("missing joint")
-        if not len(message.position) == len(message.velocity) == len(self._names):
+        if not len(message.position) == len(message.velocity) == len(message.name):
             return self._refuse("wrong size")
         q, v = np.array(message.position), np.array(message.velocity)
         if self._index is not None:

@@ -1,4 +1,4 @@
-"""Parameters that say which robot it is, for every node that loads one."""
+"""Parameters that describe the robot, for every node that loads its URDF."""
 
 from __future__ import annotations
 

@@ -10,6 +10,7 @@ from collections.abc import Callable
 import rclpy
 from builtin_interfaces.msg import Time
 from numba.core.event import TimingListener, install_listener
+from rclpy.context import Context
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -21,7 +22,7 @@ from viability_bounds_pkg.robot_description import RobotDescriptionError
 try:
     from rclpy.experimental import EventsExecutor
 except ImportError:  # early Jazzy releases
-    EventsExecutor = None
+    EventsExecutor = None  # type: ignore[assignment,misc]
 
 CONTROL_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Streams of states, bounds and commands: the newest wins, nothing is sent again."""
@@ -42,7 +43,7 @@ _LEAVE_TIMEOUT = 5
 """How long a node may take to leave the graph, s."""
 
 
-def make_executor(context: rclpy.Context | None = None) -> Executor:
+def make_executor(context: Context | None = None) -> Executor:
     """Return the fastest executor that this release of rclpy has.
 
     The events executor relays a message about ten times faster than the single-threaded one,
@@ -53,7 +54,7 @@ def make_executor(context: rclpy.Context | None = None) -> Executor:
     return SingleThreadedExecutor(context=context)
 
 
-def spin(executor: Executor, context: rclpy.Context | None = None) -> None:
+def spin(executor: Executor, context: Context | None = None) -> None:
     """Run callbacks until the context is shut down or Ctrl-C comes.
 
     ``EventsExecutor.spin()`` of rclpy 7.1 runs no callback, and a wait without time-out does

@@ -1,0 +1,43 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[2]
+SCRIPT = """
+import sys
+import rclpy
+from numba import njit
+from rclpy.node import Node
+from viability_bounds_pkg.ros.runtime import run
+
+@njit
+def add(x):
+    return x + 1
+
+def make():
+    node = Node("quick")
+    if "compile" in sys.argv:
+        add(1)
+    node.create_timer(0.01, rclpy.try_shutdown)
+    return node
+
+sys.exit(run(make, []))
+"""
+
+
+@pytest.mark.parametrize("compiles", [True, False])
+def test_a_node_says_when_its_start_had_to_compile(compiles):
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, *(["compile"] if compiles else [])],
+        cwd=PACKAGE,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    said = [line for line in done.stderr.splitlines() if "compiling took" in line]
+    assert len(said) == compiles, done.stderr
+    assert not compiles or "scripts/setup.sh" in said[0]
