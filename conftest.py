@@ -1,8 +1,35 @@
 """Fixtures and settings for the tests of all packages."""
 
 import os
+from typing import Any
+
+import pytest
+from hypothesis import settings
 
 # Matrices here are small: a thread for each core only keeps other tests from running.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 pytest_plugins = ["ros_harness", "arms"]
+
+# Every run tries the same examples; with --hypothesis-profile=explore it tries others.
+settings.register_profile("same", deadline=None, derandomize=True, print_blob=True)
+settings.register_profile("explore", deadline=None, print_blob=True)
+settings.load_profile("same")
+
+SPREAD = {"test/test_demo.py", "test/test_readme.py", "test/test_startup.py"}
+"""Files of tests that share nothing and take long, for any process that has time."""
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Keep the tests of most files in one process each, because they share what they make."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class Scheduling(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = super()._split_scope(nodeid)
+            return nodeid if file in SPREAD else file
+
+    # As in `testpaths`: the long ones first, so that none of them is alone at the end.
+    config.option.loadscopereorder = False
+    return Scheduling(config, log)

@@ -96,7 +96,8 @@ _build() {
     # Sources are symlinked, so only changes of these files need a new build.
     local built="$root/install/.built" now
     now="$(cat "$root"/src/*/setup.py "$root"/src/*/setup.cfg "$root"/src/*/package.xml \
-        "$root/colcon.meta" "$stamp" | sha256sum | cut -d' ' -f1) $root"
+        "$root/colcon.meta" "$stamp" <(cd "$root" && find config | sort) |
+        sha256sum | cut -d' ' -f1) $root"
     if [ "$(cat "$built" 2>/dev/null)" = "$now" ]; then
         return 0
     fi

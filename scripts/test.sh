@@ -1,8 +1,10 @@
 #!/usr/bin/env bash
 # Runs the tests, setting itself up first. Arguments go to pytest:
 #
-#     bash scripts/test.sh                  all of them
-#     bash scripts/test.sh -k viability     some of them
+#     bash scripts/test.sh                  all of them, in several processes
+#     bash scripts/test.sh -k viability     some of them, in one
+#     bash scripts/test.sh -n 2             as many as you say; 0 for one
+#     bash scripts/test.sh --hypothesis-profile=explore    with other examples than last time
 set -eu
 root="$(cd "$(dirname "$0")/.." && pwd)"
 set +u
@@ -13,4 +15,6 @@ cd "$root"
 # A ROS domain of its own, so that other nodes do not interfere.
 export ROS_DOMAIN_ID="${ROS_DOMAIN_ID:-$((1 + $$ % 100))}"
 export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
+# One process more than cores, because some tests wait.
+[ $# -gt 0 ] || set -- -n "$(($(nproc) + 1))"
 exec python -m pytest "$@"

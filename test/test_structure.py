@@ -168,3 +168,13 @@ def test_packages_are_described_alike():
         assert "<license>Apache-2.0</license>" in text
         assert (folder / "resource" / package).exists()
         assert f"script_dir=$base/lib/{package}" in (folder / "setup.cfg").read_text()
+
+
+def test_parameter_files_and_scenarios_are_installed():
+    share = ROOT / "install" / "sim_bridge" / "share" / "sim_bridge" / "config"
+    own, installed = (
+        {path.relative_to(folder): path.read_text() for path in folder.rglob("*.yaml")}
+        for folder in (ROOT / "config", share)
+    )
+    assert len(own) > 5
+    assert installed == own

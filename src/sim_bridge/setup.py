@@ -1,8 +1,11 @@
 """Build description of sim_bridge."""
 
+from glob import glob
+
 from setuptools import find_packages, setup
 
 PACKAGE = "sim_bridge"
+CONFIG = ("config", "config/obstacles", "config/scenarios")
 
 setup(
     name=PACKAGE,
@@ -12,6 +15,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
+        *((f"share/{PACKAGE}/{folder}", glob(f"{folder}/*.yaml")) for folder in CONFIG),
     ],
     install_requires=["setuptools"],
     zip_safe=True,

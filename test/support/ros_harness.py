@@ -43,26 +43,41 @@ TIMEOUT = 10.0
 RECORDING_QOS = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Loses nothing that comes while other callbacks run."""
 
-# On Linux these domains use no port that the system hands out by itself.
-_DOMAINS = range(215, 232)
+# On Linux these domains use no port that the system hands out by itself: the upper ones are for
+# tests alone, among the lower ones may be other programs.
+_DOMAINS = (range(215, 232), range(60, 101))
 _LOCK_PORT = 17_400
-_next_domain = itertools.count(os.getpid())
+_turns = itertools.count(os.getpid())
 
 
 @contextmanager
 def private_domain() -> Iterator[int]:
-    """Hold a domain id that no other process holds through this function."""
+    """Hold a domain id that no other process uses, or holds through this function."""
     deadline = time.monotonic() + 60.0
     while time.monotonic() < deadline:
-        domain = _DOMAINS[next(_next_domain) % len(_DOMAINS)]
-        with socket.socket() as lock:
-            try:
-                lock.bind(("127.0.0.1", _LOCK_PORT + domain))
-            except OSError:
-                continue
-            yield domain
-            return
+        for domains in _DOMAINS:
+            for _ in domains:
+                domain = domains[next(_turns) % len(domains)]
+                with socket.socket() as lock:
+                    try:
+                        lock.bind(("127.0.0.1", _LOCK_PORT + domain))
+                    except OSError:
+                        continue
+                    if _in_use(domain):
+                        continue
+                    yield domain
+                    return
     raise RuntimeError("every domain is taken")
+
+
+def _in_use(domain: int) -> bool:
+    """Return whether a node has the port that the first one of a domain takes."""
+    with socket.socket(type=socket.SOCK_DGRAM) as port:
+        try:
+            port.bind(("", 7410 + 250 * domain))
+        except OSError:
+            return True
+    return False
 
 
 def read_config(robot: str, node: str) -> dict[str, Any]:

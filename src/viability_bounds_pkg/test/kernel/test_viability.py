@@ -287,6 +287,15 @@ def test_no_speed_beyond_its_limit_from_anywhere(limits, dt, share, q, v):
         assert braking >= min(needed, hardest) * (1.0 - 1e-9)
 
 
+@pytest.mark.parametrize("mirror", [1.0, -1.0])
+@pytest.mark.parametrize(("q", "v"), [(1.02, 0.0), (1.05, -0.4)])
+def test_a_joint_on_its_way_back_is_on_its_limit_after_a_step(q, v, mirror):
+    dt, solver = 0.1, BoundsSolver(one_joint(-1.0, 1.0, 5.0, -20.0, 20.0), 0.1)
+    bounds = solver.bounds([mirror * q], [mirror * v])
+    a = bounds.upper[0] if mirror > 0.0 else -bounds.lower[0]
+    assert q + dt * v + 0.5 * dt * dt * a == pytest.approx(1.0, abs=1e-12)
+
+
 @pytest.mark.parametrize("rows", [0, 1, 5, 24, 25, 5000])
 def test_batches_of_any_size_are_states_one_by_one(rows):
     limits = JointLimits(
