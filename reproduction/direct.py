@@ -7,6 +7,7 @@ runs in which something is to happen at an exact step, and for many of them.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -102,6 +103,12 @@ class DirectLoop:
         values = self._values("controller_node", controller_parameters.TABLE)
         made = controller_parameters.make_configuration(values)
         ros_controller_assembly.configure(self.controller, made)
+
+    def change_friction(self, **settings: Any) -> None:
+        """Change settings of the friction compensation, also those that are no parameters."""
+        additional = self.controller.additional
+        friction = replace(additional.settings.friction, **settings)
+        additional.settings = replace(additional.settings, friction=friction)
 
     @property
     def dt(self) -> float:

@@ -24,8 +24,8 @@ ELBOW = 5
 HAND = "wrist_left_ft_tool_link"
 # Section IV-A: lambda = 2, tau_m = 0.1 of the torque limits, theta 0.1 and 100 1/s, mu = 0.5.
 PAPER: dict[str, Any] = {"integral_lambda": 2.0, "integral_budget": []}
-PRINTED = PAPER | {"integral_as_printed": True}
-UNLIMITED = PRINTED | {"integral_anti_windup": "none"}
+PRINTED = PAPER | {"integral_anti_windup": "paper"}
+UNLIMITED = PAPER | {"integral_anti_windup": "none"}
 PLAIN = UNLIMITED | {"integral_theta_slow": 0.0, "integral_mu": 0.0}
 # Pushes in world axes, N: to the side, and down.
 PUSHES = ((0.0, -60.0, 0.0), (0.0, 0.0, -100.0))
@@ -115,7 +115,7 @@ def push(changed: dict[str, Any], force: tuple[float, ...], seconds: float = 5.0
     places = hand(loop, released) - target
     direction = places[0] / np.linalg.norm(places[0])
     far = np.flatnonzero(np.linalg.norm(places, axis=1) > AWAY)
-    budget = loop.controller.additional.settings.joints.budget
+    budget = loop.controller.additional.settings.integral.budget
     share = np.abs(column(pushed + released, "additional")) / budget
     return {
         "loop": loop,
@@ -141,7 +141,7 @@ def figure_5() -> Figure:
             loop, samples = run["loop"], run["samples"]
             t = column(samples, "t") - samples[0].t
             additional = column(samples, "additional")[:, ELBOW]
-            budget = loop.controller.additional.settings.joints.budget[ELBOW]
+            budget = loop.controller.additional.settings.integral.budget[ELBOW]
             axis.plot(t, additional, color="tab:red", label="additional torque, elbow")
             for sign in (-1.0, 1.0):
                 axis.axhline(sign * budget, color="tab:red", linestyle=":")
@@ -237,8 +237,7 @@ def ablation() -> Figure:
         "no integral": {"integral_action": "none"},
         "plain integral": PLAIN,
         "leaky (12)-(14)": UNLIMITED,
-        "leaky, clip": PRINTED | {"integral_anti_windup": "clip"},
-        "leaky, (10)": PRINTED | {"integral_anti_windup": "scaling"},
+        "leaky, (10)": PAPER | {"integral_anti_windup": "scaling"},
         "leaky, (11) as printed": PRINTED,
         "leaky, (11), whole torque": PAPER,
         "the same, the file's values": {},

@@ -19,7 +19,7 @@ from torque_safety_controller.additional_torque import (
 )
 from torque_safety_controller.controller import Controller, Gains
 from torque_safety_controller.friction.settings import FrictionModel, FrictionSettings
-from torque_safety_controller.integral_feedback.settings import IntegralSettings
+from torque_safety_controller.integral_feedback import IntegralSettings
 from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.parameters.friction_parameters import TABLE, friction_settings
 from viability_bounds_pkg.exceptions import SettingError
@@ -41,8 +41,8 @@ FIRM = slice(0, 5)  # joints with inertia enough to call for all of the friction
 
 
 def additional(mode="none", friction=ON, budget=0.05) -> AdditionalTorque:
-    integral = IntegralSettings(budget * ARM.tau_max, lambda_=30.0)
-    return AdditionalTorque(AdditionalSettings(mode, integral, None, 2.0 * ARM.tau_max, friction))
+    integral = IntegralSettings(budget * ARM.tau_max, gain=30.0)
+    return AdditionalTorque(AdditionalSettings(mode, integral, 2.0 * ARM.tau_max, friction))
 
 
 def controller(**others) -> Controller:
@@ -63,10 +63,10 @@ def test_both_are_added_and_the_integral_s_budget_is_its_own():
     made = controller(mode="joints")
     steps(made, 3000)
     both = made.additional
-    np.testing.assert_allclose(both.last, both.joints.additional_torque + both.friction.last)
+    np.testing.assert_allclose(both.last, both.integral + both.friction.last)
     assert both.saturated.any()
-    budget = both.joints.settings.budget
-    assert (np.abs(both.joints.additional_torque) <= budget * (1.0 + 1e-9)).all()
+    budget = both.settings.integral.budget
+    assert (np.abs(both.integral) <= budget * (1.0 + 1e-9)).all()
     assert (np.abs(both.last) > budget).any()
 
 
@@ -151,20 +151,14 @@ def test_each_parameter_reaches_the_settings():
         "friction_model_static": 1.3 * COULOMB,
         "friction_model_viscous": 0.2 * COULOMB,
         "friction_model_stribeck_velocity": np.full(N, 0.07),
-        "friction_budget": 0.3 * ARM.tau_max,
     }
     given = values(
         friction_compensation=0.4,
-        friction_theta=11.0,
-        friction_gain=70.0,
         **{key: value.tolist() for key, value in rows.items()},
     )
     made = friction_settings(given, "abcdefg", ARM.tau_max)
-    assert (made.scale, made.theta, made.gain) == (0.4, 11.0, 70.0)
-    found = (
-        *(getattr(made.model, k) for k in ("coulomb", "static", "viscous", "stribeck_velocity")),
-        made.budget,
-    )
+    assert made.scale == 0.4
+    found = (getattr(made.model, k) for k in ("coulomb", "static", "viscous", "stribeck_velocity"))
     for value, expected in zip(found, rows.values(), strict=True):
         np.testing.assert_array_equal(value, expected)
     only = friction_settings(
@@ -186,10 +180,6 @@ REFUSED = [
     ("friction_model_static", [0.01] * N, "at least coulomb"),
     ("friction_model_viscous", [math.nan] * N, "not NaN"),
     ("friction_model_stribeck_velocity", [0.0] * N, "> 0"),
-    ("friction_budget", [1e3] * N, "at most torque_max"),
-    ("friction_budget", [-1.0] * N, ">= 0"),
-    ("friction_theta", -3.0, ">= 0"),
-    ("friction_gain", 0.0, "> 0"),
 ]
 GIVEN = {
     "friction_compensation": 0.5,

@@ -16,7 +16,7 @@ from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.ros.parameters import Parameter, per_joint
 
 BUDGET = 0.2
-"""Default budget in torque limits."""
+"""Most that is compensated, in torque limits."""
 
 MODEL = {
     "coulomb": "dry friction of moving joints, N m",
@@ -39,30 +39,7 @@ TABLE = (
         Parameter(f"friction_model_{name}", list[float], text, default=np.zeros(0), live=True)
         for name, text in MODEL.items()
     ),
-    Parameter(
-        "friction_budget",
-        list[float],
-        f"most that is compensated, N m; {BUDGET:g} of torque_max if empty",
-        default=np.zeros(0),
-        live=True,
-    ),
-    Parameter(
-        "friction_theta",
-        float,
-        "rate at which the reference velocity returns to the measured one, 1/s",
-        default=3.0,
-        live=True,
-    ),
-    Parameter(
-        "friction_gain",
-        float,
-        "gain of the reference velocity, 1/s; -1: what the control rate allows",
-        default=-1.0,
-        live=True,
-    ),
 )
-
-_PARAMETER_OF = {"scale": "friction_compensation", "theta": "friction_theta"}
 
 
 def friction_settings(
@@ -97,19 +74,12 @@ def friction_settings(
     }
     if found["static"] is None:
         found["static"] = found["coulomb"]
-    budget = BUDGET * tau_max
-    if len(values["friction_budget"]):
-        budget = per_joint(values, "friction_budget", joints)
-        if (budget > tau_max).any():
-            raise SettingError("friction_budget", budget, "at most torque_max")
     try:
         model = FrictionModel(**found)
     except SettingError as error:
         name = f"friction_model_{error.name}"
         raise SettingError(name, error.value, error.allowed) from error
     try:
-        gain = None if values["friction_gain"] == -1.0 else values["friction_gain"]
-        return FrictionSettings(model, budget, scale, values["friction_theta"], gain)
+        return FrictionSettings(model, BUDGET * tau_max, scale)
     except SettingError as error:
-        name = _PARAMETER_OF.get(error.name, f"friction_{error.name}")
-        raise SettingError(name, error.value, error.allowed) from error
+        raise SettingError("friction_compensation", error.value, error.allowed) from error

@@ -12,7 +12,6 @@ from torque_safety_controller.integral_feedback.settings import (
     METHODS,
     IntegralSettings,
 )
-from torque_safety_controller.nullspace.settings import NullspaceSettings
 from torque_safety_controller.parameters.friction_parameters import friction_settings
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.ros.parameters import Parameter, per_joint
@@ -53,15 +52,9 @@ TABLE = (
     Parameter(
         "integral_anti_windup",
         str,
-        f"for joints: one of {', '.join(METHODS)}; qp is eq. (11)",
+        f"for joints: one of {', '.join(METHODS)}; qp limits the whole torque and the "
+        "integrators; scaling is eq. (10) and paper (11) as printed, for K s only",
         default="qp",
-        live=True,
-    ),
-    Parameter(
-        "integral_as_printed",
-        bool,
-        "limit K s only and leave the integrators as they are, as the paper does",
-        default=False,
         live=True,
     ),
     Parameter(
@@ -72,7 +65,7 @@ TABLE = (
     ),
 )
 
-_NAME_OF = {"lambda_": "lambda"}
+_NAME_OF = {"gain": "lambda", "slow_leak_rate": "theta_slow", "fast_leak_rate": "theta_fast"}
 
 
 def additional_settings(
@@ -100,33 +93,20 @@ def additional_settings(
         budget = per_joint(values, "integral_budget", joints)
         if (budget > tau_max).any():
             raise SettingError("integral_budget", budget, "at most torque_max")
-    common = {
-        "budget": budget,
-        "lambda_": values["integral_lambda"],
-        "theta_slow": values["integral_theta_slow"],
-        "theta_fast": values["integral_theta_fast"],
-        "mu": values["integral_mu"],
-    }
-    as_printed = values["integral_as_printed"]
     try:
-        return AdditionalSettings(
-            mode,
-            IntegralSettings(
-                **common,
-                anti_windup=values["integral_anti_windup"],
-                whole_torque=not as_printed,
-                correct_state=not as_printed,
-                paper_form=as_printed,
-            ),
-            NullspaceSettings(**common, keep_integral=as_printed)
-            if rows.stop < len(joints)
-            else None,
-            DISTURBANCE_MAX * tau_max,
-            friction_settings(values, joints, tau_max),
+        integral = IntegralSettings(
+            budget,
+            gain=values["integral_lambda"],
+            slow_leak_rate=values["integral_theta_slow"],
+            fast_leak_rate=values["integral_theta_fast"],
+            mu=values["integral_mu"],
+            anti_windup=values["integral_anti_windup"],
         )
     except SettingError as error:
         name = f"integral_{_NAME_OF.get(error.name, error.name)}"
         raise SettingError(name, error.value, error.allowed) from error
+    friction = friction_settings(values, joints, tau_max)
+    return AdditionalSettings(mode, integral, DISTURBANCE_MAX * tau_max, friction)
 
 
 def task_rows(values: Mapping[str, Any]) -> slice:

@@ -48,7 +48,7 @@ class DisturbanceObserver:
         _observe(np.zeros(n), ones, ones, ones, 1.0, 1.0, ones, np.eye(n))
         _shift(ones, -ones, ones)
 
-    def start(self) -> None:
+    def reset(self) -> None:
         """Forget the past."""
         self.estimate.fill(0.0)
         self._begun = False
@@ -67,7 +67,7 @@ class DisturbanceObserver:
         if self.time_constant is None:
             return
         if not elapsed > 0.0:
-            self.start()
+            self.reset()
         elif self._begun:
             gain = -math.expm1(-elapsed / self.time_constant) if self.time_constant > 0.0 else 1.0
             _observe(self.estimate, v, self._v_last, a_last, elapsed, gain, tau_max, M)

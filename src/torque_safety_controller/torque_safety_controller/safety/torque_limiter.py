@@ -29,7 +29,7 @@ class TorqueLimiter:
         self._rate_limited = bool(np.isfinite(rate).any())
         self.last: np.ndarray | None = None
 
-    def start(self) -> None:
+    def reset(self) -> None:
         """Forget the last torque: the next may be any within the limits."""
         self.last = None
 
