@@ -66,7 +66,7 @@ def project_to_limits(u: ArrayLike, s: ArrayLike, u_max: ArrayLike) -> Array:
     s = s / (np.abs(s).max() or 1.0)
     with np.errstate(over="ignore"):
         u, limits = u / unit, u_max / unit
-    x = nearest_dissipating(u, s, limits, scale_factor(u, limits) * (s @ u))
+    x = nearest_dissipating(u, s, limits, scale_factor(u, limits) * float(s @ u))
     return np.clip(unit * x, -u_max, u_max)
 
 

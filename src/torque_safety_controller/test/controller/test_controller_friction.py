@@ -256,9 +256,3 @@ def test_what_cannot_be_is_refused_while_the_node_runs(ros):
         reason = ros.refuses(NODE, **{name: value})
         assert reason.startswith(f"parameter '{name}' is ") and allowed in reason
     assert chain.node.get_parameter("friction_compensation").value == before
-
-
-def test_settings_may_be_without_friction():
-    settings = replace(additional().settings, friction=None)
-    assert settings.friction.model.n == N
-    assert settings.friction.scale == 0.0

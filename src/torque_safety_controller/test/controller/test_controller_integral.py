@@ -182,7 +182,7 @@ BAD = [
     ("integral_lambda", "much", "a number"),
     ("integral_theta_slow", -0.1, ">= 0"),
     ("integral_theta_slow", math.nan, ">= 0"),
-    ("integral_theta_fast", -1.0, ">= 0"),
+    ("integral_theta_fast", -1.0, ">= the slow one"),
     ("integral_theta_fast", math.inf, "finite"),
     ("integral_theta_fast", 0.05, ">= the slow one, 0.1"),
     ("integral_mu", -0.01, "0 to 1"),

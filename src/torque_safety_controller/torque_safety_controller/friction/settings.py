@@ -62,7 +62,8 @@ class FrictionModel:
         """Return F(v), N m, for velocities of shape (..., n), rad/s."""
         v = np.asarray(v, dtype=np.float64)
         dry = np.exp(-((v / self.stribeck_velocity) ** 2)) * (self.static - self.coulomb)
-        return self.coulomb + dry + self.viscous * np.abs(v)
+        level: NDArray[np.float64] = self.coulomb + dry + self.viscous * np.abs(v)
+        return level
 
 
 def no_friction(n: int) -> FrictionModel:

@@ -16,8 +16,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from torque_safety_controller.integral_feedback import kernels
 from torque_safety_controller.integral_feedback.action import ArmTerms, check_time
+from torque_safety_controller.integral_feedback.kernels import Memory, advance, evaluate, step
 from torque_safety_controller.integral_feedback.leaky_integrator import mix
 from torque_safety_controller.integral_feedback.settings import QP, IntegralSettings
 from viability_bounds_pkg.exceptions import ArmSafetyError
@@ -47,7 +47,7 @@ class IntegralFeedback:
 
     def __init__(self, settings: IntegralSettings) -> None:
         n = len(settings.budget)
-        self.memory = kernels.Memory(*np.zeros((4, n)))
+        self.memory = Memory(*np.zeros((4, n)))
         self.leak = 0.0
         self.saturated = np.zeros(n, dtype=bool)
         self._settings, self._law = settings, settings.law
@@ -87,7 +87,7 @@ class IntegralFeedback:
         if a_last.shape != self.saturated.shape:
             raise ValueError(f"a_last must have shape {self.saturated.shape}: {a_last.shape}")
         torque = np.empty_like(a_last)
-        leak = kernels.step(
+        leak = step(
             self.memory, self._law, self.leak, arm, a_last, float(dt), torque, self.saturated
         )
         if math.isnan(leak):
@@ -100,7 +100,7 @@ class IntegralFeedback:
         check_time(dt)
         arm.check_velocity()
         self.memory.v[:] = arm.v
-        kernels.advance(self.memory, self._law, self.leak, arm.v, 0.0 * arm.v, float(dt))
+        advance(self.memory, self._law, self.leak, arm.v, 0.0 * arm.v, float(dt))
 
     def initialise(self, torque: Array, arm: ArmTerms) -> Array:
         """See `IntegralAction`; it is then forgotten at the slow rate.
@@ -125,5 +125,5 @@ class IntegralFeedback:
         limited = torque if self._law.method == QP else K * s
         memory.widening[:] = np.maximum(np.abs(limited) - self._law.budget, 0.0)
         result = np.empty_like(torque)
-        self.leak = kernels.evaluate(memory, self._law, arm.M, arm.C, result, self.saturated)
+        self.leak = evaluate(memory, self._law, arm.M, arm.C, result, self.saturated)
         return result

@@ -139,25 +139,24 @@ def nearest_with_leak(M: Array, s: Array, u: Array, limit: Array, w: Array, y: A
     """
     n = len(s)
     largest = np.abs(s).max()
-    direction, wish, limits, level = np.zeros(n + 1), np.zeros(n + 1), np.empty(n + 1), 0.0
-    wish[:n], limits[:n], limits[n] = u, limit, np.inf
+    direction, wish, limits = np.zeros(n + 1), np.zeros(n + 1), np.full(n + 1, np.inf)
+    reference = np.zeros(n + 1)
+    wish[:n], limits[:n], reference[:n] = u, limit, w
     size = 0.0
     if largest > 0.0:
         direction[:n] = s / largest
         momentum = M @ direction[:n]
         size = math.sqrt(momentum @ momentum)
-        if size > 0.0:
-            direction[n] = max(direction[:n] @ momentum, 0.0) / size
-        reference = np.zeros(n + 1)
-        reference[:n] = w
-        level = direction @ reference
-    result = nearest_dissipating(wish, direction, limits, level)
+        power = direction[:n] @ momentum
+        if size > 0.0 and power > 0.0:
+            direction[n] = power / size
+    result = nearest_dissipating(wish, direction, limits, float(direction @ reference))
     leak = result[n] / (size * largest) if size * largest > 0.0 else 0.0
     if not (np.isfinite(result).all() and math.isfinite(leak)):
         y[:] = clip(u, limit)
         return 0.0
     y[:] = result[:n]
-    return leak
+    return float(leak)
 
 
 @compiled

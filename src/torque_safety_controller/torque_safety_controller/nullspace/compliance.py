@@ -22,7 +22,13 @@ from numpy.typing import NDArray
 from torque_safety_controller.integral_feedback.action import ArmTerms, check_time
 from torque_safety_controller.integral_feedback.settings import IntegralSettings
 from torque_safety_controller.linalg.generalized_inverse import check_task_shape
-from torque_safety_controller.nullspace import kernels
+from torque_safety_controller.nullspace.kernels import (
+    FAILED,
+    NEAR_SINGULAR,
+    Memory,
+    skip,
+    step,
+)
 
 Array = NDArray[np.float64]
 
@@ -50,8 +56,8 @@ class NullspaceCompliance:
         n = len(settings.budget)
         check_task_shape(m, n)
         self._shape = m, n
-        sizes = (n, n, m, n, n, n, n)
-        self.memory = kernels.Memory(*(np.zeros(size) for size in sizes), np.zeros((m, n)))
+        a, s, root, offset, widening, v = np.zeros((6, n))
+        self.memory = Memory(a, s, np.zeros(m), root, offset, widening, v, np.zeros((m, n)))
         self.near_singular = False
         self.saturated = np.zeros(n, dtype=bool)
         self.settings = settings
@@ -89,7 +95,7 @@ class NullspaceCompliance:
         """See `IntegralAction`.
 
         The slow memory takes what the task feels of it, and keeps it; the rest fades with
-        `kernels.FADING_TIME`.
+        `FADING_TIME`.
         """
         return self._step(arm, arm.v, 0.0, True, torque.copy())
 
@@ -97,7 +103,7 @@ class NullspaceCompliance:
         """See `IntegralAction`."""
         check_time(dt)
         arm.check_velocity()
-        kernels.skip(self.memory, self._law, arm.v, arm.J, float(dt))
+        skip(self.memory, self._law, arm.v, arm.J, float(dt))
 
     def _step(
         self, arm: ArmTerms, a_last: Array, dt: float, initialise: bool, torque: Array
@@ -107,7 +113,7 @@ class NullspaceCompliance:
         if a_last.shape != (n,) or torque.shape != (n,):
             raise ValueError(f"for {n} joints: vectors {a_last.shape}, {torque.shape}")
         try:
-            outcome = kernels.step(
+            outcome = step(
                 self.memory,
                 self._law,
                 arm,
@@ -119,7 +125,7 @@ class NullspaceCompliance:
             )
         except np.linalg.LinAlgError as error:
             raise ValueError("M must be positive definite") from error
-        if outcome == kernels.FAILED:
+        if outcome == FAILED:
             raise ValueError("M must be positive definite, and all numbers finite")
-        self.near_singular = outcome == kernels.NEAR_SINGULAR
+        self.near_singular = outcome == NEAR_SINGULAR
         return torque

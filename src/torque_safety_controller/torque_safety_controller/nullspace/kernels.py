@@ -165,7 +165,7 @@ def energy_product(law: Law, M: Array, a: Array, x: Array, b: Array, y: Array) -
     weight = 0.0
     if law.fast_leak_rate > law.slow_leak_rate:
         weight = law.mu * law.gain / (law.fast_leak_rate - law.slow_leak_rate)
-    return a @ (M @ b) + weight * (x @ (np.diag(M) * y))
+    return float(a @ (M @ b) + weight * (x @ (np.diag(M) * y)))
 
 
 @compiled

@@ -91,7 +91,17 @@ class DisturbanceObserver:
 
 
 @compiled
-def _observe(estimate, v, v_last, a_last, elapsed, gain, tau_max, M):
+def _observe(
+    estimate: Array,
+    v: Array,
+    v_last: Array,
+    a_last: Array,
+    elapsed: float,
+    gain: float,
+    tau_max: Array,
+    M: Array,
+) -> None:
+    """Let the estimate follow the error of the last step, at a rate `gain`; in place."""
     for j in range(v.size):
         e = (v[j] - v_last[j]) / elapsed - a_last[j]
         e = estimate[j] + gain * (e - estimate[j])
@@ -101,7 +111,8 @@ def _observe(estimate, v, v_last, a_last, elapsed, gain, tau_max, M):
 
 
 @compiled
-def _shift(estimate, lower, upper):
+def _shift(estimate: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+    """Return the bounds tightened by the estimate: the upper one, or the lower one."""
     low, high = lower.copy(), upper.copy()
     for j in range(low.size):
         e = estimate[j]
