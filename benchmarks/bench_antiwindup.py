@@ -20,15 +20,14 @@ from proxsuite import proxqp
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "src" / "torque_safety_controller"))
 
 from torque_safety_controller.anti_windup import (
-    clip_to_limits,
     project_to_limits,
     scale_factor,
     scale_to_limits,
 )
-from torque_safety_controller.integral_feedback.feedback import (
+from torque_safety_controller.integral_feedback import (
+    ArmTerms,
     IntegralFeedback,
     IntegralSettings,
-    paper_settings,
 )
 
 JOINTS = 9
@@ -90,8 +89,8 @@ def integral_steps(rng: np.random.Generator, law: IntegralSettings) -> Callable[
     A = rng.normal(size=(JOINTS, JOINTS))
     M, C = A @ A.T + np.eye(JOINTS), rng.normal(size=(JOINTS, JOINTS))
     feedback = IntegralFeedback(law)
-    feedback.start(np.zeros(JOINTS))
-    return lambda v, a_ref: feedback.torque(M, C, v, a_ref, 1e-3)
+    no_task = np.zeros((0, JOINTS))
+    return lambda v, a_ref: feedback.torque(ArmTerms(M, C, no_task, no_task, v), a_ref, 1e-3)
 
 
 def measure(name: str, function, u, s, flush, off: float | None = None) -> None:
@@ -127,12 +126,14 @@ def main() -> None:
         results = [np.array(function(x, y)) for x, y in zip(u, s, strict=True)]
         measure(name, function, u, s, flush, np.abs(np.array(results) - exact).max())
     measure("(10)", lambda x, _: scale_to_limits(x, u_max), u, s, flush)
-    measure("clip", lambda x, _: clip_to_limits(x, u_max), u, s, flush)
+    measure("clip by NumPy", lambda x, _: np.clip(x, -u_max, u_max), u, s, flush)
     measure("nothing, for comparison", lambda x, _: x, u, s, flush)
     for name, law in {
         "integral step, not limited": IntegralSettings(np.full(JOINTS, 1e6)),
         "integral step, all joints limited": IntegralSettings(np.full(JOINTS, 1e-3)),
-        "integral step, all limited, as the paper": paper_settings(np.full(JOINTS, 1e-3)),
+        "integral step, all limited, as the paper": IntegralSettings(
+            np.full(JOINTS, 1e-3), anti_windup="paper"
+        ),
     }.items():
         measure(name, integral_steps(rng, law), 1e-3 * u, 10.0 + s, flush)
 

@@ -5,7 +5,7 @@ means that other data has been read since the last call, as in a control loop.
 
 With --motion the hand draws a circle of 20 cm in 2 s while the elbow is pushed for 10 s, against
 viscous friction that the controller does not know of, and without joint limits, so that the arm
-passes close to singularities. The forms differ in what they remember for how long.
+passes close to singularities.
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ import numpy as np
 import pinocchio as pin
 import yaml
 
+from torque_safety_controller.integral_feedback import ArmTerms, IntegralSettings
 from torque_safety_controller.linalg.generalized_inverse import (
+    THRESHOLD,
     dynamically_consistent_inverse,
-    pseudo_inverse,
 )
-from torque_safety_controller.nullspace.compliance import NullspaceCompliance, NullspaceSettings
+from torque_safety_controller.nullspace import NullspaceCompliance
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -47,15 +48,15 @@ class Arm:
         self.hand = self.model.getFrameId(values["end_effector_frame"])
         self.elbow = self.model.getJointId("arm_left_4_joint")
 
-    def terms(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return M, C, J and J'."""
+    def terms(self, q: np.ndarray, v: np.ndarray) -> ArmTerms:
+        """Return M, C, J, J' and v."""
         M = pin.crba(self.model, self.data, q).copy()
         C = pin.computeCoriolisMatrix(self.model, self.data, q, v).copy()
         pin.computeJointJacobiansTimeVariation(self.model, self.data, q, v)
         pin.updateFramePlacement(self.model, self.data, self.hand)
         J = pin.getFrameJacobian(self.model, self.data, self.hand, pin.LOCAL)
         J_dot = pin.getFrameJacobianTimeVariation(self.model, self.data, self.hand, pin.LOCAL)
-        return M, C, J.copy(), J_dot.copy()
+        return ArmTerms(*(np.ascontiguousarray(x) for x in (M, C, J, J_dot, v)))
 
 
 def measure(name: str, function, arguments, flush: np.ndarray) -> None:
@@ -83,42 +84,36 @@ def cost() -> None:
     for k in range(STEPS):
         wave = 0.3 * np.sin(2.0 * k * DT + np.arange(arm.n))
         v = 0.6 * np.cos(2.0 * k * DT + np.arange(arm.n))
-        arguments.append((*arm.terms(arm.q + wave, v), v, v + 0.3, DT))
-    inverses = [(J, J_dot, M, C + C.T) for M, C, J, J_dot, *_ in arguments]
-    measure(
-        "pseudo-inverse and derivative", lambda J, D, *_: pseudo_inverse(J, D), inverses, flush
-    )
+        arguments.append((arm.terms(arm.q + wave, v), v + 0.3, DT))
+    inverses = [(x.J, x.J_dot, x.M, x.C + x.C.T, THRESHOLD) for x, *_ in arguments]
     measure("consistent inverse and derivative", dynamically_consistent_inverse, inverses, flush)
     wide, tight = np.full(arm.n, np.inf), np.full(arm.n, 1e-3)
-    for name, rows, settings in (
-        ("step, 6 rows", 6, NullspaceSettings(wide)),
-        ("step, 3 rows", 3, NullspaceSettings(wide)),
-        ("step, 6 rows, pseudo-inverse", 6, NullspaceSettings(wide, dynamically_consistent=False)),
-        ("step, 6 rows, near a singularity", 6, NullspaceSettings(wide, threshold=0.3)),
-        ("step, 6 rows, torque limited", 6, NullspaceSettings(tight)),
-        (
-            "step, 6 rows, all of these",
-            6,
-            NullspaceSettings(tight, dynamically_consistent=False, threshold=0.3),
-        ),
+    for name, rows, budget in (
+        ("step, 6 rows", 6, wide),
+        ("step, 3 rows", 3, wide),
+        ("step, 6 rows, torque limited", 6, tight),
     ):
-        compliance = NullspaceCompliance(settings, rows)
-        cut = [(M, C, J[:rows], D[:rows], *rest) for M, C, J, D, *rest in arguments]
+        compliance = NullspaceCompliance(IntegralSettings(budget), rows)
+        cut = [
+            (x._replace(J=x.J[:rows].copy(), J_dot=x.J_dot[:rows].copy()), *rest)
+            for x, *rest in arguments
+        ]
         measure(name, compliance.torque, cut, flush)
 
 
-def motion(force: float, settings: NullspaceSettings) -> np.ndarray:
+def motion(force: float, budget: float) -> np.ndarray:
     """Return error of the hand, m, largest torque, N m, and size of the memory of each step."""
     arm = Arm()
     model, data, n = arm.model, arm.data, arm.n
-    compliance = NullspaceCompliance(settings, 6)
+    compliance = NullspaceCompliance(IntegralSettings(np.full(n, budget)), 6)
     q, v, a_ref = np.array([0, 0.1, 0.4, 0.5, -0.3, -1.5, 0.2, 0.1, 0.1]), np.zeros(n), np.zeros(n)
     pin.framesForwardKinematics(model, data, q)
     start, rate = data.oMf[arm.hand].copy(), np.pi
     rows = []
     for t in np.arange(0.0, 15.0, DT):
-        M, C, J, J_dot = arm.terms(q, v)
-        added = compliance.torque(M, C, J, J_dot, v, a_ref, DT)
+        terms = arm.terms(q, v)
+        J, J_dot = terms.J, terms.J_dot
+        added = compliance.torque(terms, a_ref, DT)
         place, radius, phase = start.copy(), 0.1 * min(t, 1.0), rate * t
         place.translation += radius * np.array([0.0, np.sin(phase), 1.0 - np.cos(phase)])
         pin.framesForwardKinematics(model, data, q)
@@ -139,30 +134,20 @@ def motion(force: float, settings: NullspaceSettings) -> np.ndarray:
             tau += lever[:3].T @ np.array([0.0, force, 0.0])
         v = v + DT * pin.aba(model, data, q, v, tau)
         q = q + DT * v
-        memory = max(np.abs(compliance._memory.s).max(), np.abs(compliance._memory.integral).max())
+        memory = np.abs(compliance.memory.a).max()
         rows.append((np.linalg.norm(error[:3]), np.abs(added).max(), memory))
     return np.array(rows)
 
 
 def compare() -> None:
-    """Run the forms under the same pushes and print what became of them."""
-    print("form                                push   hand error   largest torque   memory")
-    unlimited = np.full(9, np.inf)
-    for name, settings in {
-        "as printed, never forgetting": NullspaceSettings(
-            unlimited, keep_integral=True, theta_slow=0.0, theta_null=0.0
-        ),
-        "as printed, all of it leaking": NullspaceSettings(
-            unlimited, keep_integral=True, theta_null=0.1
-        ),
-        "null space forgotten faster": NullspaceSettings(unlimited, keep_integral=True),
-        "and a alone kept (default)": NullspaceSettings(unlimited),
-        "default, 10 N m at most": NullspaceSettings(np.full(9, 10.0)),
-    }.items():
+    """Run the same pushes without and with a budget and print what became of them."""
+    print("budget       push   hand error   largest torque   memory")
+    for budget in (np.inf, 10.0):
         for force in (-40.0, 0.0, 40.0):
-            error, torque, memory = motion(force, settings)[2000:].max(axis=0)
+            error, torque, memory = motion(force, budget)[2000:].max(axis=0)
             print(
-                f"{name:<35} {force:4.0f} N {1e3 * error:8.1f} mm {torque:12.1f} N m {memory:9.1f}"
+                f"{budget:4.0f} N m {force:6.0f} N {1e3 * error:8.1f} mm {torque:12.1f} N m "
+                f"{memory:9.1f}"
             )
 
 

@@ -21,8 +21,9 @@ MODES = {
 }
 RAMP = 0.3  # s, in which a person's push grows
 HAND_FORCE, ELBOW_FORCE = 50.0, 100.0  # N
-ACTIVE = {"friction_compensation": 0.7, "friction_theta": 100.0, "friction_gain": 300.0}
-"""70% of the friction compensated in the direction of motion: docs/friction.md, "Which theta?"."""
+ACTIVE = {"leak_rate": 100.0, "gain": 300.0}
+"""Of the friction compensation, for active compliance."""
+"""Friction compensated by 70% the way the joint moves: docs/friction.md, "Which theta?"."""
 
 
 class TimedForce(NamedTuple):
@@ -124,9 +125,11 @@ def push(
     elbow: float = ELBOW_FORCE,
     axes: str = "xyz",
     held: float = 1.5,
+    friction: Mapping[str, float] | None = None,
 ) -> Pushed:
     """Push an arm that holds its hand where it is; arguments as of `course`."""
     loop = DirectLoop(ROBOT, changed)
+    loop.change_friction(**friction or {})
     loop.run(0.5)
     pushes = course(loop, hand, elbow, axes, held)
     begin = loop.t
@@ -259,11 +262,16 @@ def forces() -> Figure:
     """How far the elbow gives way to which force; friction compensated, too."""
     figure = Figure("paper1-elbow-force")
     compliant = MODES["with null-space compliance"]
-    cases = {**MODES, "with, and friction compensated by 70%": compliant | ACTIVE}
+    cases = {name: (changed, {}) for name, changed in MODES.items()}
+    active = "with, and friction compensated by 70%"
+    cases[active] = compliant | {"friction_compensation": 0.7}, ACTIVE
     sizes = (20.0, 40.0, 60.0, 80.0, 100.0, 120.0, 140.0)
     picture, axes = plt.subplots(1, 2, figsize=(12, 4.5), layout="constrained")
-    for name, changed in cases.items():
-        found = [judge(push(changed, hand=0.0, elbow=size, held=1.0)) for size in sizes]
+    for name, (changed, friction) in cases.items():
+        found = [
+            judge(push(changed, hand=0.0, elbow=size, held=1.0, friction=friction))
+            for size in sizes
+        ]
         moved, off_goal = (
             np.array([each[key] for each in found])
             for key in ("witness_motion_rad", "elbow_hand_m")

@@ -111,6 +111,12 @@ class DirectLoop:
         self._changed |= parameters
         assembly.configure(self.controller, self._controller_configuration())
 
+    def change_friction(self, **settings: Any) -> None:
+        """Change settings of the friction compensation, also those that are no parameters."""
+        additional = self.controller.additional
+        friction = replace(additional.settings.friction, **settings)
+        additional.settings = replace(additional.settings, friction=friction)
+
     @property
     def dt(self) -> float:
         """Control period, s."""

@@ -34,7 +34,7 @@ ELBOW, PUSH, PUSHED = "arm_left_4_link", (0.0, 60.0, 0.0), 1.5  # N, s
 PUSHES = (
     ("off", {}, 0.0),
     ("stiff", {}, 1.0),
-    ("yielding", {"friction_theta": 100.0, "friction_gain": 300.0}, 0.7),
+    ("yielding", {"leak_rate": 100.0, "gain": 300.0}, 0.7),
 )
 
 
@@ -105,7 +105,7 @@ def switched() -> tuple[float, float]:
     for changes in (on, {"friction_compensation": 0.3}, {"friction_compensation": 0.0}):
         loop.controller.set_pose_goal(home * pin.SE3(np.eye(3), np.array([0.05, 0.0, 0.05])))
         before = loop.run(0.3)[-2:]
-        loop.change(**changes)
+        loop.change_friction(**changes)
         tau = column((*before, *loop.run(loop.dt)), "tau") / loop.config.tau_max
         steps.append(np.abs(np.diff(tau, axis=0)).max(axis=1))
         loop.controller.set_pose_goal(home)
@@ -117,7 +117,7 @@ def switched() -> tuple[float, float]:
 def push_elbow(changes: dict[str, float], share: float) -> tuple[float, float]:
     """Return how far the elbow went, m, pushed with the null space free, and the hand, m."""
     loop = start({"integral_action": "task"}, share)
-    loop.change(**changes)
+    loop.change_friction(**changes)
     loop.run(1.0)
     before = loop.robot.link_pose(ELBOW).translation
     loop.robot.apply_wrench(ELBOW, PUSH, (0.0, 0.0, 0.0))
@@ -190,7 +190,7 @@ def more(figure: Figure) -> bool:
     rows = Figure("friction")
     for theta in THETAS:
         loop = start({"integral_action": "none"}, 1.3)
-        loop.change(friction_theta=theta)
+        loop.change_friction(leak_rate=theta)
         reached = reach(loop)
         figure.metrics[f"theta_{theta:g}_speed_at_rest_rad_s"] = reached["speed"]
         rows.rows.append(

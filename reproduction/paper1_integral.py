@@ -99,7 +99,7 @@ def push(changed: dict[str, Any], force: tuple[float, ...], seconds: float = 5.0
     places = hand_places(loop, released) - target
     direction = places[0] / np.linalg.norm(places[0])
     far = np.flatnonzero(np.linalg.norm(places, axis=1) > AWAY)
-    budget = loop.controller.additional.settings.joints.budget
+    budget = loop.controller.additional.settings.integral.budget
     share = np.abs(column(pushed + released, "additional")) / budget
     return {
         "loop": loop,
@@ -125,7 +125,7 @@ def figure_5() -> Figure:
             loop, samples = run["loop"], run["samples"]
             t = column(samples, "t") - samples[0].t
             additional = column(samples, "additional")[:, ELBOW]
-            budget = loop.controller.additional.settings.joints.budget[ELBOW]
+            budget = loop.controller.additional.settings.integral.budget[ELBOW]
             axis.plot(t, additional, color="tab:red", label="additional torque, elbow")
             for sign in (-1.0, 1.0):
                 axis.axhline(sign * budget, color="tab:red", linestyle=":")

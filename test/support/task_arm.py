@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 from arms import load_arm
 
+from torque_safety_controller.integral_feedback import ArmTerms
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 
 _TALOS = "package://example-robot-data/robots/talos_data/robots/talos_reduced.urdf"
@@ -28,6 +29,12 @@ class Terms(NamedTuple):
     h: np.ndarray
     J: np.ndarray
     J_dot: np.ndarray
+
+
+def arm_terms(terms: Terms, v: np.ndarray) -> ArmTerms:
+    """Return what integral actions need of the terms at velocity `v`."""
+    J, J_dot = terms.J, terms.J_dot
+    return ArmTerms(*(np.ascontiguousarray(x) for x in (terms.M, terms.C, J, J_dot, v)))
 
 
 class TaskArm:

@@ -1,25 +1,25 @@
 """The torque added to the model's: integral action in one of its modes, and friction's.
 
 Modes are ``none``; ``joints``, every joint stiff, (3)-(14) of [Benallegue2021]; and ``task``,
-stiff in the task and free in its null space, (15)-(26). Whatever is changed while the arm moves,
-and whatever comes instead of its next state, the torque goes on from where it was. Friction is
-compensated beside it, with a budget of its own.
+stiff in the task and free in its null space, (15)-(26). The torque stays continuous when mode or
+settings change, and when a state is missing or unusable. Friction is compensated beside it, with
+a budget of its own.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torque_safety_controller.friction.compensation import FrictionCompensation
 from torque_safety_controller.friction.settings import FrictionSettings, no_friction
+from torque_safety_controller.integral_feedback.action import ArmTerms, IntegralAction
 from torque_safety_controller.integral_feedback.feedback import IntegralFeedback
 from torque_safety_controller.integral_feedback.settings import IntegralSettings
 from torque_safety_controller.nullspace.compliance import NullspaceCompliance
-from torque_safety_controller.nullspace.settings import NullspaceSettings
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.compiled import compiled
 
@@ -37,27 +37,20 @@ _NEGLIGIBLE = 1e-9  # N m
 
 @dataclass(frozen=True, eq=False)
 class AdditionalSettings:
-    """What may change while the controller runs.
+    """Settings of `AdditionalTorque`; all of them may change while the controller runs.
 
     Attributes:
         mode: one of `MODES`.
-        joints: of mode ``joints``.
-        task: of mode ``task``; None where the task leaves no null space.
+        integral: of the integral action, whatever the mode.
         disturbance_max: largest disturbance of each joint that is integrated, shape (n,), N m;
             what friction and a wrong model never are, but a sensor's glitch or a blow may be.
         friction: of the friction compensation; None for none.
     """
 
     mode: str
-    joints: IntegralSettings
-    task: NullspaceSettings | None
+    integral: IntegralSettings
     disturbance_max: Array
     friction: FrictionSettings | None = None
-
-    def __post_init__(self) -> None:
-        if self.friction is None:
-            n = len(self.joints.budget)
-            object.__setattr__(self, "friction", FrictionSettings(no_friction(n), np.zeros(n)))
 
 
 class AdditionalTorque:
@@ -65,45 +58,45 @@ class AdditionalTorque:
 
     Args:
         settings: may be replaced between steps: the torque does not jump.
-        rows: which rows of the pose's Jacobian are the task of mode ``task``.
+        rows: which rows of the pose's Jacobian are the task of mode ``task``; without a null
+            space left of them there is no such mode.
 
     Attributes:
         last: what the last step added, shape (n,), N m.
         integral: what of it is the integral action's, shape (n,), N m.
         skipped: steps that were not integrated over: time jumped, or the state did.
-        joints: the integral action of mode ``joints``.
-        task: that of mode ``task``, or None.
+        actions: the integral actions by mode.
         friction: the friction compensation.
     """
 
     def __init__(self, settings: AdditionalSettings, rows: slice = slice(0, 6)) -> None:
-        n = len(settings.joints.budget)
-        self.joints = IntegralFeedback(settings.joints)
-        self.task: NullspaceCompliance | None = None
-        if settings.task is not None:
-            self.task = NullspaceCompliance(settings.task, rows.stop - rows.start)
-        self.friction = FrictionCompensation(settings.friction)
+        n, m = len(settings.integral.budget), rows.stop - rows.start
+        self.actions: dict[str, IntegralAction] = {"joints": IntegralFeedback(settings.integral)}
+        if m < n:
+            self.actions["task"] = NullspaceCompliance(settings.integral, m)
+        self._no_friction = FrictionSettings(no_friction(n), np.zeros(n))
+        self.friction = FrictionCompensation(settings.friction or self._no_friction)
         self.skipped = 0
         self._rows = rows
-        self._settings = settings
         self._zero = np.zeros(n)
-        self.start()
+        self._settings = settings
+        self.reset()
         # Compiled now, not in a control loop.
         zero = self._zero
         _jumped(np.eye(n), zero, zero, zero, zero, zero, 0.0, zero)
 
     @property
     def settings(self) -> AdditionalSettings:
-        """Settings; the next step goes over to them."""
+        """Settings; the next step changes over to them."""
         return self._settings
 
     @settings.setter
     def settings(self, settings: AdditionalSettings) -> None:
+        settings.integral.check_joints(len(self._zero))
+        if settings.integral.same_as(self._integral_settings):
+            settings = replace(settings, integral=self._integral_settings)
         self._settings = settings
-        self.joints.settings = settings.joints
-        if self.task is not None and settings.task is not None:
-            self.task.settings = settings.task
-        self.friction.settings = settings.friction
+        self.friction.settings = settings.friction or self._no_friction
 
     @property
     def idle(self) -> bool:
@@ -114,23 +107,20 @@ class AdditionalTorque:
     @property
     def saturated(self) -> NDArray[np.bool_]:
         """Which joints are at their budget, shape (n,)."""
-        if self._mode == "joints":
-            return self.joints.saturated
-        if self._mode == "task" and self.task.limited:
-            budget = self.task.settings.budget
-            return np.abs(self.task.additional_torque) >= (1.0 - 1e-9) * budget
-        return np.zeros(self.last.size, dtype=bool)
+        if self._action is None:
+            return np.zeros(self.last.size, dtype=bool)
+        return self._action.saturated
 
-    def start(self) -> None:
+    def reset(self) -> None:
         """Forget the past: the next step begins with nothing added."""
-        self._mode = self._settings.mode
+        self._select_action()
         self._started = False
         self._lost = self._resuming = False
         self._q_last = self._v_last = self._zero
         self.last = self.integral = self._zero
         self._fading = self._zero
         self._faded = True
-        self.friction.start()
+        self.friction.reset()
 
     def torque(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> Array:
         """Return what to add in this step, shape (n,), N m; finite whatever comes.
@@ -146,7 +136,7 @@ class AdditionalTorque:
         """
         try:
             torque = self._next(robot, v, a_last, elapsed)
-        except ValueError:  # numbers beyond sense
+        except ValueError:  # numbers that are not finite, or no mass matrix
             self._lost = True
             torque = None
         if torque is None:
@@ -158,35 +148,7 @@ class AdditionalTorque:
         self.last = torque + self.friction.torque(robot.M, v, a_last, time, robot.dt)
         return self.last
 
-    def _next(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> Array | None:
-        """Return the torque of this step; None where the state jumped."""
-        if not self._started:
-            self._begin(robot, v)
-        known = 0.0 < elapsed <= LONGEST_GAP * robot.dt and not self._lost
-        jumped = known and self._mode != "none" and self._jumped(robot, v, a_last, elapsed)
-        if not known or jumped:
-            self._skip(robot, v, elapsed)
-            self._lost = False
-        self._q_last, self._v_last = robot.q.copy(), v.copy()
-        if jumped:
-            return None
-        if known:
-            torque = self._of_mode(robot, v, a_last, elapsed)
-        else:
-            self.skipped += 1
-            torque = self._of_mode(robot, v, self._zero, 0.0)
-        if self._resuming or not known:
-            self._resuming = False
-            self._fade(self.integral - torque)
-        if not self._faded:
-            gap = min(elapsed, LONGEST_GAP * robot.dt) if elapsed > 0.0 else 0.0
-            self._fade(self._fading * math.exp(-gap / _FADING_TIME))
-            torque = torque + self._fading
-        if self._mode != self._settings.mode:
-            self._enter(robot, v, torque)
-        return torque
-
-    def seed(self, robot: RobotModel, v: Array, torque: Array) -> Array:
+    def initialise(self, robot: RobotModel, v: Array, torque: Array) -> Array:
         """Begin so that the torque is `torque` now; return that. Friction's fades in.
 
         The mode that is set takes over what it can, within budgets that are widened as far as
@@ -197,55 +159,82 @@ class AdditionalTorque:
             v: velocity, shape (n,), rad/s.
             torque: shape (n,), N m, finite.
         """
-        self.friction.start()
-        self._enter(robot, v, torque)
+        self.friction.reset()
+        self._select_action()
+        self._take_over(robot, v, torque, reset=True)
         self.last = self.integral = torque
         return torque
 
-    def _enter(self, robot: RobotModel, v: Array, torque: Array) -> None:
-        """Enter the mode that is set so that it gives `torque` now; see `seed`."""
-        self._mode = self._settings.mode
+    def _next(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> Array | None:
+        """Return the torque of this step; None where the state jumped."""
+        arm, action = self._arm(robot, v), self._action
+        if not self._started:
+            self._begin(robot, arm)
+        known = 0.0 < elapsed <= LONGEST_GAP * robot.dt and not self._lost
+        jumped = known and action is not None and self._jumped(robot, v, a_last, elapsed)
+        if action is not None and (jumped or not known):
+            action.skip(arm, elapsed if 0.0 <= elapsed < math.inf else 0.0)
+        self._lost = False
+        self._q_last, self._v_last = robot.q.copy(), v.copy()
+        if jumped:
+            return None
+        if not known:
+            self.skipped += 1
+        if action is None:
+            torque = self._zero
+        elif known:
+            torque = action.torque(arm, a_last, elapsed)
+        else:
+            torque = action.torque(arm, self._zero, 0.0)
+        if self._resuming or not known:
+            self._resuming = False
+            self._fade(self.integral - torque)
+        if not self._faded:
+            gap = min(elapsed, LONGEST_GAP * robot.dt) if elapsed > 0.0 else 0.0
+            self._fade(self._fading * math.exp(-gap / _FADING_TIME))
+            torque = torque + self._fading
+        changed = self._mode != self._settings.mode
+        if changed or self._integral_settings is not self._settings.integral:
+            self._select_action()
+            self._take_over(robot, v, torque, reset=changed)
+        return torque
+
+    def _select_action(self) -> None:
+        """Let the mode and the settings that are set hold from now on."""
+        self._mode, self._integral_settings = self._settings.mode, self._settings.integral
+        self._action = self.actions.get(self._mode)
+        for action in self.actions.values():
+            action.settings = self._integral_settings
+
+    def _take_over(self, robot: RobotModel, v: Array, torque: Array, reset: bool) -> None:
+        """Let the present action give `torque` now; what it cannot give fades."""
         taken = self._zero
         try:
-            self._begin(robot, v)
-            if self._mode == "joints":
-                taken = self.joints.seed(torque, robot.M, robot.C)
-            elif self._mode == "task":
-                J, J_dot = robot.J[self._rows], robot.J_dot[self._rows]
-                taken = self.task.seed(torque, robot.M, robot.C, J, J_dot, v)
-        except ValueError:  # too fast, or numbers beyond sense: all of it fades
+            arm = self._arm(robot, v)
+            if reset:
+                self._begin(robot, arm)
+            if self._action is not None:
+                taken = self._action.initialise(torque, arm)
+        except ValueError:  # too fast, or numbers that are not finite: all of it fades
             self._started = False
         self._fade(torque - taken)
 
-    def _begin(self, robot: RobotModel, v: Array) -> None:
+    def _begin(self, robot: RobotModel, arm: ArmTerms) -> None:
         """Let the memory of the mode begin, empty, at this state."""
-        if self._mode == "joints":
-            self.joints.start(v)
-        elif self._mode == "task":
-            self.task.start(v, robot.J[self._rows])
-        self._q_last, self._v_last = robot.q.copy(), v.copy()
+        if self._action is not None:
+            self._action.reset(arm)
+        self._q_last, self._v_last = robot.q.copy(), arm.v.copy()
         self._started, self._lost = True, False
+
+    def _arm(self, robot: RobotModel, v: Array) -> ArmTerms:
+        """Return what the actions need; in contiguous arrays, for which they are compiled."""
+        J, J_dot = robot.J[self._rows], robot.J_dot[self._rows]
+        return ArmTerms(*(np.ascontiguousarray(x) for x in (robot.M, robot.C, J, J_dot, v)))
 
     def _jumped(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> bool:
         """Return whether nothing that the integral is for can have changed the state so."""
         q_last, v_last, largest = self._q_last, self._v_last, self._settings.disturbance_max
-        return _jumped(robot.M, q_last, robot.q, v_last, v, a_last, elapsed, largest)
-
-    def _of_mode(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> Array:
-        """Return the torque of the present mode."""
-        if self._mode == "joints":
-            return self.joints.torque(robot.M, robot.C, v, a_last, elapsed)
-        if self._mode == "task":
-            J, J_dot = robot.J[self._rows], robot.J_dot[self._rows]
-            return self.task.torque(robot.M, robot.C, J, J_dot, v, a_last, elapsed)
-        return self._zero
-
-    def _skip(self, robot: RobotModel, v: Array, elapsed: float) -> None:
-        gap = elapsed if 0.0 <= elapsed < math.inf else 0.0
-        if self._mode == "joints":
-            self.joints.skip(v, gap)
-        elif self._mode == "task":
-            self.task.skip(v, robot.J[self._rows], gap)
+        return bool(_jumped(robot.M, q_last, robot.q, v_last, v, a_last, elapsed, largest))
 
     def _fade(self, torque: Array) -> None:
         self._fading = torque

@@ -1,14 +1,14 @@
-"""Anti-windup: limits on a torque that leave it a damping one, [Benallegue2021] III-B.
+"""Limits on the integral torque that keep it dissipative: eq. (10) and (11), [Benallegue2021].
 
-The integral torque u = K s is to stay within limits u_max. Three ways, all of which leave alone
-what is within its limits:
+The integral torque u = K s is to stay within limits u_max, and to take energy out of s all the
+same: s'u > 0. Both ways leave alone what is within the limits:
 
-- `clip_to_limits` cuts each component by itself, for comparison;
 - `scale_to_limits`, eq. (10), scales the whole vector by lambda_w;
 - `project_to_limits`, eq. (11), takes the nearest vector within the limits that dissipates, in
   s'x, no less than (10) does.
 
-`docs/integral_action.md` says when the last two differ from the first.
+For the K of the control step, lambda diag(M), (11) is the clip of each component by itself;
+`docs/integral_action.md` proves it.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torque_safety_controller.integral_feedback import anti_windup_kernels as kernels
+from viability_bounds_pkg.compiled import compiled
 
 Array = NDArray[np.float64]
 
 
-def scale_factor(u: ArrayLike, u_max: ArrayLike) -> float:
-    """Return lambda_w = min(1, min_i u_max_i / |u_i|): eq. (10), [Benallegue2021].
+def scale_to_limits(u: ArrayLike, u_max: ArrayLike) -> Array:
+    """Return ``lambda_w u``, shape (n,), N m: eq. (10), [Benallegue2021].
 
-    Rounded down, so that no lambda_w |u_i| is above u_max_i. Where u_i is 0 it is not limited,
-    even by u_max_i = 0.
+    lambda_w = min(1, min_i u_max_i / |u_i|). Where u_i is 0 it is not limited, even by
+    u_max_i = 0. No component is beyond its limit, not even by rounding.
 
     Args:
         u: shape (n,), N m.
@@ -34,33 +34,19 @@ def scale_factor(u: ArrayLike, u_max: ArrayLike) -> float:
     Raises:
         ValueError: wrong shapes, u not finite, or limits negative or NaN.
     """
-    u, u_max = _vectors(u=u, u_max=u_max)
-    return kernels.scale_factor(u, u_max)
-
-
-def scale_to_limits(u: ArrayLike, u_max: ArrayLike) -> Array:
-    """Return ``lambda_w u``, shape (n,), N m: eq. (10), [Benallegue2021]; see `scale_factor`."""
-    u, u_max = _vectors(u=u, u_max=u_max)
-    x = kernels.scale_factor(u, u_max) * u
-    kernels.clip(x, u_max, x)  # off by rounding at most
-    return x
-
-
-def clip_to_limits(u: ArrayLike, u_max: ArrayLike) -> Array:
-    """Return `u` with each component cut to its limit, shape (n,), N m; see `scale_factor`."""
-    u, u_max = _vectors(u=u, u_max=u_max)
-    x = np.empty_like(u)
-    kernels.clip(u, u_max, x)
-    return x
+    u, u_max = _checked(u_max, u=u)
+    return np.clip(scale_factor(u, u_max) * u, -u_max, u_max)
 
 
 def project_to_limits(u: ArrayLike, s: ArrayLike, u_max: ArrayLike) -> Array:
-    """Solve the QP of eq. (11), [Benallegue2021], exactly.
+    """Solve the QP of eq. (11), [Benallegue2021].
 
         minimise  |x - u|^2   subject to   -u_max <= x <= u_max,   s'x >= lambda_w s'u.
 
-    It always has a solution: lambda_w u. Both constraints hold for the numbers returned, not
-    only up to rounding.
+    It always has a solution, as lambda_w u fulfils both. The limits hold exactly; the inequality
+    holds to rounding, 1e-14 of sum_i |s_i| (|x_i| + |u_i|); x is exact to 1e-12 of the largest
+    |u_i| where the s_i are of like size, and loses a digit for each power of ten between those
+    whose joints are within their limits and the largest.
 
     Args:
         u: shape (n,), N m; K s in the paper, but any vector will do.
@@ -73,23 +59,87 @@ def project_to_limits(u: ArrayLike, s: ArrayLike, u_max: ArrayLike) -> Array:
     Raises:
         ValueError: wrong shapes, u or s not finite, or limits negative or NaN.
     """
-    u, s, u_max = _vectors(u=u, s=s, u_max=u_max)
-    x = np.empty_like(u)
-    kernels.project(u, s, u_max, x)
+    u, s, u_max = _checked(u_max, u=u, s=s)
+    # Scaled to about 1, products of very large or small numbers stay numbers.
+    unit = np.abs(u).max() or 1.0
+    s = np.where(u_max > 0.0, s, 0.0)  # it has no say where x is 0
+    s = s / (np.abs(s).max() or 1.0)
+    with np.errstate(over="ignore"):
+        u, limits = u / unit, u_max / unit
+    x = nearest_dissipating(u, s, limits, scale_factor(u, limits) * float(s @ u))
+    return np.clip(unit * x, -u_max, u_max)
+
+
+@compiled
+def scale_factor(u: Array, u_max: Array) -> float:
+    """Return lambda_w of eq. (10); see `scale_to_limits`."""
+    factor = 1.0
+    for i in range(len(u)):
+        if abs(u[i]) > u_max[i]:
+            factor = min(factor, u_max[i] / abs(u[i]))
+    return factor
+
+
+@compiled
+def clip(u: Array, u_max: Array) -> Array:
+    """Return `u` with each component cut to its limit, shape (n,)."""
+    return np.minimum(np.maximum(u, -u_max), u_max)
+
+
+@compiled
+def nearest_dissipating(u: Array, s: Array, u_max: Array, level: float) -> Array:
+    """Return the point nearest to `u` with |x| <= u_max and s'x >= level, shape (n,).
+
+    It is ``x(nu) = clip(u + nu s)`` for the least nu >= 0 with s'x(nu) >= level. s'x(nu) never
+    falls, and is linear between the values of nu at which a component leaves one limit or
+    arrives at the other. The two of those values next to the solution are found by trying them
+    all; between them the components that are free move together.
+
+    Args:
+        u: shape (n,).
+        s: shape (n,), of size 1 or so.
+        u_max: shape (n,), >= 0, may be infinite.
+        level: of s'x; if no point reaches it the result has the largest s'x.
+    """
+    x = clip(u, u_max)
+    if s @ x >= level:
+        return x
+    leaves, arrives = np.full(len(u), np.inf), np.full(len(u), -np.inf)
+    for i in range(len(u)):
+        if s[i] != 0.0:
+            end = np.copysign(u_max[i], s[i])
+            leaves[i] = (-end - u[i]) / s[i]
+            arrives[i] = (end - u[i]) / s[i]
+    nu, enough = 0.0, np.inf
+    for point in np.concatenate((leaves, arrives)):
+        if nu < point < enough:
+            if s @ clip(u + point * s, u_max) < level:
+                nu = point
+            else:
+                enough = point
+    x = clip(u + nu * s, u_max)
+    missing = level - s @ x
+    push = np.where((leaves <= nu) & (nu < arrives), s, 0.0)
+    slope = push @ push
+    if slope > 0.0 and missing <= slope * (enough - nu):
+        return clip(x + missing / slope * push, u_max)
+    if enough < np.inf:
+        # Where |u_i| is 1e16 times its limit, i leaves and arrives at the same rounded nu.
+        rest = clip(u + enough * s, u_max) - x
+        return clip(x + missing / (s @ rest) * rest, u_max)
     return x
 
 
-def _vectors(**arrays: ArrayLike) -> list[Array]:
-    """Return the arguments as arrays of one length; `u_max` must be among them."""
-    vectors = [np.ascontiguousarray(x, dtype=np.float64) for x in arrays.values()]
-    u_max = vectors[-1]
-    for name, x in zip(arrays, vectors, strict=True):
-        if x.ndim != 1 or x.shape != u_max.shape:
-            shapes = ", ".join(f"{key} {y.shape}" for key, y in zip(arrays, vectors, strict=True))
-            raise ValueError(f"must all have shape (n,): {shapes}")
-        if x is u_max:
-            if not kernels.all_limits(x):
-                raise ValueError(f"{name} must be numbers >= 0, is {x}")
-        elif not kernels.all_finite(x):
+def _checked(u_max: ArrayLike, **vectors: ArrayLike) -> list[Array]:
+    """Return the vectors and then the limits as arrays of one length."""
+    arrays = {name: np.ascontiguousarray(x, dtype=np.float64) for name, x in vectors.items()}
+    limits = np.ascontiguousarray(u_max, dtype=np.float64)
+    if any(x.ndim != 1 or x.shape != limits.shape for x in arrays.values()):
+        shapes = ", ".join(f"{name} {x.shape}" for name, x in arrays.items())
+        raise ValueError(f"must all have shape (n,): {shapes}, u_max {limits.shape}")
+    for name, x in arrays.items():
+        if not np.isfinite(x).all():
             raise ValueError(f"{name} must be finite, is {x}")
-    return vectors
+    if not (limits >= 0.0).all():
+        raise ValueError(f"u_max must be numbers >= 0, is {limits}")
+    return [*arrays.values(), limits]

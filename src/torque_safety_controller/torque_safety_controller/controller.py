@@ -114,10 +114,10 @@ class Controller:
 
     def _forget(self) -> None:
         self._a_last = np.zeros(self.robot.n)
-        self._limiter.start()
-        self._observer.start()
+        self._limiter.reset()
+        self._observer.reset()
         if self.additional is not None:
-            self.additional.start()
+            self.additional.reset()
         if self.interaction is not None:
             self.interaction.start()
 
@@ -229,7 +229,7 @@ class Controller:
         self.goals = here
         self._limiter.go_on_from(tau)
         if self.additional is not None:
-            self.additional.seed(self.robot, v, self._limiter.last - step.tau)
+            self.additional.initialise(self.robot, v, self._limiter.last - step.tau)
         return step
 
     def hold(self, q: np.ndarray, v: np.ndarray, elapsed: float | None = None) -> Step:
@@ -306,7 +306,7 @@ class Controller:
         self, q: np.ndarray, v: np.ndarray, additional: np.ndarray | None, failure: str
     ) -> Step:
         robot = self.robot
-        self._observer.start()  # what is asked for here may be more than the motors can give
+        self._observer.reset()  # what is asked for here may be more than the motors can give
         a = -self.gains.hold_kd * v
         bias = robot.h
         if additional is not None and np.isfinite(additional).all():

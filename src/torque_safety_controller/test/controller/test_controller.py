@@ -15,8 +15,7 @@ from torque_safety_controller.additional_torque import (
     AdditionalTorque,
 )
 from torque_safety_controller.controller import Controller, Gains
-from torque_safety_controller.integral_feedback.settings import IntegralSettings
-from torque_safety_controller.nullspace.settings import NullspaceSettings
+from torque_safety_controller.integral_feedback import IntegralSettings
 from torque_safety_controller.tasks.tasks import pose_error
 
 GAINS = Gains(
@@ -77,7 +76,7 @@ class Fixed:
     def __init__(self, torque) -> None:
         self._torque = torque
 
-    def start(self) -> None:
+    def reset(self) -> None:
         """Nothing to forget."""
 
     def torque(self, robot, v, a_last, elapsed):
@@ -85,10 +84,8 @@ class Fixed:
 
 
 def integral(arm, mode, **changed) -> AdditionalSettings:
-    common = {"budget": 0.2 * arm.tau_max, "lambda_": 30.0} | changed
-    return AdditionalSettings(
-        mode, IntegralSettings(**common), NullspaceSettings(**common), 2.0 * arm.tau_max
-    )
+    settings = IntegralSettings(**{"budget": 0.2 * arm.tau_max, "gain": 30.0} | changed)
+    return AdditionalSettings(mode, settings, 2.0 * arm.tau_max)
 
 
 def with_integral(arm, mode="joints", gains=GAINS, rate=None, **changed) -> Controller:

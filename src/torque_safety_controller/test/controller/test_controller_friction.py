@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,7 +18,7 @@ from torque_safety_controller.additional_torque import (
 )
 from torque_safety_controller.controller import Controller, Gains
 from torque_safety_controller.friction.settings import FrictionModel, FrictionSettings
-from torque_safety_controller.integral_feedback.settings import IntegralSettings
+from torque_safety_controller.integral_feedback import IntegralSettings
 from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.parameters.friction_parameters import (
     FRICTION_TABLE,
@@ -46,8 +45,8 @@ FIRM = slice(0, 5)  # joints with inertia enough to call for all of the friction
 
 
 def additional(mode="none", friction=ON, budget=0.05) -> AdditionalTorque:
-    integral = IntegralSettings(budget * ARM.tau_max, lambda_=30.0)
-    return AdditionalTorque(AdditionalSettings(mode, integral, None, 2.0 * ARM.tau_max, friction))
+    integral = IntegralSettings(budget * ARM.tau_max, gain=30.0)
+    return AdditionalTorque(AdditionalSettings(mode, integral, 2.0 * ARM.tau_max, friction))
 
 
 def controller(**others) -> Controller:
@@ -68,10 +67,10 @@ def test_both_are_added_and_the_integral_s_budget_is_its_own():
     made = controller(mode="joints")
     steps(made, 3000)
     both = made.additional
-    np.testing.assert_allclose(both.last, both.joints.additional_torque + both.friction.last)
+    np.testing.assert_allclose(both.last, both.integral + both.friction.last)
     assert both.saturated.any()
-    budget = both.joints.settings.budget
-    assert (np.abs(both.joints.additional_torque) <= budget * (1.0 + 1e-9)).all()
+    budget = both.settings.integral.budget
+    assert (np.abs(both.integral) <= budget * (1.0 + 1e-9)).all()
     assert (np.abs(both.last) > budget).any()
 
 
@@ -261,9 +260,3 @@ def test_what_cannot_be_is_refused_while_the_node_runs(ros):
         assert names_parameter(reason, name)
         assert allowed in reason or "out of range" in reason
     assert chain.node.get_parameter("friction_compensation").value == before
-
-
-def test_settings_may_be_without_friction():
-    settings = replace(additional().settings, friction=None)
-    assert settings.friction.model.n == N
-    assert settings.friction.scale == 0.0

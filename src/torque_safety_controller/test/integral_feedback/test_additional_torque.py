@@ -15,8 +15,7 @@ from torque_safety_controller.additional_torque import (
     AdditionalSettings,
     AdditionalTorque,
 )
-from torque_safety_controller.integral_feedback.settings import METHODS, IntegralSettings
-from torque_safety_controller.nullspace.settings import NullspaceSettings
+from torque_safety_controller.integral_feedback import METHODS, IntegralSettings
 
 ARM = load_arm("panda")
 N = ARM.n
@@ -30,14 +29,8 @@ POSITION = slice(0, 3)
 
 
 def make_settings(mode="joints", disturbance=2.0, **changed) -> AdditionalSettings:
-    common = {"budget": BUDGET, "lambda_": LAMBDA} | changed
-    of_joints = {key: common.pop(key) for key in ("anti_windup",) if key in common}
-    return AdditionalSettings(
-        mode,
-        IntegralSettings(**common, **of_joints),
-        NullspaceSettings(**common),
-        disturbance * ARM.tau_max,
-    )
+    integral = IntegralSettings(**{"budget": BUDGET, "gain": LAMBDA} | changed)
+    return AdditionalSettings(mode, integral, disturbance * ARM.tau_max)
 
 
 class Loop:
@@ -128,10 +121,10 @@ def test_changing_one_s_mind_within_a_step_is_no_change():
     [
         {"budget": 0.01 * ARM.tau_max},
         {"budget": np.zeros(N)},
-        {"lambda_": 2.0},
-        {"lambda_": 80.0},
-        {"theta_slow": 1.0},
-        {"theta_fast": 5.0},
+        {"gain": 2.0},
+        {"gain": 80.0},
+        {"slow_leak_rate": 1.0},
+        {"fast_leak_rate": 5.0},
         {"mu": 0.0},
         {"mu": 0.9},
     ],
@@ -320,14 +313,14 @@ def test_a_position_that_jumps_is_seen_and_one_that_moves_is_not():
 def test_steps_are_bounded_whatever_velocity_does():
     """Of (C + K) s the increment of s changes K s by at most 2 lambda dt tau_max."""
     rng = np.random.default_rng(4)
-    loop = Loop("joints", budget=np.full(N, np.inf), theta_slow=0.0, theta_fast=0.0)
+    loop = Loop("joints", budget=np.full(N, np.inf), slow_leak_rate=0.0, fast_leak_rate=0.0)
     bound = 2.0 * LAMBDA * DT
     largest, before = 0.0, np.zeros(N)
     for _ in range(2000):
         v = rng.uniform(-1.0, 1.0, N) * ARM.v_max * rng.choice([1e-3, 0.01, 0.1, 1.0])
         loop.robot.update(ARM.q_start, v, REST)
         loop.additional.torque(loop.robot, v, rng.uniform(-20.0, 20.0, N), DT)
-        K_s = loop.additional.joints.s * LAMBDA * np.diagonal(loop.robot.M)
+        K_s = loop.additional.actions["joints"].s * LAMBDA * np.diagonal(loop.robot.M)
         largest, before = max(largest, relative(K_s - before)), K_s
     assert 0.5 * bound < largest
     # The mass matrix is that of the middle of the step, which differs by what v dt / 2 does.
@@ -335,7 +328,7 @@ def test_steps_are_bounded_whatever_velocity_does():
     assert 0 < loop.additional.skipped < 2000
 
 
-# Seeding
+# Initialising
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -345,7 +338,7 @@ def test_it_begins_with_the_torque_it_is_told(mode):
         loop = Loop(mode)
         torque = rng.uniform(-0.3, 0.3, N) * ARM.tau_max
         loop.robot.update(loop.q, REST, REST)
-        np.testing.assert_array_equal(loop.additional.seed(loop.robot, REST, torque), torque)
+        np.testing.assert_array_equal(loop.additional.initialise(loop.robot, REST, torque), torque)
         assert not loop.additional.idle
         after = loop.additional.torque(loop.robot, REST, REST, DT)
         # 1 / 0.2 s of what cannot be kept, 1 / 1 s of what is beyond the budget.
@@ -357,18 +350,20 @@ def test_a_joint_s_budget_is_widened_only_where_it_must():
     loop.robot.update(loop.q, REST, REST)
     torque = 0.5 * BUDGET
     torque[3] = 2.0 * BUDGET[3]
-    loop.additional.seed(loop.robot, REST, torque)
+    loop.additional.initialise(loop.robot, REST, torque)
     np.testing.assert_allclose(
-        loop.additional.joints.widening, [0, 0, 0, BUDGET[3], 0, 0, 0], atol=1e-12
+        loop.additional.actions["joints"].memory.widening,
+        [0, 0, 0, BUDGET[3], 0, 0, 0],
+        atol=1e-12,
     )
 
 
-def test_what_cannot_be_seeded_fades():
+def test_what_cannot_be_initialised_fades():
     loop = Loop("joints")
     loop.robot.update(loop.q, REST, REST)
     loop.robot.C = -LAMBDA * np.diag(np.diagonal(loop.robot.M))  # C + K is singular
     torque = 0.1 * ARM.tau_max
-    np.testing.assert_array_equal(loop.additional.seed(loop.robot, REST, torque), torque)
+    np.testing.assert_array_equal(loop.additional.initialise(loop.robot, REST, torque), torque)
     after = loop.additional.torque(loop.robot, REST, REST, DT)
     np.testing.assert_allclose(after, torque * math.exp(-DT / 0.2), rtol=1e-9)
 
@@ -406,7 +401,7 @@ def test_it_is_finite_and_never_raises(first, steps):
         for q, v, a, elapsed, mode, theta in steps:
             if mode is not None:
                 additional.settings = replace(
-                    make_settings(mode, theta_slow=theta), disturbance_max=1e9 * ARM.tau_max
+                    make_settings(mode, slow_leak_rate=theta), disturbance_max=1e9 * ARM.tau_max
                 )
             robot.update(ARM.q_start + q, v, a)
             torque = additional.torque(robot, v, a, elapsed)

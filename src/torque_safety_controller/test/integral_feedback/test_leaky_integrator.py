@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from torque_safety_controller.integral_feedback.leaky_integrator import LeakyIntegrator, mix
+from torque_safety_controller.integral_feedback import LeakyIntegrator
+from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors, mix
 
 SHARP = 1e-12
 
@@ -44,7 +45,7 @@ def test_exact_for_any_step(theta):
     st.floats(-1e3, 1e3),
     st.floats(-1e3, 1e3),
 )
-@settings(deadline=None)
+@settings(deadline=None, derandomize=True)
 def test_many_steps_are_one(theta, dt, parts, start, increment):
     """A step may be cut in any number of parts: the exact form is consistent with itself."""
     whole, cut = LeakyIntegrator(theta, 1), LeakyIntegrator(theta, 1)
@@ -76,24 +77,20 @@ def test_forgets_63_percent_within_the_time_constant(theta):
 def test_steady_slope_is_remembered_for_the_time_constant():
     """s' / theta is where a leaky integral of a constant s' ends."""
     theta, dt, slope = 5.0, 0.01, 3.0
-    exact, printed = LeakyIntegrator(theta, 1), LeakyIntegrator(theta, 1, paper_form=True)
+    exact, printed = LeakyIntegrator(theta, 1), 0.0
+    decay, gain = leak_factors(theta, dt, True)
     for k in range(1, 2000):
         exact.update([slope * k * dt], dt)
-        printed.update([slope * k * dt], dt)
+        printed = decay * printed + gain * slope * dt
     assert exact.value[0] == pytest.approx(slope / theta, rel=1e-9)
     # (13) is above it by half a step's leak, to first order.
-    excess = printed.value[0] / exact.value[0] - 1.0
+    excess = printed / exact.value[0] - 1.0
     assert excess == pytest.approx(0.5 * theta * dt, rel=0.02)
 
 
 def test_paper_form_is_equation_13():
-    theta, dt = 30.0, 0.002
-    integrator = LeakyIntegrator(theta, 3, paper_form=True)
-    value, s_last = np.zeros(3), np.zeros(3)
-    for _, s in zip(*ramps(np.random.default_rng(2), 30), strict=True):
-        value = np.exp(-theta * dt) * value + (s - s_last)
-        s_last = s
-        np.testing.assert_allclose(integrator.update(s, dt), value, rtol=SHARP, atol=SHARP)
+    for theta, dt in ((30.0, 0.002), (0.0, 1.0), (1e3, 1e3)):
+        assert leak_factors(theta, dt, True) == (math.exp(-theta * dt), 1.0)
 
 
 def test_longest_and_shortest_steps():
@@ -101,23 +98,6 @@ def test_longest_and_shortest_steps():
         integrator = LeakyIntegrator(theta, 1)
         integrator.update([1.0], 0.0)
         assert integrator.update([2.0], dt)[0] == pytest.approx(left, rel=1e-6)
-
-
-def test_s_may_grow_without_bound():
-    """After an hour of drift the value is as good as at the start: s itself does not matter."""
-    far, near = LeakyIntegrator(10.0, 1), LeakyIntegrator(10.0, 1)
-    far.restart(2.0**40)
-    for k in range(1, 200):
-        s = math.ldexp(round(math.ldexp(math.sin(0.1 * k), 10)), -10)  # exact, even far away
-        assert far.update([2.0**40 + s], 0.01)[0] == near.update([s], 0.01)[0]
-
-
-def test_changing_theta_does_not_change_the_value():
-    integrator = LeakyIntegrator(0.1, 2)
-    before = integrator.update([3.0, -1.0], 0.5)
-    integrator.theta = 80.0
-    np.testing.assert_array_equal(integrator.value, before)
-    np.testing.assert_allclose(integrator.update([3.0, -1.0], 0.01), math.exp(-0.8) * before)
 
 
 def test_two_rates_are_mixed_as_equation_14_says():
@@ -139,14 +119,11 @@ def test_refuses_what_it_cannot_use_and_keeps_what_it_has():
     integrator = LeakyIntegrator(1.0, 2)
     integrator.update([1.0, 2.0], 0.1)
     before = integrator.value.copy()
-    with pytest.raises(ValueError, match="theta must be a finite number >= 0, is -2"):
-        integrator.theta = -2.0
     for s in ([1.0], [1.0, math.nan], [[1.0, 2.0]], [math.inf, 0.0]):
         with pytest.raises(ValueError, match="s must be 2 finite numbers"):
             integrator.update(s, 0.1)
     for dt in (-0.1, math.nan, math.inf):
         with pytest.raises(ValueError, match="dt must be a finite number >= 0"):
             integrator.update([5.0, 5.0], dt)
-    assert integrator.theta == 1.0
     np.testing.assert_array_equal(integrator.value, before)
     np.testing.assert_allclose(integrator.update([1.0, 2.0], 0.0), before)

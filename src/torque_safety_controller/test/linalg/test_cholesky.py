@@ -1,23 +1,21 @@
 import numpy as np
 import pytest
 
-from torque_safety_controller.linalg.cholesky import factorise, solve_columns, solve_vector
+from torque_safety_controller.linalg.cholesky import factorise, solve_vector
 
 
 @pytest.mark.parametrize("n", [1, 2, 6, 9])
-def test_factorisation_and_solves_against_numpy(n):
+def test_factorisation_and_solution_against_numpy(n):
     rng = np.random.default_rng(n)
     A = rng.normal(size=(n, n + 2))
     A = A @ A.T
     L = A.copy()
     assert factorise(L)
     np.testing.assert_allclose(np.tril(L), np.linalg.cholesky(A), rtol=1e-12, atol=1e-13)
-    x, B = rng.normal(size=n), rng.normal(size=(n, 4))
-    y, Y = x.copy(), B.copy()
+    x = rng.normal(size=n)
+    y = x.copy()
     solve_vector(L, y)
-    solve_columns(L, Y)
     np.testing.assert_allclose(A @ y, x, atol=1e-9)
-    np.testing.assert_allclose(A @ Y, B, atol=1e-9)
 
 
 @pytest.mark.parametrize(

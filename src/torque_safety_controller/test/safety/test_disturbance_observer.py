@@ -91,5 +91,5 @@ def test_it_forgets():
     observer.observe(np.array([1.0]), np.zeros(1), 0.0, LARGEST, np.eye(1))
     assert observer.estimate == 0.0
     lower, upper = np.array([-1.0]), np.array([1.0])
-    observer.start()
+    observer.reset()
     assert observer.shift(lower, upper) == (lower, upper)

@@ -49,7 +49,7 @@ class JointRegression:
     @property
     def unknowns(self) -> int:
         """How many numbers are fitted."""
-        return self._basis.shape[1] + 4
+        return int(self._basis.shape[1]) + 4
 
     def reduce(self, columns: Array) -> Array:
         """Return what the errors of the model leave of weighted columns, shape (B, ...)."""

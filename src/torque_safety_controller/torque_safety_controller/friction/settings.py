@@ -1,4 +1,4 @@
-"""What the friction compensation can be set to, checked in one place."""
+"""Friction model and settings of the friction compensation, checked in one place."""
 
 from __future__ import annotations
 
@@ -12,6 +12,12 @@ from viability_bounds_pkg.exceptions import SettingError
 
 DEFAULT_STRIBECK_VELOCITY = 0.01
 """rad/s."""
+
+LEAK_RATE = 3.0
+"""theta: rate at which the reference velocity returns to the measured one, 1/s, by default."""
+
+GAIN = 0.1
+"""gamma in control rates, by default: how soon the reference velocity calls for all friction."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +62,8 @@ class FrictionModel:
         """Return F(v), N m, for velocities of shape (..., n), rad/s."""
         v = np.asarray(v, dtype=np.float64)
         dry = np.exp(-((v / self.stribeck_velocity) ** 2)) * (self.static - self.coulomb)
-        return self.coulomb + dry + self.viscous * np.abs(v)
+        level: NDArray[np.float64] = self.coulomb + dry + self.viscous * np.abs(v)
+        return level
 
 
 def no_friction(n: int) -> FrictionModel:
@@ -73,9 +80,10 @@ class FrictionSettings:
         model: of the joints' friction.
         budget: most that is ever compensated, whatever the model says, shape (n,), N m, >= 0.
         scale: share of the model that is compensated, 0 to 1; 0 is off.
-        theta: rate at which the reference velocity returns to the measured one, 1/s, >= 0.
-        gain: of the reference velocity, in torques for the inertia felt, 1/s, > 0; None for what
-            the control rate allows.
+        leak_rate: theta, rate at which the reference velocity returns to the measured one, 1/s,
+            >= 0.
+        gain: gamma of the reference velocity, in torques for the inertia felt, 1/s, > 0; None
+            for `GAIN` times the control rate.
 
     Raises:
         SettingError: a value is out of range.
@@ -84,7 +92,7 @@ class FrictionSettings:
     model: FrictionModel
     budget: NDArray[np.float64]
     scale: float = 0.0
-    theta: float = 3.0
+    leak_rate: float = LEAK_RATE
     gain: float | None = None
 
     def __post_init__(self) -> None:
@@ -94,8 +102,8 @@ class FrictionSettings:
         object.__setattr__(self, "budget", budget)
         if not 0.0 <= self.scale <= 1.0:
             raise SettingError("scale", self.scale, "a number from 0 to 1")
-        if not (math.isfinite(self.theta) and self.theta >= 0.0):
-            raise SettingError("theta", self.theta, "a finite number >= 0")
+        if not (math.isfinite(self.leak_rate) and self.leak_rate >= 0.0):
+            raise SettingError("leak_rate", self.leak_rate, "a finite number >= 0")
         if self.gain is not None and not (math.isfinite(self.gain) and self.gain > 0.0):
             raise SettingError("gain", self.gain, "a finite number > 0")
 

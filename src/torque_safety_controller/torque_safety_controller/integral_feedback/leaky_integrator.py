@@ -1,4 +1,4 @@
-"""Integration that forgets: eq. (12)-(14), [Benallegue2021].
+"""Leaky integration, which forgets: eq. (12)-(14), [Benallegue2021].
 
     s_leaky' = -theta s_leaky + s'
 
@@ -12,6 +12,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from torque_safety_controller.integral_feedback.action import check_time
 from viability_bounds_pkg.compiled import compiled
 
 Array = NDArray[np.float64]
@@ -26,7 +27,7 @@ def leak_factors(theta: float, dt: float, paper_form: bool) -> tuple[float, floa
         s_leaky(dt) = exp(-theta dt) s_leaky(0) + (1 - exp(-theta dt)) / (theta dt) * increment.
 
     Args:
-        theta: rate of forgetting, 1/s, >= 0.
+        theta: leak rate, 1/s, >= 0.
         dt: step, s, >= 0.
         paper_form: take the whole increment, as eq. (13) does: as if all of it came at the end of
             the step.
@@ -38,18 +39,19 @@ def leak_factors(theta: float, dt: float, paper_form: bool) -> tuple[float, floa
     return decay, -math.expm1(-x) / x
 
 
+@compiled
+def mix(fast: Array, slow: Array, mu: float) -> Array:
+    """Return ``mu fast + (1 - mu) slow``, eq. (14), shape (n,)."""
+    return mu * fast + (1.0 - mu) * slow
+
+
 class LeakyIntegrator:
     """Leaky integral of s', from samples of s; starts at zero, as s does.
 
-    Only increments of s count, so that s may be measured from anywhere after `restart`.
-
     Args:
-        theta: rate of forgetting, 1/s, finite and >= 0: after 1 / theta seconds, 63% of the past
-            is forgotten. 0 for a plain integrator. May be changed between steps: the value does
-            not jump.
+        theta: leak rate, 1/s, finite and >= 0: after 1 / theta seconds, 63% of the past is
+            forgotten. 0 for a plain integrator.
         n: number of components.
-        paper_form: eq. (13) as printed; by default the exact solution of (12). They differ
-            by half a step's worth of leak, theta dt / 2 of each increment.
 
     Attributes:
         value: leaky integral, shape (n,).
@@ -58,24 +60,14 @@ class LeakyIntegrator:
         ValueError: theta or n out of range.
     """
 
-    def __init__(self, theta: float, n: int, paper_form: bool = False) -> None:
+    def __init__(self, theta: float, n: int) -> None:
         if n < 1:
             raise ValueError(f"n must be at least 1, is {n}")
-        self.theta = theta
-        self.paper_form = paper_form
-        self.value: Array = np.zeros(n)
-        self._s_last = np.zeros(n)
-
-    @property
-    def theta(self) -> float:
-        """Rate of forgetting, 1/s."""
-        return self._theta
-
-    @theta.setter
-    def theta(self, theta: float) -> None:
         if not (math.isfinite(theta) and theta >= 0.0):
             raise ValueError(f"theta must be a finite number >= 0, is {theta}")
+        self.value: Array = np.zeros(n)
         self._theta = float(theta)
+        self._s_last = np.zeros(n)
 
     def update(self, s: ArrayLike, dt: float) -> Array:
         """Take a new sample and return the leaky integral, shape (n,).
@@ -90,30 +82,8 @@ class LeakyIntegrator:
         s = np.array(s, dtype=np.float64)
         if s.shape != self.value.shape or not np.isfinite(s).all():
             raise ValueError(f"s must be {len(self.value)} finite numbers, is {s}")
-        value = self.add(s - self._s_last, dt)
+        check_time(dt)
+        decay, gain = leak_factors(self._theta, dt, False)
+        self.value = decay * self.value + gain * (s - self._s_last)
         self._s_last = s
-        return value
-
-    def add(self, increment: ArrayLike, dt: float) -> Array:
-        """Take what s has grown by, shape (n,), and return the leaky integral; see `update`."""
-        if not (math.isfinite(dt) and dt >= 0.0):
-            raise ValueError(f"dt must be a finite number >= 0, is {dt}")
-        decay, gain = leak_factors(self._theta, dt, self.paper_form)
-        self.value = decay * self.value + gain * np.asarray(increment, dtype=np.float64)
         return self.value.copy()
-
-    def restart(self, s: ArrayLike | float = 0.0) -> None:
-        """Set the integral to zero; `s` is the sample that the next increment counts from."""
-        self.value = np.zeros(len(self.value))
-        self._s_last = self.value + s
-
-
-def mix(fast: Array, slow: Array, mu: float) -> Array:
-    """Return ``mu fast + (1 - mu) slow``, eq. (14), shape (n,).
-
-    Args:
-        fast: what a fast forgetting integrator returns, shape (n,).
-        slow: what a slowly forgetting one does, shape (n,).
-        mu: weight of the fast one, 0 to 1.
-    """
-    return mu * fast + (1.0 - mu) * slow

@@ -1,53 +1,62 @@
-"""What the integral action can be set to, checked in one place."""
+"""Settings of the integral action, checked in one place."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from viability_bounds_pkg.exceptions import SettingError
 
-METHODS = ("none", "clip", "scaling", "qp")
-"""Ways to limit the additional torque: not at all, component by component, (10), (11)."""
+Array = NDArray[np.float64]
+
+METHODS = ("none", "scaling", "paper", "qp")
+"""Anti-windup of the joints: none; (10) or (11) as [Benallegue2021] prints them, that is for K s
+only, with the integrators left alone and (13); or for the whole torque, integrators included."""
+
+NONE, SCALING, PAPER, QP = range(len(METHODS))
+
+WIDENING_TIME = 1.0
+"""Time constant with which a budget widened by a handover returns to what it should be, s."""
+
+
+class Law(NamedTuple):
+    """The numbers of `IntegralSettings`, as compiled functions take them."""
+
+    budget: Array
+    gain: float
+    slow_leak_rate: float
+    fast_leak_rate: float
+    mu: float
+    method: int
 
 
 @dataclass(frozen=True, eq=False)
 class IntegralSettings:
-    """Settings of `IntegralFeedback`; the defaults of the rates are the paper's, IV-A.
+    """Settings of an integral action; gain, rates and mu are by default the paper's, IV-A.
 
     Attributes:
         budget: limit of the additional torque of each joint, tau_m, shape (n,), N m, >= 0; inf
             for none. Given for one joint or more; kept as a read-only copy.
-        lambda_: gain, 1/s, > 0; K = lambda_ diag(M).
-        theta_slow: rate of the slow forgetting, 1/s, >= 0; 0 never forgets.
-        theta_fast: rate of the fast forgetting, 1/s, >= 0.
-        mu: weight of the fast one, 0 to 1, eq. (14).
-        anti_windup: one of `METHODS`.
-        whole_torque: whether the budget is for all of the additional torque, (C + K) s; else,
-            as in the paper, for K s alone.
-        correct_state: whether the integrators are brought back to what the limited torque
-            stands for, so that they leave the limit at once.
-        paper_form: whether leaky integration is eq. (13) as printed; else the exact one.
-        widening_time: time constant with which a budget that a handover widened returns to
-            what it should be, s, > 0.
+        gain: lambda of K = lambda diag(M), 1/s, > 0.
+        slow_leak_rate: theta_s, 1/s, >= 0; 0 never forgets.
+        fast_leak_rate: theta_f, 1/s, >= theta_s.
+        mu: weight of the fast integrator, 0 to 1, eq. (14).
+        anti_windup: one of `METHODS`; `NullspaceCompliance` has its own, whatever this is.
 
     Raises:
         SettingError: a value is out of range.
     """
 
-    budget: NDArray[np.float64]
-    lambda_: float = 2.0
-    theta_slow: float = 0.1
-    theta_fast: float = 100.0
+    budget: Array
+    gain: float = 2.0
+    slow_leak_rate: float = 0.1
+    fast_leak_rate: float = 100.0
     mu: float = 0.5
     anti_windup: str = "qp"
-    whole_torque: bool = True
-    correct_state: bool = True
-    paper_form: bool = False
-    widening_time: float = 1.0
 
     def __post_init__(self) -> None:
         budget = np.array(self.budget, dtype=np.float64)
@@ -55,26 +64,36 @@ class IntegralSettings:
             raise SettingError("budget", self.budget, "a number >= 0 for each joint")
         budget.flags.writeable = False
         object.__setattr__(self, "budget", budget)
-        for name in ("theta_slow", "theta_fast"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise SettingError(name, value, "a finite number >= 0")
-        for name in ("lambda_", "widening_time"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise SettingError(name, value, "a finite number > 0")
+        if not (math.isfinite(self.gain) and self.gain > 0.0):
+            raise SettingError("gain", self.gain, "a finite number > 0")
+        slow, fast = self.slow_leak_rate, self.fast_leak_rate
+        if not (math.isfinite(slow) and slow >= 0.0):
+            raise SettingError("slow_leak_rate", slow, "a finite number >= 0")
+        if not (math.isfinite(fast) and fast >= slow):
+            raise SettingError("fast_leak_rate", fast, f"a finite number >= the slow one, {slow}")
         if not 0.0 <= self.mu <= 1.0:
             raise SettingError("mu", self.mu, "a number from 0 to 1")
         if self.anti_windup not in METHODS:
             raise SettingError("anti_windup", self.anti_windup, " or ".join(METHODS))
 
+    @property
+    def law(self) -> Law:
+        """The same numbers for compiled functions."""
+        return Law(
+            self.budget.copy(),
+            float(self.gain),
+            float(self.slow_leak_rate),
+            float(self.fast_leak_rate),
+            float(self.mu),
+            METHODS.index(self.anti_windup),
+        )
 
-def paper_settings(budget: ArrayLike) -> IntegralSettings:
-    """Return the settings of [Benallegue2021] as printed: only K s limited, the state left alone.
+    def same_as(self, other: IntegralSettings) -> bool:
+        """Return whether all values are those of `other`."""
+        names = (field.name for field in fields(self))
+        return all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
 
-    Args:
-        budget: shape (n,), N m; the paper takes a tenth of the torque limits.
-    """
-    return IntegralSettings(
-        np.asarray(budget), whole_torque=False, correct_state=False, paper_form=True
-    )
+    def check_joints(self, n: int) -> None:
+        """Raise `SettingError` unless these are settings for n joints."""
+        if self.budget.shape != (n,):
+            raise SettingError("budget", self.budget, f"one number for each of {n} joints")

@@ -47,21 +47,3 @@ def solve_vector(L: np.ndarray, x: np.ndarray) -> None:
         for k in range(i + 1, n):
             s -= L[k, i] * x[k]
         x[i] = s / L[i, i]
-
-
-@compiled
-def solve_columns(L: np.ndarray, B: np.ndarray) -> None:
-    """Replace `B`, shape (n, m), by ``(L L^T)^-1 B``; L as `factorise` leaves it."""
-    n, m = B.shape
-    for i in range(n):
-        for k in range(i):
-            for c in range(m):
-                B[i, c] -= L[i, k] * B[k, c]
-        for c in range(m):
-            B[i, c] /= L[i, i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            for c in range(m):
-                B[i, c] -= L[k, i] * B[k, c]
-        for c in range(m):
-            B[i, c] /= L[i, i]

@@ -1,1 +1,5 @@
 """Null-space compliance: stiff in a task, free in its null space."""
+
+from torque_safety_controller.nullspace.compliance import NullspaceCompliance
+
+__all__ = ["NullspaceCompliance"]

@@ -1,4 +1,8 @@
-"""One step of null-space compliance, compiled; `docs/nullspace_compliance.md` derives it."""
+"""One step of null-space compliance, compiled; `docs/nullspace_compliance.md` derives it.
+
+The torque is linear in the memory (a, x), where x = a - a_fast is what the fast memory has
+forgotten, and the stored energy is quadratic.
+"""
 
 from __future__ import annotations
 
@@ -6,226 +10,244 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from torque_safety_controller.anti_windup import clip, scale_factor
+from torque_safety_controller.integral_feedback.action import ArmTerms
 from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors
-from torque_safety_controller.linalg.cholesky import factorise, solve_vector
+from torque_safety_controller.integral_feedback.settings import WIDENING_TIME, Law
 from torque_safety_controller.linalg.generalized_inverse import (
-    DAMPED,
-    NOT_POSITIVE_DEFINITE,
-    generalized_inverse,
+    THRESHOLD,
+    dynamically_consistent_inverse,
 )
-from torque_safety_controller.nullspace.law import (
-    Law,
-    Terms,
-    energy_product,
-    law_torque,
-    split,
-    times,
-    transpose_times,
-)
-from torque_safety_controller.nullspace.limit import keep_within
 from viability_bounds_pkg.compiled import compiled
 
-FAILED, NEAR_SINGULAR, LIMITED = -1, 1, 2
-"""Outcome of a step: failed, or the sum of what applies."""
+Array = NDArray[np.float64]
+
+FADING_TIME = 0.2
+"""Time constant with which that part of an initial torque fades that the memory cannot hold, s."""
+
+FAILED, REGULAR, NEAR_SINGULAR = range(3)
+"""Outcome of a step: unusable arguments; or whether J is near a singularity."""
+
+_AT_LIMIT = 1.0 - 1e-9
+
+_SINGULAR = 1e-12  # relative; smaller pivots are rounding
 
 
 class Memory(NamedTuple):
-    """What lasts from one step to the next; written in place."""
+    """What lasts from one step to the next; written in place.
 
-    s: np.ndarray
-    """Leaky integral of a_ref - v', shape (n,), rad/s."""
-    integral: np.ndarray
-    """Leaky integral of J' s, shape (m,)."""
-    a: np.ndarray
-    """``s - J^+ integral``, eq. (16), shape (n,), rad/s."""
-    root: np.ndarray
-    """``sqrt(diag M) x``, shape (n,): its square is the fast memory's energy whatever M does."""
-    offset: np.ndarray
-    """Torque left over from the mode before, shape (n,), N m."""
-    widening: np.ndarray
-    """Of the budgets, shape (n,), N m."""
-    v: np.ndarray
-    """Shape (n,), rad/s."""
-    J: np.ndarray
-    """Shape (m, n)."""
-    M: np.ndarray
-    """Shape (n, n), kg m^2."""
+    Attributes:
+        a: the error that dies away, eq. (16), shape (n,), rad/s.
+        s: its part in the null space, (1 - J^+ J) a, shape (n,), rad/s.
+        integral: integral(J' s), which is - J a, shape (m,).
+        root: ``sqrt(diag M) x``, shape (n,): its square is the fast memory's energy whatever M
+            does.
+        offset: what is left of an initial torque that the memory cannot hold, shape (n,), N m.
+        widening: of the budgets, shape (n,), N m.
+        v: velocity, shape (n,), rad/s.
+        J: Jacobian of the task, shape (m, n).
+    """
+
+    a: Array
+    s: Array
+    integral: Array
+    root: Array
+    offset: Array
+    widening: Array
+    v: Array
+    J: Array
 
 
 @compiled
 def step(
     memory: Memory,
     law: Law,
-    budget: np.ndarray,
-    M: np.ndarray,
-    C: np.ndarray,
-    J: np.ndarray,
-    J_dot: np.ndarray,
-    v: np.ndarray,
-    a_ref: np.ndarray,
+    arm: ArmTerms,
+    a_ref: Array,
     dt: float,
-    entering: bool,
-    tau: np.ndarray,
+    initialise: bool,
+    torque: Array,
+    saturated: NDArray[np.bool_],
 ) -> int:
     """Take one step; when it fails `memory` is as before.
 
     Args:
         memory: of the last step.
         law: settings.
-        budget: limits of the torque, shape (n,).
-        M: mass matrix, shape (n, n).
-        C: Coriolis matrix, shape (n, n).
-        J: shape (m, n).
-        J_dot: shape (m, n).
-        v: shape (n,).
-        a_ref: acceleration commanded in the last step, shape (n,).
-        dt: time since the last step.
-        entering: choose the memory such that the torque is what `tau` holds.
-        tau: shape (n,), receives the torque.
+        arm: as it is now.
+        a_ref: acceleration commanded in the last step, shape (n,), rad/s^2.
+        dt: time since the last step, s.
+        initialise: choose the memory such that the torque is what `torque` holds.
+        torque: shape (n,), receives the additional torque, N m.
+        saturated: shape (n,), receives which joints are at their budgets.
 
     Returns:
-        `FAILED` when M is not positive definite or something is not finite; else whether J is
-        `NEAR_SINGULAR`, plus whether the memory was `LIMITED`.
+        `FAILED`, `REGULAR` or `NEAR_SINGULAR`.
+
+    Raises:
+        LinAlgError: M is singular.
     """
-    m, n = J.shape
-    M_dot, K = np.empty((n, n)), np.empty(n)
-    for i in range(n):
-        K[i] = law.lambda_ * M[i, i]
-        for j in range(n):
-            M_dot[i, j] = C[i, j] + C[j, i]
-    consistent = law.dynamically_consistent
-    J_plus, J_plus_dot = np.empty((n, m)), np.empty((n, m))
-    found = generalized_inverse(
-        J, J_dot, M, M_dot, consistent, True, law.threshold, J_plus, J_plus_dot
+    M, C, J = arm.M, arm.C, arm.J
+    total = M.sum() + C.sum() + J.sum() + arm.J_dot.sum() + arm.v.sum() + a_ref.sum()
+    if initialise:
+        total += torque.sum()
+    if not (math.isfinite(total) and (np.diag(M) > 0.0).all()):
+        return FAILED
+    J_plus, J_plus_dot, damped = dynamically_consistent_inverse(
+        J, arm.J_dot, M, C + C.T, THRESHOLD
     )
-    if found == NOT_POSITIVE_DEFINITE:
-        return FAILED
-    J_bar = J_plus
-    if not consistent and (entering or law.theta_null > law.theta_slow):
-        J_bar = np.empty((n, m))
-        found = generalized_inverse(J, J_dot, M, M_dot, True, False, law.threshold, J_bar, J_bar)
-        if found == NOT_POSITIVE_DEFINITE:
-            return FAILED
-    terms = Terms(M, C, J, J_dot, J_plus, J_plus_dot, J_bar, K)
-
-    if entering:
-        a, x = _enter(law, terms, tau)
-        s, integral = split(law, terms, a)
+    root_M = np.sqrt(np.diag(M))
+    if initialise:
+        a = _initial_memory(law, arm, J_plus, torque)
+        x = a if law.fast_leak_rate > law.slow_leak_rate else np.zeros_like(a)
+        widening = np.maximum(np.abs(torque) - law.budget, 0.0)
     else:
-        s, integral, a, x = _advance(memory, law, terms, v, a_ref, dt)
-        if not law.keep_integral:
-            s, integral = split(law, terms, a)
-
-    limit, offset = np.empty(n), np.empty(n)
-    narrowing, fading = math.exp(-dt / law.widening_time), math.exp(-dt / law.blend_time)
-    for i in range(n):
-        widening = (
-            max(abs(tau[i]) - budget[i], 0.0) if entering else memory.widening[i] * narrowing
-        )
-        limit[i] = budget[i] + widening
-    own = law_torque(law, terms, s, integral, a, x)
-    limited = keep_within(law, terms, limit, s, integral, a, x, own)
-    total = 0.0
-    for i in range(n):
-        offset[i] = tau[i] - own[i] if entering else fading * memory.offset[i]
-        tau[i] = min(max(own[i] + offset[i], -limit[i]), limit[i])
-        total += tau[i] + s[i] + a[i] + x[i] + v[i]
-    for i in range(m):
-        total += integral[i]
-    if not math.isfinite(total):
+        a, x = _advance(memory, law, arm, J_plus, root_M, a_ref, dt)
+        widening = math.exp(-dt / WIDENING_TIME) * memory.widening
+    limit = law.budget + widening
+    H = torque_matrix(law, arm, J_plus, J_plus_dot)
+    fast = law.mu * law.gain * np.diag(M)
+    own = H @ a - fast * x
+    limited = scale_factor(own, limit) < 1.0
+    if limited:
+        a, x, own = _limited(law, M, H, fast, limit, a, x, own)
+    offset = torque - own if initialise else math.exp(-dt / FADING_TIME) * memory.offset
+    result = clip(own + offset, limit)
+    integral = -(J @ a)
+    if not math.isfinite(result.sum() + a.sum() + x.sum() + integral.sum()):
         return FAILED
-
-    memory.s[:] = s
-    memory.integral[:] = integral
+    torque[:] = result
+    saturated[:] = limited & (np.abs(result) >= _AT_LIMIT * law.budget)
     memory.a[:] = a
+    memory.s[:] = a + J_plus @ integral
+    memory.integral[:] = integral
+    memory.root[:] = root_M * x
     memory.offset[:] = offset
+    memory.widening[:] = widening
+    memory.v[:] = arm.v
+    memory.J[:] = J
+    return NEAR_SINGULAR if damped else REGULAR
+
+
+@compiled
+def skip(memory: Memory, law: Law, v: Array, J: Array, dt: float) -> None:
+    """Let a time pass in which the memory only leaks."""
+    decay = math.exp(-law.slow_leak_rate * dt)
+    memory.a[:] *= decay
+    memory.s[:] *= decay
+    memory.integral[:] *= decay
+    memory.root[:] *= decay
+    memory.offset[:] *= math.exp(-dt / FADING_TIME)
+    memory.widening[:] *= math.exp(-dt / WIDENING_TIME)
     memory.v[:] = v
     memory.J[:] = J
-    memory.M[:] = M
-    for i in range(n):
-        memory.root[i] = math.sqrt(M[i, i]) * x[i]
-        memory.widening[i] = limit[i] - budget[i] if math.isfinite(limit[i]) else 0.0
-    return (NEAR_SINGULAR if found == DAMPED else 0) + (LIMITED if limited else 0)
 
 
 @compiled
-def storage(memory: Memory, law: Law) -> float:
-    """Return the energy that is stored: ``a^T M a / 2`` and the fast memory's, J."""
-    x = memory.root / np.sqrt(np.diag(memory.M))
-    return 0.5 * energy_product(law, memory.M, memory.a, x, memory.a, x)
+def torque_matrix(law: Law, arm: ArmTerms, J_plus: Array, J_plus_dot: Array) -> Array:
+    """Return the H of eq. (21) with (26), shape (n, n): the torque is H a - mu K x."""
+    K = law.gain * np.diag(arm.M)
+    P = J_plus @ arm.J
+    # J^+ J' s + (J^+)' integral, where s = (1 - P) a and integral = - J a.
+    inner = J_plus @ (arm.J_dot - arm.J_dot @ P) - J_plus_dot @ arm.J
+    H = arm.C - arm.M @ inner
+    H += (1.0 - law.mu) * (P.T * K) @ P
+    for i in range(len(H)):
+        H[i, i] += law.mu * K[i]
+    return H
 
 
 @compiled
-def pause(memory: Memory, law: Law, v: np.ndarray, J: np.ndarray, dt: float) -> None:
-    """Let a time pass in which the memory only leaks."""
-    decay = math.exp(-law.theta_slow * dt)
-    for i in range(len(v)):
-        memory.s[i] *= decay
-        memory.a[i] *= decay
-        memory.root[i] *= decay
-        memory.offset[i] *= math.exp(-dt / law.blend_time)
-        memory.widening[i] *= math.exp(-dt / law.widening_time)
-        memory.v[i] = v[i]
-    for i in range(len(memory.integral)):
-        memory.integral[i] *= decay
-    memory.J[:] = J
+def energy_product(law: Law, M: Array, a: Array, x: Array, b: Array, y: Array) -> float:
+    """Return the inner product of (a, x) and (b, y) whose square is twice the energy, J."""
+    weight = 0.0
+    if law.fast_leak_rate > law.slow_leak_rate:
+        weight = law.mu * law.gain / (law.fast_leak_rate - law.slow_leak_rate)
+    return float(a @ (M @ b) + weight * (x @ (np.diag(M) * y)))
 
 
 @compiled
-def _advance(memory, law, terms, v, a_ref, dt):
-    """Return the memory after the acceleration error of the last step: s, integral, a, x."""
-    m, n = terms.J.shape
-    s, integral, a, x = np.empty(n), np.empty(m), np.empty(n), np.empty(n)
-    slow, slow_gain = leak_factors(law.theta_slow, dt, False)
-    fast, fast_gain = leak_factors(law.theta_fast, dt, False)
+def _advance(
+    memory: Memory,
+    law: Law,
+    arm: ArmTerms,
+    J_plus: Array,
+    root_M: Array,
+    a_ref: Array,
+    dt: float,
+) -> tuple[Array, Array]:
+    """Return a and x after the acceleration error of the last step."""
+    slow, slow_gain = leak_factors(law.slow_leak_rate, dt, False)
+    fast, fast_gain = leak_factors(law.fast_leak_rate, dt, False)
     ratio = fast_gain / slow_gain
-    middle = np.empty(n)
-    for i in range(n):
-        left = slow * memory.s[i]
-        s[i] = left + slow_gain * (a_ref[i] * dt - (v[i] - memory.v[i]))
-        middle[i] = 0.5 * (left + s[i])
+    left = slow * memory.s
+    s = left + slow_gain * (a_ref * dt - (arm.v - memory.v))
     # With the middle of s the product rule is exact: J a grows by the middle of J times the
     # increment of s.
-    for i in range(m):
-        integral[i] = slow * memory.integral[i]
-        for j in range(n):
-            integral[i] += (terms.J[i, j] - memory.J[i, j]) * middle[j]
-    task = times(terms.J_plus, integral)
-    for i in range(n):
-        a[i] = s[i] - task[i]
-        # The fast memory takes fast_gain of what a gained, of which slow_gain is seen.
-        x[i] = (1.0 - ratio) * a[i] + (ratio * slow - fast) * memory.a[i]
-        x[i] += fast * memory.root[i] / math.sqrt(terms.M[i, i])
-    if law.theta_null > law.theta_slow:
-        forgotten = -math.expm1((law.theta_slow - law.theta_null) * dt)
-        task = times(terms.J_bar, times(terms.J, a))
-        for i in range(n):
-            change = forgotten * (a[i] - task[i])
-            s[i] -= change
-            a[i] -= change
-    return s, integral, a, x
+    integral = slow * memory.integral + (arm.J - memory.J) @ (0.5 * (left + s))
+    a = s - J_plus @ integral
+    # The fast memory takes fast_gain of what a gained, of which slow_gain is seen.
+    x = (1.0 - ratio) * a + (ratio * slow - fast) * memory.a + fast * memory.root / root_M
+    # The null space forgets at the fast rate.
+    forgotten = -math.expm1((law.slow_leak_rate - law.fast_leak_rate) * dt)
+    return a - forgotten * (a - J_plus @ (arm.J @ a)), x
 
 
 @compiled
-def _enter(law, terms, tau):
-    """Return a and x that hold of `tau` what the slow memory can; the fast memory is empty."""
-    m, n = terms.J.shape
-    a = np.zeros(n)
-    if law.mu < 1.0 and law.free_null_space:
-        # The task feels the force F = J_bar^T tau. Where J a = y the slow torque is
-        # J^T ((1 - mu) J^+^T K J^+ y), which is J^T F for this y:
-        y = transpose_times(terms.J_bar, tau)
-        B = np.zeros((m, m))
-        for i in range(m):
-            for j in range(i + 1):
-                for k in range(n):
-                    B[i, j] += terms.J_plus[k, i] * terms.K[k] * terms.J_plus[k, j]
-                B[i, j] *= 1.0 - law.mu
-        if factorise(B):
-            solve_vector(B, y)
-            a = times(terms.J_bar, y)
-    elif law.mu < 1.0:
-        for i in range(n):
-            a[i] = tau[i] / ((1.0 - law.mu) * terms.K[i])
-    return a, a.copy() if law.theta_fast > law.theta_slow else np.zeros(n)
+def _initial_memory(law: Law, arm: ArmTerms, J_plus: Array, torque: Array) -> Array:
+    """Return the a whose slow memory gives what the task feels of `torque`.
+
+    The task feels the force F = J^+^T torque. Where J a = y the slow torque is
+    J^T ((1 - mu) J^+^T K J^+ y), which is J^T F for this y.
+    """
+    K = law.gain * np.diag(arm.M)
+    B = (1.0 - law.mu) * (J_plus.T * K) @ J_plus
+    return J_plus @ (np.linalg.pinv(B, _SINGULAR) @ (J_plus.T @ torque))
+
+
+@compiled
+def _limited(
+    law: Law, M: Array, H: Array, fast: Array, limit: Array, a: Array, x: Array, torque: Array
+) -> tuple[Array, Array, Array]:
+    """Return a memory and its torque with |torque| <= limit that stores no more energy.
+
+    Scaling all of the memory by (10) does both, but weakens every joint for the sake of one. So
+    a is changed such that only the torques beyond their limits change, to the limits. If that
+    stores more energy than before, it is done in part: the memory is the furthest point on the
+    way from the scaled one that does not. Both ends are within the limits, and with them the way.
+
+    Args:
+        law: settings.
+        M: mass matrix, shape (n, n).
+        H: of `torque_matrix`.
+        fast: diagonal of mu K, shape (n,).
+        limit: shape (n,), >= 0, may be infinite.
+        a: shape (n,).
+        x: shape (n,).
+        torque: that they give, shape (n,).
+    """
+    scale = scale_factor(torque, limit)
+    cut = clip(torque, limit) - torque
+    regular = H + _SINGULAR * (np.abs(H).max() + 1e-300) * np.eye(len(H))
+    shift, way = np.linalg.solve(regular, cut), 0.0
+    if np.abs(H @ shift - cut).max() <= 1e-6 * np.abs(cut).max():
+        way = _way(law, M, a, x, scale, shift)
+    else:
+        shift[:] = 0.0
+    keep = scale + way * (1.0 - scale)
+    return keep * a + way * shift, keep * x, clip(keep * torque + way * cut, limit)
+
+
+@compiled
+def _way(law: Law, M: Array, a: Array, x: Array, scale: float, shift: Array) -> float:
+    """Return how far from (scale a, scale x) to (a + shift, x) the energy is that of (a, x)."""
+    da, dx = (1.0 - scale) * a + shift, (1.0 - scale) * x
+    spare = (1.0 - scale * scale) * energy_product(law, M, a, x, a, x)
+    linear = scale * energy_product(law, M, a, x, da, dx)
+    square = energy_product(law, M, da, dx, da, dx)
+    if square + 2.0 * linear <= spare:
+        return 1.0
+    root = math.sqrt(linear * linear + square * spare)
+    return spare / (linear + root) if linear > 0.0 else (root - linear) / square

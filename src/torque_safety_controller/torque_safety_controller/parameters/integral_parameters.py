@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torque_safety_controller.additional_torque import MODES, AdditionalSettings
-from torque_safety_controller.integral_feedback.settings import IntegralSettings
-from torque_safety_controller.nullspace.settings import NullspaceSettings
+from torque_safety_controller.integral_feedback.settings import (
+    METHODS,
+    IntegralSettings,
+)
 from torque_safety_controller.parameters.friction_parameters import friction_settings
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.ros.parameters import (
@@ -30,10 +32,6 @@ DISTURBANCE_MAX = 2.0
 
 TASKS = {"pose": slice(0, 6), "position": slice(0, 3)}
 """Rows of the pose's Jacobian that are a task of integral action ``task``."""
-
-METHODS = ("none", "scaling", "paper", "qp")
-"""Anti-windup of the joints: none; (10) or (11) as [Benallegue2021] prints them, that is for K s
-only, with the integrators left alone and (13); or for the whole torque, integrators included."""
 
 INTEGRAL_TABLE = (
     Parameter(
@@ -76,9 +74,8 @@ INTEGRAL_TABLE = (
     Parameter(
         "integral_anti_windup",
         str,
-        "for joints: how the torque is limited: not at all (none); K s only and the integrators "
-        "left alone, as printed, by (10) (scaling) or (11) (paper); all of it by (11), and the "
-        "integrators with it (qp)",
+        "for joints: qp limits the whole torque and the integrators; paper and scaling limit K s "
+        "only, by eq. (11) and (10) as printed; none limits nothing",
         default="qp",
         live=True,
         choices=METHODS,
@@ -107,8 +104,7 @@ def additional_settings(
         SettingError: values that do not fit together.
     """
     mode = values["integral_action"]
-    null_space = task_rows(values).stop < len(joints)
-    if mode == "task" and not null_space:
+    if mode == "task" and task_rows(values).stop >= len(joints):
         allowed = f"'none' or 'joints': {len(joints)} joints have no null space left of the task"
         raise SettingError("integral_action", mode, allowed)
     budget = given_or(values, "integral_budget", BUDGET * tau_max)
@@ -117,27 +113,16 @@ def additional_settings(
     slow, fast, mu = leak = values["integral_leak"]
     if fast < slow or mu > 1.0:
         raise SettingError("integral_leak", leak, "theta_f >= theta_s and mu <= 1")
-    gain, method = values["integral_lambda"], values["integral_anti_windup"]
-    printed, paper = method != "qp", method == "paper"
-    return AdditionalSettings(
-        mode,
-        IntegralSettings(
-            budget,
-            gain,
-            slow,
-            fast,
-            mu,
-            anti_windup="qp" if paper else method,
-            whole_torque=not printed,
-            correct_state=not printed,
-            paper_form=printed,
-        ),
-        NullspaceSettings(budget, gain, slow, fast, mu, keep_integral=paper)
-        if null_space
-        else None,
-        DISTURBANCE_MAX * tau_max,
-        friction_settings(values, tau_max),
+    integral = IntegralSettings(
+        budget,
+        gain=values["integral_lambda"],
+        slow_leak_rate=slow,
+        fast_leak_rate=fast,
+        mu=mu,
+        anti_windup=values["integral_anti_windup"],
     )
+    friction = friction_settings(values, tau_max)
+    return AdditionalSettings(mode, integral, DISTURBANCE_MAX * tau_max, friction)
 
 
 def task_rows(values: Mapping[str, Any]) -> slice:

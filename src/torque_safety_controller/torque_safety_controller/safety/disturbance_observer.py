@@ -48,7 +48,7 @@ class DisturbanceObserver:
         _observe(np.zeros(n), ones, ones, ones, 1.0, 1.0, ones, np.eye(n))
         _shift(ones, -ones, ones)
 
-    def start(self) -> None:
+    def reset(self) -> None:
         """Forget the past."""
         self.estimate.fill(0.0)
         self._begun = False
@@ -67,7 +67,7 @@ class DisturbanceObserver:
         if self.time_constant is None:
             return
         if not elapsed > 0.0:
-            self.start()
+            self.reset()
         elif self._begun:
             gain = -math.expm1(-elapsed / self.time_constant) if self.time_constant > 0.0 else 1.0
             _observe(self.estimate, v, self._v_last, a_last, elapsed, gain, tau_max, M)
@@ -91,7 +91,17 @@ class DisturbanceObserver:
 
 
 @compiled
-def _observe(estimate, v, v_last, a_last, elapsed, gain, tau_max, M):
+def _observe(
+    estimate: Array,
+    v: Array,
+    v_last: Array,
+    a_last: Array,
+    elapsed: float,
+    gain: float,
+    tau_max: Array,
+    M: Array,
+) -> None:
+    """Let the estimate follow the error of the last step, at a rate `gain`; in place."""
     for j in range(v.size):
         e = (v[j] - v_last[j]) / elapsed - a_last[j]
         e = estimate[j] + gain * (e - estimate[j])
@@ -101,7 +111,8 @@ def _observe(estimate, v, v_last, a_last, elapsed, gain, tau_max, M):
 
 
 @compiled
-def _shift(estimate, lower, upper):
+def _shift(estimate: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+    """Return the bounds tightened by the estimate: the upper one, or the lower one."""
     low, high = lower.copy(), upper.copy()
     for j in range(low.size):
         e = estimate[j]

@@ -24,12 +24,12 @@ class TorqueLimiter:
     def __init__(self, tau_max: ArrayLike, tau_rate_max: ArrayLike | None, dt: float) -> None:
         self.tau_max = np.asarray(tau_max, dtype=float)
         self._tau_min = -self.tau_max
-        rate = np.full(self.tau_max.shape, math.inf) if tau_rate_max is None else tau_rate_max
-        self._step = np.where(np.isinf(rate), np.inf, rate * np.float64(dt))
+        rate = np.asarray(math.inf if tau_rate_max is None else tau_rate_max, dtype=np.float64)
+        self._step = np.where(np.isinf(rate), np.inf, rate * dt)
         self._rate_limited = bool(np.isfinite(rate).any())
         self.last: np.ndarray | None = None
 
-    def start(self) -> None:
+    def reset(self) -> None:
         """Forget the last torque: the next may be any within the limits."""
         self.last = None
 
