@@ -12,10 +12,11 @@ import yaml
 
 from torque_safety_controller.contact.contacts import Contact, Contacts
 from torque_safety_controller.controller import Controller, Gains
-from torque_safety_controller.qp.constraints import Rows
+from torque_safety_controller.qp.constraints import AccelerationRange, Rows
 from torque_safety_controller.qp.inverse_dynamics_qp import InverseDynamicsQP
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.robot_description import build_model, read_urdf
+from viability_bounds_pkg.state import State
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -43,7 +44,7 @@ def qp_alone(controller: Controller, q: np.ndarray, v: np.ndarray) -> dict:
     pin.forwardKinematics(robot.model, data, q, v, np.zeros(n))
     contacts = Contacts(robot.model, [Contact(robot.frame, np.zeros(3), [0.0, 0.0, -1.0], 0.5, 4)])
     task = contacts.wrench_task(0, np.array([0.0, 0.0, -10.0, 0.0, 0.0, 0.0]), 1e-3)
-    robot.update(q, v, np.zeros(n))
+    robot.update(State(q, v), np.zeros(n))
     limits = robot.M, -controller.tau_max - robot.h, controller.tau_max - robot.h
     tasks = controller.goals.tasks(robot, q, v, controller.gains)
     wide, tight = np.full(n, 5.0), np.full(n, 0.5)
@@ -97,21 +98,26 @@ def main() -> None:
     controller = Controller(robot, tau_max, Gains(10.0, 6.3, 1.0, 10.0, 6.3, 1e-3, True, 20.0))
     q = np.array(values["start_positions"])
     v = np.full(n, 0.1)
-    controller.start(q)
-    robot.update(q + 0.1, v, v)
+    controller.reset(q)
+    robot.update(State(q + 0.1, v), v)
     controller.set_pose_goal(robot.pose.copy())
     wide, tight = np.full(n, 100.0), np.full(n, 0.5)
 
     def off_and_on() -> None:
         # Bounds that change sides each time, so that the solver proper is needed.
         off_and_on.sign = -off_and_on.sign
-        controller.step(q, v, off_and_on.sign * tight - 0.1, off_and_on.sign * tight + 0.1)
+        controller.step(
+            State(q, v),
+            AccelerationRange(off_and_on.sign * tight - 0.1, off_and_on.sign * tight + 0.1),
+        )
 
     off_and_on.sign = 1.0
     rows = {
-        "step, same bounds active as before": lambda: controller.step(q, v, -wide, wide),
+        "step, same bounds active as before": lambda: controller.step(
+            State(q, v), AccelerationRange(-wide, wide)
+        ),
         "step, other bounds active (solver)": off_and_on,
-        "  model at the current state": lambda: robot.update(q, v, v),
+        "  model at the current state": lambda: robot.update(State(q, v), v),
         "  torque of the middle of the step": lambda: robot.torque(q, v, v),
         "  limits and rate of torque": lambda: controller._limiter.limited(tau_max),
     }

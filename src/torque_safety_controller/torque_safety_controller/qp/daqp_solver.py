@@ -1,0 +1,119 @@
+"""DAQP, a dual active-set method: fast from a good guess, and certain about infeasibility.
+
+DAQP [Arnstrom2022] does not look at its input: NaN in C passes as a limit that is never violated.
+So what it calls a solution is checked against the limits.
+"""
+
+from __future__ import annotations
+
+import math
+
+import daqp
+import numpy as np
+from numpy.typing import NDArray
+
+from torque_safety_controller.qp.quadratic_program import QuadraticProgram, SolverResult, Status
+
+Array = NDArray[np.float64]
+
+_SETTINGS: dict[str, float] = {
+    "primal_tol": 1e-9,
+    "iter_limit": 1000,
+    "eta_prox": 1e-10,
+    "sing_tol": 1e-13,
+}
+_LOOSE = {"primal_tol": 5e-7}
+_INFEASIBLE = (-1, -6)  # exit flags of DAQP; the second: equalities that contradict each other
+_LARGE = 1e4
+VIOLATION = 1e-6
+"""Largest violation of a limit, in its unit, of what is taken for a solution."""
+
+
+class DaqpSolver:
+    """Solves programs with DAQP, starting from the limits active in the last of the same size.
+
+    Args:
+        proximal: for costs that are flat in some directions, with a diagonal H: weight of the
+            distance from the last iterate, by which DAQP makes them strictly convex. The result
+            is exact all the same. With 0 a flat cost is a failure.
+    """
+
+    def __init__(self, proximal: float = 0.0) -> None:
+        self._settings = _SETTINGS | {"eps_prox": -proximal}  # negative: only where H is singular
+        self._models: dict[tuple[int, int], _Model] = {}
+
+    def solve(self, program: QuadraticProgram) -> SolverResult:
+        """Return the minimum, or why there is none; see `Solver`."""
+        size = program.C.shape
+        model = self._models.get(size)
+        if model is None:
+            model = self._models[size] = _Model(self._settings)
+        result = model.solve(program)
+        if result.status is not Status.SOLVED:
+            # The guess may have been misleading, equalities contradictory by rounding only, or the
+            # numbers too large for tolerances that are absolute.
+            del self._models[size]
+            scale = _scale(program)
+            result = _Model(self._settings | _LOOSE).solve(_divided(program, scale))
+            result = result._replace(x=_clipped(scale * result.x, program))
+        return result
+
+
+class _Model:
+    """DAQP's workspace for programs of one size."""
+
+    def __init__(self, settings: dict[str, float]) -> None:
+        self._model = daqp.Model()
+        self._model.settings = settings
+        self._sense: NDArray[np.int32] | None = None
+
+    def solve(self, program: QuadraticProgram) -> SolverResult:
+        H, g, C, lower, upper, _ = program
+        n = len(g)
+        if self._sense is None:
+            flag, _ = self._model.setup(H, g, C, upper, lower)
+        else:
+            # Stated each time: DAQP keeps limits once equal, and rows once zero, as they were.
+            flag = self._model.update(H, g, C, upper, lower, self._sense)
+        if flag >= 0:
+            x, _, flag, info = self._model.solve()
+        if flag < 0:
+            valid = flag in _INFEASIBLE and _is_valid(program)
+            return SolverResult(Status.INFEASIBLE if valid else Status.FAILED, np.empty(n), 0)
+        x = _clipped(x, program)
+        value = C @ x
+        kept = (value >= lower[n:] - VIOLATION) & (value <= upper[n:] + VIOLATION)
+        if not (math.isfinite(value.dot(value)) and kept.all()):
+            return SolverResult(Status.FAILED, x, info["iterations"])
+        # 1 for an active upper limit, 3 for a lower one.
+        self._sense = np.sign(info["lam"]).astype(np.int32) & 3
+        return SolverResult(Status.SOLVED, x, info["iterations"])
+
+
+def _clipped(x: Array, program: QuadraticProgram) -> Array:
+    """Return x within its own limits."""
+    n = len(x)
+    return np.minimum(np.maximum(x, program.lower[:n]), program.upper[:n])
+
+
+def _scale(program: QuadraticProgram) -> float:
+    """Return by what to divide x to keep the limits below `_LARGE`; 1 if they are."""
+    limits = np.abs(np.concatenate([program.lower, program.upper]))
+    return max(1.0, float(limits[np.isfinite(limits)].max(initial=0.0)) / _LARGE)
+
+
+def _divided(program: QuadraticProgram, scale: float) -> QuadraticProgram:
+    """Return the program for ``x / scale``."""
+    H, g, C, lower, upper, names = program
+    return QuadraticProgram(H, g / scale, C, lower / scale, upper / scale, names)
+
+
+def _is_valid(program: QuadraticProgram) -> bool:
+    """Return whether all is finite that must be, and limits are not crossed."""
+    H, g, C, lower, upper, _ = program
+    return bool(
+        all(np.isfinite(each).all() for each in (H, g, C))
+        and (lower <= upper).all()
+        and (lower < np.inf).all()
+        and (upper > -np.inf).all()
+    )
