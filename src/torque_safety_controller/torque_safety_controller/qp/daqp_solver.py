@@ -6,12 +6,11 @@ So what it calls a solution is checked against the limits.
 
 from __future__ import annotations
 
-import math
-
 import daqp
 import numpy as np
 from numpy.typing import NDArray
 
+from torque_safety_controller.qp.kernels import clip_and_check
 from torque_safety_controller.qp.quadratic_program import QuadraticProgram, SolverResult, Status
 
 Array = NDArray[np.float64]
@@ -55,7 +54,9 @@ class DaqpSolver:
             del self._models[size]
             scale = _scale(program)
             result = _Model(self._settings | _LOOSE).solve(_divided(program, scale))
-            result = result._replace(x=_clipped(scale * result.x, program))
+            n = len(program.g)
+            x = np.clip(scale * result.x, program.lower[:n], program.upper[:n])
+            result = result._replace(x=x)
         return result
 
 
@@ -69,8 +70,8 @@ class _Model:
 
     def solve(self, program: QuadraticProgram) -> SolverResult:
         H, g, C, lower, upper, _ = program
-        n = len(g)
         if self._sense is None:
+            self._sense = np.zeros(len(lower), dtype=np.int32)
             flag, _ = self._model.setup(H, g, C, upper, lower)
         else:
             # Stated each time: DAQP keeps limits once equal, and rows once zero, as they were.
@@ -79,21 +80,10 @@ class _Model:
             x, _, flag, info = self._model.solve()
         if flag < 0:
             valid = flag in _INFEASIBLE and _is_valid(program)
-            return SolverResult(Status.INFEASIBLE if valid else Status.FAILED, np.empty(n), 0)
-        x = _clipped(x, program)
-        value = C @ x
-        kept = (value >= lower[n:] - VIOLATION) & (value <= upper[n:] + VIOLATION)
-        if not (math.isfinite(value.dot(value)) and kept.all()):
-            return SolverResult(Status.FAILED, x, info["iterations"])
-        # 1 for an active upper limit, 3 for a lower one.
-        self._sense = np.sign(info["lam"]).astype(np.int32) & 3
-        return SolverResult(Status.SOLVED, x, info["iterations"])
-
-
-def _clipped(x: Array, program: QuadraticProgram) -> Array:
-    """Return x within its own limits."""
-    n = len(x)
-    return np.minimum(np.maximum(x, program.lower[:n]), program.upper[:n])
+            status = Status.INFEASIBLE if valid else Status.FAILED
+            return SolverResult(status, np.empty(len(g)), 0)
+        kept = clip_and_check(x, C, lower, upper, VIOLATION, info["lam"], self._sense)
+        return SolverResult(Status.SOLVED if kept else Status.FAILED, x, info["iterations"])
 
 
 def _scale(program: QuadraticProgram) -> float:

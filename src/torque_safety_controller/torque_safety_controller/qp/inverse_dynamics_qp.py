@@ -21,6 +21,10 @@ from numpy.typing import NDArray
 
 from torque_safety_controller.qp.constraints import AccelerationRange, LinearConstraints
 from torque_safety_controller.qp.daqp_solver import DaqpSolver
+from torque_safety_controller.qp.kernels import (
+    add_identity,
+    add_least_squares,
+)
 from torque_safety_controller.qp.proxqp_solver import ProxqpSolver
 from torque_safety_controller.qp.quadratic_program import (
     NoSolutionFound,
@@ -90,8 +94,7 @@ class InverseDynamicsQP:
         self._relaxed_solvers = tuple(solvers.values())
         self._solvers = (solvers.pop(solver), *solvers.values())
         self._relaxing_solvers = (*(DaqpSolver(weight) for weight in _PROXIMAL), ProxqpSolver())
-        self._no_constraints = LinearConstraints(np.zeros((0, n)), np.zeros(0), np.zeros(0))
-        self._no_contacts = ContactForces(np.zeros((n, 0)), np.zeros(0))
+        self._no_forces = np.zeros(0)
 
     def build(
         self,
@@ -119,19 +122,37 @@ class InverseDynamicsQP:
             ValueError: constraints or contacts of the wrong shape.
         """
         n = self._n
-        G, g_lower, g_upper = self._checked(constraints or self._no_constraints)
-        B, rho_max, wrench_tasks = self._checked_forces(contacts or self._no_contacts)
-        k, r = len(G), len(rho_max)
-        H, g = self._cost(tasks, wrench_tasks, n + r)
+        scale = 1.0 / _greatest_weight(tasks, () if contacts is None else contacts.tasks)
+        lower, upper = [bounds.lower, tau_lower], [bounds.upper, tau_upper]
+        r = k = 0
+        if contacts is not None:
+            contacts = self._checked_forces(contacts)
+            r = len(contacts.rho_max)
+            lower.insert(1, np.zeros(r))
+            upper.insert(1, contacts.rho_max)
+        if constraints is not None:
+            constraints = self._checked(constraints)
+            k = len(constraints.G)
+            lower.append(constraints.lower)
+            upper.append(constraints.upper)
         C = np.zeros((n + k, n + r))
         C[:n, :n] = M
-        if r:
-            C[:n, n:] = -B
-        if k:
-            C[n:, :n] = G
-        lower = np.concatenate([bounds.lower, np.zeros(r), tau_lower, g_lower])
-        upper = np.concatenate([bounds.upper, rho_max, tau_upper, g_upper])
-        return QuadraticProgram(H, g, C, lower, upper, _names(n, r, k))
+        if contacts is not None:
+            C[:n, n:] = -contacts.B
+        if constraints is not None:
+            C[n:, :n] = constraints.G
+        H, g = self._gamma * np.eye(n + r), np.zeros(n + r)
+        for A, b, weight in tasks:
+            if A is None:
+                add_identity(H, g, b, weight * scale)
+            else:
+                add_least_squares(H, g, A, b, weight * scale, 0)
+        if contacts is not None:
+            for W, F_des, weight, first in contacts.tasks:
+                add_least_squares(H, g, W, F_des, weight * scale, n + first)
+        return QuadraticProgram(
+            H, g, C, np.concatenate(lower), np.concatenate(upper), _names(n, r, k)
+        )
 
     def solve(self, program: QuadraticProgram) -> Solution:
         """Return the accelerations and forces that serve the tasks best within the limits.
@@ -152,55 +173,34 @@ class InverseDynamicsQP:
         elif result.status is not Status.SOLVED:
             raise NoSolutionFound("not finite, absurd, or lower limits above upper ones", program)
         x = result.x
-        return Solution(x[:n], x[n:], relaxation, constraint_relaxation, result.iterations)
+        a, rho = (x[:n], x[n:]) if len(x) > n else (x, self._no_forces)
+        return Solution(a, rho, relaxation, constraint_relaxation, result.iterations)
 
     def _checked(self, constraints: LinearConstraints) -> LinearConstraints:
-        G, lower, upper = constraints
-        if np.shape(G) != (len(lower), self._n) or len(upper) != len(lower):
+        """Return `constraints` in the one layout that the kernels are compiled for."""
+        G, lower, upper = (np.ascontiguousarray(each, dtype=float) for each in constraints)
+        if G.shape != (len(lower), self._n) or lower.shape != upper.shape or lower.ndim != 1:
             raise ValueError(
-                f"constraints on {self._n} joints with G {np.shape(G)}, lower {np.shape(lower)}, "
-                f"upper {np.shape(upper)}"
+                f"constraints on {self._n} joints with G {G.shape}, lower {lower.shape}, "
+                f"upper {upper.shape}"
             )
-        return constraints
+        return LinearConstraints(G, lower, upper)
 
     def _checked_forces(self, contacts: ContactForces) -> ContactForces:
-        B, rho_max, tasks = contacts
-        if np.shape(B) != (self._n, len(rho_max)):
+        B = np.ascontiguousarray(contacts.B, dtype=float)
+        rho_max = np.ascontiguousarray(contacts.rho_max, dtype=float)
+        if rho_max.ndim != 1 or B.shape != (self._n, len(rho_max)):
             raise ValueError(
-                f"forces on {self._n} joints with B {np.shape(B)}, rho_max {np.shape(rho_max)}"
+                f"forces on {self._n} joints with B {B.shape}, rho_max {rho_max.shape}"
             )
-        for W, F_des, _, first in tasks:
+        for W, F_des, _, first in contacts.tasks:
             m, r = W.shape
             if F_des.shape != (m,) or not 0 <= first <= len(rho_max) - r:
                 raise ValueError(
                     f"wrench task with W {W.shape} from force {first} of {len(rho_max)} on, "
                     f"F_des {F_des.shape}"
                 )
-        return contacts
-
-    def _cost(
-        self, tasks: Sequence[TaskTerm], wrench_tasks: Sequence[WrenchTerm], size: int
-    ) -> tuple[Array, Array]:
-        """Return H and g; the largest weight becomes 1, so that gamma keeps its sense."""
-        greatest = 0.0
-        for term in (*tasks, *wrench_tasks):
-            if term.weight > greatest:
-                greatest = term.weight
-        if not greatest > 0.0:
-            raise NoSolutionFound("no task with a weight above 0")
-        H, g = np.zeros((size, size)), np.zeros(size)
-        H.flat[:: size + 1] = self._gamma
-        for A, b, weight in tasks:
-            weight /= greatest
-            if A is None:
-                H.flat[: self._n * (size + 1) : size + 1] += weight
-                g[: self._n] -= weight * b
-            else:
-                _add(H[: self._n, : self._n], g[: self._n], A, b, weight)
-        for W, F_des, weight, first in wrench_tasks:
-            part = slice(self._n + first, self._n + first + W.shape[1])
-            _add(H[part, part], g[part], W, F_des, weight / greatest)
-        return H, g
+        return ContactForces(B, rho_max, contacts.tasks)
 
     def _relax(self, program: QuadraticProgram) -> tuple[SolverResult, Array | None]:
         """Solve with bounds and constraints moved by the least that leaves a solution.
@@ -275,10 +275,18 @@ def _first_to_decide(solvers: Iterable[Solver], program: QuadraticProgram) -> So
     return result
 
 
-def _add(H: Array, g: Array, A: Array, b: Array, weight: float) -> None:
-    """Add ``weight * |A x - b|^2 / 2`` to the cost ``x'Hx / 2 + g'x``, in place."""
-    H += weight * (A.T @ A)
-    g -= weight * (A.T @ b)
+def _greatest_weight(tasks: Sequence[TaskTerm], wrench_tasks: Sequence[WrenchTerm]) -> float:
+    """Return the largest weight; it is made 1, so that gamma keeps its sense."""
+    greatest = 0.0
+    for task in tasks:
+        if task.weight > greatest:
+            greatest = task.weight
+    for wrench_task in wrench_tasks:
+        if wrench_task.weight > greatest:
+            greatest = wrench_task.weight
+    if not greatest > 0.0:
+        raise NoSolutionFound("no task with a weight above 0")
+    return greatest
 
 
 @lru_cache(maxsize=256)

@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from torque_safety_controller.linalg.dense_kernels import spring_damper
 from torque_safety_controller.qp.terms import TaskTerm
 from torque_safety_controller.robot_model import RobotModel
 
@@ -49,10 +50,9 @@ class PoseTask:
         error = pose_error(robot.pose, self.pose_des)
         if self.stiffness is not None:
             error = self.stiffness * error
-        twist = robot.J @ robot.v
-        b = self.kp * error - self.kd * twist - robot.drift
+        b = spring_damper(robot.J, robot.v, error, robot.drift, self.kp, self.kd)
         if self.motion is not None:
-            b = b + self._feedforward(robot.pose, twist, self.motion)
+            b = b + self._feedforward(robot.pose, robot.J @ robot.v, self.motion)
         return TaskTerm(robot.J, b, self.weight)
 
     def _feedforward(self, pose: pin.SE3, twist: Array, motion: PoseMotion) -> Array:
