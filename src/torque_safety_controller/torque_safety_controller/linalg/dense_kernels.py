@@ -6,6 +6,8 @@ Each function is here because NumPy's way costs more than 3 % of a control step 
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,9 +35,29 @@ def null_space_part(J: Array, x: Array, regularisation: float) -> Array:
 
     It is `x` where J is not finite.
     """
-    G = J @ J.T
-    for i in range(len(G)):
-        G[i, i] += regularisation
-    if not np.isfinite(G.sum()):
-        return x.copy()
-    return x - J.T @ np.linalg.solve(G, J @ x)
+    m, n = J.shape
+    y = J @ x
+    # Cholesky's factor of J J' + regularisation I, row by row.
+    L = np.empty((m, m))
+    for i in range(m):
+        for j in range(i + 1):
+            s = regularisation if i == j else 0.0
+            for k in range(n):
+                s += J[i, k] * J[j, k]
+            for k in range(j):
+                s -= L[i, k] * L[j, k]
+            if i > j:
+                L[i, j] = s / L[j, j]
+            elif 0.0 < s < np.inf:
+                L[i, i] = math.sqrt(s)
+            else:
+                return x.copy()
+    for i in range(m):
+        for k in range(i):
+            y[i] -= L[i, k] * y[k]
+        y[i] /= L[i, i]
+    for i in range(m - 1, -1, -1):
+        for k in range(i + 1, m):
+            y[i] -= L[k, i] * y[k]
+        y[i] /= L[i, i]
+    return x - J.T @ y

@@ -20,6 +20,7 @@ _SETTINGS: dict[str, float] = {
     "iter_limit": 1000,
     "eta_prox": 1e-10,
     "sing_tol": 1e-13,
+    "eq_reduction": -1,
 }
 _LOOSE = {"primal_tol": 5e-7}
 _INFEASIBLE = (-1, -6)  # exit flags of DAQP; the second: equalities that contradict each other
@@ -39,51 +40,41 @@ class DaqpSolver:
 
     def __init__(self, proximal: float = 0.0) -> None:
         self._settings = _SETTINGS | {"eps_prox": -proximal}  # negative: only where H is singular
-        self._models: dict[tuple[int, int], _Model] = {}
+        self._active: dict[tuple[int, ...], NDArray[np.int32]] = {}
 
     def solve(self, program: QuadraticProgram) -> SolverResult:
         """Return the minimum, or why there is none; see `Solver`."""
         size = program.C.shape
-        model = self._models.get(size)
-        if model is None:
-            model = self._models[size] = _Model(self._settings)
-        result = model.solve(program)
+        active = self._active.get(size)
+        if active is None:
+            active = self._active[size] = np.zeros(len(program.lower), dtype=np.int32)
+        result = _solve(program, active, self._settings)
         if result.status is not Status.SOLVED:
             # The guess may have been misleading, equalities contradictory by rounding only, or the
             # numbers too large for tolerances that are absolute.
-            del self._models[size]
+            active[:] = 0
             scale = _scale(program)
-            result = _Model(self._settings | _LOOSE).solve(_divided(program, scale))
+            result = _solve(_divided(program, scale), active, self._settings | _LOOSE)
             n = len(program.g)
             x = np.clip(scale * result.x, program.lower[:n], program.upper[:n])
             result = result._replace(x=x)
         return result
 
 
-class _Model:
-    """DAQP's workspace for programs of one size."""
-
-    def __init__(self, settings: dict[str, float]) -> None:
-        self._model = daqp.Model()
-        self._model.settings = settings
-        self._sense: NDArray[np.int32] | None = None
-
-    def solve(self, program: QuadraticProgram) -> SolverResult:
-        H, g, C, lower, upper, _ = program
-        if self._sense is None:
-            self._sense = np.zeros(len(lower), dtype=np.int32)
-            flag, _ = self._model.setup(H, g, C, upper, lower)
-        else:
-            # Stated each time: DAQP keeps limits once equal, and rows once zero, as they were.
-            flag = self._model.update(H, g, C, upper, lower, self._sense)
-        if flag >= 0:
-            x, _, flag, info = self._model.solve()
-        if flag < 0:
-            valid = flag in _INFEASIBLE and _is_valid(program)
-            status = Status.INFEASIBLE if valid else Status.FAILED
-            return SolverResult(status, np.empty(len(g)), 0)
-        kept = clip_and_check(x, C, lower, upper, VIOLATION, info["lam"], self._sense)
-        return SolverResult(Status.SOLVED if kept else Status.FAILED, x, info["iterations"])
+def _solve(
+    program: QuadraticProgram, active: NDArray[np.int32], settings: dict[str, float]
+) -> SolverResult:
+    """Solve from a guess of the active limits, which receives those of the solution."""
+    H, g, C, lower, upper, _ = program
+    x, _, flag, info = daqp.solve(H, g, C, upper, lower, active, **settings)
+    if flag < 0:
+        valid = flag in _INFEASIBLE and _is_valid(program)
+        status = Status.INFEASIBLE if valid else Status.FAILED
+    elif clip_and_check(x, C, lower, upper, VIOLATION, info["lam"], active):
+        status = Status.SOLVED
+    else:
+        status = Status.FAILED
+    return SolverResult(status, x, info["iterations"])
 
 
 def _scale(program: QuadraticProgram) -> float:

@@ -141,7 +141,7 @@ class InverseDynamicsQP:
             C[:n, n:] = -contacts.B
         if constraints is not None:
             C[n:, :n] = constraints.G
-        H, g = self._gamma * np.eye(n + r), np.zeros(n + r)
+        H, g = _diagonal(n + r, self._gamma).copy(), np.zeros(n + r)
         for A, b, weight in tasks:
             if A is None:
                 add_identity(H, g, b, weight * scale)
@@ -287,6 +287,11 @@ def _greatest_weight(tasks: Sequence[TaskTerm], wrench_tasks: Sequence[WrenchTer
     if not greatest > 0.0:
         raise NoSolutionFound("no task with a weight above 0")
     return greatest
+
+
+@lru_cache
+def _diagonal(size: int, value: float) -> Array:
+    return value * np.eye(size)
 
 
 @lru_cache(maxsize=256)

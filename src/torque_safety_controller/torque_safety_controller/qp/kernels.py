@@ -21,9 +21,20 @@ def add_least_squares(H: Array, g: Array, A: Array, b: Array, weight: float, fir
 
     z are as many of x as A has columns, from index `first` on.
     """
-    end = first + A.shape[1]
-    H[first:end, first:end] += weight * (A.T @ A)
-    g[first:end] -= weight * (A.T @ b)
+    m, n = A.shape
+    for i in range(n):
+        for j in range(i + 1):
+            s = 0.0
+            for k in range(m):
+                s += A[k, i] * A[k, j]
+            s *= weight
+            H[first + i, first + j] += s
+            if i != j:
+                H[first + j, first + i] += s
+        s = 0.0
+        for k in range(m):
+            s += A[k, i] * b[k]
+        g[first + i] -= weight * s
 
 
 @compiled
@@ -44,7 +55,7 @@ def clip_and_check(
     multipliers: Array,
     sense: NDArray[np.int32],
 ) -> bool:
-    """Clip x to its own limits, in place; return whether C x is finite and within its limits.
+    """Clip x to its own limits, in place; return whether it and C x are finite and in limits.
 
     Args:
         x: shape (p,).
@@ -57,6 +68,8 @@ def clip_and_check(
     """
     m, p = C.shape
     for i in range(p):
+        if not (math.isfinite(x[i]) and lower[i] <= upper[i]):
+            return False
         x[i] = min(max(x[i], lower[i]), upper[i])
     for i in range(m):
         value = 0.0
