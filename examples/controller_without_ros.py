@@ -12,10 +12,12 @@ import numpy as np
 import pinocchio as pin
 
 from torque_safety_controller.controller import Controller, Gains
+from torque_safety_controller.qp.constraints import AccelerationRange
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.acceleration_limits import estimate_acceleration_limits
 from viability_bounds_pkg.estimation.discretisation_margin import discretisation_margin
 from viability_bounds_pkg.joint_limits import JointLimits
+from viability_bounds_pkg.state import State
 from viability_bounds_pkg.torque_margin import tightened, torque_margins
 from viability_bounds_pkg.viability import BoundsSolver
 
@@ -39,12 +41,12 @@ def main() -> int:
     gains = Gains(100.0, 20.0, 1.0, 10.0, 6.0, 1e-3, True, 20.0)
     controller = Controller(RobotModel(model, "effector_body", DT), tau_max, gains)
     q, v, data = np.full(n, 0.3), np.zeros(n), model.createData()
-    controller.start(q)
+    controller.reset(q)
     controller.set_pose_goal(pin.SE3(np.eye(3), np.array([0.0, -3.0, 0.0])))
     position = speed = torque = -np.inf
     for _ in range(round(3.0 / DT)):
         bounds = solver.bounds(q, v)
-        tau = controller.step(q, v, bounds.lower, bounds.upper).tau
+        tau = controller.step(State(q, v), AccelerationRange(bounds.lower, bounds.upper)).tau
         for _ in range(SUBSTEPS):
             h = DT / SUBSTEPS
             a = pin.aba(model, data, q + 0.5 * h * v, v, tau)

@@ -18,19 +18,18 @@ from chain import ROOT
 from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.nodes import bullet_parameters
 from sim_bridge.nodes.ft_sensor import ForceTorqueReading
-from torque_safety_controller.controller import Step
+from torque_safety_controller.controller import ControlOutput
 from torque_safety_controller.node import assembly
 from torque_safety_controller.parameters.controller_parameters import (
     TABLE,
     ControllerConfiguration,
     make_configuration,
 )
+from torque_safety_controller.qp.constraints import AccelerationRange
 from viability_bounds_pkg.node import bounds_parameters
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 from viability_bounds_pkg.ros.parameters import Parameter, read_values
-
-FRICTION = {"friction_theta": "theta", "friction_gain": "gain"}
-"""Settings of the friction compensation that may be changed here, and that no parameter is for."""
+from viability_bounds_pkg.state import State
 
 
 class Sample(NamedTuple):
@@ -99,12 +98,7 @@ class DirectLoop:
     def _controller_configuration(self) -> ControllerConfiguration:
         """Return what the controller node would be made of."""
         values = self._values("controller_node", TABLE)
-        made = make_configuration(values)
-        chosen = {
-            field: self._changed[name] for name, field in FRICTION.items() if name in self._changed
-        }
-        friction = replace(made.additional.friction, **chosen)
-        return replace(made, additional=replace(made.additional, friction=friction))
+        return make_configuration(values)
 
     def change(self, **parameters: Any) -> None:
         """Change live parameters of the controller, as a running node would."""
@@ -125,7 +119,7 @@ class DirectLoop:
     def begin(self) -> None:
         """Make where the arm is its goal, and forget the past."""
         q = self.robot.state().q
-        self.controller.start(q)
+        self.controller.reset(q)
         self.controller.set_posture_goal(q)
         self.controller.set_pose_goal(self.pose())
 
@@ -151,13 +145,13 @@ class DirectLoop:
             self.step()
         return tuple(self.samples[first:])
 
-    def step(self) -> Step:
+    def step(self) -> ControlOutput:
         """Play one control step under torque control."""
         q, v, _ = self.robot.state()
         if self._sensor is not None and self.sensing:
             self.controller.interaction.sensor.receive(self._sensor.read())
         bounds = self._bounds(q, v)
-        step = self.controller.step(q, v, bounds.lower, bounds.upper)
+        step = self.controller.step(State(q, v), AccelerationRange(bounds.lower, bounds.upper))
         self._record(q, v, step.tau)
         self.robot.step(step.tau, self.config.substeps)
         return step
@@ -169,11 +163,13 @@ class DirectLoop:
         self.robot.move(q_des, np.zeros(q.size), config.tau_max, config.v_max, config.substeps)
         self._record(q, v, self.robot.state().motor_torque)
 
-    def take_over(self, q_des: np.ndarray) -> None:
+    def bumpless_transfer(self, q_des: np.ndarray) -> None:
         """Prepare torque control in a step that is still the drives'."""
         q, v, tau = self.robot.state()
         bounds = self._bounds(q, v)
-        self.controller.take_over(q, v, bounds.lower, bounds.upper, tau)
+        self.controller.bumpless_transfer(
+            State(q, v), AccelerationRange(bounds.lower, bounds.upper), tau
+        )
         self.move(q_des)
 
     def _record(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> None:
@@ -184,7 +180,7 @@ class DirectLoop:
                 v,
                 tau.copy(),
                 self.controller.additional.integral.copy(),
-                self.controller.goals.error.copy(),
+                self.controller.goals.error(self.controller.robot.pose),
             )
         )
         self.t += self.dt

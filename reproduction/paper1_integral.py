@@ -46,7 +46,7 @@ def figure_3() -> Figure:
         q[ELBOW] = loop.config.q_start[ELBOW] + 0.1 * min(1.0, k / 1000)
         loop.move(q)
     before = len(loop.samples)
-    loop.take_over(q)
+    loop.bumpless_transfer(q)
     loop.run(1.5)
     samples = tuple(loop.samples[before - 500 :])
     tau, additional = column(samples, "tau"), column(samples, "additional")

@@ -11,7 +11,9 @@ from ros_harness import CONFIG
 from sim_bridge.scenario.events import AddObstacle, PoseGoal
 from sim_bridge.scenario.scenario import load_scenario
 from torque_safety_controller.collision.geometry import load_geometry
+from torque_safety_controller.qp.constraints import AccelerationRange
 from viability_bounds_pkg.robot_description import read_urdf
+from viability_bounds_pkg.state import State
 
 MARGIN = 0.02  # m
 RESERVE = 0.002  # m; not to be used up by much
@@ -190,23 +192,24 @@ def test_every_way_to_solve_has_the_rows_and_none_has_a_nan():
     G, lower = rows_of(loop, q, v, wide)
     assert len(lower) > 0
     assert (G @ (-controller.gains.hold_kd * v) < lower).any(), "damping alone would do"
-    controller.start(q)
-    for solve in (controller.rest, controller.step):
-        step = solve(q, v, -wide, wide)
+    controller.reset(q)
+    for solve in (controller.brake, controller.step):
+        step = solve(State(q, v), AccelerationRange(-wide, wide))
         assert not step.failure
         assert (G @ step.a >= lower - 1e-6).all()
-    step = controller.take_over(q, v, -wide, wide, np.zeros(7))
+    step = controller.bumpless_transfer(State(q, v), AccelerationRange(-wide, wide), np.zeros(7))
     assert not step.failure
     assert (G @ step.a >= lower - 1e-6).all()
     infinite = np.full(7, np.inf)
-    assert (G @ controller.step(q, v, -infinite, infinite).a >= lower - 1e-6).all()
+    step = controller.step(State(q, v), AccelerationRange(-infinite, infinite))
+    assert (G @ step.a >= lower - 1e-6).all()
     for bad in (np.full(7, np.nan), np.r_[np.inf, np.zeros(6)]):
         for state in ((q, bad), (bad, v)):
-            step = controller.step(*state, -wide, wide)
+            step = controller.step(State(*state), AccelerationRange(-wide, wide))
             assert step.failure
             assert np.isfinite(step.tau).all()
             assert (np.abs(step.tau) <= controller.tau_max).all()
-    assert not controller.step(q, v, -wide, wide).failure
+    assert not controller.step(State(q, v), AccelerationRange(-wide, wide)).failure
 
 
 def test_distances_that_contradict_each_other_give_way_before_the_joints_bounds():
@@ -222,8 +225,8 @@ def test_distances_that_contradict_each_other_give_way_before_the_joints_bounds(
     relaxed = 0
     for _ in range(500):
         step = loop.step()
-        if step.row_relaxation is not None:
-            relaxed += step.row_relaxation.max() > 0.0
+        if step.constraint_relaxation is not None:
+            relaxed += step.constraint_relaxation.max() > 0.0
             assert step.relaxation.max() < 1e-3  # rad/s^2
     assert relaxed > 100
     assert_no_limit_broken(loop)

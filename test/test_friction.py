@@ -16,7 +16,7 @@ from sim_bridge.tools.record_excitation import record
 from torque_safety_controller.friction.compensation import GAIN
 from torque_safety_controller.friction.identification import friction_model, identify
 from torque_safety_controller.friction.joint_recording import Recording
-from torque_safety_controller.tasks.tasks import critical_damping
+from torque_safety_controller.tasks.gains import critical_damping
 from viability_bounds_pkg.cli.limits_file import read_robot
 from viability_bounds_pkg.ros.parameters import read_values
 

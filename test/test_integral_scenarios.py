@@ -17,6 +17,9 @@ from paper1_integral import (
     push,
 )
 
+from torque_safety_controller.qp.constraints import AccelerationRange
+from viability_bounds_pkg.state import State
+
 
 def error_at_rest(changed):
     loop = DirectLoop(ROBOT, changed)
@@ -56,7 +59,9 @@ def test_a_pause_of_the_robot_does_not_kick():
     q, v, _ = loop.robot.state()
     loop.robot.reset(q + 0.05, v + 0.2)
     bounds = loop.limits
-    step = loop.controller.step(q + 0.05, v + 0.2, bounds.a_min, bounds.a_max, elapsed=3.0)
+    step = loop.controller.step(
+        State(q + 0.05, v + 0.2), AccelerationRange(bounds.a_min, bounds.a_max), elapsed=3.0
+    )
     additional = loop.controller.additional.last
     assert np.isfinite(step.tau).all()
     jump = np.abs(additional - before.additional) / loop.config.tau_max
@@ -69,7 +74,7 @@ def test_the_handover_does_not_jolt():
     for k in range(1200):
         q[5] = loop.config.q_start[5] + 0.1 * min(1.0, k / 1000)
         loop.move(q)
-    loop.take_over(q)
+    loop.bumpless_transfer(q)
     loop.run(0.2)
     samples = tuple(loop.samples[1000:])
     jumps = np.abs(np.diff(column(samples, "tau"), axis=0)) / loop.config.tau_max

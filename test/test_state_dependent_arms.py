@@ -6,8 +6,10 @@ from arms import load_arm
 from ros_harness import read_config
 
 from torque_safety_controller.controller import Controller, Gains
+from torque_safety_controller.qp.constraints import AccelerationRange
 from viability_bounds_pkg.estimation.discretisation_margin import discretisation_margin
 from viability_bounds_pkg.joint_limits import JointLimits
+from viability_bounds_pkg.state import State
 from viability_bounds_pkg.state_dependent.limits import StateDependentBounds
 from viability_bounds_pkg.torque_margin import tightened, torque_margins
 from viability_bounds_pkg.viability import BoundsSolver
@@ -76,7 +78,7 @@ class Race:
         controller = Controller(arm.robot(DT), arm.tau_max, RACING)
         rng = np.random.default_rng(seed)
         q, v = arm.q_start.copy(), np.zeros(arm.n)
-        controller.start(q)
+        controller.reset(q)
         distances, broken, relaxed = [], np.zeros(2), 0
         for k in range(steps):
             if k % 300 == 0:
@@ -84,7 +86,7 @@ class Race:
                 goal = np.clip(goal, -2.0, 2.0)
                 controller.set_posture_goal(goal)
             bounds = solver.bounds(q, v)
-            step = controller.step(q, v, bounds.lower, bounds.upper)
+            step = controller.step(State(q, v), AccelerationRange(bounds.lower, bounds.upper))
             relaxed += step.relaxation is not None
             q, v = arm.move(q, v, step.tau, DT, 2)
             broken[0] = max(broken[0], (q - limits.q_max).max(), (limits.q_min - q).max())

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from torque_safety_controller.linalg.dense_kernels import middle_of_step
 from viability_bounds_pkg.robot_description import RobotDescriptionError
+from viability_bounds_pkg.state import State
+
+Array = NDArray[np.float64]
 
 
 class RobotModel:
@@ -29,6 +33,7 @@ class RobotModel:
 
     Attributes:
         q: position, shape (n,), rad.
+        v: velocity, shape (n,), rad/s.
         pose: placement of the end effector in the base frame.
         J: its Jacobian in its own axes, shape (6, n), linear rows first.
         drift: its acceleration at zero joint acceleration, J' v, shape (6,).
@@ -55,7 +60,8 @@ class RobotModel:
         self._frame_id = model.getFrameId(frame)
         self.data = model.createData()
         self._zero = np.zeros(self.n)
-        self.q = self._zero
+        self.q: Array = self._zero
+        self.v: Array = self._zero
         self.pose = pin.SE3.Identity()
         self.J = np.zeros((6, self.n))
         self.drift = np.zeros(6)
@@ -65,16 +71,15 @@ class RobotModel:
         self.J_dot = np.zeros((6, self.n))
         self.rates = False
 
-    def update(self, q: np.ndarray, v: np.ndarray, a_last: np.ndarray) -> None:
+    def update(self, state: State, a_last: Array) -> None:
         """Compute everything for one control step.
 
         Args:
-            q: position, shape (n,), rad.
-            v: velocity, shape (n,), rad/s.
+            state: of the n joints.
             a_last: acceleration commanded last, shape (n,), rad/s^2.
         """
         model, data = self.model, self.data
-        self.q = q
+        q, v = self.q, self.v = state
         q_mid, v_mid = middle_of_step(q, v, a_last, self.dt)
         self.M = pin.crba(model, data, q_mid)
         self.h = pin.nonLinearEffects(model, data, q_mid, v_mid)
@@ -95,7 +100,8 @@ class RobotModel:
             model, data, self._frame_id, pin.ReferenceFrame.LOCAL
         ).vector
 
-    def torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+    def torque(self, a: Array) -> Array:
         """Return the torque that, held for dt, gives mean acceleration `a`, shape (n,), N m."""
-        q_mid, v_mid = middle_of_step(q, v, a, self.dt)
-        return pin.rnea(self.model, self.data, q_mid, v_mid, a)
+        q_mid, v_mid = middle_of_step(self.q, self.v, a, self.dt)
+        tau: Array = pin.rnea(self.model, self.data, q_mid, v_mid, a)
+        return tau

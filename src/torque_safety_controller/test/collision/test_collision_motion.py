@@ -8,6 +8,7 @@ from torque_safety_controller.collision.avoidance import CollisionAvoidance, Col
 from torque_safety_controller.collision.obstacles import box, sphere
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.joint_limits import JointLimits
+from viability_bounds_pkg.state import State
 
 MARGIN = 0.02  # m
 TOLERANCE = 5e-4  # m; of the reserve of 2 mm, what may be used in these motions
@@ -57,7 +58,8 @@ def test_the_hand_driven_into_the_arm_or_the_table_stops_before_it(obstacles):
     robot = RobotModel(arm.model, arm.frame, dt)
 
     def move(q, v, a):
-        return arm.move(q, v, robot.torque(q, v, a), dt, 2)
+        robot.update(State(q, v), a)
+        return arm.move(q, v, robot.torque(a), dt, 2)
 
     _, trip = journey(dt, obstacles, move)
     goal = arm.q_start.copy()

@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import coal
 import numpy as np
 import pinocchio as pin
@@ -20,6 +22,7 @@ from torque_safety_controller.collision.obstacles import (
     half_space,
     sphere,
 )
+from torque_safety_controller.qp.constraints import AccelerationRange
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.viability import BoundsSolver
 
@@ -414,12 +417,17 @@ def test_constraints_for_the_qp_are_finite_whatever_it_is_given():
     q, v, wide = np.array([0.6, -0.4]), np.array([-0.5, 0.2]), np.full(2, 5000.0)
     rows = avoidance.rows(q, v, -wide, wide)
     G, lower = rows.G.copy(), rows.lower.copy()
-    scaled = avoidance.constraint(q, v, -wide, wide)
+
+    def constraint(q, v, bounds):
+        robot = SimpleNamespace(q=q, v=v)  # all that it looks at
+        return avoidance.constraint(robot, AccelerationRange(-bounds, bounds))
+
+    scaled = constraint(q, v, wide)
     np.testing.assert_allclose(scaled.G, ROW_SCALE * G)
     np.testing.assert_allclose(scaled.lower, ROW_SCALE * lower)
     assert np.isposinf(scaled.upper).all()
     for bad in (np.array([np.nan, 0.0]), np.array([0.0, np.inf])):
-        assert avoidance.constraint(bad, v, -wide, wide) is None
-        assert avoidance.constraint(q, bad, -wide, wide) is None
-    unbounded = avoidance.constraint(q, v, np.full(2, -np.inf), np.full(2, np.inf))
+        assert constraint(bad, v, wide) is None
+        assert constraint(q, bad, wide) is None
+    unbounded = constraint(q, v, np.full(2, np.inf))
     np.testing.assert_allclose(unbounded.lower, ROW_SCALE * lower)

@@ -12,9 +12,13 @@ from torque_safety_controller.contact.contacts import (
     Contacts,
     friction_pyramid,
 )
-from torque_safety_controller.qp.constraints import Rows, stack_rows
+from torque_safety_controller.qp.constraints import (
+    AccelerationRange,
+    LinearConstraints,
+    stack_constraints,
+)
 from torque_safety_controller.qp.inverse_dynamics_qp import InverseDynamicsQP
-from torque_safety_controller.tasks.tasks import TaskTerm
+from torque_safety_controller.qp.terms import TaskTerm
 
 SOLE = np.array([[0.05, 0.03, 0.1], [0.05, -0.03, 0.1], [-0.05, -0.03, 0.1], [-0.05, 0.03, 0.1]])
 HAND = "panda_hand_tcp"
@@ -233,18 +237,20 @@ def press(arm, F_des, tau_max, index=0, posture_weight=1e4, weight=10.0, rows=No
     """Hold still and let a contact exert a wrench; return the solution and the torque."""
     M, h = arm.dynamics()
     wide = np.full(7, 100.0)
-    solution = InverseDynamicsQP(7, 1e-9).solve(
+    forces = arm.contacts.forces([arm.contacts.wrench_task(index, F_des, weight)])
+    qp = InverseDynamicsQP(7, 1e-9)
+    program = qp.build(
         [TaskTerm(None, -20.0 * arm.v, posture_weight)],
-        -wide,
-        wide,
+        AccelerationRange(-wide, wide),
         M,
         -tau_max - h,
         tau_max - h,
         rows,
-        arm.contacts.forces([arm.contacts.wrench_task(index, F_des, weight)]),
+        forces,
     )
+    solution = qp.solve(program)
     assert (solution.rho >= 0.0).all()
-    tau = M @ solution.a + h - solution.contact_torque
+    tau = M @ solution.a + h - forces.B @ solution.rho
     assert (np.abs(tau) <= tau_max + 1e-6).all()
     # What is asked for is what happens, if the environment pushes back so.
     np.testing.assert_allclose(arm.accelerations(tau, solution.rho), solution.a, atol=1e-6)
@@ -337,23 +343,24 @@ def test_points_that_must_rest_do():
         A, v_c, drift = arm.contacts.acceleration(1, normal_only)
         rows = arm.contacts.rest_rows(1, 20.0, normal_only)
         qp = InverseDynamicsQP(7, 1e-9)
-        hard = qp.solve([wanted], -wide, wide, M, -wide - h, wide - h, rows)
+        bounds = AccelerationRange(-wide, wide)
+        hard = qp.solve(qp.build([wanted], bounds, M, -wide - h, wide - h, rows))
         assert hard.relaxation is None
         np.testing.assert_allclose(A @ hard.a + drift, -20.0 * v_c, atol=1e-6)
         task = arm.contacts.rest_task(1, 20.0, 1e4, normal_only)
-        soft = qp.solve([wanted, task], -wide, wide, M, -wide - h, wide - h)
+        soft = qp.solve(qp.build([wanted, task], bounds, M, -wide - h, wide - h))
         np.testing.assert_allclose(soft.a, hard.a, atol=0.02)
         assert np.abs(hard.a - wanted.b).max() > 0.1
 
 
 def test_rows_are_stacked_in_order():
-    one = Rows(np.ones((1, 2)), np.zeros(1), np.ones(1))
-    two = Rows(2.0 * np.ones((2, 2)), np.full(2, 2.0), np.full(2, 3.0))
-    none = Rows(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
-    assert stack_rows([]) is None
-    assert stack_rows([none, none]) is None
-    assert stack_rows([none, two]) is two
-    stacked = stack_rows([one, none, two])
+    one = LinearConstraints(np.ones((1, 2)), np.zeros(1), np.ones(1))
+    two = LinearConstraints(2.0 * np.ones((2, 2)), np.full(2, 2.0), np.full(2, 3.0))
+    none = LinearConstraints(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+    assert stack_constraints([]) is None
+    assert stack_constraints([none, none]) is None
+    assert stack_constraints([none, two]) is two
+    stacked = stack_constraints([one, none, two])
     np.testing.assert_array_equal(stacked.G, [[1, 1], [2, 2], [2, 2]])
     np.testing.assert_array_equal(stacked.lower, [0, 2, 2])
     np.testing.assert_array_equal(stacked.upper, [1, 3, 3])
@@ -383,16 +390,17 @@ def test_the_force_on_a_springy_table_becomes_the_one_that_is_asked_for():
         drift = pin.getFrameAcceleration(model, data, frame, pin.LOCAL).vector
         error = across @ pin.log6(pose.actInv(goal)).vector
         hand = TaskTerm(J, 900.0 * error - 50.0 * J @ v - drift, 1e4)
-        solution = qp.solve(
+        pressed = contacts.forces([contacts.wrench_task(0, F_des, 10.0)])
+        program = qp.build(
             [hand, TaskTerm(None, -5.0 * v, 10.0)],
-            -wide,
-            wide,
+            AccelerationRange(-wide, wide),
             M,
             -tau_max - h,
             tau_max - h,
-            contacts=contacts.forces([contacts.wrench_task(0, F_des, 10.0)]),
+            contacts=pressed,
         )
-        tau = M @ solution.a + h - solution.contact_torque
+        solution = qp.solve(program)
+        tau = M @ solution.a + h - pressed.B @ solution.rho
         speed = up @ (pose.rotation @ (J @ v)[:3])
         pushed = max(0.0, 2000.0 * (goal.translation[2] - pose.translation[2]) - 20.0 * speed)
         v = v + dt * np.linalg.solve(M, tau - h + J[:3].T @ pose.rotation.T @ (pushed * up))

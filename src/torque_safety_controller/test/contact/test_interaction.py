@@ -9,7 +9,7 @@ from arms import load_arm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torque_safety_controller.contact.admittance import AdmittanceGains, admittance_task
+from torque_safety_controller.contact.admittance import AdmittanceGains, AdmittanceTask
 from torque_safety_controller.contact.contacts import Contact, Contacts
 from torque_safety_controller.contact.dual_compliance import DualCompliance, DualSettings
 from torque_safety_controller.contact.interaction import (
@@ -19,7 +19,9 @@ from torque_safety_controller.contact.interaction import (
 )
 from torque_safety_controller.contact.wrench_sensor import SensorSettings, WrenchSensor
 from torque_safety_controller.controller import Controller
+from torque_safety_controller.qp.constraints import AccelerationRange
 from torque_safety_controller.tasks.gains import Gains
+from viability_bounds_pkg.state import State
 
 GAINS = Gains(
     pose_kp=10.0,
@@ -59,15 +61,15 @@ class Hand:
         )
         self.controller = Controller(ARM.robot(DT), tau_max, gains, interaction=self.interaction)
         self.controller.warm_up()
-        self.controller.start(Q)
+        self.controller.reset(Q)
         self.pose = ARM.robot(0.0)
-        self.pose.update(Q, REST, REST)
+        self.pose.update(State(Q, REST), REST)
         self.controller.set_pose_goal(self.pose.pose.copy())
 
     def step(self, wrench=None, q=Q, v=REST, bounds=WIDE):
         if wrench is not None:
             self.interaction.sensor.receive(wrench)
-        return self.controller.step(q, v, -bounds, bounds)
+        return self.controller.step(State(q, v), AccelerationRange(-bounds, bounds))
 
     @property
     def state(self) -> Compliance:
@@ -90,18 +92,18 @@ def test_the_task_asks_for_what_equation_27_says(seed):
     rng = np.random.default_rng(seed)
     robot = ARM.robot(0.0)
     q, v = ARM.random_state(rng)
-    robot.update(q, v, REST)
+    robot.update(State(q, v), REST)
     F_ref, F, F_ref_rate, F_rate = rng.normal(size=(4, 6)) * 10.0
     gains = AdmittanceGains(*rng.uniform(0.0, 1.0, size=4))
     Kp = np.diag([gains.force_kp] * 3 + [gains.moment_kp] * 3)
     Kv = np.diag([gains.force_kd] * 3 + [gains.moment_kd] * 3)
     expected = -Kp @ (F_ref - F) - Kv @ (F_ref_rate - F_rate)
     g = gains.acceleration(F_ref - F, F_ref_rate - F_rate, 50.0)
-    task = admittance_task(robot.J, robot.drift, g, 2.0)
+    task = AdmittanceTask(g, 2.0).term(robot)
     a = np.linalg.lstsq(task.A, task.b, rcond=None)[0]
     np.testing.assert_allclose(robot.J @ a + robot.drift, expected, atol=1e-6)
     some = np.array([1, 2, 5])
-    part = admittance_task(robot.J, robot.drift, g, 2.0, some)
+    part = AdmittanceTask(g, 2.0, some).term(robot)
     np.testing.assert_array_equal(part.A, task.A[some])
     np.testing.assert_array_equal(part.b, task.b[some])
 
@@ -166,8 +168,8 @@ def test_the_motors_give_what_the_contact_takes():
     free = hand.step(force())
     hand.interaction.set_target(-force(z=-10.0))
     exact = ARM.robot(DT)
-    exact.update(Q, REST, REST)
-    np.testing.assert_allclose(free.tau, exact.torque(Q, REST, free.a), atol=1e-9)
+    exact.update(State(Q, REST), REST)
+    np.testing.assert_allclose(free.tau, exact.torque(free.a), atol=1e-9)
     for _ in range(2000):
         pressing = hand.step(force(z=-10.0))
     assert hand.interaction.contacts.closed[0]
@@ -321,7 +323,7 @@ def test_starting_anew_presses_nothing():
     hand = Hand(directions=Z)
     hand.interaction.set_target(force(z=10.0))
     hand.step(force())
-    hand.controller.start(Q)
+    hand.controller.reset(Q)
     hand.step(force())
     assert hand.state is Compliance.OFF
 
@@ -336,7 +338,7 @@ def test_other_contacts_are_closed_by_name_only_and_carry_no_more_than_they_must
     )
     interaction = Interaction(None, contacts, None, None, InteractionSettings(closed=(1,)))
     robot = ARM.robot(DT)
-    robot.update(Q, REST, REST)
+    robot.update(State(Q, REST), REST)
     forces = interaction.forces(robot)
     assert contacts.closed.tolist() == [False, True]
     assert [task.F_des.tolist() for task in forces.tasks] == [[0.0, 0.0, 0.0]]

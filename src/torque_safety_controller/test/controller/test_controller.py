@@ -16,7 +16,9 @@ from torque_safety_controller.additional_torque import (
 )
 from torque_safety_controller.controller import Controller, Gains
 from torque_safety_controller.integral_feedback import IntegralSettings
-from torque_safety_controller.tasks.tasks import pose_error
+from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.tasks.pose_task import pose_error
+from viability_bounds_pkg.state import State
 
 GAINS = Gains(
     pose_kp=10.0,
@@ -48,13 +50,13 @@ def strong(arm, **arguments) -> Controller:
     return make(arm, tau_max=np.full(arm.n, 1e4), **arguments)
 
 
-def wide(arm):
-    return np.full(arm.n, -WIDE), np.full(arm.n, WIDE)
+def wide(arm) -> AccelerationRange:
+    return AccelerationRange(np.full(arm.n, -WIDE), np.full(arm.n, WIDE))
 
 
 def pose_at(arm, q) -> pin.SE3:
     robot = arm.robot(0.0)
-    robot.update(q, np.zeros(arm.n), np.zeros(arm.n))
+    robot.update(State(q, np.zeros(arm.n)), np.zeros(arm.n))
     return robot.pose.copy()
 
 
@@ -114,7 +116,7 @@ VECTORS = arrays(float, 7, elements=NUMBERS)
     width=VECTORS,
     additional=st.one_of(st.none(), VECTORS),
     goals=st.sampled_from(["none", "pose", "posture", "both"]),
-    after=st.sampled_from(["step", "rest", "hold"]),
+    after=st.sampled_from(["step", "brake", "hold"]),
 )
 def test_torques_are_finite_and_within_their_limits_whatever_comes(
     q, v, a, width, additional, goals, after
@@ -126,22 +128,22 @@ def test_torques_are_finite_and_within_their_limits_whatever_comes(
         controller.set_pose_goal(pose_at(arm, arm.q_start + 0.2))
     if goals in ("posture", "both"):
         controller.set_posture_goal(arm.q_start - 0.2)
-    controller.start(arm.q_start)
+    controller.reset(arm.q_start)
     with np.errstate(all="ignore"):
         upper = a + np.abs(width)
-        assert_may_be_sent(controller.step(q, v, a, upper), arm)
+        assert_may_be_sent(controller.step(State(q, v), AccelerationRange(a, upper)), arm)
         # The same afterwards, when the state is sane and only the past is not.
         bounds = wide(arm)
-        state = arm.q_start, np.zeros(arm.n)
+        state = State(arm.q_start, np.zeros(arm.n))
         step = {
-            "step": lambda: controller.step(*state, *bounds),
-            "rest": lambda: controller.rest(*state, *bounds),
-            "hold": lambda: controller.hold(*state),
+            "step": lambda: controller.step(state, bounds),
+            "brake": lambda: controller.brake(state, bounds),
+            "hold": lambda: controller.hold(state),
         }[after]()
         assert_may_be_sent(step, arm)
         if additional is None:
             # The acceleration of the last step may still be beyond sense, but not for long.
-            assert not controller.step(*state, *bounds).failure
+            assert not controller.step(state, bounds).failure
 
 
 def test_random_states_outside_all_limits(arm):
@@ -153,7 +155,9 @@ def test_random_states_outside_all_limits(arm):
         q = rng.uniform(1.5 * arm.q_min, 1.5 * arm.q_max)
         v = rng.uniform(-4.0, 4.0, arm.n) * arm.v_max
         lower = rng.uniform(-30.0, 30.0, arm.n)
-        step = controller.step(q, v, lower, lower + rng.uniform(0.0, 10.0, arm.n))
+        step = controller.step(
+            State(q, v), AccelerationRange(lower, lower + rng.uniform(0.0, 10.0, arm.n))
+        )
         assert_may_be_sent(step, arm)
         assert not step.failure
         saturated += (np.abs(step.tau) > 0.999 * arm.tau_max).any()
@@ -165,13 +169,13 @@ def test_random_states_outside_all_limits(arm):
 def test_a_state_that_is_not_finite_is_survived(arm):
     controller = make(arm)
     controller.set_pose_goal(pose_at(arm, arm.q_start))
-    rest = arm.q_start, np.zeros(arm.n), *wide(arm)
+    rest = State(arm.q_start, np.zeros(arm.n)), wide(arm)
     before = controller.step(*rest)
     for bad in (math.nan, math.inf, 1e200):
         q, v = arm.q_start.copy(), np.zeros(arm.n)
         v[2] = bad
         with np.errstate(all="ignore"):
-            step = controller.step(q, v, *wide(arm))
+            step = controller.step(State(q, v), wide(arm))
         assert_may_be_sent(step, arm)
         assert not step.tracking
         assert step.failure
@@ -184,10 +188,10 @@ def test_an_additional_torque_that_is_not_finite_leaves_the_arm_held(arm):
     controller = make(arm, additional=Fixed(np.full(arm.n, math.nan)))
     controller.set_pose_goal(pose_at(arm, arm.q_start))
     q, v = arm.q_start, np.zeros(arm.n)
-    for step in (controller.step(q, v, *wide(arm)), controller.hold(q, v)):
+    for step in (controller.step(State(q, v), wide(arm)), controller.hold(State(q, v))):
         assert not step.tracking
         np.testing.assert_allclose(step.tau, gravity(arm, q), atol=EXACT)
-    assert controller.step(q, v, *wide(arm)).failure
+    assert controller.step(State(q, v), wide(arm)).failure
 
 
 def test_the_torque_limits_hold_with_the_additional_torque_in_them(arm):
@@ -198,11 +202,11 @@ def test_the_torque_limits_hold_with_the_additional_torque_in_them(arm):
     exact = limited = 0
     for _ in range(60):
         q, v = arm.random_state(rng)
-        controller.start(q)
-        step = controller.step(q, 0.1 * v, *wide(arm))
+        controller.reset(q)
+        step = controller.step(State(q, 0.1 * v), wide(arm))
         assert_may_be_sent(step, arm)
         # It is in there once: what is left is the torque of the model.
-        rest = step.tau - push - controller.robot.torque(q, 0.1 * v, step.a)
+        rest = step.tau - push - controller.robot.torque(step.a)
         exact += np.abs(rest).max() < EXACT
         limited += (step.tau > 0.999 * arm.tau_max).any()
     assert exact > 10
@@ -223,9 +227,11 @@ def test_the_rate_of_torque_is_limited_whatever_comes(arm):
         lower = rng.uniform(-30.0, 20.0, arm.n)
         with np.errstate(all="ignore"):
             step = (
-                controller.hold(q, v)
+                controller.hold(State(q, v))
                 if k % 5 == 0
-                else controller.step(q, v, lower, lower + rng.uniform(0.0, 10.0, arm.n))
+                else controller.step(
+                    State(q, v), AccelerationRange(lower, lower + rng.uniform(0.0, 10.0, arm.n))
+                )
             )
         assert_may_be_sent(step, arm)
         if last is not None:
@@ -235,10 +241,10 @@ def test_the_rate_of_torque_is_limited_whatever_comes(arm):
         last = step.tau
     assert reached[np.isfinite(rate)].all(), "the limit is not felt"
     # A robot that was away begins anew.
-    controller.start(arm.q_start)
+    controller.reset(arm.q_start)
     q, v = arm.random_state(rng)
-    free = make(arm).hold(q, v).tau
-    np.testing.assert_allclose(controller.hold(q, v).tau, free, atol=EXACT)
+    free = make(arm).hold(State(q, v)).tau
+    np.testing.assert_allclose(controller.hold(State(q, v)).tau, free, atol=EXACT)
 
 
 # What it does when it can
@@ -251,7 +257,9 @@ def test_accelerations_stay_inside_their_bounds(arm):
     at_bound = 0
     for _ in range(50):
         lower, upper = -rng.uniform(0.1, 1.0, arm.n), rng.uniform(0.1, 1.0, arm.n)
-        step = controller.step(arm.q_start, np.zeros(arm.n), lower, upper)
+        step = controller.step(
+            State(arm.q_start, np.zeros(arm.n)), AccelerationRange(lower, upper)
+        )
         assert step.relaxation is None
         assert (step.a >= lower - SOLVED).all()
         assert (step.a <= upper + SOLVED).all()
@@ -265,8 +273,8 @@ def test_the_torque_gives_the_acceleration_asked_for(arm):
     controller.set_pose_goal(pose_at(arm, arm.q_start + 0.1))
     for _ in range(10):
         q, v = arm.random_state(rng)
-        controller.start(q)
-        step = controller.step(q, v, *wide(arm))
+        controller.reset(q)
+        step = controller.step(State(q, v), wide(arm))
         _, v_end = arm.move(q, v, step.tau, arm.dt, steps=8)
         asked = step.a * arm.dt
         np.testing.assert_allclose(v_end - v, asked, atol=0.02 * np.abs(asked).max() + 1e-4)
@@ -276,22 +284,24 @@ def test_bounds_that_the_motors_cannot_keep_are_relaxed_and_reported(arm):
     controller = make(arm)
     controller.set_posture_goal(arm.q_start)
     lower = np.full(arm.n, 300.0)
-    step = controller.step(arm.q_start, np.zeros(arm.n), lower, lower + 1.0)
+    step = controller.step(
+        State(arm.q_start, np.zeros(arm.n)), AccelerationRange(lower, lower + 1.0)
+    )
     assert_may_be_sent(step, arm)
     assert step.tracking
     assert (step.relaxation > 0.0).any()
     outside = np.maximum(np.maximum(lower - step.a, step.a - lower - 1.0), 0.0)
     np.testing.assert_allclose(step.relaxation, outside, atol=SOLVED)
-    free = controller.step(arm.q_start, np.zeros(arm.n), *wide(arm))
+    free = controller.step(State(arm.q_start, np.zeros(arm.n)), wide(arm))
     assert free.relaxation is None
 
 
 def test_without_a_goal_it_rests(arm):
     controller = strong(arm)
-    controller.start(arm.q_start)
+    controller.reset(arm.q_start)
     assert not controller.goals.any
     v = 0.1 * arm.v_max
-    step = controller.step(arm.q_start, v, *wide(arm))
+    step = controller.step(State(arm.q_start, v), wide(arm))
     assert not step.tracking
     assert not step.failure
     np.testing.assert_allclose(step.a, -GAINS.hold_kd * v, rtol=1e-4, atol=SOLVED)
@@ -300,12 +310,12 @@ def test_without_a_goal_it_rests(arm):
 @pytest.mark.parametrize("goal", ["pose", "posture"])
 def test_with_a_goal_it_tracks(arm, goal):
     controller = strong(arm)
-    controller.start(arm.q_start)
+    controller.reset(arm.q_start)
     if goal == "pose":
         controller.set_pose_goal(pose_at(arm, arm.q_start + 0.1))
     else:
         controller.set_posture_goal(arm.q_start + 0.1)
-    step = controller.step(arm.q_start, np.zeros(arm.n), *wide(arm))
+    step = controller.step(State(arm.q_start, np.zeros(arm.n)), wide(arm))
     assert step.tracking
     assert not step.failure
     assert np.abs(step.a).max() > 0.1
@@ -319,12 +329,15 @@ def simulate(arm, controller, q, v, seconds, act):
         q, v = arm.move(q, v, step.tau, arm.dt, steps=2)
 
 
-@pytest.mark.parametrize("way", ["hold", "rest"])
-def test_hold_and_rest_damp_and_carry_the_arm(arm, way):
+@pytest.mark.parametrize("way", ["hold", "brake"])
+def test_hold_and_brake_damp_and_carry_the_arm(arm, way):
     controller = make(arm)
     q, v = arm.q_start, 0.3 * arm.v_max * np.array([1, -1, 1, -1, 1, -1, 1])
-    bounds = np.full(arm.n, -8.0), np.full(arm.n, 8.0)
-    act = controller.hold if way == "hold" else lambda q, v: controller.rest(q, v, *bounds)
+    bounds = AccelerationRange(np.full(arm.n, -8.0), np.full(arm.n, 8.0))
+    act = {
+        "hold": lambda q, v: controller.hold(State(q, v)),
+        "brake": lambda q, v: controller.brake(State(q, v), bounds),
+    }[way]
     speeds = []
     for q_now, v_now, step in simulate(arm, controller, q, v, 1.0, act):
         assert_may_be_sent(step, arm)
@@ -340,7 +353,7 @@ def test_hold_and_rest_damp_and_carry_the_arm(arm, way):
 def test_a_pose_goal_is_reached(arm):
     controller = make(arm)
     goal = pose_at(arm, arm.q_start + np.array([0.2, -0.1, 0.2, 0.1, -0.2, 0.1, 0.1]))
-    controller.start(arm.q_start)
+    controller.reset(arm.q_start)
     controller.set_pose_goal(goal)
     bounds = np.full(arm.n, -3.0), np.full(arm.n, 3.0)
     first = last = None
@@ -350,13 +363,13 @@ def test_a_pose_goal_is_reached(arm):
         arm.q_start,
         np.zeros(arm.n),
         6.0,
-        lambda q, v: controller.step(q, v, *bounds),
+        lambda q, v: controller.step(State(q, v), AccelerationRange(*bounds)),
     ):
         last = pose_error(pose_at(arm, q), goal)
         first = last if first is None else first
     assert np.linalg.norm(first) > 0.05
     assert np.linalg.norm(last) < 1e-4  # m, rad
-    np.testing.assert_allclose(controller.goals.error, last, atol=1e-12)
+    np.testing.assert_allclose(controller.goals.error(controller.robot.pose), last, atol=1e-12)
 
 
 # Each gain reaches the output
@@ -379,18 +392,18 @@ def test_each_gain_of_the_tasks_reaches_the_torque(arm, gain, value):
 
     def tau(gains):
         controller = make(arm, gains=gains)
-        controller.start(arm.q_start + 0.1)
+        controller.reset(arm.q_start + 0.1)
         controller.set_pose_goal(pose_at(arm, arm.q_start + 0.05))
-        return controller.step(arm.q_start, 0.02 * arm.v_max, *wide(arm)).tau
+        return controller.step(State(arm.q_start, 0.02 * arm.v_max), wide(arm)).tau
 
     changed = replace(GAINS, **{gain: value})
     assert np.abs(tau(changed) - tau(GAINS)).max() > 1e-3
     # Also when it changes while the controller runs.
     controller = make(arm)
-    controller.start(arm.q_start + 0.1)
+    controller.reset(arm.q_start + 0.1)
     controller.set_pose_goal(pose_at(arm, arm.q_start + 0.05))
     controller.gains = changed
-    step = controller.step(arm.q_start, 0.02 * arm.v_max, *wide(arm))
+    step = controller.step(State(arm.q_start, 0.02 * arm.v_max), wide(arm))
     np.testing.assert_allclose(step.tau, tau(changed), atol=1e-6)
 
 
@@ -400,28 +413,28 @@ def test_the_damping_in_hold_reaches_the_acceleration(arm, way):
     for kd in (5.0, 40.0):
         controller = strong(arm, gains=replace(GAINS, hold_kd=kd))
         step = (
-            controller.hold(arm.q_start, v)
+            controller.hold(State(arm.q_start, v))
             if way == "hold"
-            else controller.rest(arm.q_start, v, *wide(arm))
+            else controller.brake(State(arm.q_start, v), wide(arm))
         )
         np.testing.assert_allclose(step.a, -kd * v, rtol=1e-4, atol=SOLVED)
 
 
 def test_a_pose_without_weight_is_left_out(arm):
     controller = strong(arm, gains=replace(GAINS, pose_weight=0.0))
-    controller.start(arm.q_start + 0.1)
+    controller.reset(arm.q_start + 0.1)
     controller.set_pose_goal(pose_at(arm, arm.q_start + 0.3))
-    step = controller.step(arm.q_start, np.zeros(arm.n), *wide(arm))
+    step = controller.step(State(arm.q_start, np.zeros(arm.n)), wide(arm))
     np.testing.assert_allclose(step.a, GAINS.posture_kp * 0.1, atol=1e-3)
 
 
 def test_the_posture_is_where_it_started_until_one_is_asked_for(arm):
     controller = strong(arm, gains=replace(GAINS, pose_weight=0.0))
     controller.set_pose_goal(pose_at(arm, arm.q_start))
-    at_rest = arm.q_start, np.zeros(arm.n), *wide(arm)
-    controller.start(arm.q_start + 0.1)
+    at_rest = State(arm.q_start, np.zeros(arm.n)), wide(arm)
+    controller.reset(arm.q_start + 0.1)
     np.testing.assert_allclose(controller.step(*at_rest).a, GAINS.posture_kp * 0.1, atol=1e-3)
-    controller.start(arm.q_start - 0.1)
+    controller.reset(arm.q_start - 0.1)
     np.testing.assert_allclose(controller.step(*at_rest).a, -GAINS.posture_kp * 0.1, atol=1e-3)
     controller.set_posture_goal(arm.q_start + 0.05)
     np.testing.assert_allclose(controller.step(*at_rest).a, GAINS.posture_kp * 0.05, atol=1e-3)
@@ -431,9 +444,9 @@ def test_start_keeps_a_copy_of_the_state(arm):
     controller = strong(arm, gains=replace(GAINS, pose_weight=0.0))
     controller.set_pose_goal(pose_at(arm, arm.q_start))
     q = arm.q_start.copy()
-    controller.start(q)
+    controller.reset(q)
     q += 1.0  # a reader may use its array again
-    step = controller.step(arm.q_start, np.zeros(arm.n), *wide(arm))
+    step = controller.step(State(arm.q_start, np.zeros(arm.n)), wide(arm))
     np.testing.assert_allclose(step.a, 0.0, atol=1e-3)
 
 
@@ -442,7 +455,7 @@ def test_start_keeps_a_copy_of_the_state(arm):
 
 DEEDS = st.lists(
     st.tuples(
-        st.sampled_from(["step", "rest", "hold", "take_over", "start"]),
+        st.sampled_from(["step", "brake", "hold", "bumpless_transfer", "reset"]),
         st.sampled_from([None, *MODES]),
         st.one_of(st.none(), NUMBERS),
         st.one_of(st.just(np.zeros(7)), VECTORS),
@@ -471,19 +484,19 @@ def test_torque_limits_hold_whatever_the_integral_does(mode, share, rate, deeds)
             if other is not None:
                 controller.additional.settings = integral(arm, other, budget=budget)
             q = arm.q_start + dq
-            bounds = -np.abs(x), np.abs(x)
-            if deed == "start":
-                controller.start(q)
+            bounds = AccelerationRange(-np.abs(x), np.abs(x))
+            if deed == "reset":
+                controller.reset(q)
                 continue
             act = getattr(controller, deed)
-            last = {"hold": (elapsed,), "take_over": (*bounds, x)}
-            step = act(q, v, *last.get(deed, (*bounds, elapsed)))
+            last = {"hold": (elapsed,), "bumpless_transfer": (bounds, x)}
+            step = act(State(q, v), *last.get(deed, (bounds, elapsed)))
             assert_may_be_sent(step, arm)
             assert np.isfinite(controller.additional.last).all()
         # Once the world makes sense again, so does the controller.
         controller.goals.pose_des = None
         controller.set_posture_goal(arm.q_start)
-        rest = arm.q_start, np.zeros(arm.n), *wide(arm)
+        rest = State(arm.q_start, np.zeros(arm.n)), wide(arm)
         for _ in range(3):
             assert_may_be_sent(controller.step(*rest), arm)
         assert not controller.step(*rest).failure
@@ -504,11 +517,11 @@ def test_the_integral_carries_what_the_model_does_not_know():
     for mode in ("none", "joints", "task"):
         controller = with_integral(arm, mode, STIFF)
         goal = pose_at(arm, arm.q_start)
-        controller.start(arm.q_start)
+        controller.reset(arm.q_start)
         controller.set_pose_goal(goal)
         q, v = arm.q_start, np.zeros(arm.n)
         for _ in range(round(0.6 / KHZ)):
-            q, v = pushed(arm, q, v, controller.step(q, v, *wide(arm)).tau, push)
+            q, v = pushed(arm, q, v, controller.step(State(q, v), wide(arm)).tau, push)
         errors[mode] = np.linalg.norm(pose_error(pose_at(arm, q), goal)[:3])
     assert errors["joints"] < 0.1 * errors["none"]
     assert errors["task"] < 0.1 * errors["none"]
@@ -516,21 +529,21 @@ def test_the_integral_carries_what_the_model_does_not_know():
 
 def test_the_limits_on_torque_leave_the_integral_its_share(arm):
     """The QP keeps the sum within its limits: the accelerations it returns are those it gives."""
-    state = arm.q_start, np.zeros(arm.n)
+    state = State(arm.q_start, np.zeros(arm.n))
     saturated = 0
     for sign in (1.0, -1.0):
         controller = with_integral(arm, gains=replace(GAINS, posture_kp=1e4))
-        controller.take_over(*state, *wide(arm), sign * 0.5 * arm.tau_max)
+        controller.bumpless_transfer(state, wide(arm), sign * 0.5 * arm.tau_max)
         controller.goals.pose_des = None
         controller.set_posture_goal(arm.q_max)
         for _ in range(5):
-            step = controller.step(*state, *wide(arm))
+            step = controller.step(state, wide(arm))
             assert_may_be_sent(step, arm)
             assert not step.failure
             added = controller.additional.last
             assert (np.abs(added) > 0.01 * arm.tau_max).any()
             # The limits are those in the middle of a step with the acceleration of the last one.
-            model = controller.robot.torque(*state, step.a)
+            model = controller.robot.torque(step.a)
             np.testing.assert_allclose(step.tau, model + added, atol=0.01 * arm.tau_max.max())
             saturated += (np.abs(step.tau) > 0.99 * arm.tau_max).any()
     assert saturated == 10
@@ -540,12 +553,12 @@ def test_in_hold_nothing_grows_on_what_the_motors_cannot_give(arm):
     controller = with_integral(arm, gains=replace(GAINS, hold_kd=100.0))
     robot = controller.robot
     q, v = arm.q_start, np.zeros(arm.n)
-    robot.update(q, v, v)
+    robot.update(State(q, v), v)
     # So fast that to brake as it should takes 1.8 times what the first motor has.
     v[0] = 1.8 * arm.tau_max[0] / (100.0 * robot.M[0, 0])
     saturated = 0
     for _ in range(8):
-        step = controller.hold(q, v, KHZ)
+        step = controller.hold(State(q, v), KHZ)
         saturated += abs(step.tau[0]) == arm.tau_max[0]
         q, v = arm.move(q, v, step.tau, KHZ, steps=2)
     assert saturated > 4
@@ -564,12 +577,12 @@ def test_it_takes_over_the_torque_of_others(arm, mode):
         controller = with_integral(arm, mode)
         tau = gravity(arm, arm.q_start) + rng.uniform(-0.15, 0.15, arm.n) * arm.tau_max
         tau = np.clip(tau, -arm.tau_max, arm.tau_max)
-        state = arm.q_start, np.zeros(arm.n)
+        state = State(arm.q_start, np.zeros(arm.n))
         controller.set_pose_goal(pose_at(arm, arm.q_start + 0.5))  # forgotten
-        step = controller.take_over(*state, *wide(arm), tau)
+        step = controller.bumpless_transfer(state, wide(arm), tau)
         assert not step.failure
         # The next step is at the same place, where friction holds the arm.
-        after = controller.step(*state, *wide(arm))
+        after = controller.step(state, wide(arm))
         assert (np.abs(after.tau - tau) < 0.01 * arm.tau_max).all()
         np.testing.assert_allclose(after.a, 0.0, atol=5e-3)
         assert controller.goals.pose_des.isApprox(pose_at(arm, arm.q_start))
@@ -578,9 +591,9 @@ def test_it_takes_over_the_torque_of_others(arm, mode):
 
 def test_torque_beyond_the_limits_is_taken_over_up_to_them(arm):
     controller = with_integral(arm)
-    state = arm.q_start, np.zeros(arm.n)
-    controller.take_over(*state, *wide(arm), 1.5 * arm.tau_max)
-    step = controller.step(*state, *wide(arm))
+    state = State(arm.q_start, np.zeros(arm.n))
+    controller.bumpless_transfer(state, wide(arm), 1.5 * arm.tau_max)
+    step = controller.step(state, wide(arm))
     assert_may_be_sent(step, arm)
     assert (step.tau > 0.97 * arm.tau_max).all()
 
@@ -588,10 +601,10 @@ def test_torque_beyond_the_limits_is_taken_over_up_to_them(arm):
 def test_the_rate_of_torque_counts_from_what_was_measured(arm):
     rate = np.full(arm.n, 1.0)
     controller = with_integral(arm, "none", rate=rate)
-    state = arm.q_start, np.zeros(arm.n)
+    state = State(arm.q_start, np.zeros(arm.n))
     tau = gravity(arm, arm.q_start) + 0.2 * arm.tau_max
-    controller.take_over(*state, *wide(arm), tau)
-    assert (np.abs(controller.step(*state, *wide(arm)).tau - tau) <= rate * KHZ + EXACT).all()
+    controller.bumpless_transfer(state, wide(arm), tau)
+    assert (np.abs(controller.step(state, wide(arm)).tau - tau) <= rate * KHZ + EXACT).all()
 
 
 @pytest.mark.parametrize("bad", ["bounds", "torque", "position"])
@@ -603,11 +616,11 @@ def test_a_handover_that_fails_leaves_everything_as_it_was(arm, bad):
     q = nan if bad == "position" else arm.q_start
     bounds = (nan, nan) if bad == "bounds" else wide(arm)
     tau = nan if bad == "torque" else 0.5 * arm.tau_max
-    step = controller.take_over(q, np.zeros(arm.n), *bounds, tau)
+    step = controller.bumpless_transfer(State(q, np.zeros(arm.n)), AccelerationRange(*bounds), tau)
     assert step.failure
     assert not controller.additional.last.any()
     assert controller.goals.pose_des is goal
     assert controller.goals.q_des is None
-    step = controller.hold(arm.q_start, np.zeros(arm.n))
+    step = controller.hold(State(arm.q_start, np.zeros(arm.n)))
     np.testing.assert_allclose(step.tau, gravity(arm, arm.q_start), atol=EXACT)
-    assert not controller.step(arm.q_start, np.zeros(arm.n), *wide(arm)).failure
+    assert not controller.step(State(arm.q_start, np.zeros(arm.n)), wide(arm)).failure

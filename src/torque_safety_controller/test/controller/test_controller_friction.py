@@ -24,9 +24,11 @@ from torque_safety_controller.parameters.friction_parameters import (
     FRICTION_TABLE,
     friction_settings,
 )
+from torque_safety_controller.qp.constraints import AccelerationRange
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.ros.parameters import read_values
 from viability_bounds_pkg.ros.robot_parameters import ROBOT_TABLE
+from viability_bounds_pkg.state import State
 
 NODE = "controller_node"
 MS = 1_000_000
@@ -51,7 +53,7 @@ def additional(mode="none", friction=ON, budget=0.05) -> AdditionalTorque:
 
 def controller(**others) -> Controller:
     made = Controller(ARM.robot(DT), ARM.tau_max, GAINS, None, additional(**others))
-    made.start(ARM.q_start)
+    made.reset(ARM.q_start)
     made.set_posture_goal(ARM.q_start)
     return made
 
@@ -59,7 +61,7 @@ def controller(**others) -> Controller:
 def steps(made, count, q=ARM.q_start, v=V):
     """Return the last of some steps at one state."""
     for _ in range(count):
-        step = made.step(q, v, -WIDE, WIDE)
+        step = made.step(State(q, v), AccelerationRange(-WIDE, WIDE))
     return step
 
 
@@ -96,10 +98,10 @@ def test_the_qp_keeps_the_sum_within_the_torque_limits(share):
     for _ in range(400):
         q = ARM.q_start + 0.3 * rng.standard_normal(N)
         v = 0.2 * rng.standard_normal(N)
-        step = made.step(q, v, -WIDE, WIDE)
+        step = made.step(State(q, v), AccelerationRange(-WIDE, WIDE))
         assert (np.abs(step.tau) <= ARM.tau_max).all()
         assert not step.failure
-        wanted = made.robot.torque(q, v, step.a) + made.additional.last
+        wanted = made.robot.torque(step.a) + made.additional.last
         np.testing.assert_allclose(step.tau, wanted, atol=0.02 * ARM.tau_max.max())
         at_limit += (np.abs(step.tau) > 0.98 * ARM.tau_max).any()
     assert at_limit > 20
@@ -109,11 +111,11 @@ def test_the_handover_goes_on_from_the_drives_torque_and_friction_fades_in():
     made = controller(mode="joints")
     steps(made, 2000)
     q, rest = ARM.q_start, np.zeros(N)
-    made.robot.update(q, rest, rest)
+    made.robot.update(State(q, rest), rest)
     tau = made.robot.h + 0.04 * ARM.tau_max
-    made.take_over(q, V, -WIDE, WIDE, tau)
+    made.bumpless_transfer(State(q, V), AccelerationRange(-WIDE, WIDE), tau)
     np.testing.assert_array_equal(made.additional.friction.last, 0.0)
-    first = made.step(q, V, -WIDE, WIDE)
+    first = made.step(State(q, V), AccelerationRange(-WIDE, WIDE))
     friction = made.additional.friction.last
     assert (np.abs(friction) <= 1.01 * DT / 0.2 * MODEL.level(V)).all()
     assert np.abs((first.tau - tau) / ARM.tau_max).max() < 0.01
@@ -127,11 +129,13 @@ def test_what_comes_after_a_gap_or_a_jump_does_not_kick():
     before = steps(made, 500)
     for elapsed in (0.4, 0.0, -1.0, math.nan):
         w = made.additional.friction.reference_velocity.copy()
-        tau = made.step(ARM.q_start, V, -WIDE, WIDE, elapsed).tau
+        tau = made.step(State(ARM.q_start, V), AccelerationRange(-WIDE, WIDE), elapsed).tau
         np.testing.assert_array_equal(made.additional.friction.reference_velocity, w)
         assert np.abs((tau - before.tau) / ARM.tau_max).max() < 2e-3
     w = made.additional.friction.last.copy()
-    made.step(ARM.q_start, V + 200.0, -WIDE, WIDE)  # a glitch of the sensor
+    made.step(
+        State(ARM.q_start, V + 200.0), AccelerationRange(-WIDE, WIDE)
+    )  # a glitch of the sensor
     np.testing.assert_array_equal(made.additional.friction.last, w)
 
 

@@ -19,8 +19,10 @@ from torque_safety_controller.additional_torque import (
 from torque_safety_controller.controller import Controller, Gains
 from torque_safety_controller.integral_feedback import IntegralSettings
 from torque_safety_controller.node.controller_node import ControllerNode
-from torque_safety_controller.tasks.tasks import critical_damping
+from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.tasks.gains import critical_damping
 from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.state import State
 
 NODE = "controller_node"
 MS = 1_000_000
@@ -60,7 +62,7 @@ def core(mode="joints", rows=slice(0, 6), **changed) -> Controller:
     """The node's core, set up by hand; also says what its defaults are."""
     additional = AdditionalTorque(make_settings(mode, **changed), rows)
     controller = Controller(ARM.robot(), ARM.tau_max, GAINS, additional=additional)
-    controller.start(Q)
+    controller.reset(Q)
     return controller
 
 
@@ -93,7 +95,9 @@ class Chain:
 
 
 def answers(controller, speeds=SPEEDS) -> np.ndarray:
-    return np.array([controller.step(Q, v, -WIDE, WIDE).tau for v in speeds])
+    return np.array(
+        [controller.step(State(Q, v), AccelerationRange(-WIDE, WIDE)).tau for v in speeds]
+    )
 
 
 SMALL = (0.001 * ARM.tau_max).tolist()
@@ -162,7 +166,7 @@ def test_parameters_change_while_it_runs_and_the_torque_goes_on(ros):
         controller.additional.settings = make_settings(**common)
         before = controller.additional.last
         for k, v in enumerate(SPEEDS):
-            expected = controller.step(Q, v, -WIDE, WIDE).tau
+            expected = controller.step(State(Q, v), AccelerationRange(-WIDE, WIDE)).tau
             np.testing.assert_allclose(
                 chain.answer(v), expected, atol=SAME_TORQUE, err_msg=f"{changed}, step {k}"
             )

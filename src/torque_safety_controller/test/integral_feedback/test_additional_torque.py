@@ -16,6 +16,7 @@ from torque_safety_controller.additional_torque import (
     AdditionalTorque,
 )
 from torque_safety_controller.integral_feedback import METHODS, IntegralSettings
+from viability_bounds_pkg.state import State
 
 ARM = load_arm("panda")
 N = ARM.n
@@ -46,10 +47,10 @@ class Loop:
     def step(self, elapsed=DT, v_seen=None, disturbance=DISTURBANCE) -> np.ndarray:
         """Play a period; return what was added."""
         v = self.v if v_seen is None else v_seen
-        self.robot.update(self.q, v, self.a)
+        self.robot.update(State(self.q, v), self.a)
         added = self.additional.torque(self.robot, v, self.a, elapsed)
         self.a = 100.0 * (ARM.q_start - self.q) - 20.0 * v
-        tau = self.robot.torque(self.q, v, self.a) + added + disturbance
+        tau = self.robot.torque(self.a) + added + disturbance
         self.q, self.v = ARM.move(self.q, self.v, tau, DT, steps=1)
         self.torques.append(added)
         return added
@@ -253,7 +254,7 @@ def test_numbers_beyond_sense_keep_the_last_torque():
             seen = loop.v.copy()
             seen[0] = bad
             with np.errstate(all="ignore"):
-                loop.robot.update(loop.q, seen, loop.a)
+                loop.robot.update(State(loop.q, seen), loop.a)
             added = loop.additional.torque(loop.robot, seen, loop.a, DT)
             np.testing.assert_array_equal(added, before)
             loop.run(0.02)
@@ -267,7 +268,7 @@ def test_a_beginning_with_numbers_beyond_sense_is_put_off(mode):
     loop = Loop(mode)
     seen = np.full(N, math.nan)
     with np.errstate(all="ignore"):
-        loop.robot.update(loop.q, seen, loop.a)
+        loop.robot.update(State(loop.q, seen), loop.a)
     np.testing.assert_array_equal(loop.additional.torque(loop.robot, seen, loop.a, DT), REST)
     loop.additional.settings = make_settings("task")
     np.testing.assert_array_equal(loop.additional.torque(loop.robot, seen, loop.a, DT), REST)
@@ -318,7 +319,7 @@ def test_steps_are_bounded_whatever_velocity_does():
     largest, before = 0.0, np.zeros(N)
     for _ in range(2000):
         v = rng.uniform(-1.0, 1.0, N) * ARM.v_max * rng.choice([1e-3, 0.01, 0.1, 1.0])
-        loop.robot.update(ARM.q_start, v, REST)
+        loop.robot.update(State(ARM.q_start, v), REST)
         loop.additional.torque(loop.robot, v, rng.uniform(-20.0, 20.0, N), DT)
         K_s = loop.additional.actions["joints"].s * LAMBDA * np.diagonal(loop.robot.M)
         largest, before = max(largest, relative(K_s - before)), K_s
@@ -337,7 +338,7 @@ def test_it_begins_with_the_torque_it_is_told(mode):
     for _ in range(20):
         loop = Loop(mode)
         torque = rng.uniform(-0.3, 0.3, N) * ARM.tau_max
-        loop.robot.update(loop.q, REST, REST)
+        loop.robot.update(State(loop.q, REST), REST)
         np.testing.assert_array_equal(loop.additional.initialise(loop.robot, REST, torque), torque)
         assert not loop.additional.idle
         after = loop.additional.torque(loop.robot, REST, REST, DT)
@@ -347,7 +348,7 @@ def test_it_begins_with_the_torque_it_is_told(mode):
 
 def test_a_joint_s_budget_is_widened_only_where_it_must():
     loop = Loop("joints")
-    loop.robot.update(loop.q, REST, REST)
+    loop.robot.update(State(loop.q, REST), REST)
     torque = 0.5 * BUDGET
     torque[3] = 2.0 * BUDGET[3]
     loop.additional.initialise(loop.robot, REST, torque)
@@ -360,7 +361,7 @@ def test_a_joint_s_budget_is_widened_only_where_it_must():
 
 def test_what_cannot_be_initialised_fades():
     loop = Loop("joints")
-    loop.robot.update(loop.q, REST, REST)
+    loop.robot.update(State(loop.q, REST), REST)
     loop.robot.C = -LAMBDA * np.diag(np.diagonal(loop.robot.M))  # C + K is singular
     torque = 0.1 * ARM.tau_max
     np.testing.assert_array_equal(loop.additional.initialise(loop.robot, REST, torque), torque)
@@ -403,13 +404,13 @@ def test_it_is_finite_and_never_raises(first, steps):
                 additional.settings = replace(
                     make_settings(mode, slow_leak_rate=theta), disturbance_max=1e9 * ARM.tau_max
                 )
-            robot.update(ARM.q_start + q, v, a)
+            robot.update(State(ARM.q_start + q, v), a)
             torque = additional.torque(robot, v, a, elapsed)
             assert torque.shape == (N,)
             assert np.isfinite(torque).all()
             assert (np.abs(torque) <= 2.0 * BUDGET).all()
         # And it comes round.
-        rest = ARM.q_start, REST, REST
+        rest = State(ARM.q_start, REST), REST
         robot.update(*rest)
         for _ in range(4):
             additional.torque(robot, REST, REST, DT)

@@ -10,6 +10,7 @@ from ros_harness import joint_state, read_config
 
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.state import State
 
 ARM = load_arm("panda")
 VALUES = read_config("panda", NODE) | {
@@ -48,7 +49,7 @@ def test_an_overlap_is_reported_and_countered_and_a_nan_stays_outside(ros):
     tau = talk.answer(10, ARM.q_start)
     assert (np.abs(tau) <= ARM.tau_max).all()
     robot = ARM.robot()
-    robot.update(ARM.q_start, np.zeros(ARM.n), np.zeros(ARM.n))
+    robot.update(State(ARM.q_start, np.zeros(ARM.n)), np.zeros(ARM.n))
     assert np.abs(tau - robot.h).max() > 0.1, "it does not move out"
     ros.wait_until(lambda: "less than the margin" in ros.reported(NODE, "message"), "a report")
     report = ros.diagnostics[NODE]

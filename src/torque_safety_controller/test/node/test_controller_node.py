@@ -17,10 +17,12 @@ from trajectory_msgs.msg import JointTrajectory
 
 from torque_safety_controller.controller import Controller, Gains
 from torque_safety_controller.node.controller_node import ControllerNode
-from torque_safety_controller.tasks.tasks import critical_damping
+from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.tasks.gains import critical_damping
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import read_urdf
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, LATCHED_QOS, set_stamp, stamp_to_ns
+from viability_bounds_pkg.state import State
 
 ARM = load_arm("baxter_left_arm")
 # Watchdogs that do not bark while a busy machine runs the other tests.
@@ -47,7 +49,7 @@ SAME_TORQUE = 1e-6  # N m; two runs of the solver
 def expected(pose=None, posture=None, gains=GAINS) -> Controller:
     """The node's core, set up by hand."""
     controller = Controller(ARM.robot(), ARM.tau_max, gains)
-    controller.start(Q)
+    controller.reset(Q)
     if pose is not None:
         controller.set_pose_goal(pose)
     if posture is not None:
@@ -57,7 +59,7 @@ def expected(pose=None, posture=None, gains=GAINS) -> Controller:
 
 def pose_at(q) -> pin.SE3:
     robot = ARM.robot(0.0)
-    robot.update(q, REST, REST)
+    robot.update(State(q, REST), REST)
     return robot.pose.copy()
 
 
@@ -141,7 +143,9 @@ def test_it_is_stopped_and_silent_without_a_state(ros):
 def test_without_a_goal_it_brings_the_arm_to_rest(ros):
     chain = Chain(ros)
     tau = chain.answer(10)
-    np.testing.assert_allclose(tau, expected().rest(Q, V, LOWER, UPPER).tau, atol=SAME_TORQUE)
+    np.testing.assert_allclose(
+        tau, expected().brake(State(Q, V), AccelerationRange(LOWER, UPPER)).tau, atol=SAME_TORQUE
+    )
     chain.await_mode("HOLD", "no goal")
     assert ros.diagnostics[NODE]["level"] == DiagnosticStatus.WARN
 
@@ -152,9 +156,12 @@ def test_with_a_pose_goal_it_tracks(ros, frame):
     chain.poses.publish(pose_message(GOAL, frame))
     ros.wait_until(lambda: chain.reported("goals_pending") == "1", "the goal")
     tau = chain.answer(10)
-    step = expected(GOAL).step(Q, V, LOWER, UPPER)
+    step = expected(GOAL).step(State(Q, V), AccelerationRange(LOWER, UPPER))
     np.testing.assert_allclose(tau, step.tau, atol=SAME_TORQUE)
-    assert np.abs(tau - expected().rest(Q, V, LOWER, UPPER).tau).max() > 0.1
+    assert (
+        np.abs(tau - expected().brake(State(Q, V), AccelerationRange(LOWER, UPPER)).tau).max()
+        > 0.1
+    )
     chain.await_mode("TRACKING", "goal")
     assert ros.diagnostics[NODE]["level"] == DiagnosticStatus.OK
     error = pin.log6(pose_at(Q).actInv(GOAL)).vector
@@ -174,7 +181,11 @@ def test_poses_are_in_the_base_frame(ros):
     chain.poses.publish(pose_message(base.actInv(GOAL), frame))
     ros.wait_until(lambda: chain.reported("goals_pending") == "1", "the goal")
     tau = chain.answer(10)
-    np.testing.assert_allclose(tau, expected(GOAL).step(Q, V, LOWER, UPPER).tau, atol=SAME_TORQUE)
+    np.testing.assert_allclose(
+        tau,
+        expected(GOAL).step(State(Q, V), AccelerationRange(LOWER, UPPER)).tau,
+        atol=SAME_TORQUE,
+    )
 
 
 def test_with_a_posture_goal_it_tracks_whatever_the_order_of_names(ros):
@@ -196,7 +207,7 @@ def test_it_holds_while_bounds_are_missing_and_goes_on_by_itself(ros):
     tau = chain.await_command(stamp + 10, lambda: chain.state(stamp + 10))
     assert time.monotonic() - begin >= 0.1
     chain.await_mode("HOLD", "acceleration limits are stale")
-    hold = expected(GOAL).hold(Q, V)
+    hold = expected(GOAL).hold(State(Q, V))
     np.testing.assert_allclose(tau, hold.tau, atol=0.5)  # the node's last acceleration differs
     # The next ones are held at once.
     begin = time.monotonic()
@@ -303,7 +314,8 @@ def test_state_and_limits_are_matched_in_either_order(ros, order):
         assert stamp * MS not in chain.commands.stamps
         tau = chain.await_command(stamp, second)
         robot = ARM.robot()
-        np.testing.assert_allclose(tau, robot.torque(Q, V, only), atol=1e-3)
+        robot.update(State(Q, V), only)
+        np.testing.assert_allclose(tau, robot.torque(only), atol=1e-3)
 
 
 def test_old_limits_are_never_used_for_a_new_state(ros):

@@ -19,6 +19,7 @@ from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.node.goals import GoalRefused, trajectory_from_message
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory, circle
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp
+from viability_bounds_pkg.state import State
 
 MS = 1_000_000
 PLANE = [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]  # from the lowest point towards y
@@ -112,7 +113,7 @@ def test_it_is_followed_in_the_robots_time(ros):
     q, v, wide = arm.q_start, np.zeros(arm.n), np.full(arm.n, 50.0)
     joints = values["joints"]
     robot = arm.robot(0.0)
-    robot.update(q, v, v)
+    robot.update(State(q, v), v)
     start = robot.pose.copy()
     points = circle(start, 0.05, PLANE, period=0.02, points_per_turn=8)
     meant = PoseTrajectory(points)

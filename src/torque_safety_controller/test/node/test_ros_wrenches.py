@@ -18,6 +18,7 @@ from torque_safety_controller.parameters import controller_parameters
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.ros.parameters import read_values
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS, set_stamp
+from viability_bounds_pkg.state import State
 
 ARM = load_arm("panda")
 KNOWN = {row.name for row in controller_parameters.TABLE}
@@ -129,7 +130,7 @@ def test_a_target_is_exerted_and_torques_say_so(ros):
         after = hand.step()
     hand.until("contacts_closed", "panda_hand")
     robot = ARM.robot(0.0)
-    robot.update(ARM.q_start, np.zeros(ARM.n), np.zeros(ARM.n))
+    robot.update(State(ARM.q_start, np.zeros(ARM.n)), np.zeros(ARM.n))
     pressed = robot.J.T @ np.array([0.0, 0.0, 10.0, 0.0, 0.0, 0.0])
     np.testing.assert_allclose(after - before, pressed, atol=0.05)
 

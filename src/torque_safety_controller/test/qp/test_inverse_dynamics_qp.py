@@ -6,9 +6,10 @@ import pytest
 from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import lsq_linear, nnls
 
-from torque_safety_controller.qp.active_set import FAILED
-from torque_safety_controller.qp.inverse_dynamics_qp import InverseDynamicsQP, NoSolutionFound
-from torque_safety_controller.tasks.tasks import TaskTerm
+from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp.inverse_dynamics_qp import SOLVERS, InverseDynamicsQP
+from torque_safety_controller.qp.quadratic_program import NoSolutionFound, SolverResult, Status
+from torque_safety_controller.qp.terms import TaskTerm
 
 N = 7
 GAMMA = 1e-6
@@ -35,6 +36,15 @@ class Problem(NamedTuple):
             H += scale * weight * A.T @ A
             g -= scale * weight * A.T @ b
         return H, g
+
+
+def built(qp, problem: Problem):
+    tasks, a_lower, a_upper, *limits = problem
+    return qp.build(tasks, AccelerationRange(a_lower, a_upper), *limits)
+
+
+def solution_of(qp, problem: Problem):
+    return qp.solve(built(qp, problem))
 
 
 def random_problem(rng, room=1.0, scale=1.0) -> Problem:
@@ -123,7 +133,8 @@ def test_agrees_with_an_independent_solver(room, scale):
         if best is None or reference(problem, -1e-4) is None:
             continue  # no solution, or one by a hair
         solved += 1
-        a, relaxation = qp.solve(*problem)[:2]
+        solution = solution_of(qp, problem)
+        a, relaxation = solution.a, solution.relaxation
         assert relaxation is None
         np.testing.assert_array_less(excess(problem, a), ACCELERATION_TOLERANCE)
         assert_torques_kept(problem, a)
@@ -138,12 +149,11 @@ def test_without_limits_it_is_least_squares():
     rng = np.random.default_rng(4)
     problem = random_problem(rng)
     no = np.full(N, np.inf)
-    a, relaxation, *_ = InverseDynamicsQP(N, GAMMA).solve(
-        problem.tasks, -no, no, problem.M, -no, no
-    )
+    unlimited = problem._replace(a_lower=-no, a_upper=no, tau_lower=-no, tau_upper=no)
+    solution = solution_of(InverseDynamicsQP(N, GAMMA), unlimited)
     H, g = problem.cost()
-    assert relaxation is None
-    np.testing.assert_allclose(a, np.linalg.solve(H, -g), atol=1e-3)
+    assert solution.relaxation is None
+    np.testing.assert_allclose(solution.a, np.linalg.solve(H, -g), atol=1e-3)
 
 
 @pytest.mark.parametrize(("room", "scale"), [(0.3, 0.1), (0.3, 1.0), (0.05, 1.0), (0.3, 100.0)])
@@ -157,7 +167,8 @@ def test_when_both_cannot_be_met_torques_win_and_the_bounds_give_way_least(room,
         if np.abs(needed).max() < 1e-2:
             continue
         relaxed += 1
-        a, relaxation = qp.solve(*problem)[:2]
+        solution = solution_of(qp, problem)
+        a, relaxation = solution.a, solution.relaxation
         assert_torques_kept(problem, a)
         np.testing.assert_allclose(relaxation, excess(problem, a), atol=1e-12)
         np.testing.assert_allclose(relaxation, np.abs(needed), atol=1e-4)
@@ -179,25 +190,25 @@ def test_one_problem_without_a_solution_leaves_no_trace():
     rng = np.random.default_rng(6)
     easy, hard = random_problem(rng), random_problem(rng, room=0.05)
     qp = InverseDynamicsQP(N, GAMMA)
-    before = qp.solve(*easy)
+    before = solution_of(qp, easy)
     assert before.relaxation is None
-    assert qp.solve(*hard).relaxation is not None
-    after = qp.solve(*easy)
+    assert solution_of(qp, hard).relaxation is not None
+    after = solution_of(qp, easy)
     assert after.relaxation is None
     np.testing.assert_allclose(after.a, before.a, atol=ACCELERATION_TOLERANCE)
 
 
-def test_a_step_like_the_last_needs_no_iterations():
+def test_a_step_like_the_last_needs_one_iteration():
     rng = np.random.default_rng(12)
     qp = InverseDynamicsQP(N, GAMMA)
     no = np.full(N, np.inf)
     spared = limited = 0
     for _ in range(20):
         problem = random_problem(rng)._replace(tau_lower=-no, tau_upper=no)
-        first = qp.solve(*problem)
-        again = qp.solve(*problem)
+        first = solution_of(qp, problem)
+        again = solution_of(qp, problem)
         np.testing.assert_allclose(again.a, first.a, rtol=1e-5, atol=ACCELERATION_TOLERANCE)
-        spared += again.iterations == 0
+        spared += again.iterations == 1
         limited += (excess(problem, 1.001 * first.a) > 0.0).any()
     assert limited == 20, "no bound is active"
     assert spared > 15
@@ -241,7 +252,8 @@ LITTLE_ROOM = Problem(
 
 
 def test_little_room_is_not_taken_for_none():
-    a, relaxation, *_ = InverseDynamicsQP(N, GAMMA).solve(*LITTLE_ROOM)
+    solution = solution_of(InverseDynamicsQP(N, GAMMA), LITTLE_ROOM)
+    a, relaxation = solution.a, solution.relaxation
     assert relaxation is None
     np.testing.assert_allclose(a, reference(LITTLE_ROOM), atol=NEAR)
 
@@ -251,7 +263,8 @@ def test_a_joint_without_freedom():
     problem = random_problem(np.random.default_rng(7))
     a_upper = problem.a_upper.copy()
     a_upper[2] = problem.a_lower[2]
-    a, relaxation, *_ = InverseDynamicsQP(N, GAMMA).solve(*problem._replace(a_upper=a_upper))
+    solution = solution_of(InverseDynamicsQP(N, GAMMA), problem._replace(a_upper=a_upper))
+    a, relaxation = solution.a, solution.relaxation
     assert relaxation is None
     assert a[2] == pytest.approx(problem.a_lower[2], abs=ACCELERATION_TOLERANCE)
 
@@ -259,11 +272,11 @@ def test_a_joint_without_freedom():
 def test_only_the_ratio_of_weights_counts():
     problem = random_problem(np.random.default_rng(8))
     heavier = [task._replace(weight=1e5 * task.weight) for task in problem.tasks]
-    a = InverseDynamicsQP(N, GAMMA).solve(*problem).a
-    b = InverseDynamicsQP(N, GAMMA).solve(*problem._replace(tasks=heavier)).a
+    a = solution_of(InverseDynamicsQP(N, GAMMA), problem).a
+    b = solution_of(InverseDynamicsQP(N, GAMMA), problem._replace(tasks=heavier)).a
     np.testing.assert_allclose(a, b, atol=ACCELERATION_TOLERANCE)
     lighter = [problem.tasks[0], problem.tasks[1]._replace(weight=3.0)]
-    c = InverseDynamicsQP(N, GAMMA).solve(*problem._replace(tasks=lighter)).a
+    c = solution_of(InverseDynamicsQP(N, GAMMA), problem._replace(tasks=lighter)).a
     assert np.abs(a - c).max() > 0.1
 
 
@@ -272,17 +285,17 @@ def test_without_a_weight_there_is_no_solution():
     for weight in (0.0, np.nan):
         tasks = [task._replace(weight=weight) for task in problem.tasks]
         with pytest.raises(NoSolutionFound):
-            InverseDynamicsQP(N, GAMMA).solve(*problem._replace(tasks=tasks))
+            solution_of(InverseDynamicsQP(N, GAMMA), problem._replace(tasks=tasks))
 
 
 @pytest.mark.parametrize("field", ["A", "b", "a_lower", "a_upper", "M", "tau_lower", "tau_upper"])
 @pytest.mark.parametrize("warm", [False, True])
 def test_a_nan_raises_soon_and_leaves_no_trace(field, warm):
     problem = random_problem(np.random.default_rng(9))
-    expected = InverseDynamicsQP(N, GAMMA).solve(*problem).a
+    expected = solution_of(InverseDynamicsQP(N, GAMMA), problem).a
     qp = InverseDynamicsQP(N, GAMMA)
     if warm:
-        qp.solve(*problem)
+        solution_of(qp, problem)
     if field in ("A", "b"):
         poisoned = getattr(problem.tasks[0], field).copy()
         bad = problem._replace(
@@ -294,9 +307,9 @@ def test_a_nan_raises_soon_and_leaves_no_trace(field, warm):
     poisoned.flat[3] = np.nan
     begin = time.monotonic()
     with pytest.raises(NoSolutionFound):
-        qp.solve(*bad)
+        solution_of(qp, bad)
     assert time.monotonic() - begin < LONG
-    solution = qp.solve(*problem)
+    solution = solution_of(qp, problem)
     assert solution.relaxation is None
     np.testing.assert_allclose(solution.a, expected, atol=ACCELERATION_TOLERANCE)
 
@@ -307,7 +320,7 @@ def test_crossed_limits_raise_soon(low, high):
     crossed = problem._replace(**{low: getattr(problem, high) + 1.0})
     begin = time.monotonic()
     with pytest.raises(NoSolutionFound):
-        InverseDynamicsQP(N, GAMMA).solve(*crossed)
+        solution_of(InverseDynamicsQP(N, GAMMA), crossed)
     assert time.monotonic() - begin < LONG
 
 
@@ -319,7 +332,7 @@ def test_absurd_numbers_cost_neither_time_nor_limits(scale):
         problem = random_problem(rng, room, scale)
         begin = time.monotonic()
         try:
-            a = qp.solve(*problem).a
+            a = solution_of(qp, problem).a
         except NoSolutionFound:
             pass
         else:
@@ -333,24 +346,41 @@ def test_proxqp_gives_the_same_accelerations():
     mine, other = InverseDynamicsQP(N, GAMMA), InverseDynamicsQP(N, GAMMA, "proxqp")
     for _ in range(60):
         problem = random_problem(rng)
-        expected, found = mine.solve(*problem), other.solve(*problem)
+        expected, found = solution_of(mine, problem), solution_of(other, problem)
         assert (expected.relaxation is None) == (found.relaxation is None)
         np.testing.assert_allclose(found.a, expected.a, atol=1e-4)
-    little = other.solve(*LITTLE_ROOM)
+    little = solution_of(other, LITTLE_ROOM)
     assert little.relaxation is None
-    np.testing.assert_allclose(little.a, mine.solve(*LITTLE_ROOM).a, atol=1e-4)
+    np.testing.assert_allclose(little.a, solution_of(mine, LITTLE_ROOM).a, atol=1e-4)
 
 
-def test_a_second_opinion_where_the_first_solver_gives_up(monkeypatch):
-    qp = InverseDynamicsQP(N, GAMMA)
+class Failing:
+    """A solver that never solves anything."""
+
+    def solve(self, program):
+        return SolverResult(Status.FAILED, np.full(len(program.g), np.nan), 0)
+
+
+def test_proxqp_is_asked_where_daqp_fails(monkeypatch):
     problem = random_problem(np.random.default_rng(31))
-    expected = qp.solve(*problem)
-    monkeypatch.setattr(qp, "_minimise", lambda *_: FAILED)
-    np.testing.assert_allclose(qp.solve(*problem).a, expected.a, atol=1e-4)
+    expected = solution_of(InverseDynamicsQP(N, GAMMA), problem)
+    monkeypatch.setitem(SOLVERS, "daqp", Failing)
+    found = solution_of(InverseDynamicsQP(N, GAMMA), problem)
+    np.testing.assert_allclose(found.a, expected.a, atol=1e-4)
+
+
+def test_what_no_solver_solves_comes_with_the_error(monkeypatch):
+    for name in SOLVERS:
+        monkeypatch.setitem(SOLVERS, name, Failing)
+    qp = InverseDynamicsQP(N, GAMMA)
+    program = built(qp, random_problem(np.random.default_rng(33)))
+    with pytest.raises(NoSolutionFound) as caught:
+        qp.solve(program)
+    assert caught.value.program is program
 
 
 def test_proxqp_does_not_go_on_where_there_is_no_solution():
     problem = random_problem(np.random.default_rng(32))
     crossed = problem._replace(a_lower=problem.a_upper + 1.0)
     with pytest.raises(NoSolutionFound):
-        InverseDynamicsQP(N, GAMMA, "proxqp").solve(*crossed)
+        solution_of(InverseDynamicsQP(N, GAMMA, "proxqp"), crossed)

@@ -4,6 +4,7 @@ import pytest
 
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.robot_description import RobotDescriptionError
+from viability_bounds_pkg.state import State
 
 H = 1e-6  # rad; step of finite differences
 DIFFERENCE_TOLERANCE = 1e-7  # m and rad; of finite differences with H
@@ -11,7 +12,7 @@ DIFFERENCE_TOLERANCE = 1e-7  # m and rad; of finite differences with H
 
 def updated(arm, q, v, a=None, dt=None) -> RobotModel:
     robot = arm.robot(dt)
-    robot.update(q, v, np.zeros(arm.n) if a is None else a)
+    robot.update(State(q, v), np.zeros(arm.n) if a is None else a)
     return robot
 
 
@@ -64,9 +65,7 @@ def test_mass_matrix_and_bias_are_those_of_the_middle_of_the_step(arm):
             column = pin.rnea(arm.model, data, q_mid, v_mid, e) - bias
             np.testing.assert_allclose(robot.M[:, j], column, atol=1e-11)
         # With the last acceleration again, the QP's linear law is the torque itself.
-        np.testing.assert_allclose(
-            robot.torque(q, v, a_last), robot.M @ a_last + robot.h, atol=1e-10
-        )
+        np.testing.assert_allclose(robot.torque(a_last), robot.M @ a_last + robot.h, atol=1e-10)
 
 
 def test_asking_for_a_torque_leaves_the_rest_as_it_was(arm):
@@ -74,14 +73,14 @@ def test_asking_for_a_torque_leaves_the_rest_as_it_was(arm):
     q, v = arm.random_state(rng)
     robot = updated(arm, q, v)
     before = [robot.M.copy(), robot.h.copy(), robot.J.copy(), robot.drift.copy()]
-    robot.torque(q, v, rng.normal(size=arm.n))
+    robot.torque(rng.normal(size=arm.n))
     for x, y in zip(before, (robot.M, robot.h, robot.J, robot.drift), strict=True):
         np.testing.assert_array_equal(x, y)
 
 
 def mean_acceleration_defect(arm, q, v, a, dt, lead) -> float:
     """How far a torque held for dt misses the wanted mean acceleration, rad/s^2."""
-    tau = arm.robot(lead).torque(q, v, a)
+    tau = updated(arm, q, v, a, lead).torque(a)
     _, v_end = arm.move(q, v, tau, dt, steps=8)
     return float(np.linalg.norm((v_end - v) / dt - a))
 

@@ -1,17 +1,15 @@
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
-from torque_safety_controller.tasks.tasks import (
-    critical_damping,
-    damping_task,
-    pose_error,
-    pose_feed_forward,
-    pose_task,
-    posture_task,
-)
+from torque_safety_controller.tasks.damping_task import DampingTask
+from torque_safety_controller.tasks.gains import critical_damping
+from torque_safety_controller.tasks.pose_task import PoseMotion, PoseTask, pose_error
+from torque_safety_controller.tasks.posture_task import PostureTask
+from viability_bounds_pkg.state import State
 
 KP, KD, WEIGHT = 30.0, 7.0, 2.5
 STILL = 1e-6  # relative; the null space is regularised
@@ -19,14 +17,15 @@ STILL = 1e-6  # relative; the null space is regularised
 
 def updated(arm, q, v):
     robot = arm.robot(0.0)
-    robot.update(q, v, np.zeros(arm.n))
+    robot.update(State(q, v), np.zeros(arm.n))
     return robot
 
 
 def null_space_part(J, x) -> np.ndarray:
     """What of a joint vector the posture task may ask for, if the pose is not to feel it."""
     zero = np.zeros(len(x))
-    return posture_task(x, zero, zero, 1.0, KD, WEIGHT, J).b
+    robot = SimpleNamespace(q=zero, v=zero, J=J)
+    return PostureTask(x, 1.0, KD, WEIGHT, True).term(robot).b
 
 
 def minimum(terms, n) -> np.ndarray:
@@ -74,7 +73,7 @@ def test_the_pose_task_makes_the_error_a_damped_spring(arm):
         robot = updated(arm, q, v)
         # At the goal, where the logarithm's own derivatives vanish, but in motion.
         goal = robot.pose
-        A, b, weight = pose_task(robot, v, pose_error(robot.pose, goal), KP, KD, WEIGHT)
+        A, b, weight = PoseTask(goal, KP, KD, WEIGHT).term(robot)
         a = np.linalg.lstsq(A, b, rcond=None)[0]
         np.testing.assert_allclose(A @ a, b, atol=1e-8)
         errors = [
@@ -91,20 +90,25 @@ def test_the_pose_task_makes_the_error_a_damped_spring(arm):
 
 def test_a_pose_task_at_rest_pulls_with_its_stiffness(arm):
     robot = updated(arm, arm.q_start, np.zeros(arm.n))
-    error = np.arange(6.0)
-    A, b, weight = pose_task(robot, np.zeros(arm.n), error, KP, KD, WEIGHT)
+    goal = robot.pose * pin.exp6(0.1 * np.arange(6.0))
+    error, share = pose_error(robot.pose, goal), np.linspace(0.0, 1.0, 6)
+    A, b, weight = PoseTask(goal, KP, KD, WEIGHT).term(robot)
+    np.testing.assert_allclose(error, 0.1 * np.arange(6.0), atol=1e-12)
     np.testing.assert_allclose(b, KP * error, atol=1e-12)
+    less = PoseTask(goal, KP, KD, WEIGHT, stiffness=share).term(robot)
+    np.testing.assert_allclose(less.b, KP * share * error, atol=1e-12)
     np.testing.assert_array_equal(A, robot.J)
     assert weight == WEIGHT
 
 
 def test_posture_and_damping_terms():
     q_des, q, v = np.array([1.0, 2.0]), np.array([0.5, 3.0]), np.array([0.1, -0.2])
-    A, b, weight = posture_task(q_des, q, v, KP, KD, WEIGHT)
+    robot = SimpleNamespace(q=q, v=v)
+    A, b, weight = PostureTask(q_des, KP, KD, WEIGHT).term(robot)
     assert A is None
     assert weight == WEIGHT
     np.testing.assert_allclose(b, KP * (q_des - q) - KD * v, rtol=1e-15)
-    A, b, _ = damping_task(v, KD)
+    A, b, _ = DampingTask(KD).term(robot)
     assert A is None
     np.testing.assert_allclose(b, -KD * v, rtol=1e-15)
 
@@ -138,11 +142,11 @@ def test_the_posture_moves_the_elbow_but_not_the_hand(arm):
     begin = robot.pose.copy()
     dt = 0.01
     for _ in range(100):
-        robot.update(q, v, np.zeros(arm.n))
+        robot.update(State(q, v), np.zeros(arm.n))
         a = minimum(
             [
-                pose_task(robot, v, pose_error(robot.pose, begin), 400.0, 40.0, 1.0),
-                posture_task(q_des, q, v, 10.0, critical_damping(10.0), 1e-3, robot.J),
+                PoseTask(begin, 400.0, 40.0, 1.0).term(robot),
+                PostureTask(q_des, 10.0, critical_damping(10.0), 1e-3, True).term(robot),
             ],
             arm.n,
         )
@@ -173,12 +177,13 @@ def settle(arm, in_null_space, seconds=30.0) -> np.ndarray:
     robot = arm.robot(0.0)
     kd = critical_damping(KP)
     for _ in range(round(seconds / dt)):
-        robot.update(q, v, np.zeros(arm.n))
-        J = robot.J if in_null_space else None
+        robot.update(State(q, v), np.zeros(arm.n))
         a = minimum(
             [
-                pose_task(robot, v, pose_error(robot.pose, goal), KP, kd, 1.0),
-                posture_task(arm.q_start, q, v, 10.0, critical_damping(10.0), 1e-3, J),
+                PoseTask(goal, KP, kd, 1.0).term(robot),
+                PostureTask(arm.q_start, 10.0, critical_damping(10.0), 1e-3, in_null_space).term(
+                    robot
+                ),
             ],
             arm.n,
         )
@@ -199,10 +204,9 @@ def test_a_moving_goal_is_followed_exactly(arm):
     rng = np.random.default_rng(4)
     q, v = arm.random_state(rng)
     robot = arm.robot(0.0)
-    robot.update(q, v, np.zeros(arm.n))
+    robot.update(State(q, v), np.zeros(arm.n))
     twist, rate = robot.J @ v, rng.normal(size=6)
-    ahead = pose_feed_forward(robot, v, robot.pose, twist, rate, 7.0)
-    term = pose_task(robot, v, np.zeros(6), 30.0, 7.0, 1.0, ahead)
+    term = PoseTask(robot.pose, 30.0, 7.0, 1.0, PoseMotion(twist, rate)).term(robot)
     a = np.linalg.pinv(robot.J) @ term.b
     np.testing.assert_allclose(robot.J @ a + robot.drift, rate, atol=1e-8)
 
@@ -214,17 +218,16 @@ def test_the_error_of_a_moving_goal_dies_away_as_that_of_one_at_rest(arm):
     twist, rate = 0.3 * rng.normal(size=6), rng.normal(size=6)
     kp, kd, h = 30.0, 7.0, 1e-4
     robot = arm.robot(0.0)
-    robot.update(q, v, np.zeros(arm.n))
+    robot.update(State(q, v), np.zeros(arm.n))
     # A goal near by: the logarithm is linear to first order in the error, which is small.
     goal = robot.pose * pin.exp6(1e-6 * rng.normal(size=6))
-    ahead = pose_feed_forward(robot, v, goal, twist, rate, kd)
     error = pose_error(robot.pose, goal)
-    term = pose_task(robot, v, error, kp, kd, 1.0, ahead)
+    term = PoseTask(goal, kp, kd, 1.0, PoseMotion(twist, rate)).term(robot)
     a = np.linalg.pinv(robot.J) @ term.b
 
     def error_at(t):
         other = arm.robot(0.0)
-        other.update(q + t * v + 0.5 * t * t * a, v, np.zeros(arm.n))
+        other.update(State(q + t * v + 0.5 * t * t * a, v), np.zeros(arm.n))
         moved = goal * pin.exp6(t * twist + 0.5 * t * t * rate)
         return pose_error(other.pose, moved)
 

@@ -17,7 +17,8 @@ from torque_safety_controller.collision.kinematics import make_motion
 from torque_safety_controller.collision.model import CollisionModel
 from torque_safety_controller.collision.obstacles import CollisionError
 from torque_safety_controller.collision.row import Law, Step, make_rows
-from torque_safety_controller.qp.constraints import Rows
+from torque_safety_controller.qp.constraints import AccelerationRange, LinearConstraints
+from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.kernel.one_sided_limit import make_table
 
 Array = NDArray[np.float64]
@@ -194,25 +195,20 @@ class CollisionAvoidance:
         return np.sort(nearest[: self._rows_max])
 
     def constraint(
-        self,
-        q: Array,
-        v: Array,
-        a_lower: Array,
-        a_upper: Array,
-        disturbance: Array | None = None,
-    ) -> Rows | None:
+        self, robot: RobotModel, bounds: AccelerationRange, disturbance: Array | None = None
+    ) -> LinearConstraints | None:
         """Return the rows of one step for the QP, in a scale in which bounds are dearer.
 
         Args:
-            q: as in `rows`, like all others.
-            v: may be not finite, as `q`.
-            a_lower: may be infinite.
-            a_upper: may be infinite.
-            disturbance: finite.
+            robot: updated to the current state, which may be not finite.
+            bounds: of the accelerations, may be infinite.
+            disturbance: as in `rows`, finite.
 
         Returns:
             None in a state that is not finite, which the QP refuses.
         """
+        q, v = robot.q, robot.v
+        a_lower, a_upper = bounds
         if not (np.isfinite(q).all() and np.isfinite(v).all()):
             return None
         # Infinite, or for the QP to refuse.
@@ -222,7 +218,7 @@ class CollisionAvoidance:
             )
         chosen = self._update(q, v, a_lower, a_upper, disturbance)
         G, lower = self._rows.G[chosen], self._rows.lower[chosen]
-        return Rows(ROW_SCALE * G, ROW_SCALE * lower, np.full(len(lower), np.inf))
+        return LinearConstraints(ROW_SCALE * G, ROW_SCALE * lower, np.full(len(lower), np.inf))
 
     @property
     def count(self) -> int:

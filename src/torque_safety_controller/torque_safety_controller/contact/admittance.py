@@ -17,7 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torque_safety_controller.tasks.tasks import TaskTerm
+from torque_safety_controller.qp.terms import TaskTerm
+from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.compiled import compiled
 
 
@@ -91,26 +92,26 @@ def _acceleration(
     return g
 
 
-def admittance_task(
-    J: np.ndarray,
-    drift: np.ndarray,
-    acceleration: np.ndarray,
-    weight: float,
-    rows: np.ndarray | None = None,
-) -> TaskTerm:
-    """Return (27) as a task on the joint accelerations.
+@dataclass(slots=True)
+class AdmittanceTask:
+    """(27) as a task on the joint accelerations.
 
     It shares the Jacobian of the pose task. With the weight of that, each is served by half, as
     in the paper: along a direction of both the hand accelerates by their mean.
 
-    Args:
-        J: Jacobian of the end effector in its own axes, shape (6, n).
-        drift: its acceleration at zero joint acceleration, shape (6,).
+    Attributes:
         acceleration: g_ob, shape (6,).
         weight: of the squared error of acceleration.
         rows: directions in which it acts, shape (m,), indices; None for all.
     """
-    b = acceleration - drift
-    if rows is None:
-        return TaskTerm(J, b, weight)
-    return TaskTerm(np.ascontiguousarray(J[rows]), b[rows], weight)
+
+    acceleration: np.ndarray
+    weight: float
+    rows: np.ndarray | None = None
+
+    def term(self, robot: RobotModel) -> TaskTerm:
+        """Return ``J a = g_ob - J' v`` as a term of the cost."""
+        b = self.acceleration - robot.drift
+        if self.rows is None:
+            return TaskTerm(robot.J, b, self.weight)
+        return TaskTerm(robot.J[self.rows], b[self.rows], self.weight)

@@ -22,9 +22,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import pinocchio as pin
 
-from torque_safety_controller.qp.constraints import Rows
+from torque_safety_controller.qp.constraints import LinearConstraints
 from torque_safety_controller.qp.inverse_dynamics_qp import ContactForces
-from torque_safety_controller.tasks.tasks import TaskTerm, WrenchTerm
+from torque_safety_controller.qp.terms import TaskTerm, WrenchTerm
 from viability_bounds_pkg.exceptions import ArmSafetyError
 
 
@@ -238,8 +238,8 @@ class Contacts:
         weight /= len(self.contacts[index].points)
         return TaskTerm(np.ascontiguousarray(A), -kd * v_c - drift, weight)
 
-    def rest_rows(self, index: int, kd: float, normal_only: bool = False) -> Rows:
+    def rest_rows(self, index: int, kd: float, normal_only: bool = False) -> LinearConstraints:
         """Keep the points of a contact where they are, as equations; see `rest_task`."""
         A, v_c, drift = self.acceleration(index, normal_only)
         b = -kd * v_c - drift
-        return Rows(A, b, b)
+        return LinearConstraints(A, b, b)

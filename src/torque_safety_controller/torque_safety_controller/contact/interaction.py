@@ -16,7 +16,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from torque_safety_controller.contact.admittance import AdmittanceGains, admittance_task
+from torque_safety_controller.contact.admittance import AdmittanceGains, AdmittanceTask
 from torque_safety_controller.contact.contacts import Contacts
 from torque_safety_controller.contact.dual_compliance import DualCompliance, DualSettings
 from torque_safety_controller.contact.wrench_sensor import WrenchSensor
@@ -24,7 +24,7 @@ from torque_safety_controller.qp.inverse_dynamics_qp import ContactForces
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.goals import Goals
-from torque_safety_controller.tasks.tasks import TaskTerm
+from torque_safety_controller.tasks.task import Task
 
 Array = NDArray[np.float64]
 
@@ -244,11 +244,10 @@ class Interaction:
         """Share of the pose task's stiffness by direction, shape (6,); None for all of it."""
         return self._shares if self.state is Compliance.FORCE else None
 
-    def tasks(self, robot: RobotModel, gains: Gains) -> list[TaskTerm]:
+    def tasks(self, gains: Gains) -> list[Task]:
         """Return the admittance task, (27), if there is one in this state.
 
         Args:
-            robot: updated to the current state.
             gains: of the tasks.
         """
         settings = self._settings
@@ -260,12 +259,12 @@ class Interaction:
         damping = gains.pose_kd * gains.pose_weight / weight
         if self.state is Compliance.YIELDING:
             led = settings.yielding_gains.acceleration(-F, -rate, damping)
-            return [admittance_task(robot.J, robot.drift, led, weight)]
+            return [AdmittanceTask(led, weight)]
         mask = self._mask
         moved = settings.gains.acceleration(
             mask * (self.reference - F), mask * (self._goal_rate - rate), damping
         )
-        return [admittance_task(robot.J, robot.drift, moved, weight, self._rows)]
+        return [AdmittanceTask(moved, weight, self._rows)]
 
     def forces(self, robot: RobotModel) -> ContactForces | None:
         """Return what contacts may exert in this step, with their wrench tasks; None if nothing.
@@ -292,12 +291,14 @@ class Interaction:
 
     def rehearsal(
         self, robot: RobotModel, gains: Gains
-    ) -> tuple[list[TaskTerm], ContactForces | None]:
+    ) -> tuple[list[Task], ContactForces | None]:
         """Return tasks and forces of every kind that there may be, to compile what they need."""
         zero, weight = np.zeros(6), max(gains.pose_weight, 1.0)
-        common = robot.J, robot.drift, zero, weight
         self._settings.gains.acceleration(zero, zero, 1.0)
-        tasks = [admittance_task(*common), admittance_task(*common, np.arange(1))]
+        tasks: list[Task] = [
+            AdmittanceTask(zero, weight),
+            AdmittanceTask(zero, weight, np.arange(1)),
+        ]
         contacts = self.contacts
         if contacts is None:
             return tasks, None

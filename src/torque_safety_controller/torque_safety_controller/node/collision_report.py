@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from torque_safety_controller.collision.avoidance import CollisionAvoidance
-from torque_safety_controller.controller import Step
+from torque_safety_controller.controller import ControlOutput
 
 if TYPE_CHECKING:
     from rclpy.impl.rcutils_logger import RcutilsLogger
@@ -46,12 +46,12 @@ class CollisionReport:
             if pairs:
                 logger.warning(f"not kept apart, {meaning}: {', '.join(pairs)}")
 
-    def note(self, step: Step) -> None:
+    def note(self, step: ControlOutput) -> None:
         """Look at the distances in a step."""
         avoidance = self._avoidance
         if avoidance is None:
             return
-        if step.row_relaxation is not None and step.row_relaxation.any():
+        if step.constraint_relaxation is not None and step.constraint_relaxation.any():
             self._relaxed_steps += 1
         self._not_viable_steps += not avoidance.viable
         margin = avoidance.settings.margin

@@ -13,7 +13,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
-from torque_safety_controller.controller import Step
+from torque_safety_controller.controller import ControlOutput
 from torque_safety_controller.node.assembly import configure, make_controller
 from torque_safety_controller.node.collision_report import CollisionReport
 from torque_safety_controller.node.controller_report import LEVELS, StepRecord
@@ -27,6 +27,7 @@ from torque_safety_controller.parameters.controller_parameters import (
     ControllerConfiguration,
     make_configuration,
 )
+from torque_safety_controller.qp.constraints import AccelerationRange
 from torque_safety_controller.safety.handover import Control, Handover, HandoverRefused
 from torque_safety_controller.safety.modes import Mode, ModeKeeper
 from viability_bounds_pkg.exceptions import SettingError
@@ -34,6 +35,7 @@ from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, Ver
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.runtime import run
 from viability_bounds_pkg.ros.topics import ACCELERATION_LIMITS, JOINT_STATES
+from viability_bounds_pkg.state import State
 
 
 class ControllerNode(Node):
@@ -130,7 +132,7 @@ class ControllerNode(Node):
             self._limits.stamp = -1  # from before the restart; its stamps may come again
         self._answered_stamp = -1
         self._waiting_since = self._state_at
-        self._controller.start(self._states.q)
+        self._controller.reset(self._states.q)
         self._handover.robot_was_away()
 
     def _on_limits(self, message: JointTrajectory) -> None:
@@ -152,10 +154,9 @@ class ControllerNode(Node):
             return
         if self._goals.apply_due(self._states.stamp):
             self._goal_at = time.monotonic()
-        states, limits = self._states, self._limits
-        now = states.q, states.v, limits.lower, limits.upper
+        now = State(self._states.q, self._states.v), self._bounds()
         if self._goal_lost() or self._handover.control is Control.GIVING_BACK:
-            step = self._controller.rest(*now, self._elapsed())
+            step = self._controller.brake(*now, self._elapsed())
         else:
             step = self._controller.step(*now, self._elapsed())
         self._answer(step, stamp)
@@ -166,11 +167,14 @@ class ControllerNode(Node):
             return None
         return 1e-9 * (self._states.stamp - self._answered_stamp)
 
+    def _bounds(self) -> AccelerationRange:
+        return AccelerationRange(self._limits.lower, self._limits.upper)
+
     def _goal_lost(self) -> bool:
         timeout = self._config.goal_timeout
         return timeout > 0.0 and time.monotonic() - self._goal_at > timeout
 
-    def _answer(self, step: Step, stamp: Any) -> None:
+    def _answer(self, step: ControlOutput, stamp: Any) -> None:
         """Publish the torques of `step` for the state with `stamp`."""
         now = time.monotonic()
         elapsed = self._elapsed() or 0.0
@@ -186,7 +190,7 @@ class ControllerNode(Node):
         if self._handover.control is Control.GIVING_BACK:
             self._handover.slow_down(self._states.q, self._states.v, elapsed)
 
-    def _why_hold(self, step: Step) -> str:
+    def _why_hold(self, step: ControlOutput) -> str:
         if step.failure:
             return f"solver failed: {step.failure}"
         if self._bounds_lost:
@@ -197,8 +201,8 @@ class ControllerNode(Node):
 
     def _hold(self, stamp: Any) -> None:
         """Answer the newest state without acceleration limits."""
-        states = self._states
-        self._answer(self._controller.hold(states.q, states.v, self._elapsed()), stamp)
+        state = State(self._states.q, self._states.v)
+        self._answer(self._controller.hold(state, self._elapsed()), stamp)
 
     # Position control
 
@@ -210,7 +214,7 @@ class ControllerNode(Node):
 
     def _take_over(self) -> None:
         """Prepare to go on with torque from the next state; this one is still the drives'."""
-        states, limits = self._states, self._limits
+        states = self._states
         if self._goals.apply_due(states.stamp):
             self.get_logger().warning("goals from before the handover are dropped")
         try:
@@ -218,7 +222,8 @@ class ControllerNode(Node):
         except HandoverRefused as error:
             self._fail_handover(str(error))
             return
-        step = self._controller.take_over(states.q, states.v, limits.lower, limits.upper, tau)
+        state = State(states.q, states.v)
+        step = self._controller.bumpless_transfer(state, self._bounds(), tau)
         if step.failure:
             self._fail_handover(f"solver failed: {step.failure}")
             return
@@ -260,7 +265,8 @@ class ControllerNode(Node):
             if self._handover.by_drives:
                 self._hold_position(self._message_stamp)
                 return
-            step = self._controller.hold(self._states.q, np.zeros_like(self._states.v), 0.0)
+            state = State(self._states.q, np.zeros_like(self._states.v))
+            step = self._controller.hold(state, 0.0)
             self._commands.torque(step.tau, self._message_stamp)
             self._enter(Mode.HOLD, self._why_refused())
 

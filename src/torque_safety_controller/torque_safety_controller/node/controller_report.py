@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from torque_safety_controller.controller import Controller, Step
+from torque_safety_controller.controller import Controller, ControlOutput
 from torque_safety_controller.safety.modes import Mode
 
 LEVELS = {
@@ -34,7 +34,7 @@ class StepRecord:
         self._latencies: deque[float] = deque(maxlen=_LATENCIES_KEPT)
         self._last_relaxation = np.zeros(n)
 
-    def note(self, step: Step, latency: float) -> None:
+    def note(self, step: ControlOutput, latency: float) -> None:
         """Count a step that was answered `latency` seconds after its state came."""
         self._latencies.append(latency)
         self._steps += 1
@@ -64,10 +64,11 @@ class StepRecord:
         a = controller.acceleration
         near = 1e-3 * (a_upper - a_lower) + 1e-6
         at_limit = (a <= a_lower + near) | (a >= a_upper - near)
+        error = controller.goals.error(controller.robot.pose)
         values = {
             "steps": self._steps,
-            "position_error_m": float(np.linalg.norm(controller.goals.error[:3])),
-            "orientation_error_rad": float(np.linalg.norm(controller.goals.error[3:])),
+            "position_error_m": float(np.linalg.norm(error[:3])),
+            "orientation_error_rad": float(np.linalg.norm(error[3:])),
             "qp_iterations": controller.iterations,
             "qp_failures": self._failures,
             "bounds_relaxed_steps": self._relaxed_steps,

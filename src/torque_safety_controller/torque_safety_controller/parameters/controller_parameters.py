@@ -30,8 +30,7 @@ from torque_safety_controller.parameters.interaction_parameters import (
 from torque_safety_controller.qp.inverse_dynamics_qp import SOLVERS
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.safety.modes import CONTROLS
-from torque_safety_controller.tasks.gains import Gains
-from torque_safety_controller.tasks.tasks import critical_damping
+from torque_safety_controller.tasks.gains import Gains, critical_damping
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import RobotDescriptionError
 from viability_bounds_pkg.ros.parameters import Parameter, Range, above, given_or
@@ -129,7 +128,7 @@ TABLE = (
         "qp_solver",
         str,
         "solver of the QP; proxqp takes several times as long",
-        default="active_set",
+        default="daqp",
         choices=tuple(SOLVERS),
     ),
     Parameter(

@@ -1,33 +1,62 @@
-"""Constraints on the joint accelerations beyond their bounds and the torque limits."""
+"""Constraints on the joint accelerations: their bounds, and further linear ones."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
+
+from torque_safety_controller.robot_model import RobotModel
+
+Array = NDArray[np.float64]
 
 
-class Rows(NamedTuple):
-    """The constraints ``lower <= G a <= upper``; equal limits make an equation.
+class AccelerationRange(NamedTuple):
+    """Lower and upper bounds of the joint accelerations."""
 
-    Where the torque limits leave no solution, rows and acceleration bounds give way together,
-    as little as possible in the sum of squares. A row may be scaled, with its limits, to say
-    how dear it is: a row times 10 gives way as one that costs 100 times as much. Lengths up to
-    1e4 are sensible.
+    lower: Array
+    """Shape (n,), rad/s^2; -inf for no bound."""
+    upper: Array
+    """Shape (n,), rad/s^2, not below `lower`; inf for no bound."""
+
+
+class LinearConstraints(NamedTuple):
+    """The constraints ``lower <= G a <= upper`` on the joint accelerations a.
+
+    Equal limits make an equality. Where the torque limits leave no solution, these constraints
+    and the acceleration bounds are relaxed together, by the least sum of squares. Scaling a row
+    of G and its limits by s multiplies the cost of relaxing it by s^2, up to a length of 1e3 of
+    the row.
     """
 
-    G: np.ndarray
+    G: Array
     """Shape (k, n)."""
-    lower: np.ndarray
+    lower: Array
     """Shape (k,); -inf for no limit."""
-    upper: np.ndarray
+    upper: Array
     """Shape (k,), not below `lower`; inf for no limit."""
 
 
-def stack_rows(parts: Sequence[Rows]) -> Rows | None:
-    """Return all rows as one, in order; None without any."""
+class Constraint(Protocol):
+    """Anything that limits the accelerations of the arm in its current state."""
+
+    def constraint(
+        self, robot: RobotModel, bounds: AccelerationRange, disturbance: Array | None = None
+    ) -> LinearConstraints | None:
+        """Return the constraints of one step; None for none.
+
+        Args:
+            robot: updated to the current state.
+            bounds: of the accelerations, which apply besides.
+            disturbance: acceleration on top of the commanded one, shape (n,), rad/s^2.
+        """
+
+
+def stack_constraints(parts: Sequence[LinearConstraints]) -> LinearConstraints | None:
+    """Return all constraints as one, in order; None without any."""
     parts = [part for part in parts if len(part.G)]
     if len(parts) < 2:
         return parts[0] if parts else None
-    return Rows(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+    return LinearConstraints(*(np.concatenate(each) for each in zip(*parts, strict=True)))

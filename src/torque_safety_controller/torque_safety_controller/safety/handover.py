@@ -3,7 +3,7 @@
 [Benallegue2021], IV-A: the position reference is captured and held while the QP, at the arm's own
 configuration, makes its first torque; in the next step torque is what the robot is given. The
 integral action begins with the difference between the torque measured and the one computed, so
-that the torque goes on from what the drives applied (`Controller.take_over`).
+that the torque goes on from what the drives applied (`Controller.bumpless_transfer`).
 
 Drives brake an arm in motion as hard as they can. So on the way back it is brought to rest under
 torque control first.

@@ -33,9 +33,10 @@ class TorqueLimiter:
         """Forget the last torque: the next may be any within the limits."""
         self.last = None
 
-    def go_on_from(self, tau: np.ndarray) -> None:
-        """Take `tau`, shape (n,), N m, for the torque sent last."""
+    def go_on_from(self, tau: np.ndarray) -> np.ndarray:
+        """Take `tau`, shape (n,), N m, within the limits, for the torque sent last; return it."""
         self.last = np.clip(tau, self._tau_min, self.tau_max)
+        return self.last
 
     def range(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the least and greatest torques that may follow, shape (n,) each, N m."""

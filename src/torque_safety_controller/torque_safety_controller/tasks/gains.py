@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 
@@ -29,3 +30,8 @@ class Gains:
     posture_in_null_space: bool
     hold_kd: float
     disturbance_time: float | None = None
+
+
+def critical_damping(kp: float) -> float:
+    """Return ``2 sqrt(kp)``, the gain that brings an error to zero fastest without overshoot."""
+    return 2.0 * math.sqrt(kp)

@@ -1,4 +1,4 @@
-"""Where an arm is to be, and the tasks that bring it there."""
+"""Goals of the end effector and the joints, and the tasks that bring the arm there."""
 
 from __future__ import annotations
 
@@ -6,16 +6,14 @@ import math
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
-from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks.gains import Gains
-from torque_safety_controller.tasks.tasks import (
-    TaskTerm,
-    pose_error,
-    pose_feed_forward,
-    pose_task,
-    posture_task,
-)
+from torque_safety_controller.tasks.pose_task import PoseMotion, PoseTask, pose_error
+from torque_safety_controller.tasks.posture_task import PostureTask
+from torque_safety_controller.tasks.task import Task
+
+Array = NDArray[np.float64]
 
 
 class Goals:
@@ -25,20 +23,17 @@ class Goals:
         pose_des: end-effector goal in the URDF's root frame; None until one is set.
         q_des: joint goal, shape (n,), rad; None until one is set.
         posture: what the null space is held at without a joint goal, shape (n,), rad.
-        error: of the pose goal in the last step, shape (6,), m and rad, in the end effector's
-            axes.
-        taken: how often the arm has taken the pose where it was for its goal, by `hold`; what
-            follows a plan of its own has been overruled when it grows.
+        taken: how often the current pose was made the goal, by `hold`; a trajectory that was
+            being followed has been overruled when it grows.
     """
 
     def __init__(self, n: int) -> None:
         self.pose_des: pin.SE3 | None = None
-        self.q_des: np.ndarray | None = None
+        self.q_des: Array | None = None
         self.posture = np.zeros(n)
-        self.error = np.full(6, math.nan)
         self.taken = 0
-        self._pose_motion: tuple[np.ndarray, np.ndarray] | None = None
-        self._v_des: np.ndarray | None = None
+        self._pose_motion: PoseMotion | None = None
+        self._v_des: Array | None = None
 
     @property
     def any(self) -> bool:
@@ -48,8 +43,8 @@ class Goals:
     def set_pose(
         self,
         pose_des: pin.SE3,
-        twist: np.ndarray | None = None,
-        twist_rate: np.ndarray | None = None,
+        twist: Array | None = None,
+        twist_rate: Array | None = None,
     ) -> None:
         """Move the end effector to `pose_des` in the URDF's root frame.
 
@@ -60,9 +55,12 @@ class Goals:
             twist_rate: time derivative of `twist`, shape (6,); with `twist`.
         """
         self.pose_des = pose_des
-        self._pose_motion = None if twist is None else (twist, twist_rate)
+        if twist is None or twist_rate is None:
+            self._pose_motion = None
+        else:
+            self._pose_motion = PoseMotion(twist, twist_rate)
 
-    def set_posture(self, q_des: np.ndarray, v_des: np.ndarray | None = None) -> None:
+    def set_posture(self, q_des: Array, v_des: Array | None = None) -> None:
         """Bring the joints, or what the pose task leaves free of them, to `q_des`, rad.
 
         Args:
@@ -77,47 +75,41 @@ class Goals:
         self.set_pose(pose.copy())
         self.taken += 1
 
-    def tasks(
-        self,
-        robot: RobotModel,
-        q: np.ndarray,
-        v: np.ndarray,
-        gains: Gains,
-        stiffness: np.ndarray | None = None,
-    ) -> list[TaskTerm]:
+    def error(self, pose: pin.SE3) -> Array:
+        """Return the error of the end effector's pose, shape (6,), m and rad, in its axes.
+
+        NaN without a goal for the pose.
+        """
+        return np.full(6, math.nan) if self.pose_des is None else pose_error(pose, self.pose_des)
+
+    def tasks(self, gains: Gains, stiffness: Array | None = None) -> list[Task]:
         """Return the pose task, if there is a goal for it, and the posture task.
 
         Args:
-            robot: updated to the current state.
-            q: position, shape (n,), rad.
-            v: velocity, shape (n,), rad/s.
             gains: of the tasks.
             stiffness: share of `gains.pose_kp` in each of the end effector's axes, shape (6,);
                 None for all of it.
         """
-        tasks = []
-        if self.pose_des is not None:
-            self.error = error = pose_error(robot.pose, self.pose_des)
-            if stiffness is not None:
-                error = stiffness * error
-            if gains.pose_weight > 0.0:
-                kp, kd, weight = gains.pose_kp, gains.pose_kd, gains.pose_weight
-                tasks.append(pose_task(robot, v, error, kp, kd, weight, self._ahead(robot, v, kd)))
+        tasks: list[Task] = []
+        if self.pose_des is not None and gains.pose_weight > 0.0:
+            tasks.append(
+                PoseTask(
+                    self.pose_des,
+                    gains.pose_kp,
+                    gains.pose_kd,
+                    gains.pose_weight,
+                    self._pose_motion,
+                    stiffness,
+                )
+            )
         tasks.append(
-            posture_task(
+            PostureTask(
                 self.posture if self.q_des is None else self.q_des,
-                q,
-                v,
                 gains.posture_kp,
                 gains.posture_kd,
                 gains.posture_weight,
-                robot.J if tasks and gains.posture_in_null_space else None,
+                gains.posture_in_null_space and bool(tasks),
                 None if self._v_des is None else gains.posture_kd * self._v_des,
             )
         )
         return tasks
-
-    def _ahead(self, robot: RobotModel, v: np.ndarray, kd: float) -> np.ndarray | None:
-        if self._pose_motion is None:
-            return None
-        return pose_feed_forward(robot, v, self.pose_des, *self._pose_motion, kd)

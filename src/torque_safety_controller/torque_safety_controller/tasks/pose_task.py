@@ -1,0 +1,75 @@
+"""The task that brings the end effector to a pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from torque_safety_controller.linalg.dense_kernels import spring_damper
+from torque_safety_controller.qp.terms import TaskTerm
+from torque_safety_controller.robot_model import RobotModel
+
+Array = NDArray[np.float64]
+
+
+class PoseMotion(NamedTuple):
+    """How a goal pose moves, in its own axes."""
+
+    twist: Array
+    """Shape (6,), m/s and rad/s."""
+    twist_rate: Array
+    """Its time derivative, shape (6,)."""
+
+
+@dataclass(slots=True)
+class PoseTask:
+    """Brings the end effector to a pose: eq. (34) of [DelPrete2018], (7)-(8) of [Benallegue2021].
+
+    Attributes:
+        pose_des: goal in the URDF's root frame.
+        kp: stiffness, 1/s^2.
+        kd: damping, 1/s.
+        weight: of the squared error of acceleration.
+        motion: of the goal; None for one at rest.
+        stiffness: share of `kp` in each of the end effector's axes, shape (6,); None for all.
+    """
+
+    pose_des: pin.SE3
+    kp: float
+    kd: float
+    weight: float
+    motion: PoseMotion | None = None
+    stiffness: Array | None = None
+
+    def term(self, robot: RobotModel) -> TaskTerm:
+        """Return ``J a = kp error - kd J v - J' v + feedforward`` as a term of the cost."""
+        error = pose_error(robot.pose, self.pose_des)
+        if self.stiffness is not None:
+            error = self.stiffness * error
+        b = spring_damper(robot.J, robot.v, error, robot.drift, self.kp, self.kd)
+        if self.motion is not None:
+            b = b + self._feedforward(robot.pose, robot.J @ robot.v, self.motion)
+        return TaskTerm(robot.J, b, self.weight)
+
+    def _feedforward(self, pose: pin.SE3, twist: Array, motion: PoseMotion) -> Array:
+        """Return what a goal in motion adds, shape (6,), in the end effector's axes.
+
+        The goal's twist as seen at the end effector is X xi_des with X the action of the placement
+        H^-1 H_des between them; it changes with rate ``X xi_des' - xi x (X xi_des)``, because the
+        axes move with the twist xi of the end effector.
+        """
+        between = pose.actInv(self.pose_des)
+        seen = between.act(pin.Motion(motion.twist))
+        rate = between.act(pin.Motion(motion.twist_rate)) - pin.Motion(twist).cross(seen)
+        feedforward: Array = self.kd * seen.vector + rate.vector
+        return feedforward
+
+
+def pose_error(pose: pin.SE3, pose_des: pin.SE3) -> Array:
+    """Return ``log(H^-1 H_des)``, shape (6,): m, then rad, in the end effector's axes."""
+    error: Array = pin.log6(pose.actInv(pose_des)).vector
+    return error

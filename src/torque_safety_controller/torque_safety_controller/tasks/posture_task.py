@@ -1,0 +1,53 @@
+"""The task that brings the joints to a posture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torque_safety_controller.linalg.dense_kernels import null_space_part
+from torque_safety_controller.qp.terms import TaskTerm
+from torque_safety_controller.robot_model import RobotModel
+
+Array = NDArray[np.float64]
+
+_RANK_REGULARISATION = 1e-9
+
+
+@dataclass(slots=True)
+class PostureTask:
+    """Brings the joints to `q_des`: eq. (34) of [DelPrete2018], eq. (6) of [Benallegue2021].
+
+    In the paper posture and pose compete by their weights, and the pose comes to rest off its
+    goal by about the ratio of the weights in m per rad. In the null space the stiffness acts only
+    where it does not move the end effector, so that the pose is reached; damping acts everywhere
+    either way.
+
+    Attributes:
+        q_des: desired positions, shape (n,), rad.
+        kp: stiffness, 1/s^2.
+        kd: damping, 1/s.
+        weight: of the squared error of acceleration.
+        in_null_space: whether the stiffness leaves the end effector alone.
+        feedforward: ``kd v_des + a_des``, shape (n,), rad/s^2; None for a goal at rest.
+    """
+
+    q_des: Array
+    kp: float
+    kd: float
+    weight: float
+    in_null_space: bool = False
+    feedforward: Array | None = None
+
+    def term(self, robot: RobotModel) -> TaskTerm:
+        """Return ``a = kp (q_des - q) - kd v + feedforward`` as a term of the cost."""
+        error = self.q_des - robot.q
+        if self.in_null_space:
+            # Regularised where J has lost rank; there it leaves in what the pose cannot feel.
+            error = null_space_part(robot.J, error, _RANK_REGULARISATION)
+        b = self.kp * error - self.kd * robot.v
+        if self.feedforward is not None:
+            b = b + self.feedforward
+        return TaskTerm(None, b, self.weight)
