@@ -99,15 +99,15 @@ class BoundsSolver:
         False and the interval is inside the acceleration limits, but means nothing.
 
         Raises:
-            ValueError: the shapes differ, or do not fit the number of joints.
+            JointLimitsError: the shapes differ, or do not fit the number of joints.
         """
         q = np.asarray(q, dtype=np.float64)
         v = np.asarray(v, dtype=np.float64)
         n = len(self.limits)
         if q.shape != v.shape or q.ndim not in (1, 2) or q.shape[-1] != n:
-            raise ValueError(
-                f"q {q.shape} and v {v.shape} must both have shape ({n},) or (batch, {n})"
-            )
+            shapes = f"with q of shape {q.shape} and v of shape {v.shape}"
+            allowed = f"both must have shape ({n},) or (batch, {n})"
+            raise JointLimitsError("state", None, shapes, allowed)
         return solve(q, v, self.table)
 
     def velocity_range(self, q: ArrayLike) -> tuple[Array, Array]:
@@ -152,8 +152,7 @@ def acceleration_bounds(
         period: control period, s, at most `dt`; None means `dt`.
 
     Raises:
-        JointLimitsError: `dt`, `margin` or `period` is unusable.
-        ValueError: the shapes of `q` and `v` do not fit.
+        JointLimitsError: `dt`, `margin` or `period` is unusable, or the shapes of `q` and `v`.
     """
     if margin is not None:
         margin = tuple(checked_margin(margin, limits).tolist())

@@ -336,7 +336,7 @@ def test_states_that_are_not_finite_do_no_harm():
     ],
 )
 def test_refuses_states_of_the_wrong_shape(q, v):
-    with pytest.raises(ValueError, match="shape"):
+    with pytest.raises(JointLimitsError, match="shape"):
         acceleration_bounds(q, v, one_joint(-1.0, 1.0, 2.0, -10.0, 8.0), 0.1)
 
 
