@@ -7,16 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sim_bridge.bullet.obstacles import SHAPES, Obstacle, ObstacleError
-from sim_bridge.scenario.fields import (
-    Fields,
-    ScenarioError,
-    name,
-    number,
-    only,
-    quaternion,
-    refuse,
-    vector,
-)
+from sim_bridge.scenario.fields import Entry, ScenarioError, refuse
 from sim_bridge.scenario.trajectory import read_trajectory
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory
 
@@ -128,97 +119,80 @@ ServiceEvent = EnableTorque | ParameterChange | TriggerCall
 Event = Goal | WorldEvent | ServiceEvent
 
 
-def read_event(entry: Any, where: str) -> Event:
+def read_event(content: Any, where: str) -> Event:
     """Return the event that an entry of the file describes.
 
     Raises:
         ScenarioError: the entry is unknown, malformed or out of range.
     """
-    if not isinstance(entry, dict) or len(entry) != 2 or "time" not in entry:
+    kinds = set(content) - {"time"} if isinstance(content, dict) else set()
+    if len(kinds) != 1 or "time" not in content or not kinds <= set(_KINDS):
         raise ScenarioError(f"{where} must have 'time' and one of {', '.join(_KINDS)}")
-    kind = next(key for key in entry if key != "time")
-    if kind not in _KINDS:
-        raise ScenarioError(f"{where} must have 'time' and one of {', '.join(_KINDS)}")
-    time = number(entry["time"], f"{where}.time", zero=True)
-    content, where = entry[kind], f"{where}.{kind}"
-    if kind != "enable_torque" and not isinstance(content, dict):
-        raise refuse(where, content, "fields and their values")
-    return _KINDS[kind](time, content, where)
+    kind = kinds.pop()
+    time = Entry(content, where).number("time", zero=True)
+    return _KINDS[kind](time, content[kind], f"{where}.{kind}")
 
 
-def _pose(time: float, fields: Fields, where: str) -> PoseGoal:
-    only(fields, ("position", "orientation"), where)
-    return PoseGoal(
-        time,
-        vector(fields.get("position"), 3, f"{where}.position"),
-        quaternion(fields.get("orientation"), f"{where}.orientation"),
-    )
+def _pose(time: float, content: Any, where: str) -> PoseGoal:
+    entry = Entry(content, where, ("position", "orientation"))
+    return PoseGoal(time, entry.vector("position"), entry.quaternion("orientation"))
 
 
-def _posture(time: float, fields: Fields, where: str) -> PostureGoal:
-    return PostureGoal(
-        time, {str(k): number(v, f"{where}.{k}", negative=True) for k, v in fields.items()}
-    )
+def _posture(time: float, content: Any, where: str) -> PostureGoal:
+    entry = Entry(content, where)
+    return PostureGoal(time, {str(key): entry.number(key, negative=True) for key in entry.fields})
 
 
-def _trajectory(time: float, fields: Fields, where: str) -> TrajectoryGoal:
-    return TrajectoryGoal(time, read_trajectory(fields, where))
+def _trajectory(time: float, content: Any, where: str) -> TrajectoryGoal:
+    return TrajectoryGoal(time, read_trajectory(content, where))
 
 
-def _wrench(time: float, fields: Fields, where: str) -> WrenchGoal:
-    only(fields, ("force", "torque", "frame"), where)
-    frame = fields.get("frame", "")
+def _wrench(time: float, content: Any, where: str) -> WrenchGoal:
+    entry = Entry(content, where, ("force", "torque", "frame"))
+    frame = entry.fields.get("frame", "")
     if not isinstance(frame, str):
-        raise refuse(f"{where}.frame", frame, "the name of a frame, or nothing")
-    return WrenchGoal(time, *_force_and_torque(fields, where), frame)
+        raise entry.refuse("frame", "the name of a frame, or nothing")
+    force, torque = (entry.vector(key, default=_ZERO) for key in ("force", "torque"))
+    return WrenchGoal(time, force, torque, frame)
 
 
-def _push(time: float, fields: Fields, where: str) -> Push:
-    only(fields, ("link", "duration", "force", "torque"), where)
-    link = name(fields.get("link"), f"{where}.link", "the name of a link")
-    duration = number(fields.get("duration"), f"{where}.duration")
-    return Push(time, duration, link, *_force_and_torque(fields, where))
+def _push(time: float, content: Any, where: str) -> Push:
+    entry = Entry(content, where, ("link", "duration", "force", "torque"))
+    force, torque = (entry.vector(key, default=_ZERO) for key in ("force", "torque"))
+    link, duration = entry.name("link", "the name of a link"), entry.number("duration")
+    return Push(time, duration, link, force, torque)
 
 
-def _force_and_torque(fields: Fields, where: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    return (
-        vector(fields.get("force", _ZERO), 3, f"{where}.force"),
-        vector(fields.get("torque", _ZERO), 3, f"{where}.torque"),
-    )
-
-
-def _obstacle(time: float, fields: Fields, where: str) -> AddObstacle:
-    only(fields, ("name", "shape", "size", "position", "orientation"), where)
-    obstacle = (
-        name(fields.get("name"), f"{where}.name", "a name"),
-        name(fields.get("shape"), f"{where}.shape", f"one of {', '.join(SHAPES)}"),
-        vector(fields.get("size"), 3, f"{where}.size"),
-        vector(fields.get("position"), 3, f"{where}.position"),
-        quaternion(fields.get("orientation", _UPRIGHT), f"{where}.orientation"),
-    )
+def _obstacle(time: float, content: Any, where: str) -> AddObstacle:
+    entry = Entry(content, where, ("name", "shape", "size", "position", "orientation"))
     try:
-        return AddObstacle(time, Obstacle(*obstacle))
+        obstacle = Obstacle(
+            entry.name("name", "a name"),
+            entry.name("shape", f"one of {', '.join(SHAPES)}"),
+            entry.vector("size"),
+            entry.vector("position"),
+            entry.quaternion("orientation", _UPRIGHT),
+        )
     except ObstacleError as error:
         raise ScenarioError(f"{where}: {error}") from None
+    return AddObstacle(time, obstacle)
 
 
-def _remove_obstacle(time: float, fields: Fields, where: str) -> RemoveObstacle:
-    only(fields, ("name",), where)
-    return RemoveObstacle(time, name(fields.get("name"), f"{where}.name", "a name"))
+def _remove_obstacle(time: float, content: Any, where: str) -> RemoveObstacle:
+    return RemoveObstacle(time, Entry(content, where, ("name",)).name("name", "a name"))
 
 
-def _enable_torque(time: float, value: Any, where: str) -> EnableTorque:
-    if not isinstance(value, bool):
-        raise refuse(where, value, "true or false")
-    return EnableTorque(time, value)
+def _enable_torque(time: float, content: Any, where: str) -> EnableTorque:
+    if not isinstance(content, bool):
+        raise refuse(where, content, "true or false")
+    return EnableTorque(time, content)
 
 
-def _parameters(time: float, fields: Fields, where: str) -> ParameterChange:
-    only(fields, ("node", "values"), where)
-    node = name(fields.get("node"), f"{where}.node", "the name of a node")
-    values = fields.get("values")
+def _parameters(time: float, content: Any, where: str) -> ParameterChange:
+    entry = Entry(content, where, ("node", "values"))
+    node, values = entry.name("node", "the name of a node"), entry.fields.get("values")
     if not isinstance(values, dict) or not values:
-        raise refuse(f"{where}.values", values, "parameters and their values")
+        raise entry.refuse("values", "parameters and their values")
     return ParameterChange(
         time, node, {str(k): _parameter(v, f"{where}.values.{k}") for k, v in values.items()}
     )
@@ -236,13 +210,11 @@ def _parameter(value: Any, where: str) -> Any:
     raise refuse(where, value, "true, false, a number, a string, or a list of numbers or strings")
 
 
-def _call(time: float, fields: Fields, where: str) -> TriggerCall:
-    only(fields, ("service", "type"), where)
-    if fields.get("type", "trigger") != "trigger":
-        raise refuse(f"{where}.type", fields["type"], "trigger")
-    return TriggerCall(
-        time, name(fields.get("service"), f"{where}.service", "the name of a service")
-    )
+def _call(time: float, content: Any, where: str) -> TriggerCall:
+    entry = Entry(content, where, ("service", "type"))
+    if entry.fields.get("type", "trigger") != "trigger":
+        raise entry.refuse("type", "trigger")
+    return TriggerCall(time, entry.name("service", "the name of a service"))
 
 
 _KINDS: dict[str, Callable[[float, Any, str], Event]] = {

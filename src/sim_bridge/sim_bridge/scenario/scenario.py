@@ -8,7 +8,7 @@ from pathlib import Path
 import yaml
 
 from sim_bridge.scenario.events import AddObstacle, Event, Push, RemoveObstacle, read_event
-from sim_bridge.scenario.fields import ScenarioError, number, refuse
+from sim_bridge.scenario.fields import Entry, ScenarioError, refuse
 from sim_bridge.urdf.arm import ConfiguredArm
 
 
@@ -58,7 +58,7 @@ def load_scenario(path: str | Path) -> Scenario:
     if not isinstance(content, dict) or set(content) - {"duration", "events"}:
         raise ScenarioError(f"scenario {path}: has keys other than 'duration' and 'events'")
     try:
-        duration = number(content.get("duration"), "duration")
+        duration = Entry(content, "").number("duration")
         entries = content.get("events") or []
         if not isinstance(entries, list):
             raise ScenarioError(f"events is {entries!r}; allowed: a list")
