@@ -92,7 +92,7 @@ def run(tree: Path, fault: dict[str, Any], digests: dict[str, str]) -> tuple[str
             return "caught", f"ended by {signal.Signals(-result.returncode).name}"
         if result.returncode == 0:
             return "missed", ""
-        by = re.search(r"^(?:FAILED|ERROR) (?:\S*/)?(\S+)", result.stdout, re.MULTILINE)
+        by = re.search(r"^FAILED (?:\S*/)?(\S+)", result.stdout, re.MULTILINE)
         if by is None:
             return "not run", (result.stdout + result.stderr)[-300:]
         return "caught", by[1]
@@ -114,11 +114,17 @@ def main() -> int:
         from viability_bounds_pkg.compiled import _digest
 
         digests = {name: _digest(name) for name in PACKAGES}
-    outcomes = []
+    outcomes: list[str] = []
+    healthy: dict[str, bool] = {}
     for fault in faults:
         if fault in lost:
             continue
+        names = fault["tests"]
+        if names not in healthy:
+            healthy[names] = run(tree, fault | {"new": fault["old"]}, digests)[0] == "missed"
         outcome, by = run(tree, fault, digests)
+        if not healthy[names]:
+            outcome, by = "not told", "its tests fail without it"
         outcomes.append(outcome)
         (path,) = places(tree, fault)
         print(f"{outcome:8}{path.stem:26}{fault['what']:62}{by}", flush=True)
