@@ -140,7 +140,8 @@ class _Segment:
 def _jacobian_rate(phi: Array, phi_dot: Array) -> Array:
     """Return the time derivative of Jr(phi), shape (3, 3), by a central difference."""
     h = _STEP / (1.0 + float(np.linalg.norm(phi_dot)))
-    return (pin.Jexp3(phi + h * phi_dot) - pin.Jexp3(phi - h * phi_dot)) / (2.0 * h)
+    rate: Array = (pin.Jexp3(phi + h * phi_dot) - pin.Jexp3(phi - h * phi_dot)) / (2.0 * h)
+    return rate
 
 
 def _quintic(T: float, start: tuple[Array, ...], end: tuple[Array, ...]) -> Array:
