@@ -29,10 +29,12 @@ from torque_safety_controller.collision.model import CollisionModel, build_colli
 from torque_safety_controller.collision.obstacles import box, capsule, half_space, sphere
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.parameters import controller_parameters
+from torque_safety_controller.qp.constraints import AccelerationRange
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.node import bounds_parameters
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 from viability_bounds_pkg.ros.parameters import read_values
+from viability_bounds_pkg.state import State
 
 ROOT = Path(__file__).resolve().parent.parent
 STATES = 1000
@@ -208,7 +210,7 @@ def controllers(robot: Robot, goals: int = 5, duration: float = 1.0) -> None:
         lower, upper, _ = bounds(q, v)
         for name in pair if step % 2 else reversed(pair):
             start = time.perf_counter()
-            answer = pair[name].step(q, v, lower, upper)
+            answer = pair[name].step(State(q, v), AccelerationRange(lower, upper))
             times[name].append(time.perf_counter() - start)
             if name == "with":
                 a = answer.a

@@ -273,13 +273,9 @@ class Controller:
         if contacts is not None and self.interaction is not None:
             tau = tau - contacts.B @ solution.rho
             self.interaction.note_forces(solution.rho)
-        return ControlOutput(
-            self._limiter.limited(tau),
-            self._remember(solution.a),
-            True,
-            solution.relaxation,
-            constraint_relaxation=solution.constraint_relaxation,
-        )
+        self._a_last = a = solution.a
+        tau = self._limiter.limited(tau)
+        return ControlOutput(tau, a, True, solution.relaxation, "", solution.constraint_relaxation)
 
     def _hold(self, additional: Array | None, failure: str) -> ControlOutput:
         robot = self.robot

@@ -1,4 +1,6 @@
+import itertools
 import math
+from collections import deque
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +10,7 @@ from arms import load_arm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.optimize import nnls
 
 from torque_safety_controller.additional_torque import (
     MODES,
@@ -348,6 +351,42 @@ def test_hold_and_brake_damp_and_carry_the_arm(arm, way):
     assert max(speeds) <= speeds[0] * 1.01
     # At rest the motors carry the arm.
     np.testing.assert_allclose(step.tau, carried, atol=0.05 * arm.tau_max.max())
+
+
+def test_the_programs_of_a_run_are_solved_to_optimality(arm, monkeypatch):
+    """By Karush, Kuhn and Tucker, towards a goal beyond the limits of position."""
+    controller = make(arm)
+    programs = []
+    solve = controller._qp.solve
+
+    def recorded(program):
+        programs.append((program, solve(program)))
+        return programs[-1][1]
+
+    monkeypatch.setattr(controller._qp, "solve", recorded)
+    controller.reset(arm.q_start)
+    controller.set_pose_goal(pose_at(arm, arm.q_start + 0.8))
+    bounds = AccelerationRange(-0.3 * arm.v_max, 0.3 * arm.v_max)
+    turns = itertools.cycle([bounds, wide(arm)])
+    start = arm.q_start, np.zeros(arm.n), 1.0
+    deque(
+        simulate(arm, controller, *start, lambda q, v: controller.step(State(q, v), next(turns))),
+        maxlen=0,
+    )
+    limited = 0
+    for program, solution in programs:
+        if solution.relaxation is not None:
+            continue
+        x = np.r_[solution.a, solution.rho]
+        assert program.violations(x).max() < 1e-7
+        N = np.vstack([np.eye(len(x)), program.C])
+        at_lower, at_upper = (N @ x < program.lower + 1e-7), (N @ x > program.upper - 1e-7)
+        normals = np.vstack([N[at_lower], -N[at_upper]])
+        slope = program.H @ x + program.g
+        left = nnls(normals.T, slope)[1] if len(normals) else np.linalg.norm(slope)
+        assert left < 1e-6 * (1.0 + np.linalg.norm(program.g))
+        limited += len(normals) > 0
+    assert limited > 0.3 * len(programs)
 
 
 def test_a_pose_goal_is_reached(arm):

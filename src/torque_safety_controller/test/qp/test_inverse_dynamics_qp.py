@@ -4,11 +4,18 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from scipy.linalg import cholesky, solve_triangular
-from scipy.optimize import lsq_linear, nnls
+from scipy.optimize import Bounds, lsq_linear, minimize, nnls
 
 from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp.daqp_solver import DaqpSolver
 from torque_safety_controller.qp.inverse_dynamics_qp import SOLVERS, InverseDynamicsQP
-from torque_safety_controller.qp.quadratic_program import NoSolutionFound, SolverResult, Status
+from torque_safety_controller.qp.proxqp_solver import ProxqpSolver
+from torque_safety_controller.qp.quadratic_program import (
+    NoSolutionFound,
+    QuadraticProgram,
+    SolverResult,
+    Status,
+)
 from torque_safety_controller.qp.terms import TaskTerm
 
 N = 7
@@ -384,3 +391,88 @@ def test_proxqp_does_not_go_on_where_there_is_no_solution():
     crossed = problem._replace(a_lower=problem.a_upper + 1.0)
     with pytest.raises(NoSolutionFound):
         solution_of(InverseDynamicsQP(N, GAMMA, "proxqp"), crossed)
+
+
+def by_slsqp(program: QuadraticProgram) -> np.ndarray:
+    """A third solver, of a third kind: sequential least squares, for problems in general."""
+    n = len(program.g)
+    below, above = np.isfinite(program.lower[n:]), np.isfinite(program.upper[n:])
+    C, lower, upper = program.C, program.lower[n:], program.upper[n:]
+    return minimize(
+        program.cost,
+        np.zeros(n),
+        jac=lambda x: program.H @ x + program.g,
+        bounds=Bounds(program.lower[:n], program.upper[:n]),
+        constraints=[
+            {"type": "ineq", "fun": lambda x: (C @ x - lower)[below], "jac": lambda _: C[below]},
+            {"type": "ineq", "fun": lambda x: (upper - C @ x)[above], "jac": lambda _: -C[above]},
+        ],
+        method="SLSQP",
+        options={"ftol": 1e-14, "maxiter": 1000},
+    ).x
+
+
+def test_any_solver_can_be_handed_the_program():
+    rng = np.random.default_rng(34)
+    qp = InverseDynamicsQP(N, GAMMA)
+    for _ in range(20):
+        program = built(qp, random_problem(rng))
+        found = DaqpSolver().solve(program)
+        if found.status is not Status.SOLVED:
+            continue
+        np.testing.assert_allclose(qp.solve(program).a, found.x, atol=1e-9)
+        np.testing.assert_allclose(ProxqpSolver().solve(program).x, found.x, atol=1e-4)
+        assert program.cost(found.x) <= program.cost(by_slsqp(program)) + 1e-6
+
+
+def test_the_program_says_what_it_limits():
+    qp = InverseDynamicsQP(N, GAMMA)
+    problem = random_problem(np.random.default_rng(35))
+    program = built(qp, problem._replace(a_lower=np.full(N, 1.0), a_upper=np.full(N, 1.5)))
+    assert program.names == tuple(
+        f"{what} {i}" for what in ("acceleration", "torque") for i in range(N)
+    )
+    np.testing.assert_array_equal(program.C, problem.M)
+    np.testing.assert_array_equal(program.lower, np.r_[np.ones(N), problem.tau_lower])
+    H, g = problem.cost()
+    np.testing.assert_allclose(program.H, H, atol=1e-12)
+    np.testing.assert_allclose(program.g, g, atol=1e-12)
+    a = np.full(N, 1.25)
+    a[3] = 1.0
+    assert "acceleration 3 min" in program.active(a)
+    assert "acceleration 2 min" not in program.active(a)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "masses"), [(1e-4, 1.0), (1e4, 1.0), (1e-3, 1e3), (1e-3, 1e-3), (1.0, 1e-2)]
+)
+def test_the_least_relaxation_for_any_weights_and_masses(ratio, masses):
+    rng = np.random.default_rng(36)
+    qp = InverseDynamicsQP(N, GAMMA)
+    relaxed = 0
+    for k in range(100):
+        problem = random_problem(rng, (0.3, 0.05)[k % 2])
+        problem = problem._replace(
+            tasks=[problem.tasks[0], problem.tasks[1]._replace(weight=3.0 * ratio)],
+            M=masses * problem.M,
+            tau_lower=masses * problem.tau_lower,
+            tau_upper=masses * problem.tau_upper,
+        )
+        needed = least_relaxation(problem)
+        solution = solution_of(qp, problem)
+        assert_torques_kept(problem, solution.a)
+        if np.abs(needed).max() > 1e-2:
+            relaxed += 1
+            np.testing.assert_allclose(solution.relaxation, np.abs(needed), atol=1e-4)
+            assert np.linalg.norm(solution.relaxation) <= np.linalg.norm(needed) + 1e-5
+    assert relaxed > 50
+
+
+def test_a_mass_matrix_that_is_nearly_singular():
+    rng = np.random.default_rng(37)
+    qp = InverseDynamicsQP(N, GAMMA)
+    for k in range(60):
+        problem = random_problem(rng, (1.0, 0.3)[k % 2])
+        u = rng.normal(size=(N, 1))
+        problem = problem._replace(M=u @ u.T + 10.0 ** rng.uniform(-4, -2) * np.eye(N))
+        assert_torques_kept(problem, solution_of(qp, problem).a)

@@ -30,34 +30,41 @@ def spring_damper(J: Array, v: Array, error: Array, drift: Array, kp: float, kd:
 
 
 @compiled
-def null_space_part(J: Array, x: Array, regularisation: float) -> Array:
-    """Return ``x - J' (J J' + regularisation I)^-1 J x``, shape (n,), J of shape (m, n).
+def null_space_spring_damper(
+    J: Array, q_des: Array, q: Array, v: Array, kp: float, kd: float, regularisation: float
+) -> Array:
+    """Return ``kp N (q_des - q) - kd v``, shape (n,), with N the projector on J's null space.
 
-    It is `x` where J is not finite.
+    ``N = I - J' (J J' + regularisation I)^-1 J``, J of shape (m, n); I where J is not finite.
     """
     m, n = J.shape
-    y = J @ x
+    error = q_des - q
+    b = kp * error - kd * v
     # Cholesky's factor of J J' + regularisation I, row by row.
     L = np.empty((m, m))
+    y = np.empty(m)
     for i in range(m):
+        s = 0.0
+        for k in range(n):
+            s += J[i, k] * error[k]
         for j in range(i + 1):
-            s = regularisation if i == j else 0.0
+            p = regularisation if i == j else 0.0
             for k in range(n):
-                s += J[i, k] * J[j, k]
+                p += J[i, k] * J[j, k]
             for k in range(j):
-                s -= L[i, k] * L[j, k]
+                p -= L[i, k] * L[j, k]
             if i > j:
-                L[i, j] = s / L[j, j]
-            elif 0.0 < s < np.inf:
-                L[i, i] = math.sqrt(s)
+                L[i, j] = p / L[j, j]
+                s -= L[i, j] * y[j]
+            elif 0.0 < p < np.inf:
+                L[i, i] = math.sqrt(p)
             else:
-                return x.copy()
-    for i in range(m):
-        for k in range(i):
-            y[i] -= L[i, k] * y[k]
-        y[i] /= L[i, i]
+                return b
+        y[i] = s / L[i, i]
     for i in range(m - 1, -1, -1):
         for k in range(i + 1, m):
             y[i] -= L[k, i] * y[k]
         y[i] /= L[i, i]
-    return x - J.T @ y
+        for k in range(n):
+            b[k] -= kp * J[i, k] * y[i]
+    return b

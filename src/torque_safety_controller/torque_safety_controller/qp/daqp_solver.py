@@ -22,7 +22,7 @@ _SETTINGS: dict[str, float] = {
     "sing_tol": 1e-13,
     "eq_reduction": -1,
 }
-_LOOSE = {"primal_tol": 5e-7}
+_LOOSE = {"primal_tol": 5e-7, "eta_prox": 1e-6}
 _INFEASIBLE = (-1, -6)  # exit flags of DAQP; the second: equalities that contradict each other
 _LARGE = 1e4
 VIOLATION = 1e-6

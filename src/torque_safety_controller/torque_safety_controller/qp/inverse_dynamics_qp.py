@@ -24,6 +24,7 @@ from torque_safety_controller.qp.daqp_solver import DaqpSolver
 from torque_safety_controller.qp.kernels import (
     add_identity,
     add_least_squares,
+    write_plain,
 )
 from torque_safety_controller.qp.proxqp_solver import ProxqpSolver
 from torque_safety_controller.qp.quadratic_program import (
@@ -93,7 +94,10 @@ class InverseDynamicsQP:
         # Limits that leave next to no room are DAQP's in any case: ProxQP can hardly solve those.
         self._relaxed_solvers = tuple(solvers.values())
         self._solvers = (solvers.pop(solver), *solvers.values())
-        self._relaxing_solvers = (*(DaqpSolver(weight) for weight in _PROXIMAL), ProxqpSolver())
+        self._relaxing_solvers: tuple[Solver, ...] = (
+            *(DaqpSolver(weight) for weight in _PROXIMAL),
+            ProxqpSolver(),
+        )
         self._no_forces = np.zeros(0)
 
     def build(
@@ -123,25 +127,24 @@ class InverseDynamicsQP:
         """
         n = self._n
         scale = 1.0 / _greatest_weight(tasks, () if contacts is None else contacts.tasks)
-        lower, upper = [bounds.lower, tau_lower], [bounds.upper, tau_upper]
         r = k = 0
         if contacts is not None:
             contacts = self._checked_forces(contacts)
             r = len(contacts.rho_max)
-            lower.insert(1, np.zeros(r))
-            upper.insert(1, contacts.rho_max)
         if constraints is not None:
             constraints = self._checked(constraints)
             k = len(constraints.G)
-            lower.append(constraints.lower)
-            upper.append(constraints.upper)
-        C = np.zeros((n + k, n + r))
-        C[:n, :n] = M
+        size = n + r
+        H, g, C = np.empty((size, size)), np.empty(size), np.empty((n + k, size))
+        lower, upper = np.empty(size + n + k), np.empty(size + n + k)
+        write_plain(H, g, C, lower, upper, self._gamma, *bounds, M, tau_lower, tau_upper)
         if contacts is not None:
             C[:n, n:] = -contacts.B
+            upper[n:size] = contacts.rho_max
         if constraints is not None:
             C[n:, :n] = constraints.G
-        H, g = _diagonal(n + r, self._gamma).copy(), np.zeros(n + r)
+            lower[size + n :] = constraints.lower
+            upper[size + n :] = constraints.upper
         for A, b, weight in tasks:
             if A is None:
                 add_identity(H, g, b, weight * scale)
@@ -150,9 +153,7 @@ class InverseDynamicsQP:
         if contacts is not None:
             for W, F_des, weight, first in contacts.tasks:
                 add_least_squares(H, g, W, F_des, weight * scale, n + first)
-        return QuadraticProgram(
-            H, g, C, np.concatenate(lower), np.concatenate(upper), _names(n, r, k)
-        )
+        return QuadraticProgram(H, g, C, lower, upper, _names(n, r, k))
 
     def solve(self, program: QuadraticProgram) -> Solution:
         """Return the accelerations and forces that serve the tasks best within the limits.
@@ -164,17 +165,18 @@ class InverseDynamicsQP:
             NoSolutionFound: numbers that are not finite or absurd, or limits that are crossed.
         """
         n = self._n
-        result = _first_to_decide(self._solvers, program)
+        status, x, iterations = self._solvers[0].solve(program)
+        if status is Status.FAILED:
+            status, x, iterations = self._solvers[1].solve(program)
         relaxation = constraint_relaxation = None
-        if result.status is Status.INFEASIBLE:
-            result, relaxed = self._relax(program)
+        if status is Status.INFEASIBLE:
+            x, relaxed, iterations = self._relax(program)
             if relaxed is not None:
                 relaxation, constraint_relaxation = relaxed[:n], relaxed[n:]
-        elif result.status is not Status.SOLVED:
+        elif status is not Status.SOLVED:
             raise NoSolutionFound("not finite, absurd, or lower limits above upper ones", program)
-        x = result.x
         a, rho = (x[:n], x[n:]) if len(x) > n else (x, self._no_forces)
-        return Solution(a, rho, relaxation, constraint_relaxation, result.iterations)
+        return Solution(a, rho, relaxation, constraint_relaxation, iterations)
 
     def _checked(self, constraints: LinearConstraints) -> LinearConstraints:
         """Return `constraints` in the one layout that the kernels are compiled for."""
@@ -202,15 +204,15 @@ class InverseDynamicsQP:
                 )
         return ContactForces(B, rho_max, contacts.tasks)
 
-    def _relax(self, program: QuadraticProgram) -> tuple[SolverResult, Array | None]:
+    def _relax(self, program: QuadraticProgram) -> tuple[Array, Array | None, int]:
         """Solve with bounds and constraints moved by the least that leaves a solution.
 
         First, in the variables (x, e), with S x what may be relaxed, the bounded a and G a:
 
             minimise |e|^2   subject to   S x - e, rho and the torques in limits;
 
-        then the program itself, with the limits moved by e. Returns its result and by how much
-        the limits of S x are violated, shape (n + k,); None for as good as nothing.
+        then the program itself, with the limits moved by e. Returns its solution; by how much it
+        violates the limits of S x, shape (n + k,), None for as good as nothing; and iterations.
         """
         n, size = self._n, len(program.g)
         relaxable = np.r_[:n, size + n : len(program.lower)]  # where the limits of S x are
@@ -250,11 +252,11 @@ class InverseDynamicsQP:
         result = _first_to_solve(
             self._relaxed_solvers, program._replace(C=C, lower=lower, upper=upper)
         )
-        if result.status is not Status.SOLVED:
-            raise NoSolutionFound("no accelerations were found, even with bounds relaxed", program)
-        relaxation = program.violations(result.x)[relaxable]
-        result = result._replace(iterations=least.iterations + result.iterations)
-        return result, relaxation if relaxation.max() >= _NEGLIGIBLE else None
+        # Where too little room is left for the tasks, what was found first keeps the limits, too.
+        x = result.x if result.status is Status.SOLVED else least.x[:size]
+        relaxation = program.violations(x)[relaxable]
+        iterations = least.iterations + result.iterations
+        return x, relaxation if relaxation.max() >= _NEGLIGIBLE else None, iterations
 
 
 def _first_to_solve(solvers: Iterable[Solver], program: QuadraticProgram) -> SolverResult:
@@ -262,15 +264,6 @@ def _first_to_solve(solvers: Iterable[Solver], program: QuadraticProgram) -> Sol
     for solver in solvers:
         result = solver.solve(program)
         if result.status is Status.SOLVED:
-            break
-    return result
-
-
-def _first_to_decide(solvers: Iterable[Solver], program: QuadraticProgram) -> SolverResult:
-    """Return what the first solver says that does not fail; if all do, what the last says."""
-    for solver in solvers:
-        result = solver.solve(program)
-        if result.status is not Status.FAILED:
             break
     return result
 
@@ -287,11 +280,6 @@ def _greatest_weight(tasks: Sequence[TaskTerm], wrench_tasks: Sequence[WrenchTer
     if not greatest > 0.0:
         raise NoSolutionFound("no task with a weight above 0")
     return greatest
-
-
-@lru_cache
-def _diagonal(size: int, value: float) -> Array:
-    return value * np.eye(size)
 
 
 @lru_cache(maxsize=256)

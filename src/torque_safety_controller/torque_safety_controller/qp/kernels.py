@@ -16,6 +16,52 @@ Array = NDArray[np.float64]
 
 
 @compiled
+def write_plain(
+    H: Array,
+    g: Array,
+    C: Array,
+    lower: Array,
+    upper: Array,
+    gamma: float,
+    a_lower: Array,
+    a_upper: Array,
+    M: Array,
+    tau_lower: Array,
+    tau_upper: Array,
+) -> None:
+    """Write a program in x = (a, rho) with C = (M, 0; 0, 0) and the cost gamma |x|^2 / 2.
+
+    Args:
+        H: shape (n + r, n + r), written, like the next four.
+        g: shape (n + r,).
+        C: shape (n + k, n + r).
+        lower: of a, rho, M a and k more, shape (n + r + n + k,); zero but for a and M a.
+        upper: same shape.
+        gamma: weight of |x|^2.
+        a_lower: limits of a, shape (n,).
+        a_upper: shape (n,).
+        M: shape (n, n).
+        tau_lower: limits of M a, shape (n,).
+        tau_upper: shape (n,).
+    """
+    n, size = len(a_lower), len(g)
+    for i in range(size):
+        for j in range(size):
+            H[i, j] = 0.0
+        H[i, i] = gamma
+        g[i] = lower[i] = upper[i] = 0.0
+    for i in range(len(C)):
+        for j in range(size):
+            C[i, j] = 0.0
+        lower[size + i] = upper[size + i] = 0.0
+    for i in range(n):
+        for j in range(n):
+            C[i, j] = M[i, j]
+        lower[i], upper[i] = a_lower[i], a_upper[i]
+        lower[size + i], upper[size + i] = tau_lower[i], tau_upper[i]
+
+
+@compiled
 def add_least_squares(H: Array, g: Array, A: Array, b: Array, weight: float, first: int) -> None:
     """Add ``weight * |A z - b|^2 / 2`` to the cost ``x'Hx / 2 + g'x``, in place.
 

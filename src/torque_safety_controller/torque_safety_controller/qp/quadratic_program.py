@@ -39,7 +39,8 @@ class QuadraticProgram(NamedTuple):
     def violations(self, x: Array) -> Array:
         """Return by how much x, shape (p,), violates each limit, shape (p + m,)."""
         value = np.concatenate([x, self.C @ x])
-        return np.maximum(np.maximum(self.lower - value, value - self.upper), 0.0)
+        violations: Array = np.maximum(np.maximum(self.lower - value, value - self.upper), 0.0)
+        return violations
 
     def active(self, x: Array, tolerance: float = 1e-6) -> list[str]:
         """Return the names of the limits that x, shape (p,), is at or beyond."""

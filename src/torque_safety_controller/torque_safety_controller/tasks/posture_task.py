@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from torque_safety_controller.linalg.dense_kernels import null_space_part
+from torque_safety_controller.linalg.dense_kernels import null_space_spring_damper
 from torque_safety_controller.qp.terms import TaskTerm
 from torque_safety_controller.robot_model import RobotModel
 
@@ -43,11 +43,13 @@ class PostureTask:
 
     def term(self, robot: RobotModel) -> TaskTerm:
         """Return ``a = kp (q_des - q) - kd v + feedforward`` as a term of the cost."""
-        error = self.q_des - robot.q
         if self.in_null_space:
             # Regularised where J has lost rank; there it leaves in what the pose cannot feel.
-            error = null_space_part(robot.J, error, _RANK_REGULARISATION)
-        b = self.kp * error - self.kd * robot.v
+            b = null_space_spring_damper(
+                robot.J, self.q_des, robot.q, robot.v, self.kp, self.kd, _RANK_REGULARISATION
+            )
+        else:
+            b = self.kp * (self.q_des - robot.q) - self.kd * robot.v
         if self.feedforward is not None:
             b = b + self.feedforward
         return TaskTerm(None, b, self.weight)
