@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from collision_arm import Journey, panda, two_links
 
-from torque_safety_controller.collision.avoidance import CollisionAvoidance, CollisionSettings
-from torque_safety_controller.collision.obstacles import box, sphere
+from torque_safety_controller.collision.avoidance import RESERVE, CollisionAvoidance
+from torque_safety_controller.collision.bodies import box, sphere
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.joint_limits import JointLimits
 
@@ -37,7 +37,7 @@ def test_without_rows_the_same_goals_collide():
     class Blind:
         def rows(self, q, v, lower, upper):
             rows = trip_rows(q, v, lower, upper)
-            return rows._replace(names=[], viable=rows.viable[:0])
+            return rows._replace(lower=rows.lower[:0], viable=rows.viable[:0])
 
         closest = trip.avoidance.closest
 
@@ -116,6 +116,6 @@ def test_a_shorter_step_uses_less_of_the_reserve():
         arm, trip = journey(dt)
         goal = arm.q_start + np.array([0.6, 1.2, 0.0, 1.2, 0.0, 0.5, 0.0])
         trip.go(arm.q_start, goal, 2.0, kp=200.0)
-        used.append(MARGIN + CollisionSettings().reserve - min(trip.distances))
+        used.append(MARGIN + RESERVE - min(trip.distances))
     assert used[1] < used[0] + 1e-6
     assert used[1] < 1e-4

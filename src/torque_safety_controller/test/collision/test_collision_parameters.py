@@ -5,7 +5,7 @@ from collision_arm import panda
 from ros_harness import read_config
 
 from torque_safety_controller.collision.avoidance import CollisionSettings
-from torque_safety_controller.collision.obstacles import SHAPES, make_obstacle
+from torque_safety_controller.collision.bodies import SHAPES, make_obstacle
 from torque_safety_controller.parameters import controller_parameters
 from torque_safety_controller.parameters.collision_parameters import TABLE, load_collision
 from torque_safety_controller.parameters.controller_parameters import make_configuration
@@ -51,24 +51,24 @@ def test_defaults_are_those_of_the_settings():
 
 @pytest.mark.parametrize("name", [f.name for f in TABLE if f.kind is float])
 def test_each_setting_arrives(name):
-    settings = configuration(**{"collision_influence": 0.9, name: 0.7}).settings
+    settings = configuration(**{name: 0.7}).settings
     assert getattr(settings, name.removeprefix("collision_")) == 0.7
 
 
 def test_obstacles_become_shapes_in_the_base_frame():
     avoidance = load(**THINGS)
     bodies = avoidance.model.bodies
-    np.testing.assert_allclose(bodies.box_half, [[0.2, 0.5, 0.025]])
-    np.testing.assert_allclose(bodies.box_centre, [[0.7, 0.0, 0.2]])
+    table, ball, pole, floor = bodies.half[bodies.first[-5:-1]]
+    np.testing.assert_allclose(table, [0.2, 0.5, 0.025])
+    np.testing.assert_allclose(ball, 0.0)
+    np.testing.assert_allclose(pole, [0.0, 0.0, 0.5])
+    np.testing.assert_allclose(bodies.radius[-4:], [0.0, 0.1, 0.03, 0.0])
+    centres = [[0.7, 0.0, 0.2], [0.5, 0.3, 0.5], [0.4, -0.4, 0.5], [0.0, 0.0, -0.1 - floor[2]]]
+    np.testing.assert_allclose(bodies.centre[-4:], centres, atol=1e-12)
     expected = pin.Quaternion(np.array(TURNED)).toRotationMatrix()
-    np.testing.assert_allclose(bodies.box_axes[0], expected, atol=1e-12)
-    ball, pole = bodies.start[-2:], bodies.start[-1:] + bodies.segment[-1:]
-    np.testing.assert_allclose(ball[0], [0.5, 0.3, 0.5], atol=1e-12)
-    np.testing.assert_allclose(bodies.radius[-2:], [0.1, 0.03])
-    np.testing.assert_allclose(ball[1], [0.4, -0.4, 0.0], atol=1e-12)
-    np.testing.assert_allclose(pole[0], [0.4, -0.4, 1.0], atol=1e-12)
-    np.testing.assert_allclose(bodies.normal, [[0.0, 0.0, 1.0]], atol=1e-12)
-    np.testing.assert_allclose(bodies.level, [-0.1])
+    np.testing.assert_allclose(bodies.rotation[-4], expected, atol=1e-12)
+    np.testing.assert_allclose(bodies.rotation[-3:, :, 2], [[0.0, 0.0, 1.0]] * 3, atol=1e-12)
+    assert bodies.plane.tolist()[-4:] == [False, False, False, True]
     assert {"panda_hand - table", "panda_hand - ball"} <= set(avoidance.model.names)
 
 
@@ -82,13 +82,11 @@ def test_pairs_are_those_listed_or_those_chosen_at_the_posture_given():
     middle = load(collision_posture=None)
     assert "panda_hand - panda_link5" in middle.model.left_out["near at start"]
     # What is asked to be kept further apart is left out sooner.
-    wide = load(collision_margin=0.08, collision_influence=0.2)
+    wide = load(collision_margin=0.08)
     assert len(wide.model.left_out["near at start"]) > 1
 
 
-def test_capsules_and_acceleration_limits_arrive():
-    one = load(collision_capsules_per_link=1)
-    assert {len(capsules) for capsules in one.model.capsules.values()} == {1}
+def test_acceleration_limits_arrive():
     config = configuration()
     np.testing.assert_array_equal(config.a_min, PANDA["acceleration_min"])
     np.testing.assert_array_equal(config.a_max, PANDA["acceleration_max"])
@@ -110,12 +108,9 @@ def test_what_an_arm_is_mounted_on_is_left_out_and_said_to_be():
     ("changes", "name"),
     [
         ({"collision_margin": -0.1}, "collision_margin"),
-        ({"collision_margin": 0.2}, "collision_influence"),
-        ({"collision_reserve": float("nan")}, "collision_reserve"),
+        ({"collision_margin": float("nan")}, "collision_margin"),
         ({"collision_braking": 0.0}, "collision_braking"),
-        ({"collision_braking_share": 1.5}, "collision_braking_share"),
         ({"collision_speed_max": float("inf")}, "collision_speed_max"),
-        ({"collision_capsules_per_link": 0}, "collision_capsules_per_link"),
         ({"collision_pairs": ["panda_hand"]}, "collision_pairs"),
         ({"collision_posture": [0.0] * 6}, "collision_posture"),
         ({"collision_posture": [9.0] * 7}, "collision_posture"),

@@ -10,14 +10,13 @@ import numpy as np
 import pinocchio as pin
 
 from torque_safety_controller.collision.avoidance import CollisionAvoidance, CollisionSettings
-from torque_safety_controller.collision.geometry import load_geometry
-from torque_safety_controller.collision.model import Pruning, build_collision_model
-from torque_safety_controller.collision.obstacles import (
+from torque_safety_controller.collision.bodies import (
     SHAPES,
-    CollisionError,
-    Obstacle,
+    CollisionBody,
     make_obstacle,
 )
+from torque_safety_controller.collision.geometry import load_geometry
+from torque_safety_controller.collision.model import Pruning, build_collision_model
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import RobotDescriptionError
 from viability_bounds_pkg.ros.parameters import Parameter, per_joint
@@ -31,13 +30,8 @@ _NEAR = 0.028  # m; beyond margin and reserve, pairs that never come nearer need
 
 _SETTINGS = {
     "margin": "distance kept between links and to obstacles, m",
-    "reserve": "kept on top of it for what changes within a step, m",
     "braking": "deceleration that a distance counts on at most, m/s^2",
-    "braking_share": "share of what the joints can do along a distance that it counts on, up to "
-    "collision_braking, 0 to 1",
     "speed_max": "greatest speed of approach, m/s",
-    "recovery_speed": "speed at which what is nearer than the margin is parted, m/s",
-    "influence": "distance beyond which nothing is looked at that does not approach fast, m",
 }
 
 _OBSTACLES = {
@@ -74,9 +68,6 @@ TABLE = (
         default=np.zeros(0),
     ),
     Parameter(
-        "collision_capsules_per_link", int, "capsules that stand for a link at most", default=3
-    ),
-    Parameter(
         "acceleration_min",
         list[float],
         "for collision_avoidance: lower acceleration limits, rad/s^2, < 0",
@@ -98,18 +89,6 @@ TABLE = (
     ),
 )
 
-_PARAMETER_OF = {
-    "a_min": "acceleration_min",
-    "a_max": "acceleration_max",
-    "q_start": "collision_posture",
-    "name": "obstacle_names",
-    "shape": "obstacle_shapes",
-    "size": "obstacle_sizes",
-    "position": "obstacle_positions",
-    "orientation": "obstacle_orientations",
-    "base_frame": "base_frame",
-}
-
 
 @dataclass(frozen=True, eq=False)
 class CollisionConfiguration:
@@ -119,7 +98,6 @@ class CollisionConfiguration:
         settings: distances and speeds.
         pairs: of links to keep apart; None to choose them automatically.
         posture: free of collisions, rad.
-        capsules_per_link: at most.
         q_min: position limits, rad: within them links are looked for in each other's way.
         q_max: rad.
         a_min: acceleration limits, rad/s^2.
@@ -130,12 +108,11 @@ class CollisionConfiguration:
     settings: CollisionSettings
     pairs: tuple[tuple[str, str], ...] | None
     posture: np.ndarray
-    capsules_per_link: int
     q_min: np.ndarray
     q_max: np.ndarray
     a_min: np.ndarray
     a_max: np.ndarray
-    obstacles: tuple[Obstacle, ...]
+    obstacles: tuple[CollisionBody, ...]
 
 
 def collision_configuration(
@@ -155,16 +132,10 @@ def collision_configuration(
     Raises:
         SettingError: a value cannot be used.
     """
-    try:
-        settings = CollisionSettings(
-            *(values[f"collision_{field.name}"] for field in fields(CollisionSettings))
-        )
-        obstacles = _obstacles(values)
-    except CollisionError as error:
-        raise _parameter_error(error) from error
-    count = values["collision_capsules_per_link"]
-    if count < 1:
-        raise SettingError("collision_capsules_per_link", count, "at least 1")
+    settings = CollisionSettings(
+        *(values[f"collision_{field.name}"] for field in fields(CollisionSettings))
+    )
+    obstacles = _obstacles(values)
     pairs = tuple(_pair(text) for text in values["collision_pairs"])
     posture = _posture(values, joints, q_min, q_max)
     if not values["collision_avoidance"]:
@@ -173,7 +144,6 @@ def collision_configuration(
         settings=settings,
         pairs=pairs or None,
         posture=posture,
-        capsules_per_link=count,
         q_min=q_min,
         q_max=q_max,
         a_min=per_joint(values, "acceleration_min", joints),
@@ -203,8 +173,7 @@ def load_collision(
         return None
     limited = model.copy()
     limited.lowerPositionLimit, limited.upperPositionLimit = config.q_min, config.q_max
-    settings = config.settings
-    kept = settings.margin + settings.reserve
+    kept = config.settings.kept
     try:
         geometry = load_geometry(urdf, model, locked_joints(values))
         collision = build_collision_model(
@@ -214,19 +183,16 @@ def load_collision(
             config.obstacles,
             config.pairs,
             values["base_frame"],
-            config.capsules_per_link,
             Pruning(clearance=kept + _BEYOND, near=kept + _NEAR),
         )
         dt = HORIZON / values["rate_hz"]
-        return CollisionAvoidance(collision, config.a_min, config.a_max, dt, settings)
-    except CollisionError as error:
-        raise _parameter_error(error) from error
+        return CollisionAvoidance(collision, config.a_min, config.a_max, dt, config.settings)
     except RobotDescriptionError as error:
         allowed = f"a URDF whose collision geometry loads ({error})"
         raise SettingError("robot_description", values["robot_description"], allowed) from error
 
 
-def _obstacles(values: Mapping[str, Any]) -> tuple[Obstacle, ...]:
+def _obstacles(values: Mapping[str, Any]) -> tuple[CollisionBody, ...]:
     names = values["obstacle_names"]
     if len(set(names)) != len(names) or "" in names:
         raise SettingError("obstacle_names", names, "names, each once")
@@ -262,8 +228,3 @@ def _posture(
         return posture
     limited = np.isfinite(q_min) & np.isfinite(q_max)
     return np.where(limited, 0.5 * (np.where(limited, q_min, 0.0) + q_max), 0.0)
-
-
-def _parameter_error(error: CollisionError) -> SettingError:
-    name = _PARAMETER_OF.get(error.field, f"collision_{error.field}")
-    return SettingError(name, error.value, error.allowed)
