@@ -12,6 +12,7 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from ros_harness import read_config
 from std_srvs.srv import Trigger
 
+from torque_safety_controller.contact import interaction
 from torque_safety_controller.node.assembly import make_controller
 from torque_safety_controller.parameters import controller_parameters
 from viability_bounds_pkg.exceptions import SettingError
@@ -117,9 +118,11 @@ def test_measurements_that_are_none_are_dropped_counted_and_named(ros):
     assert hand.reported("compliance") == "sensor silent"
 
 
-def test_a_target_is_exerted_and_torques_say_so(ros):
+def test_a_target_is_exerted_and_torques_say_so(ros, monkeypatch):
     """In contact with what gives exactly that back, the motors carry it."""
-    hand = Hand(ros, dual_compliance=False, wrench_time=1e-3, contact_force_step=20.0)
+    monkeypatch.setattr(interaction, "WRENCH_TIME", 1e-3)
+    monkeypatch.setattr(interaction, "FORCE_STEP", 20.0)
+    hand = Hand(ros, dual_compliance=False)
     hand.feels = wrench()
     hand.give_pose()
     before = hand.step()
@@ -196,19 +199,16 @@ def build(**changed):
         ({"force_directions": [1.0] * 5}, "force_directions"),
         ({"force_directions": [0.5] * 6}, "force_directions"),
         ({"force_stiffness": [2.0] * 6}, "force_stiffness"),
-        ({"admittance_force_kp": -1.0}, "admittance_force_kp"),
-        ({"admittance_moment_kd": math.inf}, "admittance_moment_kd"),
-        ({"admittance_weight": -3.0}, "admittance_weight"),
+        ({"admittance_kp": [-1.0, 0.0]}, "admittance_kp"),
+        ({"admittance_kd": [0.0, math.inf]}, "admittance_kd"),
         ({"admittance_speed_max": [0.1]}, "admittance_speed_max"),
         ({"yield_speed_max": [0.0, 1.0]}, "yield_speed_max"),
-        ({"yield_force": 0.0}, "yield_force"),
-        ({"yield_release": 1.5}, "yield_release"),
-        ({"wrench_weight": 0.0}, "wrench_weight"),
+        ({"yield_threshold": [0.0, 1.0]}, "yield_threshold"),
+        ({"yield_kp": [0.1]}, "yield_kp"),
         ({"contact_frames": ["moon"]}, "contact_frames"),
         ({"contact_frames": ["panda_hand", "panda_link8"]}, "contact_points"),
         ({"contact_normals": [0.0, 0.0, 0.0]}, "contact_normals"),
         ({"contact_friction": [-0.5]}, "contact_friction"),
-        ({"contact_facets": 2}, "contact_facets"),
         ({"closed_contacts": ["panda_link4"]}, "closed_contacts"),
     ],
 )

@@ -10,7 +10,6 @@ import pinocchio as pin
 
 from torque_safety_controller.contact.admittance import AdmittanceGains
 from torque_safety_controller.contact.contacts import Contact, Contacts
-from torque_safety_controller.contact.dual_compliance import DualSettings
 from torque_safety_controller.contact.interaction import Interaction, InteractionSettings
 from torque_safety_controller.contact.wrench_sensor import SensorSettings, WrenchSensor
 from torque_safety_controller.robot_model import RobotModel
@@ -55,10 +54,20 @@ TABLE = (
         np.zeros(0),
         live=True,
     ),
-    Parameter("admittance_force_kp", float, "gain of (27), m/s^2 per N", 5e-3, live=True),
-    Parameter("admittance_force_kd", float, "gain of (27), m/s^2 per N/s", 1e-7, live=True),
-    Parameter("admittance_moment_kp", float, "gain of (27), rad/s^2 per N m", 5e-3, live=True),
-    Parameter("admittance_moment_kd", float, "gain of (27), rad/s^2 per N m/s", 1e-7, live=True),
+    Parameter(
+        "admittance_kp",
+        list[float],
+        "gains of (27), m/s^2 per N and rad/s^2 per N m; 5e-3 and 5e-3 if empty",
+        np.zeros(0),
+        live=True,
+    ),
+    Parameter(
+        "admittance_kd",
+        list[float],
+        "gains of (27), m/s^2 per N/s and rad/s^2 per N m/s; 1e-7 and 1e-7 if empty",
+        np.zeros(0),
+        live=True,
+    ),
     Parameter(
         "admittance_speed_max",
         list[float],
@@ -68,28 +77,30 @@ TABLE = (
         live=True,
     ),
     Parameter(
-        "admittance_weight", float, "weight of the task; -1: that of the pose task", -1.0, True
-    ),
-    Parameter("wrench_weight", float, "weight of a wrench task, > 0", 10.0, live=True),
-    Parameter(
-        "wrench_time", float, "time constant of going over to a new target wrench, s", 0.1, True
-    ),
-    Parameter(
         "dual_compliance",
         bool,
-        "whether the hand yields to who pulls at it, and stays where it is let go",
+        "whether the hand yields to wrenches above yield_threshold, and stays where they end",
         default=False,
         live=True,
     ),
-    Parameter("yield_force", float, "force above which it does, N", 10.0, live=True),
-    Parameter("yield_moment", float, "moment above which it does, N m", 2.0, live=True),
-    Parameter("yield_release", float, "share of both below which it stops", 0.5, live=True),
-    Parameter("yield_force_kp", float, "how easily it is led, m/s^2 per N", 0.1, live=True),
-    Parameter("yield_moment_kp", float, "how easily, rad/s^2 per N m", 1.0, live=True),
+    Parameter(
+        "yield_threshold",
+        list[float],
+        "force and moment above which it does, N and N m; 10 and 2 if empty",
+        np.zeros(0),
+        live=True,
+    ),
+    Parameter(
+        "yield_kp",
+        list[float],
+        "gains with which it does, m/s^2 per N and rad/s^2 per N m; 0.1 and 1 if empty",
+        np.zeros(0),
+        live=True,
+    ),
     Parameter(
         "yield_speed_max",
         list[float],
-        "speeds at which it is led at most, m/s and rad/s; 0.25 and 1 if empty",
+        "speeds at which it yields at most, m/s and rad/s; 0.25 and 1 if empty",
         np.zeros(0),
         live=True,
     ),
@@ -116,14 +127,6 @@ TABLE = (
         list[float],
         "coefficient of friction at each point; none if empty",
         np.zeros(0),
-    ),
-    Parameter("contact_facets", int, "edges of a friction pyramid, at least 3", 4),
-    Parameter(
-        "contact_force_step",
-        float,
-        "by how much the force counted on at the hand may exceed the measured one, N",
-        0.5,
-        live=True,
     ),
     Parameter(
         "closed_contacts",
@@ -159,7 +162,6 @@ def interaction_settings(values: Mapping[str, Any]) -> InteractionSettings:
     for name in ("force_directions", "dual_compliance"):
         if np.any(values[name]) and not values["ft_frame"]:
             raise SettingError(name, values[name], "only with a force/torque sensor, 'ft_frame'")
-    weight = values["admittance_weight"]
     frames = _contact_frames(values)
     for frame in values["closed_contacts"]:
         if frame not in frames:
@@ -167,48 +169,35 @@ def interaction_settings(values: Mapping[str, Any]) -> InteractionSettings:
             raise SettingError(
                 "closed_contacts", list(values["closed_contacts"]), f"of 'contact_frames': {known}"
             )
+    threshold = _pair(values, "yield_threshold", (10.0, 2.0))
     return InteractionSettings(
         directions=directions == 1.0,
         stiffness=stiffness,
         gains=AdmittanceGains(
-            *(
-                positive(values, f"admittance_{name}", zero=True)
-                for name in ("force_kp", "force_kd", "moment_kp", "moment_kd")
-            ),
-            *_speeds(values, "admittance_speed_max", (0.01, 0.05)),
+            _pair(values, "admittance_kp", (5e-3, 5e-3), zero=True),
+            _pair(values, "admittance_kd", (1e-7, 1e-7), zero=True),
+            _pair(values, "admittance_speed_max", (0.01, 0.05)),
         ),
-        weight=None if weight == -1.0 else positive(values, "admittance_weight"),
-        wrench_weight=positive(values, "wrench_weight"),
-        wrench_time=positive(values, "wrench_time"),
-        force_step=positive(values, "contact_force_step"),
         closed=tuple(frames.index(frame) for frame in values["closed_contacts"]),
-        dual=_dual(values),
+        yield_threshold=threshold if values["dual_compliance"] else None,
         yielding_gains=AdmittanceGains(
-            positive(values, "yield_force_kp", zero=True),
-            0.0,
-            positive(values, "yield_moment_kp", zero=True),
-            0.0,
-            *_speeds(values, "yield_speed_max", (0.25, 1.0)),
+            _pair(values, "yield_kp", (0.1, 1.0), zero=True),
+            (0.0, 0.0),
+            _pair(values, "yield_speed_max", (0.25, 1.0)),
         ),
     )
 
 
-def _dual(values: Mapping[str, Any]) -> DualSettings | None:
-    force, moment = positive(values, "yield_force"), positive(values, "yield_moment")
-    release = positive(values, "yield_release", zero=True)
-    if release > 1.0:
-        raise SettingError("yield_release", release, "a number from 0 to 1")
-    return DualSettings(force, moment, release) if values["dual_compliance"] else None
-
-
-def _speeds(
-    values: Mapping[str, Any], name: str, default: tuple[float, float]
+def _pair(
+    values: Mapping[str, Any], name: str, default: tuple[float, float], *, zero: bool = False
 ) -> tuple[float, float]:
     value = values[name]
     if not len(value):
         return default
-    if len(value) != 2 or not (np.isfinite(value) & (value > 0.0)).all():
-        raise SettingError(name, value, "two finite numbers > 0, m/s and rad/s")
+    if len(value) != 2 or not (np.isfinite(value) & (value >= 0.0)).all():
+        raise SettingError(name, value, "two finite numbers >= 0, linear and angular")
+    if not zero and not value.all():
+        raise SettingError(name, value, "two finite numbers > 0, linear and angular")
     return float(value[0]), float(value[1])
 
 
@@ -300,8 +289,6 @@ def _contacts(values: Mapping[str, Any], model: pin.Model) -> Contacts | None:
         friction = np.zeros(len(named))
     if len(friction) != len(named) or not (np.isfinite(friction) & (friction >= 0.0)).all():
         raise SettingError("contact_friction", friction, f"{len(named)} finite numbers >= 0")
-    if values["contact_facets"] < 3:
-        raise SettingError("contact_facets", values["contact_facets"], "at least 3")
     contacts = []
     for frame in _contact_frames(values):
         if not model.existFrame(frame):
@@ -312,8 +299,7 @@ def _contacts(values: Mapping[str, Any], model: pin.Model) -> Contacts | None:
             if friction[i] != friction[first] or not np.array_equal(normals[i], normals[first]):
                 allowed = f"the same friction and normal at all points of {frame!r}"
                 raise SettingError("contact_normals", values["contact_normals"], allowed)
-        facets = values["contact_facets"]
-        contacts.append(Contact(frame, points[its], normals[first], friction[first], facets))
+        contacts.append(Contact(frame, points[its], normals[first], friction[first]))
     return Contacts(model, contacts)
 
 
