@@ -7,8 +7,8 @@ from scipy.optimize import linprog, nnls
 from task_arm import TaskArm
 
 from torque_safety_controller.contact.contacts import (
-    Contact,
     Contacts,
+    FrictionContact,
     friction_pyramid,
 )
 from torque_safety_controller.qp.constraints import Rows, stack_rows
@@ -80,7 +80,7 @@ def test_more_facets_fill_the_cone():
 
 
 def test_a_patch_exerts_moments_with_the_centre_of_pressure_inside():
-    contact = Contact(HAND, SOLE, np.array([0.0, 0.0, -2.0]), 0.5, 6)
+    contact = FrictionContact(HAND, SOLE, np.array([0.0, 0.0, -2.0]), 0.5, 6)
     assert contact.W.shape == (6, 24)
     rng = np.random.default_rng(2)
     for _ in range(50):
@@ -95,7 +95,7 @@ def test_a_patch_exerts_moments_with_the_centre_of_pressure_inside():
         centre = np.array([-moment[1], moment[0]]) / force[2]
         assert (np.abs(centre) <= [0.05 + 1e-12, 0.03 + 1e-12]).all()
     assert np.linalg.matrix_rank(contact.W) == 6
-    assert np.linalg.matrix_rank(Contact(HAND, SOLE[0], [0, 0, 1.0], 0.5).W) == 3
+    assert np.linalg.matrix_rank(FrictionContact(HAND, SOLE[0], [0, 0, 1.0], 0.5).W) == 3
 
 
 @pytest.mark.parametrize(
@@ -115,15 +115,15 @@ def test_a_patch_exerts_moments_with_the_centre_of_pressure_inside():
 )
 def test_what_cannot_be_is_refused(change, words):
     values = {"frame": HAND, "points": SOLE, "normal": [0.0, 0.0, 1.0], "friction": 0.5}
-    Contact(**values)
+    FrictionContact(**values)
     with pytest.raises(SettingError, match=words):
-        Contact(**{**values, **change})
+        FrictionContact(**{**values, **change})
 
 
 def test_unknown_frames_and_no_contacts_are_refused():
     model = TaskArm("panda").model
     with pytest.raises(SettingError, match="'tentacle'.*panda_hand_tcp"):
-        Contacts(model, [Contact("tentacle", SOLE, [0, 0, 1.0], 0.5)])
+        Contacts(model, [FrictionContact("tentacle", SOLE, [0, 0, 1.0], 0.5)])
     with pytest.raises(SettingError, match="at least one"):
         Contacts(model, [])
 
@@ -138,8 +138,8 @@ class Arm:
         self.contacts = Contacts(
             self.model,
             [
-                Contact(HAND, SOLE, [0.0, 0.0, -1.0], 0.6, facets),
-                Contact(ELBOW, [0.02, 0.1, -0.03], [0.3, 1.0, 0.0], 0.4, facets),
+                FrictionContact(HAND, SOLE, [0.0, 0.0, -1.0], 0.6, facets),
+                FrictionContact(ELBOW, [0.02, 0.1, -0.03], [0.3, 1.0, 0.0], 0.4, facets),
             ],
         )
         self.q = TaskArm("panda").posture + 0.1 * rng.normal(size=7)
@@ -314,7 +314,7 @@ def test_the_force_on_a_springy_table_becomes_the_one_that_is_asked_for():
     model, frame = arm.model, arm.model.getFrameId(HAND)
     up = np.array([0.0, 0.0, 1.0])
     normal = arm.points(arm.q, 0)[1].T @ up
-    contacts = Contacts(model, [Contact(HAND, np.zeros(3), normal, 0.5)])
+    contacts = Contacts(model, [FrictionContact(HAND, np.zeros(3), normal, 0.5)])
     F_des = np.r_[10.0 * normal, 0.0, 0.0, 0.0]
     across = np.eye(6)
     across[:3, :3] -= np.outer(normal, normal)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from torque_safety_controller.contact import interaction
 from torque_safety_controller.contact.admittance import AdmittanceGains, admittance_task
-from torque_safety_controller.contact.contacts import Contact, Contacts
+from torque_safety_controller.contact.contacts import Contacts, FrictionContact
 from torque_safety_controller.contact.interaction import (
     Compliance,
     Interaction,
@@ -53,7 +53,7 @@ class Hand:
         )
         contacts = None
         if contact:
-            contacts = Contacts(ARM.model, [Contact(ARM.frame, np.zeros(3), NORMAL, 0.5)])
+            contacts = Contacts(ARM.model, [FrictionContact(ARM.frame, np.zeros(3), NORMAL, 0.5)])
         self.interaction = Interaction(
             sensor, contacts, 0 if contact else None, None, InteractionSettings(**settings)
         )
@@ -335,8 +335,8 @@ def test_other_contacts_are_closed_by_name_only_and_carry_no_more_than_they_must
     contacts = Contacts(
         ARM.model,
         [
-            Contact(ARM.frame, np.zeros(3), NORMAL, 0.5),
-            Contact("panda_link4", np.zeros(3), [0.0, 1.0, 0.0], 0.3),
+            FrictionContact(ARM.frame, np.zeros(3), NORMAL, 0.5),
+            FrictionContact("panda_link4", np.zeros(3), [0.0, 1.0, 0.0], 0.3),
         ],
     )
     interaction = Interaction(None, contacts, None, None, InteractionSettings(closed=(1,)))

@@ -89,7 +89,7 @@ class Pairs(NamedTuple):
     moves: Array
 
 
-class Motion(NamedTuple):
+class ArmMotion(NamedTuple):
     """Where bodies are, and how joints move; all in the root frame.
 
     Attributes:
@@ -194,7 +194,7 @@ class Workspace(NamedTuple):
 
     bodies: Bodies
     pairs: Pairs
-    motion: Motion
+    motion: ArmMotion
     limits: DistanceLimits
     table: Table
     rows: CollisionRows
@@ -223,7 +223,7 @@ class _Distance(NamedTuple):
 
 
 @compiled_vectors
-def place_bodies(bodies: Bodies, motion: Motion) -> None:
+def place_bodies(bodies: Bodies, motion: ArmMotion) -> None:
     """Compute where the bodies are."""
     for i in range(len(bodies.joint)):
         placement = motion.placements[bodies.joint[i]]
@@ -236,7 +236,7 @@ def place_bodies(bodies: Bodies, motion: Motion) -> None:
 
 
 @compiled_vectors
-def _move_joints(v: Array, motion: Motion) -> None:
+def _move_joints(v: Array, motion: ArmMotion) -> None:
     for i in range(1, len(motion.parent)):
         p = motion.parent[i]
         for k in range(2):
@@ -253,7 +253,7 @@ def _at_point(field: Array, point: Vector) -> Vector:
 
 
 @compiled_vectors
-def _closest(i: int, part: int, j: int, other: int, bodies: Bodies, motion: Motion) -> _Closest:
+def _closest(i: int, part: int, j: int, other: int, bodies: Bodies, motion: ArmMotion) -> _Closest:
     """Return the closest points of a part of capsule `i` and a part of body `j`."""
     axis, h = column(motion.rotation[i], 2), bodies.half[part, 2]
     start = along(at(motion.centre, i), bodies.offset[part, 2] - h, axis)
@@ -268,7 +268,7 @@ def _closest(i: int, part: int, j: int, other: int, bodies: Bodies, motion: Moti
 
 
 @compiled_vectors
-def _too_far(i: int, j: int, near: float, bodies: Bodies, motion: Motion) -> bool:
+def _too_far(i: int, j: int, near: float, bodies: Bodies, motion: ArmMotion) -> bool:
     """Return whether the ball around a capsule tells that a body is not near."""
     middle = in_axes(motion.rotation[j], sub(at(motion.centre, i), at(motion.centre, j)))
     d = point_to_box(middle, at(bodies.half, bodies.first[j])).distance
@@ -278,7 +278,7 @@ def _too_far(i: int, j: int, near: float, bodies: Bodies, motion: Motion) -> boo
 
 
 @compiled_vectors
-def _highest_speed(i: int, j: int, bodies: Bodies, motion: Motion) -> float:
+def _highest_speed(i: int, j: int, bodies: Bodies, motion: ArmMotion) -> float:
     """Return at least the speed with which two bodies approach each other."""
     first, second = motion.velocity[bodies.joint[i]], motion.velocity[bodies.joint[j]]
     v = sub(_at_point(first, at(motion.centre, i)), _at_point(second, at(motion.centre, j)))
@@ -333,7 +333,7 @@ def _pair_rows(k: int, pair: int, near: float, bounds: JointBounds, work: Worksp
 @compiled_vectors
 def _rate_and_bias(
     i: int, j: int, found: _Closest, n: Vector, o: Vector, slides: bool, bodies: Bodies,
-    motion: Motion,
+    motion: ArmMotion,
 ) -> tuple[float, float]:  # fmt: skip
     """Return the rate of a distance, and its acceleration at zero joint acceleration.
 
@@ -467,7 +467,7 @@ def survey(
     clearance: float,
     pairs: Pairs,
     bodies: Bodies,
-    motion: Motion,
+    motion: ArmMotion,
     least: Array,
     short: NDArray[np.int64],
 ) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from torque_safety_controller.collision.bodies import CollisionBody, capsule
 from torque_safety_controller.collision.capsule_fit import Capsule, capsules_around
 from torque_safety_controller.collision.geometry import link_shapes
-from torque_safety_controller.collision.kernels import Bodies, Motion, Pairs, survey
+from torque_safety_controller.collision.kernels import ArmMotion, Bodies, Pairs, survey
 from torque_safety_controller.collision.kinematics import JointKinematics
 from viability_bounds_pkg.exceptions import SettingError
 
@@ -125,10 +125,10 @@ def build_collision_model(
     return CollisionModel(model, bodies, remaining, tuple(names), capsules, left_out)
 
 
-def make_motion(bodies: Bodies, kinematics: JointKinematics, model: pin.Model) -> Motion:
+def make_motion(bodies: Bodies, kinematics: JointKinematics, model: pin.Model) -> ArmMotion:
     """Return what the kernels read of the joints, and memory for what they compute of them."""
     count = len(bodies.joint)
-    return Motion(
+    return ArmMotion(
         parent=np.array(list(model.parents), dtype=np.int64),
         placements=kinematics.placements,
         J=kinematics.J,

@@ -1,7 +1,7 @@
 """Contact forces: wrist sensor, contacts of the QP, admittance and dual compliance."""
 
 from torque_safety_controller.contact.admittance import AdmittanceGains
-from torque_safety_controller.contact.contacts import Contact, Contacts, friction_pyramid
+from torque_safety_controller.contact.contacts import Contacts, FrictionContact, friction_pyramid
 from torque_safety_controller.contact.interaction import (
     Compliance,
     Interaction,
@@ -16,7 +16,7 @@ from torque_safety_controller.contact.wrench_sensor import (
 __all__ = [
     "AdmittanceGains",
     "Compliance",
-    "Contact",
+    "FrictionContact",
     "Contacts",
     "Interaction",
     "InteractionSettings",

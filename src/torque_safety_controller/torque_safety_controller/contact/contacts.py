@@ -64,7 +64,7 @@ def friction_pyramid(normal: ArrayLike, friction: float, facets: int = FACETS) -
 
 
 @dataclass(frozen=True, eq=False)
-class Contact:
+class FrictionContact:
     """One contact of a link, in the axes of one of its frames.
 
     Attributes:
@@ -121,7 +121,7 @@ class Contacts:
         SettingError: none, or an unknown frame.
     """
 
-    def __init__(self, model: pin.Model, contacts: Sequence[Contact]) -> None:
+    def __init__(self, model: pin.Model, contacts: Sequence[FrictionContact]) -> None:
         if not contacts:
             raise SettingError("contacts", [], "at least one")
         for contact in contacts:

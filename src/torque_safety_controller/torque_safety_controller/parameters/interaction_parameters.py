@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from torque_safety_controller.contact.admittance import AdmittanceGains
-from torque_safety_controller.contact.contacts import Contact, Contacts
+from torque_safety_controller.contact.contacts import Contacts, FrictionContact
 from torque_safety_controller.contact.interaction import Interaction, InteractionSettings
 from torque_safety_controller.contact.wrench_sensor import SensorSettings, WrenchSensor
 from torque_safety_controller.robot_model import RobotModel
@@ -299,7 +299,7 @@ def _contacts(values: Mapping[str, Any], model: pin.Model) -> Contacts | None:
             if friction[i] != friction[first] or not np.array_equal(normals[i], normals[first]):
                 allowed = f"the same friction and normal at all points of {frame!r}"
                 raise SettingError("contact_normals", values["contact_normals"], allowed)
-        contacts.append(Contact(frame, points[its], normals[first], friction[first]))
+        contacts.append(FrictionContact(frame, points[its], normals[first], friction[first]))
     return Contacts(model, contacts)
 
 
