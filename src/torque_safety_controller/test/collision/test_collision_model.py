@@ -257,14 +257,14 @@ def test_what_cannot_be_is_refused():
 @pytest.mark.parametrize(
     "make, word",
     [
-        (lambda: sphere("s", [0.0, 0.0], 0.1), "positions"),
-        (lambda: sphere("s", [0.0, 0.0, np.nan], 0.1), "positions"),
-        (lambda: sphere("s", [0.0, 0.0, 0.0], 0.0), "sizes"),
-        (lambda: capsule("c", [0.0] * 3, "abc", 0.1), "positions"),
-        (lambda: box("b", [0.0] * 3, [0.1, 0.0, 0.1]), "sizes"),
-        (lambda: box("b", [0.0] * 3, [0.1] * 3, [0.0] * 4), "orientations"),
-        (lambda: half_space("h", [0.0] * 3, [0.0] * 3), "orientations"),
-        (lambda: box("", [0.0] * 3, [0.1] * 3), "names"),
+        (lambda: sphere("s", [0.0, 0.0], 0.1), "start of"),
+        (lambda: sphere("s", [0.0, 0.0, np.nan], 0.1), "start of"),
+        (lambda: sphere("s", [0.0, 0.0, 0.0], 0.0), "sizes of"),
+        (lambda: capsule("c", [0.0] * 3, "abc", 0.1), "end of"),
+        (lambda: box("b", [0.0] * 3, [0.1, 0.0, 0.1]), "sizes of"),
+        (lambda: box("b", [0.0] * 3, [0.1] * 3, [0.0] * 4), "orientation of"),
+        (lambda: half_space("h", [0.0] * 3, [0.0] * 3), "normal of"),
+        (lambda: box("", [0.0] * 3, [0.1] * 3), "name of an"),
     ],
 )
 def test_obstacles_that_cannot_be_are_refused(make, word):

@@ -263,7 +263,7 @@ def test_ends_have_rows_before_the_closest_point_jumps_there():
 
 def test_bodies_that_overlap_are_parted_slowly_and_reported():
     wall = half_space("wall", [0.85, 0.0, 0.0], [-1.0, 0.0, 0.0])
-    avoidance, _ = two_links(BALL, 0.4, [wall], "prismatic", "1 0 0", recovery_speed=0.1)
+    avoidance, _ = two_links(BALL, 0.4, [wall], "prismatic", "1 0 0")
     q, v, limit = np.zeros(2), np.zeros(2), np.full(2, 20.0)
     assert wide_rows(avoidance, q, v).distance[0] == pytest.approx(-0.1)
     speeds, kept = [], []

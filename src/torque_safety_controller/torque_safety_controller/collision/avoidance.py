@@ -12,14 +12,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from torque_safety_controller.collision.kernels import (
+    RESERVE,
     CollisionRows,
     DistanceLimits,
     JointBounds,
     Workspace,
     collision_rows,
 )
-from torque_safety_controller.collision.kinematics import JointKinematics
-from torque_safety_controller.collision.model import CollisionModel, make_motion
+from torque_safety_controller.collision.kinematics import Kinematics
+from torque_safety_controller.collision.model import CollisionModel
 from torque_safety_controller.qp.constraints import Rows
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.kernel.array_checks import both_finite
@@ -31,15 +32,6 @@ Array = NDArray[np.float64]
 ROW_SCALE = 0.01
 """Of rows in the QP: where they, the torques and the joints' bounds have no common solution, a
 distance gives way at a ten thousandth of what joints cost, so that the joints keep theirs."""
-
-RESERVE = 0.002
-"""Kept on top of the margin for what the linearisation within a step may take, m."""
-
-BRAKING_SHARE = 0.3
-"""Share of what the joints can do along a distance that it counts on, up to `braking`."""
-
-RECOVERY_SPEED = 0.1
-"""Speed at which bodies inside the margin are parted, m/s."""
 
 INFLUENCE = 0.08
 """Distance beyond the margin at which pairs are looked at that do not approach fast, m."""
@@ -125,20 +117,17 @@ class CollisionAvoidance:
         self._rows_max = rows_max
         self._undisturbed = np.zeros(n)
         self._braking = np.minimum(-lower, upper)
-        self._kinematics = JointKinematics(model.arm)
+        self._kinematics = Kinematics(model.arm, len(model.bodies.joint))
         parts, pairs = np.diff(model.bodies.first), model.pairs
         most = int((parts[pairs.first] + parts[pairs.second]).sum())
         self._work = Workspace(
             model.bodies,
             pairs,
-            make_motion(model.bodies, self._kinematics, model.arm),
+            self._kinematics.motion,
             DistanceLimits(
                 kept=settings.kept,
-                reserve=RESERVE,
                 braking=settings.braking,
-                braking_share=BRAKING_SHARE,
                 speed_max=settings.speed_max,
-                recovery_speed=RECOVERY_SPEED,
                 influence=settings.margin + INFLUENCE,
                 dt=dt,
             ),

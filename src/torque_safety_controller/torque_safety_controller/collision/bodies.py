@@ -29,7 +29,7 @@ class CollisionBody:
         half: half its edges, shape (3,), m; those of a sphere are 0, those of a capsule but z.
         radius: of the rounding, m.
         plane: whether it stands for a half space.
-        joint: index of the joint that moves it; 0 for what stands still.
+        joint: index of the joint that moves it; 0 for what does not move.
     """
 
     name: str
@@ -41,7 +41,10 @@ class CollisionBody:
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
-            raise SettingError("obstacle_names", self.name, "non-empty strings")
+            raise SettingError("name of an obstacle", self.name, "a non-empty string")
+        if not (self.half >= 0.0).all() or not (self.half.all() or self.radius > 0.0):
+            sizes = [*(2.0 * self.half), self.radius]
+            raise SettingError(f"sizes of obstacle {self.name!r}", sizes, "positive lengths")
 
 
 def make_obstacle(
@@ -60,21 +63,19 @@ def make_obstacle(
             z < 0.
 
     Raises:
-        SettingError: a value cannot be used; named as the node's parameters.
+        SettingError: a value cannot be used.
     """
     if shape not in SHAPES:
-        allowed = f"one of {', '.join(SHAPES)} (obstacle {name!r})"
-        raise SettingError("obstacle_shapes", shape, allowed)
-    centre, rotation = _vector(name, "positions", position), _rotation(name, orientation)
+        raise SettingError(f"shape of obstacle {name!r}", shape, f"one of {', '.join(SHAPES)}")
+    centre, rotation = _vector(name, "position", position), _rotation(name, orientation)
     if shape == "half_space":
         return half_space(name, centre, rotation[:, 2])
     if shape == "box":
         return box(name, centre, size, orientation)
-    diameter, other, height = _positive(name, size, 3)
+    diameter, other, height = _vector(name, "size", size)
     if diameter != other or (shape == "sphere" and diameter != height):
         equal = "three times" if shape == "sphere" else "twice"
-        allowed = f"a positive diameter {equal} (obstacle {name!r})"
-        raise SettingError("obstacle_sizes", size, allowed)
+        raise SettingError(f"size of obstacle {name!r}", size, f"a diameter {equal}")
     half = 0.5 * height * rotation[:, 2] if shape == "cylinder" else np.zeros(3)
     return capsule(name, centre - half, centre + half, 0.5 * diameter)
 
@@ -86,8 +87,8 @@ def sphere(name: str, centre: ArrayLike, radius: float) -> CollisionBody:
 
 def capsule(name: str, start: ArrayLike, end: ArrayLike, radius: float) -> CollisionBody:
     """Return all points within `radius` of the segment between two points of shape (3,), m."""
-    a, b = _vector(name, "positions", start), _vector(name, "positions", end)
-    (radius,) = _positive(name, [radius], 1)
+    a, b = _vector(name, "start", start), _vector(name, "end", end)
+    (radius,) = _vector(name, "radius", [radius], 1)
     half = np.array([0.0, 0.0, 0.5 * np.linalg.norm(b - a)])
     return CollisionBody(name, pin.SE3(_rotation_to(b - a), 0.5 * (a + b)), half, radius)
 
@@ -103,8 +104,8 @@ def box(
         size: lengths of its edges, shape (3,), m.
         orientation: quaternion x, y, z, w of its axes, normalised here.
     """
-    placement = pin.SE3(_rotation(name, orientation), _vector(name, "positions", centre))
-    return CollisionBody(name, placement, 0.5 * _positive(name, size, 3))
+    placement = pin.SE3(_rotation(name, orientation), _vector(name, "centre", centre))
+    return CollisionBody(name, placement, 0.5 * _vector(name, "size", size))
 
 
 def half_space(name: str, point: ArrayLike, normal: ArrayLike) -> CollisionBody:
@@ -115,11 +116,10 @@ def half_space(name: str, point: ArrayLike, normal: ArrayLike) -> CollisionBody:
         point: on the plane, shape (3,), m.
         normal: out of the solid, shape (3,), of any length but zero.
     """
-    direction = _vector(name, "orientations", normal)
+    direction = _vector(name, "normal", normal)
     if not direction.any():
-        allowed = f"a direction, not zero (obstacle {name!r})"
-        raise SettingError("obstacle_orientations", normal, allowed)
-    surface = pin.SE3(_rotation_to(direction), _vector(name, "positions", point))
+        raise SettingError(f"normal of obstacle {name!r}", normal, "not zero")
+    surface = pin.SE3(_rotation_to(direction), _vector(name, "point", point))
     below = pin.SE3(np.eye(3), np.array([0.0, 0.0, -_LARGE]))
     return CollisionBody(name, surface * below, np.full(3, _LARGE), plane=True)
 
@@ -133,18 +133,10 @@ def _rotation_to(axis: Array) -> Array:
 
 def _rotation(name: str, orientation: ArrayLike) -> Array:
     """Return the rotation of a quaternion x, y, z, w."""
-    quaternion = _vector(name, "orientations", orientation, 4)
+    quaternion = _vector(name, "orientation", orientation, 4)
     if np.linalg.norm(quaternion) < 1e-6:
-        allowed = f"quaternions, not zero (obstacle {name!r})"
-        raise SettingError("obstacle_orientations", orientation, allowed)
+        raise SettingError(f"orientation of obstacle {name!r}", orientation, "not zero")
     return np.array(pin.Quaternion(quaternion).normalized().toRotationMatrix())
-
-
-def _positive(name: str, values: ArrayLike, n: int) -> Array:
-    sizes = _vector(name, "sizes", values, n)
-    if not (sizes > 0.0).all():
-        raise SettingError("obstacle_sizes", values, f"positive lengths (obstacle {name!r})")
-    return sizes
 
 
 def _vector(name: str, field: str, values: ArrayLike, n: int = 3) -> Array:
@@ -153,6 +145,5 @@ def _vector(name: str, field: str, values: ArrayLike, n: int = 3) -> Array:
     except (TypeError, ValueError):
         array = np.zeros(0)
     if array.shape != (n,) or not np.isfinite(array).all():
-        allowed = f"{n} finite numbers (obstacle {name!r})"
-        raise SettingError(f"obstacle_{field}", values, allowed)
+        raise SettingError(f"{field} of obstacle {name!r}", values, f"{n} finite numbers")
     return array

@@ -40,7 +40,16 @@ from viability_bounds_pkg.kernel.bounds_kernel import Table, solve
 
 Array = NDArray[np.float64]
 
-_BLUNT = 1e-3  # m; axes nearer than this have met, and no curvature is told any more
+RESERVE = 0.002
+"""Kept on top of the margin for what the linearisation within a step may take, m."""
+
+BRAKING_SHARE = 0.3
+"""Share of what the joints can do along a distance that it counts on, up to `braking`."""
+
+RECOVERY_SPEED = 0.1
+"""Speed at which bodies inside the margin are parted, m/s."""
+
+_BLUNT = 1e-3  # m; no curvature is computed for axes nearer than this
 # Squared sine of the angle between two segments, or a segment and a face, below which the
 # closest points slide so fast that the rows of the ends take over.
 _PARALLEL = 1e-2
@@ -55,7 +64,7 @@ class Bodies(NamedTuple):
     """Boxes with rounded edges, and their parts: first the whole, then its edges or ends.
 
     Attributes:
-        joint: that moves the body, shape (b,), int; 0 for what stands still.
+        joint: that moves the body, shape (b,), int; 0 for what does not move.
         rotation: of the box in the joint's axes, shape (b, 3, 3).
         centre: of the box there, shape (b, 3), m.
         radius: of the rounding, shape (b,), m.
@@ -90,12 +99,15 @@ class Pairs(NamedTuple):
 
 
 class ArmMotion(NamedTuple):
-    """Where bodies are, and how joints move; all in the root frame.
+    """Where bodies are, and how joints move; all in the root frame, joint 0 is the root.
+
+    Spatial velocities are about the root's origin: linear, then angular.
 
     Attributes:
         parent: of each joint, shape (n + 1,), int.
-        placements: of the joints, shape (n + 1, 4, 3), see `kinematics.JointKinematics`.
-        J: spatial velocity of each joint for a unit joint velocity, shape (n, 2, 3), likewise.
+        placements: of the joints: the rows of the rotation, then the origin, m, shape
+            (n + 1, 4, 3).
+        J: spatial velocity of each joint for a unit joint velocity, shape (n, 2, 3).
         dJ: its time derivative, shape (n, 2, 3).
         velocity: spatial velocities of the joints, shape (n + 1, 2, 3), m/s and rad/s.
         bias: their rates at zero joint acceleration, shape (n + 1, 2, 3).
@@ -130,25 +142,19 @@ class JointBounds(NamedTuple):
 
 
 class DistanceLimits(NamedTuple):
-    """What distances are kept and how; see `avoidance.CollisionSettings` and the constants there.
+    """What distances are kept and how.
 
     Attributes:
-        kept: distance to keep, margin and reserve, m.
-        reserve: share of it that may be used, m.
+        kept: distance to keep, margin and `RESERVE`, m.
         braking: deceleration that a distance counts on at most, m/s^2.
-        braking_share: of what joints can do along a distance, counted on up to `braking`.
         speed_max: of approach, m/s.
-        recovery_speed: of bodies that are parted, m/s.
         influence: distance beyond which only fast approach matters, m.
         dt: how long an acceleration is held, s.
     """
 
     kept: float
-    reserve: float
     braking: float
-    braking_share: float
     speed_max: float
-    recovery_speed: float
     influence: float
     dt: float
 
@@ -395,7 +401,7 @@ def _write_row(k: int, pair: int, at_d: _Distance, bounds: JointBounds, work: Wo
         least += min(low, high)
         lever = max(lever, abs(g))
     # A bias towards the other body takes from the braking, but it falls with the speed squared.
-    share = limits.braking_share * brake
+    share = BRAKING_SHARE * brake
     counted = min(limits.braking, share)
     braking = max(min(counted, share + at_d.bias), _LEAST_SHARE * counted, _LEAST_BRAKING)
     room = at_d.d - limits.kept
@@ -408,14 +414,14 @@ def _write_row(k: int, pair: int, at_d: _Distance, bounds: JointBounds, work: Wo
     if room < 0.0:
         # Where a distance is greatest, levers vanish: the push with them.
         gentle = max(stop, 0.0) + counted * min(1.0, lever / _LEVER)
-        wanted = min(wanted, back, gentle, (limits.recovery_speed - rate) / limits.dt)
+        wanted = min(wanted, back, gentle, (RECOVERY_SPEED - rate) / limits.dt)
     elif rate < 0.0:
         wanted = min(wanted, max(back, stop))
     wanted -= at_d.bias + min(pushed, 0.0)
     if wanted <= least:
         return False
     rounding = _ROUNDING * (1e-3 + abs(most) + abs(least))
-    rows, room = work.rows, room + limits.reserve
+    rows, room = work.rows, room + RESERVE
     rows.lower[k] = min(wanted, most - rounding)
     rows.pair[k], rows.distance[k], rows.rate[k], rows.bias[k] = pair, at_d.d, rate, at_d.bias
     stops = rate >= 0.0 or rate * rate <= 2.0 * braking * room

@@ -6,38 +6,44 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from torque_safety_controller.collision.kernels import ArmMotion
+
 Array = NDArray[np.float64]
 
 
-class JointKinematics:
-    """Joint placements, Jacobian and its rate at one state, in the root frame.
+class Kinematics:
+    """Joint placements, Jacobian and its rate at one state.
 
     Args:
         model: n joints with one coordinate each.
+        bodies: how many bodies the joints move.
 
     Attributes:
-        placements: of the joints, shape (n + 1, 4, 3): the rows of the rotation, then the origin,
-            m; joint 0 is the root.
-        J: spatial velocity of each joint about the root's origin for a unit joint velocity, shape
-            (n, 2, 3): linear, then angular.
-        dJ: its time derivative, shape (n, 2, 3).
+        motion: placements, J and dJ are computed here, the rest by the kernels.
     """
 
-    def __init__(self, model: pin.Model) -> None:
-        self._model = model
-        self._data = model.createData()
-        self.placements: Array = np.zeros((model.njoints, 4, 3))
-        self._rows = self.placements.reshape(-1, 3)
-        # Views of Pinocchio's memory: to read each placement anew takes ten times as long.
+    def __init__(self, model: pin.Model, bodies: int) -> None:
+        self._model, self._data = model, model.createData()
+        data, joints = self._data, model.njoints
+        self.motion = ArmMotion(
+            parent=np.array(list(model.parents), dtype=np.int64),
+            placements=np.zeros((joints, 4, 3)),
+            J=data.J.T.reshape(-1, 2, 3),  # views of Pinocchio's memory, like the two below
+            dJ=data.dJ.T.reshape(-1, 2, 3),
+            velocity=np.zeros((joints, 2, 3)),
+            bias=np.zeros((joints, 2, 3)),
+            rotation=np.zeros((bodies, 3, 3)),
+            centre=np.zeros((bodies, 3)),
+        )
+        self._rows = self.motion.placements.reshape(-1, 3)
+        # To read each placement anew takes ten times as long.
         self._views = [
             view
-            for i in range(model.njoints)
-            for view in (self._data.oMi[i].rotation, self._data.oMi[i].translation[None])
+            for i in range(joints)
+            for view in (data.oMi[i].rotation, data.oMi[i].translation[None])
         ]
-        self.J: Array = self._data.J.T.reshape(-1, 2, 3)
-        self.dJ: Array = self._data.dJ.T.reshape(-1, 2, 3)
 
     def update(self, q: Array, v: Array) -> None:
-        """Compute everything at a state of shapes (n,), rad, and (n,), rad/s."""
+        """Compute the joints' part of `motion` at positions and velocities of shape (n,)."""
         pin.computeJointJacobiansTimeVariation(self._model, self._data, q, v)
         np.concatenate(self._views, out=self._rows)

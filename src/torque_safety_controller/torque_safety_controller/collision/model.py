@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from torque_safety_controller.collision.bodies import CollisionBody, capsule
 from torque_safety_controller.collision.capsule_fit import Capsule, capsules_around
 from torque_safety_controller.collision.geometry import link_shapes
-from torque_safety_controller.collision.kernels import ArmMotion, Bodies, Pairs, survey
-from torque_safety_controller.collision.kinematics import JointKinematics
+from torque_safety_controller.collision.kernels import Bodies, Pairs, survey
+from torque_safety_controller.collision.kinematics import Kinematics
 from viability_bounds_pkg.exceptions import SettingError
 
 Array = NDArray[np.float64]
@@ -125,21 +125,6 @@ def build_collision_model(
     return CollisionModel(model, bodies, remaining, tuple(names), capsules, left_out)
 
 
-def make_motion(bodies: Bodies, kinematics: JointKinematics, model: pin.Model) -> ArmMotion:
-    """Return what the kernels read of the joints, and memory for what they compute of them."""
-    count = len(bodies.joint)
-    return ArmMotion(
-        parent=np.array(list(model.parents), dtype=np.int64),
-        placements=kinematics.placements,
-        J=kinematics.J,
-        dJ=kinematics.dJ,
-        velocity=np.zeros((model.njoints, 2, 3)),
-        bias=np.zeros((model.njoints, 2, 3)),
-        rotation=np.zeros((count, 3, 3)),
-        centre=np.zeros((count, 3)),
-    )
-
-
 def _pack(bodies: Sequence[CollisionBody]) -> Bodies:
     """Return bodies as arrays, with their parts."""
     parts = [_parts(body) for body in bodies]
@@ -245,8 +230,8 @@ def _prune(
     low = np.where(np.isfinite(model.lowerPositionLimit), model.lowerPositionLimit, -np.pi)
     high = np.where(np.isfinite(model.upperPositionLimit), model.upperPositionLimit, np.pi)
     samples = np.random.default_rng(0).uniform(low, high, size=(pruning.samples, model.nq))
-    kinematics, zero = JointKinematics(model), np.zeros(model.nv)
-    motion = make_motion(bodies, kinematics, model)
+    kinematics, zero = Kinematics(model, len(bodies.joint)), np.zeros(model.nv)
+    motion = kinematics.motion
     closest, short = np.full(len(pairs.first), np.inf), np.zeros(len(pairs.first), dtype=np.int64)
     kinematics.update(q_start, zero)
     survey(pruning.near, pruning.clearance, pairs, bodies, motion, closest, short)

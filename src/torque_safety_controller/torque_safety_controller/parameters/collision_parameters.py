@@ -208,7 +208,14 @@ def _obstacles(values: Mapping[str, Any]) -> tuple[CollisionBody, ...]:
             allowed = f"{each * len(names)} numbers, {each} for each of 'obstacle_names'"
             raise SettingError(f"obstacle_{key}", numbers, allowed)
         columns.append(numbers.reshape(-1, each))
-    return tuple(map(make_obstacle, names, values["obstacle_shapes"], *columns))
+    obstacles = []
+    for row in zip(names, values["obstacle_shapes"], *columns, strict=True):
+        try:
+            obstacles.append(make_obstacle(*row))
+        except SettingError as error:
+            field = error.name.split()[0].removesuffix("s")
+            raise SettingError(f"obstacle_{field}s", error.value, error.allowed) from error
+    return tuple(obstacles)
 
 
 def _pair(text: str) -> tuple[str, str]:
