@@ -23,10 +23,10 @@ import yaml
 
 from torque_safety_controller.additional_torque import AdditionalTorque
 from torque_safety_controller.collision.avoidance import CollisionAvoidance
+from torque_safety_controller.collision.bodies import box, capsule, half_space, sphere
 from torque_safety_controller.collision.geometry import link_shapes, load_geometry
-from torque_safety_controller.collision.kernels import BOX, CAPSULES, HALF_SPACE, Pairs
+from torque_safety_controller.collision.kernels import Pairs
 from torque_safety_controller.collision.model import CollisionModel, build_collision_model
-from torque_safety_controller.collision.obstacles import box, capsule, half_space, sphere
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.parameters import controller_parameters
 from torque_safety_controller.qp.constraints import AccelerationRange
@@ -39,7 +39,7 @@ from viability_bounds_pkg.state import State
 ROOT = Path(__file__).resolve().parent.parent
 STATES = 1000
 CACHE = 8_000_000  # numbers; more than the last-level cache holds
-KINDS = {CAPSULES: "two capsules", BOX: "capsule and box", HALF_SPACE: "capsule and half space"}
+KINDS = ("two capsules", "capsule and box", "capsule and half space")
 SURROUNDINGS = {
     "panda": (
         box("table", [0.6, 0.0, 0.1], [0.4, 1.0, 0.05]),
@@ -121,11 +121,18 @@ class Robot:
         return CollisionAvoidance(model or self.collision, self.a_min, self.a_max, self.dt)
 
 
-def only(model: CollisionModel, kind: int, repeat: int = 1) -> CollisionModel:
+def kinds(model: CollisionModel) -> np.ndarray:
+    """Return the kind of each pair, an index of `KINDS`."""
+    bodies, second = model.bodies, model.pairs.second
+    solid = bodies.half[bodies.first[second]].all(axis=1)
+    return np.where(bodies.plane[second], 2, np.where(solid, 1, 0))
+
+
+def only(model: CollisionModel, kind: int) -> CollisionModel:
     """Return the model with the pairs of one kind, or with none."""
-    mask = np.tile(model.pairs.kind == kind, repeat)
-    pairs = Pairs(*(np.tile(a, repeat)[mask].copy() for a in model.pairs))
-    names = tuple(n for n, kept in zip(model.names * repeat, mask, strict=True) if kept)
+    mask = kinds(model) == kind
+    pairs = Pairs(*(a[mask] for a in model.pairs))
+    names = tuple(n for n, kept in zip(model.names, mask, strict=True) if kept)
     return dataclasses.replace(model, pairs=pairs, names=names)
 
 
@@ -147,7 +154,7 @@ def steps(robot: Robot) -> None:
         states = robot.states(speed)
         near, rows = [], []
         for state in states:
-            rows.append(len(avoidance.rows(*state).names))
+            rows.append(len(avoidance.rows(*state).lower))
             near.append(np.count_nonzero(np.isfinite(avoidance.distances)))
         cold = []
         for state in states[:40]:
@@ -166,7 +173,7 @@ def pairs(robot: Robot) -> None:
     model = robot.collision
     bare = median_time(robot.avoidance(only(model, -1)).rows, states)
     print(f"  without pairs: {bare:.1f} us (kinematics, and what Python takes)")
-    for kind, name in KINDS.items():
+    for kind, name in enumerate(KINDS):
         part = only(model, kind)
         count = len(part.names)
         if not count:
@@ -174,13 +181,8 @@ def pairs(robot: Robot) -> None:
         costs = {}
         for label, influence in (("far", 1e-1), ("near", 50.0)):
             avoidance = robot.avoidance(part)
-            avoidance = CollisionAvoidance(
-                part,
-                robot.a_min,
-                robot.a_max,
-                robot.dt,
-                dataclasses.replace(avoidance.settings, influence=influence),
-            )
+            limits = avoidance._work.limits._replace(influence=influence)
+            avoidance._work = avoidance._work._replace(limits=limits)
             still = [(q, 0.0 * v, low, high) for q, v, low, high in states]
             time_ = median_time(avoidance.rows, still)
             costs[label] = (time_ - bare) / count
@@ -232,16 +234,14 @@ def coal_pairs(robot: Robot) -> None:
     for label in ("capsules", "convex hulls"):
         geometry = pin.GeometryModel()
         if label == "capsules":
-            for i, (j, p, u, r) in enumerate(
-                zip(bodies.joint, bodies.start, bodies.segment, bodies.radius, strict=True)
+            for i, (j, R, p, r) in enumerate(
+                zip(bodies.joint, bodies.rotation, bodies.centre, bodies.radius, strict=True)
             ):
-                length = float(np.linalg.norm(u))
-                z = np.array([0.0, 0.0, 1.0])
-                turn = pin.Quaternion.FromTwoVectors(z, u if length > 0.0 else z)
-                place = pin.SE3(turn.toRotationMatrix(), p + 0.5 * u)
-                shape = coal.Capsule(float(r), length)
-                geometry.addGeometryObject(pin.GeometryObject(str(i), int(j), 0, place, shape))
-            chosen = model.pairs.kind == CAPSULES
+                shape = coal.Capsule(float(r), 2.0 * bodies.half[bodies.first[i], 2])
+                geometry.addGeometryObject(
+                    pin.GeometryObject(str(i), int(j), 0, pin.SE3(R, p), shape)
+                )
+            chosen = kinds(model) == 0
             for i, j in zip(model.pairs.first[chosen], model.pairs.second[chosen], strict=True):
                 geometry.addCollisionPair(pin.CollisionPair(int(i), int(j)))
         else:

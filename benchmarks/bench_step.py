@@ -15,7 +15,7 @@ import numpy as np
 import pinocchio as pin
 import yaml
 
-from torque_safety_controller.contact.contacts import Contact, Contacts
+from torque_safety_controller.contact.contacts import Contacts, FrictionContact
 from torque_safety_controller.controller import Controller, Gains
 from torque_safety_controller.qp.constraints import AccelerationRange, LinearConstraints
 from torque_safety_controller.qp.inverse_dynamics_qp import SOLVERS, InverseDynamicsQP
@@ -72,7 +72,9 @@ def qp_alone(controller: Controller, state: State) -> dict[str, Callable[[], Any
     data = robot.model.createData()
     pin.computeJointJacobians(robot.model, data, state.q)
     pin.forwardKinematics(robot.model, data, state.q, state.v, np.zeros(n))
-    contacts = Contacts(robot.model, [Contact(robot.frame, np.zeros(3), [0.0, 0.0, -1.0], 0.5, 4)])
+    contacts = Contacts(
+        robot.model, [FrictionContact(robot.frame, np.zeros(3), [0.0, 0.0, -1.0], 0.5, 4)]
+    )
     wrench = contacts.wrench_task(0, np.array([0.0, 0.0, -10.0, 0.0, 0.0, 0.0]), 1e-3)
     robot.update(state, np.zeros(n))
     limits = robot.M, -controller.tau_max - robot.h, controller.tau_max - robot.h

@@ -15,13 +15,13 @@ from torque_safety_controller.collision.avoidance import (
     CollisionRows,
     CollisionSettings,
 )
+from torque_safety_controller.collision.bodies import box, capsule, half_space, sphere
 from torque_safety_controller.collision.geometry import load_geometry
 from torque_safety_controller.collision.model import (
     CollisionModel,
     Pruning,
     build_collision_model,
 )
-from torque_safety_controller.collision.obstacles import box, capsule, half_space, sphere
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 from viability_bounds_pkg.viability import BoundsSolver
@@ -65,8 +65,16 @@ def two_links(
     )
     limit = np.full(2, 20.0)
     dt = settings.pop("dt", 1e-3)
-    given = CollisionSettings(**settings)
-    return CollisionAvoidance(collision, -limit, limit, dt, given), model
+    constants = {k: settings.pop(k) for k in ("influence",) if k in settings}
+    avoidance = CollisionAvoidance(collision, -limit, limit, dt, CollisionSettings(**settings))
+    return with_constants(avoidance, **constants), model
+
+
+def with_constants(avoidance: CollisionAvoidance, **constants: float) -> CollisionAvoidance:
+    """Change what no setting reaches, to see more in a test."""
+    limits = avoidance._work.limits._replace(**constants)
+    avoidance._work = avoidance._work._replace(limits=limits)
+    return avoidance
 
 
 @cache
@@ -95,7 +103,7 @@ def least_relaxed(
     a_des: np.ndarray, a_lower: np.ndarray, a_upper: np.ndarray, rows: CollisionRows
 ) -> np.ndarray:
     """Return the accelerations nearest to those wanted; rows give way only to the bounds."""
-    n, k = len(a_des), len(rows.names)
+    n, k = len(a_des), len(rows.lower)
     if not k:
         return np.clip(a_des, a_lower, a_upper)
     H = np.diag(np.r_[np.ones(n), np.full(k, 1e-6)])

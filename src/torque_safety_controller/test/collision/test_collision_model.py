@@ -5,16 +5,11 @@ import pytest
 from collision_arm import panda
 from ros_harness import read_config
 
+from torque_safety_controller.collision.bodies import box, capsule, half_space, sphere
 from torque_safety_controller.collision.capsule_fit import capsules_around, fitted_capsule
 from torque_safety_controller.collision.geometry import link_shapes, load_geometry
 from torque_safety_controller.collision.model import Pruning, build_collision_model
-from torque_safety_controller.collision.obstacles import (
-    CollisionError,
-    box,
-    capsule,
-    half_space,
-    sphere,
-)
+from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import RobotDescriptionError, build_model, read_urdf
 
 FEW = Pruning(samples=300)
@@ -226,13 +221,14 @@ def test_obstacles_are_in_the_base_frame():
         model, geometry, arm.q_start, things, base_frame="table_frame", pruning=FEW
     )
     bodies = collision.bodies
-    np.testing.assert_allclose(bodies.start[-1], place.act(np.array([0.1, 0.2, 0.3])))
-    np.testing.assert_allclose(bodies.box_centre[0], place.act(np.array([0.3, 0.0, 0.1])))
-    np.testing.assert_allclose(bodies.box_axes[0], place.rotation)
+    np.testing.assert_allclose(bodies.centre[-3], place.act(np.array([0.1, 0.2, 0.3])))
+    np.testing.assert_allclose(bodies.centre[-2], place.act(np.array([0.3, 0.0, 0.1])))
+    np.testing.assert_allclose(bodies.rotation[-2], place.rotation)
     normal = place.rotation[:, 2]
-    np.testing.assert_allclose(bodies.normal[0], normal)
+    np.testing.assert_allclose(bodies.rotation[-1, :, 2], normal)
     on_floor = place.act(np.array([0.0, 0.0, -0.1]))
-    assert bodies.level[0] == pytest.approx(normal @ on_floor)
+    surface = bodies.centre[-1] + bodies.half[bodies.first[-2], 2] * normal
+    assert normal @ surface == pytest.approx(normal @ on_floor)
 
 
 def test_what_cannot_be_is_refused():
@@ -244,33 +240,33 @@ def test_what_cannot_be_is_refused():
 
     ball = sphere("ball", [1.0, 0.0, 0.0], 0.1)
     for changes, word in (
-        ({"q_start": arm.q_start[:3]}, "q_start"),
-        ({"q_start": np.full(7, np.nan)}, "q_start"),
-        ({"pairs": [("panda_hand", "hand")]}, "pairs = hand: "),
+        ({"q_start": arm.q_start[:3]}, "collision_posture"),
+        ({"q_start": np.full(7, np.nan)}, "collision_posture"),
+        ({"pairs": [("panda_hand", "hand")]}, "collision_pairs' is 'hand'"),
         ({"pairs": [("panda_hand",)]}, "two links"),
         ({"pairs": [("panda_hand", "panda_link7")]}, "move to each other"),
         ({"base_frame": "nowhere"}, "nowhere"),
         ({"base_frame": "panda_link3"}, "not moved"),
-        ({"obstacles": [ball, ball]}, "name = ball"),
+        ({"obstacles": [ball, ball]}, "obstacle_names' is 'ball'"),
         ({"obstacles": [sphere("panda_link1", [1, 0, 0], 0.1)]}, "panda_link1"),
     ):
-        with pytest.raises(CollisionError, match=word):
+        with pytest.raises(SettingError, match=word):
             build(**changes)
 
 
 @pytest.mark.parametrize(
     "make, word",
     [
-        (lambda: sphere("s", [0.0, 0.0], 0.1), "start"),
-        (lambda: sphere("s", [0.0, 0.0, np.nan], 0.1), "start"),
-        (lambda: sphere("s", [0.0, 0.0, 0.0], 0.0), "radius"),
-        (lambda: capsule("c", [0.0] * 3, "abc", 0.1), "end"),
-        (lambda: box("b", [0.0] * 3, [0.1, 0.0, 0.1]), "size"),
-        (lambda: box("b", [0.0] * 3, [0.1] * 3, [0.0] * 4), "orientation"),
-        (lambda: half_space("h", [0.0] * 3, [0.0] * 3), "normal"),
-        (lambda: box("", [0.0] * 3, [0.1] * 3), "name"),
+        (lambda: sphere("s", [0.0, 0.0], 0.1), "start of"),
+        (lambda: sphere("s", [0.0, 0.0, np.nan], 0.1), "start of"),
+        (lambda: sphere("s", [0.0, 0.0, 0.0], 0.0), "sizes of"),
+        (lambda: capsule("c", [0.0] * 3, "abc", 0.1), "end of"),
+        (lambda: box("b", [0.0] * 3, [0.1, 0.0, 0.1]), "sizes of"),
+        (lambda: box("b", [0.0] * 3, [0.1] * 3, [0.0] * 4), "orientation of"),
+        (lambda: half_space("h", [0.0] * 3, [0.0] * 3), "normal of"),
+        (lambda: box("", [0.0] * 3, [0.1] * 3), "name of an"),
     ],
 )
 def test_obstacles_that_cannot_be_are_refused(make, word):
-    with pytest.raises(CollisionError, match=word):
+    with pytest.raises(SettingError, match=word):
         make()

@@ -6,7 +6,7 @@ from collision_arm import panda
 from ros_harness import read_config
 
 from torque_safety_controller.collision.avoidance import CollisionSettings
-from torque_safety_controller.collision.obstacles import SHAPES, make_obstacle
+from torque_safety_controller.collision.bodies import SHAPES, make_obstacle
 from torque_safety_controller.parameters import controller_parameters
 from torque_safety_controller.parameters.collision_parameters import (
     COLLISION_TABLE,
@@ -61,17 +61,17 @@ def test_each_setting_arrives(name):
 def test_obstacles_become_shapes_in_the_base_frame():
     avoidance = load(obstacles=THINGS)
     bodies = avoidance.model.bodies
-    np.testing.assert_allclose(bodies.box_half, [[0.2, 0.5, 0.025]])
-    np.testing.assert_allclose(bodies.box_centre, [[0.7, 0.0, 0.2]])
+    table, ball, pole, floor = bodies.half[bodies.first[-5:-1]]
+    np.testing.assert_allclose(table, [0.2, 0.5, 0.025])
+    np.testing.assert_allclose(ball, 0.0)
+    np.testing.assert_allclose(pole, [0.0, 0.0, 0.5])
+    np.testing.assert_allclose(bodies.radius[-4:], [0.0, 0.1, 0.03, 0.0])
+    centres = [[0.7, 0.0, 0.2], [0.5, 0.3, 0.5], [0.4, -0.4, 0.5], [0.0, 0.0, -0.1 - floor[2]]]
+    np.testing.assert_allclose(bodies.centre[-4:], centres, atol=1e-12)
     expected = pin.utils.rotate("z", 0.8)
-    np.testing.assert_allclose(bodies.box_axes[0], expected, atol=1e-12)
-    ball, pole = bodies.start[-2:], bodies.start[-1:] + bodies.segment[-1:]
-    np.testing.assert_allclose(ball[0], [0.5, 0.3, 0.5], atol=1e-12)
-    np.testing.assert_allclose(bodies.radius[-2:], [0.1, 0.03])
-    np.testing.assert_allclose(ball[1], [0.4, -0.4, 0.0], atol=1e-12)
-    np.testing.assert_allclose(pole[0], [0.4, -0.4, 1.0], atol=1e-12)
-    np.testing.assert_allclose(bodies.normal, [[0.0, 0.0, 1.0]], atol=1e-12)
-    np.testing.assert_allclose(bodies.level, [-0.1])
+    np.testing.assert_allclose(bodies.rotation[-4], expected, atol=1e-12)
+    np.testing.assert_allclose(bodies.rotation[-3:, :, 2], [[0.0, 0.0, 1.0]] * 3, atol=1e-12)
+    assert bodies.plane.tolist()[-4:] == [False, False, False, True]
     assert {"panda_hand - table", "panda_hand - ball"} <= set(avoidance.model.names)
 
 

@@ -4,7 +4,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 import pytest
-from collision_arm import panda, two_links
+from collision_arm import panda, two_links, with_constants
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -13,16 +13,9 @@ from torque_safety_controller.collision.avoidance import (
     CollisionAvoidance,
     CollisionSettings,
 )
-from torque_safety_controller.collision.kernels import BOX, CAPSULES
-from torque_safety_controller.collision.kinematics import make_chain, make_motion, move
-from torque_safety_controller.collision.obstacles import (
-    CollisionError,
-    box,
-    capsule,
-    half_space,
-    sphere,
-)
+from torque_safety_controller.collision.bodies import box, capsule, half_space, sphere
 from torque_safety_controller.qp.constraints import AccelerationRange
+from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.viability import BoundsSolver
 
@@ -31,11 +24,11 @@ ROD = '<cylinder radius="0.05" length="0.4"/>'
 WIDE = 1e6  # rad/s^2; with such bounds no row is implied by them
 
 
-def everything(**changes) -> CollisionAvoidance:
+def everything() -> CollisionAvoidance:
     """Panda among all obstacles, near and far."""
     _, limits, collision, _ = panda()
-    given = CollisionSettings(influence=5.0, **changes)
-    return CollisionAvoidance(collision, limits.a_min, limits.a_max, 2e-3, given, rows_max=1000)
+    avoidance = CollisionAvoidance(collision, limits.a_min, limits.a_max, 2e-3, rows_max=1000)
+    return with_constants(avoidance, influence=5.0)
 
 
 def random_states(count, speed=1.0, seed=0):
@@ -50,67 +43,69 @@ def wide_rows(avoidance, q, v):
     return avoidance.rows(q, v, -wide, wide)
 
 
+def names_of(avoidance, rows):
+    return [avoidance.model.names[k] for k in rows.pair]
+
+
 def test_the_motion_of_the_joints_is_pinocchios():
+    """Velocity and bias of points fixed to the joints."""
     arm = panda()[0]
-    chain = make_chain(arm.model)
-    motion, data = make_motion(chain), arm.model.createData()
+    avoidance, data = everything(), arm.model.createData()
+    motion = avoidance._work.motion
     for q, v in random_states(20):
-        move(q, v, chain, motion)
+        wide_rows(avoidance, q, v)
         pin.forwardKinematics(arm.model, data, q, v, np.zeros(arm.n))
         for i in range(1, arm.model.njoints):
-            np.testing.assert_allclose(motion.rotation[i], data.oMi[i].rotation, atol=1e-13)
-            np.testing.assert_allclose(motion.origin[i], data.oMi[i].translation, atol=1e-13)
-            frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-            velocity = pin.getVelocity(arm.model, data, i, frame)
-            bias = pin.getClassicalAcceleration(arm.model, data, i, frame)
-            np.testing.assert_allclose(motion.velocity[i], velocity.linear, atol=1e-12)
-            np.testing.assert_allclose(motion.turning[i], velocity.angular, atol=1e-12)
-            np.testing.assert_allclose(motion.bias[i], bias.linear, atol=1e-12)
-            np.testing.assert_allclose(motion.turning_bias[i], bias.angular, atol=1e-12)
+            placement = data.oMi[i]
+            np.testing.assert_allclose(motion.placements[i, :3], placement.rotation, atol=1e-13)
+            np.testing.assert_allclose(motion.placements[i, 3], placement.translation, atol=1e-13)
+            for ours, theirs in ((motion.velocity, data.v), (motion.bias, data.a)):
+                spatial = placement.act(theirs[i])
+                np.testing.assert_allclose(ours[i, 0], spatial.linear, atol=1e-12)
+                np.testing.assert_allclose(ours[i, 1], spatial.angular, atol=1e-12)
 
 
 def test_distances_are_coals():
     """Every pair of capsules, box and half space, by another implementation."""
     avoidance = everything()
-    bodies, pairs, rows = avoidance.model.bodies, avoidance.model.pairs, avoidance._rows
+    bodies, pairs = avoidance.model.bodies, avoidance.model.pairs
     compared = 0
     for q, v in random_states(60, seed=1):
         wide_rows(avoidance, q, v)
-        for kind, i, j, d in zip(*pairs, rows.found, strict=True):
-            first = _coal_capsule(bodies, rows, i)
-            if kind == CAPSULES:
-                second = _coal_capsule(bodies, rows, j)
-            elif kind == BOX:
-                place = coal.Transform3s(bodies.box_axes[j], bodies.box_centre[j])
-                second = coal.Box(2.0 * bodies.box_half[j]), place
-            else:
-                second = coal.Halfspace(bodies.normal[j], bodies.level[j]), coal.Transform3s()
-            result = coal.DistanceResult()
-            expected = coal.distance(*first, *second, coal.DistanceRequest(), result)
+        for i, j, d in zip(pairs.first, pairs.second, avoidance.distances, strict=True):
+            if d == np.inf:
+                continue
+            first, second = _coal_body(avoidance, i), _coal_body(avoidance, j)
+            request, result = coal.DistanceRequest(), coal.DistanceResult()
+            expected = coal.distance(*first, *second, request, result)
+            box_like = isinstance(second[0], coal.Box)
             # A capsule whose axis is inside a box is measured otherwise: from its deepest point.
-            if kind == BOX and d < -bodies.radius[i]:
+            if box_like and d < -bodies.radius[i]:
                 assert expected < 0.0
             else:
                 # coal goes by GJK for boxes, to 1e-6 m
-                assert d == pytest.approx(expected, abs=2e-6 if kind == BOX else 1e-9)
+                assert d == pytest.approx(expected, abs=2e-6 if box_like else 1e-9)
             compared += 1
     assert compared > 2000
 
 
-def _coal_capsule(bodies, rows, i):
-    u = rows.segment[i]
-    length = float(np.linalg.norm(u))
-    z = u / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
-    turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), z).toRotationMatrix()
-    shape = coal.Capsule(float(bodies.radius[i]), length)
-    return shape, coal.Transform3s(turn, rows.start[i] + 0.5 * u)
+def _coal_body(avoidance, i):
+    bodies, motion = avoidance.model.bodies, avoidance._work.motion
+    half = bodies.half[bodies.first[i]]
+    R, centre = motion.rotation[i].copy(), motion.centre[i].copy()
+    if bodies.plane[i]:
+        surface = R[:, 2] @ centre + half[2]
+        return coal.Halfspace(R[:, 2], surface), coal.Transform3s()
+    if half.all():
+        return coal.Box(2.0 * half), coal.Transform3s(R, centre)
+    return coal.Capsule(float(bodies.radius[i]), 2.0 * half[2]), coal.Transform3s(R, centre)
 
 
 def test_rate_and_acceleration_by_finite_differences():
     """Of the closest points of each pair, along motions: curvature and sliding included."""
     avoidance = everything()
     h = 2e-4  # s
-    found = avoidance._rows.found
+    found = avoidance.distances
     compared, off = 0, 0
     rng = np.random.default_rng(2)
     for q, v in random_states(60, seed=3):
@@ -122,7 +117,7 @@ def test_rate_and_acceleration_by_finite_differences():
         rows = wide_rows(avoidance, q, v)
         before, now, after = nearby
         rate, acceleration = (after - before) / (2.0 * h), (after + before - 2.0 * now) / h**2
-        for k, p in enumerate(avoidance._rows.pair[: len(rows.names)]):
+        for k, p in enumerate(rows.pair):
             if rows.distance[k] != pytest.approx(now[p], abs=1e-12) or now[p] <= 0.0:
                 continue  # of other features than the closest points, or overlapping
             compared += 1
@@ -153,7 +148,7 @@ def test_a_ball_before_a_wall_by_hand(kind, axis):
         x_dot = -length * np.sin(q[0]) * v[0] + np.cos(q[0]) * v[1]
         x_bias = -length * np.cos(q[0]) * v[0] ** 2 - 2.0 * np.sin(q[0]) * v[0] * v[1]
         J = np.array([-length * np.sin(q[0]), np.cos(q[0])])
-    assert rows.names == ["fore - wall"]
+    assert names_of(avoidance, rows) == ["fore - wall"]
     assert rows.distance[0] == pytest.approx(1.0 - x - 0.05)
     assert rows.rate[0] == pytest.approx(-x_dot)
     assert rows.G[0] @ a + rows.bias[0] == pytest.approx(-(J @ a + x_bias))
@@ -207,8 +202,8 @@ def test_rows_are_left_out_only_if_the_bounds_imply_them():
         _, limits, _, _ = panda()
         rows = avoidance.rows(q, v, limits.a_min, limits.a_max)
         least = np.where(every.G > 0.0, limits.a_min, limits.a_max)
-        assert len(rows.names) == np.count_nonzero(np.sum(every.G * least, axis=1) < every.lower)
-        some += len(rows.names)
+        assert len(rows.lower) == np.count_nonzero(np.sum(every.G * least, axis=1) < every.lower)
+        some += len(rows.lower)
     assert some > 100
 
 
@@ -218,10 +213,10 @@ def test_pairs_that_are_not_looked_at_have_twice_the_way_to_stop():
     usual = CollisionAvoidance(collision, limits.a_min, limits.a_max, 2e-3, rows_max=1000)
     compared = 0
     for q, v in random_states(150, speed=1.5, seed=5):
-        near = set(usual.rows(q, v, limits.a_min, limits.a_max).names)
+        near = set(usual.rows(q, v, limits.a_min, limits.a_max).pair)
         every = avoidance.rows(q, v, limits.a_min, limits.a_max)
-        for name, d, rate in zip(every.names, every.distance, every.rate, strict=True):
-            if name not in near:
+        for pair, d, rate in zip(every.pair, every.distance, every.rate, strict=True):
+            if pair not in near:
                 assert d > 0.1
                 assert d - 0.022 > rate**2 / 2.0
                 compared += 1
@@ -236,10 +231,10 @@ def test_of_too_many_rows_the_nearest_are_returned():
     for q, v in random_states(100, speed=2.0, seed=8):
         rows = few.rows(q, v, limits.a_min, limits.a_max)
         all_rows = every.rows(q, v, limits.a_min, limits.a_max)
-        nearest = np.sort(all_rows.distance)[: len(rows.names)]
+        nearest = np.sort(all_rows.distance)[: len(rows.lower)]
         np.testing.assert_array_equal(np.sort(rows.distance), nearest)
-        assert len(rows.names) == min(3, len(all_rows.names)) == len(rows.G) == len(rows.viable)
-        cut += len(all_rows.names) > 3
+        assert len(rows.lower) == min(3, len(all_rows.lower)) == len(rows.G) == len(rows.viable)
+        cut += len(all_rows.lower) > 3
     assert cut > 10
 
 
@@ -271,14 +266,14 @@ def test_ends_have_rows_before_the_closest_point_jumps_there():
 
 def test_bodies_that_overlap_are_parted_slowly_and_reported():
     wall = half_space("wall", [0.85, 0.0, 0.0], [-1.0, 0.0, 0.0])
-    avoidance, _ = two_links(BALL, 0.4, [wall], "prismatic", "1 0 0", recovery_speed=0.1)
+    avoidance, _ = two_links(BALL, 0.4, [wall], "prismatic", "1 0 0")
     q, v, limit = np.zeros(2), np.zeros(2), np.full(2, 20.0)
     assert wide_rows(avoidance, q, v).distance[0] == pytest.approx(-0.1)
     speeds, kept = [], []
     for _ in range(3000):
         rows = avoidance.rows(q, v, -limit, limit)
         a = np.zeros(2)
-        if rows.names:
+        if len(rows.lower):
             a[1] = max(0.0, -rows.lower[0] / -rows.G[0, 1])
             a[1] = min(0.0, rows.lower[0] / rows.G[0, 1])
             kept.append(bool(rows.viable.all()))
@@ -313,9 +308,9 @@ def test_rows_are_finite_in_every_state(position, velocity, speed):
     avoidance = _near()
     q = arm.q_min + (np.array(position) + 1.0) * 0.5 * (arm.q_max - arm.q_min)
     rows = avoidance.rows(q, speed * np.array(velocity), limits.a_min, limits.a_max)
-    for array in rows[:2] + rows[3:6]:
+    for array in rows:
         assert np.isfinite(array).all()
-    assert rows.G.shape == (len(rows.names), 7)
+    assert rows.G.shape == (len(rows.lower), 7)
 
 
 _cache = []
@@ -357,25 +352,23 @@ def test_degenerate_places_give_finite_rows(obstacle, offset):
     [
         ({"margin": -0.1}, "margin"),
         ({"braking": 0.0}, "braking"),
-        ({"braking_share": 1.5}, "braking_share"),
-        ({"influence": 0.01}, "influence"),
         ({"speed_max": float("nan")}, "speed_max"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(changes, word):
-    with pytest.raises(CollisionError, match=word):
+    with pytest.raises(SettingError, match=word):
         CollisionSettings(**changes)
 
 
 def test_limits_and_steps_that_cannot_be_are_refused():
     _, limits, collision, _ = panda()
-    with pytest.raises(CollisionError, match="a_max"):
+    with pytest.raises(SettingError, match="acceleration_max"):
         CollisionAvoidance(collision, limits.a_min, -limits.a_max, 1e-3)
-    with pytest.raises(CollisionError, match="a_min"):
+    with pytest.raises(SettingError, match="acceleration_min"):
         CollisionAvoidance(collision, limits.a_min[:3], limits.a_max, 1e-3)
-    with pytest.raises(CollisionError, match="rows_max"):
+    with pytest.raises(SettingError, match="rows_max"):
         CollisionAvoidance(collision, limits.a_min, limits.a_max, 1e-3, rows_max=0)
-    with pytest.raises(CollisionError, match="dt"):
+    with pytest.raises(SettingError, match="dt"):
         CollisionAvoidance(collision, limits.a_min, limits.a_max, 0.0)
 
 

@@ -9,9 +9,9 @@ from arms import load_arm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from torque_safety_controller.contact import interaction
 from torque_safety_controller.contact.admittance import AdmittanceGains, AdmittanceTask
-from torque_safety_controller.contact.contacts import Contact, Contacts
-from torque_safety_controller.contact.dual_compliance import DualCompliance, DualSettings
+from torque_safety_controller.contact.contacts import Contacts, FrictionContact
 from torque_safety_controller.contact.interaction import (
     Compliance,
     Interaction,
@@ -55,7 +55,7 @@ class Hand:
         )
         contacts = None
         if contact:
-            contacts = Contacts(ARM.model, [Contact(ARM.frame, np.zeros(3), NORMAL, 0.5)])
+            contacts = Contacts(ARM.model, [FrictionContact(ARM.frame, np.zeros(3), NORMAL, 0.5)])
         self.interaction = Interaction(
             sensor, contacts, 0 if contact else None, None, InteractionSettings(**settings)
         )
@@ -94,9 +94,8 @@ def test_the_task_asks_for_what_equation_27_says(seed):
     q, v = ARM.random_state(rng)
     robot.update(State(q, v), REST)
     F_ref, F, F_ref_rate, F_rate = rng.normal(size=(4, 6)) * 10.0
-    gains = AdmittanceGains(*rng.uniform(0.0, 1.0, size=4))
-    Kp = np.diag([gains.force_kp] * 3 + [gains.moment_kp] * 3)
-    Kv = np.diag([gains.force_kd] * 3 + [gains.moment_kd] * 3)
+    gains = AdmittanceGains(*rng.uniform(0.0, 1.0, size=(2, 2)))
+    Kp, Kv = np.diag(np.repeat(gains.kp, 3)), np.diag(np.repeat(gains.kd, 3))
     expected = -Kp @ (F_ref - F) - Kv @ (F_ref_rate - F_rate)
     g = gains.acceleration(F_ref - F, F_ref_rate - F_rate, 50.0)
     task = AdmittanceTask(g, 2.0).term(robot)
@@ -111,7 +110,7 @@ def test_the_task_asks_for_what_equation_27_says(seed):
 @pytest.mark.parametrize("push", [0.1, 3.0, 100.0])
 def test_the_hand_does_not_rush(push):
     """It settles at the speed of (27) against the damping, or at the limit."""
-    gains = AdmittanceGains(0.1, 0.0, 0.2, 0.0, speed_max=0.02, turn_max=0.1)
+    gains = AdmittanceGains((0.1, 0.2), (0.0, 0.0), (0.02, 0.1))
     direction = np.array([2.0, -1.0, 2.0]) / 3.0
     wrench = push * np.concatenate([direction, direction])
     g = gains.acceleration(-wrench, np.zeros(6), 50.0)
@@ -126,7 +125,7 @@ def test_a_hand_that_feels_too_little_moves_on_and_too_much_back():
     for _ in range(3000):
         free = hand.step(force())
     assert hand.state is Compliance.FORCE
-    wanted = 0.5 * PAPER.force_kp * 10.0
+    wanted = 0.5 * PAPER.kp[0] * 10.0
     assert hand.hand_acceleration(free)[2] == pytest.approx(wanted, rel=1e-3)
     np.testing.assert_allclose(np.delete(hand.hand_acceleration(free), 2), 0.0, atol=1e-4)
     hand.step(force(z=-30.0))  # in which the derivative acts, too
@@ -184,8 +183,10 @@ def test_the_motors_give_what_the_contact_takes():
     np.testing.assert_allclose(pressing.tau, expected, atol=1e-2)
 
 
-def test_torque_limits_hold_with_the_contact_counted_in():
-    hand = Hand(contact=True, directions=Z, wrench_weight=1e6, wrench_time=1e-3)
+def test_torque_limits_hold_with_the_contact_counted_in(monkeypatch):
+    monkeypatch.setattr(interaction, "WRENCH_WEIGHT", 1e6)
+    monkeypatch.setattr(interaction, "WRENCH_TIME", 1e-3)
+    hand = Hand(contact=True, directions=Z)
     hand.interaction.set_target(-force(z=-2000.0))
     steps = [hand.step(force(z=-2000.0), bounds=np.full(7, 0.5)) for _ in range(50)]
     assert all((np.abs(step.tau) <= ARM.tau_max).all() for step in steps)
@@ -194,8 +195,10 @@ def test_torque_limits_hold_with_the_contact_counted_in():
     assert (np.abs(steps[-1].tau) > 0.999 * ARM.tau_max).any()
 
 
-def test_what_is_counted_on_exceeds_what_is_felt_by_a_step_at_most():
-    hand = Hand(contact=True, directions=Z, force_step=2.0, wrench_time=1e-6, wrench_weight=1e3)
+def test_what_is_counted_on_exceeds_what_is_felt_by_a_step_at_most(monkeypatch):
+    monkeypatch.setattr(interaction, "FORCE_STEP", 2.0)
+    monkeypatch.setattr(interaction, "WRENCH_TIME", 1e-6)
+    hand = Hand(contact=True, directions=Z)
     hand.interaction.set_target(-force(x=5.0, z=-10.0))
     contacts = hand.interaction.contacts
     for measured, counted in ((0.0, 2.0), (3.0, 5.0), (-7.0, 2.0), (9.0, 10.0), (40.0, 10.0)):
@@ -209,41 +212,43 @@ def test_what_is_counted_on_exceeds_what_is_felt_by_a_step_at_most():
 # Dual compliance
 
 
-@settings(deadline=None)
-@given(st.lists(st.floats(-30.0, 30.0), min_size=1, max_size=60), st.floats(0.0, 1.0))
-def test_yielding_has_hysteresis(forces, release):
-    decision = DualCompliance(DualSettings(force=10.0, moment=1.0, release=release))
-    for value in forces:
-        before = decision.yielding
-        after = decision.update(force(y=value))
+def test_yielding_has_hysteresis():
+    hand = Hand(yield_threshold=(10.0, 1.0))
+    before = False
+    for value in np.random.default_rng(0).uniform(-20.0, 20.0, 200):
+        hand.step(force(y=value))
+        after = hand.state is Compliance.YIELDING
         if abs(value) > 10.0:
             assert after
-        elif abs(value) <= 10.0 * release:
+        elif abs(value) <= 10.0 * interaction.YIELD_RELEASE:
             assert not after
         else:
             assert after == before
+        before = after
 
 
 def test_a_moment_is_yielded_to_as_well():
-    decision = DualCompliance(DualSettings())
-    assert decision.update(np.array([0, 0, 0, 0, 2.1, 0.0]))
-    assert not decision.update(np.array([0, 0, 0, 0, 0.9, 0.0]))
+    hand = Hand(yield_threshold=(10.0, 2.0))
+    hand.step(np.array([0, 0, 0, 0, 2.1, 0.0]))
+    assert hand.state is Compliance.YIELDING
+    hand.step(np.array([0, 0, 0, 0, 0.9, 0.0]))
+    assert hand.state is Compliance.HOLDING
 
 
 def test_the_hand_is_held_below_the_threshold_and_led_above():
-    settings = {"dual": DualSettings(force=10.0)}
+    settings = {"yield_threshold": (10.0, 2.0)}
     hand = Hand(**settings)
     held = hand.step(force(x=9.0))
     assert hand.state is Compliance.HOLDING
     np.testing.assert_allclose(hand.hand_acceleration(held), 0.0, atol=1e-4)
     led = hand.step(force(x=12.0))
     assert hand.state is Compliance.YIELDING
-    gain = InteractionSettings().yielding_gains.force_kp
+    gain = InteractionSettings().yielding_gains.kp[0]
     assert hand.hand_acceleration(led)[0] == pytest.approx(0.5 * gain * 12.0, rel=1e-2)
 
 
 def test_where_the_hand_is_let_go_is_its_new_goal():
-    hand = Hand(dual=DualSettings())
+    hand = Hand(yield_threshold=(10.0, 2.0))
     hand.step(force(x=20.0))
     elsewhere = Q + 0.05
     hand.step(force(x=20.0), elsewhere)
@@ -262,7 +267,7 @@ def test_where_the_hand_is_let_go_is_its_new_goal():
 
 @pytest.mark.parametrize("pressing", [False, True])
 def test_a_sensor_that_falls_silent_ends_it_where_the_hand_is(pressing):
-    hand = Hand(contact=True, directions=Z, dual=DualSettings())
+    hand = Hand(contact=True, directions=Z, yield_threshold=(10.0, 2.0))
     if pressing:
         hand.interaction.set_target(-force(z=-10.0))
     hand.step(force(z=-20.0))
@@ -312,9 +317,9 @@ def test_directions_exchanged_while_pressing_hold_the_hand_where_it_is():
 
 
 def test_settings_that_change_do_not_let_go_of_a_hand_that_is_led():
-    hand = Hand(dual=DualSettings(force=10.0))
+    hand = Hand(yield_threshold=(10.0, 2.0))
     hand.step(force(x=20.0))
-    hand.interaction.settings = replace(hand.interaction.settings, dual=DualSettings(force=11.0))
+    hand.interaction.settings = replace(hand.interaction.settings, yield_threshold=(11.0, 2.0))
     hand.step(force(x=8.0))
     assert hand.state is Compliance.YIELDING
 
@@ -332,8 +337,8 @@ def test_other_contacts_are_closed_by_name_only_and_carry_no_more_than_they_must
     contacts = Contacts(
         ARM.model,
         [
-            Contact(ARM.frame, np.zeros(3), NORMAL, 0.5),
-            Contact("panda_link4", np.zeros(3), [0.0, 1.0, 0.0], 0.3),
+            FrictionContact(ARM.frame, np.zeros(3), NORMAL, 0.5),
+            FrictionContact("panda_link4", np.zeros(3), [0.0, 1.0, 0.0], 0.3),
         ],
     )
     interaction = Interaction(None, contacts, None, None, InteractionSettings(closed=(1,)))

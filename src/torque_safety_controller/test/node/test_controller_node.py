@@ -194,7 +194,7 @@ def test_with_a_posture_goal_it_tracks_whatever_the_order_of_names(ros):
     chain.postures.publish(joint_state(names, 0, [*reversed(GOAL_Q), math.nan]))
     ros.wait_until(lambda: chain.reported("goals_pending") == "1", "the goal")
     tau = chain.answer(10)
-    step = expected(posture=GOAL_Q).step(Q, V, LOWER, UPPER)
+    step = expected(posture=GOAL_Q).step(State(Q, V), AccelerationRange(LOWER, UPPER))
     np.testing.assert_allclose(tau, step.tau, atol=SAME_TORQUE)
     chain.await_mode("TRACKING")
 
@@ -298,6 +298,13 @@ def test_a_silent_robot_that_repeats_its_state_is_answered_and_not_called_stoppe
 # Stamps
 
 
+def torque_for(q, a):
+    """Return the torque for accelerations `a` at velocity V."""
+    robot = ARM.robot()
+    robot.update(State(q, V), a)
+    return robot.torque(a)
+
+
 @pytest.mark.parametrize("order", ["limits first", "state first"])
 def test_state_and_limits_are_matched_in_either_order(ros, order):
     chain = Chain(ros)
@@ -313,9 +320,7 @@ def test_state_and_limits_are_matched_in_either_order(ros, order):
         )
         assert stamp * MS not in chain.commands.stamps
         tau = chain.await_command(stamp, second)
-        robot = ARM.robot()
-        robot.update(State(Q, V), only)
-        np.testing.assert_allclose(tau, robot.torque(only), atol=1e-3)
+        np.testing.assert_allclose(tau, torque_for(Q, only), atol=1e-3)
 
 
 def test_old_limits_are_never_used_for_a_new_state(ros):
@@ -339,7 +344,7 @@ def test_a_robot_that_starts_over_at_the_same_stamp_does_not_get_the_old_limits(
     assert not chain.commands
     only = np.full(ARM.n, 0.5)
     tau = chain.await_command(10, lambda: (chain.state(10, moved), chain.bound(10, only, only)))
-    np.testing.assert_allclose(tau, ARM.robot().torque(moved, V, only), atol=1e-3)
+    np.testing.assert_allclose(tau, torque_for(moved, only), atol=1e-3)
 
 
 def test_a_repeated_state_gets_the_same_command_again(ros):
@@ -412,7 +417,7 @@ def test_limits_in_any_order_and_of_others_too(ros):
             chain.state(10),
         ),
     )
-    np.testing.assert_allclose(tau, ARM.robot().torque(Q, V, only), atol=1e-3)
+    np.testing.assert_allclose(tau, torque_for(Q, only), atol=1e-3)
 
 
 # Goals
@@ -495,7 +500,10 @@ def test_goals_take_effect_at_their_stamps(ros):
             core.set_pose_goal(other)
         tau = chain.answer(stamp)
         np.testing.assert_allclose(
-            tau, core.step(Q, V, LOWER, UPPER).tau, atol=1e-4, err_msg=f"at {stamp} ms"
+            tau,
+            core.step(State(Q, V), AccelerationRange(LOWER, UPPER)).tau,
+            atol=1e-4,
+            err_msg=f"at {stamp} ms",
         )
     ros.wait_until(lambda: chain.reported("goals_pending") == "0")
     assert chain.reported("mode") == "TRACKING"
@@ -592,11 +600,15 @@ def test_gains_change_while_it_runs(ros, changed, gains):
     core = expected(GOAL, away)
     wide = np.full(ARM.n, 50.0)
     before = chain.answer(10, lower=-wide, upper=wide)
-    np.testing.assert_allclose(before, core.step(Q, V, -wide, wide).tau, atol=1e-4)
+    np.testing.assert_allclose(
+        before, core.step(State(Q, V), AccelerationRange(-wide, wide)).tau, atol=1e-4
+    )
     ros.accepts(NODE, **changed)
     core.gains = replace(core.gains, **gains)
     after = chain.answer(20, lower=-wide, upper=wide)
-    np.testing.assert_allclose(after, core.step(Q, V, -wide, wide).tau, atol=1e-4)
+    np.testing.assert_allclose(
+        after, core.step(State(Q, V), AccelerationRange(-wide, wide)).tau, atol=1e-4
+    )
     assert np.abs(after - before).max() > 1e-3
 
 

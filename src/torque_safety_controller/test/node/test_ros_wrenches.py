@@ -13,6 +13,7 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from ros_harness import read_config
 from std_srvs.srv import Trigger
 
+from torque_safety_controller.contact import interaction
 from torque_safety_controller.node.assembly import make_controller
 from torque_safety_controller.parameters import controller_parameters
 from viability_bounds_pkg.exceptions import SettingError
@@ -117,8 +118,10 @@ def test_measurements_that_are_none_are_dropped_counted_and_named(ros):
     assert hand.reported("compliance") == "sensor silent"
 
 
-def test_a_target_is_exerted_and_torques_say_so(ros):
+def test_a_target_is_exerted_and_torques_say_so(ros, monkeypatch):
     """In contact with what gives exactly that back, the motors carry it."""
+    monkeypatch.setattr(interaction, "WRENCH_TIME", 1e-3)
+    monkeypatch.setattr(interaction, "FORCE_STEP", 20.0)
     hand = Hand(ros, dual_compliance=False)
     hand.feels = wrench()
     hand.give_pose()
@@ -266,7 +269,7 @@ def test_what_a_tool_weighs_is_that_of_the_parameter_or_of_the_urdf():
     def left(tool, mass, lever):
         controller = build(ft_tool=tool, ft_filter_hz=1e4)
         robot, sensor = controller.robot, controller.interaction.sensor
-        robot.update(ARM.q_start, np.zeros(ARM.n), np.zeros(ARM.n))
+        robot.update(State(ARM.q_start, np.zeros(ARM.n)), np.zeros(ARM.n))
         rotation = robot.pose.rotation @ sensor.placement.rotation
         weight = rotation.T @ (mass * robot.model.gravity.linear)
         felt = np.r_[weight, np.cross(lever, weight)]

@@ -1,1 +1,32 @@
-"""Collision avoidance: distances that can always be kept."""
+"""Collision avoidance: constraints that keep links apart and away from obstacles."""
+
+from torque_safety_controller.collision.avoidance import CollisionAvoidance, CollisionSettings
+from torque_safety_controller.collision.bodies import (
+    CollisionBody,
+    box,
+    capsule,
+    half_space,
+    make_obstacle,
+    sphere,
+)
+from torque_safety_controller.collision.geometry import load_geometry
+from torque_safety_controller.collision.model import (
+    CollisionModel,
+    Pruning,
+    build_collision_model,
+)
+
+__all__ = [
+    "CollisionAvoidance",
+    "CollisionBody",
+    "CollisionModel",
+    "CollisionSettings",
+    "Pruning",
+    "box",
+    "build_collision_model",
+    "capsule",
+    "half_space",
+    "load_geometry",
+    "make_obstacle",
+    "sphere",
+]

@@ -1,4 +1,4 @@
-"""Collision avoidance as rows on joint accelerations: distances that can be kept for ever.
+"""Collision avoidance as constraints on joint accelerations: distances that can always be kept.
 
 `docs/collision_avoidance.md` derives the rows, and says what they promise and what not.
 """
@@ -6,26 +6,34 @@
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, dataclass, fields
-from typing import NamedTuple
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torque_safety_controller.collision.kernels import ROWS_OF_KIND, collision_rows
-from torque_safety_controller.collision.kinematics import make_motion
+from torque_safety_controller.collision.kernels import (
+    RESERVE,
+    CollisionRows,
+    DistanceLimits,
+    JointBounds,
+    Workspace,
+    collision_rows,
+)
+from torque_safety_controller.collision.kinematics import Kinematics
 from torque_safety_controller.collision.model import CollisionModel
-from torque_safety_controller.collision.obstacles import CollisionError
-from torque_safety_controller.collision.row import Law, Step, make_rows
 from torque_safety_controller.qp.constraints import AccelerationRange, LinearConstraints
 from torque_safety_controller.robot_model import RobotModel
-from viability_bounds_pkg.kernel.one_sided_limit import make_table
+from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.kernel.one_sided_limit import JointTable, make_table
 
 Array = NDArray[np.float64]
 
 ROW_SCALE = 0.01
 """Of rows in the QP: where they, the torques and the joints' bounds have no common solution, a
 distance gives way at a ten thousandth of what joints cost, so that the joints keep theirs."""
+
+INFLUENCE = 0.08
+"""Distance beyond the margin at which pairs are looked at that do not approach fast, m."""
 
 # Of the virtual joint, whose braking is 1: more than anything has.
 _FAST, _HARD = 1e6, 1e12
@@ -37,58 +45,29 @@ class CollisionSettings:
 
     Attributes:
         margin: distance to keep, m.
-        reserve: kept on top of it, m; what the linearisation within a step may take.
         braking: deceleration that a distance counts on at most, m/s^2.
-        braking_share: share of what the joints can do along a distance that it counts on, up
-            to `braking`.
         speed_max: greatest speed of approach, m/s.
-        recovery_speed: speed at which bodies inside the margin are parted, m/s.
-        influence: distance beyond which a pair is not looked at, m, unless it approaches fast.
+
+    Raises:
+        SettingError: a value is out of range; named as the node's parameters.
     """
 
     margin: float = 0.02
-    reserve: float = 0.002
     braking: float = 2.0
-    braking_share: float = 0.3
     speed_max: float = 1.0
-    recovery_speed: float = 0.1
-    influence: float = 0.1
 
     def __post_init__(self) -> None:
         for f in fields(self):
             value = getattr(self, f.name)
-            if not (isinstance(value, int | float) and math.isfinite(value) and value >= 0.0):
-                raise CollisionError(f.name, value, "a finite number >= 0")
-            if value == 0.0 and f.name not in ("margin", "reserve"):
-                raise CollisionError(f.name, value, "a finite number > 0")
-        if self.braking_share > 1.0:
-            raise CollisionError("braking_share", self.braking_share, "at most 1")
-        if self.influence <= self.margin + self.reserve:
-            raise CollisionError("influence", self.influence, "more than margin and reserve")
+            if not (math.isfinite(value) and value >= 0.0):
+                raise SettingError(f"collision_{f.name}", value, "a finite number >= 0")
+            if value == 0.0 and f.name != "margin":
+                raise SettingError(f"collision_{f.name}", value, "a finite number > 0")
 
-
-class CollisionRows(NamedTuple):
-    """Rows ``G a >= lower``; arrays are views that the next step overwrites.
-
-    Attributes:
-        G: shape (k, n), m/rad.
-        lower: shape (k,), m/s^2; never more than some `a` within the bounds reaches.
-        names: of the bodies of each row, length k.
-        distance: shape (k,), m; negative where capsules overlap.
-        rate: rate of change of the distance, shape (k,), m/s.
-        bias: its acceleration at zero joint acceleration, shape (k,), m/s^2, so that its
-            acceleration is ``G a + bias``.
-        viable: shape (k,), bool; False where the margin is broken, or more braking is needed to
-            keep it than is counted on or than the bounds allow.
-    """
-
-    G: Array
-    lower: Array
-    names: list[str]
-    distance: Array
-    rate: Array
-    bias: Array
-    viable: NDArray[np.bool_]
+    @property
+    def kept(self) -> float:
+        """Margin and reserve, m."""
+        return self.margin + RESERVE
 
 
 class CollisionAvoidance:
@@ -104,8 +83,12 @@ class CollisionAvoidance:
         rows_max: how many rows a step returns at most; of more, those of the least distances.
             Only arms deep in obstacles have more, and a QP needs an end.
 
+    Attributes:
+        model, settings: as given.
+        count: how many rows the last step had, before those beyond `rows_max` were dropped.
+
     Raises:
-        CollisionError: limits of the wrong size or sign, or a step that is not positive.
+        SettingError: limits of the wrong size or sign, or a step that is not positive.
     """
 
     def __init__(
@@ -117,37 +100,49 @@ class CollisionAvoidance:
         settings: CollisionSettings | None = None,
         rows_max: int = 40,
     ) -> None:
-        n = len(model.chain.parent) - 1
-        lower, upper = np.asarray(a_min, dtype=float), np.asarray(a_max, dtype=float)
-        for name, limit, sign in (("a_min", lower, -1.0), ("a_max", upper, 1.0)):
+        n = model.arm.nv
+        lower, upper = np.asarray(a_min, dtype=np.float64), np.asarray(a_max, dtype=np.float64)
+        for name, limit, sign in (("min", lower, -1.0), ("max", upper, 1.0)):
             if limit.shape != (n,) or not (np.isfinite(limit) & (sign * limit > 0.0)).all():
                 kind = "negative" if sign < 0.0 else "positive"
-                raise CollisionError(name, limit, f"{n} finite {kind} numbers")
+                raise SettingError(f"acceleration_{name}", limit, f"{n} finite {kind} numbers")
         if not (math.isfinite(dt) and dt > 0.0):
-            raise CollisionError("dt", dt, "a finite number > 0")
+            raise SettingError("dt", dt, "a finite number > 0")
         if rows_max < 1:
-            raise CollisionError("rows_max", rows_max, "positive")
-        self._rows_max = rows_max
-        self.settings = settings or CollisionSettings()
+            raise SettingError("rows_max", rows_max, "positive")
         self.model = model
-        table = make_table(
-            dt=dt,
-            position=[math.inf, 0.0],
-            braking=1.0,
-            v_max=_FAST,
-            low=-_HARD,
-            high=_HARD,
-        )
-        most = int(ROWS_OF_KIND[model.pairs.kind].sum()) + 1
-        self._count = 0
+        self.settings = settings = settings or CollisionSettings()
+        self.count = 0
+        self._rows_max = rows_max
         self._undisturbed = np.zeros(n)
-        self._rows = make_rows(most, n, len(model.names), len(model.bodies.joint))
-        self._fixed = (
-            np.minimum(-lower, upper),
-            *table,
-            Law(*astuple(self.settings), dt),
+        self._braking = np.minimum(-lower, upper)
+        self._kinematics = Kinematics(model.arm, len(model.bodies.joint))
+        parts, pairs = np.diff(model.bodies.first), model.pairs
+        most = int((parts[pairs.first] + parts[pairs.second]).sum())
+        self._work = Workspace(
+            model.bodies,
+            pairs,
+            self._kinematics.motion,
+            DistanceLimits(
+                kept=settings.kept,
+                braking=settings.braking,
+                speed_max=settings.speed_max,
+                influence=settings.margin + INFLUENCE,
+                dt=dt,
+            ),
+            _virtual_joint(dt),
+            CollisionRows(
+                G=np.zeros((most + 1, n)),
+                lower=np.zeros(most),
+                pair=np.zeros(most, dtype=np.int64),
+                distance=np.zeros(most),
+                rate=np.zeros(most),
+                bias=np.zeros(most),
+                viable=np.zeros(most, dtype=bool),
+            ),
+            distances=np.full(len(model.names), np.inf),
+            seen=np.zeros((16, 2, 3)),
         )
-        self._arm = (model.chain, make_motion(model.chain), self._rows)
         # The first call compiles; let it be this one and not one in a control loop.
         self.rows(np.zeros(n), np.zeros(n), lower, upper)
 
@@ -159,7 +154,7 @@ class CollisionAvoidance:
         a_upper: Array,
         disturbance: Array | None = None,
     ) -> CollisionRows:
-        """Return the rows of one step; those that the bounds imply are left out.
+        """Return the rows of one step, overwritten by the next; those that bounds imply are not.
 
         Args:
             q: shape (n,), rad.
@@ -171,28 +166,16 @@ class CollisionAvoidance:
 
         Values that are not finite are the caller's to refuse.
         """
-        chosen = self._update(q, v, a_lower, a_upper, disturbance)
-        rows, names = self._rows, self.model.names
-        return CollisionRows(
-            rows.G[chosen],
-            rows.lower[chosen],
-            [names[i] for i in rows.pair[chosen].tolist()],
-            rows.distance[chosen],
-            rows.rate[chosen],
-            rows.bias[chosen],
-            rows.viable[chosen],
-        )
-
-    def _update(self, q, v, a_lower, a_upper, disturbance) -> slice | NDArray[np.int64]:
-        """Compute the rows of a step; return which are to be used."""
+        self._kinematics.update(q, v)
         pushed = self._undisturbed if disturbance is None else disturbance
-        step = Step(a_lower, a_upper, pushed, *self._fixed)
-        k = collision_rows(q, v, self.model.pairs, self.model.bodies, step, *self._arm)
-        self._count = k
-        if k <= self._rows_max:
-            return slice(k)
-        nearest = np.argpartition(self._rows.distance[:k], self._rows_max)
-        return np.sort(nearest[: self._rows_max])
+        bounds = JointBounds(a_lower, a_upper, pushed, self._braking)
+        self.count = k = collision_rows(v, bounds, self._work)
+        rows = self._work.rows
+        chosen: slice | NDArray[np.int64] = slice(k)
+        if k > self._rows_max:
+            nearest = np.argpartition(rows.distance[:k], self._rows_max)
+            chosen = np.sort(nearest[: self._rows_max])
+        return CollisionRows._make([array[chosen] for array in rows])
 
     def constraint(
         self, robot: RobotModel, bounds: AccelerationRange, disturbance: Array | None = None
@@ -216,29 +199,30 @@ class CollisionAvoidance:
             a_lower, a_upper = (
                 np.nan_to_num(bound, posinf=_FAST, neginf=-_FAST) for bound in (a_lower, a_upper)
             )
-        chosen = self._update(q, v, a_lower, a_upper, disturbance)
-        G, lower = self._rows.G[chosen], self._rows.lower[chosen]
-        return LinearConstraints(ROW_SCALE * G, ROW_SCALE * lower, np.full(len(lower), np.inf))
-
-    @property
-    def count(self) -> int:
-        """How many rows the last step had, before those beyond `rows_max` were dropped."""
-        return self._count
+        rows = self.rows(q, v, a_lower, a_upper, disturbance)
+        lower = ROW_SCALE * rows.lower
+        return LinearConstraints(ROW_SCALE * rows.G, lower, np.full(len(lower), np.inf))
 
     @property
     def viable(self) -> bool:
         """Whether all rows of the last step were viable."""
-        return bool(self._rows.viable[: self._count].all())
+        return bool(self._work.rows.viable[: self.count].all())
 
     @property
     def distances(self) -> Array:
         """Distances of all pairs in the last step, shape (p,), m; inf where one is far."""
-        return self._rows.found
+        return self._work.distances
 
     def closest(self) -> tuple[float, str]:
         """Return the least distance in the last step, m, and between what; inf if all are far."""
-        if not self.model.names:
-            return math.inf, ""
-        index = int(np.argmin(self._rows.found))
-        distance = float(self._rows.found[index])
-        return distance, self.model.names[index] if distance < math.inf else ""
+        distance = float(self.distances.min(initial=math.inf))
+        if distance == math.inf:
+            return distance, ""
+        return distance, self.model.names[int(self.distances.argmin())]
+
+
+def _virtual_joint(dt: float) -> JointTable:
+    """Return the table of a joint with a lower limit of 0 and none above, whose braking is 1."""
+    return make_table(
+        dt=dt, position=[math.inf, 0.0], braking=1.0, v_max=_FAST, low=-_HARD, high=_HARD
+    )

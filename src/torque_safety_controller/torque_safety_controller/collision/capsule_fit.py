@@ -13,12 +13,16 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+CAPSULES_PER_LINK = 3
+"""Most capsules around a mesh."""
+
 _ROUNDS = 24
 _CANDIDATES = 48
 _EXTREMES = 96  # directions in which vertices are sought that decide the fit
 _CUTS = (0.25, 0.375, 0.5, 0.625, 0.75)
 _WORTH = 0.8  # a cut must leave less than this share of the volume
 _SMALLEST = 1e-4  # m; radius of the capsule around a point
+_ROUNDING = 1e-11  # m; what the squares of distances lack
 
 
 class Capsule(NamedTuple):
@@ -41,15 +45,19 @@ class Capsule(NamedTuple):
         return float(np.pi * self.radius**2 * (length + 4.0 / 3.0 * self.radius))
 
 
-def capsules_around(vertices: Array, triangles: NDArray, most: int = 3) -> list[Capsule]:
+def capsules_around(
+    vertices: Array, triangles: NDArray[np.int64], most: int = CAPSULES_PER_LINK
+) -> list[Capsule]:
     """Return up to `most` capsules that cover a mesh; more only where they are much smaller.
 
     Args:
         vertices: shape (m, 3), m.
-        triangles: indices of vertices, shape (k, 3).
+        triangles: indices of vertices, shape (k, 3); of none there are no capsules.
         most: number of capsules, at least 1.
     """
-    parts = [(np.asarray(triangles), fitted_capsule(vertices[np.unique(triangles)]))]
+    if not len(triangles):
+        return []
+    parts = [(triangles, fitted_capsule(vertices[np.unique(triangles)]))]
     while len(parts) < most:
         index = max(range(len(parts)), key=lambda i: parts[i][1].volume)
         halves = _cut(vertices, parts[index][0])
@@ -67,11 +75,10 @@ def fitted_capsule(points: Array) -> Capsule:
     """
     rng = np.random.default_rng(0)
     extremes = _extremes(points)
-    centre = points.mean(axis=0)
-    axes = np.linalg.svd(extremes - extremes.mean(axis=0))[2]
-    middle = 0.5 * ((extremes @ axes.T).max(axis=0) + (extremes @ axes.T).min(axis=0)) @ axes
-    scale = max(float(np.abs(extremes - centre).max()), _SMALLEST)
-    volumes = _volumes(extremes, axes, np.tile(middle, (3, 1)))
+    axes = _principal_axes(extremes)
+    middle = _middle(extremes, axes)
+    scale = max(float(np.abs(extremes - points.mean(axis=0)).max()), _SMALLEST)
+    volumes = _volumes(extremes, axes, middle[None])
     best = int(np.argmin(volumes))
     axis, origin, volume = axes[best], middle, volumes[best]
     for k in range(_ROUNDS):
@@ -86,12 +93,13 @@ def fitted_capsule(points: Array) -> Capsule:
     return _capsule_along(points, axis, origin)
 
 
-def _cut(vertices: Array, triangles: NDArray) -> list[tuple[NDArray, Capsule]] | None:
+def _cut(
+    vertices: Array, triangles: NDArray[np.int64]
+) -> list[tuple[NDArray[np.int64], Capsule]] | None:
     """Return the best cut of triangles in two across one of their principal axes."""
     centroids = vertices[triangles].mean(axis=1)
-    axes = np.linalg.svd(centroids - centroids.mean(axis=0), full_matrices=False)[2]
     best, least = None, np.inf
-    for axis in axes:
+    for axis in _principal_axes(centroids):
         along = centroids @ axis
         low, high = along.min(), along.max()
         for share in _CUTS:
@@ -99,7 +107,11 @@ def _cut(vertices: Array, triangles: NDArray) -> list[tuple[NDArray, Capsule]] |
             if behind.all() or not behind.any():
                 continue
             halves = [triangles[behind], triangles[~behind]]
-            volume = sum(_rough_volume(vertices[np.unique(half)]) for half in halves)
+            volume = 0.0
+            for half in halves:
+                points = vertices[np.unique(half)]
+                axes = _principal_axes(points)
+                volume += _volumes(points, axes, _middle(points, axes)[None]).min()
             if volume < least:
                 best, least = halves, volume
     if best is None:
@@ -107,11 +119,18 @@ def _cut(vertices: Array, triangles: NDArray) -> list[tuple[NDArray, Capsule]] |
     return [(half, fitted_capsule(vertices[np.unique(half)])) for half in best]
 
 
-def _rough_volume(points: Array) -> float:
-    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+def _principal_axes(points: Array) -> Array:
+    """Return the principal axes of points as rows, shape (3, 3)."""
+    centred = points - points.mean(axis=0)
+    axes: Array = np.linalg.svd(centred, full_matrices=len(points) < 3)[2]
+    return axes
+
+
+def _middle(points: Array, axes: Array) -> Array:
+    """Return the middle of the box around points along given axes, shape (3,)."""
     along = points @ axes.T
-    middle = 0.5 * (along.max(axis=0) + along.min(axis=0)) @ axes
-    return float(_volumes(points, axes, np.tile(middle, (len(axes), 1))).min())
+    middle: Array = 0.5 * (along.max(axis=0) + along.min(axis=0)) @ axes
+    return middle
 
 
 def _extremes(points: Array) -> Array:
@@ -120,30 +139,29 @@ def _extremes(points: Array) -> Array:
     height, angle = 1.0 - 2.0 * k / _EXTREMES, np.pi * (1.0 + 5.0**0.5) * k
     ring = np.sqrt(1.0 - height**2)
     directions = np.stack([ring * np.cos(angle), ring * np.sin(angle), height])
-    return points[np.unique(np.argmax(points @ directions, axis=0))]
+    furthest: Array = points[np.unique(np.argmax(points @ directions, axis=0))]
+    return furthest
 
 
 def _volumes(points: Array, axes: Array, origins: Array) -> Array:
-    """Return the volumes of the capsules along lines, each given by an axis and an origin."""
+    """Return the volumes of the capsules along lines, given by axes and origins as rows."""
     along, across2 = _coordinates(points, axes, origins)
-    radius2 = across2.max(axis=1)
-    cap = np.sqrt(radius2[:, None] - across2)
+    square = across2.max(axis=1)
+    cap = np.sqrt(square[:, None] - across2)
     length = ((along - cap).max(axis=1) - (along + cap).min(axis=1)).clip(0.0)
-    radius = np.sqrt(radius2)
-    return np.pi * radius2 * (length + 4.0 / 3.0 * radius)
+    volumes: Array = np.pi * square * (length + 4.0 / 3.0 * np.sqrt(square))
+    return volumes
 
 
 def _capsule_along(points: Array, axis: Array, origin: Array) -> Capsule:
+    """Return the smallest capsule around points whose axis is along a line."""
     along, across2 = _coordinates(points, axis[None], origin[None])
-    along, across2 = along[0], across2[0]
     radius = max(float(np.sqrt(across2.max())), _SMALLEST)
     cap = np.sqrt(np.maximum(radius**2 - across2, 0.0))
     low, high = float((along + cap).min()), float((along - cap).max())
     if low > high:
         low = high = 0.5 * (low + high)
-    start, end = origin + low * axis, origin + high * axis
-    # What rounding lacks, so that all points are inside.
-    return Capsule(start, end, max(radius, float(_distance(points, start, end).max())) + 1e-12)
+    return Capsule(origin + low * axis, origin + high * axis, radius + _ROUNDING)
 
 
 def _coordinates(points: Array, axes: Array, origins: Array) -> tuple[Array, Array]:
@@ -152,11 +170,3 @@ def _coordinates(points: Array, axes: Array, origins: Array) -> tuple[Array, Arr
     squared = np.sum(points**2, axis=1)[None] - 2.0 * origins @ points.T
     squared += np.sum(origins**2, axis=1)[:, None]
     return along, np.maximum(squared - along**2, 0.0)
-
-
-def _distance(points: Array, start: Array, end: Array) -> Array:
-    """Return the distances of points from a segment, shape (m,)."""
-    axis = end - start
-    square = float(axis @ axis)
-    share = ((points - start) @ axis / square).clip(0.0, 1.0) if square > 0.0 else 0.0
-    return np.linalg.norm(points - start - np.multiply.outer(share, axis), axis=1)

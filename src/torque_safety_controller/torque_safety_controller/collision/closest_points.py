@@ -1,82 +1,71 @@
-"""Closest points of segments and boxes, in closed form and compiled."""
+"""Closest points of a segment and a box, in closed form and compiled.
+
+All vectors are in the axes of the box, whose corners are at +- `half`. A box with lengths of zero
+is a segment or a point.
+"""
 
 from __future__ import annotations
 
 from math import sqrt
+from typing import NamedTuple
 
-import numpy as np
+from torque_safety_controller.collision.vectors3 import (
+    Vector,
+    along,
+    compiled_vectors,
+    cross,
+    dot,
+)
 
-from torque_safety_controller.collision.vectors3 import along, column, compiled, dot, sub
+MET = 1e-9
+"""Distance, m, below which two points give no direction."""
 
 _SHORT = 1e-12  # m^2; a segment with less is a point
-_DEEP = 60  # bisections: to rounding
+_BISECTIONS = 60  # to rounding
 
 
-@compiled
-def clamp(x, low, high):
-    """Return the number of [low, high] that is nearest to x."""
-    return low if x < low else (high if x > high else x)
+class SurfacePoint(NamedTuple):
+    """The point of a box nearest to a given one.
 
-
-@compiled
-def on_segment(point, a, u):
-    """Return t in [0, 1] so that a + t u is nearest to a point."""
-    square = dot(u, u)
-    return clamp(dot(sub(point, a), u) / square, 0.0, 1.0) if square > _SHORT else 0.0
-
-
-@compiled
-def between_segments(a, u, b, w):
-    """Return s and t in [0, 1] so that a + s u and b + t w are nearest to each other.
-
-    [Ericson2005], 5.1.9. For parallel segments one of many.
+    Attributes:
+        distance: signed, m; negative inside the box.
+        normal: unit vector out of the box.
+        free: whether the nearest point may slide along each axis: those of its face or edge.
     """
-    r = sub(a, b)
-    uu, ww, wr = dot(u, u), dot(w, w), dot(w, r)
-    if uu <= _SHORT:
-        return 0.0, on_segment(a, b, w)
-    if ww <= _SHORT:
-        return on_segment(b, a, u), 0.0
-    ur, uw = dot(u, r), dot(u, w)
-    square = uu * ww - uw * uw
-    s = clamp((uw * wr - ur * ww) / square, 0.0, 1.0) if square > 1e-12 * uu * ww else 0.0
-    t = (uw * s + wr) / ww
-    if t < 0.0:
-        return clamp(-ur / uu, 0.0, 1.0), 0.0
-    if t > 1.0:
-        return clamp((uw - ur) / uu, 0.0, 1.0), 1.0
-    return s, t
+
+    distance: float
+    normal: Vector
+    free: tuple[bool, bool, bool]
 
 
-@compiled
-def in_axes(point, R: np.ndarray, centre):
-    """Return a point in the axes R, shape (3, 3), about `centre`."""
-    r = sub(point, centre)
-    return dot(r, column(R, 0)), dot(r, column(R, 1)), dot(r, column(R, 2))
+@compiled_vectors
+def clamp(x: float, limit: float) -> float:
+    """Return the number of [-limit, limit] that is nearest to x."""
+    return min(max(x, -limit), limit)
 
 
-@compiled
-def _slope(s, a, u, half):
-    """Return half the derivative of the squared distance of a + s u from a box at zero."""
+@compiled_vectors
+def _slope(s: float, a: Vector, u: Vector, half: Vector) -> float:
+    """Return half the derivative of the squared distance of a + s u from the box."""
     slope = 0.0
     for k in range(3):
         x = a[k] + s * u[k]
-        slope += u[k] * (x - clamp(x, -half[k], half[k]))
+        slope += u[k] * (x - clamp(x, half[k]))
     return slope
 
 
-@compiled
-def _depth(x, half):
-    """Return the signed distance of a point from the nearest face; negative inside a box."""
+@compiled_vectors
+def _depth(x: Vector, half: Vector) -> float:
+    """Return the signed distance of a point from the nearest face; negative inside the box."""
     return max(abs(x[0]) - half[0], abs(x[1]) - half[1], abs(x[2]) - half[2])
 
 
-@compiled
-def segment_to_box(a, u, half):
-    """Return s in [0, 1] so that a + s u is nearest to a box, or deepest in it.
+@compiled_vectors
+def segment_to_box(a: Vector, u: Vector, half: Vector) -> float:
+    """Return s in [0, 1] so that a + s u is nearest to the box, or deepest in it.
 
-    The squared distance is convex and piecewise quadratic in s: its slope is followed from one
-    break to the next. All in the axes of the box, whose corners are at +- `half`.
+    The squared distance is convex and piecewise quadratic in s: its slope is evaluated where the
+    line crosses the planes of the faces, and interpolated between two of these.
     """
     if dot(u, u) <= _SHORT:
         return 0.0
@@ -88,22 +77,21 @@ def segment_to_box(a, u, half):
         s = 1.0
     else:
         for k in range(3):
-            for side in (-half[k], half[k]):
-                if abs(u[k]) > 1e-300:
-                    x = (side - a[k]) / u[k]
-                    if low < x < high:
-                        slope = _slope(x, a, u, half)
-                        if slope < 0.0:
-                            low, slope_low = x, slope
-                        else:
-                            high, slope_high = x, slope
+            for face in (-half[k], half[k]):
+                x = (face - a[k]) / u[k]  # not finite along the face
+                if low < x < high:
+                    slope = _slope(x, a, u, half)
+                    if slope < 0.0:
+                        low, slope_low = x, slope
+                    else:
+                        high, slope_high = x, slope
         rise = slope_high - slope_low
         s = low - (high - low) * slope_low / rise if rise > 0.0 else 0.5 * (low + high)
-    if _depth(along(a, s, u), half) > 0.0:
+    if _depth(along(a, s, u), half) > MET:
         return s
     # The segment goes through the box: the depth is convex in s, too.
     low, high = 0.0, 1.0
-    for _ in range(_DEEP):
+    for _ in range(_BISECTIONS):
         third = (high - low) / 3.0
         if _depth(along(a, low + third, u), half) < _depth(along(a, high - third, u), half):
             high -= third
@@ -112,22 +100,28 @@ def segment_to_box(a, u, half):
     return 0.5 * (low + high)
 
 
-@compiled
-def point_to_box(x, half):
-    """Return the signed distance of a point from a box, the normal and which axes are free.
+@compiled_vectors
+def point_to_box(x: Vector, half: Vector) -> SurfacePoint:
+    """Return the nearest point of the surface; inside the box that of the nearest face."""
+    r = (x[0] - clamp(x[0], half[0]), x[1] - clamp(x[1], half[1]), x[2] - clamp(x[2], half[2]))
+    d = sqrt(dot(r, r))
+    if d > MET:
+        inside = (abs(x[0]) < half[0], abs(x[1]) < half[1], abs(x[2]) < half[2])
+        return SurfacePoint(d, (r[0] / d, r[1] / d, r[2] / d), inside)
+    depth = _depth(x, half)
+    if abs(x[0]) - half[0] == depth:
+        return SurfacePoint(depth, (1.0 if x[0] >= 0.0 else -1.0, 0.0, 0.0), (False, True, True))
+    if abs(x[1]) - half[1] == depth:
+        return SurfacePoint(depth, (0.0, 1.0 if x[1] >= 0.0 else -1.0, 0.0), (True, False, True))
+    return SurfacePoint(depth, (0.0, 0.0, 1.0 if x[2] >= 0.0 else -1.0), (True, True, False))
 
-    All in the axes of the box. Free axes are those of the face or edge that the closest point
-    lies in. Inside, the nearest face is meant, and the distance is negative.
-    """
-    rx = x[0] - clamp(x[0], -half[0], half[0])
-    ry = x[1] - clamp(x[1], -half[1], half[1])
-    rz = x[2] - clamp(x[2], -half[2], half[2])
-    d = sqrt(rx * rx + ry * ry + rz * rz)
-    if d > 0.0:
-        return d, (rx / d, ry / d, rz / d), (rx == 0.0, ry == 0.0, rz == 0.0)
-    ex, ey, ez = abs(x[0]) - half[0], abs(x[1]) - half[1], abs(x[2]) - half[2]
-    if ex >= ey and ex >= ez:
-        return ex, (1.0 if x[0] >= 0.0 else -1.0, 0.0, 0.0), (False, True, True)
-    if ey >= ez:
-        return ey, (0.0, 1.0 if x[1] >= 0.0 else -1.0, 0.0), (True, False, True)
-    return ez, (0.0, 0.0, 1.0 if x[2] >= 0.0 else -1.0), (True, True, False)
+
+@compiled_vectors
+def across(u: Vector, w: Vector) -> Vector:
+    """Return a unit vector across two directions, or across one if they are parallel."""
+    x, y = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+    for n in (cross(u, w), cross(u, x), cross(u, y), cross(w, x), cross(w, y)):
+        size = sqrt(dot(n, n))
+        if size > MET:
+            return n[0] / size, n[1] / size, n[2] / size
+    return 0.0, 0.0, 1.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections import Counter
 from collections.abc import Mapping
+from itertools import combinations, product
 from typing import NamedTuple
 from xml.etree import ElementTree
 
@@ -15,6 +16,8 @@ from numpy.typing import NDArray
 
 from torque_safety_controller.collision.capsule_fit import Capsule
 from viability_bounds_pkg.robot_description import RobotDescriptionError, package_directories
+
+Array = NDArray[np.float64]
 
 _SIDES = 16  # of the prism around a cylinder
 
@@ -32,7 +35,7 @@ class LinkShape(NamedTuple):
 
     link: str
     joint: int
-    vertices: NDArray[np.float64]
+    vertices: Array
     triangles: NDArray[np.int64]
     capsules: list[Capsule]
 
@@ -84,21 +87,20 @@ def link_shapes(model: pin.Model, geometry: pin.GeometryModel) -> list[LinkShape
     """
     shapes: dict[str, LinkShape] = {}
     for item in geometry.geometryObjects:
-        link = model.frames[item.parentFrame].name
+        link, place, geom = model.frames[item.parentFrame].name, item.placement, item.geometry
         shape = shapes.setdefault(
             link,
             LinkShape(
                 link, item.parentJoint, np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64), []
             ),
         )
-        placement = item.placement
-        if isinstance(item.geometry, coal.Sphere | coal.Capsule):
-            half = getattr(item.geometry, "halfLength", 0.0) * placement.rotation[:, 2]
-            centre = placement.translation
-            shape.capsules.append(Capsule(centre - half, centre + half, item.geometry.radius))
+        if isinstance(geom, coal.Sphere | coal.Capsule):
+            half = getattr(geom, "halfLength", 0.0) * place.rotation[:, 2]
+            centre = place.translation
+            shape.capsules.append(Capsule(centre - half, centre + half, geom.radius))
             continue
         vertices, triangles = _mesh(item)
-        vertices = vertices @ placement.rotation.T + placement.translation
+        vertices = vertices @ place.rotation.T + place.translation
         shapes[link] = shape._replace(
             vertices=np.vstack([shape.vertices, vertices]),
             triangles=np.vstack([shape.triangles, triangles + len(shape.vertices)]),
@@ -117,7 +119,7 @@ def _check_complete(urdf: str, model: pin.Model, geometry: pin.GeometryModel) ->
             )
 
 
-def _mesh(item: pin.GeometryObject) -> tuple[np.ndarray, np.ndarray]:
+def _mesh(item: pin.GeometryObject) -> tuple[Array, NDArray[np.int64]]:
     """Return vertices and triangles of a mesh, a box or a cylinder in its own axes."""
     shape = item.geometry
     if isinstance(shape, coal.BVHModelBase):
@@ -125,30 +127,17 @@ def _mesh(item: pin.GeometryObject) -> tuple[np.ndarray, np.ndarray]:
         triangles = [(t[0], t[1], t[2]) for t in indices]  # it does not say where it ends
         return np.array(shape.vertices()), np.array(triangles, dtype=np.int64)
     if isinstance(shape, coal.Box):
-        corners = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij")).reshape(3, 8).T
-        return corners * shape.halfSide, _faces([[0, 1, 3, 2], [4, 6, 7, 5]], 4)
-    if isinstance(shape, coal.Cylinder):
+        corners = np.array(list(product((-1.0, 1.0), repeat=3))) * shape.halfSide
+    elif isinstance(shape, coal.Cylinder):
         angle = 2.0 * np.pi * np.arange(_SIDES) / _SIDES
         radius = shape.radius / np.cos(np.pi / _SIDES)  # the prism is outside
         ring = radius * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
         lift = np.array([0.0, 0.0, shape.halfLength])
-        rings = [list(range(_SIDES)), list(range(_SIDES, 2 * _SIDES))]
-        return np.vstack([ring - lift, ring + lift]), _faces(rings, _SIDES)
-    raise RobotDescriptionError(
-        f"{item.name}: collision geometry {type(shape).__name__} is not among "
-        "mesh, box, cylinder, capsule and sphere"
-    )
-
-
-def _faces(ends: list[list[int]], sides: int) -> np.ndarray:
-    """Return triangles of two end faces and the quadrilaterals between them."""
-    triangles = []
-    for end in ends:
-        triangles += [[end[0], end[k], end[k + 1]] for k in range(1, sides - 1)]
-    first, second = ends
-    if sides == 4:
-        second = [i + 4 for i in first]
-    for k in range(sides):
-        j = (k + 1) % sides
-        triangles += [[first[k], first[j], second[k]], [second[k], first[j], second[j]]]
-    return np.array(triangles, dtype=np.int64)
+        corners = np.vstack([ring - lift, ring + lift])
+    else:
+        raise RobotDescriptionError(
+            f"{item.name}: collision geometry {type(shape).__name__} is not among "
+            "mesh, box, cylinder, capsule and sphere"
+        )
+    # All triangles between corners: the faces are among them, and none is outside.
+    return corners, np.array(list(combinations(range(len(corners)), 3)), dtype=np.int64)

@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from torque_safety_controller.collision.bodies import CollisionBody, capsule
 from torque_safety_controller.collision.capsule_fit import Capsule, capsules_around
 from torque_safety_controller.collision.geometry import link_shapes
-from torque_safety_controller.collision.kernels import (
-    BOX,
-    CAPSULES,
-    HALF_SPACE,
-    Bodies,
-    Pairs,
-    distance_of,
-    place_capsules,
-)
-from torque_safety_controller.collision.kinematics import Chain, make_chain, make_motion, move
-from torque_safety_controller.collision.obstacles import CollisionError, Obstacle
-from torque_safety_controller.collision.row import make_rows
-from viability_bounds_pkg.compiled import compiled
+from torque_safety_controller.collision.kernels import Bodies, Pairs, survey
+from torque_safety_controller.collision.kinematics import Kinematics
+from viability_bounds_pkg.exceptions import SettingError
+
+Array = NDArray[np.float64]
+
+_MOSTLY = 0.5  # pairs that are near each other in more than this share of the samples are left out
 
 
 @dataclass(frozen=True)
@@ -32,18 +28,15 @@ class Pruning:
 
     Attributes:
         samples: random configurations within the position limits; +-pi where there are none.
-        seed: of them.
         near: pairs that never come nearer than this are left out, m.
-        clearance: pairs that are nearer than this at the start are left out, m: more than the
-            margin to be kept. Their capsules, not the links, are in each other's way.
-        always: so are pairs that are nearer in more than this share of the samples.
+        clearance: pairs that are nearer than this at the start, or in most samples, are left
+            out, m: more than the margin to be kept. Their capsules, not the links, are in each
+            other's way.
     """
 
     samples: int = 20_000
-    seed: int = 0
     near: float = 0.05
     clearance: float = 0.025
-    always: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -51,7 +44,7 @@ class CollisionModel:
     """Shapes of an arm and its surroundings, and the pairs to be kept apart.
 
     Attributes:
-        chain: the arm's joints.
+        arm: the arm's joints.
         bodies: all shapes.
         pairs: of them.
         names: of the two bodies of each pair, ``link - link`` or ``link - obstacle``.
@@ -60,199 +53,204 @@ class CollisionModel:
             ``near mostly``; with obstacles ``near always``, as what the arm is mounted on.
     """
 
-    chain: Chain
+    arm: pin.Model
     bodies: Bodies
     pairs: Pairs
     names: tuple[str, ...]
     capsules: dict[str, list[Capsule]]
-    left_out: dict[str, list[str]] = field(default_factory=dict)
+    left_out: dict[str, list[str]]
 
 
 def build_collision_model(
     model: pin.Model,
     geometry: pin.GeometryModel,
     q_start: ArrayLike,
-    obstacles: Sequence[Obstacle] = (),
+    obstacles: Sequence[CollisionBody] = (),
     pairs: Sequence[tuple[str, str]] | None = None,
     base_frame: str | None = None,
-    capsules_per_link: int = 3,
     pruning: Pruning | None = None,
 ) -> CollisionModel:
     """Return the collision model of an arm.
 
     Args:
         model: n joints with one coordinate each.
-        geometry: of `collision_geometry.load_geometry`.
+        geometry: of `geometry.load_geometry`.
         q_start: a configuration free of collisions, shape (n,), rad: of the pairs chosen
             automatically, those that are near each other there are left out.
         obstacles: that every link is kept away from which can move.
         pairs: of links to be kept apart; None chooses them automatically: all that are not
             neighbours, less those that `pruning` leaves out.
         base_frame: that obstacles are given in; None: the URDF's root. Fixed to the base.
-        capsules_per_link: at most.
         pruning: of the pairs; it also leaves out obstacles that a link cannot come near, or
             cannot get away from.
 
     Raises:
-        CollisionError: an unknown link, a frame that moves, names that are not different, a
-            start of the wrong size, or nothing to keep apart in a pair asked for.
+        SettingError: an unknown link, a frame that moves, names that are not different, a
+            start of the wrong size, or nothing to keep apart in a pair asked for; named as the
+            node's parameters.
     """
-    pruning = pruning or Pruning()
-    q_start = np.asarray(q_start, dtype=float)
+    q_start = np.asarray(q_start, dtype=np.float64)
     if q_start.shape != (model.nq,) or not np.isfinite(q_start).all():
-        raise CollisionError("q_start", q_start, f"{model.nq} finite numbers")
-    owners, joints, capsules = [], [], []
+        raise SettingError("collision_posture", q_start, f"{model.nq} finite numbers")
+    capsules: dict[str, list[Capsule]] = {}
+    links: list[CollisionBody] = []
     for shape in link_shapes(model, geometry):
-        around = list(shape.capsules)
-        if len(shape.triangles):
-            around += capsules_around(shape.vertices, shape.triangles, capsules_per_link)
-        owners += [shape.link] * len(around)
-        joints += [shape.joint] * len(around)
-        capsules += around
-    links = set(owners)
-    _check_names(links, obstacles)
-    placement = _base_placement(model, base_frame)
-    of_links = len(capsules)
-    boxes, planes, standing = [], [], []
-    for obstacle in obstacles:
-        place = placement * obstacle.placement
-        if obstacle.kind == "capsule":
-            half = obstacle.size[0] * place.rotation[:, 2]
-            centre = place.translation
-            standing.append((CAPSULES, len(capsules), obstacle.name))
-            capsules.append(Capsule(centre - half, centre + half, float(obstacle.size[1])))
-            joints.append(0)
-        elif obstacle.kind == "box":
-            standing.append((BOX, len(boxes), obstacle.name))
-            boxes.append((place, obstacle.size))
+        around = shape.capsules + capsules_around(shape.vertices, shape.triangles)
+        capsules[shape.link] = around
+        links += [replace(capsule(shape.link, *each), joint=shape.joint) for each in around]
+    _check_names(set(capsules), obstacles)
+    base = _base_placement(model, base_frame)
+    every = links + [replace(body, placement=base * body.placement) for body in obstacles]
+    chosen = _link_pairs(model, links, pairs)
+    own = len(chosen)
+    chosen += [
+        (i, j)
+        for j in range(len(links), len(every))
+        for i, body in enumerate(links)
+        if body.joint > 0
+    ]
+    bodies = _pack(every)
+    candidates = _pairs(model, every, chosen)
+    reasons = _prune(model, bodies, candidates, own, pairs is None, q_start, pruning or Pruning())
+    kept, names = [], []
+    left_out: dict[str, list[str]] = {}
+    for k, ((i, j), reason) in enumerate(zip(chosen, reasons, strict=True)):
+        name = f"{every[i].name} - {every[j].name}"
+        if reason:
+            left_out.setdefault(reason, []).append(name)
         else:
-            standing.append((HALF_SPACE, len(planes), obstacle.name))
-            planes.append(place)
-    bodies = Bodies(
-        np.array(joints, dtype=np.int64),
-        np.array([c.start for c in capsules]).reshape(-1, 3),
-        np.array([c.end - c.start for c in capsules]).reshape(-1, 3),
-        np.array([c.radius for c in capsules]),
-        np.array([p.rotation for p, _ in boxes]).reshape(-1, 3, 3),
-        np.array([p.translation for p, _ in boxes]).reshape(-1, 3),
-        np.array([half for _, half in boxes]).reshape(-1, 3),
-        np.array([p.rotation[:, 2] for p in planes]).reshape(-1, 3),
-        np.array([p.rotation[:, 2] @ p.translation for p in planes]),
-    )
-    chain = make_chain(model)
-    candidates = _link_pairs(owners, joints, chain, pairs)
-    own = len(candidates)
-    for kind, j, name in standing:
-        for i in range(of_links):
-            if joints[i] > 0:
-                candidates.append((kind, i, j, f"{owners[i]} - {name}"))
-    kept, left_out = _prune(model, chain, bodies, candidates, own, pairs is None, q_start, pruning)
-    table = np.array([c[:3] for c in kept], dtype=np.int64).reshape(-1, 3).T
-    by_link: dict[str, list[Capsule]] = {}
-    for owner, capsule in zip(owners, capsules, strict=False):  # obstacles come last
-        by_link.setdefault(owner, []).append(capsule)
-    return CollisionModel(
-        chain,
-        bodies,
-        Pairs(*(np.ascontiguousarray(row) for row in table)),
-        tuple(c[3] for c in kept),
-        by_link,
-        left_out,
+            kept.append(k)
+            names.append(name)
+    remaining = Pairs._make(array[kept] for array in candidates)
+    return CollisionModel(model, bodies, remaining, tuple(names), capsules, left_out)
+
+
+def _pack(bodies: Sequence[CollisionBody]) -> Bodies:
+    """Return bodies as arrays, with their parts."""
+    parts = [_parts(body) for body in bodies]
+    flat = np.array([part for each in parts for part in each]).reshape(-1, 2, 3)
+    return Bodies(
+        joint=np.array([body.joint for body in bodies], dtype=np.int64),
+        rotation=np.array([body.placement.rotation for body in bodies]).reshape(-1, 3, 3),
+        centre=np.array([body.placement.translation for body in bodies]).reshape(-1, 3),
+        radius=np.array([body.radius for body in bodies]),
+        plane=np.array([body.plane for body in bodies], dtype=bool),
+        first=np.cumsum([0, *map(len, parts)]),
+        offset=flat[:, 0].copy(),
+        half=flat[:, 1].copy(),
     )
 
 
-def _check_names(links: set[str], obstacles: Sequence[Obstacle]) -> None:
+def _parts(body: CollisionBody) -> list[tuple[Array, Array]]:
+    """Return middle and half lengths of a body, and of the ends or edges that count apart."""
+    half, point = body.half, np.zeros(3)
+    parts = [(point, half)]
+    if body.plane or not half.any():
+        return parts
+    if not half.all():  # a segment
+        return [*parts, (-half, point), (half, point)]
+    for axis, signs in product(np.eye(3), product((-1.0, 1.0), repeat=2)):
+        corner = np.zeros(3)
+        corner[axis == 0.0] = signs
+        parts.append((corner * half, axis * half))
+    return parts
+
+
+def _pairs(
+    model: pin.Model, bodies: Sequence[CollisionBody], chosen: Sequence[tuple[int, int]]
+) -> Pairs:
+    """Return pairs as arrays."""
+    moved_by = np.zeros((len(bodies), model.njoints))
+    for row, body in zip(moved_by, bodies, strict=True):
+        row[list(model.supports[body.joint])] = 1.0
+    first, second = np.array(chosen, dtype=np.int64).reshape(-1, 2).T.copy()
+    return Pairs(first, second, (moved_by[first] - moved_by[second])[:, 1:].copy())
+
+
+def _check_names(links: set[str], obstacles: Sequence[CollisionBody]) -> None:
     names = [obstacle.name for obstacle in obstacles]
     for name in names:
         if names.count(name) > 1 or name in links:
-            raise CollisionError("name", name, "what no other obstacle and no link is called")
+            allowed = "what no other obstacle and no link is called"
+            raise SettingError("obstacle_names", name, allowed)
 
 
 def _base_placement(model: pin.Model, base_frame: str | None) -> pin.SE3:
     if base_frame is None:
         return pin.SE3.Identity()
     if not model.existFrame(base_frame):
-        raise CollisionError("base_frame", base_frame, "a frame of the URDF")
+        raise SettingError("base_frame", base_frame, "a frame of the URDF")
     frame = model.frames[model.getFrameId(base_frame)]
     if frame.parentJoint != 0:
-        raise CollisionError("base_frame", base_frame, "a frame that is not moved by a joint")
+        raise SettingError("base_frame", base_frame, "a frame that is not moved by a joint")
     return frame.placement
 
 
-def _link_pairs(owners, joints, chain, pairs) -> list[tuple[int, int, int, str]]:
+def _link_pairs(
+    model: pin.Model,
+    links: Sequence[CollisionBody],
+    pairs: Sequence[tuple[str, str]] | None,
+) -> list[tuple[int, int]]:
     """Return the pairs of capsules of the links asked for, or of all that are not neighbours."""
-    wanted = None if pairs is None else _checked_pairs(pairs, owners, joints)
-    candidates = []
-    for i in range(len(owners)):
-        for j in range(i):
-            first, second = joints[i], joints[j]
-            if first == second:
-                continue
-            if wanted is None:
-                if second == chain.parent[first] or first == chain.parent[second]:
-                    continue
-            elif frozenset((owners[i], owners[j])) not in wanted:
-                continue
-            candidates.append((CAPSULES, i, j, f"{owners[i]} - {owners[j]}"))
-    return candidates
-
-
-def _checked_pairs(pairs, owners, joints) -> set[frozenset[str]]:
-    joint_of = dict(zip(owners, joints, strict=False))
-    for pair in pairs:
-        if len(pair) != 2:
-            raise CollisionError("pairs", pair, "two links")
+    joint_of = {body.name: body.joint for body in links}
+    for pair in pairs or ():
         for link in pair:
             if link not in joint_of:
-                known = ", ".join(sorted(joint_of))
-                raise CollisionError("pairs", link, f"links with collision geometry: {known}")
-        if joint_of[pair[0]] == joint_of[pair[1]]:
-            raise CollisionError("pairs", pair, "links that move to each other")
-    return {frozenset(pair) for pair in pairs}
+                allowed = f"links with collision geometry: {', '.join(sorted(joint_of))}"
+                raise SettingError("collision_pairs", link, allowed)
+        if len(pair) != 2 or joint_of[pair[0]] == joint_of[pair[1]]:
+            raise SettingError("collision_pairs", pair, "two links that move to each other")
+    wanted = None if pairs is None else {frozenset(pair) for pair in pairs}
+    chosen = []
+    for i, first in enumerate(links):
+        for j, second in enumerate(links[:i]):
+            if wanted is not None:
+                apart = frozenset((first.name, second.name)) in wanted
+            else:
+                apart = second.joint not in (first.joint, model.parents[first.joint])
+                apart = apart and first.joint != model.parents[second.joint]
+            if apart:
+                chosen.append((i, j))
+    return chosen
 
 
-def _prune(model, chain, bodies, candidates, own, automatic, q_start, pruning):
-    """Return the candidates to keep and the names of the others by reason."""
-    rng = np.random.default_rng(pruning.seed)
+def _prune(
+    model: pin.Model,
+    bodies: Bodies,
+    pairs: Pairs,
+    own: int,
+    automatic: bool,
+    q_start: Array,
+    pruning: Pruning,
+) -> list[str]:
+    """Return for each pair why it is left out; empty for what is kept.
+
+    The first `own` pairs are of links, chosen automatically or asked for; obstacles follow.
+    """
     low = np.where(np.isfinite(model.lowerPositionLimit), model.lowerPositionLimit, -np.pi)
     high = np.where(np.isfinite(model.upperPositionLimit), model.upperPositionLimit, np.pi)
-    samples = rng.uniform(low, high, size=(pruning.samples, model.nq))
-    table = np.array([c[:3] for c in candidates], dtype=np.int64).reshape(-1, 3)
-    motion = make_motion(chain)
-    rows = make_rows(0, model.nv, 0, len(bodies.joint))
-    least = pruning.clearance
-    nearest, often = _survey(samples, least, table, chain, motion, bodies, rows)
-    at_start, _ = _survey(q_start[None], least, table, chain, motion, bodies, rows)
-    kept, left_out = [], {}
-    for k, candidate in enumerate(candidates):
+    samples = np.random.default_rng(0).uniform(low, high, size=(pruning.samples, model.nq))
+    kinematics, zero = Kinematics(model, len(bodies.joint)), np.zeros(model.nv)
+    motion = kinematics.motion
+    closest, short = np.full(len(pairs.first), np.inf), np.zeros(len(pairs.first), dtype=np.int64)
+    kinematics.update(q_start, zero)
+    survey(pruning.near, pruning.clearance, pairs, bodies, motion, closest, short)
+    at_start, short[:], closest[:] = short.astype(bool), 0, np.inf
+    for q in samples:
+        kinematics.update(q, zero)
+        survey(pruning.near, pruning.clearance, pairs, bodies, motion, closest, short)
+    reasons = []
+    for k in range(len(closest)):
         reason = ""
-        if nearest[k] > pruning.near:
+        if k < own and not automatic:
+            pass
+        elif closest[k] > pruning.near:
             reason = "far"
-        elif k >= own and often[k] == pruning.samples:
-            reason = "near always"
-        elif automatic and k < own:
-            if at_start[k] < least:
-                reason = "near at start"
-            elif often[k] > pruning.always * pruning.samples:
-                reason = "near mostly"
-        if reason and (automatic or k >= own):
-            left_out.setdefault(reason, []).append(candidate[3])
-        else:
-            kept.append(candidate)
-    return kept, left_out
-
-
-@compiled
-def _survey(samples, clearance, table, chain, motion, bodies, rows):
-    """Return each pair's least distance over configurations, and how often it is short."""
-    least = np.full(len(table), np.inf)
-    short = np.zeros(len(table), dtype=np.int64)
-    still = np.zeros(samples.shape[1])
-    for m in range(len(samples)):
-        move(samples[m], still, chain, motion)
-        place_capsules(motion, bodies, rows)
-        for k in range(len(table)):
-            d = distance_of(table[k, 0], table[k, 1], table[k, 2], bodies, rows)
-            least[k] = min(least[k], d)
-            short[k] += d < clearance
-    return least, short
+        elif k >= own:
+            reason = "near always" if short[k] == pruning.samples else ""
+        elif at_start[k]:
+            reason = "near at start"
+        elif short[k] > _MOSTLY * pruning.samples:
+            reason = "near mostly"
+        reasons.append(reason)
+    return reasons

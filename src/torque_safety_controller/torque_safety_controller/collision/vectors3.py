@@ -1,30 +1,48 @@
-"""Vectors of three numbers as tuples, compiled: they stay in registers, and allocate nothing."""
+"""Vectors of three numbers as tuples, for compiled functions: they allocate no memory."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, TypeVar
+
 import numpy as np
+from numpy.typing import NDArray
 
 from viability_bounds_pkg.compiled import compiled
 
-compiled = compiled(error_model="numpy", _nrt=False)
-"""Compiles what allocates no arrays. To count references to those it is given, as numba does for
-each one taken out of a tuple, takes several times longer than the arithmetic here."""
+Array = NDArray[np.float64]
+Vector = tuple[float, float, float]
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 
-@compiled
-def at(A: np.ndarray, i: int):
+def compiled_vectors(function: F) -> F:
+    """Compile a function that allocates no arrays."""
+    # Without counts of references to its arrays: with them a step's rows take 2.4 times as long.
+    result: F = compiled(error_model="numpy", _nrt=False)(function)
+    return result
+
+
+@compiled_vectors
+def at(A: Array, i: int) -> Vector:
     """Return row `i` of an array of shape (m, 3)."""
     return A[i, 0], A[i, 1], A[i, 2]
 
 
-@compiled
-def dot(a, b):
+@compiled_vectors
+def column(R: Array, k: int) -> Vector:
+    """Return column `k` of a matrix of shape (3, 3)."""
+    return R[0, k], R[1, k], R[2, k]
+
+
+@compiled_vectors
+def dot(a: Vector, b: Vector) -> float:
     """Return a . b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@compiled
-def cross(a, b):
+@compiled_vectors
+def cross(a: Vector, b: Vector) -> Vector:
     """Return a x b."""
     return (
         a[1] * b[2] - a[2] * b[1],
@@ -33,29 +51,25 @@ def cross(a, b):
     )
 
 
-@compiled
-def sub(a, b):
+@compiled_vectors
+def sub(a: Vector, b: Vector) -> Vector:
     """Return a - b."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
-@compiled
-def along(a, s, u):
+@compiled_vectors
+def along(a: Vector, s: float, u: Vector) -> Vector:
     """Return a + s u."""
     return a[0] + s * u[0], a[1] + s * u[1], a[2] + s * u[2]
 
 
-@compiled
-def column(R: np.ndarray, k: int):
-    """Return column `k` of an array of shape (3, 3)."""
-    return R[0, k], R[1, k], R[2, k]
+@compiled_vectors
+def times(R: Array, a: Vector) -> Vector:
+    """Return R a for a matrix of shape (3, 3)."""
+    return dot(at(R, 0), a), dot(at(R, 1), a), dot(at(R, 2), a)
 
 
-@compiled
-def turned(R: np.ndarray, a):
-    """Return R a."""
-    return (
-        R[0, 0] * a[0] + R[0, 1] * a[1] + R[0, 2] * a[2],
-        R[1, 0] * a[0] + R[1, 1] * a[1] + R[1, 2] * a[2],
-        R[2, 0] * a[0] + R[2, 1] * a[1] + R[2, 2] * a[2],
-    )
+@compiled_vectors
+def in_axes(R: Array, a: Vector) -> Vector:
+    """Return R' a, the components of a vector along the columns of R."""
+    return dot(column(R, 0), a), dot(column(R, 1), a), dot(column(R, 2), a)

@@ -16,35 +16,31 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torque_safety_controller.qp.terms import TaskTerm
 from torque_safety_controller.robot_model import RobotModel
-from viability_bounds_pkg.compiled import compiled
+
+Array = NDArray[np.float64]
+
+_PARTS = slice(3), slice(3, 6)  # of a wrench: force and moment
 
 
 @dataclass(frozen=True)
 class AdmittanceGains:
-    """Gains of (27); the defaults are those of Table I.
+    """Gains of (27), each for forces and for moments; the defaults are those of Table I.
 
     Attributes:
-        force_kp: m/s^2 per N.
-        force_kd: m/s^2 per N/s.
-        moment_kp: rad/s^2 per N m.
-        moment_kd: rad/s^2 per N m/s.
-        speed_max: m/s that it asks for at most, against the damping of the pose task.
-        turn_max: rad/s, likewise.
+        kp: m/s^2 per N, rad/s^2 per N m.
+        kd: m/s^2 per N/s, rad/s^2 per N m/s.
+        speed_max: that it asks for at most, against the damping of the pose task, m/s, rad/s.
     """
 
-    force_kp: float = 5e-3
-    force_kd: float = 1e-7
-    moment_kp: float = 5e-3
-    moment_kd: float = 1e-7
-    speed_max: float = math.inf
-    turn_max: float = math.inf
+    kp: tuple[float, float] = (5e-3, 5e-3)
+    kd: tuple[float, float] = (1e-7, 1e-7)
+    speed_max: tuple[float, float] = (math.inf, math.inf)
 
-    def acceleration(
-        self, error: np.ndarray, error_rate: np.ndarray, damping: float
-    ) -> np.ndarray:
+    def acceleration(self, error: Array, error_rate: Array, damping: float) -> Array:
         """Return g_ob of (27), shape (6,), m/s^2 and rad/s^2, within the limits of speed.
 
         Args:
@@ -52,44 +48,12 @@ class AdmittanceGains:
             error_rate: its time derivative, shape (6,).
             damping: that it acts against, 1/s.
         """
-        return _acceleration(
-            error,
-            error_rate,
-            self.force_kp,
-            self.force_kd,
-            damping * self.speed_max,
-            self.moment_kp,
-            self.moment_kd,
-            damping * self.turn_max,
-        )
-
-
-@compiled
-def _acceleration(
-    error: np.ndarray,
-    error_rate: np.ndarray,
-    force_kp: float,
-    force_kd: float,
-    force_most: float,
-    moment_kp: float,
-    moment_kd: float,
-    moment_most: float,
-) -> np.ndarray:
-    """Return g_ob of (27), shape (6,); parts beyond their greatest size are made shorter."""
-    g = np.empty(6)
-    for first, kp, kd, most in (
-        (0, force_kp, force_kd, force_most),
-        (3, moment_kp, moment_kd, moment_most),
-    ):
-        size = 0.0
-        for i in range(first, first + 3):
-            g[i] = -kp * error[i] - kd * error_rate[i]
-            size += g[i] * g[i]
-        size = math.sqrt(size)
-        if size > most:
-            for i in range(first, first + 3):
-                g[i] *= most / size
-    return g
+        g = np.empty(6)
+        for part, kp, kd, speed_max in zip(_PARTS, self.kp, self.kd, self.speed_max, strict=True):
+            a = -kp * error[part] - kd * error_rate[part]
+            size, most = math.sqrt(a @ a), damping * speed_max
+            g[part] = a * (most / size) if size > most else a
+        return g
 
 
 @dataclass(slots=True)
@@ -105,9 +69,9 @@ class AdmittanceTask:
         rows: directions in which it acts, shape (m,), indices; None for all.
     """
 
-    acceleration: np.ndarray
+    acceleration: Array
     weight: float
-    rows: np.ndarray | None = None
+    rows: NDArray[np.int64] | None = None
 
     def term(self, robot: RobotModel) -> TaskTerm:
         """Return ``J a = g_ob - J' v`` as a term of the cost."""

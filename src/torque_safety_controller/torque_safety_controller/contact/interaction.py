@@ -1,9 +1,12 @@
-"""Forces at the hand: pressing with a wrench that was asked for, and yielding to who pulls.
+"""Forces at the hand: exerting a target wrench, and yielding to external ones.
 
 One object puts together the sensor, the contacts of the QP with their wrench tasks, the
 admittance task (27) and dual compliance: [Benallegue2021], III-E and IV-C. Wrenches are those of
 the environment on the arm, about the end effector's origin and in its axes; what the arm is to
 exert is the negative.
+
+Dual compliance holds the pose while the wrench is below a threshold; above it the hand yields,
+and where the wrench ends is the new goal.
 """
 
 from __future__ import annotations
@@ -18,7 +21,6 @@ from numpy.typing import NDArray
 
 from torque_safety_controller.contact.admittance import AdmittanceGains, AdmittanceTask
 from torque_safety_controller.contact.contacts import Contacts
-from torque_safety_controller.contact.dual_compliance import DualCompliance, DualSettings
 from torque_safety_controller.contact.wrench_sensor import WrenchSensor
 from torque_safety_controller.qp.inverse_dynamics_qp import ContactForces
 from torque_safety_controller.robot_model import RobotModel
@@ -28,6 +30,19 @@ from torque_safety_controller.tasks.task import Task
 
 Array = NDArray[np.float64]
 
+WRENCH_WEIGHT = 10.0
+"""Of the wrench tasks: of squared errors of forces and moments in the QP."""
+
+WRENCH_TIME = 0.1
+"""Time constant with which a new target wrench is gone over to, s."""
+
+FORCE_STEP = 0.5
+"""By how much the force that the QP counts on at the hand may exceed the measured one along the
+contact's normal, N: the hand neither rushes at what it is to touch, nor presses on nothing."""
+
+YIELD_RELEASE = 0.5
+"""Share of the thresholds of dual compliance below which the hand stops to yield."""
+
 
 class Compliance(Enum):
     """What is done about the wrench at the hand."""
@@ -35,9 +50,9 @@ class Compliance(Enum):
     OFF = "off"
     """Nothing: there is no sensor, or nothing was asked for."""
     HOLDING = "holding"
-    """The pose is held; a pull beyond the threshold will be yielded to."""
+    """The pose is held; the hand yields to wrenches above the threshold."""
     YIELDING = "yielding"
-    """The hand is led."""
+    """The hand yields to the measured wrench."""
     FORCE = "force"
     """A wrench is exerted in the directions set for it."""
     SILENT = "sensor silent"
@@ -54,27 +69,17 @@ class InteractionSettings:
         stiffness: share of the pose task's stiffness that is left there, shape (6,), 0 to 1: 0
             for hybrid, more for parallel control. Its damping always stays.
         gains: of the admittance task when a wrench is exerted.
-        weight: of the admittance task; None for that of the pose task.
-        wrench_weight: of the wrench tasks.
-        wrench_time: time constant with which a new target wrench is gone over to, s, > 0.
-        force_step: by how much the force that the QP counts on at the hand may exceed the
-            measured one along the contact's normal, N: the hand neither rushes at what it is to
-            touch, nor presses on what is not there.
         closed: indices of other contacts that there are at present.
-        dual: when the hand yields; None never.
+        yield_threshold: force and moment above which the hand yields, N and N m; None never.
         yielding_gains: of the admittance task when it does.
     """
 
     directions: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(6, dtype=bool))
     stiffness: Array = field(default_factory=lambda: np.zeros(6))
     gains: AdmittanceGains = AdmittanceGains()
-    weight: float | None = None
-    wrench_weight: float = 10.0
-    wrench_time: float = 0.1
-    force_step: float = 0.5
     closed: tuple[int, ...] = ()
-    dual: DualSettings | None = None
-    yielding_gains: AdmittanceGains = AdmittanceGains(0.1, 0.0, 1.0, 0.0, 0.25, 1.0)
+    yield_threshold: tuple[float, float] | None = None
+    yielding_gains: AdmittanceGains = AdmittanceGains((0.1, 1.0), (0.0, 0.0), (0.25, 1.0))
 
 
 class Interaction:
@@ -110,7 +115,6 @@ class Interaction:
         self._to_hand = placement.toDualActionMatrix()  # from the contact's frame
         self._to_contact = placement.inverse().toDualActionMatrix()
         self._target: tuple[Array, Array | None] | None = None
-        self._dual: DualCompliance | None = None
         self._turned = False
         self._settings = self.settings = settings or InteractionSettings()
         self.state, self.reason, self.changes = Compliance.OFF, "at start", 0
@@ -129,12 +133,6 @@ class Interaction:
         self._rows = np.flatnonzero(settings.directions)
         self._mask = settings.directions.astype(float)
         self._shares = np.where(settings.directions, settings.stiffness, 1.0)
-        if settings.dual is None:
-            self._dual = None
-        elif self._dual is None:
-            self._dual = DualCompliance(settings.dual)
-        else:
-            self._dual.settings = settings.dual
 
     def start(self) -> None:
         """Forget the past and the target."""
@@ -184,34 +182,44 @@ class Interaction:
                 # Nothing is known of what touches the hand: stop, and stay.
                 goals.hold(robot.pose)
                 self._target = None
-            wanted = self._target is not None or self._dual is not None
+            threshold = self._settings.yield_threshold
+            wanted = self._target is not None or threshold is not None
             state = Compliance.SILENT if active or wanted else Compliance.OFF
             if self.state is not Compliance.SILENT:
                 self._enter(state, "no measurement")
-            if self._dual is not None:
-                self._dual.yielding = False
             return
         if self._target is not None and self._rows.size:
-            self._exert(robot, goals, elapsed)
+            self._exert(*self._target, sensor.wrench, robot, goals, elapsed)
             return
         if self.state is Compliance.FORCE:
             goals.hold(robot.pose)
             self._target = None
-        if self._dual is None or goals.pose_des is None:
+        if self._settings.yield_threshold is None or goals.pose_des is None:
             self._enter(Compliance.OFF, "no target wrench")
-        elif self._dual.update(sensor.wrench):
-            # Where the hand is is where it should be, so that nothing pulls it back.
+        elif self._yields(sensor.wrench, *self._settings.yield_threshold):
+            # The goal follows the hand, so that no stiffness acts against the motion.
             goals.hold(robot.pose)
             self._enter(Compliance.YIELDING, "wrench above the threshold")
         else:
             self._enter(Compliance.HOLDING, "wrench below the threshold")
 
-    def _exert(self, robot: RobotModel, goals: Goals, elapsed: float) -> None:
-        wrench, rotation = self._target
+    def _yields(self, wrench: Array, force: float, moment: float) -> bool:
+        """Return whether the hand is to yield, with hysteresis."""
+        share = YIELD_RELEASE if self.state is Compliance.YIELDING else 1.0
+        return math.hypot(*wrench[:3]) > share * force or math.hypot(*wrench[3:]) > share * moment
+
+    def _exert(
+        self,
+        wrench: Array,
+        rotation: Array | None,
+        measured: Array,
+        robot: RobotModel,
+        goals: Goals,
+        elapsed: float,
+    ) -> None:
         if rotation is not None:
             turn = robot.pose.rotation.T @ rotation
             wrench = np.concatenate([turn @ wrench[:3], turn @ wrench[3:]])
-        measured = self.sensor.wrench
         if self.state is not Compliance.FORCE:
             self._enter(Compliance.FORCE, "target wrench")
             if goals.pose_des is None:
@@ -222,7 +230,7 @@ class Interaction:
             goals.hold(robot.pose)
         self._turned = False
         before = self._goal
-        share = -math.expm1(-elapsed / self._settings.wrench_time) if elapsed > 0.0 else 0.0
+        share = -math.expm1(-elapsed / WRENCH_TIME) if elapsed > 0.0 else 0.0
         self._goal = before + share * (wrench - before)
         self._goal_rate = (self._goal - before) / elapsed if elapsed > 0.0 else np.zeros(6)
         # What the QP says that limits allow is what is to be felt: III-E (b), one step late.
@@ -231,12 +239,12 @@ class Interaction:
 
     def _count_on(self, measured: Array) -> None:
         """Find how much of the goal the QP may count on at the hand, given what is measured."""
-        if self._hand is None:
+        if self._hand is None or self.contacts is None:
             return
         normal = self.contacts.contacts[self._hand].normal
         goal = self._to_contact @ self._goal
         wanted = normal @ goal[:3]
-        most = max(normal @ (self._to_contact @ measured)[:3], 0.0) + self._settings.force_step
+        most = max(normal @ (self._to_contact @ measured)[:3], 0.0) + FORCE_STEP
         self._counted = goal * (most / wanted) if wanted > most else goal
 
     @property
@@ -250,21 +258,19 @@ class Interaction:
         Args:
             gains: of the tasks.
         """
-        settings = self._settings
-        weight = gains.pose_weight if settings.weight is None else settings.weight
-        if weight == 0.0 or self.state not in (Compliance.FORCE, Compliance.YIELDING):
+        settings, sensor, weight = self._settings, self.sensor, gains.pose_weight
+        active = self.state in (Compliance.FORCE, Compliance.YIELDING)
+        if sensor is None or weight == 0.0 or not active:
             return []
-        F, rate = self.sensor.wrench, self.sensor.rate
-        # Of the mean of the two tasks, see `admittance_task`.
-        damping = gains.pose_kd * gains.pose_weight / weight
+        F, rate = sensor.wrench, sensor.rate
         if self.state is Compliance.YIELDING:
-            led = settings.yielding_gains.acceleration(-F, -rate, damping)
-            return [AdmittanceTask(led, weight)]
+            a = settings.yielding_gains.acceleration(-F, -rate, gains.pose_kd)
+            return [AdmittanceTask(a, weight)]
         mask = self._mask
-        moved = settings.gains.acceleration(
-            mask * (self.reference - F), mask * (self._goal_rate - rate), damping
+        a = settings.gains.acceleration(
+            mask * (self.reference - F), mask * (self._goal_rate - rate), gains.pose_kd
         )
-        return [AdmittanceTask(moved, weight, self._rows)]
+        return [AdmittanceTask(a, weight, self._rows)]
 
     def forces(self, robot: RobotModel) -> ContactForces | None:
         """Return what contacts may exert in this step, with their wrench tasks; None if nothing.
@@ -286,7 +292,7 @@ class Interaction:
         tasks = []
         for index in np.flatnonzero(closed).tolist():
             wanted = self._counted if index == self._hand else np.zeros(6)
-            tasks.append(contacts.wrench_task(index, wanted, self._settings.wrench_weight))
+            tasks.append(contacts.wrench_task(index, wanted, WRENCH_WEIGHT))
         return contacts.forces(tasks)
 
     def rehearsal(
@@ -294,7 +300,6 @@ class Interaction:
     ) -> tuple[list[Task], ContactForces | None]:
         """Return tasks and forces of every kind that there may be, to compile what they need."""
         zero, weight = np.zeros(6), max(gains.pose_weight, 1.0)
-        self._settings.gains.acceleration(zero, zero, 1.0)
         tasks: list[Task] = [
             AdmittanceTask(zero, weight),
             AdmittanceTask(zero, weight, np.arange(1)),
@@ -309,10 +314,11 @@ class Interaction:
 
     def note_forces(self, rho: Array) -> None:
         """Take note of the forces that the QP counts on, shape (r,), N."""
-        if self._hand is None or not self.contacts.closed[self._hand]:
+        contacts, hand = self.contacts, self._hand
+        if contacts is None or hand is None or not contacts.closed[hand]:
             return
-        missing = self._counted - self.contacts.wrench(self._hand, rho)
-        if len(self.contacts.contacts[self._hand].points) == 1:
+        missing = self._counted - contacts.wrench(hand, rho)
+        if len(contacts.contacts[hand].points) == 1:
             missing[3:] = 0.0  # a point exerts no moment; none was asked of it
         self._missing = self._to_hand @ missing
 

@@ -17,10 +17,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from viability_bounds_pkg.compiled import compiled
 from viability_bounds_pkg.exceptions import ArmSafetyError
+
+Array = NDArray[np.float64]
 
 _TARE_TIME = 0.2  # s, of the mean that becomes the bias
 
@@ -71,21 +72,18 @@ class WrenchSensor:
         self.settings = settings or SensorSettings()
         self.placement = placement
         self.bias = np.zeros(6)
-        self._action = np.ascontiguousarray(placement.toDualActionMatrix())
-        self._R = np.ascontiguousarray(placement.rotation)
-        self._weight = tool.mass * np.asarray(gravity, dtype=float)
-        self._com = tool.lever.copy()
-        self.start()
-        # The first call compiles; let it be this one and not one in a control loop.
-        self.receive(np.zeros(6))
-        self.update(np.eye(3), 0.0)
+        self._action = placement.toDualActionMatrix()
+        # From gravity in the end effector's axes to the wrench of the tool's weight.
+        R = tool.mass * placement.rotation.T
+        self._weight = np.vstack([R, pin.skew(tool.lever) @ R])
+        self._gravity = np.asarray(gravity, dtype=np.float64)
         self.start()
 
     def start(self) -> None:
         """Forget what was measured; the bias stays."""
         self.wrench, self.rate = np.zeros(6), np.zeros(6)
         self.silent = True
-        self._raw: np.ndarray | None = None
+        self._raw: Array | None = None
         self._age = math.inf
         self._filtered, self._mean = np.zeros(6), np.zeros(6)
 
@@ -95,12 +93,12 @@ class WrenchSensor:
         Raises:
             WrenchError: it is something else; nothing has changed then.
         """
-        raw = np.array(raw, dtype=float)
+        raw = np.array(raw, dtype=np.float64)
         if raw.shape != (6,) or not np.isfinite(raw).all():
             raise WrenchError("not six finite numbers")
         self._raw = raw
 
-    def update(self, rotation: np.ndarray, elapsed: float) -> None:
+    def update(self, rotation: Array, elapsed: float) -> None:
         """Make the wrench of this control step.
 
         Args:
@@ -115,22 +113,16 @@ class WrenchSensor:
         time, self._age = self._age, 0.0
         if self.silent or not time > 0.0:
             time = math.inf
-        self.wrench, self.rate = _measured(
-            self._raw,
-            np.ascontiguousarray(rotation),
-            self._R,
-            self._weight,
-            self._com,
-            self._action,
-            self.bias,
-            time,
-            2.0 * math.pi * self.settings.filter_hz,
-            self._filtered,
-            self._mean,
-        )
+        found = self._raw - self._weight @ (rotation.T @ self._gravity)
+        share = -math.expm1(-2.0 * math.pi * self.settings.filter_hz * time)
+        change = share * (found - self._filtered)
+        self._filtered = self._filtered + change
+        self._mean = self._mean - math.expm1(-time / _TARE_TIME) * (found - self._mean)
+        self.wrench = self._action @ (self._filtered - self.bias)
+        self.rate = self._action @ (change / time)
         self._raw, self.silent = None, False
 
-    def tare(self) -> np.ndarray:
+    def tare(self) -> Array:
         """Take what is measured now, the tool's weight subtracted, for the bias; return it.
 
         The hand must touch nothing. It is the mean over some tenths of a second.
@@ -143,59 +135,3 @@ class WrenchSensor:
         self.bias = self._mean.copy()
         self.wrench = self._action @ (self._filtered - self.bias)
         return self.bias
-
-
-@compiled
-def _measured(
-    raw: np.ndarray,
-    rotation: np.ndarray,
-    R: np.ndarray,
-    weight: np.ndarray,
-    com: np.ndarray,
-    action: np.ndarray,
-    bias: np.ndarray,
-    time: float,
-    cut_off: float,
-    filtered: np.ndarray,
-    mean: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return wrench and rate, shape (6,) each; updates `filtered` and `mean`, shape (6,).
-
-    Args:
-        raw: measurement, shape (6,).
-        rotation: of the end effector in the root frame, shape (3, 3).
-        R: of the sensor in the end effector's frame, shape (3, 3).
-        weight: of the tool in the root frame, shape (3,), N.
-        com: its centre of mass in the sensor's axes, shape (3,), m.
-        action: of the sensor's placement on wrenches, shape (6, 6).
-        bias: shape (6,).
-        time: since the last measurement, s; inf if there was none.
-        cut_off: of the filter, rad/s.
-        filtered: shape (6,).
-        mean: shape (6,).
-    """
-    found = raw.copy()
-    force = np.zeros(3)
-    for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                force[i] += R[j, i] * rotation[k, j] * weight[k]
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        found[i] -= force[i]
-        found[3 + i] -= com[j] * force[k] - com[k] * force[j]
-    share = -math.expm1(-cut_off * time)
-    mean_share = -math.expm1(-time / _TARE_TIME)
-    change, clean = np.empty(6), np.empty(6)
-    for i in range(6):
-        step = share * (found[i] - filtered[i])
-        filtered[i] += step
-        mean[i] += mean_share * (found[i] - mean[i])
-        change[i] = step / time
-        clean[i] = filtered[i] - bias[i]
-    wrench, rate = np.zeros(6), np.zeros(6)
-    for i in range(6):
-        for j in range(6):
-            wrench[i] += action[i, j] * clean[j]
-            rate[i] += action[i, j] * change[j]
-    return wrench, rate

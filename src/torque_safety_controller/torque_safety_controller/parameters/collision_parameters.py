@@ -11,14 +11,9 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from torque_safety_controller.collision.avoidance import CollisionAvoidance, CollisionSettings
+from torque_safety_controller.collision.bodies import SHAPES, CollisionBody, make_obstacle
 from torque_safety_controller.collision.geometry import load_geometry
 from torque_safety_controller.collision.model import Pruning, build_collision_model
-from torque_safety_controller.collision.obstacles import (
-    SHAPES,
-    CollisionError,
-    Obstacle,
-    make_obstacle,
-)
 from torque_safety_controller.parameters.entries import Entry
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import RobotDescriptionError
@@ -136,7 +131,7 @@ class CollisionConfiguration:
     q_max: Array
     a_min: Array
     a_max: Array
-    obstacles: tuple[Obstacle, ...]
+    obstacles: tuple[CollisionBody, ...]
     base_frame: str
     dt: float
 
@@ -200,29 +195,26 @@ def load_collision(
             raise SettingError(f"obstacles[{index}].name", obstacle.name, "no name of a link")
     limited = model.copy()
     limited.lowerPositionLimit, limited.upperPositionLimit = config.q_min, config.q_max
-    kept = config.settings.margin + config.settings.reserve
+    kept = config.settings.kept
     try:
         geometry = load_geometry(urdf, model, robot.locked)
     except RobotDescriptionError as error:
         allowed = f"a URDF whose collision geometry loads ({error})"
         raise SettingError("robot_description", robot.description, allowed) from error
-    try:
-        collision = build_collision_model(
-            limited,
-            geometry,
-            config.posture,
-            config.obstacles,
-            config.pairs,
-            config.base_frame,
-            pruning=Pruning(clearance=kept + _BEYOND, near=kept + _NEAR),
-        )
-    except CollisionError as error:  # the rest has been checked
-        raise SettingError("collision_pairs", error.value, error.allowed) from error
+    collision = build_collision_model(
+        limited,
+        geometry,
+        config.posture,
+        config.obstacles,
+        config.pairs,
+        config.base_frame,
+        Pruning(clearance=kept + _BEYOND, near=kept + _NEAR),
+    )
     return CollisionAvoidance(collision, config.a_min, config.a_max, config.dt, config.settings)
 
 
-def _obstacles(texts: Sequence[str]) -> tuple[Obstacle, ...]:
-    obstacles: dict[str, Obstacle] = {}
+def _obstacles(texts: Sequence[str]) -> tuple[CollisionBody, ...]:
+    obstacles: dict[str, CollisionBody] = {}
     for index, text in enumerate(texts):
         entry = Entry("obstacles", index, text, _OBSTACLE_FIELDS)
         name, shape = entry.text("name"), entry.text("shape")

@@ -11,8 +11,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from torque_safety_controller.contact.admittance import AdmittanceGains
-from torque_safety_controller.contact.contacts import Contact, Contacts
-from torque_safety_controller.contact.dual_compliance import DualSettings
+from torque_safety_controller.contact.contacts import Contacts, FrictionContact
 from torque_safety_controller.contact.interaction import Interaction, InteractionSettings
 from torque_safety_controller.contact.wrench_sensor import SensorSettings, WrenchSensor
 from torque_safety_controller.parameters.entries import Entry
@@ -34,7 +33,6 @@ Array = NDArray[np.float64]
 _AXES = "x, y, z and about x, y, z of the end effector's axes"
 
 _DEFAULTS = InteractionSettings()
-_DUAL = DualSettings()
 _CONTACT_FIELDS = ("frame", "point", "normal", "friction")
 
 INTERACTION_TABLE = (
@@ -86,7 +84,7 @@ INTERACTION_TABLE = (
         "admittance_kp",
         list[float],
         "gains Kp of (27) for forces, m/s^2 per N, and moments, rad/s^2 per N m",
-        (_DEFAULTS.gains.force_kp, _DEFAULTS.gains.moment_kp),
+        _DEFAULTS.gains.kp,
         live=True,
         length=2,
         within=NOT_NEGATIVE,
@@ -112,7 +110,7 @@ INTERACTION_TABLE = (
         "yield_threshold",
         list[float],
         "force, N, and moment, N m, above which the hand yields; it stops below half of both",
-        (_DUAL.force, _DUAL.moment),
+        (10.0, 2.0),
         live=True,
         length=2,
         within=POSITIVE,
@@ -121,7 +119,7 @@ INTERACTION_TABLE = (
         "yield_kp",
         list[float],
         "acceleration by which the hand yields, m/s^2 per N and rad/s^2 per N m",
-        (_DEFAULTS.yielding_gains.force_kp, _DEFAULTS.yielding_gains.moment_kp),
+        _DEFAULTS.yielding_gains.kp,
         live=True,
         length=2,
         within=NOT_NEGATIVE,
@@ -130,7 +128,7 @@ INTERACTION_TABLE = (
         "yield_speed_max",
         list[float],
         "speeds at which it yields at most, m/s and rad/s",
-        (_DEFAULTS.yielding_gains.speed_max, _DEFAULTS.yielding_gains.turn_max),
+        _DEFAULTS.yielding_gains.speed_max,
         live=True,
         length=2,
         within=POSITIVE,
@@ -229,7 +227,7 @@ def _settings(values: Mapping[str, Any], frames: Sequence[str]) -> InteractionSe
         stiffness=given_or(values, "force_stiffness", np.zeros(6)),
         gains=_gains(values, "admittance", _DEFAULTS.gains),
         closed=tuple(frames.index(frame) for frame in values["closed_contacts"]),
-        dual=DualSettings(force, moment) if values["dual_compliance"] else None,
+        yield_threshold=(force, moment) if values["dual_compliance"] else None,
         yielding_gains=_gains(values, "yield", _DEFAULTS.yielding_gains),
     )
 
@@ -237,9 +235,7 @@ def _settings(values: Mapping[str, Any], frames: Sequence[str]) -> InteractionSe
 def _gains(values: Mapping[str, Any], prefix: str, default: AdmittanceGains) -> AdmittanceGains:
     force_kp, moment_kp = values[f"{prefix}_kp"]
     speed_max, turn_max = values[f"{prefix}_speed_max"]
-    return replace(
-        default, force_kp=force_kp, moment_kp=moment_kp, speed_max=speed_max, turn_max=turn_max
-    )
+    return replace(default, kp=(force_kp, moment_kp), speed_max=(speed_max, turn_max))
 
 
 def _contact_points(texts: Sequence[str]) -> tuple[ContactPoint, ...]:
@@ -330,7 +326,7 @@ def _contacts(points: Sequence[ContactPoint], model: pin.Model) -> Contacts | No
         if not model.existFrame(frame):
             raise SettingError(f"{first.label}.frame", frame, "a frame of the URDF")
         places = np.array([each.point for each in its])
-        contacts.append(Contact(frame, places, first.normal, first.friction))
+        contacts.append(FrictionContact(frame, places, first.normal, first.friction))
     return Contacts(model, contacts) if contacts else None
 
 
