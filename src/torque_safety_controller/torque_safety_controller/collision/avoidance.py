@@ -166,16 +166,21 @@ class CollisionAvoidance:
 
         Values that are not finite are the caller's to refuse.
         """
+        chosen = self._update(q, v, a_lower, a_upper, disturbance)
+        return CollisionRows._make([array[chosen] for array in self._work.rows])
+
+    def _update(
+        self, q: Array, v: Array, a_lower: Array, a_upper: Array, disturbance: Array | None
+    ) -> slice | NDArray[np.int64]:
+        """Compute the rows of a step; return which are to be used."""
         self._kinematics.update(q, v)
         pushed = self._undisturbed if disturbance is None else disturbance
         bounds = JointBounds(a_lower, a_upper, pushed, self._braking)
         self.count = k = collision_rows(v, bounds, self._work)
-        rows = self._work.rows
-        chosen: slice | NDArray[np.int64] = slice(k)
-        if k > self._rows_max:
-            nearest = np.argpartition(rows.distance[:k], self._rows_max)
-            chosen = np.sort(nearest[: self._rows_max])
-        return CollisionRows._make([array[chosen] for array in rows])
+        if k <= self._rows_max:
+            return slice(k)
+        nearest = np.argpartition(self._work.rows.distance[:k], self._rows_max)
+        return np.sort(nearest[: self._rows_max])
 
     def constraint(
         self, robot: RobotModel, bounds: AccelerationRange, disturbance: Array | None = None
@@ -199,9 +204,9 @@ class CollisionAvoidance:
             a_lower, a_upper = (
                 np.nan_to_num(bound, posinf=_FAST, neginf=-_FAST) for bound in (a_lower, a_upper)
             )
-        rows = self.rows(q, v, a_lower, a_upper, disturbance)
-        lower = ROW_SCALE * rows.lower
-        return LinearConstraints(ROW_SCALE * rows.G, lower, np.full(len(lower), np.inf))
+        chosen, rows = self._update(q, v, a_lower, a_upper, disturbance), self._work.rows
+        lower = ROW_SCALE * rows.lower[chosen]
+        return LinearConstraints(ROW_SCALE * rows.G[chosen], lower, np.full(len(lower), np.inf))
 
     @property
     def viable(self) -> bool:
