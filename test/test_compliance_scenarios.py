@@ -60,5 +60,5 @@ def test_switched_in_motion_the_torque_does_not_jump():
     run = curve.draw({"integral_action": "joints"}, turns=1, period=4.0, switches=switches)
     for at, beside in curve.steps_at(run, switches):
         assert at <= 1.5 * beside
-    assert pushing.off(run.samples)[0].max() < 0.02
+    assert pushing.hand_errors(run.samples)[0].max() < 0.02
     assert np.isfinite(column(run.samples, "tau")).all()
