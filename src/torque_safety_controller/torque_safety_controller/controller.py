@@ -273,7 +273,7 @@ class Controller:
         if contacts is not None and self.interaction is not None:
             tau = tau - contacts.B @ solution.rho
             self.interaction.note_forces(solution.rho)
-        self._a_last = a = solution.a
+        a = self._remember(solution.a)
         tau = self._limiter.limited(tau)
         return ControlOutput(tau, a, True, solution.relaxation, "", solution.constraint_relaxation)
 
