@@ -255,10 +255,12 @@ class Controller:
         robot, qp = self.robot, self._qp
         bias = robot.h if additional is None else robot.h + additional
         lower, upper = self._limiter.range()
-        bounds = AccelerationRange(*self._observer.shift(*bounds))
+        disturbance = self._observer.known
+        if disturbance is not None:
+            bounds = AccelerationRange(*self._observer.shift(*bounds))
         constraints = None
         if self.collision is not None:
-            constraints = self.collision.constraint(robot, bounds, self._observer.known)
+            constraints = self.collision.constraint(robot, bounds, disturbance)
         terms = [task.term(robot) for task in tasks]
         try:
             solution = qp.solve(
