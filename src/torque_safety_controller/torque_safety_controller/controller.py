@@ -255,10 +255,12 @@ class Controller:
         robot, qp = self.robot, self._qp
         bias = robot.h if additional is None else robot.h + additional
         lower, upper = self._limiter.range()
-        bounds = AccelerationRange(*self._observer.shift(*bounds))
+        disturbance = self._observer.known
+        if disturbance is not None:
+            bounds = AccelerationRange(*self._observer.shift(*bounds))
         constraints = None
         if self.collision is not None:
-            constraints = self.collision.constraint(robot, bounds, self._observer.known)
+            constraints = self.collision.constraint(robot, bounds, disturbance)
         terms = [task.term(robot) for task in tasks]
         try:
             solution = qp.solve(
@@ -273,7 +275,7 @@ class Controller:
         if contacts is not None and self.interaction is not None:
             tau = tau - contacts.B @ solution.rho
             self.interaction.note_forces(solution.rho)
-        self._a_last = a = solution.a
+        a = self._remember(solution.a)
         tau = self._limiter.limited(tau)
         return ControlOutput(tau, a, True, solution.relaxation, "", solution.constraint_relaxation)
 

@@ -20,13 +20,24 @@ Array = NDArray[np.float64]
 def middle_of_step(q: Array, v: Array, a: Array, dt: float) -> tuple[Array, Array]:
     """Return position and velocity after dt / 2 at acceleration `a`, shape (n,) each."""
     half = 0.5 * dt
-    return q + half * (v + 0.5 * half * a), v + half * a
+    q_mid, v_mid = np.empty(len(q)), np.empty(len(q))
+    for i in range(len(q)):
+        q_mid[i] = q[i] + half * (v[i] + 0.5 * half * a[i])
+        v_mid[i] = v[i] + half * a[i]
+    return q_mid, v_mid
 
 
 @compiled
 def spring_damper(J: Array, v: Array, error: Array, drift: Array, kp: float, kd: float) -> Array:
     """Return ``kp error - kd J v - drift``, shape (m,), J of shape (m, n)."""
-    return kp * error - kd * (J @ v) - drift
+    m, n = J.shape
+    b = np.empty(m)
+    for i in range(m):
+        speed = 0.0
+        for k in range(n):
+            speed += J[i, k] * v[k]
+        b[i] = kp * error[i] - kd * speed - drift[i]
+    return b
 
 
 @compiled
