@@ -88,7 +88,16 @@ class IntegralFeedback:
             raise ValueError(f"a_last must have shape {self.saturated.shape}: {a_last.shape}")
         torque = np.empty_like(a_last)
         leak = step(
-            self.memory, self._law, self.leak, arm, a_last, float(dt), torque, self.saturated
+            *self.memory,
+            *self._law,
+            self.leak,
+            arm.M,
+            arm.C,
+            arm.v,
+            a_last,
+            float(dt),
+            torque,
+            self.saturated,
         )
         if math.isnan(leak):
             raise ValueError("dynamics, velocity and acceleration must be finite")
