@@ -125,12 +125,11 @@ def step(
         a, x = _advance(memory, law, arm, J_plus, root_M, a_ref, dt)
         widening = math.exp(-dt / WIDENING_TIME) * memory.widening
     limit = law.budget + widening
-    H = torque_matrix(law, arm, J_plus, J_plus_dot)
-    fast = law.mu * law.gain * np.diag(M)
-    own = H @ a - fast * x
+    own = law_torque(law, arm, J_plus, J_plus_dot, a, x)
     limited = scale_factor(own, limit) < 1.0
     if limited:
-        a, x, own = _limited(law, M, H, fast, limit, a, x, own)
+        H = torque_matrix(law, arm, J_plus, J_plus_dot)
+        a, x, own = _limited(law, M, H, limit, a, x, own)
     offset = torque - own if initialise else math.exp(-dt / FADING_TIME) * memory.offset
     result = clip(own + offset, limit)
     integral = -(J @ a)
@@ -164,11 +163,24 @@ def skip(memory: Memory, law: Law, v: Array, J: Array, dt: float) -> None:
 
 
 @compiled
+def law_torque(
+    law: Law, arm: ArmTerms, J_plus: Array, J_plus_dot: Array, a: Array, x: Array
+) -> Array:
+    """Return the additional torque of eq. (21) with (26), shape (n,)."""
+    K = law.gain * np.diag(arm.M)
+    Ja = arm.J @ a
+    Pa = J_plus @ Ja
+    # J^+ J' s + (J^+)' integral, where s = (1 - P) a and integral = - J a.
+    inner = J_plus @ (arm.J_dot @ (a - Pa)) - J_plus_dot @ Ja
+    slow = arm.J.T @ (J_plus.T @ (K * Pa))
+    return arm.C @ a - arm.M @ inner + (1.0 - law.mu) * slow + law.mu * K * (a - x)
+
+
+@compiled
 def torque_matrix(law: Law, arm: ArmTerms, J_plus: Array, J_plus_dot: Array) -> Array:
-    """Return the H of eq. (21) with (26), shape (n, n): the torque is H a - mu K x."""
+    """Return how `law_torque` depends on a, shape (n, n)."""
     K = law.gain * np.diag(arm.M)
     P = J_plus @ arm.J
-    # J^+ J' s + (J^+)' integral, where s = (1 - P) a and integral = - J a.
     inner = J_plus @ (arm.J_dot - arm.J_dot @ P) - J_plus_dot @ arm.J
     H = arm.C - arm.M @ inner
     H += (1.0 - law.mu) * (P.T * K) @ P
@@ -227,7 +239,7 @@ def _initial_memory(law: Law, arm: ArmTerms, J_plus: Array, torque: Array) -> Ar
 
 @compiled
 def _limited(
-    law: Law, M: Array, H: Array, fast: Array, limit: Array, a: Array, x: Array, torque: Array
+    law: Law, M: Array, H: Array, limit: Array, a: Array, x: Array, torque: Array
 ) -> tuple[Array, Array, Array]:
     """Return a memory and its torque with |torque| <= limit that stores no more energy.
 
@@ -240,7 +252,6 @@ def _limited(
         law: settings.
         M: mass matrix, shape (n, n).
         H: of `torque_matrix`.
-        fast: diagonal of mu K, shape (n,).
         limit: shape (n,), >= 0, may be infinite.
         a: shape (n,).
         x: shape (n,).
