@@ -227,9 +227,8 @@ class AdditionalTorque:
         self._started, self._lost = True, False
 
     def _arm(self, robot: RobotModel, v: Array) -> ArmTerms:
-        """Return what the actions need; in contiguous arrays, for which they are compiled."""
-        J, J_dot = robot.J[self._rows], robot.J_dot[self._rows]
-        return ArmTerms(*(np.ascontiguousarray(x) for x in (robot.M, robot.C, J, J_dot, v)))
+        """Return what the actions need to know of the arm."""
+        return ArmTerms(robot.M, robot.C, robot.J[self._rows], robot.J_dot[self._rows], v)
 
     def _jumped(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> bool:
         """Return whether nothing that the integral is for can have changed the state so."""

@@ -16,7 +16,12 @@ from torque_safety_controller.integral_feedback import (
 from torque_safety_controller.integral_feedback.settings import WIDENING_TIME
 from torque_safety_controller.linalg.generalized_inverse import TaskShapeError
 from torque_safety_controller.nullspace import NullspaceCompliance
-from torque_safety_controller.nullspace.kernels import FADING_TIME, energy_product, torque_matrix
+from torque_safety_controller.nullspace.kernels import (
+    FADING_TIME,
+    energy_product,
+    law_torque,
+    torque_matrix,
+)
 from viability_bounds_pkg.exceptions import SettingError
 
 DT = 2e-3
@@ -180,6 +185,12 @@ def test_gain_matrix_is_positive(seed, m, mu):
     np.testing.assert_allclose(H, H.T, atol=1e-12 * np.abs(H).max())
     P = J_plus @ J
     expected = (1.0 - mu) * P.T @ np.diag(K) @ P + mu * np.diag(K)
+    # The torque is linear in the memory, moving or not.
+    moving = rest._replace(C=rng.normal(size=(n, n)), J_dot=rng.normal(size=(m, n)))
+    rates, a, x = rng.normal(size=(n, m)), rng.normal(size=n), rng.normal(size=n)
+    torque = torque_matrix(law, moving, J_plus, rates) @ a - mu * K * x
+    found = law_torque(law, moving, J_plus, rates, a, x)
+    np.testing.assert_allclose(found, torque, atol=1e-11 * np.abs(torque).max())
     np.testing.assert_allclose(H, expected, atol=1e-12 * H.max())
     smallest = np.linalg.eigvalsh(H)[0]
     assert smallest >= -1e-12 * H.max()

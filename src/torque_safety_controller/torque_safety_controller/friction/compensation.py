@@ -120,8 +120,8 @@ class FrictionCompensation:
     def _step(self, M: Array, v: Array, a_last: Array, elapsed: float, period: float) -> None:
         settings = self._settings
         self._faded = _compensate(
-            self._present,
-            self._wanted,
+            *self._present,
+            *self._wanted,
             -math.expm1(-elapsed / _FADING_TIME),
             M,
             v,
@@ -148,8 +148,16 @@ def _coefficients(settings: FrictionSettings) -> _Coefficients:
 
 @compiled
 def _compensate(
-    present: _Coefficients,
-    wanted: _Coefficients,
+    coulomb: Array,
+    excess: Array,
+    viscous: Array,
+    stribeck_velocity: Array,
+    budget: Array,
+    coulomb_wanted: Array,
+    excess_wanted: Array,
+    viscous_wanted: Array,
+    stribeck_velocity_wanted: Array,
+    budget_wanted: Array,
     blend: float,
     M: Array,
     v: Array,
@@ -160,21 +168,26 @@ def _compensate(
     w: Array,
     tau: Array,
 ) -> bool:
-    """Make a step in `present`, `w` and `tau`, and return whether no friction is left in them.
+    """Make a step in the coefficients, `w` and `tau`; return whether no friction is left in them.
 
-    The reference velocity is that of constant acceleration and velocity within the step.
+    The first arguments are the fields of two `_Coefficients`: Numba takes microseconds to unpack
+    named tuples that come from Python. The reference velocity is that of constant acceleration
+    and velocity within the step.
     """
-    for x, x_wanted in zip(present, wanted):  # noqa: B905 - Numba knows no strict
-        x += blend * (x_wanted - x)
+    coulomb += blend * (coulomb_wanted - coulomb)
+    excess += blend * (excess_wanted - excess)
+    viscous += blend * (viscous_wanted - viscous)
+    stribeck_velocity += blend * (stribeck_velocity_wanted - stribeck_velocity)
+    budget += blend * (budget_wanted - budget)
     decay = math.exp(-leak_rate * dt)
     held = -math.expm1(-leak_rate * dt) / (leak_rate * dt) if leak_rate * dt > 0.0 else 1.0
     gain = gamma / np.diag(np.linalg.inv(M))  # of the inertia felt while others give way
     largest = 0.0
     for i in range(len(v)):
         speed = abs(v[i])
-        excess = present.excess[i] * math.exp(-((speed / present.stribeck_velocity[i]) ** 2))
-        friction = present.coulomb[i] + excess + present.viscous[i] * speed
-        friction = min(friction, present.budget[i])
+        stiction = excess[i] * math.exp(-((speed / stribeck_velocity[i]) ** 2))
+        friction = coulomb[i] + stiction + viscous[i] * speed
+        friction = min(friction, budget[i])
         # More than what calls for all of the friction is nothing to remember.
         enough = friction / gain[i]
         w_new = decay * w[i] + (1.0 - decay) * v[i] + held * dt * a_last[i]
@@ -182,5 +195,5 @@ def _compensate(
         tau[i] = min(max(gain[i] * w[i], -friction), friction)
         if not math.isfinite(tau[i] + w[i]):
             w[i] = tau[i] = 0.0
-        largest = max(largest, present.coulomb[i] + present.excess[i] + present.viscous[i])
+        largest = max(largest, coulomb[i] + excess[i] + viscous[i])
     return largest < _NEGLIGIBLE

@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 class ArmTerms(NamedTuple):
-    """Dynamics, task and velocity of an arm in one step; contiguous arrays.
+    """Dynamics, task and velocity of an arm in one step.
 
     Attributes:
         M: mass matrix, shape (n, n), kg m^2.
@@ -32,11 +32,11 @@ class ArmTerms(NamedTuple):
 
     def check(self, n: int, m: int) -> None:
         """Raise `ValueError` unless these are terms of n joints and m rows of a task."""
-        shapes = [x.shape for x in self]
-        if shapes != [(n, n), (n, n), (m, n), (m, n), (n,)]:
-            found = ", ".join(
-                f"{name} {shape}" for name, shape in zip(self._fields, shapes, strict=True)
-            )
+        M, C, J, J_dot, v = self
+        if not (
+            M.shape == C.shape == (n, n) and J.shape == J_dot.shape == (m, n) and v.shape == (n,)
+        ):
+            found = ", ".join(f"{name} {x.shape}" for name, x in self._asdict().items())
             raise ValueError(f"for {n} joints and a task of {m} rows: {found}")
 
     def check_velocity(self) -> None:

@@ -86,9 +86,23 @@ class IntegralFeedback:
         check_time(dt)
         if a_last.shape != self.saturated.shape:
             raise ValueError(f"a_last must have shape {self.saturated.shape}: {a_last.shape}")
-        torque = np.empty_like(a_last)
+        law, torque = self._law, np.empty_like(a_last)
         leak = step(
-            self.memory, self._law, self.leak, arm, a_last, float(dt), torque, self.saturated
+            *self.memory,
+            law.budget,
+            law.gain,
+            law.slow_leak_rate,
+            law.fast_leak_rate,
+            law.mu,
+            law.method,
+            self.leak,
+            arm.M,
+            arm.C,
+            arm.v,
+            a_last,
+            float(dt),
+            torque,
+            self.saturated,
         )
         if math.isnan(leak):
             raise ValueError("dynamics, velocity and acceleration must be finite")

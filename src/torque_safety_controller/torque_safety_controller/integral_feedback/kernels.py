@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torque_safety_controller.anti_windup import clip, nearest_dissipating, scale_factor
-from torque_safety_controller.integral_feedback.action import ArmTerms
 from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors, mix
 from torque_safety_controller.integral_feedback.settings import (
     NONE,
@@ -41,10 +40,20 @@ class Memory(NamedTuple):
 
 @compiled
 def step(
-    memory: Memory,
-    law: Law,
+    fast: Array,
+    slow: Array,
+    widening: Array,
+    v_last: Array,
+    budget: Array,
+    gain: float,
+    slow_leak_rate: float,
+    fast_leak_rate: float,
+    mu: float,
+    method: int,
     leak: float,
-    arm: ArmTerms,
+    M: Array,
+    C: Array,
+    v: Array,
     a_last: Array,
     dt: float,
     torque: Array,
@@ -52,14 +61,23 @@ def step(
 ) -> float:
     """Take one step: `advance`, then `evaluate`.
 
+    The first arguments are the fields of `Memory` and of `Law`: Numba takes several microseconds
+    to unpack named tuples that come from Python.
+
     Returns:
         The leak of the next step, 1/s; NaN when something is not finite, and nothing has changed.
     """
-    finite = np.isfinite(arm.v).all() and np.isfinite(a_last).all()
-    if not (finite and np.isfinite(arm.M).all() and np.isfinite(arm.C).all()):
+    total = 0.0
+    for i in range(len(v)):
+        total += 0.0 * v[i] + 0.0 * a_last[i]
+        for j in range(len(v)):
+            total += 0.0 * M[i, j] + 0.0 * C[i, j]
+    if not math.isfinite(total):
         return math.nan
-    advance(memory, law, leak, arm.v, a_last, dt)
-    return evaluate(memory, law, arm.M, arm.C, torque, saturated)
+    memory = Memory(fast, slow, widening, v_last)
+    law = Law(budget, gain, slow_leak_rate, fast_leak_rate, mu, method)
+    advance(memory, law, leak, v, a_last, dt)
+    return evaluate(memory, law, M, C, torque, saturated)
 
 
 @compiled

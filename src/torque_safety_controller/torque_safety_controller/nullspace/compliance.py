@@ -114,9 +114,9 @@ class NullspaceCompliance:
             raise ValueError(f"for {n} joints: vectors {a_last.shape}, {torque.shape}")
         try:
             outcome = step(
-                self.memory,
-                self._law,
-                arm,
+                *self.memory,
+                *self._law,
+                *arm,
                 a_last,
                 float(dt),
                 initialise,

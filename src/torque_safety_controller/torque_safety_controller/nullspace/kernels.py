@@ -62,26 +62,40 @@ class Memory(NamedTuple):
 
 @compiled
 def step(
-    memory: Memory,
-    law: Law,
-    arm: ArmTerms,
+    last_a: Array,
+    last_s: Array,
+    last_integral: Array,
+    root: Array,
+    last_offset: Array,
+    last_widening: Array,
+    last_v: Array,
+    last_J: Array,
+    budget: Array,
+    gain: float,
+    slow_leak_rate: float,
+    fast_leak_rate: float,
+    mu: float,
+    method: int,
+    M: Array,
+    C: Array,
+    J: Array,
+    J_dot: Array,
+    v: Array,
     a_ref: Array,
     dt: float,
     initialise: bool,
     torque: Array,
     saturated: NDArray[np.bool_],
 ) -> int:
-    """Take one step; when it fails `memory` is as before.
+    """Take one step; when it fails the memory is as before.
 
-    Args:
-        memory: of the last step.
-        law: settings.
-        arm: as it is now.
-        a_ref: acceleration commanded in the last step, shape (n,), rad/s^2.
-        dt: time since the last step, s.
-        initialise: choose the memory such that the torque is what `torque` holds.
-        torque: shape (n,), receives the additional torque, N m.
-        saturated: shape (n,), receives which joints are at their budgets.
+    The first arguments are the fields of `Memory`, `Law` and `ArmTerms`: Numba takes several
+    microseconds to unpack named tuples that come from Python.
+
+    `a_ref` is the acceleration commanded in the last step, shape (n,), rad/s^2, and `dt` the time
+    since then, s. With `initialise` the memory is chosen such that the torque is what `torque`
+    holds, shape (n,), N m. It receives the torque, and `saturated`, shape (n,), which joints are
+    at their budgets.
 
     Returns:
         `FAILED`, `REGULAR` or `NEAR_SINGULAR`.
@@ -89,15 +103,19 @@ def step(
     Raises:
         LinAlgError: M is singular.
     """
-    M, C, J = arm.M, arm.C, arm.J
-    total = M.sum() + C.sum() + J.sum() + arm.J_dot.sum() + arm.v.sum() + a_ref.sum()
+    memory = Memory(
+        last_a, last_s, last_integral, root, last_offset, last_widening, last_v, last_J
+    )
+    law = Law(budget, gain, slow_leak_rate, fast_leak_rate, mu, method)
+    M, C = np.ascontiguousarray(M), np.ascontiguousarray(C)
+    J, J_dot = np.ascontiguousarray(J), np.ascontiguousarray(J_dot)
+    arm = ArmTerms(M, C, J, J_dot, v)
+    total = M.sum() + C.sum() + J.sum() + J_dot.sum() + v.sum() + a_ref.sum()
     if initialise:
         total += torque.sum()
     if not (math.isfinite(total) and (np.diag(M) > 0.0).all()):
         return FAILED
-    J_plus, J_plus_dot, damped = dynamically_consistent_inverse(
-        J, arm.J_dot, M, C + C.T, THRESHOLD
-    )
+    J_plus, J_plus_dot, damped = dynamically_consistent_inverse(J, J_dot, M, C + C.T, THRESHOLD)
     root_M = np.sqrt(np.diag(M))
     if initialise:
         a = _initial_memory(law, arm, J_plus, torque)
@@ -107,12 +125,11 @@ def step(
         a, x = _advance(memory, law, arm, J_plus, root_M, a_ref, dt)
         widening = math.exp(-dt / WIDENING_TIME) * memory.widening
     limit = law.budget + widening
-    H = torque_matrix(law, arm, J_plus, J_plus_dot)
-    fast = law.mu * law.gain * np.diag(M)
-    own = H @ a - fast * x
+    own = law_torque(law, arm, J_plus, J_plus_dot, a, x)
     limited = scale_factor(own, limit) < 1.0
     if limited:
-        a, x, own = _limited(law, M, H, fast, limit, a, x, own)
+        H = torque_matrix(law, arm, J_plus, J_plus_dot)
+        a, x, own = _limited(law, M, H, limit, a, x, own)
     offset = torque - own if initialise else math.exp(-dt / FADING_TIME) * memory.offset
     result = clip(own + offset, limit)
     integral = -(J @ a)
@@ -126,7 +143,7 @@ def step(
     memory.root[:] = root_M * x
     memory.offset[:] = offset
     memory.widening[:] = widening
-    memory.v[:] = arm.v
+    memory.v[:] = v
     memory.J[:] = J
     return NEAR_SINGULAR if damped else REGULAR
 
@@ -146,11 +163,24 @@ def skip(memory: Memory, law: Law, v: Array, J: Array, dt: float) -> None:
 
 
 @compiled
+def law_torque(
+    law: Law, arm: ArmTerms, J_plus: Array, J_plus_dot: Array, a: Array, x: Array
+) -> Array:
+    """Return the additional torque of eq. (21) with (26), shape (n,)."""
+    K = law.gain * np.diag(arm.M)
+    Ja = arm.J @ a
+    Pa = J_plus @ Ja
+    # J^+ J' s + (J^+)' integral, where s = (1 - P) a and integral = - J a.
+    inner = J_plus @ (arm.J_dot @ (a - Pa)) - J_plus_dot @ Ja
+    slow = arm.J.T @ (J_plus.T @ (K * Pa))
+    return arm.C @ a - arm.M @ inner + (1.0 - law.mu) * slow + law.mu * K * (a - x)
+
+
+@compiled
 def torque_matrix(law: Law, arm: ArmTerms, J_plus: Array, J_plus_dot: Array) -> Array:
-    """Return the H of eq. (21) with (26), shape (n, n): the torque is H a - mu K x."""
+    """Return how `law_torque` depends on a, shape (n, n)."""
     K = law.gain * np.diag(arm.M)
     P = J_plus @ arm.J
-    # J^+ J' s + (J^+)' integral, where s = (1 - P) a and integral = - J a.
     inner = J_plus @ (arm.J_dot - arm.J_dot @ P) - J_plus_dot @ arm.J
     H = arm.C - arm.M @ inner
     H += (1.0 - law.mu) * (P.T * K) @ P
@@ -209,7 +239,7 @@ def _initial_memory(law: Law, arm: ArmTerms, J_plus: Array, torque: Array) -> Ar
 
 @compiled
 def _limited(
-    law: Law, M: Array, H: Array, fast: Array, limit: Array, a: Array, x: Array, torque: Array
+    law: Law, M: Array, H: Array, limit: Array, a: Array, x: Array, torque: Array
 ) -> tuple[Array, Array, Array]:
     """Return a memory and its torque with |torque| <= limit that stores no more energy.
 
@@ -222,7 +252,6 @@ def _limited(
         law: settings.
         M: mass matrix, shape (n, n).
         H: of `torque_matrix`.
-        fast: diagonal of mu K, shape (n,).
         limit: shape (n,), >= 0, may be infinite.
         a: shape (n,).
         x: shape (n,).
