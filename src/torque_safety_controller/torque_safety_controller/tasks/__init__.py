@@ -1,1 +1,18 @@
 """Tasks: what the accelerations should do, and the goals that they serve."""
+
+from torque_safety_controller.tasks.damping_task import DampingTask
+from torque_safety_controller.tasks.gains import Gains
+from torque_safety_controller.tasks.goals import Goals
+from torque_safety_controller.tasks.pose_task import PoseMotion, PoseTask
+from torque_safety_controller.tasks.posture_task import PostureTask
+from torque_safety_controller.tasks.task import Task
+
+__all__ = [
+    "DampingTask",
+    "Gains",
+    "Goals",
+    "PoseMotion",
+    "PoseTask",
+    "PostureTask",
+    "Task",
+]
