@@ -80,7 +80,7 @@ class Hand(ControllerChain):
 
     def give_pose(self) -> None:
         pose = ARM.robot(0.0)
-        pose.update(ARM.q_start, np.zeros(ARM.n), np.zeros(ARM.n))
+        pose.update(State(ARM.q_start, np.zeros(ARM.n)), np.zeros(ARM.n))
         message = PoseStamped()
         p = message.pose.position
         p.x, p.y, p.z = map(float, pose.pose.translation)
@@ -246,14 +246,9 @@ def test_each_parameter_reaches_the_settings():
     ).interaction
     settings = interaction.settings
     gains, led = settings.gains, settings.yielding_gains
-    assert (gains.force_kp, gains.moment_kp, gains.speed_max, gains.turn_max) == (
-        0.2,
-        0.03,
-        0.1,
-        0.4,
-    )
-    assert (led.force_kp, led.moment_kp, led.speed_max, led.turn_max) == (5.0, 6.0, 0.7, 0.8)
-    assert (settings.dual.force, settings.dual.moment) == (3.0, 4.0)
+    assert (gains.kp, gains.speed_max) == ((0.2, 0.03), (0.1, 0.4))
+    assert (led.kp, led.speed_max) == ((5.0, 6.0), (0.7, 0.8))
+    assert settings.yield_threshold == (3.0, 4.0)
     np.testing.assert_array_equal(settings.directions, [0, 0, 1, 0, 0, 0])
     np.testing.assert_array_equal(settings.stiffness, [0.0, 0.1, 0.2, 0.3, 0.4, 1.0])
     assert (interaction.sensor.settings.filter_hz, interaction.sensor.settings.timeout) == (

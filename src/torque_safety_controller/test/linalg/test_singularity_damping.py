@@ -1,21 +1,17 @@
 import numpy as np
 import pytest
 
-from torque_safety_controller.linalg.cholesky import factorise, solve_vector
+from torque_safety_controller.linalg.singularity_damping import is_positive_definite
 
 
 @pytest.mark.parametrize("n", [1, 2, 6, 9])
-def test_factorisation_and_solution_against_numpy(n):
+def test_a_positive_definite_matrix_has_the_factor_that_numpy_finds(n):
     rng = np.random.default_rng(n)
     A = rng.normal(size=(n, n + 2))
     A = A @ A.T
     L = A.copy()
-    assert factorise(L)
+    assert is_positive_definite(L)
     np.testing.assert_allclose(np.tril(L), np.linalg.cholesky(A), rtol=1e-12, atol=1e-13)
-    x = rng.normal(size=n)
-    y = x.copy()
-    solve_vector(L, y)
-    np.testing.assert_allclose(A @ y, x, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -30,4 +26,4 @@ def test_factorisation_and_solution_against_numpy(n):
     ids=["zero", "indefinite", "singular", "nan", "infinite"],
 )
 def test_what_is_not_positive_definite_is_told(A):
-    assert not factorise(A.copy())
+    assert not is_positive_definite(A.copy())
