@@ -74,7 +74,7 @@ def play(loop, duration, events=()):
                 goal = pin.SE3(rotation, np.array(event.position))
                 loop.controller.set_pose_goal(goal)
         loop.step()
-        if loop.controller.collision is not None:
+        if loop.controller.constraints:
             distances.append(loop.controller.collision.closest()[0])
         contacts = max(contacts, len(loop.robot.contacts()))
     return np.array(distances), contacts
@@ -175,7 +175,7 @@ def test_a_push_into_the_wall_is_countered():
 
 def rows_of(loop, q, v, bounds):
     """The rows of a state, as the controller gets them, in their own scale."""
-    found = loop.controller.collision.rows(q, v, -bounds, bounds)
+    found = loop.controller.constraints[0].rows(q, v, -bounds, bounds)
     return found.G.copy(), found.lower.copy()
 
 

@@ -17,7 +17,11 @@ from torque_safety_controller.additional_torque import (
     AdditionalTorque,
 )
 from torque_safety_controller.contact.interaction import Interaction
-from torque_safety_controller.qp.constraints import AccelerationRange, Constraint
+from torque_safety_controller.qp.constraints import (
+    AccelerationRange,
+    Constraint,
+    stack_constraints,
+)
 from torque_safety_controller.qp.inverse_dynamics_qp import ContactForces, InverseDynamicsQP
 from torque_safety_controller.qp.quadratic_program import NoSolutionFound
 from torque_safety_controller.robot_model import RobotModel
@@ -66,12 +70,12 @@ class Controller:
         torque_rate_max: greatest change of torque, shape (n,), N m/s; inf for none.
         additional: integral action; the torque limits hold with it counted in.
         solver: of the QP, one of `inverse_dynamics_qp.SOLVERS`.
-        collision: keeps links apart and away from obstacles; None for nothing.
+        constraints: on the accelerations, besides bounds and torque limits.
         interaction: forces at the hand and other contacts; None for nothing.
 
     Attributes:
         goals: of the end effector and the joints.
-        additional, collision, interaction: as given.
+        additional, constraints, interaction: as given.
         iterations: of the last QP.
     """
 
@@ -83,7 +87,7 @@ class Controller:
         torque_rate_max: Array | None = None,
         additional: AdditionalTorque | None = None,
         solver: str = "daqp",
-        collision: Constraint | None = None,
+        constraints: Sequence[Constraint] = (),
         interaction: Interaction | None = None,
     ) -> None:
         n = robot.n
@@ -91,7 +95,7 @@ class Controller:
         self.gains = gains
         self.goals = Goals(n)
         self.additional = additional
-        self.collision = collision
+        self.constraints = constraints
         self.interaction = interaction
         self.iterations = 0
         self._limiter = TorqueLimiter(tau_max, torque_rate_max, robot.dt)
@@ -259,8 +263,9 @@ class Controller:
         if disturbance is not None:
             bounds = AccelerationRange(*self._observer.shift(*bounds))
         constraints = None
-        if self.collision is not None:
-            constraints = self.collision.constraint(robot, bounds, disturbance)
+        if self.constraints:
+            parts = [each.constraint(robot, bounds, disturbance) for each in self.constraints]
+            constraints = stack_constraints(parts)
         terms = [task.term(robot) for task in tasks]
         try:
             solution = qp.solve(

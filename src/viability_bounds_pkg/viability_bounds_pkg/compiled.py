@@ -31,7 +31,7 @@ _NOT_CALLED = {"node", "nodes", "ros", "parameters", "cli", "tools", "__pycache_
 @overload
 def compiled(function: F) -> F: ...
 @overload
-def compiled(*, error_model: str) -> Callable[[F], F]: ...
+def compiled(**options: Any) -> Callable[[F], F]: ...
 def compiled(function: Any = None, **options: Any) -> Any:
     """Compile a function at its first call with Numba, and keep the result for later processes.
 
@@ -66,7 +66,7 @@ class _SourceCache(FunctionCache):
     """Numba's cache of one function, which also looks at the sources around it."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        super().__init__(function)  # type: ignore[no-untyped-call]
+        super().__init__(function)
         own = self._impl.locator.get_source_stamp()
         # When this stamp differs from the one in the cache, Numba drops what is there.
         stamp = own, _digest(function.__module__.partition(".")[0])

@@ -32,6 +32,7 @@ def make_controller(
         SettingError: parameters that do not fit the URDF.
     """
     robot, base, urdf = load_robot(config, node)
+    collision = load_collision(config.collision, config.robot, urdf, robot.model)
     controller = Controller(
         robot,
         config.tau_max,
@@ -39,7 +40,7 @@ def make_controller(
         config.tau_rate_max,
         AdditionalTorque(config.additional, config.task_rows),
         config.qp_solver,
-        load_collision(config.collision, config.robot, urdf, robot.model),
+        [] if collision is None else [collision],
         make_interaction(config.interaction, config.robot, robot, urdf),
     )
     controller.warm_up()

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from torque_safety_controller.collision.avoidance import CollisionAvoidance
 from torque_safety_controller.controller import ControlOutput
+from torque_safety_controller.qp.constraints import Constraint
 
 if TYPE_CHECKING:
     from rclpy.impl.rcutils_logger import RcutilsLogger
@@ -24,15 +26,16 @@ class CollisionReport:
 
     Args:
         logger: of the node.
-        avoidance: None if there is none.
+        constraints: of the controller; collision avoidance is reported where it is among them.
 
     Attributes:
         too_near: pair that is nearer than the margin now, in words; empty if none is.
     """
 
-    def __init__(self, logger: RcutilsLogger, avoidance: CollisionAvoidance | None) -> None:
+    def __init__(self, logger: RcutilsLogger, constraints: Sequence[Constraint]) -> None:
         self._logger = logger
-        self._avoidance = avoidance
+        own = (each for each in constraints if isinstance(each, CollisionAvoidance))
+        self._avoidance = avoidance = next(own, None)
         self._relaxed_steps = self._not_viable_steps = 0
         self.too_near = ""
         if avoidance is None:

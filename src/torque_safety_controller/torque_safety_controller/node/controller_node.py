@@ -74,7 +74,7 @@ class ControllerNode(Node):
         self._answered_stamp = -1
         self._bounds_lost = False
         self._record = StepRecord(len(config.joints))
-        self._collision = CollisionReport(self.get_logger(), self._controller.collision)
+        self._collision = CollisionReport(self.get_logger(), self._controller.constraints)
 
         self._commands = JointCommands(self, config.joints, config.ros2_control_topic)
         JOINT_STATES.subscription(self, self._on_state)

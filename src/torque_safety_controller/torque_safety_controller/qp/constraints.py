@@ -54,9 +54,9 @@ class Constraint(Protocol):
         """
 
 
-def stack_constraints(parts: Sequence[LinearConstraints]) -> LinearConstraints | None:
+def stack_constraints(parts: Sequence[LinearConstraints | None]) -> LinearConstraints | None:
     """Return all constraints as one, in order; None without any."""
-    parts = [part for part in parts if len(part.G)]
-    if len(parts) < 2:
-        return parts[0] if parts else None
-    return LinearConstraints(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+    given = [part for part in parts if part is not None and len(part.G)]
+    if len(given) < 2:
+        return given[0] if given else None
+    return LinearConstraints(*(np.concatenate(each) for each in zip(*given, strict=True)))

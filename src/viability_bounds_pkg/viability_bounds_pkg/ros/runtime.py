@@ -22,7 +22,7 @@ from viability_bounds_pkg.robot_description import RobotDescriptionError
 try:
     from rclpy.experimental import EventsExecutor
 except ImportError:  # early Jazzy releases
-    EventsExecutor = None  # type: ignore[assignment,misc]
+    EventsExecutor = None
 
 CONTROL_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Streams of states, bounds and commands: the newest wins, nothing is sent again."""
