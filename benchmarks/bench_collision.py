@@ -92,7 +92,7 @@ class Robot:
             config.tau_rate_max,
             AdditionalTorque(config.additional, config.task_rows),
             config.qp_solver,
-            collision,
+            [] if collision is None else [collision],
         )
         controller.warm_up()
         return controller
