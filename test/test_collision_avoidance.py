@@ -10,7 +10,7 @@ from ros_harness import CONFIG
 
 from sim_bridge.scenario.events import AddObstacle, PoseGoal
 from sim_bridge.scenario.scenario import load_scenario
-from torque_safety_controller.collision.geometry import load_geometry
+from torque_safety_controller.constraints[0].geometry import load_geometry
 from torque_safety_controller.qp.constraints import AccelerationRange
 from viability_bounds_pkg.robot_description import read_urdf
 from viability_bounds_pkg.state import State
@@ -75,7 +75,7 @@ def play(loop, duration, events=()):
                 loop.controller.set_pose_goal(goal)
         loop.step()
         if loop.controller.constraints:
-            distances.append(loop.controller.collision.closest()[0])
+            distances.append(loop.controller.constraints[0].closest()[0])
         contacts = max(contacts, len(loop.robot.contacts()))
     return np.array(distances), contacts
 
@@ -101,7 +101,7 @@ def test_goals_behind_obstacles_and_inside_the_arm_end_at_rest_at_the_margin():
     assert distances.min() > MARGIN + RESERVE - 1e-5
     obstacles = [e.obstacle for e in scenario.events if isinstance(e, AddObstacle)]
     meshes = Meshes(loop.model, read_urdf(URDF), obstacles)
-    pairs = set(loop.controller.collision.model.names)
+    pairs = set(loop.controller.constraints[0].model.names)
     q, v = column(loop.samples, "q"), column(loop.samples, "v")
     nearest = np.argsort(distances)[:: len(distances) // 40]
     assert min(meshes.least(q[k], pairs) for k in nearest) > MARGIN
@@ -186,7 +186,7 @@ def test_every_way_to_solve_has_the_rows_and_none_has_a_nan():
     # The hand 5 mm before the limit of its distance to the wall, on its way in.
     play(loop, 1.0, [PoseGoal(0.0, (0.75, 0.0, 0.45), (1.0, 0.0, 0.0, 0.0))])
     q = loop.robot.state().q
-    distance = controller.collision.closest()[0]
+    distance = controller.constraints[0].closest()[0]
     assert distance < 0.03
     v, wide = np.array([0.0, 0.3, 0.0, 0.3, 0.0, 0.0, 0.0]), np.full(7, 15.0)
     G, lower = rows_of(loop, q, v, wide)

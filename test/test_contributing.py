@@ -58,8 +58,8 @@ def test_the_task_asks_for_the_acceleration_of_the_point(examples):
 @pytest.mark.parametrize("limited", [True, False])
 def test_the_limit_is_kept_in_motion(examples, limited):
     arm = load_arm("panda")
-    limit = examples["HeightLimit"](FLOOR, 1.0, 2.0, arm.dt) if limited else None
-    controller = Controller(arm.robot(), arm.tau_max, GAINS, constraints=[limit])
+    limits = [examples["HeightLimit"](FLOOR, 1.0, 2.0, arm.dt)] if limited else []
+    controller = Controller(arm.robot(), arm.tau_max, GAINS, constraints=limits)
     a_max = np.full(arm.n, 15.0)
     bounds = BoundsSolver(
         JointLimits(arm.model.names[1:], arm.q_min, arm.q_max, arm.v_max, -a_max, a_max),

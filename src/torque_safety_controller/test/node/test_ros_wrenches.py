@@ -255,7 +255,7 @@ def test_each_parameter_reaches_the_settings():
         9.0,
         0.5,
     )
-    assert build(dual_compliance=False).interaction.settings.dual is None
+    assert build(dual_compliance=False).interaction.settings.yield_threshold is None
 
 
 def test_what_a_tool_weighs_is_that_of_the_parameter_or_of_the_urdf():
