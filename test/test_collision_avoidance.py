@@ -10,7 +10,7 @@ from ros_harness import CONFIG
 
 from sim_bridge.scenario.events import AddObstacle, PoseGoal
 from sim_bridge.scenario.scenario import load_scenario
-from torque_safety_controller.constraints[0].geometry import load_geometry
+from torque_safety_controller.collision.geometry import load_geometry
 from torque_safety_controller.qp.constraints import AccelerationRange
 from viability_bounds_pkg.robot_description import read_urdf
 from viability_bounds_pkg.state import State
