@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Anti-windup: the closed form of eq. (11) against ProxQP, and a step of the integral action.
 
 Run ``python benchmarks/bench_antiwindup.py``. Problems of 9 joints whose clipped torque would not

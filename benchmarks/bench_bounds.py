@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Time the acceleration bounds: one arm at a time, as a control loop asks, and in batches.
 
 Run ``bash scripts/bench.sh bounds``. Prints, for 7 joints, microseconds per call (median and best

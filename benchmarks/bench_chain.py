@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """State -> limits -> command in one process: the real nodes against nodes that only relay.
 
 Both chains live in one process on one executor, and are driven in turns by the same probe, so

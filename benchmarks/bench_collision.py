@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Collision avoidance: what a pair and a step cost, and what the capsules add to the links.
 
 For Panda and for TALOS' torso and arm, pairs chosen automatically, among a table, a floor, a pole

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A controller step with all that compliance adds, on TALOS' torso and arm of 9 joints.
 
 Each arm is simulated and controlled step by step, in turns, so that caches are as cold as in a

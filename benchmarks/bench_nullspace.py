@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Null-space compliance: what a step costs, and with --motion what its forms do.
 
 The arm is that of ``config/talos_left_arm.yaml``: 9 joints, a hand of 6 rows. With cold caches

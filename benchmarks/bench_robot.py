@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The simulated robot: what a physics step costs, and how exactly two solvers solve it."""
 
 from __future__ import annotations

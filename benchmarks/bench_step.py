@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One controller step, part by part, with each solver, and against the model terms it needs.
 
 The machine's speed cancels in the ratio of a step to the terms that Pinocchio computes for it.
@@ -31,7 +32,7 @@ ALLOWED = 1.25
 
 
 def microseconds(
-    functions: dict[str, Callable[[], Any]], repetitions: int = 300, rounds: int = 40
+    functions: dict[str, Callable[[], Any]], repetitions: int = 300, rounds: int = 20
 ) -> dict[str, float]:
     """Return the best mean times of calls, in turns: what each takes undisturbed."""
     best = dict.fromkeys(functions, float("inf"))

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Our bounds beside those of TSID, the implementation of [DelPrete2018] by its author.
 
 TSID's wheels need an older Pinocchio than ours, hence an environment of their own, `.venv-tsid`,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """TSID's side of the comparison: runs in an interpreter of its own, see `tsid_comparison.py`.
 
 ``python tsid_worker.py INPUT.npz OUTPUT.npz`` computes bounds in given states and follows rollouts

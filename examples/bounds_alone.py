@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Seven joints driven at their limits: exact bounds keep them, naive bounds do not.
 
 No robot model and no ROS: each joint is a plain integrator of the acceleration commanded. Every

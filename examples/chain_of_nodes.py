@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The three nodes in one process: a Panda is sent to a pose, and its robot judges the limits.
 
 In lockstep: the simulated robot waits for the command that answers each of its states, so that

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """An arm under torque control, without ROS: a pose out of its reach, and no limit broken.
 
 The robot is Pinocchio's forward dynamics in small steps. Its acceleration limits and what a held

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Acceleration limits that a robot's torque limits can always provide, from its URDF.
 
     python examples/limits_from_urdf.py [URDF]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The real nodes in one process, in lockstep, from a scenario to a recording."""
 
 from __future__ import annotations

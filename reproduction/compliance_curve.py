@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Figures 10 and 11 of [Benallegue2021]: a curve among poles that the controller does not know."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Figure 9 of [Benallegue2021], dual compliance; and pressing on a table, sliding along it."""
 
 from __future__ import annotations

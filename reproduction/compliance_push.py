@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Figures 6 to 8 of [Benallegue2021]: pushed at the hand and at the elbow, and released."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rendered pictures of the arm, as in figures 7, 8 and 10 of [Benallegue2021]."""
 
 from __future__ import annotations

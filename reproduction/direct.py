@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Robot, bounds and controller of a parameter file in one loop, without messages between them.
 
 The same classes, made from the same parameters as in the nodes, step by step in lockstep; for

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How exact the acceleration bounds are: against brute force, and against adversaries in motion.
 
 bash scripts/reproduce.sh exactness [--states 100000] [--joint-steps 10000000]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Results for one figure of a paper: picture, data, metrics, and rows of the table."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Friction compensation on TALOS: steady error, tracking, coefficients that are wrong, a push.
 
 bash scripts/reproduce.sh friction

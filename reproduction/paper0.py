@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Figures 1, 3, 4 and 5 and the timing of Algorithm 4 of [DelPrete2018], and a table beside it.
 
 bash scripts/reproduce.sh paper0         all of it, and docs/reproduction.md

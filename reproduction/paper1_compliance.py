@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Figures 6 to 11 of [Benallegue2021]: stiff at the hand, free in the null space.
 
 bash scripts/reproduce.sh paper1-compliance            all, and docs/reproduction_compliance.md

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Figures 3 and 5 of [Benallegue2021], an ablation of the integral action, and an endurance run.
 
 bash scripts/reproduce.sh paper1-integral              all of it, and docs/reproduction_integral.md

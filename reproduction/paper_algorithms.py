@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Algorithms 1 to 3 of [DelPrete2018] as printed, for comparison and for Fig. 3.
 
 `viability.acceleration_bounds` replaces them: these assume a viable state and condition (11),

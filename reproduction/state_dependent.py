@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How much faster Baxter's arm reaches with acceleration limits that depend on its state.
 
 bash scripts/reproduce.sh state_dependent

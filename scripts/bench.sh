@@ -1,4 +1,5 @@
 #!/usr/bin/env bash
+# SPDX-License-Identifier: Apache-2.0
 # Measures run times and prints them. Ratios compare programs that run in turns in one process.
 #
 #     bash scripts/bench.sh chain     from state to command through both nodes, against empty relays

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compiles ahead what the nodes and tools use, so that no start has to wait for it.
 
 Part of `setup.sh`. The robots of `config/` play a few control steps with everything switched on:

@@ -1,4 +1,5 @@
 #!/usr/bin/env bash
+# SPDX-License-Identifier: Apache-2.0
 # Simulates an arm that is driven to its limits, and checks the limits. Sets up what it needs.
 set -eu
 usage() {

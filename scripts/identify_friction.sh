@@ -1,4 +1,5 @@
 #!/usr/bin/env bash
+# SPDX-License-Identifier: Apache-2.0
 # Identifies the friction of a robot's joints from a recording of its motion or, without one, from a
 # motion in simulation. Sets up what it needs.
 set -eu

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Write docs/parameters.md and docs/topics.md from the tables that the nodes use.
 
 python scripts/make_reference.py

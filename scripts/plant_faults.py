@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Plants faults in copies of the tree and tells which of them the tests notice.
 
     python scripts/plant_faults.py                     all of `test/faults.yaml`

@@ -1,4 +1,5 @@
 #!/usr/bin/env bash
+# SPDX-License-Identifier: Apache-2.0
 # Reproduces the figures of a paper, writes them to results/, and prints a table with the paper's
 # numbers and ours.
 #

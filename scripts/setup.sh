@@ -1,4 +1,5 @@
 #!/usr/bin/env bash
+# SPDX-License-Identifier: Apache-2.0
 # Creates the environment for all other scripts, and activates it. Source it:
 #
 #     source scripts/setup.sh

@@ -1,4 +1,5 @@
 #!/usr/bin/env bash
+# SPDX-License-Identifier: Apache-2.0
 # Runs the tests, setting itself up first. Arguments go to pytest:
 #
 #     bash scripts/test.sh                  all of them, in several processes

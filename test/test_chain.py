@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bounds, controller and robot node together, over real DDS, in lockstep."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Panda and TALOS under torque control among obstacles: their own meshes tell the distances."""
 
 import coal

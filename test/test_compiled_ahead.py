@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Set-up compiles everything, so that neither starts of nodes nor control steps have to."""
 
 import os

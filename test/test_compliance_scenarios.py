@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """TALOS with friction, stiff at the hand and free in the null space: pushes, poles, switching.
 
 Shorter runs of what `scripts/reproduce.sh paper1-compliance` plays.

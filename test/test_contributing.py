@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The examples in CONTRIBUTING.md do what they say."""
 
 import re

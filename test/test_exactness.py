@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The long comparison of `reproduction/exactness.py`, in short, and that it can fail."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Friction of the simulated TALOS: told from a recording, and compensated."""
 
 from __future__ import annotations

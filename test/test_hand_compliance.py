@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Hands that yield to who pulls, press on a table, and hold when their sensor falls silent.
 
 With the simulated sensor, its bias, noise and a tool heavier than the URDF says.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """TALOS' arm with friction, rotors and mass errors at 1 kHz: what the integral action is for.
 
 Shorter runs of what `scripts/reproduce.sh paper1-integral` plays.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The maths without ROS: both packages installed by pip into a fresh virtual environment.
 
 The environment holds the two packages and exactly the distributions that they declare, with what

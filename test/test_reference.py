@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """docs/parameters.md and docs/topics.md say what the nodes really have."""
 
 import importlib.util

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A scenario with everything in it, played by the nodes and without them: the same numbers."""
 
 import numpy as np

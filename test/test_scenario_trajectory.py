@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a scenario sends as a trajectory is what the controller follows."""
 
 import numpy as np

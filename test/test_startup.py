@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The installed executables: what stops them at start, and how they end."""
 
 import os

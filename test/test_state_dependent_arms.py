@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """State-dependent limits on whole arms, racing from limit to limit: faster, nothing broken."""
 
 import numpy as np

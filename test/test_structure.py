@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 import ast
 from pathlib import Path
 
@@ -178,3 +179,15 @@ def test_parameter_files_and_scenarios_are_installed():
     )
     assert len(own) > 5
     assert installed == own
+
+
+def test_every_source_names_its_licence():
+    folders = ("src", "test", "reproduction", "benchmarks", "examples", "scripts", "config")
+    found = [
+        p for f in folders for end in ("py", "sh", "yaml") for p in (ROOT / f).rglob(f"*.{end}")
+    ]
+    assert len(found) > 250
+    for path in found:
+        if path.stat().st_size:
+            start = path.read_text()[:200]
+            assert "SPDX-License-Identifier: Apache-2.0" in start, path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Build description of sim_bridge."""
 
 from glob import glob

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Build description of torque_safety_controller."""
 
 from setuptools import find_packages, setup

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Build description of viability_bounds_pkg."""
 
 from setuptools import find_packages, setup

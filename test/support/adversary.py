@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motions that do their worst within the bounds, watched in continuous time.
 
 States have shape (m, n): m motions of each of n joints, all with the same step.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Our bounds beside the brute-force solution: state by state, for tests and for the long run."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The configured arms as the controller sees them, for tests that need a real one."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Problem (4) of [DelPrete2018] solved as it is stated, to check the closed forms against.
 
 Nothing here comes from Algorithms 1 to 3 or from `docs/bounds.md`: no stopping distance, no

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Arms among obstacles, and a small QP that moves them, for tests of the collision avoidance."""
 
 from __future__ import annotations

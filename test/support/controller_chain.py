@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The other side of the controller node, for tests: a robot and a bounds node."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joints that the tests of the bounds share: where condition (11) holds, and where it fails."""
 
 import numpy as np

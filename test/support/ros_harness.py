@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Nodes under test: the real ones and a probe, over real DDS, in one process and one executor.
 
 Each `RosHarness` has a context of its own in a domain that nothing else on this machine uses,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A real arm with a task of some rows, for tests of what acts in a task and its null space."""
 
 from __future__ import annotations

@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """A torque-controlled robot played by PyBullet over ROS 2 topics."""

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The torque added to the model's: integral action in one of its modes, and friction's.
 
 Modes are ``none``; ``joints``, every joint stiff, (3)-(14) of [Benallegue2021]; and ``task``,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Limits on the integral torque that keep it dissipative: eq. (10) and (11), [Benallegue2021].
 
 The integral torque u = K s is to stay within limits u_max, and to take energy out of s all the

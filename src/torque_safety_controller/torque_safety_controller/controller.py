@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The controller of one arm: state, limits and goals in, torque out; no ROS."""
 
 from __future__ import annotations

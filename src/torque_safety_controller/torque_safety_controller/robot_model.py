@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One Pinocchio model of the arm; every quantity of a control step computed once."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Acceleration limits that the torque limits can always provide, or nearly so.
 
 Section IV of [DelPrete2018] bounds accelerations by worst-case constants, estimated offline from

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Other ways to bound joint accelerations, for comparison with `viability.acceleration_bounds`.
 
 They share its signature. None of them keeps the limits in general; where a method contradicts

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Decorator for Numba functions, with a cache on disk that notices changed callees.
 
 Numba keeps compiled code until the file of the function changes. It does not notice that a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Position, velocity and acceleration limits of joints, checked when they are made."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Trajectories of the end effector: pose, twist and acceleration between points, and circles.
 
 Between two points position and orientation are quintic polynomials that meet pose, velocity and

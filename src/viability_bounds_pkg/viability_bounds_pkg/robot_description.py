@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Finds a robot description and builds its Pinocchio model.
 
 A URDF is named by a file path or by a ``package://`` URI. Packages are looked up where ROS 2

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The state of an arm: joint positions and velocities."""
 
 from __future__ import annotations

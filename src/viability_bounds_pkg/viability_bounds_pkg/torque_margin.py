@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Margins on joint limits for the zero-order hold error of a torque command.
 
 The bounds assume constant acceleration within a step; a robot under a constant torque has

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Exact joint acceleration bounds in closed form: problem (4) of [DelPrete2018].
 
 A state is viable when position and velocity limits can be kept for ever from it. The bounds are

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The simulated robot: PyBullet, drives, joint friction, sensors and obstacles."""
 
 from sim_bridge.bullet.joint_friction import JointFriction

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The links of a robot in a PyBullet world, with external wrenches, obstacles and a sensor."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """PyBullet's functions for one private physics client, without its unrequested output."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Coulomb friction between a link and an obstacle.
 
 The two are connected by a bristle: a spring of deflection s along the surface, with a little

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The wrench that a force/torque sensor of a robot measures.
 
 The Newton-Euler equations of all links beyond the sensor, in a physics step from (q, v) to v+: the

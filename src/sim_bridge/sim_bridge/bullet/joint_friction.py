@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Friction, rotor inertia and torque bias of a robot's joints.
 
 A joint behind a gear of ratio N, with motor torque tau, obeys

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Records how close each joint came to its limits, and by how much it violated them.
 
 Nothing that it finds affects the robot. It is updated at every physics step, so that violations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Obstacles in a PyBullet world, and their forces on the robot in it.
 
 An obstacle is stiff, but not rigid: contact forces between rigid ones and a robot with friction in

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Obstacles, their material, and the forces and contacts between them and a robot."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Position control by the drive of each joint: a cascade of position and velocity loops.
 
     v_ref = v_des + kappa (q_des - q), at most the speed limit,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A robot arm in PyBullet whose state follows exactly the discrete-time model of the papers.
 
 PyBullet steps by semi-implicit Euler: with step h and acceleration a,

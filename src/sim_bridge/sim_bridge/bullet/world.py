@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A PyBullet world with one robot, without what PyBullet adds to rigid-body dynamics.
 
 PyBullet's Dantzig solver, a direct one, computes the constraint impulses of brakes, friction,

@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """The robot node and the scenario node, with their parameters and messages."""

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The robot node: simulates an arm with torque- and position-controlled motors."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The robot node's parameters: the table, their checks, and the robot made of them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The topic of the simulated force/torque sensor, with bias and noise."""
 
 from __future__ import annotations

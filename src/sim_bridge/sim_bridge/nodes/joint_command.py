@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The command of a ``joint_commands`` message."""
 
 from __future__ import annotations

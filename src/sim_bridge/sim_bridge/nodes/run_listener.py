@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Subscribes to the topics of robot, bounds and controller, and records them."""
 
 from __future__ import annotations

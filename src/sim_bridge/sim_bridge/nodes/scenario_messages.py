@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The messages and service calls of a scenario's events."""
 
 from __future__ import annotations

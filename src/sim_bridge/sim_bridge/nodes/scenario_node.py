@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The scenario node: plays a scenario over topics and services, and records the run."""
 
 from __future__ import annotations

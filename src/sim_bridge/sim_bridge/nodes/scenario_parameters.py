@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The scenario node's parameters and their checks."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Runs a scenario to its end, and writes the report."""
 
 from __future__ import annotations

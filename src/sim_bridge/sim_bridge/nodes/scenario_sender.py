@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Publishes scheduled messages before their time, and calls services in order."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Topics and services of the robot node that no other package needs."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Applies external wrenches and obstacles from messages at their time stamps."""
 
 from __future__ import annotations

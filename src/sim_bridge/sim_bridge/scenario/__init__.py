@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scenarios, the recording of a run, and its report.
 
 `write_report` is not exported here: it imports matplotlib, which takes a second.

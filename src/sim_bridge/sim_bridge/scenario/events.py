@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The events of a scenario: a class for each kind of entry, and its reader."""
 
 from __future__ import annotations

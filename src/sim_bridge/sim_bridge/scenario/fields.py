@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Checks of the entries of a scenario file; each error names the entry and what is allowed."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The reference of the end effector in a scenario, and the distance of a recorded run from it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A recorded run: states, bounds and commands, matched by their stamps."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The report of a run: table, verdict, figure, data and metrics."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A scenario: goals, pushes, obstacles and service calls over time, read from YAML."""
 
 from __future__ import annotations

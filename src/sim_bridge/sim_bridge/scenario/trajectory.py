@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The entry ``trajectory`` of a scenario file: points, or a circle."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Renders a robot and the obstacles around it, without a display."""
 
 from __future__ import annotations

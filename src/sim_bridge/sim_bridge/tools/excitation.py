@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A motion from which the friction of every joint can be identified, independent of masses.
 
 All joints move at once, in parts of whole periods of cosines,

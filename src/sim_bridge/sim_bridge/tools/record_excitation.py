@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Command line tool: records a motion of the simulated robot for friction identification.
 
 The drives of the robot in a parameter file follow the motion of `excitation`; the reported

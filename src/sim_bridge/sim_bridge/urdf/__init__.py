@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Arms of robot descriptions, and descriptions rewritten for PyBullet."""
 
 from sim_bridge.urdf.arm import ConfiguredArm

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """An arm of a robot description, and its limits."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Frames, axes and numbers as a URDF writes them."""
 
 from __future__ import annotations

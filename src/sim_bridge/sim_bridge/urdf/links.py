@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Masses, shapes and children of the links of a URDF."""
 
 from __future__ import annotations

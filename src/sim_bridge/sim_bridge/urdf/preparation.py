@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rewrites a URDF so that its dynamics in PyBullet equal Pinocchio's reduced model.
 
 PyBullet reads a URDF in ways that silently change the dynamics. Each is prevented here:

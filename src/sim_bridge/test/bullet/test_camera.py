@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pictures: what is where it should be, and the robot's own world stays as it is."""
 
 from contextlib import closing

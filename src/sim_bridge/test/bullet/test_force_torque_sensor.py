@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The wrist's sensor against weights, momentum, contacts and pushes."""
 
 from contextlib import closing

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joint friction and rotors against their equations for, and in contact with the world."""
 
 from contextlib import closing

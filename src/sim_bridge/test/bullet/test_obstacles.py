@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Contacts with obstacles: statics, Coulomb's law, equations of motion, and what is refused."""
 
 from contextlib import closing

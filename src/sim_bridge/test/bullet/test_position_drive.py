@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Position control as the motors' drives do it, through the robot that they move."""
 
 from contextlib import closing

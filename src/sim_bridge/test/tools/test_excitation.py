@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The motion that friction is told from, and the executable that records it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Arms driven into obstacles and into themselves, and where they end."""
 
 import numpy as np

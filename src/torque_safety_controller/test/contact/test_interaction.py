@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Forces at the hand, through the controller that is told of them."""
 
 from dataclasses import replace

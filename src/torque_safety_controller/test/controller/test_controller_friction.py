@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Friction compensation in the controller and its node: parameters, limits, handover."""
 
 from __future__ import annotations

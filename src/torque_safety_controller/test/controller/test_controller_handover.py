@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Handover between position and torque control over real DDS, and with the real robot node."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The controller node with integral action: its parameters, at start and live."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The law by itself, and on joints that stick and slip exactly."""
 
 import math

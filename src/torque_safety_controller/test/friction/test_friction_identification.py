@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Friction told from motions of an arm whose masses are not those of the model."""
 
 import itertools

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The identify_friction executable, started as a user starts it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The additional torque of an arm whose motors give what they are told, less a disturbance."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the theory of the integral action says, against Pinocchio's dynamics of real arms."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The inverse and its derivative, against NumPy and finite differences on real arms."""
 
 import numpy as np

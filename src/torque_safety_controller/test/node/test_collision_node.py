@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The controller node with collision avoidance: what it says, and that torques stay safe."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Trajectories over topics: read, refused, followed in the robot's time."""
 
 import math

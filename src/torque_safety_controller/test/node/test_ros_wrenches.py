@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Wrenches over topics: measured, refused, exerted, yielded to; and what a silent sensor ends."""
 
 import math

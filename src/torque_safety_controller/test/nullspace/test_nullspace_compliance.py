@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Null-space compliance of simulated arms: what it is for, its limits, and what it refuses."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the theory of null-space compliance says, against Pinocchio's dynamics of real arms."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The QP with contact forces and further rows, against solvers of other kinds."""
 
 from typing import NamedTuple

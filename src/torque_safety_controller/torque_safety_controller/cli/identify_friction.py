@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Command line tool: the friction of a robot's joints from a recording of its motion.
 
 Reads a robot's parameter file and a recording, reports what it found and what not, and writes a

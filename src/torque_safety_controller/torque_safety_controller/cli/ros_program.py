@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Entry point of the controller node, which says in one line where ROS 2 is missing."""
 
 from __future__ import annotations

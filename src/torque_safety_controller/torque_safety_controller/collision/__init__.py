@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Collision avoidance: constraints that keep links apart and away from obstacles."""
 
 from torque_safety_controller.collision.avoidance import CollisionAvoidance, CollisionSettings

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Collision avoidance as constraints on joint accelerations: distances that can always be kept.
 
 `docs/collision_avoidance.md` derives the rows, and says what they promise and what not.

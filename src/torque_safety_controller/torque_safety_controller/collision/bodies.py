@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Shapes that are kept apart: obstacles, fixed in the base frame, and capsules around links."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Capsules around triangles: a few round shapes in place of a link's mesh.
 
 A capsule is convex, so that it holds a triangle when it holds its corners. Parts of a mesh, split

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Closest points of a segment and a box, in closed form and compiled.
 
 All vectors are in the axes of the box, whose corners are at +- `half`. A box with lengths of zero

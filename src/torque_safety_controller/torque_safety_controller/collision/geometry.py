@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The collision geometry of a URDF, loaded through Pinocchio and coal, as triangles of links."""
 
 from __future__ import annotations

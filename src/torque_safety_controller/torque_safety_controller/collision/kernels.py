@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From a state of the arm to linear constraints on its joint accelerations, compiled.
 
 Every body is a box with rounded edges, which may be thin: a capsule is a segment, a sphere a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Placements and motion of an arm's joints by Pinocchio, as arrays for compiled functions."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What may collide with what: capsules around an arm's links, obstacles, and pairs of them."""
 
 from __future__ import annotations

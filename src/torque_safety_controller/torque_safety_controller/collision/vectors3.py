@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Vectors of three numbers as tuples, for compiled functions: they allocate no memory."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Contact forces: wrist sensor, contacts of the QP, admittance and dual compliance."""
 
 from torque_safety_controller.contact.admittance import AdmittanceGains

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The admittance task: the hand moves until it feels the wrench that it should.
 
 [Benallegue2021], III-E (b), in the end effector's axes, with F what the environment does to the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Contacts of links with the environment: friction cones, wrenches, Jacobians.
 
 A contact is one or more points of a link at which the environment pushes, along a normal and,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Forces at the hand: exerting a target wrench, and yielding to external ones.
 
 One object puts together the sensor, the contacts of the QP with their wrench tasks, the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a wrist force/torque sensor measures, made into the wrench of the environment on the hand.
 
 A sensor feels everything beyond it: what the environment does to the hand, and the weight of the

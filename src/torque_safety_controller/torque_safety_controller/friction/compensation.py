@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Friction compensation in the direction in which the joint is wanted to go.
 
 [Benallegue2021] names it as the next step. With the friction of a moving joint at most F(v), in

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Friction of each joint from a recorded motion, whatever the masses really are.
 
 What the motors gave beyond what the model asks for,

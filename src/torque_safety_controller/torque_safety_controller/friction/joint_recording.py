@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A recording of joint states, and the averages over short blocks of it that models are fitted to.
 
 Averages over a block from sample s to sample e need no derivative of a noisy velocity: the mean

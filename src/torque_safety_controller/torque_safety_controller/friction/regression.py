@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Least squares for the friction of one joint, the errors of the model eliminated."""
 
 from __future__ import annotations

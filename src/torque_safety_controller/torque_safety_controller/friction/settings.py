@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Friction model and settings of the friction compensation, checked in one place."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Integral action: passive, leaky and limited; what every kind of it has in common."""
 
 from torque_safety_controller.integral_feedback.action import ArmTerms, IntegralAction

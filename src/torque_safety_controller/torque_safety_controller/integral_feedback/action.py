@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What every integral action offers, and what it needs to know of the arm."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Passivity-based integral action that cannot run away: [Benallegue2021], II-B and III-A to C.
 
 Of the torque of a control step,

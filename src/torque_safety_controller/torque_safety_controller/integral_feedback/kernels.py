@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One step of the joints' integral action, compiled; `docs/integral_action.md` derives it."""
 
 from __future__ import annotations

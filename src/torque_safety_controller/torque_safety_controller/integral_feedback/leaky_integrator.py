@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Leaky integration, which forgets: eq. (12)-(14), [Benallegue2021].
 
     s_leaky' = -theta s_leaky + s'

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Settings of the integral action, checked in one place."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Small dense linear algebra, compiled: for matrices of 7 columns NumPy is mostly overhead.
 
 Each function is here because NumPy's way costs more than 3 % of a control step more

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The dynamically consistent inverse of a task Jacobian, and how it changes with time.
 
     J^+ = M^-1 J^T (J M^-1 J^T + c D)^-1,   c = n / tr M                            [Khatib1995]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Damping of the directions in which a Jacobian is nearly singular, and of those only.
 
 With G = J J^T = sum g_i u_i u_i^T, where g_i is the square of a singular value of J, and the

@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """The controller node: messages in, messages out."""

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Makes the controller from its configuration, and applies live changes."""
 
 from __future__ import annotations

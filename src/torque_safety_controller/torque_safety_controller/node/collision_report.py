@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Log messages and diagnostics of the collision avoidance."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The controller node: joint states, acceleration limits and goals in, joint torques out."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Statistics of the control steps for /diagnostics."""
 
 from __future__ import annotations

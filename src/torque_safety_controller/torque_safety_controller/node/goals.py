@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Goals from messages: checked, and kept until the time of their stamps."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Commands to the robot: torques, or positions for the robot's own drives."""
 
 from __future__ import annotations

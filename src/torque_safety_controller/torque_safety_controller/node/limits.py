@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Acceleration limits from messages: names matched, sizes, values and order checked."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The service that switches between torque control and the robot's own position control."""
 
 from __future__ import annotations

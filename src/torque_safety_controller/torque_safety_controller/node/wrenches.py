@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Wrenches from messages: measured ones, and those that the arm is to exert."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Null-space compliance: stiff in a task, free in its null space."""
 
 from torque_safety_controller.nullspace.compliance import NullspaceCompliance

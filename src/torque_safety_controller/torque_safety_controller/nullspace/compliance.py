@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Stiff in a task, free in its null space: [Benallegue2021], III-D.
 
 The acceleration error ``s' = a_ref - v'`` is integrated into

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One step of null-space compliance, compiled; `docs/nullspace_compliance.md` derives it.
 
 The torque is linear in the memory (a, x), where x = a - a_fast is what the fast memory has

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The controller node's parameters: tables, checks, and the configuration made of them."""
 
 from torque_safety_controller.parameters.controller_parameters import (

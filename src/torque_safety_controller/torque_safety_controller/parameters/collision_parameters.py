@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parameters of the collision avoidance: the table, and what is made of it."""
 
 from __future__ import annotations

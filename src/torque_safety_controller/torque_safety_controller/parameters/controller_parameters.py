@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The controller node's parameters: the table, and what the node is made of from it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """List entries that are YAML mappings, as "{name: wall, shape: box, size: [0.1, 1.0, 1.0]}"."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parameters of the integral action: the table, and the settings made of them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parameters of forces at the hand and other contacts: the table, and what is made of them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The inverse-dynamics quadratic program, its constraints, and the solvers for it."""
 
 from torque_safety_controller.qp.constraints import (

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Constraints on the joint accelerations: their bounds, and further linear ones."""
 
 from __future__ import annotations

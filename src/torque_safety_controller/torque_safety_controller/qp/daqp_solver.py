@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """DAQP, a dual active-set method: fast from a good guess, and certain about infeasibility.
 
 DAQP [Arnstrom2022] does not look at its input: NaN in C passes as a limit that is never violated.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The QP for joint accelerations and contact forces: eq. (5) of [Benallegue2021].
 
     minimise    sum_t w_t |A_t a - b_t|^2 + sum_c w_c |W_c rho - F_c|^2 + gamma (|a|^2 + |rho|^2)

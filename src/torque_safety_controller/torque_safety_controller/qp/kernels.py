@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compiled inner loops of building a program and checking its solution.
 
 Written with NumPy each costs 5 to 20 % more of a control step (`scripts/bench.sh step`).

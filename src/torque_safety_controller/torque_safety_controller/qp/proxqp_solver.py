@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """ProxQP, an augmented Lagrangian method: the solver to ask where DAQP fails, or by choice.
 
 Its answers are checked: ProxQP 0.8 goes on for seconds where there is no solution, and now and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Quadratic programs, what solves them, and what comes out."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Terms of the QP's cost: weighted least squares in the accelerations or the contact forces."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What disturbs the joints' accelerations, seen one step later and kept out of the bounds.
 
 The acceleration bounds hold for the accelerations that the arm has; the controller chooses those

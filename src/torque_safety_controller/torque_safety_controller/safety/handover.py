@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From position control by the robot's own drives to torque control and back, without a jolt.
 
 [Benallegue2021], IV-A: the position reference is captured and held while the QP, at the arm's own

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which mode the controller is in, and why."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What may be sent to the motors: finite torques within their limits and rates."""
 
 from __future__ import annotations

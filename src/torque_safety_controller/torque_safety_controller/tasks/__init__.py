@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tasks: what the accelerations should do, and the goals that they serve."""
 
 from torque_safety_controller.tasks.damping_task import DampingTask

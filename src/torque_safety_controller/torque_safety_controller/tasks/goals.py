@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Goals of the end effector and the joints, and the tasks that bring the arm there."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The task that brings the end effector to a pose."""
 
 from __future__ import annotations

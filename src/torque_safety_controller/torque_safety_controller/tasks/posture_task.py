@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The task that brings the joints to a posture."""
 
 from __future__ import annotations

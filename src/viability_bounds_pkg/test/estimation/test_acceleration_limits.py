@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Algorithm 4, the refined search, and the margin of a held torque, against Pinocchio."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The estimate_acceleration_limits executable, started as a user starts it."""
 
 from __future__ import annotations

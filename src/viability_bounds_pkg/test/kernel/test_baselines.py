@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the other methods promise, and where they fail."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is compiled is never older than the functions of other files that it calls."""
 
 import subprocess

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bounds against the paper's algorithms and problem (4), and what they do with odd input."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The bounds keep the limits: in motion, under disturbances, and on the way back from outside."""
 
 import numpy as np

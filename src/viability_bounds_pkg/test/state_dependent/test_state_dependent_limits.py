@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """State-dependent limits: on a pendulum, where everything is known, and on arms in motion."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Shared by command line tools: errors and interrupts in one line, exit codes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Command line tool: acceleration limits of a robot from its torque limits.
 
 Reads a robot's parameter file, searches for the worst states (Algorithm 4 of [DelPrete2018], or

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reads a robot's parameter file and writes the file with the estimated limits."""
 
 from __future__ import annotations

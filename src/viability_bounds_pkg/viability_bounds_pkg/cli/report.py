@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Printed report of the estimated limits, and their parameter file for the nodes."""
 
 from __future__ import annotations

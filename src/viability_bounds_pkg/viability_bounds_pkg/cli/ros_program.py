@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Entry points of programs that need ROS 2, which say so in one line where it is missing."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Worst-case acceleration limits from torque limits, and the zero-order hold error."""
 
 from viability_bounds_pkg.estimation.discretisation_margin import (

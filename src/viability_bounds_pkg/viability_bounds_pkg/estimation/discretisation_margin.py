@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Worst-case zero-order hold error of joint accelerations over one control period.
 
 A torque-controlled robot receives a torque that is constant for a period `dt`, so that its

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The box of robot states in which worst cases are searched.
 
 Shared by `acceleration_limits` (Algorithm 4 of [DelPrete2018]) and `discretisation_margin`.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Largest velocity scale at which torque leaves every joint an acceleration interval."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Search for the states that leave a joint the least acceleration in each direction.
 
 Two searches that yield what has been found so far, so that a caller can show progress, stop and

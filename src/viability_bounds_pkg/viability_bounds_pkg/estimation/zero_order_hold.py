@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The zero-order hold error: how motion differs from constant acceleration under held torque."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The viability kernel: one joint's bounds, in continuous and in discrete time."""
 
 from viability_bounds_pkg.kernel.bounds_kernel import AccelerationBounds, joint_bounds, solve

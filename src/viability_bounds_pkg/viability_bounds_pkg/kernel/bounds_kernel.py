@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compiled evaluation of the acceleration bounds, joint by joint.
 
 One loop serves a single arm and a batch of a million states.

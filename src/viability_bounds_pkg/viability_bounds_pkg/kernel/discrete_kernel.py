@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The viability kernel when condition (11) of [DelPrete2018] fails.
 
 Braking lasts whole steps: a joint that stops in front of one limit early in a step is thrown

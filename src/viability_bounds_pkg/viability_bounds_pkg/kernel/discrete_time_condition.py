@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The discrete-time condition (11) of [DelPrete2018]: when braking at full rate is safe.
 
 Asymmetric limits, a margin for disturbances and continuous joints are worked out in

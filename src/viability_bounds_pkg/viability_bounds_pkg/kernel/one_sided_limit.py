@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The position limits of joints, upper and lower, as records that compiled code reads by name.
 
 Each limit is seen in the direction of motion towards it, so that the lower one is the mirror

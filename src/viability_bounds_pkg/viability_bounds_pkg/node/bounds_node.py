@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The bounds node: joint states in, acceleration limits out."""
 
 from __future__ import annotations

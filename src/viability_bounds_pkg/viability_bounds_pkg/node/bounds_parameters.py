@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The bounds node's parameters: the table, and what the node computes with from it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What every ROS node of the project shares: parameters, topics, messages, running."""
 
 from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, StampGuard, Verdict

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Messages into arrays: names matched, sizes, values and stamps checked, refusals counted."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Declare, check and update a node's parameters in one place.
 
 Each node lists its parameters as `Parameter` rows and turns their values into one frozen

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parameters that describe the robot, for every node that loads its URDF."""
 
 from __future__ import annotations

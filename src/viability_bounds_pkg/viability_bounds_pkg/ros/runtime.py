@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What every node here needs to run: quality of service, an executor, a main()."""
 
 from __future__ import annotations

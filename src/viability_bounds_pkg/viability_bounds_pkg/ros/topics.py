@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Topics and services: each declared once, for its nodes and for the reference pages."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Acceleration limits from the torque available in the present state."""
 
 from viability_bounds_pkg.state_dependent.certificate import BrakingCertificate, Reach

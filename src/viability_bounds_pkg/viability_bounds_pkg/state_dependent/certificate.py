@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Checks that the motors can brake an arm from every state the next step may reach.
 
 `state_dependent_limits` lets joints be faster than the worst-case braking allows. That is safe as

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Acceleration bounds from the torque that is available now, safe along the braking path.
 
 The limits a_min and a_max of [DelPrete2018] are what the motors can do in the worst state; the

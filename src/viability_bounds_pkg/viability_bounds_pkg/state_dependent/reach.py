@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Braking needed and available in one step, and where the step may end; compiled."""
 
 from __future__ import annotations
