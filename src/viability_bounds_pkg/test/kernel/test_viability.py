@@ -289,6 +289,15 @@ def test_no_speed_beyond_its_limit_from_anywhere(limits, dt, share, q, v):
 
 
 @pytest.mark.parametrize("mirror", [1.0, -1.0])
+def test_a_joint_that_cannot_stop_in_time_keeps_its_speed_limit(mirror):
+    """From outside it comes back so fast that it would have to turn round faster than allowed."""
+    dt, solver = 0.1, BoundsSolver(one_joint(-0.005, 0.005, 1.0, -100.0, 100.0), 0.1)
+    bounds = solver.bounds([0.006 * mirror], [-mirror])
+    assert bounds.lower == bounds.upper
+    assert dt * bounds.upper[0] == pytest.approx(2.0 * mirror)
+
+
+@pytest.mark.parametrize("mirror", [1.0, -1.0])
 @pytest.mark.parametrize(("q", "v"), [(1.02, 0.0), (1.05, -0.4)])
 def test_a_joint_on_its_way_back_is_on_its_limit_after_a_step(q, v, mirror):
     dt, solver = 0.1, BoundsSolver(one_joint(-1.0, 1.0, 5.0, -20.0, 20.0), 0.1)

@@ -10,6 +10,7 @@ from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
 from viability_bounds_pkg.state_dependent import limits as state_dependent_limits
 from viability_bounds_pkg.state_dependent.certificate import BrakingCertificate, Reach
 from viability_bounds_pkg.state_dependent.limits import StateDependentBounds
+from viability_bounds_pkg.state_dependent.reach import available
 from viability_bounds_pkg.viability import BoundsSolver
 
 MASS, LENGTH, GRAVITY = 2.0, 0.5, 9.81
@@ -94,6 +95,18 @@ def test_worst_case_of_the_pendulum():
     inertia = MASS * LENGTH**2
     np.testing.assert_allclose(limits.a_min, -0.3 * WEIGHT / inertia, rtol=1e-3)
     np.testing.assert_allclose(limits.a_max, (1.3 - np.sin(1.0)) * WEIGHT / inertia, rtol=1e-3)
+
+
+@pytest.mark.parametrize("angle", [-0.8, 0.0, 1.5, 2.5])
+def test_weight_helps_to_brake_one_way_and_hinders_the_other(angle):
+    model, tau_max, v = pendulum(0.0), 1.3 * WEIGHT, np.zeros(1)
+    data, q = model.createData(), np.array([angle])
+    M, h = pin.crba(model, data, q).copy(), pin.nonLinearEffects(model, data, q, v).copy()
+    none, peak = np.zeros(1), np.full(1, np.inf)
+    low, high, braking = available(M, h, np.array([tau_max]), none, none, peak)
+    down, up = (pin.aba(model, data, q, v, np.array([s * tau_max]))[0] for s in (-1.0, 1.0))
+    np.testing.assert_allclose(braking, [[-down, up]])
+    np.testing.assert_allclose([low[0], high[0]], [down, up])
 
 
 def test_faster_and_still_within_every_limit():
