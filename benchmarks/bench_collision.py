@@ -57,7 +57,7 @@ SURROUNDINGS = {
 }
 
 
-class Robot:
+class CollisionRobot:
     """One robot of ``config/`` with its collision model."""
 
     def __init__(self, name: str) -> None:
@@ -147,7 +147,7 @@ def median_time(function, arguments) -> float:
     return 1e6 * statistics.median(times)
 
 
-def steps(robot: Robot) -> None:
+def steps(robot: CollisionRobot) -> None:
     """Measure whole steps."""
     flush = np.zeros(CACHE)
     avoidance = robot.avoidance()
@@ -168,7 +168,7 @@ def steps(robot: Robot) -> None:
         )
 
 
-def pairs(robot: Robot) -> None:
+def pairs(robot: CollisionRobot) -> None:
     """Measure pairs of each kind: far ones, and near ones with all their features."""
     states = robot.states()
     model = robot.collision
@@ -193,7 +193,7 @@ def pairs(robot: Robot) -> None:
         )
 
 
-def controllers(robot: Robot, goals: int = 5, duration: float = 1.0) -> None:
+def controllers(robot: CollisionRobot, goals: int = 5, duration: float = 1.0) -> None:
     """Measure controller steps with and without collision avoidance, in turns."""
     avoidance = robot.avoidance()
     pair = {"with": robot.controller(avoidance), "without": robot.controller(None)}
@@ -229,7 +229,7 @@ def controllers(robot: Robot, goals: int = 5, duration: float = 1.0) -> None:
     )
 
 
-def coal_pairs(robot: Robot) -> None:
+def coal_pairs(robot: CollisionRobot) -> None:
     """Measure coal on the same pairs of capsules, and on hulls of the same links."""
     model, bodies = robot.collision, robot.collision.bodies
     for label in ("capsules", "convex hulls"):
@@ -278,7 +278,7 @@ def coal_pairs(robot: Robot) -> None:
         )
 
 
-def excess(robot: Robot) -> None:
+def excess(robot: CollisionRobot) -> None:
     """Print how far capsules stand out of their links."""
     ball = coal.Sphere(1e-6)
     rng = np.random.default_rng(0)
@@ -314,7 +314,7 @@ def excess(robot: Robot) -> None:
 def main() -> None:
     """Measure and print."""
     for name in SURROUNDINGS:
-        robot = Robot(name)
+        robot = CollisionRobot(name)
         model = robot.collision
         capsules = sum(len(c) for c in model.capsules.values())
         out = ", ".join(f"{len(names)} {reason}" for reason, names in model.left_out.items())

@@ -35,7 +35,7 @@ DT = 1e-3
 CACHE = 8_000_000  # numbers; more than the last-level cache holds
 
 
-class Arm:
+class NullspaceArm:
     """Torso and arm of TALOS."""
 
     def __init__(self) -> None:
@@ -80,7 +80,7 @@ def measure(name: str, function, arguments, flush: np.ndarray) -> None:
 
 def cost() -> None:
     """Measure steps along a motion."""
-    arm, flush = Arm(), np.zeros(CACHE)
+    arm, flush = NullspaceArm(), np.zeros(CACHE)
     arguments = []
     for k in range(STEPS):
         wave = 0.3 * np.sin(2.0 * k * DT + np.arange(arm.n))
@@ -104,7 +104,7 @@ def cost() -> None:
 
 def motion(force: float, budget: float) -> np.ndarray:
     """Return error of the hand, m, largest torque, N m, and size of the memory of each step."""
-    arm = Arm()
+    arm = NullspaceArm()
     model, data, n = arm.model, arm.data, arm.n
     compliance = NullspaceCompliance(IntegralSettings(np.full(n, budget)), 6)
     q, v, a_ref = np.array([0, 0.1, 0.4, 0.5, -0.3, -1.5, 0.2, 0.1, 0.1]), np.zeros(n), np.zeros(n)

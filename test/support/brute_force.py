@@ -30,7 +30,7 @@ FIRST_PHASES = np.array([0.5, 1.0])
 
 
 @dataclass(frozen=True)
-class Joint:
+class BruteForceJoint:
     """Limits of one joint and the step, SI units."""
 
     q_min: float
@@ -57,7 +57,7 @@ class Extremes:
 
 
 def extreme_accelerations(
-    joint: Joint, q: np.ndarray, v: np.ndarray, steps: int, end_at_rest: bool
+    joint: BruteForceJoint, q: np.ndarray, v: np.ndarray, steps: int, end_at_rest: bool
 ) -> Extremes:
     """Solve problem (4) on a finite horizon for m states, side by side.
 
@@ -80,7 +80,7 @@ def extreme_accelerations(
 
 
 def least_excess(
-    joint: Joint, q: np.ndarray, v: np.ndarray, steps: int, end_at_rest: bool
+    joint: BruteForceJoint, q: np.ndarray, v: np.ndarray, steps: int, end_at_rest: bool
 ) -> np.ndarray:
     """Return how far joints must pass the upper limit to keep all others for ever, rad.
 

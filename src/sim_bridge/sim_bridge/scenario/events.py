@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sim_bridge.bullet.obstacles import SHAPES, Obstacle, ObstacleError
-from sim_bridge.scenario.fields import Entry, ScenarioError, refuse
+from sim_bridge.scenario.fields import ScenarioEntry, ScenarioError, refuse
 from sim_bridge.scenario.trajectory import read_trajectory
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory
 
@@ -130,17 +130,17 @@ def read_event(content: Any, where: str) -> Event:
     if len(kinds) != 1 or "time" not in content or not kinds <= set(_KINDS):
         raise ScenarioError(f"{where} must have 'time' and one of {', '.join(_KINDS)}")
     kind = kinds.pop()
-    time = Entry(content, where).number("time", zero=True)
+    time = ScenarioEntry(content, where).number("time", zero=True)
     return _KINDS[kind](time, content[kind], f"{where}.{kind}")
 
 
 def _pose(time: float, content: Any, where: str) -> PoseGoal:
-    entry = Entry(content, where, ("position", "orientation"))
+    entry = ScenarioEntry(content, where, ("position", "orientation"))
     return PoseGoal(time, entry.vector("position"), entry.quaternion("orientation"))
 
 
 def _posture(time: float, content: Any, where: str) -> PostureGoal:
-    entry = Entry(content, where)
+    entry = ScenarioEntry(content, where)
     return PostureGoal(time, {str(key): entry.number(key, negative=True) for key in entry.fields})
 
 
@@ -149,7 +149,7 @@ def _trajectory(time: float, content: Any, where: str) -> TrajectoryGoal:
 
 
 def _wrench(time: float, content: Any, where: str) -> WrenchGoal:
-    entry = Entry(content, where, ("force", "torque", "frame"))
+    entry = ScenarioEntry(content, where, ("force", "torque", "frame"))
     frame = entry.fields.get("frame", "")
     if not isinstance(frame, str):
         raise entry.refuse("frame", "the name of a frame, or nothing")
@@ -158,14 +158,14 @@ def _wrench(time: float, content: Any, where: str) -> WrenchGoal:
 
 
 def _push(time: float, content: Any, where: str) -> Push:
-    entry = Entry(content, where, ("link", "duration", "force", "torque"))
+    entry = ScenarioEntry(content, where, ("link", "duration", "force", "torque"))
     force, torque = (entry.vector(key, default=_ZERO) for key in ("force", "torque"))
     link, duration = entry.name("link", "the name of a link"), entry.number("duration")
     return Push(time, duration, link, force, torque)
 
 
 def _obstacle(time: float, content: Any, where: str) -> AddObstacle:
-    entry = Entry(content, where, ("name", "shape", "size", "position", "orientation"))
+    entry = ScenarioEntry(content, where, ("name", "shape", "size", "position", "orientation"))
     try:
         obstacle = Obstacle(
             entry.name("name", "a name"),
@@ -180,7 +180,7 @@ def _obstacle(time: float, content: Any, where: str) -> AddObstacle:
 
 
 def _remove_obstacle(time: float, content: Any, where: str) -> RemoveObstacle:
-    return RemoveObstacle(time, Entry(content, where, ("name",)).name("name", "a name"))
+    return RemoveObstacle(time, ScenarioEntry(content, where, ("name",)).name("name", "a name"))
 
 
 def _enable_torque(time: float, content: Any, where: str) -> EnableTorque:
@@ -190,7 +190,7 @@ def _enable_torque(time: float, content: Any, where: str) -> EnableTorque:
 
 
 def _parameters(time: float, content: Any, where: str) -> ParameterChange:
-    entry = Entry(content, where, ("node", "values"))
+    entry = ScenarioEntry(content, where, ("node", "values"))
     node, values = entry.name("node", "the name of a node"), entry.fields.get("values")
     if not isinstance(values, dict) or not values:
         raise entry.refuse("values", "parameters and their values")
@@ -212,7 +212,7 @@ def _parameter(value: Any, where: str) -> Any:
 
 
 def _call(time: float, content: Any, where: str) -> TriggerCall:
-    entry = Entry(content, where, ("service", "type"))
+    entry = ScenarioEntry(content, where, ("service", "type"))
     if entry.fields.get("type", "trigger") != "trigger":
         raise entry.refuse("type", "trigger")
     return TriggerCall(time, entry.name("service", "the name of a service"))

@@ -16,7 +16,7 @@ class ScenarioError(ArmSafetyError, ValueError):
     """An invalid scenario file."""
 
 
-class Entry:
+class ScenarioEntry:
     """A mapping in a scenario file; its methods check and return the fields.
 
     Args:

@@ -9,7 +9,7 @@ from pathlib import Path
 import yaml
 
 from sim_bridge.scenario.events import AddObstacle, Event, Push, RemoveObstacle, read_event
-from sim_bridge.scenario.fields import Entry, ScenarioError, refuse
+from sim_bridge.scenario.fields import ScenarioEntry, ScenarioError, refuse
 from sim_bridge.urdf.arm import ConfiguredArm
 
 
@@ -59,7 +59,7 @@ def load_scenario(path: str | Path) -> Scenario:
     if not isinstance(content, dict) or set(content) - {"duration", "events"}:
         raise ScenarioError(f"scenario {path}: has keys other than 'duration' and 'events'")
     try:
-        duration = Entry(content, "").number("duration")
+        duration = ScenarioEntry(content, "").number("duration")
         entries = content.get("events") or []
         if not isinstance(entries, list):
             raise ScenarioError(f"events is {entries!r}; allowed: a list")

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from sim_bridge.scenario.fields import Entry, ScenarioError
+from sim_bridge.scenario.fields import ScenarioEntry, ScenarioError
 from viability_bounds_pkg.pose_trajectory import (
     PoseTrajectory,
     TrajectoryError,
@@ -39,9 +39,9 @@ def read_trajectory(content: Any, where: str) -> PoseTrajectory:
     Raises:
         ScenarioError: an entry is unknown, malformed or out of range.
     """
-    entry = Entry(content, where, ("points", "circle"))
+    entry = ScenarioEntry(content, where, ("points", "circle"))
     if entry.one_of(("points", "circle")) == "circle":
-        fields = Entry(entry.fields["circle"], f"{where}.circle", _CIRCLE_FIELDS)
+        fields = ScenarioEntry(entry.fields["circle"], f"{where}.circle", _CIRCLE_FIELDS)
         return PoseTrajectory(_circle(fields))
     points = entry.fields["points"]
     if not isinstance(points, list) or not points:
@@ -49,7 +49,7 @@ def read_trajectory(content: Any, where: str) -> PoseTrajectory:
     try:
         return PoseTrajectory(
             [
-                _point(Entry(point, f"{where}.points[{k}]", _POINT_FIELDS))
+                _point(ScenarioEntry(point, f"{where}.points[{k}]", _POINT_FIELDS))
                 for k, point in enumerate(points)
             ]
         )
@@ -57,7 +57,7 @@ def read_trajectory(content: Any, where: str) -> PoseTrajectory:
         raise ScenarioError(f"{where}.{error}") from None
 
 
-def _point(entry: Entry) -> TrajectoryPoint:
+def _point(entry: ScenarioEntry) -> TrajectoryPoint:
     velocity, acceleration = np.zeros((2, 6))
     velocity[:3] = entry.vector("velocity", default=_ZERO)
     acceleration[:3] = entry.vector("acceleration", default=_ZERO)
@@ -65,14 +65,14 @@ def _point(entry: Entry) -> TrajectoryPoint:
     return TrajectoryPoint(entry.number("time", zero=True), pose, velocity, acceleration)
 
 
-def _rotation(entry: Entry) -> Array:
+def _rotation(entry: ScenarioEntry) -> Array:
     """Return the field ``orientation`` as a rotation matrix, shape (3, 3)."""
     x_y_z_w = np.array(entry.quaternion("orientation"))
     rotation: Array = pin.Quaternion(x_y_z_w).toRotationMatrix()
     return rotation
 
 
-def _circle(entry: Entry) -> list[TrajectoryPoint]:
+def _circle(entry: ScenarioEntry) -> list[TrajectoryPoint]:
     size = entry.one_of(("radius", "diameter"))
     radius = entry.number(size) * (1.0 if size == "radius" else 0.5)
     e_1, e_2 = _axes(entry)
@@ -93,7 +93,7 @@ def _circle(entry: Entry) -> list[TrajectoryPoint]:
     return circle(pose, radius, (outward, along), period=period, turns=turns, ramp=ramp)
 
 
-def _axes(entry: Entry) -> tuple[Array, Array]:
+def _axes(entry: ScenarioEntry) -> tuple[Array, Array]:
     """Return the unit vectors that span the circle's plane, shape (3,) each."""
     if entry.one_of(("plane", "normal")) == "plane":
         plane, allowed = entry.fields["plane"], "two of x, y, z, -x, -y, -z at right angles"

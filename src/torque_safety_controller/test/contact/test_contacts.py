@@ -133,7 +133,7 @@ def test_unknown_frames_and_no_contacts_are_refused():
         Contacts(model, [])
 
 
-class Arm:
+class ContactArm:
     """Panda with a sole on its hand and a point on its elbow, at a state."""
 
     def __init__(self, seed=3, speed=1.0, facets=4):
@@ -180,7 +180,7 @@ class Arm:
 
 def test_joint_torques_do_the_work_of_the_forces():
     """Virtual work, with the points' displacements by finite differences."""
-    arm = Arm()
+    arm = ContactArm()
     B, step = arm.contacts.forces().B, 1e-6
     column = 0
     for index, contact in enumerate(arm.contacts.contacts):
@@ -227,7 +227,7 @@ def press(arm, F_des, tau_max, index=0, posture_weight=1e4, weight=10.0, rows=No
 
 
 def test_pressing_at_rest_takes_gravity_and_the_transposed_jacobian_times_the_force():
-    arm = Arm(speed=0.0)
+    arm = ContactArm(speed=0.0)
     F_des = np.array([1.0, -2.0, -10.0, 0.1, 0.2, 0.0])
     F_des[3:] += np.cross([0.0, 0.0, 0.1], F_des[:3])  # about the sole's middle
     solution, tau = press(arm, F_des, np.full(7, 80.0))
@@ -242,7 +242,7 @@ def test_pressing_at_rest_takes_gravity_and_the_transposed_jacobian_times_the_fo
 
 
 def test_pressing_in_motion_serves_both_tasks():
-    arm = Arm(speed=0.2)
+    arm = ContactArm(speed=0.2)
     F_des = np.array([0.0, 0.0, -10.0, 0.0, 0.0, 0.0])
     solution, _ = press(arm, F_des, np.full(7, 80.0))
     np.testing.assert_allclose(arm.contacts.wrench(0, solution.rho), F_des, atol=1e-4)
@@ -251,7 +251,7 @@ def test_pressing_in_motion_serves_both_tasks():
 
 def test_the_force_ends_where_the_torque_does():
     """Nearly the greatest normal force that torques at rest can give, by a linear programme."""
-    arm = Arm(speed=0.0, facets=16)
+    arm = ContactArm(speed=0.0, facets=16)
     arm.contacts.closed[1] = False  # to brace against it would help
     h, tau_max = arm.dynamics()[1], np.full(7, 40.0)
     F_des = np.array([0.0, 0.0, -1000.0, 0.0, 0.0, 0.0])
@@ -275,13 +275,13 @@ def test_the_force_ends_where_the_torque_does():
 
 
 def test_a_pull_is_not_to_be_had():
-    arm = Arm(speed=0.0)
+    arm = ContactArm(speed=0.0)
     solution, _ = press(arm, np.array([0.0, 0.0, 10.0, 0.0, 0.0, 0.0]), np.full(7, 80.0))
     np.testing.assert_allclose(arm.contacts.wrench(0, solution.rho), 0.0, atol=1e-6)
 
 
 def test_open_contacts_exert_nothing():
-    arm = Arm(speed=0.0)
+    arm = ContactArm(speed=0.0)
     arm.contacts.closed[0] = False
     solution, _ = press(arm, np.array([0.0, 0.0, -10.0, 0.0, 0.0, 0.0]), np.full(7, 80.0))
     np.testing.assert_array_equal(solution.rho[:16], 0.0)
@@ -292,7 +292,7 @@ def test_open_contacts_exert_nothing():
 
 def test_friction_limits_what_a_point_exerts():
     """The force of the pyramid that is nearest to one far outside the cone, by another way."""
-    arm = Arm(speed=0.0)
+    arm = ContactArm(speed=0.0)
     F_des = np.r_[np.cross([0.3, 1.0, 0.0], [0.0, 0.0, 20.0]) + [3.0, 10.0, 0.0], 0.0, 0.0, 0.0]
     solution, _ = press(arm, F_des, np.full(7, 80.0), index=1)
     contact = arm.contacts.contacts[1]
@@ -317,7 +317,7 @@ def test_rows_are_stacked_in_order():
 
 def test_the_force_on_a_springy_table_becomes_the_one_that_is_asked_for():
     """The hand holds its place along the table and presses; what pushes back is a spring."""
-    arm, dt, steps = Arm(speed=0.0), 1e-3, 1500
+    arm, dt, steps = ContactArm(speed=0.0), 1e-3, 1500
     model, frame = arm.model, arm.model.getFrameId(HAND)
     up = np.array([0.0, 0.0, 1.0])
     normal = arm.points(arm.q, 0)[1].T @ up

@@ -44,7 +44,7 @@ NORMAL = np.array([0.0, 0.0, -1.0])
 """A table below a hand that points down pushes against the hand's z axis."""
 
 
-class Hand:
+class SimulatedHand:
     """A controller of Panda, and what its sensor feels."""
 
     def __init__(self, contact=False, tau_max=ARM.tau_max, gains=GAINS, **settings) -> None:
@@ -121,7 +121,7 @@ def test_the_hand_does_not_rush(push):
 
 def test_a_hand_that_feels_too_little_moves_on_and_too_much_back():
     """The paper's weights: the mean of what the two tasks want, in the direction of force only."""
-    hand = Hand(directions=Z)
+    hand = SimulatedHand(directions=Z)
     hand.interaction.set_target(-force(z=-10.0))  # press along z: the table pushes with -10
     for _ in range(3000):
         free = hand.step(force())
@@ -139,7 +139,7 @@ def test_a_hand_that_feels_too_little_moves_on_and_too_much_back():
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
 def test_stiffness_is_what_is_left_of_it_where_force_is_controlled(share):
-    hand = Hand(directions=Z, stiffness=np.full(6, share))
+    hand = SimulatedHand(directions=Z, stiffness=np.full(6, share))
     goal = hand.pose.pose * pin.SE3(np.eye(3), np.array([0.01, 0.0, 0.02]))
     hand.controller.set_pose_goal(goal)
     hand.interaction.set_target(np.zeros(6))
@@ -149,7 +149,7 @@ def test_stiffness_is_what_is_left_of_it_where_force_is_controlled(share):
 
 
 def test_a_target_in_the_base_frame_turns_with_the_hand():
-    hand = Hand(directions=np.ones(6, dtype=bool))
+    hand = SimulatedHand(directions=np.ones(6, dtype=bool))
     R = hand.pose.pose.rotation
     pressed = np.array([1.0, 2.0, -3.0, 0.1, 0.2, 0.3])
     hand.interaction.set_target(pressed, np.eye(3))
@@ -164,7 +164,7 @@ def test_a_target_in_the_base_frame_turns_with_the_hand():
 
 def test_the_motors_give_what_the_contact_takes():
     """Against inverse dynamics with the force as Pinocchio's external one; and only in contact."""
-    hand = Hand(contact=True, directions=Z, tau_max=np.full(7, 1e3))
+    hand = SimulatedHand(contact=True, directions=Z, tau_max=np.full(7, 1e3))
     free = hand.step(force())
     hand.interaction.set_target(-force(z=-10.0))
     exact = ARM.robot(DT)
@@ -187,7 +187,7 @@ def test_the_motors_give_what_the_contact_takes():
 def test_torque_limits_hold_with_the_contact_counted_in(monkeypatch):
     monkeypatch.setattr(interaction, "WRENCH_WEIGHT", 1e6)
     monkeypatch.setattr(interaction, "WRENCH_TIME", 1e-3)
-    hand = Hand(contact=True, directions=Z)
+    hand = SimulatedHand(contact=True, directions=Z)
     hand.interaction.set_target(-force(z=-2000.0))
     steps = [hand.step(force(z=-2000.0), bounds=np.full(7, 0.5)) for _ in range(50)]
     assert all((np.abs(step.tau) <= ARM.tau_max).all() for step in steps)
@@ -199,7 +199,7 @@ def test_torque_limits_hold_with_the_contact_counted_in(monkeypatch):
 def test_what_is_counted_on_exceeds_what_is_felt_by_a_step_at_most(monkeypatch):
     monkeypatch.setattr(interaction, "FORCE_STEP", 2.0)
     monkeypatch.setattr(interaction, "WRENCH_TIME", 1e-6)
-    hand = Hand(contact=True, directions=Z)
+    hand = SimulatedHand(contact=True, directions=Z)
     hand.interaction.set_target(-force(x=5.0, z=-10.0))
     contacts = hand.interaction.contacts
     for measured, counted in ((0.0, 2.0), (3.0, 5.0), (-7.0, 2.0), (9.0, 10.0), (40.0, 10.0)):
@@ -214,7 +214,7 @@ def test_what_is_counted_on_exceeds_what_is_felt_by_a_step_at_most(monkeypatch):
 
 
 def test_yielding_has_hysteresis():
-    hand = Hand(yield_threshold=(10.0, 1.0))
+    hand = SimulatedHand(yield_threshold=(10.0, 1.0))
     before = False
     for value in np.random.default_rng(0).uniform(-20.0, 20.0, 200):
         hand.step(force(y=value))
@@ -229,7 +229,7 @@ def test_yielding_has_hysteresis():
 
 
 def test_a_moment_is_yielded_to_as_well():
-    hand = Hand(yield_threshold=(10.0, 2.0))
+    hand = SimulatedHand(yield_threshold=(10.0, 2.0))
     hand.step(np.array([0, 0, 0, 0, 2.1, 0.0]))
     assert hand.state is Compliance.YIELDING
     hand.step(np.array([0, 0, 0, 0, 0.9, 0.0]))
@@ -238,7 +238,7 @@ def test_a_moment_is_yielded_to_as_well():
 
 def test_the_hand_is_held_below_the_threshold_and_led_above():
     settings = {"yield_threshold": (10.0, 2.0)}
-    hand = Hand(**settings)
+    hand = SimulatedHand(**settings)
     held = hand.step(force(x=9.0))
     assert hand.state is Compliance.HOLDING
     np.testing.assert_allclose(hand.hand_acceleration(held), 0.0, atol=1e-4)
@@ -249,7 +249,7 @@ def test_the_hand_is_held_below_the_threshold_and_led_above():
 
 
 def test_where_the_hand_is_let_go_is_its_new_goal():
-    hand = Hand(yield_threshold=(10.0, 2.0))
+    hand = SimulatedHand(yield_threshold=(10.0, 2.0))
     hand.step(force(x=20.0))
     elsewhere = Q + 0.05
     hand.step(force(x=20.0), elsewhere)
@@ -268,7 +268,7 @@ def test_where_the_hand_is_let_go_is_its_new_goal():
 
 @pytest.mark.parametrize("pressing", [False, True])
 def test_a_sensor_that_falls_silent_ends_it_where_the_hand_is(pressing):
-    hand = Hand(contact=True, directions=Z, yield_threshold=(10.0, 2.0))
+    hand = SimulatedHand(contact=True, directions=Z, yield_threshold=(10.0, 2.0))
     if pressing:
         hand.interaction.set_target(-force(z=-10.0))
     hand.step(force(z=-20.0))
@@ -288,7 +288,7 @@ def test_a_sensor_that_falls_silent_ends_it_where_the_hand_is(pressing):
 
 
 def test_directions_taken_back_end_the_pressing_where_the_hand_is():
-    hand = Hand(directions=Z)
+    hand = SimulatedHand(directions=Z)
     hand.interaction.set_target(force(z=10.0))
     hand.step(force())
     elsewhere = Q + 0.05
@@ -302,7 +302,7 @@ def test_directions_taken_back_end_the_pressing_where_the_hand_is():
 
 def test_directions_exchanged_while_pressing_hold_the_hand_where_it_is():
     """Else what was pressed along would spring back to a goal that the hand has left."""
-    hand = Hand(directions=Z)
+    hand = SimulatedHand(directions=Z)
     hand.interaction.set_target(force(z=10.0))
     hand.step(force())
     elsewhere = Q + 0.05
@@ -318,7 +318,7 @@ def test_directions_exchanged_while_pressing_hold_the_hand_where_it_is():
 
 
 def test_settings_that_change_do_not_let_go_of_a_hand_that_is_led():
-    hand = Hand(yield_threshold=(10.0, 2.0))
+    hand = SimulatedHand(yield_threshold=(10.0, 2.0))
     hand.step(force(x=20.0))
     hand.interaction.settings = replace(hand.interaction.settings, yield_threshold=(11.0, 2.0))
     hand.step(force(x=8.0))
@@ -326,7 +326,7 @@ def test_settings_that_change_do_not_let_go_of_a_hand_that_is_led():
 
 
 def test_starting_anew_presses_nothing():
-    hand = Hand(directions=Z)
+    hand = SimulatedHand(directions=Z)
     hand.interaction.set_target(force(z=10.0))
     hand.step(force())
     hand.controller.reset(Q)

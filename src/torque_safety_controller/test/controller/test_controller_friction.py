@@ -207,7 +207,7 @@ def test_there_must_be_a_model_to_compensate():
         friction_settings(values(friction_compensation=0.5), ARM.tau_max)
 
 
-class Chain:
+class FrictionChain:
     """A robot that stands at one place, and its bounds node, in front of the real node."""
 
     def __init__(self, ros, **changed) -> None:
@@ -233,7 +233,7 @@ class Chain:
 
 
 def test_it_is_switched_while_the_node_runs(ros):
-    chain = Chain(ros, **GIVEN | {"friction_compensation": 0.0})
+    chain = FrictionChain(ros, **GIVEN | {"friction_compensation": 0.0})
     torques = [chain.answer() for _ in range(2)]
     ros.accepts(NODE, friction_compensation=1.0)
     torques += [chain.answer() for _ in range(60)]
@@ -258,7 +258,7 @@ def test_it_is_switched_while_the_node_runs(ros):
 
 
 def test_what_cannot_be_is_refused_while_the_node_runs(ros):
-    chain = Chain(ros, **GIVEN)
+    chain = FrictionChain(ros, **GIVEN)
     before = chain.node.get_parameter("friction_compensation").value
     for name, value, allowed in REFUSED:
         reason = ros.refuses(NODE, **{name: value})

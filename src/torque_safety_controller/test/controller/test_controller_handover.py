@@ -38,7 +38,7 @@ SMALL = 0.01 * TAU_MAX
 WIDE = np.full(N, 5.0)
 
 
-class Chain(ControllerChain):
+class HandoverChain(ControllerChain):
     """The other side of the controller: robot, bounds node and user."""
 
     def __init__(self, ros, **changed) -> None:
@@ -100,7 +100,7 @@ def assert_torque(command: JointState) -> np.ndarray:
 
 
 def test_it_goes_over_to_the_torque_of_the_motors_and_back(ros):
-    chain = Chain(ros)
+    chain = HandoverChain(ros)
     assert_position(chain.answer(bounds=False))
     chain.await_report(mode="POSITION", reason="as at start", control="position")
     # The goal of the drives does not follow the arm.
@@ -122,7 +122,7 @@ def test_it_goes_over_to_the_torque_of_the_motors_and_back(ros):
 
 
 def test_a_state_asked_for_again_gets_what_it_got(ros):
-    chain = Chain(ros)
+    chain = HandoverChain(ros)
     chain.answer()
     chain.enable(True)
     handover = chain.answer()
@@ -139,7 +139,7 @@ def test_a_state_asked_for_again_gets_what_it_got(ros):
 
 
 def test_a_call_between_a_state_and_its_limits_is_obeyed(ros):
-    chain = Chain(ros, start_control="torque")
+    chain = HandoverChain(ros, start_control="torque")
     assert_torque(chain.answer())
     ros.run_for(0.05, each=lambda: chain.state(10))
     chain.enable(False)
@@ -151,7 +151,7 @@ def test_a_call_between_a_state_and_its_limits_is_obeyed(ros):
 
 
 def test_a_handover_that_was_asked_for_can_be_called_off(ros):
-    chain = Chain(ros)
+    chain = HandoverChain(ros)
     chain.answer()
     chain.enable(True)
     chain.enable(False)
@@ -160,7 +160,7 @@ def test_a_handover_that_was_asked_for_can_be_called_off(ros):
 
 
 def test_an_arm_in_hold_is_given_to_its_drives(ros):
-    chain = Chain(ros, start_control="torque")
+    chain = HandoverChain(ros, start_control="torque")
     assert_torque(chain.answer())
     chain.await_report(mode="HOLD")
     chain.enable(False)
@@ -168,7 +168,7 @@ def test_an_arm_in_hold_is_given_to_its_drives(ros):
 
 
 def test_goals_from_before_the_handover_are_dropped(ros):
-    chain = Chain(ros)
+    chain = HandoverChain(ros)
     chain.answer()
     poses = ros.talk(PoseStamped, "target_pose", GOAL_QOS)
     far = PoseStamped()
@@ -187,7 +187,7 @@ def test_goals_from_before_the_handover_are_dropped(ros):
 
 def test_efforts_for_ros2_control_are_silent_under_position_control(ros):
     topic = "/effort_controller/commands"
-    chain = Chain(ros, ros2_control_topic=topic)
+    chain = HandoverChain(ros, ros2_control_topic=topic)
     efforts = ros.listen(Float64MultiArray, topic)
     ros.hears(topic)
     chain.answer()
@@ -204,14 +204,14 @@ def test_efforts_for_ros2_control_are_silent_under_position_control(ros):
 
 
 def test_torque_is_refused_before_the_first_state(ros):
-    chain = Chain(ros)
+    chain = HandoverChain(ros)
     assert "no joint state" in chain.refuses(True)
     assert "position control is on already" in chain.refuses(False)
     assert_position(chain.answer())
 
 
 def test_torque_is_refused_while_states_are_old(ros):
-    chain = Chain(ros, bounds_timeout=0.1)
+    chain = HandoverChain(ros, bounds_timeout=0.1)
     chain.answer()
     ros.run_for(0.15)
     assert "no joint state, or only old ones" in chain.refuses(True)
@@ -221,7 +221,7 @@ def test_torque_is_refused_while_states_are_old(ros):
 
 @pytest.mark.parametrize("stamp", [1, 1_000_000])
 def test_torque_is_refused_while_limits_are_old_or_of_another_run(ros, stamp):
-    chain = Chain(ros, bounds_timeout=5.0)
+    chain = HandoverChain(ros, bounds_timeout=5.0)
     chain.stamp = 10_000  # ms
     chain.answer(bounds=False)
     assert "no acceleration limits" in chain.refuses(True)
@@ -241,7 +241,7 @@ def test_torque_is_refused_while_limits_are_old_or_of_another_run(ros, stamp):
     ],
 )
 def test_torque_is_refused_where_it_cannot_begin(ros, q, tau, reason):
-    chain = Chain(ros)
+    chain = HandoverChain(ros)
     chain.answer(q, tau)
     assert reason in chain.refuses(True)
     assert_position(chain.answer(q, tau), q)
@@ -249,7 +249,7 @@ def test_torque_is_refused_where_it_cannot_begin(ros, q, tau, reason):
 
 
 def test_what_is_on_already_is_refused(ros):
-    chain = Chain(ros, start_control="torque")
+    chain = HandoverChain(ros, start_control="torque")
     before = assert_torque(chain.answer())
     assert "torque control is on already" in chain.refuses(True)
     np.testing.assert_allclose(assert_torque(chain.answer()), before, atol=1e-6)
@@ -261,7 +261,7 @@ def test_what_is_on_already_is_refused(ros):
 def test_it_starts_with_torque_or_position_only(ros):
     with pytest.raises(SettingError, match="'start_control' is 'velocity'; allowed: one of"):
         ros.start(ControllerNode, VALUES | {"start_control": "velocity"})
-    Chain(ros)
+    HandoverChain(ros)
     assert "read-only" in ros.refuses(NODE, start_control="torque")
 
 
@@ -269,7 +269,7 @@ def test_it_starts_with_torque_or_position_only(ros):
 
 
 def test_a_handover_ends_where_limits_stop_coming(ros):
-    chain = Chain(ros, bounds_timeout=0.2)
+    chain = HandoverChain(ros, bounds_timeout=0.2)
     chain.answer()
     chain.enable(True)
     # Repeated, as by a robot in lockstep, and not answered until then.
@@ -293,7 +293,7 @@ def test_a_handover_ends_where_limits_stop_coming(ros):
     ],
 )
 def test_a_handover_ends_where_torque_cannot_begin_after_all(ros, q, tau, reason):
-    chain = Chain(ros)
+    chain = HandoverChain(ros)
     chain.answer()
     chain.enable(True)
     assert_position(chain.answer(q, tau))
@@ -303,7 +303,7 @@ def test_a_handover_ends_where_torque_cannot_begin_after_all(ros, q, tau, reason
 
 @pytest.mark.parametrize("start", ["torque", "position"])
 def test_a_robot_that_was_silent_is_commanded_as_at_start(ros, start):
-    chain = Chain(ros, start_control=start, state_timeout=0.3, bounds_timeout=0.3)
+    chain = HandoverChain(ros, start_control=start, state_timeout=0.3, bounds_timeout=0.3)
     chain.answer()
     if start == "position":
         chain.enable(True)
@@ -320,7 +320,7 @@ def test_a_robot_that_was_silent_is_commanded_as_at_start(ros, start):
 
 
 def test_nothing_is_sent_once_it_is_stopped(ros):
-    chain = Chain(ros, state_timeout=0.3, bounds_timeout=0.1)
+    chain = HandoverChain(ros, state_timeout=0.3, bounds_timeout=0.1)
     chain.answer()
     # States that cannot be used: the drives hold on.
     bad = np.full(N, math.nan)
@@ -335,7 +335,7 @@ def test_nothing_is_sent_once_it_is_stopped(ros):
 # With the robot
 
 
-class Arm:
+class HandoverArm:
     """A robot in lockstep with bounds and controller, all of them real; recorded."""
 
     def __init__(self, ros, robot, **changed) -> None:
@@ -406,7 +406,7 @@ POOR_GEARS = {
     ids=["talos", "talos-friction", "talos-none", "talos-push", "panda", "panda-push", "poor"],
 )
 def test_the_handover_is_not_felt(ros, robot, changed, load):
-    arm = Arm(ros, robot, **changed)
+    arm = HandoverArm(ros, robot, **changed)
     arm.run(100)
     if load:
         arm.push(PUSHED[robot], FORCE[robot])  # for half a second
@@ -434,7 +434,7 @@ def test_the_handover_is_not_felt(ros, robot, changed, load):
 
 
 def test_an_arm_in_motion_is_brought_to_rest_before_its_drives_take_it(ros):
-    arm = Arm(ros, "talos_left_arm")
+    arm = HandoverArm(ros, "talos_left_arm")
     arm.run(50)
     arm.enable(True)
     arm.run(50)

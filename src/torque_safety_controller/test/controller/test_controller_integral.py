@@ -71,7 +71,7 @@ def make_settings(mode="joints", **changed) -> AdditionalSettings:
     return AdditionalSettings(mode, IntegralSettings(**DEFAULT | changed), 2.0 * ARM.tau_max)
 
 
-class Chain:
+class IntegralChain:
     """A controller that is asked for torques, one period after the other."""
 
     def __init__(self, ros, **changed) -> None:
@@ -139,14 +139,14 @@ TASK = {"mode": "task"}
     ids=lambda value: " ".join(value),
 )
 def test_each_parameter_reaches_the_torque(ros, changed, by_hand, without):
-    chain = Chain(ros, **changed)
+    chain = IntegralChain(ros, **changed)
     torques = np.array([chain.answer(v) for v in SPEEDS])
     np.testing.assert_allclose(torques, answers(core(**by_hand)), atol=SAME_TORQUE)
     assert np.abs(torques - answers(core(**without))).max() > 20.0 * SAME_TORQUE
 
 
 def test_parameters_change_while_it_runs_and_the_torque_goes_on(ros):
-    chain, controller = Chain(ros), core()
+    chain, controller = IntegralChain(ros), core()
     np.testing.assert_allclose(
         [chain.answer(v) for v in SPEEDS], answers(controller), atol=SAME_TORQUE
     )
@@ -214,7 +214,7 @@ def test_it_does_not_start_with_bad_parameters(ros, name, value, allowed):
 
 
 def test_bad_parameters_are_refused_live_and_the_old_ones_stay(ros):
-    chain, controller = Chain(ros), core()
+    chain, controller = IntegralChain(ros), core()
     np.testing.assert_allclose(
         [chain.answer(v) for v in SPEEDS], answers(controller), atol=SAME_TORQUE
     )
@@ -233,7 +233,7 @@ def test_bad_parameters_are_refused_live_and_the_old_ones_stay(ros):
 def test_the_task_is_read_only_and_known(ros):
     with pytest.raises(SettingError, match="'integral_task' is 'elbow'; allowed: one of pose"):
         ros.start(ControllerNode, VALUES | {"integral_task": "elbow"})
-    Chain(ros)
+    IntegralChain(ros)
     assert "read-only" in ros.refuses(NODE, integral_task="position")
 
 
@@ -266,7 +266,7 @@ def test_six_joints_have_a_null_space_of_a_position(ros):
 
 @pytest.mark.parametrize("gap", [3 * PERIOD, 300, 100_000])
 def test_a_robot_that_pauses_or_whose_clock_jumps_gets_no_kick(ros, gap):
-    chain = Chain(ros, integral_lambda=30.0)
+    chain = IntegralChain(ros, integral_lambda=30.0)
     for _ in range(20):
         before = chain.answer(SPEEDS[3])
     added = reported(ros, "additional_torque_nm")
@@ -286,7 +286,7 @@ def reported(ros, key) -> np.ndarray:
 
 def test_states_that_cannot_be_used_do_not_move_the_integral(ros):
     """While they come, the arm is held with the velocity taken for zero."""
-    chain = Chain(ros, bounds_timeout=0.1)
+    chain = IntegralChain(ros, bounds_timeout=0.1)
     for v in SPEEDS:
         chain.answer(v)
     before = reported(ros, "additional_torque_nm")

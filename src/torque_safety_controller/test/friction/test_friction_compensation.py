@@ -170,7 +170,7 @@ def test_it_begins_with_nothing_and_fades_in():
 # One joint that sticks and slips
 
 
-class Joint:
+class FrictionJoint:
     """A joint of inertia `m` on its way to zero under a spring and a damper.
 
     Friction as in `FrictionModel`, solved for the end of each period as Karnopp does: it stops
@@ -214,11 +214,11 @@ def times(model, share):
     )
 
 
-def joint(share, theta=3.0, **others) -> Joint:
+def joint(share, theta=3.0, **others) -> FrictionJoint:
     """A joint that is believed to have `share` of its friction."""
     model = times(TRUTH, share)
     compensation = FrictionCompensation(FrictionSettings(model, 1e3 * ONE, 1.0, theta))
-    held = Joint(compensation, TRUTH, **others)
+    held = FrictionJoint(compensation, TRUTH, **others)
     for _ in range(2000):  # fades in
         compensation.torque(held.m * np.eye(1), np.zeros(1), np.zeros(1), DT, DT)
     return held
@@ -262,7 +262,7 @@ def test_believing_too_much_needs_the_memory_that_the_damping_allows():
 
 
 def test_periods_of_delay_do_not_matter():
-    class Delayed(Joint):
+    class Delayed(FrictionJoint):
         queue = ()
 
         def step(self, dt=DT):

@@ -38,7 +38,7 @@ def heavier(rng, share=0.2) -> pin.Model:
     return model
 
 
-class Motion:
+class RecordedMotion:
     """Joints on cosines, from rest to rest; `still` ones excepted."""
 
     def __init__(self, seconds, periods, peak, share=1.0, still=()) -> None:
@@ -79,7 +79,7 @@ KINDS = (
     (10.0, [1, 2, 1, 2, 1, 2, 3], 0.3),
     (8.0, [4, 3, 5, 4, 6, 5, 3], 1.0),
 )
-PARTS = tuple(Motion(*kind) for kind in KINDS)
+PARTS = tuple(RecordedMotion(*kind) for kind in KINDS)
 RECORDING = record(*PARTS, bias=0.3 * COULOMB)
 
 
@@ -151,7 +151,7 @@ def test_a_few_collisions_do_not_matter():
 
 
 def test_one_way_tells_nothing():
-    fits = list(identify(ARM.model, record(Motion(10.0, [1] * N, 0.3, share=0.5))))
+    fits = list(identify(ARM.model, record(RecordedMotion(10.0, [1] * N, 0.3, share=0.5))))
     for fit in fits:
         assert "did not move both ways" in fit.notes[0]
         assert (fit.coulomb, fit.static, fit.viscous) == (0.0, 0.0, 0.0)
@@ -159,7 +159,7 @@ def test_one_way_tells_nothing():
 
 
 def test_a_joint_that_stands_is_not_guessed_at():
-    fits = list(identify(ARM.model, record(*(Motion(*kind, still=[2]) for kind in KINDS))))
+    fits = list(identify(ARM.model, record(*(RecordedMotion(*kind, still=[2]) for kind in KINDS))))
     assert "did not move both ways" in fits[2].notes[0]
     rest = [j for j in range(N) if j != 2]
     assert np.abs(off(friction_model(fits))[:, rest]).max() < 0.01
@@ -167,7 +167,7 @@ def test_a_joint_that_stands_is_not_guessed_at():
 
 def test_ways_that_differ_tell_nothing():
     """Up here and down there: position explains what friction would."""
-    recording = record(Motion(20.0, [1] * N, 0.3))
+    recording = record(RecordedMotion(20.0, [1] * N, 0.3))
     other = recording.q + np.where(recording.v > 0.0, 0.0, 1.0)  # another place on the way back
     fits = list(identify(ARM.model, Recording(recording.t, other, recording.v, recording.tau)))
     assert any("cannot be told from errors" in fit.notes[0] for fit in fits if fit.notes)

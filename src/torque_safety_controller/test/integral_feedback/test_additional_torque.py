@@ -35,7 +35,7 @@ def make_settings(mode="joints", disturbance=2.0, **changed) -> AdditionalSettin
     return AdditionalSettings(mode, integral, disturbance * ARM.tau_max)
 
 
-class Loop:
+class IntegralLoop:
     """An arm that holds its posture by a spring and a damper, and the additional torque."""
 
     def __init__(self, mode="joints", rows=POSITION, **changed) -> None:
@@ -70,9 +70,9 @@ def relative(torque) -> float:
     return float(np.abs(torque / ARM.tau_max).max())
 
 
-def settled(mode, **changed) -> Loop:
+def settled(mode, **changed) -> IntegralLoop:
     """An arm whose additional torque carries a good part of the disturbance."""
-    loop = Loop(mode, **changed).run(0.4)
+    loop = IntegralLoop(mode, **changed).run(0.4)
     assert relative(loop.additional.last) > 0.03 or mode == "none"
     assert loop.steps(50) < 2e-4
     return loop
@@ -141,7 +141,7 @@ def test_settings_change_without_a_jump(mode, changed):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_ways_to_limit_change_without_a_jump(method):
-    loop = Loop("joints", budget=0.03 * ARM.tau_max).run(0.4)
+    loop = IntegralLoop("joints", budget=0.03 * ARM.tau_max).run(0.4)
     assert loop.additional.saturated.any()
     loop.additional.settings = make_settings(budget=0.03 * ARM.tau_max, anti_windup=method)
     loop.run(0.1)
@@ -266,7 +266,7 @@ def test_numbers_beyond_sense_keep_the_last_torque():
 
 @pytest.mark.parametrize("mode", MODES)
 def test_a_beginning_with_numbers_beyond_sense_is_put_off(mode):
-    loop = Loop(mode)
+    loop = IntegralLoop(mode)
     seen = np.full(N, math.nan)
     with np.errstate(all="ignore"):
         loop.robot.update(State(loop.q, seen), loop.a)
@@ -315,7 +315,9 @@ def test_a_position_that_jumps_is_seen_and_one_that_moves_is_not():
 def test_steps_are_bounded_whatever_velocity_does():
     """Of (C + K) s the increment of s changes K s by at most 2 lambda dt tau_max."""
     rng = np.random.default_rng(4)
-    loop = Loop("joints", budget=np.full(N, np.inf), slow_leak_rate=0.0, fast_leak_rate=0.0)
+    loop = IntegralLoop(
+        "joints", budget=np.full(N, np.inf), slow_leak_rate=0.0, fast_leak_rate=0.0
+    )
     bound = 2.0 * LAMBDA * DT
     largest, before = 0.0, np.zeros(N)
     for _ in range(2000):
@@ -337,7 +339,7 @@ def test_steps_are_bounded_whatever_velocity_does():
 def test_it_begins_with_the_torque_it_is_told(mode):
     rng = np.random.default_rng(5)
     for _ in range(20):
-        loop = Loop(mode)
+        loop = IntegralLoop(mode)
         torque = rng.uniform(-0.3, 0.3, N) * ARM.tau_max
         loop.robot.update(State(loop.q, REST), REST)
         np.testing.assert_array_equal(loop.additional.initialise(loop.robot, REST, torque), torque)
@@ -348,7 +350,7 @@ def test_it_begins_with_the_torque_it_is_told(mode):
 
 
 def test_a_joint_s_budget_is_widened_only_where_it_must():
-    loop = Loop("joints")
+    loop = IntegralLoop("joints")
     loop.robot.update(State(loop.q, REST), REST)
     torque = 0.5 * BUDGET
     torque[3] = 2.0 * BUDGET[3]
@@ -361,7 +363,7 @@ def test_a_joint_s_budget_is_widened_only_where_it_must():
 
 
 def test_what_cannot_be_initialised_fades():
-    loop = Loop("joints")
+    loop = IntegralLoop("joints")
     loop.robot.update(State(loop.q, REST), REST)
     loop.robot.C = -LAMBDA * np.diag(np.diagonal(loop.robot.M))  # C + K is singular
     torque = 0.1 * ARM.tau_max

@@ -57,7 +57,7 @@ class Dynamics:
         return pin.computeCoriolisMatrix(self.model, self.data, q, v).copy()
 
 
-class Run:
+class PassivityRun:
     """A controlled arm in simulation: torque of a step held, motion by Runge and Kutta."""
 
     def __init__(self, arm, settings, dt, disturbance=None, amplitude=0.3, kp=KP):
@@ -176,7 +176,7 @@ def test_two_rates_lose_energy_as_derived(arm):
 
 def energy_balance(arm, dt, duration=0.5):
     """How far V is from what the rate -s'Ks leaves of it, relative; and the energies."""
-    run = Run(arm, unlimited(arm.n), dt)
+    run = PassivityRun(arm, unlimited(arm.n), dt)
     run.feedback.memory.fast[:] = run.feedback.memory.slow[:] = 0.3 * np.cos(np.arange(arm.n))
     V, loss = [], []
     for _ in range(round(duration / dt)):
@@ -200,7 +200,7 @@ def test_energy_decreases_at_that_rate_in_sampled_control(arm):
     assert off[2e-3] / off[1e-3] == pytest.approx(2.0, rel=0.1)
 
 
-def largest_rise(arm, method, kind=Run):
+def largest_rise(arm, method, kind=PassivityRun):
     """The largest rise of V in a step of 1 kHz control, relative, with s far beyond its limit."""
     settings = unlimited(arm.n, budget=0.02 * arm.tau_max, anti_windup=method)
     run = kind(arm, settings, 1e-3, amplitude=0.5)
@@ -221,7 +221,7 @@ def test_limited_torque_never_drives_s(arm, method):
 def test_cutting_each_joint_s_torque_can_drive_s():
     """With C s in the budget the plain clip is not passive: this is what (11) and the leak add."""
 
-    class Clipped(Run):
+    class Clipped(PassivityRun):
         def limit(self, y):
             return np.clip(y, -0.02 * self.arm.tau_max, 0.02 * self.arm.tau_max)
 
@@ -233,7 +233,7 @@ def test_cutting_each_joint_s_torque_can_drive_s():
 def test_constant_disturbance_is_balanced_without_a_position_error():
     arm = load_arm("panda")
     d = 0.1 * arm.tau_max * np.cos(np.arange(arm.n))
-    run = Run(arm, unlimited(arm.n), 2e-3, d, amplitude=0.0)
+    run = PassivityRun(arm, unlimited(arm.n), 2e-3, d, amplitude=0.0)
     y = run.steps(12.0)[-1]
     np.testing.assert_allclose(y, -d, atol=1e-4 * np.abs(d).max())
     np.testing.assert_allclose(
@@ -251,7 +251,7 @@ def test_leak_leaves_the_position_error_that_it_must(method):
     settings = unlimited(
         arm.n, fast_leak_rate=fast, slow_leak_rate=slow, mu=mu, anti_windup=method
     )
-    run = Run(arm, settings, dt, d, amplitude=0.0)
+    run = PassivityRun(arm, settings, dt, d, amplitude=0.0)
     run.steps(12.0)
     memory = mu / fast + (1.0 - mu) / slow
     if method == "none":  # (13) as printed
@@ -319,7 +319,7 @@ def test_pushed_beyond_the_budget_and_released():
         ("not corrected", {"anti_windup": "paper"}),
         ("unlimited", {"anti_windup": "none"}),
     ):
-        run = Run(arm, replace(settings, **changes), dt, push, amplitude=0.0, kp=200.0)
+        run = PassivityRun(arm, replace(settings, **changes), dt, push, amplitude=0.0, kp=200.0)
         home, torques = run.q, [run.steps(5.0)]
         away = run.q - home
         run.disturbance = np.zeros(arm.n)

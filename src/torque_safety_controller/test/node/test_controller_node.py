@@ -77,7 +77,7 @@ def pose_message(pose: pin.SE3, frame="base", stamp=0) -> PoseStamped:
     return message
 
 
-class Chain(ControllerChain):
+class NodeChain(ControllerChain):
     """The other side of the controller: robot, bounds node and user."""
 
     def __init__(self, ros, **changed) -> None:
@@ -132,7 +132,7 @@ def give_goal(chain, message=None, first=1) -> int:
 
 
 def test_it_is_stopped_and_silent_without_a_state(ros):
-    chain = Chain(ros)
+    chain = NodeChain(ros)
     ros.wait_until(lambda: chain.reported("mode") == "STOPPED", "diagnostics")
     assert chain.reported("reason") == "no joint state yet"
     assert ros.diagnostics[NODE]["level"] == DiagnosticStatus.ERROR
@@ -142,7 +142,7 @@ def test_it_is_stopped_and_silent_without_a_state(ros):
 
 
 def test_without_a_goal_it_brings_the_arm_to_rest(ros):
-    chain = Chain(ros)
+    chain = NodeChain(ros)
     tau = chain.answer(10)
     np.testing.assert_allclose(
         tau, expected().brake(State(Q, V), AccelerationRange(LOWER, UPPER)).tau, atol=SAME_TORQUE
@@ -153,7 +153,7 @@ def test_without_a_goal_it_brings_the_arm_to_rest(ros):
 
 @pytest.mark.parametrize("frame", ["base", ""])
 def test_with_a_pose_goal_it_tracks(ros, frame):
-    chain = Chain(ros)
+    chain = NodeChain(ros)
     chain.poses.publish(pose_message(GOAL, frame))
     ros.wait_until(lambda: chain.reported("goals_pending") == "1", "the goal")
     tau = chain.answer(10)
@@ -178,7 +178,7 @@ def test_poses_are_in_the_base_frame(ros):
     frame = "left_arm_mount"
     base = ARM.model.frames[ARM.model.getFrameId(frame)].placement
     assert not base.isIdentity(0.1)
-    chain = Chain(ros, base_frame=frame)
+    chain = NodeChain(ros, base_frame=frame)
     chain.poses.publish(pose_message(base.actInv(GOAL), frame))
     ros.wait_until(lambda: chain.reported("goals_pending") == "1", "the goal")
     tau = chain.answer(10)
@@ -190,7 +190,7 @@ def test_poses_are_in_the_base_frame(ros):
 
 
 def test_with_a_posture_goal_it_tracks_whatever_the_order_of_names(ros):
-    chain = Chain(ros)
+    chain = NodeChain(ros)
     names = [*reversed(JOINTS), "other"]
     chain.postures.publish(joint_state(names, 0, [*reversed(GOAL_Q), math.nan]))
     ros.wait_until(lambda: chain.reported("goals_pending") == "1", "the goal")
@@ -201,7 +201,7 @@ def test_with_a_posture_goal_it_tracks_whatever_the_order_of_names(ros):
 
 
 def test_it_holds_while_bounds_are_missing_and_goes_on_by_itself(ros):
-    chain = Chain(ros, bounds_timeout=0.1)
+    chain = NodeChain(ros, bounds_timeout=0.1)
     stamp = give_goal(chain)
     begin = time.monotonic()
     # A state whose limits do not come is held, but not before the time-out.
@@ -221,7 +221,7 @@ def test_it_holds_while_bounds_are_missing_and_goes_on_by_itself(ros):
 
 def test_slow_robots_are_not_taken_for_missing_bounds(ros):
     """The time-out counts from the state, not from the last answer."""
-    chain = Chain(ros, bounds_timeout=0.4)
+    chain = NodeChain(ros, bounds_timeout=0.4)
     stamp = give_goal(chain)
     ros.wait_until(lambda: chain.reported("mode") == "TRACKING")
     changes = chain.reported("mode_changes")
@@ -238,7 +238,7 @@ def test_slow_robots_are_not_taken_for_missing_bounds(ros):
 
 @pytest.mark.parametrize("bad", ["not finite", "wrong size", "missing joint"])
 def test_states_that_are_refused_lead_to_hold_then_stopped(ros, bad):
-    chain = Chain(ros, bounds_timeout=0.1, state_timeout=0.6)
+    chain = NodeChain(ros, bounds_timeout=0.1, state_timeout=0.6)
     stamp = give_goal(chain) + 5
     chain.answer(stamp)
     send = {
@@ -265,7 +265,7 @@ def test_states_that_are_refused_lead_to_hold_then_stopped(ros, bad):
 
 
 def test_stamps_that_stay_old_are_held_then_taken_for_a_restart(ros):
-    chain = Chain(ros, bounds_timeout=0.1, state_timeout=0.6)
+    chain = NodeChain(ros, bounds_timeout=0.1, state_timeout=0.6)
     stamp = give_goal(chain) + 1000
     chain.answer(stamp)
     earlier = iter(range(10, stamp))
@@ -277,7 +277,7 @@ def test_stamps_that_stay_old_are_held_then_taken_for_a_restart(ros):
 
 
 def test_silence_stops_it_and_a_new_state_wakes_it(ros):
-    chain = Chain(ros, state_timeout=0.2, bounds_timeout=0.1)
+    chain = NodeChain(ros, state_timeout=0.2, bounds_timeout=0.1)
     stamp = give_goal(chain)
     chain.await_mode("STOPPED", "no joint state")
     chain.commands.clear()
@@ -288,7 +288,7 @@ def test_silence_stops_it_and_a_new_state_wakes_it(ros):
 
 
 def test_a_silent_robot_that_repeats_its_state_is_answered_and_not_called_stopped(ros):
-    chain = Chain(ros, state_timeout=0.2, bounds_timeout=0.1)
+    chain = NodeChain(ros, state_timeout=0.2, bounds_timeout=0.1)
     chain.answer(10)
     chain.await_mode("STOPPED")
     chain.commands.clear()
@@ -308,7 +308,7 @@ def torque_for(q, a):
 
 @pytest.mark.parametrize("order", ["limits first", "state first"])
 def test_state_and_limits_are_matched_in_either_order(ros, order):
-    chain = Chain(ros)
+    chain = NodeChain(ros)
     chain.answer(10)
     # Limits that leave no choice show in the torque which of them were used.
     for stamp, a in ((20, 0.5), (30, -0.5), (40, 1.0)):
@@ -325,7 +325,7 @@ def test_state_and_limits_are_matched_in_either_order(ros, order):
 
 
 def test_old_limits_are_never_used_for_a_new_state(ros):
-    chain = Chain(ros)
+    chain = NodeChain(ros)
     chain.answer(10)
     ros.run_for(0.1, each=lambda: chain.state(20))
     # Late repeats of the old ones, and ones for a state that has not come.
@@ -336,7 +336,7 @@ def test_old_limits_are_never_used_for_a_new_state(ros):
 
 
 def test_a_robot_that_starts_over_at_the_same_stamp_does_not_get_the_old_limits(ros):
-    chain = Chain(ros, state_timeout=0.2, bounds_timeout=20.0)
+    chain = NodeChain(ros, state_timeout=0.2, bounds_timeout=20.0)
     chain.answer(10)
     chain.await_mode("STOPPED")
     chain.commands.clear()
@@ -349,7 +349,7 @@ def test_a_robot_that_starts_over_at_the_same_stamp_does_not_get_the_old_limits(
 
 
 def test_a_repeated_state_gets_the_same_command_again(ros):
-    chain = Chain(ros)
+    chain = NodeChain(ros)
     chain.answer(10)
     chain.commands.clear()
     ros.wait_until(lambda: len(chain.commands) >= 3, "repeats", each=lambda: chain.state(10))
@@ -394,7 +394,7 @@ def one_point():
     ],
 )
 def test_limits_that_cannot_be_used_are_refused_and_counted(ros, message, reason):
-    chain = Chain(ros)
+    chain = NodeChain(ros)
     chain.answer(10)
     ros.run_for(0.05, each=lambda: chain.state(20))
     ros.wait_until(
@@ -407,7 +407,7 @@ def test_limits_that_cannot_be_used_are_refused_and_counted(ros, message, reason
 
 
 def test_limits_in_any_order_and_of_others_too(ros):
-    chain = Chain(ros)
+    chain = NodeChain(ros)
     only = np.linspace(-0.6, 0.6, ARM.n)
     names = [*reversed(JOINTS), "other"]
     values = [*reversed(only), math.nan]
@@ -444,7 +444,7 @@ def changed_pose(frame="base", **fields) -> PoseStamped:
     ],
 )
 def test_poses_that_cannot_be_followed_are_refused_and_counted(ros, message):
-    chain = Chain(ros)
+    chain = NodeChain(ros)
     chain.answer(10)
     chain.poses.publish(message)
     ros.wait_until(lambda: chain.reported("goals_refused") == "target_pose: 1;", "the refusal")
@@ -466,7 +466,7 @@ def test_poses_that_cannot_be_followed_are_refused_and_counted(ros, message):
     ],
 )
 def test_postures_that_cannot_be_followed_are_refused_and_counted(ros, message):
-    chain = Chain(ros)
+    chain = NodeChain(ros)
     chain.answer(10)
     chain.postures.publish(message)
     ros.wait_until(lambda: chain.reported("goals_refused") == "target_posture: 1;", "the refusal")
@@ -479,7 +479,7 @@ def test_a_continuous_joint_is_not_sent_to_infinity(ros):
         "position_min": [*ARM.q_min[:6], -math.inf],
         "position_max": [*ARM.q_max[:6], math.inf],
     }
-    chain = Chain(ros, **limits)
+    chain = NodeChain(ros, **limits)
     chain.answer(10)
     chain.postures.publish(joint_state(JOINTS, 0, [*Q[:6], math.inf]))
     ros.wait_until(lambda: chain.reported("goals_refused") == "target_posture: 1;", "the refusal")
@@ -488,7 +488,7 @@ def test_a_continuous_joint_is_not_sent_to_infinity(ros):
 
 
 def test_goals_take_effect_at_their_stamps(ros):
-    chain = Chain(ros)
+    chain = NodeChain(ros)
     other = pose_at(Q - 0.1)
     chain.poses.publish(pose_message(other, stamp=70 * MS))
     chain.poses.publish(pose_message(GOAL, stamp=50 * MS))
@@ -511,7 +511,7 @@ def test_goals_take_effect_at_their_stamps(ros):
 
 
 def test_a_goal_that_is_not_renewed_is_given_up(ros):
-    chain = Chain(ros, goal_timeout=0.2)
+    chain = NodeChain(ros, goal_timeout=0.2)
     stamp = give_goal(chain)
     stamps = iter(range(stamp, stamp + 5000))
     chain.await_mode("HOLD", "goal lost", each=lambda: chain.both(next(stamps)))
@@ -524,7 +524,7 @@ def test_a_goal_that_is_not_renewed_is_given_up(ros):
 
 def test_efforts_are_published_for_ros2_control_too(ros):
     topic = "/effort_controller/commands"
-    chain = Chain(ros, ros2_control_topic=topic)
+    chain = NodeChain(ros, ros2_control_topic=topic)
     efforts = ros.listen(Float64MultiArray, topic)
     ros.hears(topic)
     tau = chain.answer(10)
@@ -533,7 +533,7 @@ def test_efforts_are_published_for_ros2_control_too(ros):
 
 
 def test_torques_keep_their_limits_also_when_bounds_ask_for_more(ros):
-    chain = Chain(ros)
+    chain = NodeChain(ros)
     much = np.full(ARM.n, 500.0)
     tau = chain.answer(10, lower=much, upper=much + 1.0)
     assert (np.abs(tau) <= ARM.tau_max).all()
@@ -546,7 +546,7 @@ def test_torques_keep_their_limits_also_when_bounds_ask_for_more(ros):
 
 
 def test_a_state_beyond_sense_is_held_and_forgotten(ros):
-    chain = Chain(ros)
+    chain = NodeChain(ros)
     stamp = give_goal(chain)
     tau = chain.answer(stamp + 10, v=np.full(ARM.n, 1e200))
     assert np.isfinite(tau).all()
@@ -559,7 +559,7 @@ def test_a_state_beyond_sense_is_held_and_forgotten(ros):
 
 def test_the_rate_of_torque_is_limited(ros):
     rate = np.full(ARM.n, 100.0)
-    chain = Chain(ros, torque_rate_max=rate.tolist())
+    chain = NodeChain(ros, torque_rate_max=rate.tolist())
     tau = [
         chain.answer(10 * k, q=Q + 0.05 * k, lower=a, upper=a)
         for k, a in ((1, -UPPER), (2, UPPER), (3, -UPPER))
@@ -570,7 +570,7 @@ def test_the_rate_of_torque_is_limited(ros):
 
 
 def test_joints_at_a_limit_are_named(ros):
-    chain = Chain(ros)
+    chain = NodeChain(ros)
     lower, upper = LOWER.copy(), UPPER.copy()
     lower[3] = upper[3] = 0.7
     chain.answer(10, v=REST, lower=lower, upper=upper)
@@ -593,7 +593,7 @@ def test_joints_at_a_limit_are_named(ros):
     ],
 )
 def test_gains_change_while_it_runs(ros, changed, gains):
-    chain = Chain(ros)
+    chain = NodeChain(ros)
     away = Q + 0.3
     chain.poses.publish(pose_message(GOAL))
     chain.postures.publish(joint_state(JOINTS, 0, away))
@@ -614,7 +614,7 @@ def test_gains_change_while_it_runs(ros, changed, gains):
 
 
 def test_the_damping_in_hold_changes_while_it_runs(ros):
-    chain = Chain(ros)
+    chain = NodeChain(ros)
     slow = 0.1 * V
     before = chain.answer(10, v=slow)
     ros.accepts(NODE, hold_kd=5.0)
@@ -638,7 +638,7 @@ def test_the_damping_in_hold_changes_while_it_runs(ros):
     ],
 )
 def test_bad_gains_are_refused_and_the_old_ones_stay(ros, name, value):
-    chain = Chain(ros)
+    chain = NodeChain(ros)
     before = chain.answer(10)
     reason = ros.refuses(NODE, **{name: value})
     assert names_parameter(reason, name)
@@ -660,7 +660,7 @@ def test_bad_gains_are_refused_and_the_old_ones_stay(ros, name, value):
     ],
 )
 def test_geometry_limits_and_rates_are_read_only(ros, name, value):
-    Chain(ros)
+    NodeChain(ros)
     assert "read-only" in ros.refuses(NODE, **{name: value})
 
 

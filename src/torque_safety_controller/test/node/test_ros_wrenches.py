@@ -47,7 +47,7 @@ def wrench(force=(0.0, 0.0, 0.0), torque=(0.0, 0.0, 0.0), frame="", stamp=0) -> 
     return message
 
 
-class Hand(ControllerChain):
+class WrenchChain(ControllerChain):
     """The other side of the controller, with a force/torque sensor."""
 
     def __init__(self, ros, **changed) -> None:
@@ -92,7 +92,7 @@ class Hand(ControllerChain):
 
 
 def test_a_pull_is_yielded_to_until_the_sensor_falls_silent(ros):
-    hand = Hand(ros)
+    hand = WrenchChain(ros)
     hand.feels = wrench(force=(1.0, 0.0, 0.0), frame="panda_link8")
     hand.give_pose()
     hand.until("compliance", "holding")
@@ -109,7 +109,7 @@ def test_a_pull_is_yielded_to_until_the_sensor_falls_silent(ros):
 
 
 def test_measurements_that_are_none_are_dropped_counted_and_named(ros):
-    hand = Hand(ros)
+    hand = WrenchChain(ros)
     hand.feels = wrench(force=(0.0, 30.0, math.nan), frame="panda_link8")
     hand.give_pose()
     hand.until("wrenches_refused", "not six finite numbers")
@@ -123,7 +123,7 @@ def test_a_target_is_exerted_and_torques_say_so(ros, monkeypatch):
     """In contact with what gives exactly that back, the motors carry it."""
     monkeypatch.setattr(interaction, "WRENCH_TIME", 1e-3)
     monkeypatch.setattr(interaction, "FORCE_STEP", 20.0)
-    hand = Hand(ros, dual_compliance=False)
+    hand = WrenchChain(ros, dual_compliance=False)
     hand.feels = wrench()
     hand.give_pose()
     before = hand.step()
@@ -152,7 +152,7 @@ def test_a_target_is_exerted_and_torques_say_so(ros, monkeypatch):
     ],
 )
 def test_targets_that_cannot_be_exerted_are_refused(ros, message, changed):
-    hand = Hand(ros, **changed)
+    hand = WrenchChain(ros, **changed)
     if changed.get("ft_frame") != "":
         hand.feels = wrench()
     hand.give_pose()
@@ -162,7 +162,7 @@ def test_targets_that_cannot_be_exerted_are_refused(ros, message, changed):
 
 
 def test_a_tare_takes_what_is_felt_for_the_bias_but_not_from_a_hand_that_is_led(ros):
-    hand = Hand(ros)
+    hand = WrenchChain(ros)
     hand.feels = wrench(force=(4.0, 0.0, 0.0))
     hand.give_pose()
     for _ in range(3):

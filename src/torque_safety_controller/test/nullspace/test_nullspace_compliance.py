@@ -38,7 +38,7 @@ def energy(compliance, M) -> float:
     return 0.5 * energy_product(compliance.settings.law, M, a, x, a, x)
 
 
-class Run:
+class ComplianceRun:
     """An arm with friction and heavy rotors that holds its hand still; `push` is on its elbow."""
 
     def __init__(self, robot="talos", rows=6, q=None, **reference):
@@ -97,7 +97,7 @@ def test_elbow_moves_further_and_the_hand_no_further():
     """Than with all joints stiff."""
     moved, errors = {}, {}
     for kind in (IntegralFeedback, NullspaceCompliance):
-        run = Run()
+        run = ComplianceRun()
         action = kind(unlimited(9)) if kind is IntegralFeedback else kind(unlimited(9), 6)
         action.reset(run.now)
         run.go(action, 0.1).go(action, 2.0, push=[0.0, 40.0, 0.0])
@@ -114,14 +114,14 @@ def test_a_constant_disturbance_is_integrated_away_while_the_null_space_is_free(
     assert np.abs(weight).max() > 2.0
 
     def steady(kind=NullspaceCompliance, **changes):
-        run = Run("panda", stiffness=20.0)
+        run = ComplianceRun("panda", stiffness=20.0)
         law = unlimited(7, gain=6.0, **changes)
         action = kind(law) if kind is IntegralFeedback else kind(law, 6)
         action.reset(run.now)
         run.go(action, 6.0, disturbance=weight)
         return run, np.linalg.norm(run.errors[-1]), np.abs(run.q - arm.posture).max()
 
-    alone = Run("panda", stiffness=20.0)
+    alone = ComplianceRun("panda", stiffness=20.0)
     for _ in range(500):
         alone.move(0.0, disturbance=weight)
     without = np.linalg.norm(alone.errors[-1])
@@ -142,7 +142,7 @@ def test_a_constant_disturbance_is_integrated_away_while_the_null_space_is_free(
 
 def test_a_push_that_lasts_does_not_make_it_grow():
     """An arm held off its posture; the law as printed would double its memory."""
-    run = Run(stiffness=20.0)
+    run = ComplianceRun(stiffness=20.0)
     compliance = started(run, unlimited(9))
     half = []
     for _ in range(2):
@@ -153,7 +153,7 @@ def test_a_push_that_lasts_does_not_make_it_grow():
 
 def test_singular_start():
     """From a stretched-out arm to where the hand is free to move, then holding it there."""
-    run = Run("panda", q=np.zeros(7))
+    run = ComplianceRun("panda", q=np.zeros(7))
     assert np.linalg.svd(run.terms.J)[1][-1] < 1e-15
     compliance = started(run, unlimited(7))
     singular = []
@@ -233,7 +233,7 @@ def test_always_finite_and_within_the_budget(rng, m, budget):
 
 def with_memory(seed, budget=np.inf):
     """A moving arm and a memory from a random torque, of which the offset has gone."""
-    run, rng = Run("talos"), np.random.default_rng(seed)
+    run, rng = ComplianceRun("talos"), np.random.default_rng(seed)
     run.v = 0.5 * rng.normal(size=9)
     run.terms = run.arm.terms(run.q, run.v)
     run.a_ref = run.v.copy()
@@ -281,7 +281,7 @@ def test_it_leaves_its_limits_at_once():
     """A hand that was held off for seconds returns without the swing of an integral wound up."""
     swings = []
     for budget in (np.inf, 3.0):
-        run = Run("panda")
+        run = ComplianceRun("panda")
         compliance = started(run, IntegralSettings(np.full(7, budget)))
         for k in range(round(4.0 / DT)):
             force = run.terms.J[:3].T @ np.array([0.0, 60.0, 0.0]) if k * DT < 3.0 else 0.0
@@ -296,7 +296,7 @@ def test_it_leaves_its_limits_at_once():
 
 
 def test_from_the_plain_mode_and_back_without_a_jump():
-    run = Run()
+    run = ComplianceRun()
     n, weight = 9, 3.0 * np.sin(np.arange(9) + 1.0)
     law = IntegralSettings(np.full(n, 20.0))
     plain, free = IntegralFeedback(law), NullspaceCompliance(law, 6)
@@ -331,7 +331,7 @@ def test_from_the_plain_mode_and_back_without_a_jump():
 
 
 def test_the_task_keeps_its_torque_and_the_rest_fades():
-    run = Run("talos")
+    run = ComplianceRun("talos")
     compliance = NullspaceCompliance(unlimited(9), 6)
     torque = 5.0 * np.cos(np.arange(9))
     J, M = run.terms.J, run.terms.M
@@ -348,7 +348,7 @@ def test_the_task_keeps_its_torque_and_the_rest_fades():
 
 
 def test_a_budget_is_widened_as_far_as_needed_and_returns():
-    run = Run("talos")
+    run = ComplianceRun("talos")
     budget = np.full(9, 2.0)
     compliance = NullspaceCompliance(IntegralSettings(budget), 6)
     torque = np.array([5.0, -1.0, 0.0, 3.0, 0.0, 0.0, 1.0, 0.0, -2.5])
@@ -376,7 +376,7 @@ def test_a_budget_is_widened_as_far_as_needed_and_returns():
     ids=lambda changes: next(iter(changes)),
 )
 def test_settings_change_without_a_jump_when_initialised(changes):
-    run = Run()
+    run = ComplianceRun()
     compliance = started(run, unlimited(9))
     push = dict(push=[0.0, 30.0, 0.0])
     run.go(compliance, 0.5, **push)
@@ -393,7 +393,7 @@ def test_settings_change_without_a_jump_when_initialised(changes):
 
 
 def test_starts_from_zero_and_a_pause_is_no_kick():
-    run = Run()
+    run = ComplianceRun()
     run.v = np.ones(9)
     compliance = started(run, unlimited(9))
     np.testing.assert_array_equal(compliance.torque(*run.arguments()), 0.0)
@@ -410,7 +410,7 @@ def test_starts_from_zero_and_a_pause_is_no_kick():
 
 
 def test_bad_input_changes_nothing():
-    run, twin = Run(), Run()
+    run, twin = ComplianceRun(), ComplianceRun()
     compliances = [started(each, unlimited(9)) for each in (run, twin)]
     for each, compliance in zip((run, twin), compliances, strict=True):
         each.go(compliance, 0.1, push=[0.0, 30.0, 0.0])
@@ -453,7 +453,7 @@ def test_a_task_without_null_space_is_refused(m):
 
 @pytest.mark.parametrize("m", range(1, 7))
 def test_any_task_with_a_null_space_is_served(m):
-    run = Run("panda", rows=m)
+    run = ComplianceRun("panda", rows=m)
     compliance = started(run, unlimited(7), m)
     run.go(compliance, 0.1, push=[0.0, 30.0, 0.0])
     assert np.abs(run.terms.J @ compliance.memory.a).max() > 1e-4

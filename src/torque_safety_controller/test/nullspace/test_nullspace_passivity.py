@@ -21,7 +21,7 @@ TWO_RATES = dict(slow_leak_rate=0.3, fast_leak_rate=20.0)
 STRETCHED = 0.25 * np.array([0.3, 0.4, 0.2, -1.6, 0.1, 2.0, 0.5])
 
 
-class Loop:
+class PassivityLoop:
     """An arm under a waving reference and the additional torque; the memory is not zero."""
 
     def __init__(self, robot, rows, dt, disturbance=0.0, posture=None, speed=0.5, **changes):
@@ -102,7 +102,7 @@ def test_energy_falls_at_the_rate_of_the_theory(robot, rows):
     """V = a'Ma/2 falls by what the gains take; what is off halves with the period."""
     offs = []
     for dt in (1e-3, 5e-4):
-        energies, off = energy_balance(Loop(robot, rows, dt, **NEVER_FORGETS), 0.25)
+        energies, off = energy_balance(PassivityLoop(robot, rows, dt, **NEVER_FORGETS), 0.25)
         assert (np.diff(energies) < 0.0).all()
         assert off < 0.005 * energies[0]
         offs.append(off)
@@ -115,7 +115,7 @@ def test_energy_of_the_two_rate_law_with_a_disturbance(robot, rows):
     """The storage function of the documentation, with all its terms, a changing M included."""
     offs = []
     for dt in (1e-3, 5e-4):
-        loop = Loop(robot, rows, dt, disturbance=1.0, **TWO_RATES)
+        loop = PassivityLoop(robot, rows, dt, disturbance=1.0, **TWO_RATES)
         energies, off = energy_balance(loop, 0.25)
         assert off < 0.01 * energies[0]
         offs.append(off)
@@ -126,7 +126,7 @@ def test_energy_falls_near_a_singularity_too():
     """With a direction damped (23) still holds, and with it passivity."""
     offs = []
     for dt in (1e-3, 5e-4):
-        loop = Loop("panda", 6, dt, posture=STRETCHED, speed=0.02, **TWO_RATES)
+        loop = PassivityLoop("panda", 6, dt, posture=STRETCHED, speed=0.02, **TWO_RATES)
         near = loop.compliance.near_singular
         energies, off = energy_balance(loop, 0.1)
         assert near
@@ -140,7 +140,7 @@ def test_energy_falls_near_a_singularity_too():
 def test_integral_of_the_task_error_is_exact(robot, rows, slow):
     """J a is the sum of J s' in the middle of the steps, leaking slowly: to rounding."""
     dt = 1e-3
-    loop = Loop(robot, rows, dt, disturbance=1.0, slow_leak_rate=slow)
+    loop = PassivityLoop(robot, rows, dt, disturbance=1.0, slow_leak_rate=slow)
     decay, gain = leak_factors(slow, dt, False)
     expected = loop.terms.J @ loop.compliance.memory.a
     largest = 0.0
@@ -160,7 +160,7 @@ def test_integral_of_the_task_error_is_exact(robot, rows, slow):
 def test_integral_of_the_task_error_near_a_singularity():
     """What is lost there, step by step: the relation of the documentation, to rounding."""
     dt, theta = 1e-3, 2.0
-    loop = Loop(
+    loop = PassivityLoop(
         "panda",
         6,
         dt,

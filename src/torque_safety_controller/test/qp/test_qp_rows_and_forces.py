@@ -19,7 +19,7 @@ GAMMA = 1e-4
 KEPT = 1e-6  # rad/s^2, N m and N
 
 
-class Problem(NamedTuple):
+class ForceProblem(NamedTuple):
     tasks: list[TaskTerm]
     a_lower: np.ndarray
     a_upper: np.ndarray
@@ -30,12 +30,12 @@ class Problem(NamedTuple):
     contacts: ContactForces
 
 
-def solution_of(qp, problem: Problem):
+def solution_of(qp, problem: ForceProblem):
     tasks, a_lower, a_upper, *rest = problem
     return qp.solve(qp.build(tasks, AccelerationRange(a_lower, a_upper), *rest))
 
 
-def random_problem(rng, k=10, r=8, room=1.0) -> Problem:
+def random_problem(rng, k=10, r=8, room=1.0) -> ForceProblem:
     """With little room, torques and bounds, or rows and bounds, contradict each other."""
     L = 0.5 * rng.normal(size=(N, N))
     G = rng.normal(size=(k, N))
@@ -53,7 +53,7 @@ def random_problem(rng, k=10, r=8, room=1.0) -> Problem:
         WrenchTerm(rng.normal(size=(6, half_r)), 10.0 * rng.normal(size=6), 0.5, 0),
         WrenchTerm(rng.normal(size=(3, r - half_r)), 10.0 * rng.normal(size=3), 2.0, half_r),
     ]
-    return Problem(
+    return ForceProblem(
         [
             TaskTerm(rng.normal(size=(6, N)), 10.0 * rng.normal(size=6), 3.0),
             TaskTerm(None, rng.normal(size=N), 3e-2),
@@ -68,7 +68,7 @@ def random_problem(rng, k=10, r=8, room=1.0) -> Problem:
     )
 
 
-def cost_of(problem: Problem):
+def cost_of(problem: ForceProblem):
     """H and g of the cost in (a, rho), the largest weight made 1."""
     r = len(problem.contacts.rho_max)
     scale = max(t.weight for t in [*problem.tasks, *problem.contacts.tasks])
@@ -84,7 +84,7 @@ def cost_of(problem: Problem):
     return H, g
 
 
-def by_proxqp(problem: Problem):
+def by_proxqp(problem: ForceProblem):
     """a and rho with the torque as a variable of its own, and by an augmented Lagrangian.
 
     Variables (a, rho, tau) with the dynamics as an equation. None without a solution.
@@ -119,7 +119,7 @@ def by_proxqp(problem: Problem):
     return x[: N + r]
 
 
-def least_relaxation(problem: Problem) -> np.ndarray:
+def least_relaxation(problem: ForceProblem) -> np.ndarray:
     """How far bounds and rows have to give way, shape (n + k,), as least squares in boxes.
 
     In the torques, the forces, and the nearest values within the limits.
@@ -135,14 +135,14 @@ def least_relaxation(problem: Problem) -> np.ndarray:
     return A @ found.x
 
 
-def excess(problem: Problem, a: np.ndarray) -> np.ndarray:
+def excess(problem: ForceProblem, a: np.ndarray) -> np.ndarray:
     value = np.r_[a, problem.rows.G @ a]
     lower = np.r_[problem.a_lower, problem.rows.lower]
     upper = np.r_[problem.a_upper, problem.rows.upper]
     return np.maximum(np.maximum(lower - value, value - upper), 0.0)
 
 
-def assert_tasks_served_best(problem: Problem, solution) -> None:
+def assert_tasks_served_best(problem: ForceProblem, solution) -> None:
     """Karush-Kuhn-Tucker, with limits where they have been moved to."""
     x = np.r_[solution.a, solution.rho]
     H, g = cost_of(problem)
@@ -163,7 +163,7 @@ def assert_tasks_served_best(problem: Problem, solution) -> None:
     assert left < 1e-5 * (1.0 + np.linalg.norm(g))
 
 
-def assert_hard_limits_kept(problem: Problem, solution) -> None:
+def assert_hard_limits_kept(problem: ForceProblem, solution) -> None:
     rho = solution.rho
     assert (rho >= 0.0).all()
     assert (rho <= problem.contacts.rho_max).all()

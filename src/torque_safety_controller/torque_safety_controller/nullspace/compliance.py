@@ -26,7 +26,7 @@ from torque_safety_controller.linalg.generalized_inverse import check_task_shape
 from torque_safety_controller.nullspace.kernels import (
     FAILED,
     NEAR_SINGULAR,
-    Memory,
+    NullspaceMemory,
     skip,
     step,
 )
@@ -58,7 +58,9 @@ class NullspaceCompliance:
         check_task_shape(m, n)
         self._shape = m, n
         a, s, root, offset, widening, v = np.zeros((6, n))
-        self.memory = Memory(a, s, np.zeros(m), root, offset, widening, v, np.zeros((m, n)))
+        self.memory = NullspaceMemory(
+            a, s, np.zeros(m), root, offset, widening, v, np.zeros((m, n))
+        )
         self.near_singular = False
         self.saturated = np.zeros(n, dtype=bool)
         self.settings = settings

@@ -36,7 +36,7 @@ _AT_LIMIT = 1.0 - 1e-9
 _SINGULAR = 1e-12  # relative; smaller pivots are rounding
 
 
-class Memory(NamedTuple):
+class NullspaceMemory(NamedTuple):
     """What lasts from one step to the next; written in place.
 
     Attributes:
@@ -90,8 +90,8 @@ def step(
 ) -> int:
     """Take one step; when it fails the memory is as before.
 
-    The first arguments are the fields of `Memory`, `Law` and `ArmTerms`: Numba takes several
-    microseconds to unpack named tuples that come from Python.
+    The first arguments are the fields of `NullspaceMemory`, `Law` and `ArmTerms`: Numba takes
+    several microseconds to unpack named tuples that come from Python.
 
     `a_ref` is the acceleration commanded in the last step, shape (n,), rad/s^2, and `dt` the time
     since then, s. With `initialise` the memory is chosen such that the torque is what `torque`
@@ -104,7 +104,7 @@ def step(
     Raises:
         LinAlgError: M is singular.
     """
-    memory = Memory(
+    memory = NullspaceMemory(
         last_a, last_s, last_integral, root, last_offset, last_widening, last_v, last_J
     )
     law = Law(budget, gain, slow_leak_rate, fast_leak_rate, mu, method)
@@ -150,7 +150,7 @@ def step(
 
 
 @compiled
-def skip(memory: Memory, law: Law, v: Array, J: Array, dt: float) -> None:
+def skip(memory: NullspaceMemory, law: Law, v: Array, J: Array, dt: float) -> None:
     """Let a time pass in which the memory only leaks."""
     decay = math.exp(-law.slow_leak_rate * dt)
     memory.a[:] *= decay
@@ -201,7 +201,7 @@ def energy_product(law: Law, M: Array, a: Array, x: Array, b: Array, y: Array) -
 
 @compiled
 def _advance(
-    memory: Memory,
+    memory: NullspaceMemory,
     law: Law,
     arm: ArmTerms,
     J_plus: Array,

@@ -58,7 +58,7 @@ def exact(q, v, factor=2.0):
     return acceleration_bounds(q, v, LIMITS, factor * PERIOD, None, PERIOD)
 
 
-class Robot:
+class BoundsProbe:
     """The other side: sends states, keeps answers."""
 
     def __init__(self, ros, **changed) -> None:
@@ -91,7 +91,7 @@ def check(answer: JointTrajectory, bounds) -> None:
 
 
 def test_answers_are_those_of_the_solver_with_the_stamp_of_the_state(ros):
-    robot = Robot(ros)
+    robot = BoundsProbe(ros)
     rng = np.random.default_rng(1)
     seen = set()
     for k in range(1, 41):
@@ -105,7 +105,7 @@ def test_answers_are_those_of_the_solver_with_the_stamp_of_the_state(ros):
 
 
 def test_joints_in_any_order_and_others_with_them(ros):
-    robot = Robot(ros)
+    robot = BoundsProbe(ros)
     order = [2, 0, 1]
     q, v = np.array(NEAR)
     answer = robot.ask(
@@ -118,7 +118,7 @@ def test_joints_in_any_order_and_others_with_them(ros):
 
 
 def test_the_same_state_again_gets_the_same_answer_again(ros):
-    robot = Robot(ros)
+    robot = BoundsProbe(ros)
     first = robot.ask(10 * MS, *NEAR)
     for _ in range(3):
         assert robot.ask(10 * MS, *NEAR) == first
@@ -139,7 +139,7 @@ def test_the_same_state_again_gets_the_same_answer_again(ros):
     ],
 )
 def test_what_is_wrong_is_dropped_and_counted(ros, stamp, q, v, joints, reason):
-    robot = Robot(ros, state_timeout=30.0)
+    robot = BoundsProbe(ros, state_timeout=30.0)
     robot.ask(10 * MS, *NEAR)
     robot.answers.clear()
     ros.wait_until(
@@ -153,7 +153,7 @@ def test_what_is_wrong_is_dropped_and_counted(ros, stamp, q, v, joints, reason):
 
 
 def test_an_empty_first_message_does_no_harm(ros):
-    robot = Robot(ros)
+    robot = BoundsProbe(ros)
     ros.wait_until(
         lambda: "missing joint" in ros.reported(NODE, "states_refused"),
         "a refusal",
@@ -163,7 +163,7 @@ def test_an_empty_first_message_does_no_harm(ros):
 
 
 def test_a_robot_that_starts_over_is_answered_after_the_time_out(ros):
-    robot = Robot(ros)
+    robot = BoundsProbe(ros)
     begin = time.monotonic()
     robot.ask(5000 * MS, *NEAR)
     check(robot.ask(10 * MS, REST, REST), exact(*np.zeros((2, 3))))
@@ -173,7 +173,7 @@ def test_a_robot_that_starts_over_is_answered_after_the_time_out(ros):
 
 
 def test_diagnostics(ros):
-    robot = Robot(ros)
+    robot = BoundsProbe(ros)
     ros.wait_until(lambda: ros.reported(NODE, "message") == "no joint state yet")
     assert ros.diagnostics[NODE]["level"] == DiagnosticStatus.WARN
     robot.ask(10 * MS, REST, REST)
@@ -190,7 +190,7 @@ def test_diagnostics(ros):
 
 
 def test_method_and_horizon_change_while_it_runs(ros):
-    robot = Robot(ros)
+    robot = BoundsProbe(ros)
     q, v = map(np.array, NEAR)
     check(robot.ask(10 * MS, q, v), exact(q, v))
     ros.accepts(NODE, bounds_dt_factor=4.0)
@@ -218,7 +218,7 @@ def test_method_and_horizon_change_while_it_runs(ros):
     ],
 )
 def test_a_bad_change_is_refused_and_the_old_value_keeps_working(ros, name, value):
-    robot = Robot(ros)
+    robot = BoundsProbe(ros)
     reason = ros.refuses(NODE, **{name: value})
     assert names_parameter(reason, name)
     assert robot.node.get_parameter(name).value == {"method": "exact"}.get(name, 2.0)
@@ -242,7 +242,7 @@ def test_a_bad_change_is_refused_and_the_old_value_keeps_working(ros, name, valu
     ],
 )
 def test_limits_and_rates_are_read_only(ros, name, value):
-    robot = Robot(ros)
+    robot = BoundsProbe(ros)
     assert "read-only" in ros.refuses(NODE, **{name: value})
     q, v = map(np.array, NEAR)
     check(robot.ask(10 * MS, q, v), exact(q, v))
@@ -320,7 +320,7 @@ def test_the_configured_margins_only_narrow_the_bounds(robot):
 
 def test_a_second_robot_can_use_what_it_answers(ros):
     # The format that the controller takes; see the table of topics.
-    robot = Robot(ros)
+    robot = BoundsProbe(ros)
     q, v = map(np.array, NEAR)
     bounds = exact(q, v)
     answer = robot.ask(10 * MS, q, v)
