@@ -85,7 +85,16 @@ class _LockedFile(IndexDataCacheFile):
         if not Path(self._index_path).exists():
             return None
         with self._lock(write=False):
-            return super().load(key)
+            try:
+                return super().load(key)
+            except Exception:  # damaged, by a power cut for example: compile again
+                return None
+
+    def _load_index(self) -> Any:
+        try:
+            return super()._load_index()
+        except Exception:  # as above
+            return {}
 
     def save(self, key: Any, data: Any) -> None:
         with self._lock(write=True):

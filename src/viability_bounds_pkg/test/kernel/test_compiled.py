@@ -89,3 +89,14 @@ def test_code_of_other_sources_is_not_run_when_writing_was_interrupted(tmp_path,
         new.save("types", "new code")
     assert new.load("types") is None
     assert old.load("types") is None
+
+
+@pytest.mark.parametrize("ending", ["nbi", "nbc"])
+def test_damaged_files_are_replaced(tmp_path, ending):
+    file = _LockedFile(tmp_path, "function", "sources")
+    file.save("types", "code")
+    (damaged,) = tmp_path.glob(f"*.{ending}")
+    damaged.write_bytes(damaged.read_bytes()[:-3])
+    assert file.load("types") is None
+    file.save("types", "code")
+    assert file.load("types") == "code"
