@@ -29,7 +29,7 @@ import yaml
 ROOT = Path(__file__).resolve().parent.parent
 TABLE = ROOT / "test" / "faults.yaml"
 PACKAGES = ("viability_bounds_pkg", "torque_safety_controller", "sim_bridge")
-COPIED = ("src", "test", "config", "reproduction", "conftest.py", "pyproject.toml")
+COPIED = ("src", "test", "config", "reproduction", "conftest.py", "pyproject.toml", "README.md")
 MOST_CPU = 180  # s, for each fault; a test that takes it up has noticed the fault
 
 PLUGIN = '''"""What was compiled stays: the fault is in no compiled function."""
