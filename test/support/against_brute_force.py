@@ -64,7 +64,7 @@ def _blocks(count: int) -> list[slice]:
 def _compare(case, q, v) -> Comparison:
     bounds = acceleration_bounds(column(q), column(v), one_joint(*case[:5]), case[5])
     lower, upper, viable = (part[:, 0] for part in bounds)
-    joint, steps = brute_force.Joint(*case), horizon(case)
+    joint, steps = brute_force.BruteForceJoint(*case), horizon(case)
     brackets = [
         brute_force.extreme_accelerations(joint, q, v, steps, end_at_rest)
         for end_at_rest in (False, True)
@@ -114,7 +114,7 @@ def detour(case, q, v, highest) -> Detour:
         v: speeds towards the upper limit there, within their own, shape (m,).
         highest: the furthest that each joint went, shape (m,).
     """
-    joint, unit = brute_force.Joint(*case), max(-case[3], case[4]) * case[5] ** 2
+    joint, unit = brute_force.BruteForceJoint(*case), max(-case[3], case[4]) * case[5] ** 2
     found = [NO_DETOUR]
     for rows in _blocks(len(q)):
         lower, upper = (

@@ -47,7 +47,7 @@ class HandoverRefused(ArmSafetyError, ValueError):
 
 
 class Handover:
-    """Keeps who is in command.
+    """Keeps track of what controls the arm: its drives, or torque.
 
     Args:
         control: ``torque`` or ``position``.
@@ -57,8 +57,8 @@ class Handover:
         tau_max: torque limits, shape (n,), N m.
 
     Attributes:
-        control: who is in command.
-        reason: why it is they.
+        control: what controls the arm at present.
+        reason: why.
     """
 
     def __init__(
