@@ -51,7 +51,7 @@ def assert_optimal(problem, x):
     slope = problem.H @ x + problem.g
     normals = np.vstack([N[at_lower], -N[at_upper]])
     left = nnls(normals.T, slope)[1] if len(normals) else np.linalg.norm(slope)
-    assert left < 1e-6 * (1.0 + np.linalg.norm(problem.g))
+    assert left < 1e-7 * (1.0 + np.linalg.norm(problem.g))
 
 
 def has_a_point(problem) -> bool:

@@ -475,5 +475,14 @@ def test_a_mass_matrix_that_is_nearly_singular():
     for k in range(60):
         problem = random_problem(rng, (1.0, 0.3)[k % 2])
         u = rng.normal(size=(N, 1))
-        problem = problem._replace(M=u @ u.T + 10.0 ** rng.uniform(-4, -2) * np.eye(N))
+        problem = problem._replace(M=u @ u.T + 10.0 ** rng.uniform(-6, -2) * np.eye(N))
         assert_torques_kept(problem, solution_of(qp, problem).a)
+
+
+def test_relaxation_with_a_mass_matrix_that_none_has_fails():
+    problem = random_problem(np.random.default_rng(38), 0.05)
+    qp = InverseDynamicsQP(N, GAMMA)
+    assert solution_of(qp, problem).relaxation is not None
+    M = problem.M - 2.0 * np.linalg.eigvalsh(problem.M)[-1] * np.eye(N)
+    with pytest.raises(NoSolutionFound, match="not positive definite"):
+        solution_of(qp, problem._replace(M=M))

@@ -267,7 +267,7 @@ def test_sizes_may_change_from_step_to_step():
         if used.relaxation is None:
             repeated += 1
             spared += solution_of(qp, problem).iterations == 1
-    assert spared > 0.6 * repeated
+    assert spared == repeated > 20
 
 
 def test_without_rows_and_forces_nothing_changes():

@@ -28,7 +28,7 @@ class LinearConstraints(NamedTuple):
 
     Equal limits make an equality. Where the torque limits leave no solution, these constraints
     and the acceleration bounds are relaxed together, by the least sum of squares. Scaling a row
-    of G and its limits by s multiplies the cost of relaxing it by s^2, up to a length of 1e3 of
+    of G and its limits by s multiplies the cost of relaxing it by s^2, up to a length of 1e4 of
     the row.
     """
 

@@ -47,7 +47,7 @@ _PROXIMAL = (1e-2, 10.0)
 # Room that is left to the tasks beyond the least relaxation, relative to it where it is above 1,
 # and to the length of a row where that is.
 _ROOM = 1e-8
-_LONGEST = 1e3
+_LONGEST = 1e4
 """Constraints with longer rows are scaled to this length when limits must be relaxed."""
 _NEGLIGIBLE = 1e-6
 """Less relaxation than this, rad/s^2, is none."""
@@ -214,8 +214,16 @@ class InverseDynamicsQP:
 
         then the program itself, with the limits moved by e. Returns its solution; by how much it
         violates the limits of S x, shape (n + k,), None for as good as nothing; and iterations.
+
+        The first is solved for z = L' a, with M = L L': then the rows are no worse conditioned
+        than L, whose condition number is the square root of that of M.
         """
         n, size = self._n, len(program.g)
+        try:
+            from_z = np.linalg.inv(np.linalg.cholesky(program.C[:n, :n])).T
+        except np.linalg.LinAlgError as error:
+            message = "the mass matrix is not positive definite"
+            raise NoSolutionFound(message, program) from error
         relaxable = np.r_[:n, size + n : len(program.lower)]  # where the limits of S x are
         soft = len(relaxable)
         # Beyond this length a row would make the problem too ill-conditioned.
@@ -229,6 +237,7 @@ class InverseDynamicsQP:
         constraints[n : 2 * n, :n] = np.eye(n)
         constraints[2 * n :, :size] = C[n:]
         constraints[n:, size:] = -np.eye(soft)
+        constraints[:, :n] = constraints[:, :n] @ from_z
         free = np.full(soft, np.inf)
         least = _first_to_solve(
             self._relaxing_solvers,
@@ -254,7 +263,9 @@ class InverseDynamicsQP:
             self._relaxed_solvers, program._replace(C=C, lower=lower, upper=upper)
         )
         # Where too little room is left for the tasks, what was found first keeps the limits, too.
-        x = result.x if result.status is Status.SOLVED else least.x[:size]
+        x = result.x
+        if result.status is not Status.SOLVED:
+            x = np.concatenate([from_z @ least.x[:n], least.x[n:size]])
         relaxation = program.violations(x)[relaxable]
         iterations = least.iterations + result.iterations
         return x, relaxation if relaxation.max() >= _NEGLIGIBLE else None, iterations
