@@ -88,8 +88,8 @@ def test_pairs_are_those_listed_or_those_chosen_at_the_posture_given():
 
 def test_acceleration_limits_arrive():
     config = configuration()
-    np.testing.assert_array_equal(config.a_min, PANDA["acceleration_min"])
-    np.testing.assert_array_equal(config.a_max, PANDA["acceleration_max"])
+    np.testing.assert_array_equal(config.acceleration_min, PANDA["acceleration_min"])
+    np.testing.assert_array_equal(config.acceleration_max, PANDA["acceleration_max"])
 
 
 def test_what_an_arm_is_mounted_on_is_left_out_and_said_to_be():
