@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters, each declared once: as a field of a frozen dataclass, its configuration.
 
-`number`, `text`, `per_joint_numbers` and the others return the field of a parameter, with the values
+`number`, `text`, `joint_numbers` and the others return the field of a parameter, with the values
 that are allowed; the name of the field is that of the parameter. `read` checks values, as from
 YAML, and makes the dataclass of them. Only conditions between several parameters are written by
 hand, in its ``__post_init__``.
@@ -215,7 +215,7 @@ def numbers(description: str, within: Range | None = None, **more: Any) -> Any:
     return _field(kind=list[float], description=description, within=within, **more)
 
 
-def per_joint_numbers(description: str, within: Range | None = None, **more: Any) -> Any:
+def joint_numbers(description: str, within: Range | None = None, **more: Any) -> Any:
     """Return the field of an array with one number a joint; `more` as for `numbers`."""
     return numbers(description, within, per_joint=True, **more)
 

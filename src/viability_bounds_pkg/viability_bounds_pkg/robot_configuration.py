@@ -15,9 +15,9 @@ from viability_bounds_pkg.parameter import (
     NOT_NEGATIVE,
     POSITIVE,
     above,
+    joint_numbers,
     number,
     numbers,
-    per_joint_numbers,
     text,
     texts,
 )
@@ -39,14 +39,12 @@ class RobotConfiguration:
     locked_positions: Array = numbers(
         "where they are, rad", default=(), note="one for each of 'locked_joints'"
     )
-    position_min: Array = per_joint_numbers(
-        "lower position limits, rad; -.inf for continuous joints"
-    )
-    position_max: Array = per_joint_numbers(
+    position_min: Array = joint_numbers("lower position limits, rad; -.inf for continuous joints")
+    position_max: Array = joint_numbers(
         "upper position limits, rad; .inf for continuous joints", note="above position_min"
     )
-    torque_max: Array = per_joint_numbers("torque limits of the motors, N m", POSITIVE)
-    rotor_inertia: Array = per_joint_numbers(
+    torque_max: Array = joint_numbers("torque limits of the motors, N m", POSITIVE)
+    rotor_inertia: Array = joint_numbers(
         "inertia of the rotors as seen from the joints, kg m^2; none if empty",
         NOT_NEGATIVE,
         if_empty=0.0,
@@ -88,7 +86,7 @@ class RobotConfiguration:
 class LimitedRobotConfiguration(RobotConfiguration):
     """A robot with velocity limits."""
 
-    velocity_max: Array = per_joint_numbers("speed limits, rad/s", POSITIVE)
+    velocity_max: Array = joint_numbers("speed limits, rad/s", POSITIVE)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -24,9 +24,9 @@ from viability_bounds_pkg.parameter import (
     Range,
     above,
     group,
+    joint_numbers,
     number,
     numbers,
-    per_joint_numbers,
     switch,
     text,
     texts,
@@ -48,7 +48,7 @@ class BulletConfiguration(ControlRate, LimitedRobotConfiguration):
         urdf: text of the URDF.
     """
 
-    start_positions: Array = per_joint_numbers("positions at start and after reset, rad", FINITE)
+    start_positions: Array = joint_numbers("positions at start and after reset, rad", FINITE)
     physics_step_max: float = number("longest physics step, s", above(0.0, 1.0), default=0.001)
     clock: str = text(
         "real_time: a period lasts its time on the wall clock; lockstep: until its command comes",
@@ -68,25 +68,25 @@ class BulletConfiguration(ControlRate, LimitedRobotConfiguration):
         live=True,
     )
     publish_clock: bool = switch("publish /clock", default=False)
-    friction_coulomb: Array = per_joint_numbers(
+    friction_coulomb: Array = joint_numbers(
         "dry friction of moving joints, N m; none if empty", NOT_NEGATIVE, if_empty=0.0
     )
-    friction_static: Array = per_joint_numbers(
+    friction_static: Array = joint_numbers(
         "dry friction of joints at rest, N m; that of moving ones if empty",
         NOT_NEGATIVE,
         default=(),
         note="at least friction_coulomb",
     )
-    friction_viscous: Array = per_joint_numbers(
+    friction_viscous: Array = joint_numbers(
         "friction that grows with speed, N m s/rad; none if empty", NOT_NEGATIVE, if_empty=0.0
     )
-    stribeck_velocity: Array = per_joint_numbers(
+    stribeck_velocity: Array = joint_numbers(
         "speed at which static has become Coulomb friction but for 1/e of the difference, rad/s; "
         f"{DEFAULT_STRIBECK_VELOCITY} if empty",
         POSITIVE,
         if_empty=DEFAULT_STRIBECK_VELOCITY,
     )
-    torque_bias: Array = per_joint_numbers(
+    torque_bias: Array = joint_numbers(
         "torque of the motors beyond what is commanded and reported, N m; none if empty",
         FINITE,
         if_empty=0.0,

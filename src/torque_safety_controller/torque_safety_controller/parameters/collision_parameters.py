@@ -19,7 +19,7 @@ from viability_bounds_pkg.parameter import (
     POSITIVE,
     check_per_joint,
     group,
-    per_joint_numbers,
+    joint_numbers,
     switch,
     texts,
 )
@@ -49,16 +49,16 @@ class CollisionConfiguration:
         default=(),
         note="each two links, as in 'link_a link_b'",
     )
-    collision_posture: Array = per_joint_numbers(
+    collision_posture: Array = joint_numbers(
         "for the automatic choice, a posture free of collisions, rad: what is nearer there than "
         "the margin is not kept apart; the middle of the position limits if empty",
         default=(),
         note="within the position limits",
     )
-    acceleration_min: Array = per_joint_numbers(
+    acceleration_min: Array = joint_numbers(
         "for collision_avoidance: lower acceleration limits, rad/s^2", NEGATIVE, default=()
     )
-    acceleration_max: Array = per_joint_numbers(
+    acceleration_max: Array = joint_numbers(
         "for collision_avoidance: upper acceleration limits, rad/s^2", POSITIVE, default=()
     )
     obstacles: tuple[str, ...] = texts(

@@ -17,7 +17,7 @@ from torque_safety_controller.qp.inverse_dynamics_qp import SOLVERS
 from torque_safety_controller.safety.modes import CONTROLS
 from torque_safety_controller.tasks.gains import Gains
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.parameter import Range, above, group, number, per_joint_numbers, text
+from viability_bounds_pkg.parameter import Range, above, group, joint_numbers, number, text
 from viability_bounds_pkg.robot_configuration import (
     ControlRate,
     RobotConfiguration,
@@ -38,7 +38,7 @@ class ControllerConfiguration(ControlRate, TaskFrames, RobotConfiguration):
         additional: settings of the integral action and of the friction compensation.
     """
 
-    torque_rate_max: Array = per_joint_numbers(
+    torque_rate_max: Array = joint_numbers(
         "limits of the rate of torque, N m/s; none if empty", if_empty=np.inf, note="all > 0"
     )
     gains: Gains = group(Gains)

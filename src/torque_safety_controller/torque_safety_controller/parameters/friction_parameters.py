@@ -18,8 +18,8 @@ from viability_bounds_pkg.parameter import (
     NOT_NEGATIVE,
     POSITIVE,
     Range,
+    joint_numbers,
     number,
-    per_joint_numbers,
 )
 
 Array = NDArray[np.float64]
@@ -38,22 +38,22 @@ class FrictionConfiguration:
         default=0.0,
         live=True,
     )
-    friction_model_coulomb: Array = per_joint_numbers(
+    friction_model_coulomb: Array = joint_numbers(
         "dry friction of moving joints, N m; none if empty", NOT_NEGATIVE, default=(), live=True
     )
-    friction_model_static: Array = per_joint_numbers(
+    friction_model_static: Array = joint_numbers(
         "dry friction of joints at rest, N m; that of moving ones if empty",
         NOT_NEGATIVE,
         default=(),
         live=True,
     )
-    friction_model_viscous: Array = per_joint_numbers(
+    friction_model_viscous: Array = joint_numbers(
         "friction that grows with speed, N m s/rad; none if empty",
         NOT_NEGATIVE,
         default=(),
         live=True,
     )
-    friction_model_stribeck_velocity: Array = per_joint_numbers(
+    friction_model_stribeck_velocity: Array = joint_numbers(
         "speed at which static has become Coulomb friction but for 1/e of the difference, rad/s; "
         f"{DEFAULT_STRIBECK_VELOCITY:g} if empty",
         POSITIVE,

@@ -14,9 +14,9 @@ from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import (
     NOT_NEGATIVE,
     above,
+    joint_numbers,
     number,
     numbers,
-    per_joint_numbers,
     text,
 )
 
@@ -39,7 +39,7 @@ class IntegralConfiguration:
         live=True,
         choices=MODES,
     )
-    integral_budget: Array = per_joint_numbers(
+    integral_budget: Array = joint_numbers(
         f"limits of the additional torque, N m; {BUDGET:g} of torque_max if empty",
         NOT_NEGATIVE,
         default=(),

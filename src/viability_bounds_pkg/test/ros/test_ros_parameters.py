@@ -15,9 +15,9 @@ from viability_bounds_pkg.parameter import (
     Range,
     above,
     group,
+    joint_numbers,
     number,
     numbers,
-    per_joint_numbers,
     read,
     switch,
     text,
@@ -37,9 +37,9 @@ class Size:
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Configuration:
     joints: tuple[str, ...] = texts("names")
-    limits: np.ndarray = per_joint_numbers("one a joint, m", POSITIVE)
-    extra: np.ndarray = per_joint_numbers("may be left out", default=())
-    filled: np.ndarray = per_joint_numbers("may be left out, too", if_empty=7.0)
+    limits: np.ndarray = joint_numbers("one a joint, m", POSITIVE)
+    extra: np.ndarray = joint_numbers("may be left out", default=())
+    filled: np.ndarray = joint_numbers("may be left out, too", if_empty=7.0)
     rate: float = number("Hz", above(0.0, 1e3))
     gain: float = number("1/s", above(0.0, 1e3), default=2.0, live=True)
     offset: float = number("less than the gain, 1/s", default=1.0, live=True)

@@ -22,8 +22,8 @@ from viability_bounds_pkg.parameter import (
     Range,
     above,
     check_per_joint,
+    joint_numbers,
     number,
-    per_joint_numbers,
     redeclared,
     text,
 )
@@ -62,15 +62,15 @@ class BoundsConfiguration(ControlRate, LimitedRobotConfiguration):
 
     robot_description: str = redeclared(RobotConfiguration, "robot_description", default="")
     torque_max: Array = redeclared(RobotConfiguration, "torque_max", default=())
-    acceleration_min: Array = per_joint_numbers("lower acceleration limits, rad/s^2", NEGATIVE)
-    acceleration_max: Array = per_joint_numbers("upper acceleration limits, rad/s^2", POSITIVE)
-    acceleration_drift: Array = per_joint_numbers(
+    acceleration_min: Array = joint_numbers("lower acceleration limits, rad/s^2", NEGATIVE)
+    acceleration_max: Array = joint_numbers("upper acceleration limits, rad/s^2", POSITIVE)
+    acceleration_drift: Array = joint_numbers(
         "largest jerk under held torque, rad/s^3; the bounds are tightened by the error that it "
         "causes within a control period; 0 if empty",
         NOT_NEGATIVE,
         if_empty=0.0,
     )
-    acceleration_disturbance: Array = per_joint_numbers(
+    acceleration_disturbance: Array = joint_numbers(
         "how much more than commanded the joints may accelerate by what the model does not know, "
         "friction, payloads, pushes, rad/s^2; the bounds are tightened by it; 0 if empty",
         NOT_NEGATIVE,
@@ -94,7 +94,7 @@ class BoundsConfiguration(ControlRate, LimitedRobotConfiguration):
         default="worst_case",
         choices=LIMITS,
     )
-    acceleration_peak: Array = per_joint_numbers(
+    acceleration_peak: Array = joint_numbers(
         f"largest acceleration that state_dependent allows, rad/s^2; {PEAK:g} times the limits "
         "above if empty",
         POSITIVE,
