@@ -29,12 +29,12 @@ from torque_safety_controller.collision.geometry import link_shapes, load_geomet
 from torque_safety_controller.collision.kernels import Pairs
 from torque_safety_controller.collision.model import CollisionModel, build_collision_model
 from torque_safety_controller.controller import Controller
-from torque_safety_controller.parameters import controller_parameters
+from torque_safety_controller.parameters import ControllerConfiguration
 from torque_safety_controller.qp.constraints import AccelerationRange
 from torque_safety_controller.robot_model import RobotModel
-from viability_bounds_pkg.node import bounds_parameters
+from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
+from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.robot_description import build_model, read_urdf
-from viability_bounds_pkg.ros.parameters import read_values
 from viability_bounds_pkg.state import State
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -84,14 +84,13 @@ class CollisionRobot:
 
     def controller(self, collision: CollisionAvoidance | None) -> Controller:
         """Return the controller that its parameter file describes."""
-        values = read_values(controller_parameters.TABLE, self.values)
-        config = controller_parameters.make_configuration(values)
+        config = read(ControllerConfiguration, self.values)
         controller = Controller(
             RobotModel(self.model, config.end_effector_frame, config.dt),
-            config.tau_max,
+            config.torque_max,
             config.gains,
-            config.tau_rate_max,
-            AdditionalTorque(config.additional, config.task_rows),
+            config.torque_rate_max,
+            AdditionalTorque(config.additional, config.integral.task_rows),
             config.qp_solver,
             [] if collision is None else [collision],
         )
@@ -100,8 +99,7 @@ class CollisionRobot:
 
     def bounds(self):
         """Return the function from a state to bounds that its parameter file describes."""
-        values = read_values(bounds_parameters.TABLE, self.values)
-        return bounds_parameters.make_configuration(values, lambda _: self.model).solve
+        return make_bounds(read(BoundsConfiguration, self.values), lambda _: self.model).solve
 
     def states(self, speed: float = 1.0) -> list[tuple[np.ndarray, ...]]:
         """Return arguments of `CollisionAvoidance.rows`."""

@@ -39,7 +39,7 @@ def main() -> int:
     ).jerk
     margins = torque_margins(1.1 * jerk, DT)
     solver = BoundsSolver(tightened(limits, margins), 2 * DT, margins.acceleration, period=DT)
-    gains = Gains(100.0, 20.0, 1.0, 10.0, 6.0, 1e-3, True, 20.0)
+    gains = Gains(pose_kp=100.0, posture_kp=10.0)
     controller = Controller(RobotModel(model, "effector_body", DT), tau_max, gains)
     q, v, data = np.full(n, 0.3), np.zeros(n), model.createData()
     controller.reset(q)

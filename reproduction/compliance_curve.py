@@ -151,7 +151,7 @@ def steps_at(run: Drawn, switches: Mapping[float, str]) -> list[tuple[float, flo
     A switch acts in the step after the one that brings it; three steps are counted as its own,
     those within 0.2 s before and after as beside it.
     """
-    tau = column(run.samples, "tau") / run.loop.config.tau_max
+    tau = column(run.samples, "tau") / run.loop.config.torque_max
     steps = np.abs(np.diff(tau, axis=0)).max(axis=1)
     wide, result = round(0.2 / run.loop.dt), []
     for time in sorted(switches):
@@ -315,7 +315,7 @@ def switching() -> Figure:
         "hand_m": float(place.max()),
         "within_limits": float(within_limits(run.loop)),
     }
-    tau = column(run.samples, "tau") / run.loop.config.tau_max
+    tau = column(run.samples, "tau") / run.loop.config.torque_max
     figure.data = {"t": run.t, "tau": column(run.samples, "tau"), "hand": place}
     picture, axes = plt.subplots(3, 1, figsize=(10, 9), sharex=True, layout="constrained")
     axes[0].plot(run.t, tau, lw=1, label=run.loop.config.joints)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import pinocchio as pin
@@ -17,20 +17,18 @@ import yaml
 from chain import ROOT
 
 from sim_bridge.bullet.limit_monitor import LimitMonitor
-from sim_bridge.nodes import bullet_parameters
+from sim_bridge.nodes.bullet_parameters import BulletConfiguration, make_robot
 from sim_bridge.nodes.ft_sensor import ForceTorqueReading
 from torque_safety_controller.controller import ControlOutput
 from torque_safety_controller.node import assembly
-from torque_safety_controller.parameters.controller_parameters import (
-    TABLE,
-    ControllerConfiguration,
-    make_configuration,
-)
+from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.qp.constraints import AccelerationRange
-from viability_bounds_pkg.node import bounds_parameters
-from viability_bounds_pkg.robot_description import build_model, read_urdf
-from viability_bounds_pkg.ros.parameters import Parameter, read_values
+from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
+from viability_bounds_pkg.parameter import read
+from viability_bounds_pkg.robot_configuration import load_model
 from viability_bounds_pkg.state import State
+
+Configuration = TypeVar("Configuration")
 
 
 class Sample(NamedTuple):
@@ -61,45 +59,38 @@ class DirectLoop:
     def __init__(self, robot: str, changed: Mapping[str, Any] | None = None) -> None:
         self._file = yaml.safe_load((ROOT / "config" / f"{robot}.yaml").read_text())
         self._changed = dict(changed or {})
-        bullet = self._values("bullet_node", bullet_parameters.TABLE)
-        config = bullet_parameters.make_configuration(bullet)
-        self.robot = bullet_parameters.make_robot(config, bullet)
-        self.robot.monitor = LimitMonitor(config.q_min, config.q_max, config.v_max, config.tau_max)
+        config = self._configuration("bullet_node", BulletConfiguration)
+        self.robot = make_robot(config)
+        self.robot.monitor = LimitMonitor(
+            config.position_min, config.position_max, config.velocity_max, config.torque_max
+        )
         self.config = config
-        self.model = build_model(
-            read_urdf(bullet["robot_description"]),
-            config.joints,
-            config.locked,
-            bullet["rotor_inertia"] if len(bullet["rotor_inertia"]) else None,
-        )
-        bounds = bounds_parameters.make_configuration(
-            self._values("bounds_node", bounds_parameters.TABLE), lambda _: self.model
-        )
+        self.model = load_model(config, config.urdf)
+        bounds = self._configuration("bounds_node", BoundsConfiguration)
         self.limits = bounds.limits
-        self._bounds = bounds.solve
+        self._bounds = make_bounds(bounds, lambda _: self.model).solve
         self.controller, _ = assembly.make_controller(self._controller_configuration())
         self.sensing = True
         self._sensor = None
         interaction = self.controller.interaction
-        if config.sensor.frame and interaction is not None and interaction.sensor is not None:
+        if config.sensor.ft_frame and interaction is not None and interaction.sensor is not None:
             self._sensor = ForceTorqueReading(self.robot, config.sensor)
         self.samples: list[Sample] = []
         self.t = 0.0
-        self.robot.reset(config.q_start, np.zeros(len(config.joints)))
+        self.robot.reset(config.start_positions, np.zeros(len(config.joints)))
         self.begin()
 
-    def _values(self, node: str, table: tuple[Parameter, ...]) -> dict[str, Any]:
-        """Return a node's parameters as it would get them from the file."""
+    def _configuration(self, node: str, kind: type[Configuration]) -> Configuration:
+        """Return a node's configuration as it would get it from the file."""
         given: dict[str, Any] = {}
         for section in ("/**", f"/**/{node}"):
             given |= self._file.get(section, {}).get("ros__parameters", {})
         given |= self._changed
-        return read_values(table, given)
+        return read(kind, given)
 
     def _controller_configuration(self) -> ControllerConfiguration:
         """Return what the controller node would be made of."""
-        values = self._values("controller_node", TABLE)
-        return make_configuration(values)
+        return self._configuration("controller_node", ControllerConfiguration)
 
     def change(self, **parameters: Any) -> None:
         """Change live parameters of the controller, as a running node would."""
@@ -161,7 +152,9 @@ class DirectLoop:
         """Play one control step under position control by the robot's drives."""
         q, v, _ = self.robot.state()
         config = self.config
-        self.robot.move(q_des, np.zeros(q.size), config.tau_max, config.v_max, config.substeps)
+        self.robot.move(
+            q_des, np.zeros(q.size), config.torque_max, config.velocity_max, config.substeps
+        )
         self._record(q, v, self.robot.state().motor_torque)
 
     def bumpless_transfer(self, q_des: np.ndarray) -> None:

@@ -107,7 +107,7 @@ def switched() -> tuple[float, float]:
         loop.controller.set_pose_goal(home * pin.SE3(np.eye(3), np.array([0.05, 0.0, 0.05])))
         before = loop.run(0.3)[-2:]
         loop.change(**changes)
-        tau = column((*before, *loop.run(loop.dt)), "tau") / loop.config.tau_max
+        tau = column((*before, *loop.run(loop.dt)), "tau") / loop.config.torque_max
         steps.append(np.abs(np.diff(tau, axis=0)).max(axis=1))
         loop.controller.set_pose_goal(home)
         loop.run(1.0)

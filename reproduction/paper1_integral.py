@@ -42,9 +42,9 @@ def figure_3() -> Figure:
     """From position to torque control, with the elbow loaded by friction."""
     figure = Figure("paper1-fig3")
     loop = DirectLoop(ROBOT)
-    q = loop.config.q_start.copy()
+    q = loop.config.start_positions.copy()
     for k in range(1500):  # move, so that friction holds a part of the weight, and rest
-        q[ELBOW] = loop.config.q_start[ELBOW] + 0.1 * min(1.0, k / 1000)
+        q[ELBOW] = loop.config.start_positions[ELBOW] + 0.1 * min(1.0, k / 1000)
         loop.move(q)
     before = len(loop.samples)
     loop.bumpless_transfer(q)
@@ -53,11 +53,11 @@ def figure_3() -> Figure:
     tau, additional = column(samples, "tau"), column(samples, "additional")
     t = column(samples, "t") - samples[501].t
     figure.data = {"t": t, "tau": tau, "additional": additional, "q": column(samples, "q")}
-    jumps = np.abs(np.diff(tau, axis=0)) / loop.config.tau_max
+    jumps = np.abs(np.diff(tau, axis=0)) / loop.config.torque_max
     # Sample 500 is the drives' last, 501 the first under torque control.
     ordinary = np.delete(jumps, 500, axis=0).max()
     excess = float(jumps[500].max() - ordinary)
-    without = np.abs(additional[501] / loop.config.tau_max)
+    without = np.abs(additional[501] / loop.config.torque_max)
     figure.metrics = {
         "handover_step_share": float(jumps[500].max()),
         "ordinary_step_share": float(ordinary),
@@ -313,7 +313,7 @@ class Disturbed:
                 integral_lambda=float(rng.choice([2.0, 10.0, 100.0])),
                 integral_leak=[float(rng.choice([0.0, 0.1, 1.0])), 100.0, float(rng.uniform())],
                 integral_action=str(rng.choice(["none", "joints", "joints", "task"])),
-                integral_budget=(rng.uniform(0.05, 0.3) * loop.config.tau_max).tolist(),
+                integral_budget=(rng.uniform(0.05, 0.3) * loop.config.torque_max).tolist(),
             )
 
     def _step(self) -> None:
@@ -324,11 +324,13 @@ class Disturbed:
         sample = loop.samples.pop()
         self.steps += 1
         self.not_finite += not np.isfinite(step.tau).all()
-        ratio = (np.abs(step.tau) / loop.config.tau_max).max()
+        ratio = (np.abs(step.tau) / loop.config.torque_max).max()
         self.torque_ratio = max(self.torque_ratio, float(ratio))
         self.relaxed += step.relaxation is not None
-        over = np.maximum(sample.q - loop.config.q_max, loop.config.q_min - sample.q).max()
-        fast = (np.abs(sample.v) - loop.config.v_max).max()
+        over = np.maximum(
+            sample.q - loop.config.position_max, loop.config.position_min - sample.q
+        ).max()
+        fast = (np.abs(sample.v) - loop.config.velocity_max).max()
         self.deepest, self.fastest = max(self.deepest, over), max(self.fastest, fast)
         if over > 0.0 or fast > 0.0:
             self.beyond += 1

@@ -15,21 +15,23 @@ from pathlib import Path
 import numpy as np
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
-from sim_bridge.nodes import bullet_parameters, scenario_parameters
 from sim_bridge.nodes import topics as bullet_topics
+from sim_bridge.nodes.bullet_parameters import BulletConfiguration
+from sim_bridge.scenario.scenario import ScenarioConfiguration
 from torque_safety_controller.node import topics as controller_topics
-from torque_safety_controller.parameters import controller_parameters
-from viability_bounds_pkg.node import bounds_parameters
-from viability_bounds_pkg.ros.parameters import REQUIRED, Parameter
+from torque_safety_controller.parameters import ControllerConfiguration
+from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
+from viability_bounds_pkg.parameter import REQUIRED, Parameter, parameter_table
 from viability_bounds_pkg.ros.topics import SHARED_TOPICS, OfferedService, Topic
 
 ROOT = Path(__file__).resolve().parent.parent
-TABLES: dict[str, Sequence[Parameter]] = {
-    "bounds_node": bounds_parameters.TABLE,
-    "controller_node": controller_parameters.TABLE,
-    "bullet_node": bullet_parameters.TABLE,
-    "scenario_node": scenario_parameters.TABLE,
+CONFIGURATIONS = {
+    "bounds_node": BoundsConfiguration,
+    "controller_node": ControllerConfiguration,
+    "bullet_node": BulletConfiguration,
+    "scenario_node": ScenarioConfiguration,
 }
+TABLES = {node: parameter_table(kind) for node, kind in CONFIGURATIONS.items()}
 TOPICS: tuple[Topic, ...] = (*SHARED_TOPICS, *controller_topics.TOPICS, *bullet_topics.TOPICS)
 SERVICES: tuple[OfferedService, ...] = (*controller_topics.SERVICES, *bullet_topics.SERVICES)
 _HEAD = "<!-- Made by scripts/make_reference.py: change the tables in the code instead. -->\n"

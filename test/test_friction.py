@@ -11,7 +11,7 @@ import pytest
 from direct import DirectLoop, column
 from ros_harness import CONFIG, read_config
 
-from sim_bridge.nodes import bullet_parameters
+from sim_bridge.nodes.bullet_parameters import BulletConfiguration, make_robot
 from sim_bridge.tools.excitation import excitation
 from sim_bridge.tools.record_excitation import record
 from torque_safety_controller.friction.compensation import GAIN
@@ -19,7 +19,7 @@ from torque_safety_controller.friction.identification import friction_model, ide
 from torque_safety_controller.friction.joint_recording import Recording
 from torque_safety_controller.tasks.gains import critical_damping
 from viability_bounds_pkg.cli.limits_file import read_robot
-from viability_bounds_pkg.ros.parameters import read_values
+from viability_bounds_pkg.parameter import read
 
 ROBOT = "talos_left_arm"
 GIVEN = read_config(ROBOT, "bullet_node")
@@ -32,11 +32,10 @@ THETA = 3.0  # 1/s, the default
 @pytest.fixture(scope="module")
 def found():
     """The friction found in 36 s of motion of arms 10% heavier than the model."""
-    values = read_values(bullet_parameters.TABLE, GIVEN)
-    config = bullet_parameters.make_configuration(values)
+    config = read(BulletConfiguration, GIVEN)
     assert set(GIVEN["mass_scales"]) == {1.1}
-    motion = excitation(config, config.q_start, config.dt)
-    with closing(bullet_parameters.make_robot(config, values)) as robot:
+    motion = excitation(config, config.start_positions, config.dt)
+    with closing(make_robot(config)) as robot:
         recorded, monitor = record(robot, config, *motion)
     assert not monitor.violated
     model = read_robot(CONFIG / f"{ROBOT}.yaml").model

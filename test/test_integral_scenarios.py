@@ -65,20 +65,20 @@ def test_a_pause_of_the_robot_does_not_kick():
     )
     additional = loop.controller.additional.last
     assert np.isfinite(step.tau).all()
-    jump = np.abs(additional - before.additional) / loop.config.tau_max
+    jump = np.abs(additional - before.additional) / loop.config.torque_max
     assert jump.max() < 1e-2
 
 
 def test_the_handover_does_not_jolt():
     loop = DirectLoop(ROBOT)
-    q = loop.config.q_start.copy()
+    q = loop.config.start_positions.copy()
     for k in range(1200):
-        q[5] = loop.config.q_start[5] + 0.1 * min(1.0, k / 1000)
+        q[5] = loop.config.start_positions[5] + 0.1 * min(1.0, k / 1000)
         loop.move(q)
     loop.bumpless_transfer(q)
     loop.run(0.2)
     samples = tuple(loop.samples[1000:])
-    jumps = np.abs(np.diff(column(samples, "tau"), axis=0)) / loop.config.tau_max
+    jumps = np.abs(np.diff(column(samples, "tau"), axis=0)) / loop.config.torque_max
     # The drives' last step is 1200, counted from the beginning.
     assert jumps[200].max() < np.delete(jumps, 200, axis=0).max() + 0.01
     assert np.ptp(column(samples, "q")[200:], axis=0).max() < 1e-3

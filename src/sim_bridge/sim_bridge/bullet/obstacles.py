@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sim_bridge.bullet.vectors import finite_vector
 from viability_bounds_pkg.exceptions import ArmSafetyError
+from viability_bounds_pkg.parameter import Range, above, number
 
 Array = NDArray[np.float64]
 
@@ -93,20 +94,19 @@ class Contact(NamedTuple):
 
 @dataclass(frozen=True)
 class ContactMaterial:
-    """Friction, stiffness and damping of obstacles.
-
-    Args:
-        friction: Coulomb's coefficient.
-        stiffness: of an obstacle as a whole against displacement, N/m.
-        damping: against its velocity, N s/m.
+    """Friction, stiffness and damping of obstacles; each obstacle moves as a whole.
 
     Raises:
         ValueError: one of them is not finite, the stiffness not positive, another one negative.
     """
 
-    friction: float = 0.5
-    stiffness: float = 2e5
-    damping: float = 600.0
+    friction: float = number(
+        "Coulomb's coefficient between robot and obstacles", Range(0.0, 10.0), default=0.5
+    )
+    stiffness: float = number(
+        "stiffness of obstacles, N/m; 2e5: 0.5 mm at 100 N", above(0.0, 1e9), default=2e5
+    )
+    damping: float = number("damping of obstacles, N s/m", Range(0.0, 1e9), default=600.0)
 
     def __post_init__(self) -> None:
         """Check the values."""

@@ -20,7 +20,7 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from sim_bridge.bullet.limit_monitor import LimitMonitor
-from sim_bridge.nodes.bullet_parameters import TABLE, make_configuration, make_robot
+from sim_bridge.nodes.bullet_parameters import BulletConfiguration, make_robot
 from sim_bridge.nodes.ft_sensor import ForceTorquePublisher
 from sim_bridge.nodes.joint_command import (
     CommandError,
@@ -61,14 +61,16 @@ class BulletNode(Node):
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("bullet_node", **node_arguments)
         try:
-            self._node_parameters = NodeParameters(self, TABLE, make_configuration)
+            self._node_parameters = NodeParameters(self, BulletConfiguration)
             config = self._node_parameters.configuration
-            self._robot = make_robot(config, self._node_parameters.values)
+            self._robot = make_robot(config)
         except SettingError:
             self.destroy_node()
             raise
         self._config = config
-        self._monitor = LimitMonitor(config.q_min, config.q_max, config.v_max, config.tau_max)
+        self._monitor = LimitMonitor(
+            config.position_min, config.position_max, config.velocity_max, config.torque_max
+        )
         self._robot.monitor = self._monitor
         self._dt_ns = round(1e9 * config.dt)
         self._paused = config.start_paused
@@ -80,7 +82,7 @@ class BulletNode(Node):
             self, self._robot, config.external_wrench_timeout, self._refused
         )
         self._ft_publisher = None
-        if config.sensor.frame:
+        if config.sensor.ft_frame:
             self._ft_publisher = ForceTorquePublisher(self, self._robot, config.sensor)
         self._restart()
 
@@ -106,7 +108,7 @@ class BulletNode(Node):
         config = self._config
         n = len(config.joints)
         self._world.clear()
-        self._robot.reset(config.q_start, np.zeros(n))
+        self._robot.reset(config.start_positions, np.zeros(n))
         if self._ft_publisher is not None:
             self._ft_publisher.restart()
         self._monitor.reset()
@@ -149,12 +151,12 @@ class BulletNode(Node):
         self._world.apply_due(self._stamp)
         if self._command is None:
             self._braked += 1
-            self._robot.brake(config.substeps, config.tau_max)
+            self._robot.brake(config.substeps, config.torque_max)
         elif isinstance(self._command, TorqueCommand):
             self._robot.step(self._command.tau, config.substeps)
         else:
             q, v = self._command
-            self._robot.move(q, v, config.tau_max, config.v_max, config.substeps)
+            self._robot.move(q, v, config.torque_max, config.velocity_max, config.substeps)
         self._periods += 1
         self._advanced = True
         if self._periods >= self._pause_at:
@@ -206,7 +208,7 @@ class BulletNode(Node):
         self._latencies.append(time.monotonic() - self._published_at)
         self._missed_in_row = 0
         if isinstance(command, TorqueCommand):
-            tau, tau_max = command.tau, self._config.tau_max
+            tau, tau_max = command.tau, self._config.torque_max
             self._torque_ratio = max(self._torque_ratio, float(np.max(np.abs(tau) / tau_max)))
             # The motors do not exceed their limits, whatever the command.
             command = TorqueCommand(np.clip(tau, -tau_max, tau_max))

@@ -1,265 +1,158 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The robot node's parameters: the table, their checks, and the robot made of them."""
+"""The robot node's parameters, and the robot made of them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_bridge.bullet.joint_friction import DEFAULT_STRIBECK_VELOCITY, JointFriction
 from sim_bridge.bullet.obstacles import ContactMaterial
 from sim_bridge.bullet.robot import BulletRobot
-from sim_bridge.nodes.ft_sensor import SENSOR_TABLE, SensorConfiguration, sensor_configuration
-from sim_bridge.urdf.arm import ConfiguredArm
+from sim_bridge.nodes.ft_sensor import SensorConfiguration
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.robot_description import RobotDescriptionError
-from viability_bounds_pkg.ros.parameters import (
+from viability_bounds_pkg.parameter import (
     FINITE,
     NOT_NEGATIVE,
     POSITIVE,
-    Parameter,
     Range,
     above,
-    given_or,
-    joint_names,
+    group,
+    joint_numbers,
+    number,
+    numbers,
+    switch,
+    text,
+    texts,
+    whole_number,
 )
-from viability_bounds_pkg.ros.robot_parameters import (
-    ROBOT_TABLE,
-    locked_joints,
-    position_limits,
-    robot_urdf,
-)
+from viability_bounds_pkg.robot_configuration import ControlRate, LimitedRobotConfiguration
+from viability_bounds_pkg.robot_description import RobotDescriptionError
+
+Array = NDArray[np.float64]
 
 CLOCKS = ("real_time", "lockstep")
-_MATERIAL = ContactMaterial()
 
-TABLE = (
-    *ROBOT_TABLE,
-    Parameter(
-        "velocity_max",
-        list[float],
-        "speed limits, rad/s",
-        per_joint=True,
-        within=POSITIVE,
-    ),
-    Parameter(
-        "start_positions",
-        list[float],
-        "positions at start and after reset, rad",
-        per_joint=True,
-        within=FINITE,
-    ),
-    Parameter("rate_hz", float, "rate of the control loop, Hz", within=above(0.0, 1e4)),
-    Parameter(
-        "physics_step_max",
-        float,
-        "longest physics step, s",
-        default=0.001,
-        within=above(0.0, 1.0),
-    ),
-    Parameter(
-        "clock",
-        str,
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BulletConfiguration(ControlRate, LimitedRobotConfiguration):
+    """Parameters of the robot node; arrays of shape (n,) in `joints` order.
+
+    Attributes:
+        urdf: text of the URDF.
+    """
+
+    start_positions: Array = joint_numbers("positions at start and after reset, rad", FINITE)
+    physics_step_max: float = number("longest physics step, s", above(0.0, 1.0), default=0.001)
+    clock: str = text(
         "real_time: a period lasts its time on the wall clock; lockstep: until its command comes",
         default="real_time",
         choices=CLOCKS,
-    ),
-    Parameter(
-        "command_timeout",
-        int,
+    )
+    command_timeout: int = whole_number(
         "control periods that the last command is held for before the robot brakes",
+        Range(1, 1000),
         default=5,
-        within=Range(1, 1000),
-    ),
-    Parameter("start_paused", bool, "wait for the pause service before moving", default=False),
-    Parameter(
-        "pause_after",
-        float,
+    )
+    start_paused: bool = switch("wait for the pause service before moving", default=False)
+    pause_after: float = number(
         "robot time after which it pauses by itself, s since it began to move; 0: never",
+        Range(0.0, 1e5),
         default=0.0,
         live=True,
-        within=Range(0.0, 1e5),
-    ),
-    Parameter("publish_clock", bool, "publish /clock", default=False),
-    Parameter(
-        "friction_coulomb",
-        list[float],
-        "dry friction of moving joints, N m; none if empty",
-        default=np.zeros(0),
-        per_joint=True,
-        within=NOT_NEGATIVE,
-    ),
-    Parameter(
-        "friction_static",
-        list[float],
+    )
+    publish_clock: bool = switch("publish /clock", default=False)
+    friction_coulomb: Array = joint_numbers(
+        "dry friction of moving joints, N m; none if empty", NOT_NEGATIVE, if_empty=0.0
+    )
+    friction_static: Array = joint_numbers(
         "dry friction of joints at rest, N m; that of moving ones if empty",
-        default=np.zeros(0),
-        per_joint=True,
-        within=NOT_NEGATIVE,
+        NOT_NEGATIVE,
+        default=(),
         note="at least friction_coulomb",
-    ),
-    Parameter(
-        "friction_viscous",
-        list[float],
-        "friction that grows with speed, N m s/rad; none if empty",
-        default=np.zeros(0),
-        per_joint=True,
-        within=NOT_NEGATIVE,
-    ),
-    Parameter(
-        "stribeck_velocity",
-        list[float],
+    )
+    friction_viscous: Array = joint_numbers(
+        "friction that grows with speed, N m s/rad; none if empty", NOT_NEGATIVE, if_empty=0.0
+    )
+    stribeck_velocity: Array = joint_numbers(
         "speed at which static has become Coulomb friction but for 1/e of the difference, rad/s; "
         f"{DEFAULT_STRIBECK_VELOCITY} if empty",
-        default=np.zeros(0),
-        per_joint=True,
-        within=POSITIVE,
-    ),
-    Parameter(
-        "torque_bias",
-        list[float],
+        POSITIVE,
+        if_empty=DEFAULT_STRIBECK_VELOCITY,
+    )
+    torque_bias: Array = joint_numbers(
         "torque of the motors beyond what is commanded and reported, N m; none if empty",
-        default=np.zeros(0),
-        per_joint=True,
-        within=FINITE,
-    ),
-    Parameter(
-        "mass_scale_links",
-        list[str],
-        "links with another mass than in the URDF",
-        default=(),
-        note="each once",
-    ),
-    Parameter(
-        "mass_scales",
-        list[float],
+        FINITE,
+        if_empty=0.0,
+    )
+    mass_scale_links: tuple[str, ...] = texts(
+        "links with another mass than in the URDF", default=(), note="each once"
+    )
+    mass_scales: Array = numbers(
         "factors for their masses and inertias",
-        default=np.zeros(0),
-        within=POSITIVE,
+        POSITIVE,
+        default=(),
         note="one for each of 'mass_scale_links'",
-    ),
-    Parameter(
-        "external_wrench_timeout",
-        float,
-        "how long a push lasts, s of robot time",
-        default=0.5,
-        within=above(0.0, 3600.0),
-    ),
-    Parameter(
-        "obstacle_friction",
-        float,
-        "Coulomb's coefficient between robot and obstacles",
-        default=_MATERIAL.friction,
-        within=Range(0.0, 10.0),
-    ),
-    Parameter(
-        "obstacle_stiffness",
-        float,
-        "stiffness of obstacles, N/m; 2e5: 0.5 mm at 100 N",
-        default=_MATERIAL.stiffness,
-        within=above(0.0, 1e9),
-    ),
-    Parameter(
-        "obstacle_damping",
-        float,
-        "damping of obstacles, N s/m",
-        default=_MATERIAL.damping,
-        within=Range(0.0, 1e9),
-    ),
-    *SENSOR_TABLE,
-)
+    )
+    external_wrench_timeout: float = number(
+        "how long a push lasts, s of robot time", above(0.0, 3600.0), default=0.5
+    )
+    material: ContactMaterial = group(ContactMaterial, "obstacle_")
+    sensor: SensorConfiguration = group(SensorConfiguration)
+    urdf: str = field(init=False)
 
+    def __post_init__(self) -> None:
+        """Check what concerns several parameters, and read the URDF."""
+        super().__post_init__()
+        static = self.friction_static
+        if len(static) and not (static >= self.friction_coulomb).all():
+            raise SettingError("friction_static", static, "at least friction_coulomb everywhere")
+        links, scales = self.mass_scale_links, self.mass_scales
+        if len(set(links)) != len(links):
+            raise SettingError("mass_scale_links", links, "links of the URDF, each once")
+        if len(links) != len(scales):
+            allowed = f"{len(links)} numbers, one for each of 'mass_scale_links'"
+            raise SettingError("mass_scales", scales, allowed)
+        object.__setattr__(self, "urdf", self.read_urdf())
 
-@dataclass(frozen=True)
-class BulletConfiguration(ConfiguredArm):
-    """Checked parameters of the robot node; arrays of shape (n,) in `joints` order."""
+    @property
+    def lockstep(self) -> bool:
+        """Whether a period lasts until its command comes."""
+        return self.clock == "lockstep"
 
-    joint_friction: JointFriction
-    mass_scales: dict[str, float]
-    q_start: np.ndarray
-    dt: float
-    substeps: int
-    lockstep: bool
-    command_timeout: int
-    start_paused: bool
-    pause_after: float
-    publish_clock: bool
-    external_wrench_timeout: float
-    material: ContactMaterial
-    sensor: SensorConfiguration
-
-
-def make_configuration(values: Mapping[str, Any]) -> BulletConfiguration:
-    """Check parameter values and read the URDF.
-
-    Raises:
-        SettingError: a value cannot be used.
-    """
-    joints = joint_names(values)
-    urdf = robot_urdf(values["robot_description"])
-    dt = 1.0 / values["rate_hz"]
-    q_min, q_max = position_limits(values, joints)
-    return BulletConfiguration(
-        urdf=urdf,
-        joints=joints,
-        locked=locked_joints(values),
-        q_min=q_min,
-        q_max=q_max,
-        v_max=values["velocity_max"],
-        tau_max=values["torque_max"],
-        joint_friction=_joint_friction(values, joints),
-        mass_scales=_mass_scales(values),
-        q_start=values["start_positions"],
-        dt=dt,
+    @cached_property
+    def substeps(self) -> int:
+        """Physics steps of a control period."""
         # The rounding keeps 1 kHz with steps of 1 ms from becoming two steps of 0.5 ms.
-        substeps=max(1, int(np.ceil(dt / values["physics_step_max"] - 1e-9))),
-        lockstep=values["clock"] == "lockstep",
-        command_timeout=values["command_timeout"],
-        start_paused=values["start_paused"],
-        pause_after=values["pause_after"],
-        publish_clock=values["publish_clock"],
-        external_wrench_timeout=values["external_wrench_timeout"],
-        material=ContactMaterial(
-            values["obstacle_friction"],
-            values["obstacle_stiffness"],
-            values["obstacle_damping"],
-        ),
-        sensor=sensor_configuration(values),
-    )
+        return max(1, math.ceil(self.dt / self.physics_step_max - 1e-9))
+
+    @property
+    def scaled_links(self) -> dict[str, float]:
+        """Factors for masses and inertias by link."""
+        return dict(zip(self.mass_scale_links, map(float, self.mass_scales), strict=True))
+
+    @property
+    def joint_friction(self) -> JointFriction:
+        """Friction, bias and rotors of the joints."""
+        static = self.friction_static
+        return JointFriction(
+            len(self.joints),
+            friction_coulomb=self.friction_coulomb,
+            friction_static=static if len(static) else self.friction_coulomb,
+            friction_viscous=self.friction_viscous,
+            stribeck_velocity=self.stribeck_velocity,
+            torque_bias=self.torque_bias,
+            rotor_inertia=self.rotor_inertia,
+        )
 
 
-def _joint_friction(values: Mapping[str, Any], joints: tuple[str, ...]) -> JointFriction:
-    zero = np.zeros(len(joints))
-    coulomb = given_or(values, "friction_coulomb", zero)
-    static = given_or(values, "friction_static", coulomb)
-    if not (static >= coulomb).all():
-        raise SettingError("friction_static", static, "at least friction_coulomb everywhere")
-    return JointFriction(
-        len(joints),
-        friction_coulomb=coulomb,
-        friction_static=static,
-        friction_viscous=given_or(values, "friction_viscous", zero),
-        stribeck_velocity=given_or(values, "stribeck_velocity", zero + DEFAULT_STRIBECK_VELOCITY),
-        torque_bias=given_or(values, "torque_bias", zero),
-        rotor_inertia=given_or(values, "rotor_inertia", zero),
-    )
-
-
-def _mass_scales(values: Mapping[str, Any]) -> dict[str, float]:
-    links, scales = values["mass_scale_links"], values["mass_scales"]
-    if len(set(links)) != len(links):
-        raise SettingError("mass_scale_links", links, "links of the URDF, each once")
-    if len(links) != len(scales):
-        allowed = f"{len(links)} numbers, one for each of 'mass_scale_links'"
-        raise SettingError("mass_scales", scales, allowed)
-    return dict(zip(links, map(float, scales), strict=True))
-
-
-def make_robot(config: BulletConfiguration, values: Mapping[str, Any]) -> BulletRobot:
+def make_robot(config: BulletConfiguration) -> BulletRobot:
     """Return the robot that the parameters describe.
 
     Raises:
@@ -272,26 +165,27 @@ def make_robot(config: BulletConfiguration, values: Mapping[str, Any]) -> Bullet
             locked_positions=config.locked,
             physics_dt=config.dt / config.substeps,
             joint_friction=config.joint_friction,
-            mass_scales=config.mass_scales,
+            mass_scales=config.scaled_links,
             material=config.material,
-            sensor_frame=config.sensor.frame,
+            sensor_frame=config.sensor.ft_frame,
         )
     except RobotDescriptionError as error:
-        name, allowed = _culprit(config)
-        raise SettingError(name, values[name], f"{allowed} ({error})") from error
+        name, value, allowed = _culprit(config)
+        raise SettingError(name, value, f"{allowed} ({error})") from error
 
 
-def _culprit(config: BulletConfiguration) -> tuple[str, str]:
-    """Return the parameter that prevents the robot, and its allowed values."""
+def _culprit(config: BulletConfiguration) -> tuple[str, Any, str]:
+    """Return the parameter that prevents the robot, its value, and what it may be."""
     root = ElementTree.fromstring(config.urdf)
     joints = {joint.get("name") for joint in root.iter("joint")}
     if not joints >= set(config.joints):
-        return "joints", "joints of the URDF"
-    if not joints - set(config.joints) >= set(config.locked):
-        return "locked_joints", "other joints of the URDF"
-    if not {link.get("name") for link in root.iter("link")} >= set(config.mass_scales):
-        return "mass_scale_links", "links of the URDF"
+        return "joints", config.joints, "joints of the URDF"
+    if not joints - set(config.joints) >= set(config.locked_joints):
+        return "locked_joints", config.locked_joints, "other joints of the URDF"
+    if not {link.get("name") for link in root.iter("link")} >= set(config.mass_scale_links):
+        return "mass_scale_links", config.mass_scale_links, "links of the URDF"
     carriers = {parent.get("link") for parent in root.iter("parent")}
-    if config.sensor.frame and config.sensor.frame not in carriers:
-        return "ft_frame", "a link of the URDF that carries others, or empty"
-    return "robot_description", "a URDF that PyBullet can load"
+    if config.sensor.ft_frame and config.sensor.ft_frame not in carriers:
+        allowed = "a link of the URDF that carries others, or empty"
+        return "ft_frame", config.sensor.ft_frame, allowed
+    return "robot_description", config.robot_description, "a URDF that PyBullet can load"

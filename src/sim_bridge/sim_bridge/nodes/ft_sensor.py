@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import WrenchStamped
@@ -14,69 +12,45 @@ from rclpy.node import Node
 
 from sim_bridge.bullet.robot import BulletRobot
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.ros.parameters import (
+from viability_bounds_pkg.parameter import (
     FINITE,
     NOT_NEGATIVE,
-    Parameter,
     Range,
-    given_or,
+    numbers,
+    text,
+    whole_number,
 )
 from viability_bounds_pkg.ros.runtime import set_stamp
 from viability_bounds_pkg.ros.topics import FT_WRENCH
 
 Array = NDArray[np.float64]
 
-SENSOR_TABLE = (
-    Parameter("ft_frame", str, "link that is a force/torque sensor; none if empty", default=""),
-    Parameter(
-        "ft_bias",
-        list[float],
-        "bias of the sensor, force and moment, N and N m; none if empty",
-        default=np.zeros(0),
-        length=6,
-        within=FINITE,
-    ),
-    Parameter(
-        "ft_noise",
-        list[float],
-        "standard deviation of its noise, force and moment, N and N m; none if empty",
-        default=np.zeros(0),
-        length=6,
-        within=NOT_NEGATIVE,
-    ),
-    Parameter("ft_seed", int, "seed of that noise", default=0, within=Range(0, 2**31 - 1)),
-)
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class SensorConfiguration:
-    """A force/torque sensor.
+    """Parameters of a force/torque sensor."""
 
-    Attributes:
-        frame: its link; empty if there is none.
-        bias: force and moment, shape (6,), N and N m.
-        noise: standard deviation of force and moment, shape (6,), N and N m.
-        seed: of the noise.
-    """
+    ft_frame: str = text("link that is a force/torque sensor; none if empty", default="")
+    ft_bias: Array = numbers(
+        "bias of the sensor, force and moment, N and N m; none if empty",
+        FINITE,
+        length=6,
+        default=(),
+    )
+    ft_noise: Array = numbers(
+        "standard deviation of its noise, force and moment, N and N m; none if empty",
+        NOT_NEGATIVE,
+        length=6,
+        default=(),
+    )
+    ft_seed: int = whole_number("seed of that noise", Range(0, 2**31 - 1), default=0)
 
-    frame: str
-    bias: Array
-    noise: Array
-    seed: int
-
-
-def sensor_configuration(values: Mapping[str, Any]) -> SensorConfiguration:
-    """Check parameter values.
-
-    Raises:
-        SettingError: a value cannot be used.
-    """
-    for name in ("ft_bias", "ft_noise"):
-        if len(values[name]) and not values["ft_frame"]:
-            allowed = "only with a force/torque sensor, 'ft_frame'"
-            raise SettingError(name, values[name], allowed)
-    bias, noise = (given_or(values, name, np.zeros(6)) for name in ("ft_bias", "ft_noise"))
-    return SensorConfiguration(values["ft_frame"], bias, noise, values["ft_seed"])
+    def __post_init__(self) -> None:
+        """Check that there is no bias or noise without a sensor."""
+        for name in ("ft_bias", "ft_noise"):
+            if len(getattr(self, name)) and not self.ft_frame:
+                allowed = "only with a force/torque sensor, 'ft_frame'"
+                raise SettingError(name, getattr(self, name), allowed)
 
 
 class ForceTorqueReading:
@@ -88,17 +62,20 @@ class ForceTorqueReading:
     """
 
     def __init__(self, robot: BulletRobot, config: SensorConfiguration) -> None:
-        self._robot, self._config = robot, config
+        self._robot, self._seed = robot, config.ft_seed
+        self._bias, self._noise = (
+            value if len(value) else np.zeros(6) for value in (config.ft_bias, config.ft_noise)
+        )
         self.restart()
 
     def restart(self) -> None:
         """Restart the noise from its seed."""
-        self._random = np.random.default_rng(self._config.seed)
+        self._random = np.random.default_rng(self._seed)
 
     def read(self) -> Array:
         """Return force and moment, shape (6,), N and N m, with new noise."""
-        noise = self._config.noise * self._random.standard_normal(6)
-        return self._robot.sensor_wrench() + self._config.bias + noise
+        noise = self._noise * self._random.standard_normal(6)
+        return self._robot.sensor_wrench() + self._bias + noise
 
 
 class ForceTorquePublisher:
@@ -113,7 +90,7 @@ class ForceTorquePublisher:
     def __init__(self, node: Node, robot: BulletRobot, config: SensorConfiguration) -> None:
         self._reading = ForceTorqueReading(robot, config)
         self._message = WrenchStamped()
-        self._message.header.frame_id = config.frame
+        self._message.header.frame_id = config.ft_frame
         self._publisher = FT_WRENCH.publisher(node)
 
     def restart(self) -> None:

@@ -21,10 +21,10 @@ from sim_bridge.nodes.scenario_messages import (
     to_robot,
     to_service,
 )
-from sim_bridge.nodes.scenario_parameters import TABLE, make_configuration
 from sim_bridge.nodes.scenario_sender import ScenarioRefused, ScheduledPublisher, ServiceCaller
 from sim_bridge.scenario.events import ServiceEvent
 from sim_bridge.scenario.recording import RecordedRun
+from sim_bridge.scenario.scenario import ScenarioConfiguration
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.ros.parameters import NodeParameters
 
@@ -67,7 +67,7 @@ class ScenarioNode(Node):
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("scenario_node", **node_arguments)
         try:
-            config = NodeParameters(self, TABLE, make_configuration).configuration
+            config = NodeParameters(self, ScenarioConfiguration).configuration
         except SettingError:
             self.destroy_node()
             raise
@@ -80,9 +80,9 @@ class ScenarioNode(Node):
         self._refusal: ScenarioRefused | None = None
         self._halt = self._end = 0  # periods from the start
         frames = config.base_frame, config.end_effector_frame
-        self._goals = ScheduledPublisher(self, to_controller(config.scenario, *frames))
-        self._world = ScheduledPublisher(self, to_robot(config.scenario, config.base_frame))
-        self._due = deque(e for e in config.scenario.events if isinstance(e, ServiceEvent))
+        self._goals = ScheduledPublisher(self, to_controller(config.plan, *frames))
+        self._world = ScheduledPublisher(self, to_robot(config.plan, config.base_frame))
+        self._due = deque(e for e in config.plan.events if isinstance(e, ServiceEvent))
         own = RESET, pause(False), change_parameters("bullet_node", {})
         self._caller = ServiceCaller(self, [*own, *map(to_service, self._due)])
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -149,7 +149,7 @@ class ScenarioNode(Node):
         # Resuming begins a new period: the first state in motion is the next.
         self._period = round(1e9 * float(self.robot["period_s"]))
         self._first = self.listener.stamp + self._period
-        self._end = round(1e9 * self.config.scenario.duration / self._period)
+        self._end = round(1e9 * self.config.plan.duration / self._period)
 
     def _load(self) -> bool:
         """Send scheduled messages; return whether all were received."""
@@ -205,7 +205,7 @@ class ScenarioNode(Node):
         q = self.listener.q
         if self.phase is Phase.GETTING_READY or q is None:
             return "waiting for the nodes"
-        distance = np.minimum(q - self.config.q_min, self.config.q_max - q)
+        distance = np.minimum(q - self.config.position_min, self.config.position_max - q)
         nearest = int(np.argmin(distance))
         controller = self.listener.diagnostics["controller_node"]
         error = float(controller.get("position_error_m", "nan"))

@@ -51,7 +51,7 @@ def write_report(
         Whether every limit was kept.
     """
     directory.mkdir(parents=True, exist_ok=True)
-    reference = pose_reference(config.scenario.events, run.t)
+    reference = pose_reference(config.plan.events, run.t)
     errors = _errors(config, run, reference)
     metrics = _metrics(config, run, robot, errors, bounds)
     np.savez_compressed(
@@ -93,7 +93,7 @@ def _or_none(value: float) -> float | None:
 def _trajectory_error(config: ScenarioConfiguration, run: RecordedRun, errors: Array) -> float:
     """Return the largest distance to a trajectory while it lasted, m; NaN if there was none."""
     worst = np.nan
-    for event in config.scenario.events:
+    for event in config.plan.events:
         if isinstance(event, TrajectoryGoal):
             during = (run.t >= event.time) & (run.t <= event.time + event.trajectory.duration)
             worst = np.fmax(worst, np.fmax.reduce(errors[during, 0], initial=np.nan))
@@ -112,7 +112,7 @@ def _metrics(
     ratio = max(float(robot["commanded_torque_ratio_max"]), _floats(robot, "torque_ratio").max())
     kept = position.max() <= TOLERANCE and velocity.max() <= TOLERANCE and ratio <= 1.0 + TOLERANCE
     return {
-        "robot": config.name,
+        "robot": config.robot_name,
         "bounds_method": bounds.get("method", "unknown"),
         "clock": robot["clock"],
         "rate_hz": 1.0 / float(robot["period_s"]),
@@ -145,7 +145,7 @@ def _metrics(
                 run.joints,
                 _floats(robot, "lower_clearance_rad").tolist(),
                 _floats(robot, "upper_clearance_rad").tolist(),
-                (np.abs(run.v).max(axis=0) / config.v_max).tolist(),
+                (np.abs(run.v).max(axis=0) / config.velocity_max).tolist(),
                 _floats(robot, "torque_ratio").tolist(),
                 strict=True,
             )
@@ -201,26 +201,26 @@ def _draw(
     path: Path, config: ScenarioConfiguration, run: RecordedRun, errors: Array, metrics: Metrics
 ) -> None:
     """Draw the joint nearest to a limit in detail, and all joints relative to their limits."""
-    clearance = np.minimum(run.q - config.q_min, config.q_max - run.q).min(axis=0)
+    clearance = np.minimum(run.q - config.position_min, config.position_max - run.q).min(axis=0)
     j = int(np.argmin(clearance))
     t = run.t
     figure, axes = plt.subplots(4, 2, figsize=(12, 10), sharex=True, layout="constrained")
     verdict = "no limit broken" if metrics["limits_kept"] else "LIMITS BROKEN"
     figure.suptitle(
-        f"{config.name}: {metrics['bounds_method']} bounds, {metrics['rate_hz']:g} Hz, "
+        f"{config.robot_name}: {metrics['bounds_method']} bounds, {metrics['rate_hz']:g} Hz, "
         f"{metrics['clock']}: {verdict}"
     )
     one, every = axes[:, 0], axes[:, 1]
     limit = {"color": "tab:red", "linestyle": "--", "linewidth": 1.2}
 
     one[0].plot(t, run.q[:, j])
-    for value in (config.q_min[j], config.q_max[j]):
+    for value in (config.position_min[j], config.position_max[j]):
         one[0].axhline(value, **limit)
     one[0].set(title=f"{run.joints[j]}, the joint nearest to a limit", ylabel="position [rad]")
     one[1].plot(t, run.v[:, j])
     for sign in (-1, 1):
-        one[1].axhline(sign * config.v_max[j], **limit)
-        one[3].axhline(sign * config.tau_max[j], **limit)
+        one[1].axhline(sign * config.velocity_max[j], **limit)
+        one[3].axhline(sign * config.torque_max[j], **limit)
         for axis in every[:3]:
             axis.axhline(sign, **limit)
     one[1].set(ylabel="velocity [rad/s]")
@@ -232,11 +232,14 @@ def _draw(
     one[3].plot(t, run.tau[:, j])
     one[3].set(ylabel="torque [N m]", xlabel="time [s]")
 
-    middle, half = 0.5 * (config.q_max + config.q_min), 0.5 * (config.q_max - config.q_min)
+    middle, half = (
+        0.5 * (config.position_max + config.position_min),
+        0.5 * (config.position_max - config.position_min),
+    )
     for i, name in enumerate(run.joints):
         every[0].plot(t, (run.q[:, i] - middle[i]) / half[i], label=name)
-        every[1].plot(t, run.v[:, i] / config.v_max[i])
-        every[2].plot(t, run.tau[:, i] / config.tau_max[i])
+        every[1].plot(t, run.v[:, i] / config.velocity_max[i])
+        every[2].plot(t, run.tau[:, i] / config.torque_max[i])
     every[0].set(title="all joints, limits at -1 and 1", ylabel="position / limit")
     every[0].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize="small")
     every[1].set(ylabel="velocity / limit")

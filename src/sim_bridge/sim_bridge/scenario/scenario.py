@@ -3,14 +3,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import yaml
 
-from sim_bridge.scenario.events import AddObstacle, Event, Push, RemoveObstacle, read_event
+from sim_bridge.scenario.events import (
+    AddObstacle,
+    Event,
+    PostureGoal,
+    Push,
+    RemoveObstacle,
+    WrenchGoal,
+    read_event,
+)
 from sim_bridge.scenario.fields import ScenarioEntry, ScenarioError, refuse
-from sim_bridge.urdf.arm import ConfiguredArm
+from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.parameter import above, number, text
+from viability_bounds_pkg.robot_configuration import LimitedRobotConfiguration, TaskFrames
 
 
 @dataclass(frozen=True)
@@ -26,23 +36,47 @@ class Scenario:
     events: tuple[Event, ...]
 
 
-@dataclass(frozen=True)
-class ScenarioConfiguration(ConfiguredArm):
-    """A scenario and the arm that plays it.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScenarioConfiguration(TaskFrames, LimitedRobotConfiguration):
+    """Parameters of the scenario node: a scenario and the arm that plays it.
 
     Attributes:
-        name: of the robot.
-        base_frame: of pose goals.
-        end_effector_frame: frame that pose goals move.
-        scenario: its events.
-        ready_timeout: how long the other nodes may take to start or to answer, s.
+        urdf: text of the URDF.
+        plan: the scenario.
     """
 
-    name: str
-    base_frame: str
-    end_effector_frame: str
-    scenario: Scenario
-    ready_timeout: float
+    robot_name: str = text("name of the robot in the report", default="robot")
+    scenario: str = text("YAML file of the scenario")
+    ready_timeout: float = number(
+        "how long the other nodes may take to start, s", above(0.0, 3600.0), default=180.0
+    )
+    urdf: str = field(init=False)
+    plan: Scenario = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Read URDF and scenario, and check that they fit."""
+        super().__post_init__()
+        try:
+            plan = load_scenario(self.scenario)
+        except ScenarioError as error:
+            raise SettingError("scenario", self.scenario, str(error)) from error
+        frames = self.end_effector_frame, self.base_frame
+        for event in plan.events:
+            allowed = ""
+            if isinstance(event, PostureGoal) and set(self.joints) - set(event.positions):
+                missing = ", ".join(name for name in self.joints if name not in event.positions)
+                allowed = (
+                    f"postures of all 'joints'; at {event.time:g} s there is none of {missing}"
+                )
+            if isinstance(event, WrenchGoal) and event.frame not in ("", *frames):
+                allowed = (
+                    f"wrenches in the axes of {' or '.join(frames)}; at {event.time:g} s there "
+                    f"is one in those of {event.frame!r}"
+                )
+            if allowed:
+                raise SettingError("scenario", self.scenario, allowed)
+        object.__setattr__(self, "plan", plan)
+        object.__setattr__(self, "urdf", self.read_urdf())
 
 
 def load_scenario(path: str | Path) -> Scenario:

@@ -15,8 +15,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_bridge.urdf.arm import ConfiguredArm
 from viability_bounds_pkg.exceptions import ArmSafetyError
+from viability_bounds_pkg.robot_configuration import LimitedRobotConfiguration
 
 Array = NDArray[np.float64]
 
@@ -32,7 +32,7 @@ class ExcitationError(ArmSafetyError, ValueError):
 
 
 def excitation(
-    arm: ConfiguredArm,
+    arm: LimitedRobotConfiguration,
     q_start: Array,
     dt: float,
     amplitude: float = 0.6,
@@ -52,7 +52,7 @@ def excitation(
     Raises:
         ExcitationError: a joint starts outside its limits or too near to both.
     """
-    q_min, q_max, v_max = arm.q_min, arm.q_max, arm.v_max
+    q_min, q_max, v_max = arm.position_min, arm.position_max, arm.velocity_max
     room = np.maximum(q_max - q_start, q_start - q_min)
     for joint, q, low, high, most in zip(arm.joints, q_start, q_min, q_max, room, strict=True):
         if not low <= q <= high:

@@ -22,9 +22,7 @@ from tqdm import tqdm
 from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.bullet.robot import BulletRobot
 from sim_bridge.nodes.bullet_parameters import (
-    TABLE,
     BulletConfiguration,
-    make_configuration,
     make_robot,
 )
 from sim_bridge.tools.excitation import ExcitationError, excitation
@@ -35,7 +33,7 @@ from viability_bounds_pkg.cli.limits_file import (
     node_parameters,
     write_whole,
 )
-from viability_bounds_pkg.ros.parameters import read_values
+from viability_bounds_pkg.parameter import read
 
 Array = NDArray[np.float64]
 
@@ -78,10 +76,11 @@ def _run(options: argparse.Namespace) -> int:
     if options.output.resolve() == options.parameters.resolve():
         raise ParameterFileError(f"{options.output} is read, and cannot be written too")
     given = node_parameters(options.parameters, "/**/bullet_node")
-    values = read_values(TABLE, given)
-    config = make_configuration(values)
-    motion = excitation(config, config.q_start, config.dt, options.amplitude, options.speed)
-    with closing(make_robot(config, values)) as robot:
+    config = read(BulletConfiguration, given)
+    motion = excitation(
+        config, config.start_positions, config.dt, options.amplitude, options.speed
+    )
+    with closing(make_robot(config)) as robot:
         recorded, monitor = record(robot, config, *motion)
     broken = np.flatnonzero(
         (monitor.max_position_violation > 0.0) | (monitor.max_velocity_violation > 0.0)
@@ -112,13 +111,15 @@ def record(
         q: positions after each control period, shape (N, n), rad.
         v: velocities there, shape (N, n), rad/s.
     """
-    monitor = LimitMonitor(config.q_min, config.q_max, config.v_max, config.tau_max)
+    monitor = LimitMonitor(
+        config.position_min, config.position_max, config.velocity_max, config.torque_max
+    )
     robot.monitor = monitor
     robot.reset(q[0], np.zeros(q.shape[1]))
     states = []
     # With no terminal to draw on there is no bar.
     for q_des, v_des in tqdm(zip(q, v, strict=True), total=len(q), unit=" periods", disable=None):
-        robot.move(q_des, v_des, config.tau_max, config.v_max, config.substeps)
+        robot.move(q_des, v_des, config.torque_max, config.velocity_max, config.substeps)
         states.append(robot.state())
     recorded = {
         "t": config.dt * np.arange(1, len(q) + 1),

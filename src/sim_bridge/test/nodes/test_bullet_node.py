@@ -242,7 +242,7 @@ def test_joint_friction_and_masses_reach_the_robot(ros):
     np.testing.assert_array_equal(simulated.stribeck_velocity, 0.02)
     np.testing.assert_array_equal(simulated.torque_bias, [0.1, 0.0, 0.0, 0.0, 0.0, 0.0, -0.1])
     np.testing.assert_array_equal(simulated.rotor_inertia, 0.1)
-    assert robot.node._config.mass_scales == {"panda_link4": 1.2}
+    assert robot.node._config.scaled_links == {"panda_link4": 1.2}
     # Less than the stiction, though wrong by the mass error and more: it stays where it is.
     robot.step(times=50)
     np.testing.assert_allclose(robot.q, Q, rtol=0.0, atol=1e-12)
@@ -262,7 +262,7 @@ def test_talos_stands_still_by_its_friction_alone(ros):
         read_urdf(values["robot_description"]), values["joints"], locked, values["rotor_inertia"]
     )
     q, tau_max = np.array(values["start_positions"]), np.array(values["torque_max"])
-    simulated, masses = node._config.joint_friction, node._config.mass_scales
+    simulated, masses = node._config.joint_friction, node._config.scaled_links
     np.testing.assert_allclose(simulated.friction_coulomb, 0.1 * tau_max)
     np.testing.assert_array_less(simulated.friction_coulomb, simulated.friction_static)
     np.testing.assert_array_equal(simulated.rotor_inertia, model.armature)

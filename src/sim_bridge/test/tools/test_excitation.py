@@ -18,8 +18,8 @@ import sim_bridge
 import viability_bounds_pkg
 from sim_bridge.tools.excitation import PARTS, ROOM, ExcitationError, excitation
 from sim_bridge.tools.record_excitation import main
-from sim_bridge.urdf.arm import ConfiguredArm
 from torque_safety_controller.friction.joint_recording import load_recording
+from viability_bounds_pkg.robot_configuration import LimitedRobotConfiguration
 
 PACKAGES = [
     str(Path(package.__file__).resolve().parents[1])
@@ -35,7 +35,14 @@ DT = 2e-3
 
 
 def motion(q_start=START, q_min=Q_MIN, q_max=Q_MAX, **options):
-    arm = ConfiguredArm("", JOINTS, {}, q_min, q_max, V_MAX, np.array(PANDA["torque_max"]))
+    arm = LimitedRobotConfiguration(
+        robot_description="",
+        joints=JOINTS,
+        position_min=q_min,
+        position_max=q_max,
+        velocity_max=V_MAX,
+        torque_max=np.array(PANDA["torque_max"]),
+    )
     return excitation(arm, q_start, DT, **options)
 
 

@@ -8,15 +8,11 @@ from ros_harness import read_config
 
 from torque_safety_controller.collision.avoidance import CollisionSettings
 from torque_safety_controller.collision.bodies import SHAPES, make_obstacle
-from torque_safety_controller.parameters import controller_parameters
-from torque_safety_controller.parameters.collision_parameters import (
-    COLLISION_TABLE,
-    load_collision,
-)
-from torque_safety_controller.parameters.controller_parameters import make_configuration
+from torque_safety_controller.node.assembly import load_collision
+from torque_safety_controller.parameters import ControllerConfiguration
+from torque_safety_controller.parameters.collision_parameters import CollisionConfiguration
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.robot_description import read_urdf
-from viability_bounds_pkg.ros.parameters import read_values
+from viability_bounds_pkg.parameter import parameter_table, read
 
 PANDA = read_config("panda", "controller_node")
 THINGS = [
@@ -27,33 +23,33 @@ THINGS = [
 ]
 
 
-def values(**changes):
-    given = PANDA | {"collision_avoidance": True} | changes
-    return read_values(controller_parameters.TABLE, given)
+def controller_configuration(**changes):
+    return read(ControllerConfiguration, PANDA | {"collision_avoidance": True} | changes)
 
 
 def configuration(**changes):
-    return make_configuration(values(**changes)).collision
+    return controller_configuration(**changes).collision
 
 
 def load(**changes):
     arm = panda()[0]
-    config = make_configuration(values(**changes))
-    urdf = read_urdf(PANDA["robot_description"])
-    return load_collision(config.collision, config.robot, urdf, arm.model)
+    config = controller_configuration(**changes)
+    return load_collision(config, config.read_urdf(), arm.model)
 
 
 def test_off_by_default_and_then_nothing_is_loaded():
-    assert configuration(collision_avoidance=None) is None
+    assert load(collision_avoidance=None) is None
     assert load(collision_avoidance=False) is None
-    assert not values(collision_avoidance=None)["collision_avoidance"]
+    assert not configuration(collision_avoidance=None).collision_avoidance
 
 
 def test_defaults_are_those_of_the_settings():
     assert configuration().settings == CollisionSettings()
 
 
-@pytest.mark.parametrize("name", [f.name for f in COLLISION_TABLE if f.kind is float])
+@pytest.mark.parametrize(
+    "name", [row.name for row in parameter_table(CollisionConfiguration) if row.kind is float]
+)
 def test_each_setting_arrives(name):
     settings = configuration(**{name: 0.07}).settings
     assert getattr(settings, name.removeprefix("collision_")) == 0.07
@@ -92,8 +88,8 @@ def test_pairs_are_those_listed_or_those_chosen_at_the_posture_given():
 
 def test_acceleration_limits_arrive():
     config = configuration()
-    np.testing.assert_array_equal(config.a_min, PANDA["acceleration_min"])
-    np.testing.assert_array_equal(config.a_max, PANDA["acceleration_max"])
+    np.testing.assert_array_equal(config.acceleration_min, PANDA["acceleration_min"])
+    np.testing.assert_array_equal(config.acceleration_max, PANDA["acceleration_max"])
 
 
 def test_what_an_arm_is_mounted_on_is_left_out_and_said_to_be():

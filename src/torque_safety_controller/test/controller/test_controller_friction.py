@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -21,14 +22,11 @@ from torque_safety_controller.controller import Controller, Gains
 from torque_safety_controller.friction.settings import FrictionModel, FrictionSettings
 from torque_safety_controller.integral_feedback import IntegralSettings
 from torque_safety_controller.node.controller_node import ControllerNode
-from torque_safety_controller.parameters.friction_parameters import (
-    FRICTION_TABLE,
-    friction_settings,
-)
+from torque_safety_controller.parameters.friction_parameters import FrictionConfiguration
 from torque_safety_controller.qp.constraints import AccelerationRange
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.ros.parameters import read_values
-from viability_bounds_pkg.ros.robot_parameters import ROBOT_TABLE
+from viability_bounds_pkg.parameter import group, read
+from viability_bounds_pkg.robot_configuration import RobotConfiguration
 from viability_bounds_pkg.state import State
 
 NODE = "controller_node"
@@ -39,7 +37,15 @@ DT = 1e-3
 COULOMB = 0.1 * ARM.tau_max
 MODEL = FrictionModel(COULOMB, 1.3 * COULOMB, 0.2 * COULOMB, np.full(N, 0.02))
 ON = FrictionSettings(MODEL, 0.2 * ARM.tau_max, 1.0)
-GAINS = Gains(100.0, 20.0, 0.0, 100.0, 20.0, 1.0, True, 20.0)
+GAINS = Gains(
+    pose_kp=100.0,
+    pose_kd=20.0,
+    pose_weight=0.0,
+    posture_kp=100.0,
+    posture_kd=20.0,
+    posture_weight=1.0,
+    hold_kd=20.0,
+)
 WIDE = np.full(N, 50.0)
 V = 0.3 * np.sign(0.5 - np.arange(N) % 2)
 # Of a state that does not change: each joint is wanted to stop, and does not.
@@ -143,12 +149,18 @@ def test_what_comes_after_a_gap_or_a_jump_does_not_kick():
 # Parameters
 
 
-def values(**changed):
-    return read_values((*ROBOT_TABLE, *FRICTION_TABLE), read_config("panda", NODE) | changed)
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Parameters(RobotConfiguration):
+    friction: FrictionConfiguration = group(FrictionConfiguration)
+
+
+def settings(**changed):
+    made = read(Parameters, read_config("panda", NODE) | changed)
+    return made.friction.settings(ARM.tau_max)
 
 
 def test_defaults_are_off():
-    made = friction_settings(values(), ARM.tau_max)
+    made = settings()
     assert made.scale == 0.0
     assert made.model.level(np.ones(N)).max() == 0.0
     np.testing.assert_allclose(made.budget, 0.2 * ARM.tau_max)
@@ -161,17 +173,16 @@ def test_each_parameter_reaches_the_settings():
         "friction_model_viscous": 0.2 * COULOMB,
         "friction_model_stribeck_velocity": np.full(N, 0.07),
     }
-    given = values(
+    made = settings(
         friction_compensation=0.4,
         **{key: value.tolist() for key, value in rows.items()},
     )
-    made = friction_settings(given, ARM.tau_max)
     assert made.scale == 0.4
     for name, expected in rows.items():
         np.testing.assert_array_equal(
             getattr(made.model, name.removeprefix("friction_model_")), expected
         )
-    only = friction_settings(values(friction_model_coulomb=COULOMB.tolist()), ARM.tau_max)
+    only = settings(friction_model_coulomb=COULOMB.tolist())
     np.testing.assert_array_equal(only.model.static, COULOMB)
     np.testing.assert_array_equal(only.model.viscous, 0.0)
     np.testing.assert_array_equal(only.model.stribeck_velocity, 0.01)
@@ -199,12 +210,12 @@ GIVEN = {
 @pytest.mark.parametrize(("name", "value", "allowed"), REFUSED)
 def test_what_cannot_be_is_refused_by_name(name, value, allowed):
     with pytest.raises(SettingError, match=f"parameter '{name}' is .*{re.escape(allowed)}"):
-        friction_settings(values(**GIVEN | {name: value}), ARM.tau_max)
+        settings(**GIVEN | {name: value})
 
 
 def test_there_must_be_a_model_to_compensate():
     with pytest.raises(SettingError, match="0 as long as no friction_model_coulomb"):
-        friction_settings(values(friction_compensation=0.5), ARM.tau_max)
+        settings(friction_compensation=0.5)
 
 
 class FrictionChain:

@@ -16,14 +16,14 @@ from std_srvs.srv import Trigger
 
 from torque_safety_controller.contact import interaction
 from torque_safety_controller.node.assembly import make_controller
-from torque_safety_controller.parameters import controller_parameters
+from torque_safety_controller.parameters import ControllerConfiguration
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.ros.parameters import read_values
+from viability_bounds_pkg.parameter import parameter_table, read
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS, set_stamp
 from viability_bounds_pkg.state import State
 
 ARM = load_arm("panda")
-KNOWN = {row.name for row in controller_parameters.TABLE}
+KNOWN = {row.name for row in parameter_table(ControllerConfiguration)}
 FORCES = {
     "ft_frame": "panda_link8",
     "ft_tool": [0.0, 0.0, 0.0, 0.0],
@@ -182,8 +182,7 @@ def test_a_tare_takes_what_is_felt_for_the_bias_but_not_from_a_hand_that_is_led(
 
 def build(**changed):
     given = VALUES | changed
-    values = read_values(controller_parameters.TABLE, given)
-    return make_controller(controller_parameters.make_configuration(values))[0]
+    return make_controller(read(ControllerConfiguration, given))[0]
 
 
 def contact(**changed):

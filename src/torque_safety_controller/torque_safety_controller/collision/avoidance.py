@@ -26,6 +26,7 @@ from torque_safety_controller.qp.constraints import AccelerationRange, LinearCon
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.kernel.one_sided_limit import JointTable, make_table
+from viability_bounds_pkg.parameter import Range, above, number
 
 Array = NDArray[np.float64]
 
@@ -45,17 +46,17 @@ class CollisionSettings:
     """What distances are kept, and how.
 
     Attributes:
-        margin: distance to keep, m.
         braking: deceleration that a distance counts on at most, m/s^2.
-        speed_max: greatest speed of approach, m/s.
 
     Raises:
         SettingError: a value is out of range; named as the node's parameters.
     """
 
-    margin: float = 0.02
+    margin: float = number(
+        "distance kept between links and to obstacles, m", Range(0.0, 0.5), default=0.02
+    )
+    speed_max: float = number("largest speed of approach, m/s", above(0.0, 10.0), default=1.0)
     braking: float = 2.0
-    speed_max: float = 1.0
 
     def __post_init__(self) -> None:
         for f in fields(self):

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from viability_bounds_pkg.compiled import compiled
 from viability_bounds_pkg.exceptions import ArmSafetyError
+from viability_bounds_pkg.parameter import above, number
 
 Array = NDArray[np.float64]
 
@@ -34,15 +35,17 @@ class WrenchError(ArmSafetyError, ValueError):
 
 @dataclass(frozen=True)
 class SensorSettings:
-    """How measurements are taken.
+    """How measurements are taken."""
 
-    Attributes:
-        filter_hz: cut-off frequency of the filter, Hz.
-        timeout: how long without a measurement before the sensor counts as silent, s.
-    """
-
-    filter_hz: float = 30.0
-    timeout: float = 0.05
+    filter_hz: float = number(
+        "cut-off frequency of the wrench's filter, Hz", above(0.0, 1e4), default=30.0, live=True
+    )
+    timeout: float = number(
+        "how long without a wrench before force control ends, s",
+        above(0.0, 60.0),
+        default=0.05,
+        live=True,
+    )
 
 
 class WrenchSensor:

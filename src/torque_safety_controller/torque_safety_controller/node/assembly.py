@@ -1,23 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes the controller from its configuration, and applies live changes."""
+"""Makes the controller from its configuration and the URDF, and applies live changes."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 import pinocchio as pin
 
 from torque_safety_controller.additional_torque import AdditionalTorque
+from torque_safety_controller.collision.avoidance import CollisionAvoidance
+from torque_safety_controller.collision.geometry import load_geometry
+from torque_safety_controller.collision.model import Pruning, build_collision_model
+from torque_safety_controller.contact.contacts import Contacts, FrictionContact
+from torque_safety_controller.contact.interaction import Interaction
+from torque_safety_controller.contact.wrench_sensor import WrenchSensor
 from torque_safety_controller.controller import Controller
-from torque_safety_controller.parameters.collision_parameters import load_collision
-from torque_safety_controller.parameters.controller_parameters import (
-    ControllerConfiguration,
-    load_robot,
-)
-from torque_safety_controller.parameters.interaction_parameters import make_interaction
+from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
+from torque_safety_controller.parameters.interaction_parameters import ContactPoint
+from torque_safety_controller.robot_model import RobotModel
+from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.robot_configuration import load_model
+from viability_bounds_pkg.robot_description import RobotDescriptionError, inertia_beyond
+from viability_bounds_pkg.ros.robot_urdf import robot_urdf
 
 if TYPE_CHECKING:
     from rclpy.node import Node
+
+HORIZON = 2.0
+"""Control periods that an acceleration is assumed to last, as in the bounds: no chatter."""
+
+_BEYOND = 0.003  # m; beyond margin and reserve, pairs nearer than this are too near from the start
+_NEAR = 0.028  # m; beyond margin and reserve, pairs that never come nearer need no guard
 
 
 def make_controller(
@@ -33,16 +48,16 @@ def make_controller(
         SettingError: parameters that do not fit the URDF.
     """
     robot, base, urdf = load_robot(config, node)
-    collision = load_collision(config.collision, config.robot, urdf, robot.model)
+    collision = load_collision(config, urdf, robot.model)
     controller = Controller(
         robot,
-        config.tau_max,
+        config.torque_max,
         config.gains,
-        config.tau_rate_max,
-        AdditionalTorque(config.additional, config.task_rows),
+        config.torque_rate_max,
+        AdditionalTorque(config.additional, config.integral.task_rows),
         config.qp_solver,
         [] if collision is None else [collision],
-        make_interaction(config.interaction, config.robot, robot, urdf),
+        make_interaction(config, robot, urdf),
     )
     controller.warm_up()
     return controller, base
@@ -57,3 +72,168 @@ def configure(controller: Controller, config: ControllerConfiguration) -> None:
         controller.interaction.settings = config.interaction.settings
         if controller.interaction.sensor is not None:
             controller.interaction.sensor.settings = config.interaction.sensor
+
+
+class LoadedRobot(NamedTuple):
+    """What the URDF says.
+
+    Attributes:
+        robot: model of the arm.
+        base: placement of the base frame in the URDF's root frame.
+        urdf: its text.
+    """
+
+    robot: RobotModel
+    base: pin.SE3
+    urdf: str
+
+
+def load_robot(config: ControllerConfiguration, node: Node | None = None) -> LoadedRobot:
+    """Read the URDF, once, and return what is made of it.
+
+    Args:
+        config: checked parameters.
+        node: listens for the URDF if it comes from a topic.
+
+    Raises:
+        SettingError: a URDF that does not load, or a joint or frame that it does not have.
+    """
+    urdf = robot_urdf(config, node)
+    model = load_model(config, urdf)
+    frame = config.end_effector_frame
+    try:
+        robot = RobotModel(model, frame, config.dt)
+    except RobotDescriptionError as error:
+        allowed = f"a frame of the URDF ({error})"
+        raise SettingError("end_effector_frame", frame, allowed) from error
+    return LoadedRobot(robot, _base_placement(model, config.base_frame), urdf)
+
+
+def _base_placement(model: pin.Model, frame: str) -> pin.SE3:
+    if not model.existFrame(frame):
+        known = ", ".join(f.name for f in model.frames if f.parentJoint == 0)
+        raise SettingError("base_frame", frame, f"a frame fixed to the root: {known}")
+    found = model.frames[model.getFrameId(frame)]
+    if found.parentJoint != 0:
+        raise SettingError("base_frame", frame, "a frame fixed to the root, not a moving one")
+    return found.placement
+
+
+def load_collision(
+    config: ControllerConfiguration, urdf: str, model: pin.Model
+) -> CollisionAvoidance | None:
+    """Return the collision avoidance of an arm, or None without one.
+
+    Args:
+        config: checked parameters.
+        urdf: text of the URDF.
+        model: made of it.
+
+    Raises:
+        SettingError: collision geometry that does not load, or a link that there is not.
+    """
+    collision = config.collision
+    if not collision.collision_avoidance:
+        return None
+    for index, obstacle in enumerate(collision.bodies):
+        if model.existFrame(obstacle.name, pin.FrameType.BODY):
+            raise SettingError(f"obstacles[{index}].name", obstacle.name, "no name of a link")
+    limited = model.copy()
+    limited.lowerPositionLimit = config.position_min
+    limited.upperPositionLimit = config.position_max
+    kept = collision.settings.kept
+    try:
+        geometry = load_geometry(urdf, model, config.locked)
+    except RobotDescriptionError as error:
+        allowed = f"a URDF whose collision geometry loads ({error})"
+        raise SettingError("robot_description", config.robot_description, allowed) from error
+    return CollisionAvoidance(
+        build_collision_model(
+            limited,
+            geometry,
+            collision.posture(config),
+            collision.bodies,
+            collision.pairs,
+            config.base_frame,
+            Pruning(clearance=kept + _BEYOND, near=kept + _NEAR),
+        ),
+        collision.acceleration_min,
+        collision.acceleration_max,
+        HORIZON * config.dt,
+        collision.settings,
+    )
+
+
+def make_interaction(
+    config: ControllerConfiguration, robot: RobotModel, urdf: str
+) -> Interaction | None:
+    """Return what handles forces; None where there is neither a sensor nor a contact.
+
+    Args:
+        config: checked parameters.
+        robot: model of the arm.
+        urdf: text of its URDF.
+
+    Raises:
+        SettingError: a frame that the URDF does not have or that is not where it must be.
+    """
+    sensor = _sensor(config, robot, urdf)
+    contacts = _contacts(config.interaction.points, robot.model)
+    if sensor is None and contacts is None:
+        return None
+    hand, placement = None, None
+    if contacts is not None and sensor is not None:
+        on_hand = [
+            index
+            for index, contact in enumerate(contacts.contacts)
+            if _joint_of(robot.model, contact.frame) == _joint_of(robot.model, robot.frame)
+        ]
+        if len(on_hand) > 1:
+            frames = [contacts.contacts[index].frame for index in on_hand]
+            raise SettingError("contacts", frames, "one link that is fixed to the hand")
+        if on_hand:
+            hand = on_hand[0]
+            placement = _between(robot.model, robot.frame, contacts.contacts[hand].frame)
+    return Interaction(sensor, contacts, hand, placement, config.interaction.settings)
+
+
+def _sensor(config: ControllerConfiguration, robot: RobotModel, urdf: str) -> WrenchSensor | None:
+    settings, model = config.interaction, robot.model
+    frame, tool = settings.ft_frame, settings.ft_tool
+    if not frame:
+        return None
+    if not model.existFrame(frame, pin.FrameType.BODY):
+        raise SettingError("ft_frame", frame, "a link of the URDF, or empty")
+    if _joint_of(model, frame) != _joint_of(model, robot.frame):
+        raise SettingError("ft_frame", frame, f"a link fixed to {robot.frame!r}")
+    if len(tool):
+        inertia = pin.Inertia(tool[0], tool[1:], np.zeros((3, 3)))
+    else:
+        try:
+            inertia = inertia_beyond(urdf, frame, config.locked)
+        except RobotDescriptionError as error:
+            raise SettingError("ft_frame", frame, f"a link of the URDF ({error})") from error
+    placement = _between(model, robot.frame, frame)
+    return WrenchSensor(placement, inertia, model.gravity.linear, settings.sensor)
+
+
+def _contacts(points: Sequence[ContactPoint], model: pin.Model) -> Contacts | None:
+    contacts = []
+    for frame in dict.fromkeys(each.frame for each in points):
+        its = [each for each in points if each.frame == frame]
+        first = its[0]
+        if not model.existFrame(frame):
+            raise SettingError(f"{first.label}.frame", frame, "a frame of the URDF")
+        places = np.array([each.point for each in its])
+        contacts.append(FrictionContact(frame, places, first.normal, first.friction))
+    return Contacts(model, contacts) if contacts else None
+
+
+def _joint_of(model: pin.Model, frame: str) -> int:
+    return int(model.frames[model.getFrameId(frame)].parentJoint)
+
+
+def _between(model: pin.Model, frame: str, other: str) -> pin.SE3:
+    """Return the placement of a frame in another that is fixed to the same joint."""
+    first, second = (model.frames[model.getFrameId(name)].placement for name in (frame, other))
+    return first.actInv(second)

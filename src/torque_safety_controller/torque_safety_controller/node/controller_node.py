@@ -23,11 +23,7 @@ from torque_safety_controller.node.joint_commands import JointCommands
 from torque_safety_controller.node.limits import LimitsReader
 from torque_safety_controller.node.torque_switch import TorqueSwitch
 from torque_safety_controller.node.wrenches import WrenchSubscriber
-from torque_safety_controller.parameters.controller_parameters import (
-    TABLE,
-    ControllerConfiguration,
-    make_configuration,
-)
+from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.qp.constraints import AccelerationRange
 from torque_safety_controller.safety.handover import Control, Handover, HandoverRefused
 from torque_safety_controller.safety.modes import Mode, ModeKeeper
@@ -50,9 +46,7 @@ class ControllerNode(Node):
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("controller_node", **node_arguments)
         try:
-            self._node_parameters = NodeParameters(
-                self, TABLE, make_configuration, self._configure
-            )
+            self._node_parameters = NodeParameters(self, ControllerConfiguration, self._configure)
             config = self._node_parameters.configuration
             self._controller, base = make_controller(config, self)
         except SettingError:
@@ -60,7 +54,11 @@ class ControllerNode(Node):
             raise
         self._config = config
         self._handover = Handover(
-            config.start_control, config.joints, config.q_min, config.q_max, config.tau_max
+            config.start_control,
+            config.joints,
+            config.position_min,
+            config.position_max,
+            config.torque_max,
         )
         self._states = JointStateReader(config.joints, config.state_timeout)
         self._limits = LimitsReader(config.joints)
@@ -299,7 +297,7 @@ class ControllerNode(Node):
                 "reason": self._modes.reason,
                 "mode_changes": self._modes.changes,
                 "control": self._handover.control.value,
-                "integral_action": self._config.additional.mode,
+                "integral_action": self._config.integral.integral_action,
                 "goals_pending": len(self._goals),
                 "goals_refused": self._goals.refused,
                 "states_refused": self._states.refused,

@@ -226,7 +226,9 @@ class GoalSubscriber(GoalQueue):
     def _on_posture(self, message: JointState) -> None:
         config = self._config
         try:
-            q_des = posture_from_message(message, config.joints, config.q_min, config.q_max)
+            q_des = posture_from_message(
+                message, config.joints, config.position_min, config.position_max
+            )
         except GoalRefused as error:
             return self.refuse(TARGET_POSTURE, error)
         self.add(message, lambda: self._controller.set_posture_goal(q_des))

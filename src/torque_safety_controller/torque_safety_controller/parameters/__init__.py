@@ -1,11 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller node's parameters: tables, checks, and the configuration made of them."""
+"""The controller node's parameters: each declared once, and checked together."""
 
-from torque_safety_controller.parameters.controller_parameters import (
-    TABLE,
-    ControllerConfiguration,
-    load_robot,
-    make_configuration,
-)
+from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 
-__all__ = ["TABLE", "ControllerConfiguration", "load_robot", "make_configuration"]
+__all__ = ["ControllerConfiguration"]

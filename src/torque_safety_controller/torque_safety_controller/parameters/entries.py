@@ -11,7 +11,7 @@ import yaml
 from numpy.typing import NDArray
 
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.ros.parameters import FINITE, Range
+from viability_bounds_pkg.parameter import FINITE, Range
 
 Array = NDArray[np.float64]
 

@@ -6,31 +6,64 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from viability_bounds_pkg.parameter import Range, above, number, switch
 
-@dataclass(frozen=True)
+CRITICAL = -1.0
+"""Of ``pose_kd`` and ``posture_kd``: critical damping."""
+
+OFF = -1.0
+"""Of ``disturbance_time``: disturbances are not estimated."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Gains:
     """What may change while the controller runs.
 
-    Attributes:
-        pose_kp, pose_kd: of the pose task, 1/s^2 and 1/s.
-        pose_weight: of the pose task; 0 leaves the task out.
-        posture_kp, posture_kd: of the posture task, 1/s^2 and 1/s.
-        posture_weight: of the posture task, > 0.
-        posture_in_null_space: whether the posture leaves the pose alone.
-        hold_kd: damping in HOLD, 1/s.
-        disturbance_time: time constant with which what disturbs the accelerations is learned
-            and kept out of the bounds, s; None not to.
+    `CRITICAL` damping becomes a number and `OFF` becomes None when the gains are made.
     """
 
-    pose_kp: float
-    pose_kd: float
-    pose_weight: float
-    posture_kp: float
-    posture_kd: float
-    posture_weight: float
-    posture_in_null_space: bool
-    hold_kd: float
-    disturbance_time: float | None = None
+    pose_kp: float = number("stiffness of the pose task, 1/s^2", Range(0.0, 1e5), live=True)
+    pose_kd: float = number(
+        "damping of the pose task, 1/s; -1: critical, 2 sqrt(kp)",
+        above(0.0, 1e4, special=CRITICAL),
+        default=CRITICAL,
+        live=True,
+    )
+    pose_weight: float = number(
+        "weight of the pose task; 0: no pose task", Range(0.0, 1e5), default=1.0, live=True
+    )
+    posture_kp: float = number("stiffness of the posture task, 1/s^2", Range(0.0, 1e5), live=True)
+    posture_kd: float = number(
+        "damping of the posture task, 1/s; -1: critical, 2 sqrt(kp)",
+        above(0.0, 1e4, special=CRITICAL),
+        default=CRITICAL,
+        live=True,
+    )
+    posture_weight: float = number(
+        "weight of the posture task", above(0.0, 1e5), default=1e-3, live=True
+    )
+    posture_in_null_space: bool = switch(
+        "whether the posture task leaves the pose alone; false: eq. (33) as printed",
+        default=True,
+        live=True,
+    )
+    hold_kd: float = number("damping in HOLD, 1/s", Range(0.0, 1e4), default=20.0, live=True)
+    disturbance_time: float | None = number(
+        "time constant with which the error of the accelerations is estimated, to tighten the "
+        "bounds by it, s; -1: not at all",
+        Range(0.0, 10.0, special=OFF),
+        default=OFF,
+        live=True,
+    )
+
+    def __post_init__(self) -> None:
+        """Resolve the special values."""
+        if self.pose_kd == CRITICAL:
+            object.__setattr__(self, "pose_kd", critical_damping(self.pose_kp))
+        if self.posture_kd == CRITICAL:
+            object.__setattr__(self, "posture_kd", critical_damping(self.posture_kp))
+        if self.disturbance_time == OFF:
+            object.__setattr__(self, "disturbance_time", None)
 
 
 def critical_damping(kp: float) -> float:

@@ -15,8 +15,8 @@ from viability_bounds_pkg.baselines import naive_bounds
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.node.bounds_node import BoundsNode
-from viability_bounds_pkg.node.bounds_parameters import TABLE, make_configuration
-from viability_bounds_pkg.ros.parameters import read_values
+from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
+from viability_bounds_pkg.parameter import parameter_table, read
 from viability_bounds_pkg.state_dependent.limits import StateDependentBounds
 from viability_bounds_pkg.torque_margin import tightened, torque_margins
 from viability_bounds_pkg.viability import acceleration_bounds
@@ -300,15 +300,15 @@ def test_the_configured_margins_only_narrow_the_bounds(robot):
     assert all(margins[name] for name in values)
 
     def solver(parameters):
-        return make_configuration(read_values(TABLE, parameters), load_model=None)
+        config = read(BoundsConfiguration, parameters)
+        return config.limits, make_bounds(config, load_model=None).solve
 
-    with_margins = solver(margins)
-    without = solver(margins | {"acceleration_drift": [], "position_margin": 0.0})
-    limits = without.limits
+    _, with_margins = solver(margins)
+    limits, without = solver(margins | {"acceleration_drift": [], "position_margin": 0.0})
     rng = np.random.default_rng(2)
     q = rng.uniform(limits.q_min, limits.q_max, (2000, len(limits)))
     v = rng.uniform(-limits.v_max, limits.v_max, (2000, len(limits)))
-    narrow, wide = with_margins.solve(q, v), without.solve(q, v)
+    narrow, wide = with_margins(q, v), without(q, v)
     inside = narrow.viable
     assert inside.mean() > 0.2
     assert (wide.viable | ~inside).all()
@@ -328,7 +328,9 @@ def test_a_second_robot_can_use_what_it_answers(ros):
 
 
 PANDA = read_config("panda", NODE)
-PANDA_VALUES = {row.name: PANDA[row.name] for row in TABLE if row.name in PANDA}
+PANDA_VALUES = {
+    row.name: PANDA[row.name] for row in parameter_table(BoundsConfiguration) if row.name in PANDA
+}
 
 
 def test_state_dependent_limits_are_those_of_the_solver(ros):

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 import math
 from array import array
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,48 +10,68 @@ from rclpy.node import Node
 from ros_harness import overrides
 
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.ros.parameters import (
+from viability_bounds_pkg.parameter import (
     POSITIVE,
-    NodeParameters,
-    Parameter,
     Range,
     above,
+    group,
+    joint_numbers,
+    number,
+    numbers,
+    read,
+    switch,
+    text,
+    texts,
+    whole_number,
 )
-from viability_bounds_pkg.ros.robot_parameters import locked_joints
+from viability_bounds_pkg.robot_configuration import RobotConfiguration
+from viability_bounds_pkg.ros.parameters import NodeParameters
 
-TABLE = (
-    Parameter("joints", list[str], "names"),
-    Parameter("limits", list[float], "one a joint, m", per_joint=True, within=POSITIVE),
-    Parameter("extra", list[float], "may be left out", default=np.zeros(0), per_joint=True),
-    Parameter("pair", list[float], "two of them", default=(1.0, 2.0), live=True, length=2),
-    Parameter("rate", float, "Hz", within=above(0.0, 1e3)),
-    Parameter("gain", float, "1/s", default=2.0, live=True, within=above(0.0, 1e3)),
-    Parameter("offset", float, "less than the gain, 1/s", default=1.0, live=True),
-    Parameter("damping", float, "-1: critical", -1.0, True, within=Range(0.0, 9.0, special=-1.0)),
-    Parameter("count", int, "of something", default=3, live=True, within=Range(1, 5)),
-    Parameter("shape", str, "of it", default="round", live=True, choices=("round", "flat")),
-    Parameter("enabled", bool, "or not", default=True, live=True),
-)
+
+@dataclass(frozen=True)
+class Size:
+    count: int = whole_number("of something", Range(1, 5), default=3, live=True)
+    pair: np.ndarray = numbers("two of them", length=2, default=(1.0, 2.0), live=True)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Configuration:
+    joints: tuple[str, ...] = texts("names")
+    limits: np.ndarray = joint_numbers("one a joint, m", POSITIVE)
+    extra: np.ndarray = joint_numbers("may be left out", default=())
+    filled: np.ndarray = joint_numbers("may be left out, too", if_empty=7.0)
+    rate: float = number("Hz", above(0.0, 1e3))
+    gain: float = number("1/s", above(0.0, 1e3), default=2.0, live=True)
+    offset: float = number("less than the gain, 1/s", default=1.0, live=True)
+    damping: float = number("-1: critical", Range(0.0, 9.0, special=-1.0), default=-1.0, live=True)
+    size: Size = group(Size)
+    far: Size = group(Size, "far_")
+    shape: str = text("of it", default="round", live=True, choices=("round", "flat"))
+    enabled: bool = switch("or not", default=True, live=True)
+
+    def __post_init__(self):
+        if self.gain <= self.offset:
+            raise SettingError("offset", self.offset, "less than gain")
+
+    @property
+    def changing(self):
+        return self.gain, self.offset, self.shape
+
+
 VALUES = {"joints": ["a", "b"], "limits": [1.0, 2.0], "rate": 100.0}
-
-
-class Configuration(NamedTuple):
-    gain: float
-    offset: float
-    shape: str
-
-
-def make_configuration(values):
-    if values["gain"] <= values["offset"]:
-        raise SettingError("offset", values["offset"], "less than gain")
-    return Configuration(values["gain"], values["offset"], values["shape"])
 
 
 class Tunable(Node):
     def __init__(self, **node_arguments):
         super().__init__("tunable", **node_arguments)
         self.changes = []
-        self.parameters = NodeParameters(self, TABLE, make_configuration, self.changes.append)
+        self.parameters = NodeParameters(
+            self, Configuration, lambda config: self.changes.append(config.changing), self.check
+        )
+
+    def check(self, config):
+        if config.damping > config.rate:
+            raise SettingError("damping", config.damping, "at most rate")
 
 
 def start(ros, **changed) -> Tunable:
@@ -59,27 +80,45 @@ def start(ros, **changed) -> Tunable:
 
 def test_values_and_defaults_arrive(ros):
     node = start(ros, gain=4.5)
-    assert node.parameters.configuration == Configuration(4.5, 1.0, "round")
-    values = node.parameters.values
-    assert values["joints"] == ("a", "b")
-    np.testing.assert_array_equal(values["limits"], [1.0, 2.0])
-    assert values["extra"].shape == (0,)
-    assert (values["count"], values["enabled"]) == (3, True)
+    config = node.parameters.configuration
+    assert config.changing == (4.5, 1.0, "round")
+    assert config.joints == ("a", "b")
+    np.testing.assert_array_equal(config.limits, [1.0, 2.0])
+    assert config.extra.shape == (0,)
+    np.testing.assert_array_equal(config.filled, [7.0, 7.0])
+    assert (config.size.count, config.enabled) == (3, True)
+
+
+def test_parameters_of_a_group_may_have_a_prefix(ros):
+    node = start(ros, far_count=4)
+    config = node.parameters.configuration
+    assert (config.size.count, config.far.count) == (3, 4)
+    ros.accepts("tunable", far_pair=[3.0, 4.0])
+    np.testing.assert_array_equal(node.parameters.configuration.far.pair, [3.0, 4.0])
+    np.testing.assert_array_equal(node.parameters.configuration.size.pair, [1.0, 2.0])
+    assert ros.refuses("tunable", far_pair=[1.0]) == (
+        "parameter 'far_pair' is [1]; allowed: 2 numbers"
+    )
+
+
+def test_a_dataclass_of_parameters_has_their_defaults():
+    assert Size().count == 3
+    np.testing.assert_array_equal(Size().pair, [1.0, 2.0])
 
 
 def test_whole_numbers_are_taken_for_floats(ros):
     node = start(ros, gain=4, rate=100, limits=[1, 2])
     assert node.parameters.configuration.gain == 4.0
-    assert node.parameters.values["limits"].dtype == float
+    assert node.parameters.configuration.limits.dtype == float
 
 
 def test_a_change_arrives_once_and_all_of_it(ros):
     node = start(ros)
     ros.accepts("tunable", gain=5.0)
-    assert node.changes == [Configuration(5.0, 1.0, "round")]
+    assert node.changes == [(5.0, 1.0, "round")]
     ros.accepts("tunable", shape="flat")
-    assert node.changes[1:] == [Configuration(5.0, 1.0, "flat")]
-    assert node.parameters.configuration == Configuration(5.0, 1.0, "flat")
+    assert node.changes[1:] == [(5.0, 1.0, "flat")]
+    assert node.parameters.configuration.changing == (5.0, 1.0, "flat")
     ros.accepts("tunable", gain=6)  # ros2 param set sends a whole number for "6"
     assert node.parameters.configuration.gain == 6.0
 
@@ -105,14 +144,17 @@ def test_a_change_arrives_once_and_all_of_it(ros):
         ("shape", "oval", "parameter 'shape' is 'oval'; allowed: one of round, flat"),
         # Fine by itself, but not together with the others.
         ("offset", 2.0, "parameter 'offset' is 2; allowed: less than gain"),
+        # Fine as a configuration, but not for the node.
+        ("damping", 8.5, "parameter 'damping' is 8.5; allowed: at most rate"),
     ],
 )
 def test_a_bad_change_is_refused_and_the_old_value_stays(ros, name, value, expected):
-    node = start(ros)
+    node = start(ros, rate=8.0)
     before = node.get_parameter(name).value
+    config = node.parameters.configuration
     assert ros.refuses("tunable", **{name: value}) == expected
     assert node.get_parameter(name).value == before
-    np.testing.assert_array_equal(node.parameters.values[name], before)
+    assert node.parameters.configuration is config
     assert node.changes == []
 
 
@@ -120,13 +162,13 @@ def test_changes_are_judged_one_by_one_unless_asked_for_together(ros):
     node = start(ros)
     first, second = ros.set_parameters("tunable", offset=3.0, gain=4.0)
     assert (first.successful, second.successful) == (False, True)
-    assert node.parameters.configuration == Configuration(4.0, 1.0, "round")
+    assert node.parameters.configuration.changing == (4.0, 1.0, "round")
     result = node.set_parameters_atomically(overrides({"offset": 5.0, "gain": 8.0}))
     assert result.successful
-    assert node.changes == [Configuration(4.0, 1.0, "round"), Configuration(8.0, 5.0, "round")]
+    assert node.changes == [(4.0, 1.0, "round"), (8.0, 5.0, "round")]
     result = node.set_parameters_atomically(overrides({"shape": "flat", "gain": -1.0}))
     assert not result.successful
-    assert node.parameters.configuration == Configuration(8.0, 5.0, "round")
+    assert node.parameters.configuration.changing == (8.0, 5.0, "round")
 
 
 @pytest.mark.parametrize(
@@ -194,6 +236,7 @@ def test_descriptions_tell_what_may_change_and_to_what(ros):
     for name, expected in (
         ("limits", "finite numbers > 0, one for each of 'joints'"),
         ("extra", "numbers, one for each of 'joints', or none"),
+        ("filled", "numbers, one for each of 'joints', or none"),
         ("pair", "2 numbers"),
         ("shape", "one of round, flat"),
         ("enabled", ""),
@@ -218,9 +261,10 @@ def test_values_are_shown_as_they_are_written(value: Any, shown: str):
 
 
 def test_locked_joints():
-    names, positions = ("x", "y"), np.array([0.5, -1.0])
-    values = {"locked_joints": names, "locked_positions": positions}
-    assert locked_joints(values) == {"x": 0.5, "y": -1.0}
-    for bad in (positions[:1], np.array([0.5, math.nan]), np.array([0.5, math.inf])):
+    given = {"robot_description": "", "joints": ["z"], "torque_max": [1.0]}
+    given |= {"position_min": [-1.0], "position_max": [1.0]}
+    given |= {"locked_joints": ["x", "y"], "locked_positions": [0.5, -1.0]}
+    assert read(RobotConfiguration, given).locked == {"x": 0.5, "y": -1.0}
+    for bad in ([0.5], [0.5, math.nan], [0.5, math.inf]):
         with pytest.raises(SettingError, match="'locked_positions'"):
-            locked_joints(values | {"locked_positions": bad})
+            read(RobotConfiguration, given | {"locked_positions": bad})

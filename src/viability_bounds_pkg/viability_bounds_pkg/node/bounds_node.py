@@ -6,7 +6,6 @@ from __future__ import annotations
 import sys
 import time
 from array import array
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,17 +18,14 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from viability_bounds_pkg import viability
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.node.bounds_parameters import (
-    TABLE,
+    Bounds,
     BoundsConfiguration,
-    make_configuration,
+    make_bounds,
 )
+from viability_bounds_pkg.robot_configuration import RobotConfiguration, load_model
 from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, Verdict
 from viability_bounds_pkg.ros.parameters import NodeParameters
-from viability_bounds_pkg.ros.robot_parameters import (
-    RobotConfiguration,
-    load_model,
-    robot_urdf,
-)
+from viability_bounds_pkg.ros.robot_urdf import robot_urdf
 from viability_bounds_pkg.ros.runtime import run
 from viability_bounds_pkg.ros.topics import ACCELERATION_LIMITS, JOINT_STATES
 
@@ -47,19 +43,15 @@ class BoundsNode(Node):
         self._model: pin.Model | None = None
         try:
             self._node_parameters = NodeParameters(
-                self,
-                TABLE,
-                partial(make_configuration, load_model=self._load_model),
-                self._configure,
+                self, BoundsConfiguration, self._configure, self._make_bounds
             )
+            config = self._node_parameters.configuration
+            self._bounds = self._make_bounds(config)
         except SettingError:
             self.destroy_node()
             raise
-        config = self._node_parameters.configuration
-        joints = config.limits.names
-        self._solve = config.solve
-        self._state_dependent = config.state_dependent
-        self._longest_ns = round(1.5e9 * config.control_dt)
+        joints = config.joints
+        self._longest_ns = round(1.5e9 * config.dt)
         self._reader = JointStateReader(joints, config.state_timeout)
         self._answered = 0
         self._outside = np.zeros(len(joints), dtype=int)
@@ -74,12 +66,14 @@ class BoundsNode(Node):
     def _load_model(self, robot: RobotConfiguration) -> pin.Model:
         """Return the model, loaded once: parameters that change it are read-only."""
         if self._model is None:
-            self._model = load_model(robot, robot_urdf(robot.description, self))
+            self._model = load_model(robot, robot_urdf(robot, self))
         return self._model
 
+    def _make_bounds(self, config: BoundsConfiguration) -> Bounds:
+        return make_bounds(config, self._load_model)
+
     def _configure(self, config: BoundsConfiguration) -> None:
-        self._solve = config.solve
-        self._state_dependent = config.state_dependent
+        self._bounds = self._make_bounds(config)
         self._warn_of_affected_joints(config)
 
     def _warn_of_affected_joints(self, config: BoundsConfiguration) -> None:
@@ -88,12 +82,12 @@ class BoundsNode(Node):
                 f"method '{config.method}' does not keep the limits; it is for comparison"
             )
             return
-        holds = viability.discrete_time_condition(config.limits, config.bounds_dt)
-        for name, fine in zip(config.limits.names, holds, strict=True):
+        holds = viability.discrete_time_condition(config.limits, config.horizon)
+        for name, fine in zip(config.joints, holds, strict=True):
             if not fine:
                 self.get_logger().warning(
                     f"joint '{name}' can cross its range or exceed its speed within one braking "
-                    f"step of {config.bounds_dt:g} s (condition (11)); its bounds are stricter"
+                    f"step of {config.horizon:g} s (condition (11)); its bounds are stricter"
                 )
 
     def _on_state(self, message: JointState) -> None:
@@ -102,11 +96,11 @@ class BoundsNode(Node):
         if verdict is Verdict.REFUSED:
             return
         if verdict is Verdict.NEW:
-            if self._state_dependent is not None:
+            if self._bounds.state_dependent is not None:
                 elapsed = self._reader.stamp - last
                 if not 0 < elapsed <= self._longest_ns:
-                    self._state_dependent.reset()
-            bounds = self._solve(self._reader.q, self._reader.v)
+                    self._bounds.state_dependent.reset()
+            bounds = self._bounds.solve(self._reader.q, self._reader.v)
             points = self._answer.points
             points[0].accelerations = array("d", bounds.lower.tobytes())
             points[1].accelerations = array("d", bounds.upper.tobytes())
@@ -121,8 +115,8 @@ class BoundsNode(Node):
         silent = self._reader.stamp < 0
         values = {
             "method": config.method,
-            "control_period_s": config.control_dt,
-            "bounds_period_s": config.bounds_dt,
+            "control_period_s": config.dt,
+            "bounds_period_s": config.horizon,
             "position_margin_rad": config.margins.position,
             "velocity_margin_rad_s": config.margins.velocity,
             "acceleration_margin_rad_s2": config.margins.acceleration,
@@ -130,8 +124,8 @@ class BoundsNode(Node):
             "states_refused": self._reader.refused,
             "states_outside_kernel_by_joint": self._outside,
         }
-        if self._state_dependent is not None:
-            values["steps_by_limits"] = self._state_dependent.outcomes
+        if self._bounds.state_dependent is not None:
+            values["steps_by_limits"] = self._bounds.state_dependent.outcomes
         if silent:
             return DiagnosticStatus.WARN, "no joint state yet", values
         if self._reader.refused:

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bounds node's parameters: the table, and what the node computes with from it."""
+"""The bounds node's parameters, and the bounds that it computes by them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -15,22 +15,22 @@ from numpy.typing import NDArray
 from viability_bounds_pkg import baselines, viability
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.joint_limits import JointLimits
-from viability_bounds_pkg.ros.parameters import (
+from viability_bounds_pkg.parameter import (
     NEGATIVE,
     NOT_NEGATIVE,
     POSITIVE,
-    Parameter,
     Range,
     above,
-    given_or,
-    joint_names,
-    per_joint,
+    check_per_joint,
+    joint_numbers,
+    number,
+    redeclared,
+    text,
 )
-from viability_bounds_pkg.ros.robot_parameters import (
-    ROBOT_TABLE,
+from viability_bounds_pkg.robot_configuration import (
+    ControlRate,
+    LimitedRobotConfiguration,
     RobotConfiguration,
-    position_limits,
-    robot_configuration,
 )
 from viability_bounds_pkg.state_dependent.limits import StateDependentBounds
 from viability_bounds_pkg.torque_margin import TorqueMargins, tightened, torque_margins
@@ -41,241 +41,186 @@ BASELINES = {
     "naive": baselines.naive_bounds,
     "decre": baselines.decre_bounds,
     "rubrecht": baselines.rubrecht_bounds,
+    "damper": baselines.damper_bounds,
 }
-"""Methods to compare with that need no settings of their own."""
+"""Methods to compare with."""
 
-METHODS = ("exact", *BASELINES, "damper")
+METHODS = ("exact", *BASELINES)
 LIMITS = ("worst_case", "state_dependent")
 PEAK = 3.0
 """Default of ``acceleration_peak``, in limits of the worst case."""
 
-_OPTIONAL = {"robot_description": "", "torque_max": np.zeros(0)}
-"""Of the robot, what only state-dependent limits need."""
 
-TABLE = (
-    *(
-        replace(row, default=_OPTIONAL[row.name]) if row.name in _OPTIONAL else row
-        for row in ROBOT_TABLE
-    ),
-    Parameter("velocity_max", list[float], "speed limits, rad/s", per_joint=True, within=POSITIVE),
-    Parameter(
-        "acceleration_min",
-        list[float],
-        "lower acceleration limits, rad/s^2",
-        per_joint=True,
-        within=NEGATIVE,
-    ),
-    Parameter(
-        "acceleration_max",
-        list[float],
-        "upper acceleration limits, rad/s^2",
-        per_joint=True,
-        within=POSITIVE,
-    ),
-    Parameter(
-        "acceleration_drift",
-        list[float],
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BoundsConfiguration(ControlRate, LimitedRobotConfiguration):
+    """Parameters of the bounds node; the torque limits are empty where none are needed.
+
+    Attributes:
+        limits: of the joints.
+        margins: what the exact bounds keep back.
+    """
+
+    robot_description: str = redeclared(RobotConfiguration, "robot_description", default="")
+    torque_max: Array = redeclared(RobotConfiguration, "torque_max", default=())
+    acceleration_min: Array = joint_numbers("lower acceleration limits, rad/s^2", NEGATIVE)
+    acceleration_max: Array = joint_numbers("upper acceleration limits, rad/s^2", POSITIVE)
+    acceleration_drift: Array = joint_numbers(
         "largest jerk under held torque, rad/s^3; the bounds are tightened by the error that it "
         "causes within a control period; 0 if empty",
-        default=np.zeros(0),
-        per_joint=True,
-        within=NOT_NEGATIVE,
-    ),
-    Parameter(
-        "acceleration_disturbance",
-        list[float],
+        NOT_NEGATIVE,
+        if_empty=0.0,
+    )
+    acceleration_disturbance: Array = joint_numbers(
         "how much more than commanded the joints may accelerate by what the model does not know, "
         "friction, payloads, pushes, rad/s^2; the bounds are tightened by it; 0 if empty",
-        default=np.zeros(0),
-        per_joint=True,
-        within=NOT_NEGATIVE,
-    ),
-    Parameter(
-        "position_margin",
-        float,
+        NOT_NEGATIVE,
+        if_empty=0.0,
+    )
+    position_margin: float = number(
         "how much further inside the position limits to keep the joints, rad: what the robot or "
         "its sensors may be off",
+        Range(0.0, 1.0),
         default=0.0,
-        within=Range(0.0, 1.0),
-    ),
-    Parameter("rate_hz", float, "rate of the control loop, Hz", within=above(0.0, 1e4)),
-    Parameter(
-        "bounds_dt_factor",
-        float,
+    )
+    bounds_dt_factor: float = number(
         "horizon of the bounds in control periods; 2 avoids chatter",
+        Range(1.0, 1e3),
         default=2.0,
         live=True,
-        within=Range(1.0, 1e3),
-    ),
-    Parameter(
-        "acceleration_limits",
-        str,
+    )
+    acceleration_limits: str = text(
         "for method exact: worst_case, or state_dependent, which exceeds the limits above where "
         "the torque limits allow it; needs robot_description and torque_max",
         default="worst_case",
         choices=LIMITS,
-    ),
-    Parameter(
-        "acceleration_peak",
-        list[float],
+    )
+    acceleration_peak: Array = joint_numbers(
         f"largest acceleration that state_dependent allows, rad/s^2; {PEAK:g} times the limits "
         "above if empty",
-        default=np.zeros(0),
-        per_joint=True,
-        within=POSITIVE,
-    ),
-    Parameter(
-        "method",
-        str,
+        POSITIVE,
+        default=(),
+    )
+    method: str = text(
         "how bounds are computed: exact keeps the limits; the others are for comparison",
         default="exact",
         live=True,
         choices=METHODS,
-    ),
-    Parameter(
-        "damper_influence",
-        float,
+    )
+    damper_influence: float = number(
         "for method damper: distance to a limit from which on it acts, rad",
+        above(0.0, 10.0),
         default=0.2,
-        within=above(0.0, 10.0),
-    ),
-    Parameter(
-        "damper_gain",
-        float,
-        "for method damper: speed allowed there, rad/s",
-        default=1.0,
-        within=above(0.0, 1e3),
-    ),
-    Parameter(
-        "state_timeout",
-        float,
-        "silence after which older stamps are accepted again, s",
-        default=0.5,
-        within=above(0.0, 3600.0),
-    ),
-)
+    )
+    damper_gain: float = number(
+        "for method damper: speed allowed there, rad/s", above(0.0, 1e3), default=1.0
+    )
+    state_timeout: float = number(
+        "silence after which older stamps are accepted again, s", above(0.0, 3600.0), default=0.5
+    )
+    limits: JointLimits = field(init=False)
+    margins: TorqueMargins = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Make limits and margins, which must leave something to move with."""
+        super().__post_init__()
+        limits = JointLimits(
+            self.joints,
+            self.position_min,
+            self.position_max,
+            self.velocity_max,
+            self.acceleration_min,
+            self.acceleration_max,
+        )
+        object.__setattr__(self, "limits", limits)
+        object.__setattr__(self, "margins", self._margins(limits))
+
+    @property
+    def horizon(self) -> float:
+        """How long an acceleration is assumed to last, s."""
+        return self.bounds_dt_factor * self.dt
+
+    def _margins(self, limits: JointLimits) -> TorqueMargins:
+        margins = torque_margins(self.acceleration_drift, self.dt)
+        disturbance = self.acceleration_disturbance
+        margins.acceleration[:] += disturbance
+        braking = np.minimum(-limits.a_min, limits.a_max)
+        if not (margins.acceleration < braking).all():
+            name = "acceleration_disturbance" if disturbance.any() else "acceleration_drift"
+            allowed = (
+                f"less than what there is to brake with, {braking}, by the margins for the rate"
+            )
+            raise SettingError(name, getattr(self, name), allowed)
+        margins.position[:] += self.position_margin
+        for name, margin, room in (
+            ("velocity_max", margins.velocity, limits.v_max),
+            ("position_max", margins.position, 0.5 * (limits.q_max - limits.q_min)),
+        ):
+            if not (margin < room).all():
+                raise SettingError(
+                    name,
+                    getattr(self, name),
+                    f"more than the margins for acceleration_drift at this rate take: {margin}",
+                )
+        return margins
 
 
-@dataclass(frozen=True)
-class BoundsConfiguration:
-    """Checked parameters of the bounds node."""
+class Bounds(NamedTuple):
+    """How the bounds are computed.
 
-    limits: JointLimits
-    margins: TorqueMargins
-    """What the exact bounds keep back."""
-    control_dt: float
-    bounds_dt: float
-    method: str
-    state_timeout: float
+    Attributes:
+        solve: from positions and velocities.
+        state_dependent: whose method `solve` is, with state-dependent limits.
+    """
+
     solve: Callable[[Array, Array], viability.AccelerationBounds]
-    state_dependent: StateDependentBounds | None
-    """Whose method `solve` is, with state-dependent limits."""
+    state_dependent: StateDependentBounds | None = None
 
 
-def make_configuration(
-    values: Mapping[str, Any], load_model: Callable[[RobotConfiguration], pin.Model]
-) -> BoundsConfiguration:
-    """Check parameter values and make what the node runs on of them.
+def make_bounds(
+    config: BoundsConfiguration, load_model: Callable[[RobotConfiguration], pin.Model]
+) -> Bounds:
+    """Return how the bounds are computed.
 
     Args:
-        values: of `TABLE`, by name, as `read_values` returns them.
+        config: parameters of the node.
         load_model: returns the arm's model, asked for only where it is needed.
 
     Raises:
-        SettingError: values that do not fit together.
+        SettingError: state-dependent limits without what they need.
     """
-    joints = joint_names(values)
-    dt = 1.0 / values["rate_hz"]
-    horizon = values["bounds_dt_factor"] * dt
-    q_min, q_max = position_limits(values, joints)
-    limits = JointLimits(
-        joints,
-        q_min,
-        q_max,
-        values["velocity_max"],
-        values["acceleration_min"],
-        values["acceleration_max"],
-    )
-    margins = _margins(values, limits, dt)
-    method = values["method"]
-    state_dependent = None
-    solve: Callable[[Array, Array], viability.AccelerationBounds]
-    if method == "exact" and values["acceleration_limits"] == "state_dependent":
-        state_dependent = _state_dependent(values, load_model, limits, margins, horizon, dt)
-        solve = state_dependent.bounds
-    elif method == "exact":
+    limits, margins, horizon = config.limits, config.margins, config.horizon
+    if config.method == "exact" and config.acceleration_limits == "state_dependent":
+        state_dependent = _state_dependent(config, load_model)
+        return Bounds(state_dependent.bounds, state_dependent)
+    if config.method == "exact":
         inner = tightened(limits, margins)
-        solve = viability.BoundsSolver(inner, horizon, margins.acceleration, period=dt).bounds
-    elif method == "damper":
-        solve = partial(
-            baselines.damper_bounds,
-            limits=limits,
-            dt=horizon,
-            influence=values["damper_influence"],
-            gain=values["damper_gain"],
-        )
-    else:
-        solve = partial(BASELINES[method], limits=limits, dt=horizon)
-    return BoundsConfiguration(
-        limits=limits,
-        margins=margins,
-        control_dt=dt,
-        bounds_dt=horizon,
-        method=method,
-        state_timeout=values["state_timeout"],
-        solve=solve,
-        state_dependent=state_dependent,
-    )
+        solver = viability.BoundsSolver(inner, horizon, margins.acceleration, period=config.dt)
+        return Bounds(solver.bounds)
+    own = {"influence": config.damper_influence, "gain": config.damper_gain}
+    settings = own if config.method == "damper" else {}
+    return Bounds(partial(BASELINES[config.method], limits=limits, dt=horizon, **settings))
 
 
 def _state_dependent(
-    values: Mapping[str, Any],
-    load_model: Callable[[RobotConfiguration], pin.Model],
-    limits: JointLimits,
-    margins: TorqueMargins,
-    horizon: float,
-    dt: float,
+    config: BoundsConfiguration, load_model: Callable[[RobotConfiguration], pin.Model]
 ) -> StateDependentBounds:
-    if not values["robot_description"]:
+    limits, margins = config.limits, config.margins
+    if not config.robot_description:
         allowed = "a URDF, for state-dependent acceleration limits"
-        raise SettingError("robot_description", values["robot_description"], allowed)
+        raise SettingError("robot_description", config.robot_description, allowed)
     worst = np.maximum(-limits.a_min, limits.a_max)
-    peak = given_or(values, "acceleration_peak", PEAK * worst)
+    peak = config.acceleration_peak if len(config.acceleration_peak) else PEAK * worst
     if (peak < worst).any():
         allowed = f"at least that of the worst case, {worst}"
         raise SettingError("acceleration_peak", peak, allowed)
+    check_per_joint("torque_max", config.torque_max, limits.names)
     return StateDependentBounds(
-        load_model(robot_configuration(values)),
+        load_model(config),
         tightened(limits, margins),
-        per_joint(values, "torque_max", limits.names),
+        config.torque_max,
         peak,
-        horizon,
+        config.horizon,
         margins.acceleration,
-        dt,
+        config.dt,
         margins.position,
     )
-
-
-def _margins(values: Mapping[str, Any], limits: JointLimits, dt: float) -> TorqueMargins:
-    """Return what to keep back for the drift of acceleration and for the robot itself."""
-    zero = np.zeros(len(limits))
-    margins = torque_margins(given_or(values, "acceleration_drift", zero), dt)
-    disturbance = given_or(values, "acceleration_disturbance", zero)
-    margins.acceleration[:] += disturbance
-    braking = np.minimum(-limits.a_min, limits.a_max)
-    if not (margins.acceleration < braking).all():
-        name = "acceleration_disturbance" if disturbance.any() else "acceleration_drift"
-        allowed = f"less than what there is to brake with, {braking}, by the margins for the rate"
-        raise SettingError(name, values[name], allowed)
-    margins.position[:] += values["position_margin"]
-    for name, margin, room in (
-        ("velocity_max", margins.velocity, limits.v_max),
-        ("position_max", margins.position, 0.5 * (limits.q_max - limits.q_min)),
-    ):
-        if not (margin < room).all():
-            raise SettingError(
-                name,
-                values[name],
-                f"more than the margins for acceleration_drift at this rate take: {margin}",
-            )
-    return margins

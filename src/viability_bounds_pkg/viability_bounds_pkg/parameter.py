@@ -1,0 +1,308 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters, each declared once: as a field of a frozen dataclass, its configuration.
+
+`number`, `text`, `joint_numbers` and the others return the field of a parameter, with the values
+that are allowed; the name of the field is that of the parameter. `read` checks values, as from
+YAML, and makes the dataclass of them. Only conditions between several parameters are written by
+hand, in its ``__post_init__``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viability_bounds_pkg.exceptions import SettingError
+
+Array = NDArray[np.float64]
+Configuration = TypeVar("Configuration")
+
+REQUIRED = object()
+"""Default of a parameter that has none: the node does not start without a value."""
+
+
+@dataclass(frozen=True)
+class Range:
+    """Which finite numbers a parameter may have.
+
+    Attributes:
+        low, high: smallest and largest; infinite where there is no limit.
+        without: `low` or `high`, if that number itself is not allowed.
+        special: a number outside that is allowed too; its meaning is in the description.
+    """
+
+    low: float
+    high: float
+    without: float | None = None
+    special: float | None = None
+
+    def __contains__(self, value: float) -> bool:
+        inside = self.low <= value <= self.high and value != self.without
+        return math.isfinite(value) and (inside or value == self.special)
+
+    def __str__(self) -> str:
+        """Return the range in words, to follow "a number" or "numbers"."""
+        limits = (
+            ("> " if self.without == self.low else ">= ", self.low),
+            ("< " if self.without == self.high else "<= ", self.high),
+        )
+        text = " and ".join(sign + f"{limit:g}" for sign, limit in limits if math.isfinite(limit))
+        return text if self.special is None else f"{text}, or {self.special:g}"
+
+
+FINITE = Range(-math.inf, math.inf)
+POSITIVE = Range(0.0, math.inf, without=0.0)
+NOT_NEGATIVE = Range(0.0, math.inf)
+NEGATIVE = Range(-math.inf, 0.0, without=0.0)
+
+
+def above(low: float, high: float, special: float | None = None) -> Range:
+    """Return the numbers above `low` up to `high`, and perhaps a special one."""
+    return Range(low, high, without=low, special=special)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameter:
+    """What is known about a parameter.
+
+    Attributes:
+        name: ROS name; that of the field.
+        kind: `float`, `int`, `bool`, `str`, `list[float]` or `list[str]`. Whole numbers are
+            taken where floats are wanted, because YAML writers leave the point out.
+        description: shown by ``ros2 param describe``; ends with the unit where there is one.
+        default: value when none is given, or `REQUIRED`. An empty list means that the list may
+            be left out.
+        live: may change while the node runs; all others are read-only.
+        within: which numbers are allowed; None for all.
+        choices: which strings are allowed; empty for all.
+        length: of a list; None for any.
+        per_joint: whether a list has one number, none of them NaN, for each of ``joints``.
+        if_empty: what a list that is left out is filled with; None leaves it empty.
+        note: what else must be known about allowed values, in words.
+    """
+
+    name: str = ""
+    kind: Any
+    description: str
+    default: Any = REQUIRED
+    live: bool = False
+    within: Range | None = None
+    choices: tuple[str, ...] = ()
+    length: int | None = None
+    per_joint: bool = False
+    if_empty: float | None = None
+    note: str = ""
+
+    def coerce(self, value: Any) -> Any:
+        """Return `value` as `kind`.
+
+        Raises:
+            SettingError: the value is missing, of another type, or not allowed.
+        """
+        if value is None:
+            if self.default is REQUIRED:
+                raise SettingError(self.name, None, self._kind_name())
+            return np.array(self.default) if self.kind == list[float] else self.default
+        converted = self._convert(value)
+        if not self._allows(converted):
+            raise SettingError(self.name, value, self.constraints)
+        return converted
+
+    @property
+    def optional(self) -> bool:
+        """Whether the list may be empty."""
+        return _is_sequence(self.default) and not len(self.default)
+
+    @property
+    def constraints(self) -> str:
+        """Which values are allowed, in words; empty if all of the type are."""
+        text = ""
+        if self.choices:
+            text = f"one of {', '.join(self.choices)}"
+        elif self.kind in (float, int) and self.within is not None:
+            text = f"{_SCALARS[self.kind]} {self.within}"
+        elif self.kind == list[float]:
+            numbers = "numbers" if self.within is None else f"finite numbers {self.within}".strip()
+            if self.length is not None:
+                text = f"{self.length} {numbers}"
+            elif self.per_joint:
+                text = f"{numbers}, one for each of 'joints'"
+            elif self.within is not None:
+                text = numbers
+            text += ", or none" if text and self.optional else ""
+        return "; ".join(filter(None, (text, self.note)))
+
+    def _convert(self, value: Any) -> Any:
+        if self.kind == list[float] and _is_sequence(value) and all(map(_is_number, value)):
+            return np.array(value, dtype=float)
+        if (
+            self.kind == list[str]
+            and _is_sequence(value)
+            and all(isinstance(item, str) for item in value)
+        ):
+            return tuple(value)
+        if self.kind is float and _is_number(value):
+            return float(value)
+        if self.kind in (int, bool, str) and type(value) is self.kind:
+            return value
+        raise SettingError(self.name, value, self._kind_name())
+
+    def _allows(self, value: Any) -> bool:
+        if self.choices:
+            return value in self.choices
+        if not _is_sequence(value):
+            return self.within is None or value in self.within
+        if not len(value) and self.optional:
+            return True
+        if self.length is not None and len(value) != self.length:
+            return False
+        return self.within is None or all(item in self.within for item in value)
+
+    def _kind_name(self) -> str:
+        if self.kind in (float, int, bool, str):
+            return _SCALARS[self.kind]
+        return "a list of numbers" if self.kind == list[float] else "a list of strings"
+
+
+_SCALARS = {float: "a number", int: "a whole number", bool: "true or false", str: "a string"}
+
+
+def _is_sequence(value: Any) -> bool:
+    return not isinstance(value, str | bytes) and hasattr(value, "__len__")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def number(description: str, within: Range | None = None, **more: Any) -> Any:
+    """Return the field of a float; `more` as in `Parameter`."""
+    return _field(kind=float, description=description, within=within, **more)
+
+
+def whole_number(description: str, within: Range | None = None, **more: Any) -> Any:
+    """Return the field of an int; `more` as in `Parameter`."""
+    return _field(kind=int, description=description, within=within, **more)
+
+
+def switch(description: str, **more: Any) -> Any:
+    """Return the field of a bool; `more` as in `Parameter`."""
+    return _field(kind=bool, description=description, **more)
+
+
+def text(description: str, **more: Any) -> Any:
+    """Return the field of a string; `more` as in `Parameter`."""
+    return _field(kind=str, description=description, **more)
+
+
+def texts(description: str, **more: Any) -> Any:
+    """Return the field of a list of strings, a tuple; `more` as in `Parameter`."""
+    return _field(kind=list[str], description=description, **more)
+
+
+def numbers(description: str, within: Range | None = None, **more: Any) -> Any:
+    """Return the field of a list of numbers, an array; `more` as in `Parameter`.
+
+    With `if_empty` the list may be left out.
+    """
+    if "if_empty" in more:
+        more["default"] = ()
+    return _field(kind=list[float], description=description, within=within, **more)
+
+
+def joint_numbers(description: str, within: Range | None = None, **more: Any) -> Any:
+    """Return the field of an array with one number a joint; `more` as for `numbers`."""
+    return numbers(description, within, per_joint=True, **more)
+
+
+def group(kind: type, prefix: str = "") -> Any:
+    """Return the field of a dataclass of parameters, whose names begin with `prefix`."""
+    return field(metadata={_GROUP: (kind, prefix)})
+
+
+_PARAMETER, _GROUP = "parameter", "group"
+
+
+def _field(**row: Any) -> Any:
+    parameter = Parameter(**row)
+    metadata = {_PARAMETER: parameter}
+    if parameter.default is REQUIRED:
+        return field(metadata=metadata)
+    if parameter.kind == list[float]:
+        return field(metadata=metadata, default_factory=lambda: parameter.coerce(None))
+    return field(metadata=metadata, default=parameter.default)
+
+
+def parameter_table(kind: type) -> tuple[Parameter, ...]:
+    """Return the parameters that a dataclass and its groups declare, in their order."""
+    return _table(kind, "")
+
+
+def _table(kind: type, prefix: str) -> tuple[Parameter, ...]:
+    rows: list[Parameter] = []
+    for each in fields(kind):
+        if _PARAMETER in each.metadata:
+            rows.append(replace(each.metadata[_PARAMETER], name=prefix + each.name))
+        elif _GROUP in each.metadata:
+            rows += _table(*each.metadata[_GROUP])
+    return tuple(rows)
+
+
+def redeclared(kind: type, name: str, **changes: Any) -> Any:
+    """Return the field of a parameter that the dataclass `kind` declares, with changes."""
+    (row,) = (row for row in parameter_table(kind) if row.name == name)
+    return _field(**vars(replace(row, **changes)))
+
+
+def read(kind: type[Configuration], given: Mapping[str, Any]) -> Configuration:
+    """Return a dataclass of parameters with the values given.
+
+    Args:
+        kind: the dataclass.
+        given: values by name, as from YAML; those that are missing or None have their default.
+
+    Raises:
+        SettingError: a value is missing, of another type, or not allowed.
+    """
+    table = parameter_table(kind)
+    values = {row.name: row.coerce(given.get(row.name)) for row in table}
+    if any(row.per_joint for row in table):
+        joints = values["joints"]
+        if not joints or len(set(joints)) != len(joints) or "" in joints:
+            raise SettingError("joints", list(joints), "at least one joint name, each once")
+    for row in table:
+        length = len(values["joints"]) if row.per_joint else row.length
+        if row.optional and not len(values[row.name]):
+            if row.if_empty is not None and length is not None:
+                values[row.name] = np.full(length, row.if_empty)
+        elif row.per_joint:
+            check_per_joint(row.name, values[row.name], values["joints"])
+    return _make(kind, "", values)
+
+
+def _make(kind: type[Configuration], prefix: str, values: Mapping[str, Any]) -> Configuration:
+    made: dict[str, Any] = {}
+    for each in fields(kind):  # type: ignore[arg-type]
+        if _PARAMETER in each.metadata:
+            made[each.name] = values[prefix + each.name]
+        elif _GROUP in each.metadata:
+            of, its_prefix = each.metadata[_GROUP]
+            made[each.name] = _make(of, its_prefix, values)
+    return kind(**made)
+
+
+def check_per_joint(name: str, value: Array, joints: Sequence[str]) -> None:
+    """Check that parameter `name` has one number for each of `joints`.
+
+    Raises:
+        SettingError: another length, or a NaN.
+    """
+    if len(value) != len(joints):
+        raise SettingError(name, value, f"{len(joints)} numbers, one for each of 'joints'")
+    if np.isnan(value).any():
+        raise SettingError(name, value, "numbers, not NaN")

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters that several nodes share: those that say which robot it is, rate and frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.parameter import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    above,
+    joint_numbers,
+    number,
+    numbers,
+    text,
+    texts,
+)
+from viability_bounds_pkg.robot_description import RobotDescriptionError, build_model, read_urdf
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RobotConfiguration:
+    """Which robot it is; arrays of shape (n,) in the order of its n joints."""
+
+    robot_description: str = text("URDF: path, package:// URI, or 'topic': from that topic")
+    joints: tuple[str, ...] = texts(
+        "joints that move, base to tip, in the order of all arrays",
+        note="at least one name, each once",
+    )
+    locked_joints: tuple[str, ...] = texts("other joints that are not at zero", default=())
+    locked_positions: Array = numbers(
+        "where they are, rad", default=(), note="one for each of 'locked_joints'"
+    )
+    position_min: Array = joint_numbers("lower position limits, rad; -.inf for continuous joints")
+    position_max: Array = joint_numbers(
+        "upper position limits, rad; .inf for continuous joints", note="above position_min"
+    )
+    torque_max: Array = joint_numbers("torque limits of the motors, N m", POSITIVE)
+    rotor_inertia: Array = joint_numbers(
+        "inertia of the rotors as seen from the joints, kg m^2; none if empty",
+        NOT_NEGATIVE,
+        if_empty=0.0,
+    )
+
+    def __post_init__(self) -> None:
+        """Check the locked joints and the position limits."""
+        names, positions = self.locked_joints, self.locked_positions
+        if len(names) != len(positions):
+            allowed = f"{len(names)} numbers, one for each of 'locked_joints'"
+            raise SettingError("locked_positions", positions, allowed)
+        if not np.isfinite(positions).all():
+            raise SettingError("locked_positions", positions, "finite numbers")
+        if np.isposinf(self.position_min).any():
+            raise SettingError("position_min", self.position_min, "numbers below .inf")
+        if not (self.position_min < self.position_max).all():
+            allowed = "above position_min everywhere"
+            raise SettingError("position_max", self.position_max, allowed)
+
+    @property
+    def locked(self) -> dict[str, float]:
+        """Where joints are locked that are not at zero, rad by name."""
+        return dict(zip(self.locked_joints, map(float, self.locked_positions), strict=True))
+
+    def read_urdf(self) -> str:
+        """Return the text of the URDF that ``robot_description`` names.
+
+        Raises:
+            SettingError: there is none.
+        """
+        source = self.robot_description
+        try:
+            return read_urdf(source)
+        except RobotDescriptionError as error:
+            raise SettingError("robot_description", source, f"a URDF ({error})") from error
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LimitedRobotConfiguration(RobotConfiguration):
+    """A robot with velocity limits."""
+
+    velocity_max: Array = joint_numbers("speed limits, rad/s", POSITIVE)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ControlRate:
+    """Rate of a control loop."""
+
+    rate_hz: float = number("rate of the control loop, Hz", above(0.0, 1e4))
+
+    @property
+    def dt(self) -> float:
+        """Control period, s."""
+        return 1.0 / self.rate_hz
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TaskFrames:
+    """Frames of pose goals."""
+
+    base_frame: str = text("frame of pose goals; fixed to the URDF's root")
+    end_effector_frame: str = text("frame that pose goals move")
+
+
+def load_model(config: RobotConfiguration, urdf: str) -> pin.Model:
+    """Return the model of the arm.
+
+    Args:
+        config: which robot it is.
+        urdf: text of its URDF.
+
+    Raises:
+        SettingError: a URDF that does not load, or a joint that it does not have.
+    """
+    try:
+        return build_model(urdf, config.joints, config.locked, config.rotor_inertia)
+    except RobotDescriptionError as error:
+        name, value, allowed = _culprit(config, urdf)
+        raise SettingError(name, value, f"{allowed} ({error})") from error
+
+
+def _culprit(config: RobotConfiguration, urdf: str) -> tuple[str, Any, str]:
+    """Return which parameter keeps a model from being built, its value, and what it may be."""
+    joints = config.joints
+    for name, value, allowed, chosen in (
+        ("robot_description", config.robot_description, "a URDF", ()),
+        ("joints", joints, "joints of the URDF, base to tip", joints),
+    ):
+        try:
+            build_model(urdf, chosen)
+        except RobotDescriptionError:
+            return name, value, allowed
+    return "locked_joints", config.locked_joints, "other joints of the URDF"
