@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -91,27 +90,12 @@ class Contact(NamedTuple):
     force: Array  # of the obstacle on the robot, shape (3,), N
 
 
-@dataclass(frozen=True)
-class ContactMaterial:
-    """Friction, stiffness and damping of obstacles.
-
-    Args:
-        friction: Coulomb's coefficient.
-        stiffness: of an obstacle as a whole against displacement, N/m.
-        damping: against its velocity, N s/m.
-
-    Raises:
-        ValueError: one of them is not finite, the stiffness not positive, another one negative.
-    """
+class ContactMaterial(NamedTuple):
+    """Friction, stiffness and damping of obstacles."""
 
     friction: float = 0.5
+    """Coulomb's coefficient."""
     stiffness: float = 2e5
+    """Of an obstacle as a whole against displacement, N/m, not zero."""
     damping: float = 600.0
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        for name, low in (("friction", True), ("stiffness", False), ("damping", True)):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and (value > 0.0 or (low and value == 0.0))):
-                least = ">= 0" if low else "> 0"
-                raise ValueError(f"obstacle {name} must be finite and {least}, not {value}")
+    """Against its velocity, N s/m."""
