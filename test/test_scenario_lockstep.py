@@ -10,7 +10,7 @@ from direct import DirectLoop, column
 from ros_harness import CONFIG
 
 from sim_bridge.bullet.obstacles import Obstacle
-from sim_bridge.nodes.scenario_sender import ScenarioRefused
+from sim_bridge.nodes.scenario_node import ScenarioRefused
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory, circle
 
 ROBOT = "panda"
