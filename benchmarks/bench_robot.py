@@ -98,7 +98,7 @@ def cost_of_pressing(arm: Configured, robot: BulletRobot) -> tuple[float, int, f
     robot.reset(arm.q, zero)
     hand = robot.link_pose(arm.hand).translation
     low = hand - [0.0, 0.0, 0.3]
-    robot.add_obstacle(Obstacle("table", "box", [0.4, 0.4, 0.1], low))
+    robot.obstacles.add(Obstacle("table", "box", [0.4, 0.4, 0.1], low))
     for _ in range(4000):
         q, v, _ = robot.state()
         J = pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
@@ -109,7 +109,7 @@ def cost_of_pressing(arm: Configured, robot: BulletRobot) -> tuple[float, int, f
         start = time.perf_counter()
         robot.step(tau, STEPS // 4)
         best = min(best, 4.0 * (time.perf_counter() - start) / STEPS)
-    return 1e6 * best, len(robot.contacts()), robot.contact_force()[0]
+    return 1e6 * best, len(robot.obstacles.contacts()), robot.obstacles.force
 
 
 def surroundings(arm: Configured, friction: dict[str, object]) -> None:
@@ -125,9 +125,9 @@ def surroundings(arm: Configured, friction: dict[str, object]) -> None:
         robot.reset(arm.q, np.zeros(len(arm.joints)))
         for count in (1, 10):
             for i in range(count):
-                robot.add_obstacle(Obstacle(f"{i}", "box", [0.1] * 3, [5.0, i, 0.0]))
+                robot.obstacles.add(Obstacle(f"{i}", "box", [0.1] * 3, [5.0, i, 0.0]))
             print(f"  {f'{count} obstacles, out of reach':30s} {cost(arm, robot):6.1f}")
-        robot.clear_obstacles()
+        robot.obstacles.clear()
         took, points, force = cost_of_pressing(arm, robot)
         print(f"  {'hand on a table':30s} {took:6.1f} ({points} points, {force:.0f} N)")
 

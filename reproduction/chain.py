@@ -16,8 +16,7 @@ import yaml
 from rclpy.parameter import Parameter
 
 from sim_bridge.nodes.bullet_node import BulletNode
-from sim_bridge.nodes.scenario_node import ScenarioNode
-from sim_bridge.nodes.scenario_play import play
+from sim_bridge.nodes.scenario_node import ScenarioNode, play
 from sim_bridge.scenario.recording import RecordedRun
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode

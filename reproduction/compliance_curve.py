@@ -94,7 +94,7 @@ def draw(
     """
     loop = DirectLoop(ROBOT, {"start_positions": START, **changed})
     for pole in poles:
-        loop.robot.add_obstacle(pole)
+        loop.robot.obstacles.add(pole)
     loop.run(SETTLING)
     trajectory = PoseTrajectory(
         circle(loop.pose(), 0.5 * DIAMETER, PLANE, period=period, turns=turns)
@@ -109,7 +109,7 @@ def draw(
         pose, twist, twist_rate = trajectory.sample(t - begin)
         loop.controller.set_pose_goal(pose, twist, twist_rate)
         goals.append(pose.translation)
-        contacts = loop.robot.contacts() if poles else []
+        contacts = loop.robot.obstacles.contacts() if poles else []
         forces.append(sum(np.linalg.norm(contact.force) for contact in contacts))
         touched.update(contact.link for contact in contacts)
 

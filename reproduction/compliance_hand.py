@@ -236,7 +236,9 @@ def press(
     start = loop.pose()
     x, y, z = start.translation
     table = (x, y, z - hand.reach - GAP - 0.05)
-    loop.robot.add_obstacle(Obstacle("table", "box", (0.2, 0.6, 0.1), table, (0.0, 0.0, 0.0, 1.0)))
+    loop.robot.obstacles.add(
+        Obstacle("table", "box", (0.2, 0.6, 0.1), table, (0.0, 0.0, 0.0, 1.0))
+    )
     end = pin.SE3(start.rotation, start.translation + SLIDE)
     way = PoseTrajectory(
         [
@@ -253,7 +255,9 @@ def press(
             interaction.set_target(np.array([0.0, 0.0, hand.axis * FORCE, 0.0, 0.0, 0.0]))
         if t >= slide[0]:
             loop.controller.set_pose_goal(*way.sample(t - slide[0]))
-        force = sum((np.asarray(contact.force) for contact in loop.robot.contacts()), np.zeros(3))
+        force = sum(
+            (np.asarray(contact.force) for contact in loop.robot.obstacles.contacts()), np.zeros(3)
+        )
         place = loop.pose().translation - start.translation
         rows.append((t, force, -hand.axis * interaction.sensor.wrench[2], place))
 

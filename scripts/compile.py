@@ -54,7 +54,7 @@ def play(robot: str, changes: dict[str, Any]) -> None:
 def touch() -> None:
     """Let an arm without torque fall on a table."""
     loop = DirectLoop("panda")
-    loop.robot.add_obstacle(TABLE)
+    loop.robot.obstacles.add(TABLE)
     for _ in range(100):
         loop.robot.step(np.zeros(loop.model.nv), loop.config.substeps)
 

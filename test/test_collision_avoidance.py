@@ -69,7 +69,7 @@ def play(loop, duration, events=()):
         while pending and pending[0].time <= loop.t + 1e-9:
             event = pending.pop(0)
             if isinstance(event, AddObstacle):
-                loop.robot.add_obstacle(event.obstacle)
+                loop.robot.obstacles.add(event.obstacle)
             elif isinstance(event, PoseGoal):
                 rotation = pin.Quaternion(np.array(event.orientation)).toRotationMatrix()
                 goal = pin.SE3(rotation, np.array(event.position))
@@ -77,7 +77,7 @@ def play(loop, duration, events=()):
         loop.step()
         if loop.controller.constraints:
             distances.append(loop.controller.constraints[0].closest()[0])
-        contacts = max(contacts, len(loop.robot.contacts()))
+        contacts = max(contacts, len(loop.robot.obstacles.contacts()))
     return np.array(distances), contacts
 
 

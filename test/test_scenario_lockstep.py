@@ -10,7 +10,7 @@ from direct import DirectLoop, column
 from ros_harness import CONFIG
 
 from sim_bridge.bullet.obstacles import Obstacle
-from sim_bridge.nodes.scenario_sender import ScenarioRefused
+from sim_bridge.nodes.scenario_node import ScenarioRefused
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory, circle
 
 ROBOT = "panda"
@@ -59,17 +59,17 @@ def play_directly():
         due = {round(time / loop.dt): time for time in (0.15, 0.25, GONE)}.get(k)
         if due == 0.15:
             position = start.translation + OFFSET
-            loop.robot.add_obstacle(Obstacle("box", "box", SIZE, position))
+            loop.robot.obstacles.add(Obstacle("box", "box", SIZE, position))
         elif due == 0.25:
             loop.change(pose_kp=GAIN)
         elif due == GONE:
-            loop.robot.remove_obstacle("box")
+            loop.robot.obstacles.remove("box")
         for link, (begin, end, force) in PUSHES.items():
             on = round(begin / loop.dt) <= k < round(end / loop.dt)
             loop.robot.apply_wrench(link, force if on else np.zeros(3), np.zeros(3))
         if k >= round(BEGIN / loop.dt):
             loop.controller.set_pose_goal(*trajectory.sample(t - BEGIN))
-        touched.append(len(loop.robot.contacts()) > 0)
+        touched.append(len(loop.robot.obstacles.contacts()) > 0)
 
     return loop.run(DURATION, before), np.array(touched), start
 

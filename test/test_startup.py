@@ -123,11 +123,19 @@ def test_a_missing_file_is_refused_in_one_line(tmp_path):
 
 
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("node", [BOUNDS, CONTROLLER, ROBOT])
-def test_nodes_end_when_told_to(ros, node, sent):
-    still = ("-p", "start_paused:=true") if node is ROBOT else ()
+@pytest.mark.parametrize(
+    ("node", "options"),
+    [
+        (BOUNDS, ()),
+        (CONTROLLER, ()),
+        (ROBOT, ("-p", "clock:=real_time")),
+        (ROBOT, ("-p", "clock:=lockstep")),
+    ],
+    ids=["bounds", "controller", "robot in real time", "robot in lockstep"],
+)
+def test_nodes_end_when_told_to(ros, node, options, sent):
     process = subprocess.Popen(
-        command(node, "--params-file", ROOT / "config" / "panda.yaml", *still),
+        command(node, "--params-file", ROOT / "config" / "panda.yaml", *options),
         env=os.environ | {"ROS_DOMAIN_ID": str(ros.domain)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -145,4 +153,4 @@ def test_nodes_end_when_told_to(ros, node, sent):
     finally:
         process.kill()
     assert process.returncode == 0, errors
-    assert "Traceback" not in errors
+    assert not {word for word in ("Traceback", "Exception", "Error") if word in errors}, errors

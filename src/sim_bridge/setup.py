@@ -28,7 +28,7 @@ setup(
         "console_scripts": [
             "bullet_node = sim_bridge.nodes.bullet_node:main",
             "record_excitation = sim_bridge.tools.record_excitation:main",
-            "scenario_node = sim_bridge.nodes.scenario_play:main",
+            "scenario_node = sim_bridge.nodes.scenario_node:main",
         ],
     },
 )

@@ -1,25 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The links of a robot in a PyBullet world, with external wrenches, obstacles and a sensor."""
+"""A robot in a PyBullet world of its own, without what PyBullet adds to rigid-body dynamics.
+
+PyBullet's Dantzig solver, a direct one, computes the constraint impulses of brakes, friction,
+rotors and contacts. They are coupled through the whole arm: sequential impulses, PyBullet's other
+solver, take several times as long and leave an error of some percent, while Dantzig's solver is
+exact to rounding (docs/simulated_robot.md). If it finds no solution, PyBullet falls back to
+sequential impulses.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from xml.etree.ElementTree import fromstring
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
+from sim_bridge.bullet.client import BulletClient, pybullet, silenced
 from sim_bridge.bullet.force_torque_sensor import ForceTorqueSensor
-from sim_bridge.bullet.obstacles import Contact, ContactMaterial, LinkWrench, Obstacle
+from sim_bridge.bullet.obstacle_bodies import BulletObstacles
+from sim_bridge.bullet.obstacles import ContactMaterial, LinkWrench
 from sim_bridge.bullet.vectors import finite_vector
-from sim_bridge.bullet.world import BulletWorld
-from sim_bridge.urdf.links import carried_links
-from sim_bridge.urdf.preparation import FramePlacement, prepare_urdf
+from sim_bridge.urdf.preparation import FramePlacement, PreparedUrdf, prepare_urdf
 from viability_bounds_pkg.robot_description import RobotDescriptionError
 
 Array = NDArray[np.float64]
+
+# What PyBullet adds to rigid-body dynamics: 4 % of damping and a clip of joint velocities at 100.
+_RIGID_BODY = {"linearDamping": 0.0, "angularDamping": 0.0, "maxJointVelocity": 1e9}
+# Of sequential impulses. With PyBullet's defaults (50 rounds, 1e-7) a held Baxter arm creeps at
+# 1.6e-3 rad/s, with these at 1.6e-7 rad/s.
+_SOLVER_ITERATIONS = 500
+_SOLVER_RESIDUAL = 1e-14
+_GEAR_TORQUE_MAX = 1e9  # N m, beyond what any gear transmits
 
 
 class BulletBody:
@@ -27,19 +42,20 @@ class BulletBody:
 
     Args:
         urdf_text: the URDF.
-        joints: names of the n joints that move.
+        joints: names of the n joints that move, in the order of all arrays.
         physics_dt: the physics step, s.
         locked_positions: where other joints are locked, rad or m; those left out are at zero.
         gravity: acceleration of gravity in the base frame, m/s^2.
         mass_scales: factors for mass and inertia of links, by name.
-        collisions: load the collision shapes, meshes as their convex hulls, for contacts.
         material: of obstacles; stiff, with a friction of 0.5, by default.
         sensor_frame: link that is a force/torque sensor; no sensor if empty.
         rotor_inertias: of `prepare_urdf`.
 
     Attributes:
         description: URDF, moving joints, and where others are locked.
-        client_id: PyBullet's physics client.
+        obstacles: all other bodies in the world; the collision shapes of the robot's meshes, with
+            which it touches them, are their convex hulls.
+        client_id: PyBullet's physics client; -1 when closed.
         body_id: the robot in that client.
 
     Raises:
@@ -56,7 +72,6 @@ class BulletBody:
         locked_positions: Mapping[str, float] | None = None,
         gravity: ArrayLike = (0.0, 0.0, -9.81),
         mass_scales: Mapping[str, float] | None = None,
-        collisions: bool = True,
         material: ContactMaterial | None = None,
         sensor_frame: str = "",
         rotor_inertias: Mapping[str, float] | None = None,
@@ -65,38 +80,131 @@ class BulletBody:
             raise ValueError(f"physics_dt must be positive and finite, not {physics_dt}")
         self.joints, self.physics_dt = tuple(joints), physics_dt
         self.description = urdf_text, self.joints, dict(locked_positions or {})
-        gravity_vector = finite_vector("gravity", gravity, 3)
+        gravity = finite_vector("gravity", gravity, 3)
         prepared = prepare_urdf(
-            urdf_text,
-            joints,
-            locked_positions,
-            collisions=collisions,
-            apart=carried_links(fromstring(urdf_text), sensor_frame) if sensor_frame else (),
+            *self.description,
+            sensor_frame=sensor_frame,
             mass_scales=mass_scales,
             rotor_inertias=rotor_inertias,
-        )
-        self._frames = prepared.frames
-        self._missing_shapes = "; ".join(prepared.missing) if collisions else "not loaded"
-        self._wrenches: dict[str, LinkWrench] = {}
-        self._world = BulletWorld(
-            prepared,
-            self.joints,
-            physics_dt,
-            gravity_vector.tolist(),
-            material or ContactMaterial(),
         )
         self._sensor: ForceTorqueSensor | None = None
         if sensor_frame:
             self._sensor = ForceTorqueSensor(
-                urdf_text,
-                sensor_frame,
-                self.joints,
-                locked_positions,
-                mass_scales,
-                gravity_vector,
-                physics_dt,
+                *self.description, sensor_frame, mass_scales, gravity, physics_dt
             )
-        self.client_id, self.body_id = self._world.client_id, self._world.body_id
+        self._frames = prepared.frames
+        self._wrenches: dict[str, LinkWrench] = {}
+        self._bullet = bullet = BulletClient()
+        self.client_id = bullet.id
+        bullet.setGravity(*gravity.tolist())
+        bullet.setPhysicsEngineParameter(
+            fixedTimeStep=physics_dt,
+            numSolverIterations=_SOLVER_ITERATIONS,
+            solverResidualThreshold=_SOLVER_RESIDUAL,
+            deterministicOverlappingPairs=1,
+        )
+        with silenced(1):  # PyBullet prints which solver it uses
+            bullet.setPhysicsEngineParameter(
+                constraintSolverType=pybullet.CONSTRAINT_SOLVER_LCP_DANTZIG
+            )
+        self._load(prepared)
+        self.obstacles = BulletObstacles(
+            bullet,
+            self.body_id,
+            {index: link for link, index in self._links.items()},
+            material or ContactMaterial(),
+            physics_dt,
+            gravity.tolist(),
+            prepared.missing,
+        )
+
+    def _load(self, prepared: PreparedUrdf) -> None:
+        """Load the robot, its motors and brakes off."""
+        bullet = self._bullet
+        try:
+            self.body_id = body = bullet.load_urdf(
+                prepared.text, flags=pybullet.URDF_USE_INERTIA_FROM_FILE
+            )
+        except pybullet.error as error:
+            self.close()
+            raise RobotDescriptionError(f"URDF does not load: {error}") from error
+        infos = bullet.joint_infos(body)
+        indices = {info.name: info.id for info in infos}
+        self._indices = [indices[name] for name in self.joints]
+        self._rotors = {indices[joint]: indices[rotor] for joint, rotor in prepared.rotors.items()}
+        self._links = dict.fromkeys(prepared.principal_inertias, -1)  # -1 is the base
+        self._links.update({info.link: info.id for info in infos})
+        # In a call of its own: PyBullet ignores the link index when a value of the body is set.
+        bullet.changeDynamics(body, -1, **_RIGID_BODY)
+        for link, index in self._links.items():
+            inertia = prepared.principal_inertias[link].tolist()
+            bullet.changeDynamics(body, index, localInertiaDiagonal=inertia, lateralFriction=1.0)
+        control = partial(bullet.setJointMotorControlArray, body, self._indices)
+        self._apply_torques = partial(control, pybullet.TORQUE_CONTROL)
+        self._apply_brakes = partial(control, pybullet.VELOCITY_CONTROL)
+        # For each joint: position, velocity, reaction, and the torque that its brake applied.
+        self._joint_states = partial(bullet.getJointStates, body, self._indices)
+        for info in infos:  # PyBullet starts with the motors on
+            if info.kind != pybullet.JOINT_FIXED:
+                bullet.setJointMotorControl2(body, info.id, pybullet.VELOCITY_CONTROL, force=0.0)
+        for joint, rotor in self._rotors.items():
+            self._couple(joint, rotor)
+
+    def _couple(self, joint: int, rotor: int) -> None:
+        """Couple a rotor to its joint by a gear constraint.
+
+        Brakes and friction must act on the joint, not on the rotor: Dantzig's solver misses the
+        coupling between a gear and a motor on its second joint.
+        """
+        unused = [0.0, 0.0, 0.0]  # a gear has no axes and pivots
+        gear = self._bullet.createConstraint(
+            self.body_id, joint, self.body_id, rotor, pybullet.JOINT_GEAR, unused, unused, unused
+        )
+        # Velocities are equal at the end of each step; the rotor's position does not matter.
+        # PyBullet's constraint is v + ratio * v_rotor = 0.
+        self._bullet.changeConstraint(gear, gearRatio=-1.0, erp=0.0, maxForce=_GEAR_TORQUE_MAX)
+
+    # The physics step
+
+    def _set_state(self, q: Array, v: Array) -> None:
+        """Put the joints at positions `q`, rad, with velocities `v`, rad/s, shape (n,) each."""
+        for index, *state in zip(self._indices, q.tolist(), v.tolist(), strict=True):
+            self._bullet.resetJointState(self.body_id, index, *state)
+            if index in self._rotors:
+                self._bullet.resetJointState(self.body_id, self._rotors[index], *state)
+        self.obstacles.reset()
+        self._measure(q, v, v)
+
+    def _set_torques(self, torques: Array) -> None:
+        """Apply joint torques in the next step, shape (n,), N m."""
+        self._apply_torques(forces=torques.tolist())
+
+    def _set_brakes(self, torque_limits: Array) -> None:
+        """Set the torque limits of the zero-velocity motors, shape (n,), N m, until set again."""
+        self._apply_brakes(forces=torque_limits.tolist())
+
+    def _step(self) -> None:
+        """Make a physics step under the wrenches."""
+        bullet, body = self._bullet, self.body_id
+        for link, wrench in self._wrenches.items():
+            index, point = self._links[self._frames[link].link], self.link_pose(link).translation
+            force, torque = wrench.force.tolist(), wrench.torque.tolist()
+            bullet.applyExternalForce(body, index, force, point.tolist(), pybullet.WORLD_FRAME)
+            bullet.applyExternalTorque(body, index, torque, pybullet.WORLD_FRAME)
+        if self.obstacles:
+            self.obstacles.before_step()
+            bullet.stepSimulation()
+            self.obstacles.after_step()
+        else:
+            bullet.stepSimulation()
+
+    def _measure(self, q: Array, v: Array, v_next: Array) -> None:
+        """Update the sensor, if there is one, by a step from (q, v) to v_next."""
+        if self._sensor is not None:
+            wrenches = [*self._wrenches.values(), *self.obstacles.wrenches()]
+            self._sensor.update(q, v, v_next, wrenches)
+
+    # Links
 
     def apply_wrench(self, link: str, force: ArrayLike, torque: ArrayLike) -> None:
         """Apply a wrench to a link, from the next physics step until `clear_wrenches`.
@@ -114,11 +222,6 @@ class BulletBody:
             link, None, finite_vector("force", force, 3), finite_vector("torque", torque, 3)
         )
 
-    def _apply_wrenches(self) -> None:
-        """Let the wrenches act in the next physics step."""
-        for wrench in self._wrenches.values():
-            self._world.apply_wrench(self._frames[wrench.link], wrench)
-
     def clear_wrenches(self, link: str | None = None) -> None:
         """Remove the wrench on `link`, or all wrenches."""
         if link is None:
@@ -126,37 +229,20 @@ class BulletBody:
         else:
             self._wrenches.pop(link, None)
 
-    def add_obstacle(self, obstacle: Obstacle) -> None:
-        """Add an obstacle, replacing the one of its name if there is one.
+    def link_pose(self, link: str) -> pin.SE3:
+        """Return the pose of any link of the URDF in the frame of its root link.
 
-        Raises:
-            RobotDescriptionError: collision shapes of the robot are missing.
-            ObstacleError: it overlaps the robot.
+        It is PyBullet's, at PyBullet's own joint positions.
         """
-        if self._missing_shapes:
-            raise RobotDescriptionError(f"collision shapes are missing: {self._missing_shapes}")
-        self._world.obstacles.add(obstacle)
-
-    def remove_obstacle(self, name: str) -> bool:
-        """Remove an obstacle; return whether there was one of that name."""
-        return self._world.obstacles.remove(name)
-
-    def clear_obstacles(self) -> None:
-        """Remove all obstacles."""
-        self._world.obstacles.clear()
-
-    @property
-    def obstacles(self) -> dict[str, Obstacle]:
-        """All obstacles, by name."""
-        return self._world.obstacles.present
-
-    def contacts(self) -> list[Contact]:
-        """Return the contact points with obstacles in the last physics step."""
-        return self._world.obstacles.contacts()
-
-    def contact_force(self) -> tuple[float, float]:
-        """Return the largest force of an obstacle, N: in the last step, and since the reset."""
-        return self._world.obstacles.force, self._world.obstacles.force_max
+        frame = self._frame(link)
+        index = self._links[frame.link]
+        if index < 0:
+            return frame.placement.copy()
+        centre, orientation, *_ = self._bullet.getLinkState(
+            self.body_id, index, computeForwardKinematics=1
+        )
+        principal = pin.SE3(pin.Quaternion(np.array(orientation)), np.array(centre))
+        return principal * frame.placement
 
     def sensor_wrench(self) -> Array:
         """Return what the force/torque sensor measured in the last physics step.
@@ -173,23 +259,11 @@ class BulletBody:
             raise ValueError("the robot has no force/torque sensor")
         return self._sensor.wrench.copy()
 
-    def _measure(self, q: Array, v: Array, v_next: Array) -> None:
-        """Update the sensor, if there is one, by a step from (q, v) to v_next."""
-        if self._sensor is None:
-            return
-        wrenches = [*self._wrenches.values(), *self._world.obstacles.wrenches()]
-        self._sensor.update(q, v, v_next, wrenches)
-
-    def link_pose(self, link: str) -> pin.SE3:
-        """Return the pose of any link of the URDF in the frame of its root link.
-
-        It is PyBullet's, at PyBullet's own joint positions.
-        """
-        return self._world.pose(self._frame(link))
-
     def close(self) -> None:
         """Disconnect from PyBullet; the robot cannot be used afterwards."""
-        self._world.close()
+        if self.client_id >= 0:
+            self._bullet.disconnect()
+            self.client_id = -1
 
     def _frame(self, link: str) -> FramePlacement:
         """Return the placement of `link`, or raise `RobotDescriptionError`."""

@@ -20,7 +20,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from sim_bridge.bullet.obstacles import LinkWrench
-from sim_bridge.urdf.links import carried_links, link_at, links_beyond, scale_masses
+from sim_bridge.urdf.elements import joints_on, scale_masses
 from viability_bounds_pkg.robot_description import build_model, kinematic_order
 
 Array = NDArray[np.float64]
@@ -33,9 +33,9 @@ class ForceTorqueSensor:
 
     Args:
         urdf_text: the URDF.
-        frame: the link; the sensor measures at its origin, in its axes.
         joints: names of the n joints that move.
         locked_positions: where other joints are locked, rad or m.
+        frame: the link; the sensor measures at its origin, in its axes.
         mass_scales: factors for mass and inertia of links, by name.
         gravity: shape (3,), m/s^2.
         physics_dt: the physics step h, s.
@@ -50,32 +50,32 @@ class ForceTorqueSensor:
     def __init__(
         self,
         urdf_text: str,
-        frame: str,
         joints: Sequence[str],
-        locked_positions: Mapping[str, float] | None,
+        locked_positions: Mapping[str, float],
+        frame: str,
         mass_scales: Mapping[str, float] | None,
         gravity: Array,
         physics_dt: float,
     ) -> None:
         root = fromstring(urdf_text)
         scale_masses(root, mass_scales or {})
-        locked = dict(locked_positions or {})
-        self._beyond = {x for link in carried_links(root, frame) for x in links_beyond(root, link)}
+        locked = dict(locked_positions)
         # The joints on the sensor become joints of the model, which computes their forces.
-        mounts = [joint for joint in root.findall("joint") if link_at(joint, "parent") == frame]
-        names = {joint.get("name", "") for joint in mounts}
+        mounts = joints_on(root, frame)
+        names = [joint.get("name", "") for joint in mounts]
         for joint in mounts:
             if joint.get("type") == "fixed":
                 joint.set("type", "revolute")
                 SubElement(joint, "limit", effort="0", velocity="0")
         text = tostring(root, encoding="unicode")
-        order = kinematic_order(text, [*joints, *(names - set(joints))])
-        fixed = {name: locked.pop(name, 0.0) for name in names - set(joints)}
+        fixed = {name: locked.pop(name, 0.0) for name in names if name not in joints}
+        order = kinematic_order(text, [*joints, *fixed])
         self._model = model = build_model(text, order, locked)
         model.gravity.linear = gravity
         self._data = model.createData()
         self._frame = model.getFrameId(frame, pin.FrameType.BODY)
         self._mounts = [model.getJointId(name) for name in names]
+        self._beyond = {joint for mount in self._mounts for joint in model.subtrees[mount]}
         self._q = np.array([fixed.get(name, 0.0) for name in order])
         self._v, self._a = np.zeros((2, len(order)))
         self._moving = [order.index(name) for name in joints]
@@ -101,10 +101,10 @@ class ForceTorqueSensor:
         for mount in self._mounts:
             measured -= sensor.actInv(data.oMi[mount].act(data.f[mount]))
         for wrench in wrenches:
-            if wrench.link in self._beyond:
+            link = model.getFrameId(wrench.link, pin.FrameType.BODY)
+            if model.frames[link].parentJoint in self._beyond:
                 point = wrench.point
                 if point is None:
-                    link = model.getFrameId(wrench.link, pin.FrameType.BODY)
                     point = pin.updateFramePlacement(model, data, link).translation
                 moment = np.cross(point, wrench.force) + wrench.torque
                 measured += sensor.actInv(pin.Force(wrench.force, moment))

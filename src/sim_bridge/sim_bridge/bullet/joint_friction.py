@@ -34,7 +34,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sim_bridge.bullet.vectors import finite_vector, not_negative_vector
+from sim_bridge.bullet.vectors import finite_vector
 from viability_bounds_pkg.compiled import compiled
 
 Array = NDArray[np.float64]
@@ -72,13 +72,17 @@ class JointFriction:
         torque_bias: ArrayLike = 0.0,
         rotor_inertia: ArrayLike = 0.0,
     ) -> None:
+        def per_joint(name: str, value: ArrayLike, *, signed: bool = False) -> Array:
+            value = np.full(n, value) if np.ndim(value) == 0 else value
+            return finite_vector(name, value, n, signed=signed).copy()
+
         static = friction_coulomb if friction_static is None else friction_static
-        self.friction_coulomb = _per_joint("friction_coulomb", friction_coulomb, n)
-        self.friction_static = _per_joint("friction_static", static, n)
-        self.friction_viscous = _per_joint("friction_viscous", friction_viscous, n)
-        self.stribeck_velocity = _per_joint("stribeck_velocity", stribeck_velocity, n)
-        self.torque_bias = _per_joint("torque_bias", torque_bias, n, signed=True)
-        self.rotor_inertia = _per_joint("rotor_inertia", rotor_inertia, n)
+        self.friction_coulomb = per_joint("friction_coulomb", friction_coulomb)
+        self.friction_static = per_joint("friction_static", static)
+        self.friction_viscous = per_joint("friction_viscous", friction_viscous)
+        self.stribeck_velocity = per_joint("stribeck_velocity", stribeck_velocity)
+        self.torque_bias = per_joint("torque_bias", torque_bias, signed=True)
+        self.rotor_inertia = per_joint("rotor_inertia", rotor_inertia)
         if np.any(self.friction_static < self.friction_coulomb):
             raise ValueError("friction_static must not be below friction_coulomb")
         if np.any(self.stribeck_velocity == 0.0):
@@ -125,9 +129,3 @@ def _loads(v: Array, tau: Array, parameters: Array, out: Array) -> None:
     for j in range(v.size):
         out[0, j] = tau[j] + bias[j] - viscous[j] * v[j]
         out[1, j] = coulomb[j] + excess[j] * np.exp(-((v[j] / stribeck[j]) ** 2))
-
-
-def _per_joint(name: str, value: ArrayLike, n: int, *, signed: bool = False) -> Array:
-    """Return a number or n of them as a new array of n finite ones, or raise `ValueError`."""
-    value = np.full(n, value) if np.ndim(value) == 0 else value
-    return np.array((finite_vector if signed else not_negative_vector)(name, value, n))

@@ -27,23 +27,14 @@ class LimitMonitor:
         q_max: upper position limits, shape (n,), rad; may be inf.
         v_max: velocity limits, shape (n,), rad/s.
         tau_max: torque limits, shape (n,), N m.
-
-    Raises:
-        ValueError: shapes differ, an interval is empty or a limit not positive.
     """
 
     def __init__(
         self, q_min: ArrayLike, q_max: ArrayLike, v_max: ArrayLike, tau_max: ArrayLike
     ) -> None:
-        limits: list[Array] = [np.array(x, dtype=float) for x in (q_min, q_max, v_max, tau_max)]
-        if limits[0].ndim != 1 or any(x.shape != limits[0].shape for x in limits):
-            shapes = ", ".join(str(x.shape) for x in limits)
-            raise ValueError(f"limits must all have one shape (n,), not {shapes}")
-        self._q_min, self._q_max, self._v_max, self._tau_max = limits
-        if not np.all(self._q_min < self._q_max):
-            raise ValueError(f"q_min must be below q_max: {self._q_min} and {self._q_max}")
-        if not (np.all(self._v_max > 0.0) and np.all(self._tau_max > 0.0)):
-            raise ValueError("v_max and tau_max must be positive")
+        self._q_min, self._q_max, self._v_max, self._tau_max = np.array(
+            (q_min, q_max, v_max, tau_max), dtype=float
+        )
         # q, v, tau, and the same negated: one maximum serves the limits on both sides.
         self._sample = np.empty((2, 3, self._q_min.size))
         self._peak: Array = np.empty_like(self._sample)

@@ -37,6 +37,7 @@ from sim_bridge.bullet.obstacles import (
     Obstacle,
     ObstacleError,
 )
+from viability_bounds_pkg.robot_description import RobotDescriptionError
 
 Array = NDArray[Any]
 
@@ -48,7 +49,7 @@ _SOFTNESS = 1e-11  # m/s of all constraints for each N (rad/s, N m), while there
 
 
 class _Touching(NamedTuple):
-    """The indices of a link and of an obstacle that touch each other."""
+    """PyBullet's indices of a link and of an obstacle that touch each other."""
 
     link: int
     body: int
@@ -73,6 +74,8 @@ class BulletObstacles:
         material: of the obstacles.
         physics_dt: the physics step, s.
         gravity: shape (3,), m/s^2.
+        missing: collision shapes of the robot that are not there; with any there can be no
+            obstacles.
 
     Attributes:
         force: the largest that one obstacle exerted in the last physics step, N.
@@ -87,8 +90,9 @@ class BulletObstacles:
         material: ContactMaterial,
         physics_dt: float,
         gravity: Sequence[float],
+        missing: Sequence[str],
     ) -> None:
-        self._bullet, self._body, self._links = bullet, body, links
+        self._bullet, self._body, self._links, self._missing = bullet, body, links, missing
         self._material, self._dt = material, physics_dt
         self._mass = physics_dt * (material.damping + physics_dt * material.stiffness)
         self._hold = [-self._mass * x for x in gravity]
@@ -112,8 +116,13 @@ class BulletObstacles:
         """Add an obstacle, replacing the one of its name if there is one.
 
         Raises:
+            RobotDescriptionError: collision shapes of the robot are missing.
             ObstacleError: it overlaps the robot.
         """
+        if self._missing:
+            raise RobotDescriptionError(
+                f"collision shapes are missing: {'; '.join(self._missing)}"
+            )
         bullet = self._bullet
         self.remove(obstacle.name)
         shape = bullet.createCollisionShape(**shape_arguments(obstacle))

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -94,11 +93,7 @@ class Contact(NamedTuple):
 
 @dataclass(frozen=True)
 class ContactMaterial:
-    """Friction, stiffness and damping of obstacles; each obstacle moves as a whole.
-
-    Raises:
-        ValueError: one of them is not finite, the stiffness not positive, another one negative.
-    """
+    """Friction, stiffness and damping of obstacles; each obstacle moves as a whole."""
 
     friction: float = number(
         "Coulomb's coefficient between robot and obstacles", Range(0.0, 10.0), default=0.5
@@ -107,11 +102,3 @@ class ContactMaterial:
         "stiffness of obstacles, N/m; 2e5: 0.5 mm at 100 N", above(0.0, 1e9), default=2e5
     )
     damping: float = number("damping of obstacles, N s/m", Range(0.0, 1e9), default=600.0)
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        for name, low in (("friction", True), ("stiffness", False), ("damping", True)):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and (value > 0.0 or (low and value == 0.0))):
-                least = ">= 0" if low else "> 0"
-                raise ValueError(f"obstacle {name} must be finite and {least}, not {value}")

@@ -32,7 +32,6 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from sim_bridge.bullet.joint_friction import JointFriction
 from viability_bounds_pkg.robot_description import build_model, kinematic_order
 
 Array = NDArray[np.float64]
@@ -56,17 +55,33 @@ WINDOW = 2e-4
 class PositionDrive:
     """The drives of n joints; arrays of shape (n,) in the order of `joints`.
 
+    A model of the robot with its rotors gives the gains, and the prediction that replaces the
+    faster loops of a real drive.
+
     Args:
-        model: the robot with its rotors; for the gains, and for the prediction that replaces
-            the faster loops of a real drive.
-        joints: the model's joints in the caller's order.
+        urdf: the robot.
+        joints: in any order.
+        locked_positions: where other joints are locked, rad or m.
+        rotor_inertia: of the joints, shape (n,), kg m^2.
         dt: time between two calls of `torque`, s.
+
+    Raises:
+        RobotDescriptionError: as `build_model` does.
     """
 
-    def __init__(self, model: pin.Model, joints: Sequence[str], dt: float) -> None:
-        self._model, self._data, self._dt = model, model.createData(), dt
-        self._order = [list(joints).index(name) for name in model.names[1:]]
-        self._z = np.zeros(model.nv)  # in the model's order, as all arrays inside
+    def __init__(
+        self,
+        urdf: str,
+        joints: Sequence[str],
+        locked_positions: Mapping[str, float],
+        rotor_inertia: Array,
+        dt: float,
+    ) -> None:
+        order = kinematic_order(urdf, joints)
+        self._order = [joints.index(name) for name in order]
+        self._model = build_model(urdf, order, locked_positions, rotor_inertia[self._order])
+        self._data, self._dt = self._model.createData(), dt
+        self._z = np.zeros(len(joints))  # in the model's order, as all arrays inside
 
     def reset(self, q: Array, v: Array, tau_max: Array, tau: Array | None) -> None:
         """Initialise the integral for a bumpless transfer.
@@ -120,21 +135,3 @@ class PositionDrive:
         bias = pin.nonLinearEffects(self._model, self._data, q, v)
         stiff = tau_max / (POSITION_GAIN * FULL_TORQUE_ERROR)
         return M, bias, np.maximum(VELOCITY_BANDWIDTH * M.diagonal(), stiff)
-
-
-def make_drive(
-    urdf: str,
-    joints: Sequence[str],
-    locked_positions: Mapping[str, float] | None,
-    joint_friction: JointFriction,
-    dt: float,
-) -> PositionDrive:
-    """Return the drives of a robot's `joints`, whatever their order.
-
-    Raises:
-        RobotDescriptionError: as `build_model` does.
-    """
-    order = kinematic_order(urdf, joints)
-    rotors = dict(zip(joints, joint_friction.rotor_inertia, strict=True))
-    model = build_model(urdf, order, locked_positions, [rotors[joint] for joint in order])
-    return PositionDrive(model, joints, dt)

@@ -26,7 +26,6 @@ the maximum being at r = a h^2 / 8: 2 microrad for 15 rad/s^2 at 1 kHz.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,8 +34,8 @@ from numpy.typing import ArrayLike, NDArray
 from sim_bridge.bullet.body import BulletBody
 from sim_bridge.bullet.joint_friction import JointFriction
 from sim_bridge.bullet.limit_monitor import LimitMonitor
-from sim_bridge.bullet.position_drive import PositionDrive, make_drive
-from sim_bridge.bullet.vectors import finite_vector, not_negative_vector
+from sim_bridge.bullet.position_drive import PositionDrive
+from sim_bridge.bullet.vectors import finite_vector
 
 Array = NDArray[np.float64]
 
@@ -94,13 +93,12 @@ class BulletRobot(BulletBody):
             **body,
         )
         self.monitor: LimitMonitor | None = None
+        self._rotor_inertia = friction.rotor_inertia
         self._friction = None if friction.ideal else friction
         # PyBullet's position, half a step ahead of the velocity; see the module.
         self._q, self._v, self._motor_torque = np.zeros((3, n))
         self._brakes = np.zeros(n)
-        # Made when first needed, because it needs a model.
-        self._make_drive = partial(make_drive, *self.description, friction, physics_dt)
-        self._drive: PositionDrive | None = None
+        self._drive: PositionDrive | None = None  # made when first needed: it builds a model
         self._driving = False
         self._stepped = False  # since the last reset
 
@@ -113,11 +111,10 @@ class BulletRobot(BulletBody):
         """
         v = finite_vector("v", v, len(self.joints))
         raw = finite_vector("q", q, len(self.joints)) + 0.5 * self.physics_dt * v
-        self._world.set_state(raw, v)
+        self._set_state(raw, v)
         self._q[:], self._v[:] = raw, v
         self._motor_torque.fill(0.0)
         self._driving = self._stepped = False
-        self._measure(self._q, self._v, self._v)
 
     def step(self, tau: ArrayLike, substeps: int = 1) -> None:
         """Apply joint torques for some physics steps.
@@ -153,10 +150,12 @@ class BulletRobot(BulletBody):
         """
         n = len(self.joints)
         q_des, v_des = finite_vector("q", q, n), finite_vector("v", v, n)
-        v_max = not_negative_vector("speed_limits", speed_limits, n)
-        tau_max = not_negative_vector("torque_limits", torque_limits, n)
+        v_max = finite_vector("speed_limits", speed_limits, n, signed=False)
+        tau_max = finite_vector("torque_limits", torque_limits, n, signed=False)
         self._release_brakes()
-        drive = self._drive = self._drive or self._make_drive()
+        drive = self._drive = self._drive or PositionDrive(
+            *self.description, self._rotor_inertia, self.physics_dt
+        )
         if not self._driving:
             last = self._motor_torque if self._stepped else None
             drive.reset(*self.state()[:2], tau_max, last)
@@ -177,11 +176,11 @@ class BulletRobot(BulletBody):
             substeps: how many physics steps, at least 1.
             torque_limits: greatest torque of each brake, shape (n,), N m, not negative.
         """
-        limits = not_negative_vector("torque_limits", torque_limits, len(self.joints))
+        limits = finite_vector("torque_limits", torque_limits, len(self.joints), signed=False)
         self._driving = False
         self._brakes[:] = limits
         if self._friction is None:
-            self._world.set_brakes(limits)
+            self._set_brakes(limits)
         self._advance(substeps, braking=True)
 
     def state(self) -> RobotState:
@@ -195,7 +194,6 @@ class BulletRobot(BulletBody):
         """Make physics steps under `_motor_torque`, the torques of `control`, or the brakes."""
         if substeps < 1:
             raise ValueError(f"substeps must be at least 1, not {substeps}")
-        world = self._world
         # Otherwise the states between substeps need not be read.
         state_matters = any((control, self._friction, self._sensor, self.monitor))
         for remaining in range(substeps, 0, -1):
@@ -204,14 +202,13 @@ class BulletRobot(BulletBody):
             if self._friction is not None:
                 self._apply_friction(self._friction, braking)
             elif not braking:
-                world.set_torques(self._motor_torque)
-            self._apply_wrenches()
-            world.step()
+                self._set_torques(self._motor_torque)
+            self._step()
             self._stepped = True
             if remaining > 1 and not state_matters:
                 continue
             before = self._q.copy(), self._v.copy()
-            states = world.joint_states()
+            states = self._joint_states()
             self._q[:] = [state[0] for state in states]
             self._v[:] = [state[1] for state in states]
             if braking:  # PyBullet counts friction in, and the last of a brake now off
@@ -227,10 +224,10 @@ class BulletRobot(BulletBody):
         # A motor that is off has no bias either.
         tau = -model.torque_bias if braking else self._motor_torque
         torque, dry_friction = model.loads(self._v, tau)
-        self._world.set_torques(torque)
-        self._world.set_brakes(dry_friction + self._brakes)
+        self._set_torques(torque)
+        self._set_brakes(dry_friction + self._brakes)
 
     def _release_brakes(self) -> None:
         if self._brakes.any():
             self._brakes.fill(0.0)
-            self._world.set_brakes(self._brakes)
+            self._set_brakes(self._brakes)

@@ -9,17 +9,15 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 
-def finite_vector(name: str, value: ArrayLike, size: int) -> Array:
-    """Return `value` as an array of `size` finite numbers, or raise `ValueError`."""
+def finite_vector(name: str, value: ArrayLike, size: int, *, signed: bool = True) -> Array:
+    """Return `value` as an array of `size` finite numbers, not negative unless `signed`.
+
+    Raises:
+        ValueError: it is not.
+    """
     array = np.asarray(value, dtype=float)
     if array.shape != (size,) or not np.isfinite(array).all():
         raise ValueError(f"{name} must be {size} finite numbers, not {value!r}")
-    return array
-
-
-def not_negative_vector(name: str, value: ArrayLike, size: int) -> Array:
-    """Return `value` as an array of `size` finite numbers >= 0, or raise `ValueError`."""
-    array = finite_vector(name, value, size)
-    if np.any(array < 0.0):
+    if not signed and np.any(array < 0.0):
         raise ValueError(f"{name} must not be negative: {array}")
     return array

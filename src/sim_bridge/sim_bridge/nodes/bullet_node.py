@@ -250,7 +250,7 @@ class BulletNode(Node):
         latencies = np.array(self._latencies) if self._latencies else np.full(1, np.nan)
         median, slow = np.percentile(latencies, (50, 99)) * 1e6
         elapsed = time.monotonic() - self._started_at
-        contact_force, contact_force_max = self._robot.contact_force()
+        obstacles = self._robot.obstacles
         values = {
             "clock": "lockstep" if self._config.lockstep else "real_time",
             "paused": self._paused,
@@ -264,8 +264,8 @@ class BulletNode(Node):
             "braked_periods": self._braked,
             "commands_refused": self._refused,
             "world_changes_pending": len(self._world),
-            "contact_force_n": contact_force,
-            "contact_force_max_n": contact_force_max,
+            "contact_force_n": obstacles.force,
+            "contact_force_max_n": obstacles.force_max,
             "latency_p50_us": float(median),
             "latency_p99_us": float(slow),
             "commanded_torque_ratio_max": self._torque_ratio,

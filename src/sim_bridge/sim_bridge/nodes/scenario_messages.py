@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The messages and service calls of a scenario's events."""
+"""The messages and service calls of a scenario's events, and their publisher."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import pinocchio as pin
 from geometry_msgs.msg import PoseStamped, Transform, Twist, WrenchStamped
 from rcl_interfaces.srv import SetParameters
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
@@ -30,9 +31,11 @@ from sim_bridge.scenario.events import (
 )
 from sim_bridge.scenario.scenario import Scenario
 from viability_bounds_pkg.pose_trajectory import TrajectoryPoint
-from viability_bounds_pkg.ros.runtime import set_stamp
+from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp
 
-_ZERO = (0.0, 0.0, 0.0)
+_IN_FLIGHT_MAX = GOAL_QOS.depth - 2
+"""Messages sent but not yet reported as received: a reader's queue is that long."""
+
 _SHAPES = {"box": Marker.CUBE, "sphere": Marker.SPHERE, "cylinder": Marker.CYLINDER}
 
 
@@ -81,8 +84,8 @@ def to_robot(scenario: Scenario, base_frame: str) -> list[ScheduledMessage]:
     """Return pushes, their ends, and obstacles in the base frame, in order of time."""
     pushes = [event for event in scenario.events if isinstance(event, Push)]
     # Ends first: where one push directly follows another, the new one must remain.
-    messages = [_push(push, push.time + push.duration, _ZERO, _ZERO) for push in pushes]
-    messages += [_push(push, push.time, push.force, push.torque) for push in pushes]
+    messages = [_push(Push(push.time + push.duration, 0.0, push.link)) for push in pushes]
+    messages += map(_push, pushes)
     messages += [
         _obstacle(event, base_frame)
         for event in scenario.events
@@ -178,11 +181,9 @@ def _wrench(frame: str, force: tuple[float, ...], torque: tuple[float, ...]) -> 
     return message
 
 
-def _push(
-    push: Push, time: float, force: tuple[float, ...], torque: tuple[float, ...]
-) -> ScheduledMessage:
-    message = _wrench(push.link, force, torque)
-    return ScheduledMessage("external_wrench", message, message.header, _delay(time))
+def _push(push: Push) -> ScheduledMessage:
+    message = _wrench(push.link, push.force, push.torque)
+    return ScheduledMessage("external_wrench", message, message.header, _delay(push.time))
 
 
 def _obstacle(event: AddObstacle | RemoveObstacle, base_frame: str) -> ScheduledMessage:
@@ -201,3 +202,43 @@ def _obstacle(event: AddObstacle | RemoveObstacle, base_frame: str) -> Scheduled
     return ScheduledMessage(
         "obstacles", MarkerArray(markers=[marker]), marker.header, _delay(event.time)
     )
+
+
+class ScheduledPublisher:
+    """Publishes messages for one receiver before their time, as its queue permits.
+
+    Args:
+        node: publishes them.
+        messages: in order of time.
+    """
+
+    def __init__(self, node: Node, messages: Sequence[ScheduledMessage]) -> None:
+        kinds = {message.topic: type(message.content) for message in messages}
+        self._publishers = {
+            topic: node.create_publisher(kind, topic, GOAL_QOS) for topic, kind in kinds.items()
+        }
+        self._messages = messages
+        self._sent = 0
+
+    def without_subscriber(self) -> list[str]:
+        """Return the topics without a subscriber."""
+        return [
+            topic for topic, out in self._publishers.items() if not out.get_subscription_count()
+        ]
+
+    def proceed(self, first: int, pending: int) -> bool:
+        """Publish the messages that the receiver has room for.
+
+        Args:
+            first: stamp of the scenario's start, ns.
+            pending: number of messages that the receiver reports as waiting for their time.
+
+        Returns:
+            Whether it has received all of them.
+        """
+        portion = self._messages[self._sent : pending + _IN_FLIGHT_MAX]
+        for message in portion:
+            set_stamp(message.header.stamp, first + message.delay)
+            self._publishers[message.topic].publish(message.content)
+        self._sent += len(portion)
+        return pending >= len(self._messages)

@@ -4,31 +4,40 @@
 from __future__ import annotations
 
 import math
+import sys
+import time
 from collections import deque
-from enum import Enum, auto
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rclpy
 from rclpy.clock import Clock, ClockType
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
 from sim_bridge.nodes.run_listener import RunListener
 from sim_bridge.nodes.scenario_messages import (
     RESET,
+    ScheduledPublisher,
+    ServiceRequest,
     change_parameters,
     pause,
+    refusals,
     to_controller,
     to_robot,
     to_service,
 )
-from sim_bridge.nodes.scenario_sender import ScenarioRefused, ScheduledPublisher, ServiceCaller
 from sim_bridge.scenario.events import ServiceEvent
 from sim_bridge.scenario.recording import RecordedRun
 from sim_bridge.scenario.scenario import ScenarioConfiguration
-from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError
 from viability_bounds_pkg.ros.parameters import NodeParameters
+from viability_bounds_pkg.ros.runtime import leave, make_executor, report_refusal
 
 _POLL_PERIOD = 0.02
+_SHOW_PERIOD = 0.5
 _REFUSAL_COUNTS: dict[str, tuple[str, str | tuple[str, ...]]] = {
     "controller_node": ("goals_refused", "target_"),
     "bullet_node": ("commands_refused", ("external_wrench", "obstacles")),
@@ -36,19 +45,8 @@ _REFUSAL_COUNTS: dict[str, tuple[str, str | tuple[str, ...]]] = {
 """By node, the diagnostics key that counts refusals by topic, and the topics of a scenario."""
 
 
-class Phase(Enum):
-    """Progress of a scenario."""
-
-    GETTING_READY = auto()
-    """Waits for a paused robot, the other nodes, their subscriptions and services."""
-    RESETTING = auto()
-    """The robot is reset; the first command for that state has not come."""
-    LOADING = auto()
-    """Scheduled messages are sent; not all have been reported as received."""
-    PLAYING = auto()
-    STOPPING = auto()
-    """A message or call was refused; the robot is being paused."""
-    DONE = auto()
+class ScenarioRefused(ArmSafetyError, RuntimeError):
+    """Another node refused a message or call of the scenario; the text says which and why."""
 
 
 class ScenarioNode(Node):
@@ -59,7 +57,8 @@ class ScenarioNode(Node):
     so a run in lockstep is the same each time.
 
     Attributes:
-        phase: progress of the scenario.
+        awaits: what it waits for.
+        done: whether the scenario has ended.
         failure: why it ended early; None if it did not.
         listener: the recorded messages and diagnostics of the other nodes.
     """
@@ -72,26 +71,24 @@ class ScenarioNode(Node):
             self.destroy_node()
             raise
         self.config = config
-        self.phase = Phase.GETTING_READY
+        self.awaits = ""
+        self.done = False
         self.failure: ScenarioRefused | None = None
         self.listener = RunListener(self, config.joints)
         self._first, self._period = 0, 1
-        self._refused: dict[str, list[str]] = {}  # when the scenario's messages begin
-        self._refusal: ScenarioRefused | None = None
-        self._halt = self._end = 0  # periods from the start
+        self._refused: dict[str, list[str]] | None = None  # when the messages begin; else None
         frames = config.base_frame, config.end_effector_frame
         self._goals = ScheduledPublisher(self, to_controller(config.plan, *frames))
         self._world = ScheduledPublisher(self, to_robot(config.plan, config.base_frame))
         self._due = deque(e for e in config.plan.events if isinstance(e, ServiceEvent))
         own = RESET, pause(False), change_parameters("bullet_node", {})
-        self._caller = ServiceCaller(self, [*own, *map(to_service, self._due)])
+        self._service_clients = {
+            request.service: self.create_client(request.kind, request.service)
+            for request in (*own, *map(to_service, self._due))
+        }
+        self._course = self._play()
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_POLL_PERIOD, self._proceed, clock=steady)
-
-    @property
-    def done(self) -> bool:
-        """Whether the scenario has ended."""
-        return self.phase is Phase.DONE
 
     @property
     def robot(self) -> dict[str, str]:
@@ -100,56 +97,87 @@ class ScenarioNode(Node):
 
     def recorded_run(self) -> RecordedRun:
         """Return the recording since the robot began to move."""
-        return self.listener.recorder.run(self._first)
+        return self.listener.run(self._first)
 
     # Course of the scenario
 
     def _proceed(self) -> None:
         try:
-            if self.phase in (Phase.LOADING, Phase.PLAYING):
-                self._check_refusals()
-            if self.phase is Phase.GETTING_READY and not self.awaited():
-                self.phase, self._first = Phase.RESETTING, self.listener.stamp
-                self._caller.add("", RESET)
-            elif self.phase is Phase.RESETTING and self._caller.proceed() and self._is_reset():
-                self.phase = Phase.LOADING
-                self._plan()
-            elif self.phase is Phase.LOADING and self._load():
-                self.phase = Phase.PLAYING
-                self._resume()
-            elif self.phase is Phase.PLAYING and self._caller.proceed():
-                self._play()
-            elif self.phase is Phase.STOPPING and self._caller.proceed():
-                self.failure, self.phase = self._refusal, Phase.DONE
+            if self._refused is not None:
+                self._check_refusals(self._refused)
+            self.awaits = next(self._course)
+        except StopIteration:
+            self.done = True
         except ScenarioRefused as error:
-            self._refusal, self.phase = error, Phase.STOPPING
-            self._caller.drop()
-            self._caller.add("", pause(True))
+            self._refused, self._course = None, self._stop(error)
 
-    def awaited(self) -> list[str]:
-        """Return what is missing before the scenario can proceed."""
-        if self.phase is Phase.LOADING:
-            return ["report that goals, pushes and obstacles were received"]
-        if self.phase is not Phase.GETTING_READY:
-            return self._caller.awaited
-        paused = self.robot.get("paused") == "True"
-        topics = self._goals.without_subscriber() + self._world.without_subscriber()
-        return (
-            ([] if paused else ["a paused robot"])
-            + ([] if self.listener.answered >= 0 else ["joint commands"])
-            + [f"service {service}" for service in self._caller.missing()]
-            + [f"a subscriber of {topic}" for topic in topics]
-        )
-
-    def _is_reset(self) -> bool:
-        """Return whether there is a command for the state published by the reset."""
-        return self.listener.answered == self.listener.stamp > self._first
-
-    def _plan(self) -> None:
+    def _play(self) -> Iterator[str]:
+        """Play the scenario; yield what must happen before it proceeds."""
+        while missing := self._missing():
+            yield f"getting ready: there is no {', no '.join(missing)}"
+        before = self._first = self.listener.stamp
+        yield from self._call(RESET)
+        while not self.listener.answered == self.listener.stamp > before:
+            yield "resetting: there is no joint command for the start"
         # Resuming begins a new period: the first state in motion is the next.
         self._period = round(1e9 * float(self.robot["period_s"]))
         self._first = self.listener.stamp + self._period
-        self._end = round(1e9 * self.config.plan.duration / self._period)
+        self._refused = {}
+        while not self._load():
+            yield "loading: there is no report that goals, pushes and obstacles were received"
+        lockstep = self.robot["clock"] == "lockstep"
+        begin, end = 0, round(1e9 * self.config.plan.duration / self._period)
+        while begin < end:
+            yield from self._call_services(begin)
+            # In lockstep the robot pauses where a service is due.
+            halt = min(end, self._period_of(self._due[0])) if self._due and lockstep else end
+            left = 1e-9 * self._period * (halt - begin)
+            yield from self._call(change_parameters("bullet_node", {"pause_after": left}))
+            yield from self._call(pause(False))
+            while not self._is_paused_at(halt):
+                if not lockstep:
+                    now = (self.listener.stamp - self._first) // self._period
+                    yield from self._call_services(now)
+                yield "playing"
+            begin = halt
+
+    def _stop(self, error: ScenarioRefused) -> Iterator[str]:
+        """Pause the robot, and end."""
+        yield from self._call(pause(True))
+        self.failure = error
+
+    def _missing(self) -> list[str]:
+        """Return what is missing before the scenario can begin."""
+        clients = self._service_clients.items()
+        topics = self._goals.without_subscriber() + self._world.without_subscriber()
+        return (
+            ([] if self.robot.get("paused") == "True" else ["a paused robot"])
+            + ([] if self.listener.answered >= 0 else ["joint commands"])
+            + [f"service {name}" for name, client in clients if not client.service_is_ready()]
+            + [f"a subscriber of {topic}" for topic in topics]
+        )
+
+    def _call(self, request: ServiceRequest, when: str = "") -> Iterator[str]:
+        """Call a service and wait for its answer.
+
+        Raises:
+            ScenarioRefused: the call was refused; `when` is part of the text.
+        """
+        answer = self._service_clients[request.service].call_async(request.content)
+        while not answer.done():
+            yield f"calling: there is no answer of {request.service}"
+        if reasons := "; ".join(refusals(request, answer.result())):
+            raise ScenarioRefused(f"{when}{request.service} refused: {reasons}")
+
+    def _call_services(self, period: int) -> Iterator[str]:
+        """Call the services that are due when a period, counted from the first, begins."""
+        while self._due and self._period_of(self._due[0]) <= period:
+            event = self._due.popleft()
+            yield from self._call(to_service(event), f"at {event.time:g} s: ")
+
+    def _period_of(self, event: ServiceEvent) -> int:
+        """Return the first period that begins at or after the time of an event."""
+        return math.ceil(1e9 * event.time / self._period - 1e-6)
 
     def _load(self) -> bool:
         """Send scheduled messages; return whether all were received."""
@@ -158,52 +186,24 @@ class ScenarioNode(Node):
         changes = int(self.robot["world_changes_pending"])
         return self._world.proceed(self._first, changes) and loaded
 
-    def _check_refusals(self) -> None:
+    def _is_paused_at(self, halt: int) -> bool:
+        """Return whether the robot reports that it has paused where period `halt` begins."""
+        last = self._first + (halt - 1) * self._period
+        return int(self.robot["stamp_ns"]) >= last and self.robot["paused"] == "True"
+
+    def _check_refusals(self, known: dict[str, list[str]]) -> None:
         for node, (key, topics) in _REFUSAL_COUNTS.items():
             counts = self.listener.diagnostics[node].get(key, "").split("; ")
             refused = [count for count in counts if count.startswith(topics)]
-            if refused != self._refused.setdefault(node, refused):
+            if refused != known.setdefault(node, refused):
                 raise ScenarioRefused(f"refused by {node}: {' '.join(refused)}")
-
-    def _play(self) -> None:
-        # In lockstep the robot pauses where a service is due; its report after the pause at the
-        # end is final.
-        over = int(self.robot["stamp_ns"]) >= self._first + (self._halt - 1) * self._period
-        if not over or self.robot["paused"] != "True":
-            if self.robot["clock"] != "lockstep":
-                self._call((self.listener.stamp - self._first) // self._period)
-        elif self._halt == self._end:
-            self.phase = Phase.DONE
-        else:
-            self._resume()
-
-    def _resume(self) -> None:
-        """Call the services that are due, then resume the robot until the next ones are."""
-        now, self._halt = self._halt, self._end
-        self._call(now)
-        if self._due and self.robot["clock"] == "lockstep":
-            self._halt = min(self._end, self._period_of(self._due[0]))
-        left = 1e-9 * self._period * (self._halt - now)
-        self._caller.add("", change_parameters("bullet_node", {"pause_after": left}))
-        self._caller.add("", pause(False))
-        self._caller.proceed()
-
-    def _call(self, period: int) -> None:
-        """Call the services that are due when a period, counted from the first, begins."""
-        while self._due and self._period_of(self._due[0]) <= period:
-            event = self._due.popleft()
-            self._caller.add(f"at {event.time:g} s: ", to_service(event))
-
-    def _period_of(self, event: ServiceEvent) -> int:
-        """Return the first period that begins at or after the time of an event."""
-        return math.ceil(1e9 * event.time / self._period - 1e-6)
 
     # Output
 
     def live_line(self) -> str:
         """Return the state of the run in one line."""
         q = self.listener.q
-        if self.phase is Phase.GETTING_READY or q is None:
+        if self.awaits.startswith("getting ready") or self.listener.stamp < 0:
             return "waiting for the nodes"
         distance = np.minimum(q - self.config.position_min, self.config.position_max - q)
         nearest = int(np.argmin(distance))
@@ -216,3 +216,89 @@ class ScenarioNode(Node):
             f"pose error {1e3 * error:7.2f} mm  "
             f"{float(self.robot.get('rate_hz', 'nan')):5.0f} Hz"
         )
+
+
+def play(node: ScenarioNode, others: Sequence[Node] = (), *, quiet: bool = False) -> None:
+    """Run the scenario to its end and print its state.
+
+    Args:
+        node: the scenario.
+        others: nodes to run in the same process.
+        quiet: print nothing.
+
+    Raises:
+        TimeoutError: the other nodes did not start, or stopped answering.
+        ScenarioRefused: another node refused a message or call of the scenario.
+        ExternalShutdownException: shut down before the end.
+    """
+    executor = make_executor(node.context)
+    for each in (node, *others):
+        executor.add_node(each)
+    terminal = sys.stdout.isatty()
+    shown_at = -math.inf
+    progress, moved_at = None, time.monotonic()
+    while not node.done and rclpy.ok(context=node.context):
+        executor.spin_once(timeout_sec=0.1)
+        now = time.monotonic()
+        if (node.listener.stamp, node.awaits) != progress:
+            progress, moved_at = (node.listener.stamp, node.awaits), now
+        elif now - moved_at > node.config.ready_timeout:
+            raise TimeoutError(
+                f"nothing has moved for {node.config.ready_timeout:g} s ({node.awaits})"
+            )
+        if not quiet and now - shown_at > _SHOW_PERIOD:
+            shown_at = now
+            print(node.live_line(), end="\r" if terminal else "\n", flush=True)
+    if node.failure is not None:
+        raise node.failure
+    if not node.done:
+        raise ExternalShutdownException
+    if not quiet:
+        print(node.live_line(), flush=True)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Play a scenario; with ``--out DIRECTORY`` also write its report.
+
+    Returns:
+        0 when no limit was broken, 1 when one was, 2 when the scenario could not be played.
+    """
+    argv = rclpy.utilities.remove_ros_args(args=sys.argv if args is None else args)
+    try:
+        out = _output_directory(argv)
+        rclpy.init(args=args)
+        node = ScenarioNode()
+    except Exception as error:
+        rclpy.try_shutdown()
+        report_refusal(error)
+        return 2
+    try:
+        play(node)
+        if out is None:
+            return 0
+        from sim_bridge.scenario.report import write_report  # matplotlib takes a second to import
+
+        bounds = node.listener.diagnostics["bounds_node"]
+        kept = write_report(out, node.config, node.recorded_run(), node.robot, bounds)
+        return 0 if kept else 1
+    except (TimeoutError, ScenarioRefused) as error:
+        report_refusal(error)
+        return 2
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return 130
+    finally:
+        leave(node)
+
+
+def _output_directory(argv: list[str]) -> Path | None:
+    """Return the value of ``--out``, or None without it."""
+    if "--out" not in argv:
+        return None
+    value = argv[argv.index("--out") + 1 :][:1]
+    if not value:
+        raise ValueError("--out needs a directory")
+    return Path(value[0])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

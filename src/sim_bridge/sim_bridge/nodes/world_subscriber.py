@@ -71,7 +71,7 @@ class WorldSubscriber:
         self._pending.clear()
         self.wrench_ends.clear()
         self._robot.clear_wrenches()
-        self._robot.clear_obstacles()
+        self._robot.obstacles.clear()
 
     def apply_due(self, stamp: int) -> None:
         """Apply the changes that are due in the control period that begins at `stamp`, ns."""
@@ -128,7 +128,7 @@ class WorldSubscriber:
         """
         robot, name = self._robot, marker.ns
         if marker.action == Marker.DELETEALL:
-            return robot.clear_obstacles
+            return robot.obstacles.clear
         if marker.action == Marker.DELETE:
             return partial(self._remove, name)
         if marker.action != Marker.ADD or marker.type not in _SHAPES:
@@ -142,12 +142,12 @@ class WorldSubscriber:
         )
         frame = marker.header.frame_id
         if not frame:
-            return partial(robot.add_obstacle, given)
+            return partial(robot.obstacles.add, given)
         robot.link_pose(frame)  # or it raises
-        return lambda: robot.add_obstacle(_placed(given, robot.link_pose(frame)))
+        return lambda: robot.obstacles.add(_placed(given, robot.link_pose(frame)))
 
     def _remove(self, name: str) -> None:
-        if not self._robot.remove_obstacle(name):
+        if not self._robot.obstacles.remove(name):
             raise ObstacleError(f"there is no obstacle {name!r}")
 
     def _refuse(self, topic: str, error: Exception) -> None:

@@ -6,18 +6,14 @@
 
 from sim_bridge.scenario.events import Event, read_event
 from sim_bridge.scenario.fields import ScenarioError
-from sim_bridge.scenario.pose_reference import pose_errors, pose_reference
-from sim_bridge.scenario.recording import RecordedRun, Recorder
+from sim_bridge.scenario.recording import RecordedRun
 from sim_bridge.scenario.scenario import Scenario, load_scenario
 
 __all__ = [
     "Event",
     "RecordedRun",
-    "Recorder",
     "Scenario",
     "ScenarioError",
     "load_scenario",
-    "pose_errors",
-    "pose_reference",
     "read_event",
 ]

@@ -1,101 +1,93 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The events of a scenario: a class for each kind of entry, and its reader."""
+"""The events of a scenario: a class for each kind of entry, and the fields of that entry."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
-from sim_bridge.bullet.obstacles import SHAPES, Obstacle, ObstacleError
-from sim_bridge.scenario.fields import ScenarioEntry, ScenarioError, refuse
+from sim_bridge.bullet.obstacles import Obstacle, ObstacleError
+from sim_bridge.scenario.fields import (
+    Check,
+    ScenarioError,
+    name,
+    not_negative,
+    number,
+    positive,
+    quaternion,
+    read_fields,
+    refuse,
+    vector,
+)
 from sim_bridge.scenario.trajectory import read_trajectory
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory
 
-_ZERO = [0.0, 0.0, 0.0]
-_UPRIGHT = [0.0, 0.0, 0.0, 1.0]
+_ZERO = (0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True)
-class PoseGoal:
+class PoseGoal(NamedTuple):
     """An end-effector pose in the base frame from `time` on."""
 
     time: float
-    position: tuple[float, ...]
-    """x, y, z, m."""
-    orientation: tuple[float, ...]
-    """Unit quaternion x, y, z, w."""
+    position: tuple[float, ...]  # x, y, z, m
+    orientation: tuple[float, ...]  # unit quaternion x, y, z, w
 
 
-@dataclass(frozen=True)
-class PostureGoal:
-    """Joint positions, rad by name, from `time` on."""
+class PostureGoal(NamedTuple):
+    """Joint positions from `time` on."""
 
     time: float
-    positions: Mapping[str, float]
+    positions: Mapping[str, float]  # rad, by joint
 
 
-@dataclass(frozen=True)
-class TrajectoryGoal:
+class TrajectoryGoal(NamedTuple):
     """A trajectory of the end effector in the base frame that begins at `time`."""
 
     time: float
     trajectory: PoseTrajectory
 
 
-@dataclass(frozen=True)
-class WrenchGoal:
+class WrenchGoal(NamedTuple):
     """The desired wrench of the end effector on its environment from `time` on."""
 
     time: float
-    force: tuple[float, ...]
-    """N."""
-    torque: tuple[float, ...]
-    """N m."""
-    frame: str
-    """Frame whose axes it is given in; empty for the end effector's."""
+    force: tuple[float, ...] = _ZERO  # N
+    torque: tuple[float, ...] = _ZERO  # N m
+    frame: str = ""  # in whose axes it is given; empty for the end effector's
 
 
-@dataclass(frozen=True)
-class Push:
+class Push(NamedTuple):
     """An external wrench on a link, in world axes, from `time` on for `duration` seconds."""
 
     time: float
     duration: float
     link: str
-    force: tuple[float, ...]
-    """N."""
-    torque: tuple[float, ...]
-    """N m."""
+    force: tuple[float, ...] = _ZERO  # N
+    torque: tuple[float, ...] = _ZERO  # N m
 
 
-@dataclass(frozen=True)
-class AddObstacle:
+class AddObstacle(NamedTuple):
     """An obstacle in the robot's world; the controller does not know of it."""
 
     time: float
-    obstacle: Obstacle
-    """Placed in the base frame."""
+    obstacle: Obstacle  # placed in the base frame
 
 
-@dataclass(frozen=True)
-class RemoveObstacle:
+class RemoveObstacle(NamedTuple):
     """The removal of an obstacle."""
 
     time: float
     name: str
 
 
-@dataclass(frozen=True)
-class EnableTorque:
+class EnableTorque(NamedTuple):
     """A call of the controller's ``enable_torque``: torque or position control."""
 
     time: float
     enable: bool
 
 
-@dataclass(frozen=True)
-class ParameterChange:
+class ParameterChange(NamedTuple):
     """New values of a node's parameters."""
 
     time: float
@@ -103,12 +95,12 @@ class ParameterChange:
     values: Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class TriggerCall:
+class TriggerCall(NamedTuple):
     """A call of a ``std_srvs/Trigger`` service."""
 
     time: float
     service: str
+    type: str = "trigger"
 
 
 Goal = PoseGoal | PostureGoal | TrajectoryGoal | WrenchGoal
@@ -130,73 +122,42 @@ def read_event(content: Any, where: str) -> Event:
     if len(kinds) != 1 or "time" not in content or not kinds <= set(_KINDS):
         raise ScenarioError(f"{where} must have 'time' and one of {', '.join(_KINDS)}")
     kind = kinds.pop()
-    time = ScenarioEntry(content, where).number("time", zero=True)
-    return _KINDS[kind](time, content[kind], f"{where}.{kind}")
+    time = not_negative(content["time"], f"{where}.time")
+    event, read = _KINDS[kind]
+    place = f"{where}.{kind}"
+    if callable(read):
+        return event(time, read(content[kind], place))
+    return event(time, **read_fields(content[kind], place, read, event._field_defaults))
 
 
-def _pose(time: float, content: Any, where: str) -> PoseGoal:
-    entry = ScenarioEntry(content, where, ("position", "orientation"))
-    return PoseGoal(time, entry.vector("position"), entry.quaternion("orientation"))
+def _posture(content: Any, where: str) -> Mapping[str, float]:
+    joints = content if isinstance(content, dict) else ()
+    return read_fields(content, where, dict.fromkeys(joints, number))
 
 
-def _posture(time: float, content: Any, where: str) -> PostureGoal:
-    entry = ScenarioEntry(content, where)
-    return PostureGoal(time, {str(key): entry.number(key, negative=True) for key in entry.fields})
-
-
-def _trajectory(time: float, content: Any, where: str) -> TrajectoryGoal:
-    return TrajectoryGoal(time, read_trajectory(content, where))
-
-
-def _wrench(time: float, content: Any, where: str) -> WrenchGoal:
-    entry = ScenarioEntry(content, where, ("force", "torque", "frame"))
-    frame = entry.fields.get("frame", "")
-    if not isinstance(frame, str):
-        raise entry.refuse("frame", "the name of a frame, or nothing")
-    force, torque = (entry.vector(key, default=_ZERO) for key in ("force", "torque"))
-    return WrenchGoal(time, force, torque, frame)
-
-
-def _push(time: float, content: Any, where: str) -> Push:
-    entry = ScenarioEntry(content, where, ("link", "duration", "force", "torque"))
-    force, torque = (entry.vector(key, default=_ZERO) for key in ("force", "torque"))
-    link, duration = entry.name("link", "the name of a link"), entry.number("duration")
-    return Push(time, duration, link, force, torque)
-
-
-def _obstacle(time: float, content: Any, where: str) -> AddObstacle:
-    entry = ScenarioEntry(content, where, ("name", "shape", "size", "position", "orientation"))
+def _obstacle(content: Any, where: str) -> Obstacle:
     try:
-        obstacle = Obstacle(
-            entry.name("name", "a name"),
-            entry.name("shape", f"one of {', '.join(SHAPES)}"),
-            entry.vector("size"),
-            entry.vector("position"),
-            entry.quaternion("orientation", _UPRIGHT),
-        )
+        return Obstacle(**read_fields(content, where, _OBSTACLE, ("orientation",)))
     except ObstacleError as error:
         raise ScenarioError(f"{where}: {error}") from None
-    return AddObstacle(time, obstacle)
 
 
-def _remove_obstacle(time: float, content: Any, where: str) -> RemoveObstacle:
-    return RemoveObstacle(time, ScenarioEntry(content, where, ("name",)).name("name", "a name"))
+def _true_or_false(value: Any, where: str) -> bool:
+    if not isinstance(value, bool):
+        raise refuse(where, value, "true or false")
+    return value
 
 
-def _enable_torque(time: float, content: Any, where: str) -> EnableTorque:
-    if not isinstance(content, bool):
-        raise refuse(where, content, "true or false")
-    return EnableTorque(time, content)
+def _trigger(value: Any, where: str) -> str:
+    if value != "trigger":
+        raise refuse(where, value, "trigger")
+    return value
 
 
-def _parameters(time: float, content: Any, where: str) -> ParameterChange:
-    entry = ScenarioEntry(content, where, ("node", "values"))
-    node, values = entry.name("node", "the name of a node"), entry.fields.get("values")
-    if not isinstance(values, dict) or not values:
-        raise entry.refuse("values", "parameters and their values")
-    return ParameterChange(
-        time, node, {str(k): _parameter(v, f"{where}.values.{k}") for k, v in values.items()}
-    )
+def _parameters(content: Any, where: str) -> dict[str, Any]:
+    if not isinstance(content, dict) or not content:
+        raise refuse(where, content, "parameters and their values")
+    return {str(key): _parameter(value, f"{where}.{key}") for key, value in content.items()}
 
 
 def _parameter(value: Any, where: str) -> Any:
@@ -211,22 +172,23 @@ def _parameter(value: Any, where: str) -> Any:
     raise refuse(where, value, "true, false, a number, a string, or a list of numbers or strings")
 
 
-def _call(time: float, content: Any, where: str) -> TriggerCall:
-    entry = ScenarioEntry(content, where, ("service", "type"))
-    if entry.fields.get("type", "trigger") != "trigger":
-        raise entry.refuse("type", "trigger")
-    return TriggerCall(time, entry.name("service", "the name of a service"))
-
-
-_KINDS: dict[str, Callable[[float, Any, str], Event]] = {
-    "pose": _pose,
-    "posture": _posture,
-    "trajectory": _trajectory,
-    "wrench": _wrench,
-    "push": _push,
-    "obstacle": _obstacle,
-    "remove_obstacle": _remove_obstacle,
-    "enable_torque": _enable_torque,
-    "parameters": _parameters,
-    "call": _call,
+_OBSTACLE: dict[str, Check] = {
+    "name": name,
+    "shape": name,
+    "size": vector,
+    "position": vector,
+    "orientation": quaternion,
 }
+_KINDS: dict[str, tuple[Any, Check | Mapping[str, Check]]] = {
+    "pose": (PoseGoal, {"position": vector, "orientation": quaternion}),
+    "posture": (PostureGoal, _posture),
+    "trajectory": (TrajectoryGoal, read_trajectory),
+    "wrench": (WrenchGoal, {"force": vector, "torque": vector, "frame": name}),
+    "push": (Push, {"link": name, "duration": positive, "force": vector, "torque": vector}),
+    "obstacle": (AddObstacle, _obstacle),
+    "remove_obstacle": (RemoveObstacle, {"name": name}),
+    "enable_torque": (EnableTorque, _true_or_false),
+    "parameters": (ParameterChange, {"node": name, "values": _parameters}),
+    "call": (TriggerCall, {"service": name, "type": _trigger}),
+}
+"""By the entry's name: the event, and its fields or a function that reads its only field."""

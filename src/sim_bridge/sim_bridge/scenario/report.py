@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -14,11 +15,11 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 
 from sim_bridge.bullet.robot import BulletRobot
-from sim_bridge.scenario.events import TrajectoryGoal
-from sim_bridge.scenario.pose_reference import pose_errors, pose_reference
+from sim_bridge.scenario.events import EnableTorque, Event, PoseGoal, TrajectoryGoal
 from sim_bridge.scenario.recording import RecordedRun
 from sim_bridge.scenario.scenario import ScenarioConfiguration
 
@@ -69,16 +70,55 @@ def write_report(
     return bool(metrics["limits_kept"])
 
 
-def _errors(config: ScenarioConfiguration, run: RecordedRun, reference: Array) -> Array:
-    """Return the pose error of each state, shape (N, 2), m and rad; NaN without a reference.
+def pose_reference(events: Iterable[Event], t: Array) -> Array:
+    """Return the pose that the scenario asks of the end effector, in the base frame.
 
-    The robot's own forward kinematics are PyBullet's, which share nothing with the
+    The end effector of a compliant arm, or of one that avoids collisions, may be elsewhere.
+
+    Args:
+        events: in order of time.
+        t: times, s, shape (N,).
+
+    Returns:
+        Position and quaternion x, y, z, w, shape (N, 7); NaN before the first pose or trajectory,
+        and from a change to or from position control on until the next that comes under torque
+        control.
+    """
+    reference = np.full((len(t), 7), np.nan)
+    torque = True
+    for event in events:
+        now = np.flatnonzero(t >= event.time - 1e-9)
+        if isinstance(event, EnableTorque):
+            torque = event.enable
+            reference[now] = np.nan
+        elif torque and isinstance(event, PoseGoal):
+            reference[now] = [*event.position, *event.orientation]
+        elif torque and isinstance(event, TrajectoryGoal):
+            for i in now:
+                reference[i] = pin.SE3ToXYZQUAT(event.trajectory.sample(t[i] - event.time)[0])
+    return reference
+
+
+def _errors(config: ScenarioConfiguration, run: RecordedRun, reference: Array) -> Array:
+    """Return distance and angle of each state to the reference, shape (N, 2), m and rad.
+
+    NaN without a reference. The forward kinematics are PyBullet's, which share nothing with the
     controller's.
     """
+    errors = np.full((len(run.t), 2), np.nan)
+    rest = np.zeros(len(run.joints))
     with closing(
         BulletRobot(config.urdf, config.joints, locked_positions=config.locked, physics_dt=1e-3)
     ) as robot:
-        return pose_errors(robot, config.base_frame, config.end_effector_frame, run, reference)
+        base = robot.link_pose(config.base_frame)
+        for i in np.flatnonzero(np.isfinite(reference[:, 0])):
+            robot.reset(run.q[i], rest)
+            pose = robot.link_pose(config.end_effector_frame)
+            desired = base * pin.XYZQUATToSE3(reference[i])
+            turn = pin.log3(pose.rotation.T @ desired.rotation)
+            distance = np.linalg.norm(desired.translation - pose.translation)
+            errors[i] = distance, np.linalg.norm(turn)
+    return errors
 
 
 def _floats(robot: dict[str, str], key: str) -> Array:

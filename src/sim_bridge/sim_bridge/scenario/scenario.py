@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -17,7 +18,7 @@ from sim_bridge.scenario.events import (
     WrenchGoal,
     read_event,
 )
-from sim_bridge.scenario.fields import ScenarioEntry, ScenarioError, refuse
+from sim_bridge.scenario.fields import ScenarioError, positive, read_fields, refuse
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import above, number, text
 from viability_bounds_pkg.robot_configuration import LimitedRobotConfiguration, TaskFrames
@@ -90,14 +91,9 @@ def load_scenario(path: str | Path) -> Scenario:
         content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise ScenarioError(f"scenario {path}: {error}") from error
-    if not isinstance(content, dict) or set(content) - {"duration", "events"}:
-        raise ScenarioError(f"scenario {path}: has keys other than 'duration' and 'events'")
     try:
-        duration = ScenarioEntry(content, "").number("duration")
-        entries = content.get("events") or []
-        if not isinstance(entries, list):
-            raise ScenarioError(f"events is {entries!r}; allowed: a list")
-        events = [read_event(entry, f"events[{i}]") for i, entry in enumerate(entries)]
+        fields = read_fields(content, "", {"duration": positive, "events": _events}, ("events",))
+        duration, events = fields["duration"], fields.get("events", [])
         for i, event in enumerate(events):
             if event.time >= duration:
                 raise refuse(f"events[{i}].time", event.time, f"less than {duration:g}, the end")
@@ -107,6 +103,12 @@ def load_scenario(path: str | Path) -> Scenario:
     except ScenarioError as error:
         raise ScenarioError(f"scenario {path}: {error}") from None
     return Scenario(duration, tuple(events))
+
+
+def _events(content: Any, where: str) -> list[Event]:
+    if not isinstance(content, list | None):
+        raise refuse(where, content, "a list")
+    return [read_event(entry, f"{where}[{i}]") for i, entry in enumerate(content or ())]
 
 
 def _check_pushes(events: list[Event]) -> None:

@@ -113,7 +113,7 @@ class Camera:
 
     def _update_obstacles(self) -> None:
         """Show the obstacles that the robot's world has now."""
-        present = self._robot.obstacles
+        present = self._robot.obstacles.present
         for name, (shown, body) in list(self._shown.items()):
             if present.get(name) is not shown:
                 self._bullet.removeBody(body)

@@ -20,7 +20,7 @@ On request it adds what a URDF cannot express: rotors that gears will couple to 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -29,16 +29,18 @@ from xml.etree.ElementTree import Element, ParseError, SubElement, fromstring, t
 import numpy as np
 import pinocchio as pin
 
-from sim_bridge.urdf.geometry import (
+from sim_bridge.urdf.elements import (
     Array,
     joint_axis,
+    joints_on,
+    link_at,
     number_text,
     origin_attributes,
     read_numbers,
+    scale_masses,
     transform_of,
 )
-from sim_bridge.urdf.links import link_at, placed_shapes, scale_masses
-from viability_bounds_pkg.robot_description import RobotDescriptionError
+from viability_bounds_pkg.robot_description import RobotDescriptionError, resolve_uri
 
 _MOVABLE = ("revolute", "continuous", "prismatic")
 # PyBullet makes no stop where lower > upper.
@@ -84,8 +86,7 @@ def prepare_urdf(
     locked_positions: Mapping[str, float] | None = None,
     *,
     visuals: bool = False,
-    collisions: bool = False,
-    apart: Collection[str] = (),
+    sensor_frame: str = "",
     mass_scales: Mapping[str, float] | None = None,
     rotor_inertias: Mapping[str, float] | None = None,
 ) -> PreparedUrdf:
@@ -96,9 +97,9 @@ def prepare_urdf(
         joints: the joints that move, in any order: revolute, continuous or prismatic.
         locked_positions: where other joints are locked, rad or m; joints left out are locked
             at zero. Mimic joints are joints like any other here, as they are in Pinocchio.
-        visuals: keep the visual shapes; the files they name are looked up.
-        collisions: keep the collision shapes of what moves.
-        apart: links that do not become one with those that carry them, even if they are fixed.
+        visuals: keep the visual shapes, instead of the collision shapes of what moves.
+        sensor_frame: link with which those that it carries do not become one, even if they are
+            fixed; none if empty.
         mass_scales: factors for mass and inertia of links, by name.
         rotor_inertias: for each of `joints` that gets a rotor, its inertia, kg m^2 (kg for a
             prismatic joint). The rotors turn about axes fixed to the ground, through their
@@ -107,7 +108,8 @@ def prepare_urdf(
     Raises:
         RobotDescriptionError: not a URDF, a joint that is unknown, repeated, both moved and
             locked, or of a type with other than one coordinate; an unknown link, or one scaled
-            by other than a finite positive number; a mesh that cannot be found.
+            by other than a finite positive number; a link that carries none as `sensor_frame`; a
+        mesh of a visual shape that cannot be found.
     """
     try:
         root = fromstring(urdf)
@@ -116,6 +118,11 @@ def prepare_urdf(
     locked = dict(locked_positions or {})
     _check_joints(root, joints, locked)
     scale_masses(root, mass_scales or {})
+    apart = (
+        {link_at(joint, "child") for joint in joints_on(root, sensor_frame)}
+        if sensor_frame
+        else set()
+    )
 
     output = Element("robot", name=root.get("name", "robot"))
     output.extend(deepcopy(root.findall("material")))
@@ -138,9 +145,9 @@ def prepare_urdf(
         placed[name] = body, placement
         body.inertia += _inertia(links[name], placement)
         if visuals:
-            body.shapes += placed_shapes(links[name], "visual", placement)
-        if collisions and body is not bodies[0]:  # what stands still meets nothing
-            body.shapes += placed_shapes(links[name], "collision", placement, missing)
+            body.shapes += _placed_shapes(links[name], "visual", placement, missing)
+        elif body is not bodies[0]:  # what stands still meets nothing
+            body.shapes += _placed_shapes(links[name], "collision", placement, missing)
         for joint in outgoing.get(name, ()):
             child = _linked(joint, "child", links)
             origin = placement * transform_of(joint.find("origin"))
@@ -154,6 +161,8 @@ def prepare_urdf(
             else:
                 pending.append((child, body, origin))
 
+    if visuals and missing:
+        raise RobotDescriptionError("; ".join(missing))
     # What stands on the ground takes no part in the dynamics; its frame stays where it is.
     bodies[0] = _Body(roots[0], shapes=bodies[0].shapes)
     principal = {body.name: _append_link(output, body) for body in bodies}
@@ -212,6 +221,27 @@ def _inertia(link: Element, placement: pin.SE3) -> pin.Inertia:
             raise RobotDescriptionError(f"link {link.get('name')!r}: {error}") from error
         total += (placement * transform_of(inertial.find("origin"))).act(own)
     return total
+
+
+def _placed_shapes(
+    link: Element, kind: str, placement: pin.SE3, missing: list[str]
+) -> list[Element]:
+    """Return the shapes of `link`, placed on a body; `missing` receives meshes not found."""
+    shapes = []
+    for original in link.findall(kind):
+        shape = deepcopy(original)
+        origin = shape.find("origin")
+        if origin is None:
+            origin = SubElement(shape, "origin")
+        origin.attrib = origin_attributes(placement * transform_of(origin))
+        try:
+            for mesh in shape.iter("mesh"):
+                mesh.set("filename", str(resolve_uri(mesh.get("filename", "")).resolve()))
+        except RobotDescriptionError as error:
+            missing.append(str(error))
+        else:
+            shapes.append(shape)
+    return shapes
 
 
 def _append_link(output: Element, body: _Body) -> tuple[pin.SE3, Array]:

@@ -53,16 +53,16 @@ def test_the_robot_and_its_obstacles_are_seen_where_they_are(robot, camera):
     bare = camera.snapshot(EYE, TARGET, SIZE)
     assert bare.shape == (72, 96, 3) and bare.dtype == np.uint8
     place = np.array([0.7, 0.2, 0.5])
-    robot.add_obstacle(Obstacle("ball", "sphere", [0.12] * 3, place))
+    robot.obstacles.add(Obstacle("ball", "sphere", [0.12] * 3, place))
     picture = camera.snapshot(EYE, TARGET, SIZE)
     seen = red(picture)
     assert not red(bare).any() and seen.sum() > 20
     np.testing.assert_allclose(np.argwhere(seen).mean(axis=0), pixel(place), atol=1.0)
-    robot.add_obstacle(Obstacle("ball", "sphere", [0.12] * 3, place + [0.0, 0.3, 0.0]))
+    robot.obstacles.add(Obstacle("ball", "sphere", [0.12] * 3, place + [0.0, 0.3, 0.0]))
     moved = red(camera.snapshot(EYE, TARGET, SIZE))
     where = pixel(place + [0.0, 0.3, 0.0])
     np.testing.assert_allclose(np.argwhere(moved).mean(axis=0), where, atol=1.0)
-    robot.clear_obstacles()
+    robot.obstacles.clear()
     np.testing.assert_array_equal(camera.snapshot(EYE, TARGET, SIZE), bare)
     # The hand: the picture changes there when it moves, and not at the foot.
     bent = camera.snapshot(EYE, TARGET, SIZE, q=Q + [0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0])

@@ -96,12 +96,12 @@ def test_in_motion_it_feels_the_change_of_momentum(sensor, beyond):
     """Of the bodies beyond, whose velocities PyBullet tells; right to the length of the step."""
     h, rng = 1e-5, np.random.default_rng(1)
     with make("panda", physics_dt=h, sensor=sensor) as robot:
-        world, body = robot._world._bullet, robot.body_id
+        world, body = robot._bullet, robot.body_id
 
         def momentum(about):
             change, load = np.zeros((2, 6))
             for name in beyond:
-                index = robot._world._links[name]
+                index = robot._links[name]
                 mass, _, moments = world.getDynamicsInfo(body, index)[:3]
                 state = world.getLinkState(body, index, 1, 1)
                 x, y, z, w = state[1]
@@ -152,10 +152,10 @@ def test_pushes_and_contacts_beyond_are_felt_and_others_are_not():
         robot.clear_wrenches()
         # A ball of 10 cm comes to touch the hand from below, and a table that pushes.
         hand = robot.link_pose("gripper_left_fingertip_3_link").translation
-        robot.add_obstacle(Obstacle("ball", "sphere", [0.1] * 3, hand + [0.0, 0.0, -0.09]))
+        robot.obstacles.add(Obstacle("ball", "sphere", [0.1] * 3, hand + [0.0, 0.0, -0.09]))
         robot.step(np.zeros(n), 400)
         robot.brake(200, limits)
-        contacts = robot.contacts()
+        contacts = robot.obstacles.contacts()
         assert {contact.link for contact in contacts} == {"wrist_left_ft_tool_link"}
         place, axes = robot.link_pose(SENSOR[name]).translation, rotation(robot, SENSOR[name])
         force = sum(contact.force for contact in contacts)

@@ -110,20 +110,3 @@ def test_limits_and_samples_are_copied():
     monitor.update(q, np.zeros(1), np.zeros(1))
     q[0] = 5.0
     np.testing.assert_array_equal(monitor.closest_to_q_max, [1.0])
-
-
-@pytest.mark.parametrize(
-    "limits",
-    [
-        ([0.0], [1.0, 1.0], [1.0], [1.0]),
-        (0.0, 1.0, 1.0, 1.0),
-        ([1.0], [1.0], [1.0], [1.0]),
-        ([0.0], [np.nan], [1.0], [1.0]),
-        ([0.0], [1.0], [0.0], [1.0]),
-        ([0.0], [1.0], [1.0], [-1.0]),
-        ([0.0], [1.0], [1.0], [np.nan]),
-    ],
-)
-def test_bad_limits_are_refused(limits):
-    with pytest.raises(ValueError, match=r"must|shape"):
-        LimitMonitor(*limits)

@@ -399,11 +399,11 @@ def test_obstacles_come_and_go_with_their_stamps(ros):
     obstacles.publish(MarkerArray(markers=markers))
     ros.wait_until(lambda: len(robot.node._world) == 3, "the obstacles")
     robot.step()
-    assert set(arm.obstacles) == {"first"}
+    assert set(arm.obstacles.present) == {"first"}
     robot.step(times=2)
-    assert set(arm.obstacles) == {"first"}
+    assert set(arm.obstacles.present) == {"first"}
     robot.step()
-    assert set(arm.obstacles) == {"second"}
+    assert set(arm.obstacles.present) == {"second"}
     ros.wait_until(lambda: "obstacles: 2;" in robot.reported("commands_refused"))
     ros.call(Trigger, "bullet_node/reset", Trigger.Request())
     assert not arm.obstacles
@@ -500,7 +500,7 @@ def test_contacts_are_felt_by_motion_sensor_and_diagnostics(ros):
         q, v = robot.q, robot.v
         J = pin.computeFrameJacobian(ARM.model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
         robot.step(robot.gravity() + J.T @ [0.0, 0.0, -15.0, 0.0, 0.0, 0.0] - 5.0 * v)
-    assert arm.contacts()
+    assert arm.obstacles.contacts()
     ros.diagnostics.clear()
     ros.wait_until(lambda: robot.reported("contact_force_n"))
     assert float(robot.reported("contact_force_n")) == pytest.approx(15.0, rel=0.1)

@@ -183,7 +183,7 @@ def test_an_event_that_cannot_be_is_named(tmp_path, kind, content, names):
 @pytest.mark.parametrize(
     ("text", "names"),
     [
-        ("", "keys"),
+        ("", "the file is None; allowed: fields and their values"),
         ("duration: [", "scenario"),
         ("events: []", "duration"),
         ("duration: -1", "duration"),
@@ -191,8 +191,8 @@ def test_an_event_that_cannot_be_is_named(tmp_path, kind, content, names):
         ("duration: true", "duration"),
         ("duration: 1e999", "duration"),
         ("duration: 1" + 400 * "0", "duration"),
-        ("[1, 2]", "keys"),
-        ("duration: 1\ngoals: []", "keys"),
+        ("[1, 2]", "the file is [1, 2]; allowed: fields"),
+        ("duration: 1\ngoals: []", "the file has goals; allowed: duration, events"),
         ("duration: 1\nevents: {time: 0}", "events"),
         ("duration: 1\nevents: 5", "events"),
         ("duration: 1\nevents: [5]", "events[0]"),

@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -42,3 +43,39 @@ def test_a_node_says_when_its_start_had_to_compile(compiles):
     said = [line for line in done.stderr.splitlines() if "compiling took" in line]
     assert len(said) == compiles, done.stderr
     assert not compiles or "scripts/setup.sh" in said[0]
+
+
+INTERRUPTED = """
+import os
+import sys
+from rclpy.node import Node
+from std_msgs.msg import Header
+from viability_bounds_pkg.ros.runtime import run
+
+class Busy(Node):
+    def __init__(self):
+        super().__init__("busy")
+        self.out = self.create_publisher(Header, "out", 1)
+        self.create_timer(0.01, self.work)
+
+    def work(self):
+        os.kill(os.getpid(), int(sys.argv[1]))
+        for _ in range(1000):
+            self.out.publish(Header())
+
+sys.exit(run(Busy, []))
+"""
+
+
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_lets_the_callback_end_that_it_interrupts(sent):
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED, str(int(sent))],
+        cwd=PACKAGE,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert not {word for word in ("Traceback", "Exception", "Error") if word in done.stderr}

@@ -15,6 +15,7 @@ from rclpy.context import Context
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from viability_bounds_pkg.exceptions import SettingError
@@ -56,13 +57,17 @@ def make_executor(context: Context | None = None) -> Executor:
 
 
 def spin(executor: Executor, context: Context | None = None) -> None:
-    """Run callbacks until the context is shut down or Ctrl-C comes.
+    """Run callbacks until the context is shut down or SIGINT or SIGTERM comes.
 
     ``EventsExecutor.spin()`` of rclpy 7.1 runs no callback, and a wait without time-out does
-    not see signals, so this waits in turns on a future that is never set.
+    not see signals, so this waits in turns on a future that is never set. A signal lets the
+    callback that it interrupts end: it may be about to publish. Call it from the main thread.
     """
+    signals: list[int] = []
+    for each in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(each, lambda number, _: signals.append(number))
     never: Future = Future()
-    while rclpy.ok(context=context):
+    while rclpy.ok(context=context) and not signals:
         executor.spin_until_future_complete(never, timeout_sec=_SIGNAL_CHECK_PERIOD)
 
 
@@ -70,11 +75,12 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
     """Start the node that `make_node` returns, run it until it is told to stop.
 
     Returns:
-        The exit code: 0 after Ctrl-C or shutdown; 1 when the node cannot start, after one
+        The exit code: 0 after SIGINT, SIGTERM or shutdown; 1 when the node cannot start, after one
         line on stderr that says why.
     """
     try:
-        rclpy.init(args=args)
+        # Its own handlers would shut down the context in the middle of a callback.
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rclpy's own classes differ between releases
         report_refusal(error)
         return 1
@@ -104,10 +110,6 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
     except (SettingError, RobotDescriptionError) as error:
         report_refusal(error)
         return 1
-    except Exception:
-        # A signal shuts the context down in the middle of a callback, which then cannot publish.
-        if rclpy.ok():
-            raise
     finally:
         leave(node)
         gc.unfreeze()

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames, axes and numbers as a URDF writes them."""
+"""Links, frames, axes and numbers as a URDF writes them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Mapping
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -52,3 +53,42 @@ def read_numbers(element: Element | None, name: str, count: int) -> Array:
     if numbers.shape != (count,) or not np.isfinite(numbers).all():
         raise RobotDescriptionError(f"URDF: {name}={text!r} is not {count} finite number(s)")
     return numbers
+
+
+def link_at(joint: Element, end: str) -> str:
+    """Return the name of the link at the "parent" or "child" `end` of a joint; may be empty."""
+    element = joint.find(end)
+    return "" if element is None else element.get("link", "")
+
+
+def joints_on(root: Element, link: str) -> list[Element]:
+    """Return the joints of the URDF `root` that carry what is mounted on `link`.
+
+    Raises:
+        RobotDescriptionError: there is no such link, or nothing is mounted on it.
+    """
+    known = [element.get("name", "") for element in root.findall("link")]
+    if link not in known:
+        raise RobotDescriptionError(f"unknown link {link!r}; the URDF has: {', '.join(known)}")
+    joints = [joint for joint in root.findall("joint") if link_at(joint, "parent") == link]
+    if not joints:
+        raise RobotDescriptionError(f"link {link!r} carries no other link to measure")
+    return joints
+
+
+def scale_masses(root: Element, scales: Mapping[str, float]) -> None:
+    """Scale mass and inertia of links of the URDF `root` by finite positive factors.
+
+    Raises:
+        RobotDescriptionError: an unknown link, or another factor.
+    """
+    links = {link.get("name", ""): link for link in root.findall("link")}
+    for name, scale in scales.items():
+        if name not in links:
+            raise RobotDescriptionError(f"unknown link {name!r}; the URDF has: {', '.join(links)}")
+        if not (math.isfinite(scale) and scale > 0.0):
+            raise RobotDescriptionError(f"the mass of link {name!r} cannot be scaled by {scale}")
+        for inertial in links[name].findall("inertial"):
+            for part in (*inertial.findall("mass"), *inertial.findall("inertia")):
+                for key in part.attrib:
+                    part.set(key, number_text(scale * read_numbers(part, key, 1)))
