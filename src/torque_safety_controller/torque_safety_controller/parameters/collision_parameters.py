@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torque_safety_controller.collision.avoidance import CollisionAvoidance, CollisionSettings
 from torque_safety_controller.collision.bodies import SHAPES, CollisionBody, make_obstacle
 from torque_safety_controller.collision.geometry import load_geometry
-from torque_safety_controller.collision.model import Pruning, build_collision_model
+from torque_safety_controller.collision.model import build_collision_model
 from torque_safety_controller.parameters.entries import Entry
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import RobotDescriptionError
@@ -209,7 +209,8 @@ def load_collision(
         config.obstacles,
         config.pairs,
         config.base_frame,
-        Pruning(clearance=kept + _BEYOND, near=kept + _NEAR),
+        near=kept + _NEAR,
+        clearance=kept + _BEYOND,
     )
     return CollisionAvoidance(collision, config.a_min, config.a_max, config.dt, config.settings)
 
