@@ -25,8 +25,8 @@ import yaml
 from torque_safety_controller.additional_torque import AdditionalTorque
 from torque_safety_controller.collision.avoidance import CollisionAvoidance
 from torque_safety_controller.collision.bodies import box, capsule, half_space, sphere
+from torque_safety_controller.collision.distances import Pairs
 from torque_safety_controller.collision.geometry import link_shapes, load_geometry
-from torque_safety_controller.collision.kernels import Pairs
 from torque_safety_controller.collision.model import CollisionModel, build_collision_model
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.parameters import ControllerConfiguration
@@ -180,8 +180,7 @@ def pairs(robot: CollisionRobot) -> None:
         costs = {}
         for label, influence in (("far", 1e-1), ("near", 50.0)):
             avoidance = robot.avoidance(part)
-            limits = avoidance._work.limits._replace(influence=influence)
-            avoidance._work = avoidance._work._replace(limits=limits)
+            avoidance._use(avoidance._work._replace(influence=influence))
             still = [(q, 0.0 * v, low, high) for q, v, low, high in states]
             time_ = median_time(avoidance.rows, still)
             costs[label] = (time_ - bare) / count

@@ -18,11 +18,7 @@ from torque_safety_controller.collision.avoidance import (
 )
 from torque_safety_controller.collision.bodies import box, capsule, half_space, sphere
 from torque_safety_controller.collision.geometry import load_geometry
-from torque_safety_controller.collision.model import (
-    CollisionModel,
-    Pruning,
-    build_collision_model,
-)
+from torque_safety_controller.collision.model import CollisionModel, build_collision_model
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 from viability_bounds_pkg.viability import BoundsSolver
@@ -62,7 +58,8 @@ def two_links(
         load_geometry(urdf, model),
         np.zeros(2),
         obstacles,
-        pruning=Pruning(samples=10, near=10.0),
+        samples=10,
+        near=10.0,
     )
     limit = np.full(2, 20.0)
     dt = settings.pop("dt", 1e-3)
@@ -73,8 +70,7 @@ def two_links(
 
 def with_constants(avoidance: CollisionAvoidance, **constants: float) -> CollisionAvoidance:
     """Change what no setting reaches, to see more in a test."""
-    limits = avoidance._work.limits._replace(**constants)
-    avoidance._work = avoidance._work._replace(limits=limits)
+    avoidance._use(avoidance._work._replace(**constants))
     return avoidance
 
 
@@ -93,10 +89,7 @@ def panda(obstacles: bool = True) -> tuple[Arm, JointLimits, CollisionModel, pin
         np.array(bounds["acceleration_max"]),
     )
     surroundings = SURROUNDINGS if obstacles else ()
-    pruning = Pruning(samples=3000)
-    collision = build_collision_model(
-        arm.model, geometry, arm.q_start, surroundings, pruning=pruning
-    )
+    collision = build_collision_model(arm.model, geometry, arm.q_start, surroundings, samples=3000)
     return arm, limits, collision, geometry
 
 

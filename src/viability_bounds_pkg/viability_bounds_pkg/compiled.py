@@ -16,12 +16,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, TypeVar, overload
+from typing import Any, TypeVar, cast, overload
 
-from numba import njit
+from numba import njit, typeof, types
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 F = TypeVar("F", bound=Callable[..., Any])
+T = TypeVar("T")
 
 _functions: list[Any] = []
 
@@ -61,6 +62,21 @@ def is_kept(function: Any) -> bool:
 def compilations() -> int:
     """Return how often this process had to compile a function, because nothing was kept."""
     return sum(sum(function.stats.cache_misses.values()) for function in _functions)
+
+
+def bound(function: Callable[..., T], *arguments: Any, numbers: int = 0) -> Callable[..., T]:
+    """Return a compiled function with its first arguments fixed, compiled for their types.
+
+    Numba looks up the types of all arguments at every call: microseconds, where there are many or
+    where they are named tuples. Here it does so once.
+
+    Args:
+        function: of `compiled`.
+        arguments: passed at every call; arrays among them are read and written in place.
+        numbers: how many floats follow at the call.
+    """
+    signature = (*map(typeof, arguments), *[types.float64] * numbers)
+    return functools.partial(cast(Any, function).compile(signature), *arguments)
 
 
 class _SourceCache(FunctionCache):

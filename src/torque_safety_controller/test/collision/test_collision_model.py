@@ -9,11 +9,11 @@ from ros_harness import read_config
 from torque_safety_controller.collision.bodies import box, capsule, half_space, sphere
 from torque_safety_controller.collision.capsule_fit import capsules_around, fitted_capsule
 from torque_safety_controller.collision.geometry import link_shapes, load_geometry
-from torque_safety_controller.collision.model import Pruning, build_collision_model
+from torque_safety_controller.collision.model import build_collision_model
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import RobotDescriptionError, build_model, read_urdf
 
-FEW = Pruning(samples=300)
+FEW = 300  # samples
 
 SHAPES = """<robot name="shapes"><link name="base"><inertial><mass value="1"/>
   <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
@@ -204,7 +204,7 @@ def test_neighbours_and_distant_pairs_are_left_out_and_what_is_near_at_the_start
 def test_pairs_asked_for_are_kept_even_if_they_seem_needless():
     arm, _, _, geometry = panda()
     pairs = [("panda_hand", "panda_link1"), ("panda_link0", "panda_link2")]
-    collision = build_collision_model(arm.model, geometry, arm.q_start, pairs=pairs, pruning=FEW)
+    collision = build_collision_model(arm.model, geometry, arm.q_start, pairs=pairs, samples=FEW)
     assert set(collision.names) == {"panda_hand - panda_link1", "panda_link2 - panda_link0"}
 
 
@@ -219,7 +219,7 @@ def test_obstacles_are_in_the_base_frame():
         half_space("floor", [0.0, 0.0, -0.1], [0.0, 0.0, 2.0]),
     ]
     collision = build_collision_model(
-        model, geometry, arm.q_start, things, base_frame="table_frame", pruning=FEW
+        model, geometry, arm.q_start, things, base_frame="table_frame", samples=FEW
     )
     bodies = collision.bodies
     np.testing.assert_allclose(bodies.centre[-3], place.act(np.array([0.1, 0.2, 0.3])))
@@ -236,7 +236,7 @@ def test_what_cannot_be_is_refused():
     arm, _, _, geometry = panda()
 
     def build(**changes):
-        given = {"q_start": arm.q_start, "pruning": FEW, **changes}
+        given = {"q_start": arm.q_start, "samples": FEW, **changes}
         build_collision_model(arm.model, geometry, **given)
 
     ball = sphere("ball", [1.0, 0.0, 0.0], 0.1)

@@ -7,7 +7,7 @@ from collision_arm import Journey, panda, two_links
 
 from torque_safety_controller.collision.avoidance import CollisionAvoidance
 from torque_safety_controller.collision.bodies import box, sphere
-from torque_safety_controller.collision.kernels import RESERVE
+from torque_safety_controller.collision.rows import RESERVE
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.state import State

@@ -15,7 +15,7 @@ from torque_safety_controller.integral_feedback import (
     IntegralSettings,
 )
 from torque_safety_controller.integral_feedback.settings import WIDENING_TIME
-from torque_safety_controller.linalg.generalized_inverse import TaskShapeError
+from torque_safety_controller.linalg.generalized_inverse import THRESHOLD, TaskShapeError
 from torque_safety_controller.nullspace import NullspaceCompliance
 from torque_safety_controller.nullspace.kernels import (
     FADING_TIME,
@@ -156,12 +156,10 @@ def test_singular_start():
     run = ComplianceRun("panda", q=np.zeros(7))
     assert np.linalg.svd(run.terms.J)[1][-1] < 1e-15
     compliance = started(run, unlimited(7))
-    singular = []
     for _ in range(round(1.5 / DT)):
         added = compliance.torque(*run.arguments())
-        singular.append(compliance.near_singular)
         run.move(added, a_ref=20.0 * (run.arm.posture - run.q) - 9.0 * run.v)
-    assert singular[0] and not singular[-1]
+    assert np.linalg.svd(run.terms.J)[1][-1] > THRESHOLD
     run.hand = run.arm.hand(run.q)
     run.go(compliance, 1.0)
     assert np.abs(run.torques).max() < 15.0
@@ -420,11 +418,11 @@ def test_bad_input_changes_nothing():
         bad.flat[0] = np.nan
         with pytest.raises(ValueError, match="finite"):
             compliance.torque(now._replace(**{name: bad}), run.a_ref, DT)
-        with pytest.raises(ValueError, match="for 9 joints and a task of 6 rows"):
+        with pytest.raises(ValueError, match="in place of"):
             compliance.torque(now._replace(**{name: bad[..., :-1]}), run.a_ref, DT)
     with pytest.raises(ValueError, match="finite"):
         compliance.torque(now, np.full(9, np.nan), DT)
-    with pytest.raises(ValueError, match="for 9 joints"):
+    with pytest.raises(ValueError, match="in place of"):
         compliance.torque(now, np.zeros(8), DT)
     negative = now._replace(M=-now.M)
     for M in (negative, now._replace(M=0.0 * now.M)):
@@ -432,11 +430,6 @@ def test_bad_input_changes_nothing():
             compliance.torque(M, run.a_ref, DT)
         with pytest.raises(ValueError, match="positive definite"):
             compliance.initialise(np.ones(9), M)
-    for dt in (-1e-3, np.nan, np.inf):
-        with pytest.raises(ValueError, match="dt must be"):
-            compliance.torque(now, run.a_ref, dt)
-        with pytest.raises(ValueError, match="dt must be"):
-            compliance.skip(now, dt)
     with pytest.raises(ValueError, match="finite"):
         compliance.initialise(np.full(9, np.nan), now)
     with pytest.raises(ValueError, match="v must be"):

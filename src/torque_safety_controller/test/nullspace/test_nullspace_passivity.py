@@ -58,6 +58,9 @@ class PassivityLoop:
         t = self.terms
         return dynamically_consistent_inverse(t.J, t.J_dot, t.M, t.C + t.C.T, THRESHOLD)[0]
 
+    def near_singular(self):
+        return np.linalg.svd(self.terms.J)[1][-1] < THRESHOLD
+
     def forgotten(self):
         """x = a - a_fast."""
         return self.compliance.memory.root / np.sqrt(np.diag(self.terms.M))
@@ -127,7 +130,7 @@ def test_energy_falls_near_a_singularity_too():
     offs = []
     for dt in (1e-3, 5e-4):
         loop = PassivityLoop("panda", 6, dt, posture=STRETCHED, speed=0.02, **TWO_RATES)
-        near = loop.compliance.near_singular
+        near = loop.near_singular()
         energies, off = energy_balance(loop, 0.1)
         assert near
         assert (np.diff(energies) < 0.0).all()
@@ -151,7 +154,7 @@ def test_integral_of_the_task_error_is_exact(robot, rows, slow):
         error = loop.a_ref * dt - (loop.v - v)
         expected = decay * expected + gain * 0.5 * (J + loop.terms.J) @ error
         largest = max(largest, np.abs(expected).max())
-        assert not loop.compliance.near_singular
+        assert not loop.near_singular()
         found = loop.terms.J @ loop.compliance.memory.a
         np.testing.assert_allclose(found, expected, atol=1e-12)
     assert largest > 0.1
@@ -176,7 +179,7 @@ def test_integral_of_the_task_error_near_a_singularity():
         J, v, a, J_plus = loop.terms.J, loop.v, loop.compliance.memory.a.copy(), loop.inverse()
         loop.act()
         loop.step()
-        near += loop.compliance.near_singular
+        near += loop.near_singular()
         error = loop.a_ref * dt - (loop.v - v)
         J_new = loop.terms.J
         R, R_new = np.eye(6) - J @ J_plus, np.eye(6) - J_new @ loop.inverse()

@@ -11,18 +11,13 @@ from torque_safety_controller.collision.bodies import (
     sphere,
 )
 from torque_safety_controller.collision.geometry import load_geometry
-from torque_safety_controller.collision.model import (
-    CollisionModel,
-    Pruning,
-    build_collision_model,
-)
+from torque_safety_controller.collision.model import CollisionModel, build_collision_model
 
 __all__ = [
     "CollisionAvoidance",
     "CollisionBody",
     "CollisionModel",
     "CollisionSettings",
-    "Pruning",
     "box",
     "build_collision_model",
     "capsule",

@@ -7,25 +7,24 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torque_safety_controller.collision.kernels import (
+from torque_safety_controller.collision.model import CollisionModel
+from torque_safety_controller.collision.motion import Kinematics
+from torque_safety_controller.collision.rows import (
     RESERVE,
     CollisionRows,
-    DistanceLimits,
-    JointBounds,
     Workspace,
     collision_rows,
 )
-from torque_safety_controller.collision.kinematics import Kinematics
-from torque_safety_controller.collision.model import CollisionModel
 from torque_safety_controller.qp.constraints import AccelerationRange, LinearConstraints
 from torque_safety_controller.robot_model import RobotModel
+from viability_bounds_pkg.compiled import bound
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.kernel.one_sided_limit import JointTable, make_table
+from viability_bounds_pkg.kernel.one_sided_limit import make_table
 from viability_bounds_pkg.parameter import Range, above, number
 
 Array = NDArray[np.float64]
@@ -37,16 +36,17 @@ distance gives way at a ten thousandth of what joints cost, so that the joints k
 INFLUENCE = 0.08
 """Distance beyond the margin at which pairs are looked at that do not approach fast, m."""
 
-# Of the virtual joint, whose braking is 1: more than anything has.
+ROWS_MAX = 40
+"""Rows that a step returns at most; of more, those of the least distances. Only arms deep in
+obstacles have more, and a QP needs an end."""
+
+# Of a virtual joint whose braking is 1: more than anything has.
 _FAST, _HARD = 1e6, 1e12
 
 
 @dataclass(frozen=True)
 class CollisionSettings:
     """What distances are kept, and how.
-
-    Attributes:
-        braking: deceleration that a distance counts on at most, m/s^2.
 
     Raises:
         SettingError: a value is out of range; named as the node's parameters.
@@ -56,15 +56,12 @@ class CollisionSettings:
         "distance kept between links and to obstacles, m", Range(0.0, 0.5), default=0.02
     )
     speed_max: float = number("largest speed of approach, m/s", above(0.0, 10.0), default=1.0)
-    braking: float = 2.0
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise SettingError(f"collision_{f.name}", value, "a finite number >= 0")
-            if value == 0.0 and f.name != "margin":
-                raise SettingError(f"collision_{f.name}", value, "a finite number > 0")
+        if not 0.0 <= self.margin < math.inf:
+            raise SettingError("collision_margin", self.margin, "a finite number >= 0")
+        if not 0.0 < self.speed_max < math.inf:
+            raise SettingError("collision_speed_max", self.speed_max, "a finite number > 0")
 
     @property
     def kept(self) -> float:
@@ -82,12 +79,10 @@ class CollisionAvoidance:
         dt: how long an acceleration is held, s; more than the control period gives gentler
             rows, as with the joints' bounds.
         settings: distances and speeds.
-        rows_max: how many rows a step returns at most; of more, those of the least distances.
-            Only arms deep in obstacles have more, and a QP needs an end.
 
     Attributes:
         model, settings: as given.
-        count: how many rows the last step had, before those beyond `rows_max` were dropped.
+        count: how many rows the last step had, before those beyond `ROWS_MAX` were dropped.
 
     Raises:
         SettingError: limits of the wrong size or sign, or a step that is not positive.
@@ -100,7 +95,6 @@ class CollisionAvoidance:
         a_max: ArrayLike,
         dt: float,
         settings: CollisionSettings | None = None,
-        rows_max: int = 40,
     ) -> None:
         n = model.arm.nv
         lower, upper = np.asarray(a_min, dtype=np.float64), np.asarray(a_max, dtype=np.float64)
@@ -108,45 +102,52 @@ class CollisionAvoidance:
             if limit.shape != (n,) or not (np.isfinite(limit) & (sign * limit > 0.0)).all():
                 kind = "negative" if sign < 0.0 else "positive"
                 raise SettingError(f"acceleration_{name}", limit, f"{n} finite {kind} numbers")
-        if not (math.isfinite(dt) and dt > 0.0):
+        if not 0.0 < dt < math.inf:
             raise SettingError("dt", dt, "a finite number > 0")
-        if rows_max < 1:
-            raise SettingError("rows_max", rows_max, "positive")
         self.model = model
         self.settings = settings = settings or CollisionSettings()
         self.count = 0
-        self._rows_max = rows_max
-        self._undisturbed = np.zeros(n)
-        self._braking = np.minimum(-lower, upper)
+        self._rows_max = ROWS_MAX
         self._kinematics = Kinematics(model.arm, len(model.bodies.joint))
         parts, pairs = np.diff(model.bodies.first), model.pairs
         most = int((parts[pairs.first] + parts[pairs.second]).sum())
-        self._work = Workspace(
-            model.bodies,
-            pairs,
-            self._kinematics.motion,
-            DistanceLimits(
-                kept=settings.kept,
-                braking=settings.braking,
-                speed_max=settings.speed_max,
-                influence=settings.margin + INFLUENCE,
-                dt=dt,
-            ),
-            _virtual_joint(dt),
-            CollisionRows(
-                G=np.zeros((most + 1, n)),
-                lower=np.zeros(most),
-                pair=np.zeros(most, dtype=np.int64),
-                distance=np.zeros(most),
-                rate=np.zeros(most),
-                bias=np.zeros(most),
-                viable=np.zeros(most, dtype=bool),
-            ),
-            distances=np.full(len(model.names), np.inf),
-            seen=np.zeros((16, 2, 3)),
+        self._no_limit = np.full(most, np.inf)
+        v, a_lower, a_upper, disturbance = np.zeros((4, n))
+        # Of a joint with a lower limit of 0 and none above, whose braking is 1.
+        table = make_table(
+            dt=dt, position=[math.inf, 0.0], braking=1.0, v_max=_FAST, low=-_HARD, high=_HARD
         )
-        # The first call compiles; let it be this one and not one in a control loop.
-        self.rows(np.zeros(n), np.zeros(n), lower, upper)
+        self._use(
+            Workspace(
+                model.bodies,
+                pairs,
+                self._kinematics.motion,
+                kept=settings.kept,
+                speed_max=float(settings.speed_max),
+                influence=settings.margin + INFLUENCE,
+                dt=float(dt),
+                table=table,
+                braking=np.minimum(-lower, upper),
+                v=v,
+                a_lower=a_lower,
+                a_upper=a_upper,
+                disturbance=disturbance,
+                rows=CollisionRows(
+                    G=np.zeros((most + 1, n)),
+                    lower=np.zeros(most),
+                    pair=np.zeros(most, dtype=np.int64),
+                    distance=np.zeros(most),
+                    rate=np.zeros(most),
+                    bias=np.zeros(most),
+                    viable=np.zeros(most, dtype=bool),
+                ),
+                distances=np.full(len(model.names), np.inf),
+                seen=np.zeros((16, 2, 3)),
+            )
+        )
+
+    def _use(self, work: Workspace) -> None:
+        self._work, self._find_rows = work, bound(collision_rows, work)
 
     def rows(
         self,
@@ -168,21 +169,16 @@ class CollisionAvoidance:
 
         Values that are not finite are the caller's to refuse.
         """
-        chosen = self._update(q, v, a_lower, a_upper, disturbance)
-        return CollisionRows._make([array[chosen] for array in self._work.rows])
-
-    def _update(
-        self, q: Array, v: Array, a_lower: Array, a_upper: Array, disturbance: Array | None
-    ) -> slice | NDArray[np.int64]:
-        """Compute the rows of a step; return which are to be used."""
+        work = self._work
         self._kinematics.update(q, v)
-        pushed = self._undisturbed if disturbance is None else disturbance
-        bounds = JointBounds(a_lower, a_upper, pushed, self._braking)
-        self.count = k = collision_rows(v, bounds, self._work)
-        if k <= self._rows_max:
-            return slice(k)
-        nearest = np.argpartition(self._work.rows.distance[:k], self._rows_max)
-        return np.sort(nearest[: self._rows_max])
+        work.v[:], work.a_lower[:], work.a_upper[:] = v, a_lower, a_upper
+        work.disturbance[:] = 0.0 if disturbance is None else disturbance
+        self.count = k = self._find_rows()
+        chosen: slice | NDArray[np.int64] = slice(k)
+        if k > self._rows_max:
+            nearest = np.argpartition(work.rows.distance[:k], self._rows_max)
+            chosen = np.sort(nearest[: self._rows_max])
+        return CollisionRows._make([array[chosen] for array in work.rows])
 
     def constraint(
         self, robot: RobotModel, bounds: AccelerationRange, disturbance: Array | None = None
@@ -199,16 +195,16 @@ class CollisionAvoidance:
         """
         q, v = robot.q, robot.v
         a_lower, a_upper = bounds
-        if not (np.isfinite(q).all() and np.isfinite(v).all()):
+        if not math.isfinite(q.dot(q) + v.dot(v)):
             return None
         # Infinite, or for the QP to refuse.
-        if not (np.isfinite(a_lower).all() and np.isfinite(a_upper).all()):
+        if not math.isfinite(a_lower.dot(a_lower) + a_upper.dot(a_upper)):
             a_lower, a_upper = (
-                np.nan_to_num(bound, posinf=_FAST, neginf=-_FAST) for bound in (a_lower, a_upper)
+                np.nan_to_num(limit, posinf=_FAST, neginf=-_FAST) for limit in (a_lower, a_upper)
             )
-        chosen, rows = self._update(q, v, a_lower, a_upper, disturbance), self._work.rows
-        lower = ROW_SCALE * rows.lower[chosen]
-        return LinearConstraints(ROW_SCALE * rows.G[chosen], lower, np.full(len(lower), np.inf))
+        rows = self.rows(q, v, a_lower, a_upper, disturbance)
+        lower = ROW_SCALE * rows.lower
+        return LinearConstraints(ROW_SCALE * rows.G, lower, self._no_limit[: len(lower)])
 
     @property
     def viable(self) -> bool:
@@ -226,10 +222,3 @@ class CollisionAvoidance:
         if distance == math.inf:
             return distance, ""
         return distance, self.model.names[int(self.distances.argmin())]
-
-
-def _virtual_joint(dt: float) -> JointTable:
-    """Return the table of a joint with a lower limit of 0 and none above, whose braking is 1."""
-    return make_table(
-        dt=dt, position=[math.inf, 0.0], braking=1.0, v_max=_FAST, low=-_HARD, high=_HARD
-    )

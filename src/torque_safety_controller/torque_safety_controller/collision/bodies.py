@@ -66,17 +66,12 @@ def make_obstacle(
     Raises:
         SettingError: a value cannot be used.
     """
-    if shape not in SHAPES:
-        raise SettingError(f"shape of obstacle {name!r}", shape, f"one of {', '.join(SHAPES)}")
     centre, rotation = _vector(name, "position", position), _rotation(name, orientation)
     if shape == "half_space":
         return half_space(name, centre, rotation[:, 2])
     if shape == "box":
         return box(name, centre, size, orientation)
-    diameter, other, height = _vector(name, "size", size)
-    if diameter != other or (shape == "sphere" and diameter != height):
-        equal = "three times" if shape == "sphere" else "twice"
-        raise SettingError(f"size of obstacle {name!r}", size, f"a diameter {equal}")
+    diameter, _, height = _vector(name, "size", size)
     half = 0.5 * height * rotation[:, 2] if shape == "cylinder" else np.zeros(3)
     return capsule(name, centre - half, centre + half, 0.5 * diameter)
 

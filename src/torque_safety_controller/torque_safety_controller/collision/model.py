@@ -13,31 +13,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from torque_safety_controller.collision.bodies import CollisionBody, capsule
 from torque_safety_controller.collision.capsule_fit import Capsule, capsules_around
+from torque_safety_controller.collision.distances import Pairs, pair_distances
 from torque_safety_controller.collision.geometry import link_shapes
-from torque_safety_controller.collision.kernels import Bodies, Pairs, survey
-from torque_safety_controller.collision.kinematics import Kinematics
+from torque_safety_controller.collision.motion import Bodies, Kinematics
+from viability_bounds_pkg.compiled import bound
 from viability_bounds_pkg.exceptions import SettingError
 
 Array = NDArray[np.float64]
 
 _MOSTLY = 0.5  # pairs that are near each other in more than this share of the samples are left out
-
-
-@dataclass(frozen=True)
-class Pruning:
-    """How pairs are chosen automatically.
-
-    Attributes:
-        samples: random configurations within the position limits; +-pi where there are none.
-        near: pairs that never come nearer than this are left out, m.
-        clearance: pairs that are nearer than this at the start, or in most samples, are left
-            out, m: more than the margin to be kept. Their capsules, not the links, are in each
-            other's way.
-    """
-
-    samples: int = 20_000
-    near: float = 0.05
-    clearance: float = 0.025
 
 
 @dataclass(frozen=True)
@@ -69,7 +53,9 @@ def build_collision_model(
     obstacles: Sequence[CollisionBody] = (),
     pairs: Sequence[tuple[str, str]] | None = None,
     base_frame: str | None = None,
-    pruning: Pruning | None = None,
+    near: float = 0.05,
+    clearance: float = 0.025,
+    samples: int = 20_000,
 ) -> CollisionModel:
     """Return the collision model of an arm.
 
@@ -80,10 +66,13 @@ def build_collision_model(
             automatically, those that are near each other there are left out.
         obstacles: that every link is kept away from which can move.
         pairs: of links to be kept apart; None chooses them automatically: all that are not
-            neighbours, less those that `pruning` leaves out.
+            neighbours, less those left out by the next three.
         base_frame: that obstacles are given in; None: the URDF's root. Fixed to the base.
-        pruning: of the pairs; it also leaves out obstacles that a link cannot come near, or
-            cannot get away from.
+        near: pairs that never come nearer than this are left out, m.
+        clearance: pairs that are nearer than this at the start, or in most samples, are left
+            out, m: more than the margin to be kept. Their capsules, not the links, are in each
+            other's way. So are obstacles that a link cannot get away from.
+        samples: random configurations within the position limits; +-pi where there are none.
 
     Raises:
         SettingError: an unknown link, a frame that moves, names that are not different, a
@@ -99,7 +88,10 @@ def build_collision_model(
         around = shape.capsules + capsules_around(shape.vertices, shape.triangles)
         capsules[shape.link] = around
         links += [replace(capsule(shape.link, *each), joint=shape.joint) for each in around]
-    _check_names(set(capsules), obstacles)
+    for index, obstacle in enumerate(obstacles):
+        if obstacle.name in capsules or obstacle.name in (o.name for o in obstacles[:index]):
+            allowed = "what no other obstacle and no link is called"
+            raise SettingError("obstacle_names", obstacle.name, allowed)
     base = _base_placement(model, base_frame)
     every = links + [replace(body, placement=base * body.placement) for body in obstacles]
     chosen = _link_pairs(model, links, pairs)
@@ -112,11 +104,23 @@ def build_collision_model(
     ]
     bodies = _pack(every)
     candidates = _pairs(model, every, chosen)
-    reasons = _prune(model, bodies, candidates, own, pairs is None, q_start, pruning or Pruning())
+    at_start, _ = _survey(model, bodies, candidates, near, clearance, q_start[None])
+    low = np.where(np.isfinite(model.lowerPositionLimit), model.lowerPositionLimit, -np.pi)
+    high = np.where(np.isfinite(model.upperPositionLimit), model.upperPositionLimit, np.pi)
+    q = np.random.default_rng(0).uniform(low, high, size=(samples, model.nq))
+    short, least = _survey(model, bodies, candidates, near, clearance, q)
     kept, names = [], []
     left_out: dict[str, list[str]] = {}
-    for k, ((i, j), reason) in enumerate(zip(chosen, reasons, strict=True)):
-        name = f"{every[i].name} - {every[j].name}"
+    for k, (i, j) in enumerate(chosen):
+        name, reason = f"{every[i].name} - {every[j].name}", ""
+        if k >= own and short[k] == samples:
+            reason = "near always"
+        elif k < own and pairs is None and at_start[k]:
+            reason = "near at start"
+        elif k < own and pairs is None and short[k] > _MOSTLY * samples:
+            reason = "near mostly"
+        if least[k] > near and (k >= own or pairs is None):
+            reason = "far"
         if reason:
             left_out.setdefault(reason, []).append(name)
         else:
@@ -168,14 +172,6 @@ def _pairs(
     return Pairs(first, second, (moved_by[first] - moved_by[second])[:, 1:].copy())
 
 
-def _check_names(links: set[str], obstacles: Sequence[CollisionBody]) -> None:
-    names = [obstacle.name for obstacle in obstacles]
-    for name in names:
-        if names.count(name) > 1 or name in links:
-            allowed = "what no other obstacle and no link is called"
-            raise SettingError("obstacle_names", name, allowed)
-
-
 def _base_placement(model: pin.Model, base_frame: str | None) -> pin.SE3:
     if base_frame is None:
         return pin.SE3.Identity()
@@ -215,43 +211,17 @@ def _link_pairs(
     return chosen
 
 
-def _prune(
-    model: pin.Model,
-    bodies: Bodies,
-    pairs: Pairs,
-    own: int,
-    automatic: bool,
-    q_start: Array,
-    pruning: Pruning,
-) -> list[str]:
-    """Return for each pair why it is left out; empty for what is kept.
-
-    The first `own` pairs are of links, chosen automatically or asked for; obstacles follow.
-    """
-    low = np.where(np.isfinite(model.lowerPositionLimit), model.lowerPositionLimit, -np.pi)
-    high = np.where(np.isfinite(model.upperPositionLimit), model.upperPositionLimit, np.pi)
-    samples = np.random.default_rng(0).uniform(low, high, size=(pruning.samples, model.nq))
+def _survey(
+    model: pin.Model, bodies: Bodies, pairs: Pairs, near: float, clearance: float, samples: Array
+) -> tuple[NDArray[np.int64], Array]:
+    """Return in how many samples each pair is nearer than `clearance`, and its least distance."""
     kinematics, zero = Kinematics(model, len(bodies.joint)), np.zeros(model.nv)
-    motion = kinematics.motion
-    closest, short = np.full(len(pairs.first), np.inf), np.zeros(len(pairs.first), dtype=np.int64)
-    kinematics.update(q_start, zero)
-    survey(pruning.near, pruning.clearance, pairs, bodies, motion, closest, short)
-    at_start, short[:], closest[:] = short.astype(bool), 0, np.inf
+    found = np.zeros(len(pairs.first))
+    measure = bound(pair_distances, float(near), pairs, bodies, kinematics.motion, found)
+    short, least = np.zeros(len(found), dtype=np.int64), np.full(len(found), np.inf)
     for q in samples:
         kinematics.update(q, zero)
-        survey(pruning.near, pruning.clearance, pairs, bodies, motion, closest, short)
-    reasons = []
-    for k in range(len(closest)):
-        reason = ""
-        if k < own and not automatic:
-            pass
-        elif closest[k] > pruning.near:
-            reason = "far"
-        elif k >= own:
-            reason = "near always" if short[k] == pruning.samples else ""
-        elif at_start[k]:
-            reason = "near at start"
-        elif short[k] > _MOSTLY * pruning.samples:
-            reason = "near mostly"
-        reasons.append(reason)
-    return reasons
+        measure()
+        short += found < clearance
+        np.minimum(least, found, out=least)
+    return short, least

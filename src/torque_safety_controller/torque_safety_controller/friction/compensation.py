@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torque_safety_controller.friction.settings import GAIN, FrictionSettings
-from viability_bounds_pkg.compiled import compiled
+from viability_bounds_pkg.compiled import bound, compiled
 
 Array = NDArray[np.float64]
 
@@ -57,12 +57,22 @@ class FrictionCompensation:
         n = settings.model.n
         self.last = np.zeros(n)
         self.reference_velocity = np.zeros(n)
-        self._settings = settings
-        self._wanted = _coefficients(settings)
-        self._present = _Coefficients(*(x.copy() for x in self._wanted))
+        self._wanted = _Coefficients(*np.zeros((5, n)))
+        self._present = _Coefficients(*np.zeros((5, n)))
+        self._M, self._v, self._a_last = np.eye(n), np.zeros(n), np.zeros(n)
+        self.settings = settings
+        self._compensate = bound(
+            _compensate,
+            self._present,
+            self._wanted,
+            self._M,
+            self._v,
+            self._a_last,
+            self.reference_velocity,
+            self.last,
+            numbers=4,
+        )
         self.reset()
-        # The first call compiles; let it be this one and not one in a control loop.
-        self._step(np.eye(n), np.zeros(n), np.zeros(n), 0.0, 1.0)
 
     @property
     def settings(self) -> FrictionSettings:
@@ -72,7 +82,12 @@ class FrictionCompensation:
     @settings.setter
     def settings(self, settings: FrictionSettings) -> None:
         self._settings = settings
-        self._wanted = _coefficients(settings)
+        model, wanted = settings.model, self._wanted
+        wanted.coulomb[:] = settings.scale * model.coulomb
+        wanted.excess[:] = settings.scale * (model.static - model.coulomb)
+        wanted.viscous[:] = settings.scale * model.viscous
+        wanted.stribeck_velocity[:] = model.stribeck_velocity
+        wanted.budget[:] = settings.budget
 
     @property
     def idle(self) -> bool:
@@ -111,75 +126,42 @@ class FrictionCompensation:
                 self.reset()
             self.reference_velocity[:] = v
             self._started = True
+        self._M[:], self._v[:], self._a_last[:] = M, v, a_last
+        settings = self._settings
+        gamma = GAIN / period if settings.gain is None else float(settings.gain)
+        blend = -math.expm1(-elapsed / _FADING_TIME)
         try:
-            self._step(M, v, a_last, elapsed, period)
+            self._faded = self._compensate(blend, elapsed, float(settings.leak_rate), gamma)
         except np.linalg.LinAlgError:  # no mass matrix
             self.reference_velocity.fill(0.0)
             self.last.fill(0.0)
         return self.last
 
-    def _step(self, M: Array, v: Array, a_last: Array, elapsed: float, period: float) -> None:
-        settings = self._settings
-        self._faded = _compensate(
-            *self._present,
-            *self._wanted,
-            -math.expm1(-elapsed / _FADING_TIME),
-            M,
-            v,
-            a_last,
-            elapsed,
-            float(settings.leak_rate),
-            GAIN / period if settings.gain is None else float(settings.gain),
-            self.reference_velocity,
-            self.last,
-        )
-
-
-def _coefficients(settings: FrictionSettings) -> _Coefficients:
-    """Return what the kernel evaluates: the share is in the model."""
-    model, scale = settings.model, settings.scale
-    return _Coefficients(
-        scale * model.coulomb,
-        scale * (model.static - model.coulomb),
-        scale * model.viscous,
-        model.stribeck_velocity.copy(),
-        settings.budget.copy(),
-    )
-
 
 @compiled
 def _compensate(
-    coulomb: Array,
-    excess: Array,
-    viscous: Array,
-    stribeck_velocity: Array,
-    budget: Array,
-    coulomb_wanted: Array,
-    excess_wanted: Array,
-    viscous_wanted: Array,
-    stribeck_velocity_wanted: Array,
-    budget_wanted: Array,
-    blend: float,
+    present: _Coefficients,
+    wanted: _Coefficients,
     M: Array,
     v: Array,
     a_last: Array,
+    w: Array,
+    tau: Array,
+    blend: float,
     dt: float,
     leak_rate: float,
     gamma: float,
-    w: Array,
-    tau: Array,
 ) -> bool:
     """Make a step in the coefficients, `w` and `tau`; return whether no friction is left in them.
 
-    The first arguments are the fields of two `_Coefficients`: Numba takes microseconds to unpack
-    named tuples that come from Python. The reference velocity is that of constant acceleration
-    and velocity within the step.
+    The reference velocity is that of constant acceleration and velocity within the step.
     """
-    coulomb += blend * (coulomb_wanted - coulomb)
-    excess += blend * (excess_wanted - excess)
-    viscous += blend * (viscous_wanted - viscous)
-    stribeck_velocity += blend * (stribeck_velocity_wanted - stribeck_velocity)
-    budget += blend * (budget_wanted - budget)
+    coulomb, excess, viscous, stribeck_velocity, budget = present
+    coulomb += blend * (wanted.coulomb - coulomb)
+    excess += blend * (wanted.excess - excess)
+    viscous += blend * (wanted.viscous - viscous)
+    stribeck_velocity += blend * (wanted.stribeck_velocity - stribeck_velocity)
+    budget += blend * (wanted.budget - budget)
     decay = math.exp(-leak_rate * dt)
     held = -math.expm1(-leak_rate * dt) / (leak_rate * dt) if leak_rate * dt > 0.0 else 1.0
     gain = gamma / np.diag(np.linalg.inv(M))  # of the inertia felt while others give way

@@ -4,12 +4,18 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torque_safety_controller.integral_feedback.settings import IntegralSettings
+from torque_safety_controller.integral_feedback.settings import (
+    WIDENING_TIME,
+    IntegralSettings,
+    Law,
+)
 
 Array = NDArray[np.float64]
 
@@ -31,38 +37,53 @@ class ArmTerms(NamedTuple):
     J_dot: Array
     v: Array
 
-    def check(self, n: int, m: int) -> None:
-        """Raise `ValueError` unless these are terms of n joints and m rows of a task."""
-        M, C, J, J_dot, v = self
-        if not (
-            M.shape == C.shape == (n, n) and J.shape == J_dot.shape == (m, n) and v.shape == (n,)
-        ):
-            found = ", ".join(f"{name} {x.shape}" for name, x in self._asdict().items())
-            raise ValueError(f"for {n} joints and a task of {m} rows: {found}")
 
-    def check_velocity(self) -> None:
-        """Raise `ValueError` unless the velocity is finite."""
-        if not np.isfinite(self.v).all():
-            raise ValueError(f"v must be finite, is {self.v}")
+class IntegralAction(ABC):
+    """A torque made of the acceleration errors s' = a_ref - v' of the past.
 
+    Args:
+        settings: their number of joints stays.
+        memory: named tuple of arrays, with at least `v` and `widening`.
+        inputs: arrays that compiled functions read the arguments of a step from.
 
-class IntegralAction(Protocol):
-    """A torque made of the acceleration errors s' = a_ref - v' of the past."""
+    Attributes:
+        memory: errors and budgets; the torque continues from it.
+        saturated: which joints were at their limits in the last step, shape (n,); overwritten by
+            the next.
+    """
+
+    def __init__(self, settings: IntegralSettings, memory: Any, inputs: Sequence[Array]) -> None:
+        n = len(settings.budget)
+        self.memory = memory
+        self.saturated = np.zeros(n, dtype=bool)
+        self._inputs = inputs
+        self._torque = np.zeros(n)
+        self._settings = settings
+        self._use(settings.law)
 
     @property
     def settings(self) -> IntegralSettings:
         """Settings; after a change of them `initialise` keeps the torque continuous."""
+        return self._settings
 
     @settings.setter
-    def settings(self, settings: IntegralSettings) -> None: ...
+    def settings(self, settings: IntegralSettings) -> None:
+        settings.check_joints(len(self.saturated))
+        self._settings = settings
+        self._use(settings.law)
 
-    @property
-    def saturated(self) -> NDArray[np.bool_]:
-        """Which joints are at their limits, shape (n,)."""
+    @abstractmethod
+    def _use(self, law: Law) -> None:
+        """Go by other settings from now on."""
 
     def reset(self, arm: ArmTerms) -> None:
         """Forget everything; increments of s count from this state on."""
+        for array in self.memory:
+            array.fill(0.0)
+        self.memory.v[:] = arm.v
+        self.saturated.fill(False)
 
+    @abstractmethod
     def torque(self, arm: ArmTerms, a_last: Array, dt: float) -> Array:
         """Return the additional torque of a control step, shape (n,), N m.
 
@@ -71,10 +92,10 @@ class IntegralAction(Protocol):
         Args:
             arm: as it is now.
             a_last: acceleration commanded in the last step, shape (n,), rad/s^2.
-            dt: time since the last step, s.
+            dt: time since the last step, s, >= 0.
 
         Raises:
-            ValueError: unusable arguments; nothing has changed then.
+            ValueError: unusable terms of the arm; nothing has changed then.
         """
 
     def skip(self, arm: ArmTerms, dt: float) -> None:
@@ -82,12 +103,17 @@ class IntegralAction(Protocol):
 
         Args:
             arm: as it is now.
-            dt: how long it took, s; 0 if that is not known.
+            dt: how long it took, s, >= 0; 0 if that is not known.
 
         Raises:
-            ValueError: the velocity or time is unusable; nothing has changed then.
+            ValueError: the velocity is not finite; nothing has changed then.
         """
+        if not np.isfinite(arm.v).all():
+            raise ValueError(f"v must be finite, is {arm.v}")
+        self.memory.v[:] = arm.v
+        self.memory.widening[:] *= math.exp(-dt / WIDENING_TIME)
 
+    @abstractmethod
     def initialise(self, torque: Array, arm: ArmTerms) -> Array:
         """Choose the memory so that the additional torque is `torque`, and return that of it.
 
@@ -102,8 +128,9 @@ class IntegralAction(Protocol):
             ValueError: it cannot be done.
         """
 
-
-def check_time(dt: float) -> None:
-    """Raise `ValueError` unless `dt` is a finite number >= 0."""
-    if not 0.0 <= dt < math.inf:
-        raise ValueError(f"dt must be a finite number >= 0, is {dt}")
+    def _take(self, *arguments: Array) -> None:
+        """Take over the arguments of a step, in whatever layout they are."""
+        for own, given in zip(self._inputs, arguments, strict=True):
+            if given.shape != own.shape:
+                raise ValueError(f"shape {given.shape} in place of {own.shape}")
+            own[:] = given

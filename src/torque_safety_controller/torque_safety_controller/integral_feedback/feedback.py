@@ -17,10 +17,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from torque_safety_controller.integral_feedback.action import ArmTerms, check_time
-from torque_safety_controller.integral_feedback.kernels import Memory, advance, evaluate, step
+from torque_safety_controller.integral_feedback.action import ArmTerms, IntegralAction
+from torque_safety_controller.integral_feedback.kernels import Memory, evaluate, step
 from torque_safety_controller.integral_feedback.leaky_integrator import mix
-from torque_safety_controller.integral_feedback.settings import QP, IntegralSettings
+from torque_safety_controller.integral_feedback.settings import QP, IntegralSettings, Law
+from viability_bounds_pkg.compiled import bound
 from viability_bounds_pkg.exceptions import ArmSafetyError
 
 Array = NDArray[np.float64]
@@ -32,41 +33,34 @@ class InitialisationError(ArmSafetyError, ValueError):
     """The integral action cannot be made to give the torque asked for."""
 
 
-class IntegralFeedback:
-    """Additional torque (C + K) s of one arm, an `IntegralAction`.
+class IntegralFeedback(IntegralAction):
+    """Additional torque (C + K) s of one arm; a change of settings keeps K s.
 
     Args:
         settings: their number of joints stays.
 
     Attributes:
-        memory: integrators and budgets; the torque continues from it.
         leak: rate at which s is forgotten on top of the leak rates to stay passive, 1/s;
             mostly 0.
-        saturated: which joints asked for more than their limit in the last step, shape (n,);
-            overwritten by the next.
     """
+
+    memory: Memory
 
     def __init__(self, settings: IntegralSettings) -> None:
         n = len(settings.budget)
-        self.memory = Memory(*np.zeros((4, n)))
         self.leak = 0.0
-        self.saturated = np.zeros(n, dtype=bool)
-        self._settings, self._law = settings, settings.law
-        # The first call compiles; let it be this one and not one in a control loop.
-        zero, square, no_rows = np.zeros(n), np.zeros((n, n)), np.zeros((0, n))
-        self.torque(ArmTerms(np.eye(n), square, no_rows, no_rows, zero), zero, 0.0)
+        self._law = settings.law
+        inputs = np.eye(n), np.zeros((n, n)), np.zeros(n), np.zeros(n)  # M, C, v, a_last
+        super().__init__(settings, Memory(*np.zeros((4, n))), inputs)
 
-    @property
-    def settings(self) -> IntegralSettings:
-        """Settings; a change keeps K s."""
-        return self._settings
-
-    @settings.setter
-    def settings(self, settings: IntegralSettings) -> None:
-        settings.check_joints(len(self.saturated))
+    def _use(self, law: Law) -> None:
         for s in (self.memory.fast, self.memory.slow):
-            s *= self._settings.gain / settings.gain
-        self._settings, self._law = settings, settings.law
+            s *= self._law.gain / law.gain
+        self._law = law
+        M, C, _, _ = self._inputs
+        results = self._torque, self.saturated
+        self._step = bound(step, self.memory, law, *self._inputs, *results, numbers=2)
+        self._evaluate = bound(evaluate, self.memory, law, M, C, *results)
 
     @property
     def s(self) -> Array:
@@ -75,47 +69,23 @@ class IntegralFeedback:
 
     def reset(self, arm: ArmTerms) -> None:
         """See `IntegralAction`."""
-        for array in self.memory:
-            array.fill(0.0)
-        self.memory.v[:] = arm.v
+        super().reset(arm)
         self.leak = 0.0
-        self.saturated.fill(False)
 
     def torque(self, arm: ArmTerms, a_last: Array, dt: float) -> Array:
         """See `IntegralAction`."""
-        arm.check(len(self.saturated), len(arm.J))
-        check_time(dt)
-        if a_last.shape != self.saturated.shape:
-            raise ValueError(f"a_last must have shape {self.saturated.shape}: {a_last.shape}")
-        law, torque = self._law, np.empty_like(a_last)
-        leak = step(
-            *self.memory,
-            law.budget,
-            law.gain,
-            law.slow_leak_rate,
-            law.fast_leak_rate,
-            law.mu,
-            law.method,
-            self.leak,
-            arm.M,
-            arm.C,
-            arm.v,
-            a_last,
-            float(dt),
-            torque,
-            self.saturated,
-        )
+        self._take(arm.M, arm.C, arm.v, a_last)
+        leak = self._step(self.leak, dt)
         if math.isnan(leak):
             raise ValueError("dynamics, velocity and acceleration must be finite")
         self.leak = leak
-        return torque
+        return self._torque.copy()
 
     def skip(self, arm: ArmTerms, dt: float) -> None:
         """See `IntegralAction`."""
-        check_time(dt)
-        arm.check_velocity()
-        self.memory.v[:] = arm.v
-        advance(self.memory, self._law, self.leak, arm.v, 0.0 * arm.v, float(dt))
+        super().skip(arm, dt)
+        self.memory.fast[:] *= math.exp(-(self._law.fast_leak_rate + self.leak) * dt)
+        self.memory.slow[:] *= math.exp(-(self._law.slow_leak_rate + self.leak) * dt)
 
     def initialise(self, torque: Array, arm: ArmTerms) -> Array:
         """See `IntegralAction`; it is then forgotten at the slow rate.
@@ -139,6 +109,6 @@ class IntegralFeedback:
             memory.fast[:] = s
         limited = torque if self._law.method == QP else K * s
         memory.widening[:] = np.maximum(np.abs(limited) - self._law.budget, 0.0)
-        result = np.empty_like(torque)
-        self.leak = evaluate(memory, self._law, arm.M, arm.C, result, self.saturated)
-        return result
+        self._take(arm.M, arm.C, arm.v, arm.v)
+        self.leak = self._evaluate()
+        return self._torque.copy()

@@ -41,42 +41,25 @@ class Memory(NamedTuple):
 
 @compiled
 def step(
-    fast: Array,
-    slow: Array,
-    widening: Array,
-    v_last: Array,
-    budget: Array,
-    gain: float,
-    slow_leak_rate: float,
-    fast_leak_rate: float,
-    mu: float,
-    method: int,
-    leak: float,
+    memory: Memory,
+    law: Law,
     M: Array,
     C: Array,
     v: Array,
     a_last: Array,
-    dt: float,
     torque: Array,
     saturated: NDArray[np.bool_],
+    leak: float,
+    dt: float,
 ) -> float:
     """Take one step: `advance`, then `evaluate`.
-
-    The first arguments are the fields of `Memory` and of `Law`: Numba takes several microseconds
-    to unpack named tuples that come from Python.
 
     Returns:
         The leak of the next step, 1/s; NaN when something is not finite, and nothing has changed.
     """
-    total = 0.0
-    for i in range(len(v)):
-        total += 0.0 * v[i] + 0.0 * a_last[i]
-        for j in range(len(v)):
-            total += 0.0 * M[i, j] + 0.0 * C[i, j]
-    if not math.isfinite(total):
+    finite = np.isfinite(M).all() and np.isfinite(C).all()
+    if not (finite and np.isfinite(v).all() and np.isfinite(a_last).all()):
         return math.nan
-    memory = Memory(fast, slow, widening, v_last)
-    law = Law(budget, gain, slow_leak_rate, fast_leak_rate, mu, method)
     advance(memory, law, leak, v, a_last, dt)
     return evaluate(memory, law, M, C, torque, saturated)
 

@@ -13,7 +13,6 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torque_safety_controller.integral_feedback.action import check_time
 from viability_bounds_pkg.compiled import compiled
 
 Array = NDArray[np.float64]
@@ -83,7 +82,8 @@ class LeakyIntegrator:
         s = np.array(s, dtype=np.float64)
         if s.shape != self.value.shape or not np.isfinite(s).all():
             raise ValueError(f"s must be {len(self.value)} finite numbers, is {s}")
-        check_time(dt)
+        if not 0.0 <= dt < math.inf:
+            raise ValueError(f"dt must be a finite number >= 0, is {dt}")
         decay, gain = leak_factors(self._theta, dt, False)
         self.value = decay * self.value + gain * (s - self._s_last)
         self._s_last = s

@@ -12,7 +12,7 @@ import pinocchio as pin
 from torque_safety_controller.additional_torque import AdditionalTorque
 from torque_safety_controller.collision.avoidance import CollisionAvoidance
 from torque_safety_controller.collision.geometry import load_geometry
-from torque_safety_controller.collision.model import Pruning, build_collision_model
+from torque_safety_controller.collision.model import build_collision_model
 from torque_safety_controller.contact.contacts import Contacts, FrictionContact
 from torque_safety_controller.contact.interaction import Interaction
 from torque_safety_controller.contact.wrench_sensor import WrenchSensor
@@ -155,7 +155,8 @@ def load_collision(
             collision.bodies,
             collision.pairs,
             config.base_frame,
-            Pruning(clearance=kept + _BEYOND, near=kept + _NEAR),
+            near=kept + _NEAR,
+            clearance=kept + _BEYOND,
         ),
         collision.acceleration_min,
         collision.acceleration_max,

@@ -17,82 +17,57 @@ nothing in it grows for ever.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
-from torque_safety_controller.integral_feedback.action import ArmTerms, check_time
-from torque_safety_controller.integral_feedback.settings import IntegralSettings
+from torque_safety_controller.integral_feedback.action import ArmTerms, IntegralAction
+from torque_safety_controller.integral_feedback.settings import IntegralSettings, Law
 from torque_safety_controller.linalg.generalized_inverse import check_task_shape
-from torque_safety_controller.nullspace.kernels import (
-    FAILED,
-    NEAR_SINGULAR,
-    NullspaceMemory,
-    skip,
-    step,
-)
+from torque_safety_controller.nullspace.kernels import FADING_TIME, NullspaceMemory, step
+from viability_bounds_pkg.compiled import bound
 
 Array = NDArray[np.float64]
 
 
-class NullspaceCompliance:
-    """Additional torque that is stiff in a task of m < n rows, an `IntegralAction`.
+class NullspaceCompliance(IntegralAction):
+    """Additional torque that is stiff in a task of m < n rows; a change of settings keeps s.
 
     Args:
         settings: their number of joints stays.
         m: rows of the task's Jacobian.
 
-    Attributes:
-        settings: may be replaced between steps.
-        memory: errors and budgets; the torque continues from it.
-        near_singular: whether J was so near to a singularity in the last step that some
-            direction of the task was not fully served.
-        saturated: which joints were at their budgets in the last step, shape (n,); overwritten by
-            the next.
-
     Raises:
         TaskShapeError: `m` leaves n joints no null space.
     """
 
+    memory: NullspaceMemory
+
     def __init__(self, settings: IntegralSettings, m: int) -> None:
         n = len(settings.budget)
         check_task_shape(m, n)
-        self._shape = m, n
-        a, s, root, offset, widening, v = np.zeros((6, n))
-        self.memory = NullspaceMemory(
-            a, s, np.zeros(m), root, offset, widening, v, np.zeros((m, n))
+        a, s, root, offset, widening, v, velocity, a_ref = np.zeros((8, n))
+        J, J_dot, J_last = np.zeros((3, m, n))
+        memory = NullspaceMemory(a, s, np.zeros(m), root, offset, widening, v, J_last)
+        self._arm = ArmTerms(np.eye(n), np.zeros((n, n)), J, J_dot, velocity)
+        super().__init__(settings, memory, (*self._arm, a_ref))
+
+    def _use(self, law: Law) -> None:
+        self._law = law
+        results = self._torque, self.saturated
+        self._step = bound(
+            step, self.memory, law, self._arm, self._inputs[-1], *results, numbers=2
         )
-        self.near_singular = False
-        self.saturated = np.zeros(n, dtype=bool)
-        self.settings = settings
-        # The first call compiles; let it be this one and not one in a control loop.
-        zero, square, rows = np.zeros(n), np.zeros((n, n)), np.eye(m, n)
-        arm = ArmTerms(np.eye(n), square, rows, 0.0 * rows, zero)
-        self.torque(arm, zero, 0.0)
-        self.skip(arm, 0.0)
-
-    @property
-    def settings(self) -> IntegralSettings:
-        """Settings; a change keeps the memory."""
-        return self._settings
-
-    @settings.setter
-    def settings(self, settings: IntegralSettings) -> None:
-        settings.check_joints(self._shape[1])
-        self._settings, self._law = settings, settings.law
 
     def reset(self, arm: ArmTerms) -> None:
         """See `IntegralAction`."""
-        for array in self.memory:
-            array.fill(0.0)
-        self.memory.v[:] = arm.v
+        super().reset(arm)
         self.memory.J[:] = arm.J
-        self.near_singular = False
-        self.saturated.fill(False)
 
     def torque(self, arm: ArmTerms, a_last: Array, dt: float) -> Array:
         """See `IntegralAction`."""
-        check_time(dt)
-        return self._step(arm, a_last, dt, False, np.empty_like(a_last))
+        return self._next(arm, a_last, dt, initialise=0.0)
 
     def initialise(self, torque: Array, arm: ArmTerms) -> Array:
         """See `IntegralAction`.
@@ -100,35 +75,24 @@ class NullspaceCompliance:
         The slow memory takes what the task feels of it, and keeps it; the rest fades with
         `FADING_TIME`.
         """
-        return self._step(arm, arm.v, 0.0, True, torque.copy())
+        self._torque[:] = torque
+        return self._next(arm, arm.v, 0.0, initialise=1.0)
 
     def skip(self, arm: ArmTerms, dt: float) -> None:
         """See `IntegralAction`."""
-        check_time(dt)
-        arm.check_velocity()
-        skip(self.memory, self._law, arm.v, arm.J, float(dt))
+        super().skip(arm, dt)
+        memory, decay = self.memory, math.exp(-self._law.slow_leak_rate * dt)
+        for array in (memory.a, memory.s, memory.integral, memory.root):
+            array *= decay
+        memory.offset[:] *= math.exp(-dt / FADING_TIME)
+        memory.J[:] = arm.J
 
-    def _step(
-        self, arm: ArmTerms, a_last: Array, dt: float, initialise: bool, torque: Array
-    ) -> Array:
-        m, n = self._shape
-        arm.check(n, m)
-        if a_last.shape != (n,) or torque.shape != (n,):
-            raise ValueError(f"for {n} joints: vectors {a_last.shape}, {torque.shape}")
+    def _next(self, arm: ArmTerms, a_last: Array, dt: float, initialise: float) -> Array:
+        self._take(*arm, a_last)
         try:
-            outcome = step(
-                *self.memory,
-                *self._law,
-                *arm,
-                a_last,
-                float(dt),
-                initialise,
-                torque,
-                self.saturated,
-            )
+            usable = self._step(dt, initialise)
         except np.linalg.LinAlgError as error:
             raise ValueError("M must be positive definite") from error
-        if outcome == FAILED:
+        if not usable:
             raise ValueError("M must be positive definite, and all numbers finite")
-        self.near_singular = outcome == NEAR_SINGULAR
-        return torque
+        return self._torque.copy()

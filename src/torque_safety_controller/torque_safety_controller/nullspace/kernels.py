@@ -28,9 +28,6 @@ Array = NDArray[np.float64]
 FADING_TIME = 0.2
 """Time constant with which that part of an initial torque fades that the memory cannot hold, s."""
 
-FAILED, REGULAR, NEAR_SINGULAR = range(3)
-"""Outcome of a step: unusable arguments; or whether J is near a singularity."""
-
 _AT_LIMIT = 1.0 - 1e-9
 
 _SINGULAR = 1e-12  # relative; smaller pivots are rounding
@@ -63,62 +60,34 @@ class NullspaceMemory(NamedTuple):
 
 @compiled
 def step(
-    last_a: Array,
-    last_s: Array,
-    last_integral: Array,
-    root: Array,
-    last_offset: Array,
-    last_widening: Array,
-    last_v: Array,
-    last_J: Array,
-    budget: Array,
-    gain: float,
-    slow_leak_rate: float,
-    fast_leak_rate: float,
-    mu: float,
-    method: int,
-    M: Array,
-    C: Array,
-    J: Array,
-    J_dot: Array,
-    v: Array,
+    memory: NullspaceMemory,
+    law: Law,
+    arm: ArmTerms,
     a_ref: Array,
-    dt: float,
-    initialise: bool,
     torque: Array,
     saturated: NDArray[np.bool_],
-) -> int:
-    """Take one step; when it fails the memory is as before.
-
-    The first arguments are the fields of `NullspaceMemory`, `Law` and `ArmTerms`: Numba takes
-    several microseconds to unpack named tuples that come from Python.
+    dt: float,
+    initialise: float,
+) -> bool:
+    """Take one step; return whether the arguments were usable. If not, the memory is as before.
 
     `a_ref` is the acceleration commanded in the last step, shape (n,), rad/s^2, and `dt` the time
-    since then, s. With `initialise` the memory is chosen such that the torque is what `torque`
-    holds, shape (n,), N m. It receives the torque, and `saturated`, shape (n,), which joints are
-    at their budgets.
-
-    Returns:
-        `FAILED`, `REGULAR` or `NEAR_SINGULAR`.
+    since then, s. With `initialise` above 0 the memory is chosen such that the torque is what
+    `torque` holds, shape (n,), N m. It receives the torque, and `saturated`, shape (n,), which
+    joints are at their budgets.
 
     Raises:
         LinAlgError: M is singular.
     """
-    memory = NullspaceMemory(
-        last_a, last_s, last_integral, root, last_offset, last_widening, last_v, last_J
-    )
-    law = Law(budget, gain, slow_leak_rate, fast_leak_rate, mu, method)
-    M, C = np.ascontiguousarray(M), np.ascontiguousarray(C)
-    J, J_dot = np.ascontiguousarray(J), np.ascontiguousarray(J_dot)
-    arm = ArmTerms(M, C, J, J_dot, v)
+    M, C, J, J_dot, v = arm
     total = M.sum() + C.sum() + J.sum() + J_dot.sum() + v.sum() + a_ref.sum()
-    if initialise:
+    if initialise > 0.0:
         total += torque.sum()
     if not (math.isfinite(total) and (np.diag(M) > 0.0).all()):
-        return FAILED
-    J_plus, J_plus_dot, damped = dynamically_consistent_inverse(J, J_dot, M, C + C.T, THRESHOLD)
+        return False
+    J_plus, J_plus_dot, _ = dynamically_consistent_inverse(J, J_dot, M, C + C.T, THRESHOLD)
     root_M = np.sqrt(np.diag(M))
-    if initialise:
+    if initialise > 0.0:
         a = _initial_memory(law, arm, J_plus, torque)
         x = a if law.fast_leak_rate > law.slow_leak_rate else np.zeros_like(a)
         widening = np.maximum(np.abs(torque) - law.budget, 0.0)
@@ -131,11 +100,11 @@ def step(
     if limited:
         H = torque_matrix(law, arm, J_plus, J_plus_dot)
         a, x, own = _limited(law, M, H, limit, a, x, own)
-    offset = torque - own if initialise else math.exp(-dt / FADING_TIME) * memory.offset
+    offset = torque - own if initialise > 0.0 else math.exp(-dt / FADING_TIME) * memory.offset
     result = clip(own + offset, limit)
     integral = -(J @ a)
     if not math.isfinite(result.sum() + a.sum() + x.sum() + integral.sum()):
-        return FAILED
+        return False
     torque[:] = result
     saturated[:] = limited & (np.abs(result) >= _AT_LIMIT * law.budget)
     memory.a[:] = a
@@ -146,21 +115,7 @@ def step(
     memory.widening[:] = widening
     memory.v[:] = v
     memory.J[:] = J
-    return NEAR_SINGULAR if damped else REGULAR
-
-
-@compiled
-def skip(memory: NullspaceMemory, law: Law, v: Array, J: Array, dt: float) -> None:
-    """Let a time pass in which the memory only leaks."""
-    decay = math.exp(-law.slow_leak_rate * dt)
-    memory.a[:] *= decay
-    memory.s[:] *= decay
-    memory.integral[:] *= decay
-    memory.root[:] *= decay
-    memory.offset[:] *= math.exp(-dt / FADING_TIME)
-    memory.widening[:] *= math.exp(-dt / WIDENING_TIME)
-    memory.v[:] = v
-    memory.J[:] = J
+    return True
 
 
 @compiled
