@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write docs/parameters.md and docs/topics.md from the tables that the nodes use.
+"""Write docs/parameters.md, docs/topics.md and a list of all parameters from the nodes' tables.
 
 python scripts/make_reference.py
 python scripts/make_reference.py --check    # say which page is stale, write nothing
@@ -104,7 +104,16 @@ A robot of your own takes the place of `bullet_node`.
     return text
 
 
-PAGES = {"docs/parameters.md": parameters_page, "docs/topics.md": topics_page}
+def parameter_names() -> str:
+    """Return what a node reads to know which parameters other nodes have."""
+    return "".join(f"{name}\n" for name in sorted({r.name for t in TABLES.values() for r in t}))
+
+
+PAGES = {
+    "docs/parameters.md": parameters_page,
+    "docs/topics.md": topics_page,
+    "src/viability_bounds_pkg/viability_bounds_pkg/ros/parameter_names.txt": parameter_names,
+}
 
 
 def _is_shared(name: str) -> bool:
@@ -169,6 +178,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if check:
             print(f"{name} is stale: python scripts/make_reference.py", file=sys.stderr)
         else:
+            path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
             print(f"{name} written")
     return int(check and stale > 0)

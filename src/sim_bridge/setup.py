@@ -19,6 +19,7 @@ setup(
         *((f"share/{PACKAGE}/{folder}", glob(f"{folder}/*.yaml")) for folder in CONFIG),
     ],
     install_requires=["setuptools"],
+    extras_require={"test": ["pytest", "hypothesis"]},
     zip_safe=True,
     maintainer="The viability bounds authors",
     maintainer_email="maintainers@viability-bounds.example.org",

@@ -23,6 +23,7 @@ setup(
         "tqdm>=4",
         "viability_bounds_pkg",
     ],
+    extras_require={"test": ["pytest", "hypothesis"]},
     zip_safe=True,
     maintainer="The viability bounds authors",
     maintainer_email="maintainers@viability-bounds.example.org",

@@ -9,7 +9,7 @@ setup(
     name=PACKAGE,
     version="0.1.0",
     packages=find_packages(exclude=["test"]),
-    package_data={PACKAGE: ["py.typed"]},
+    package_data={PACKAGE: ["py.typed", "ros/parameter_names.txt"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
@@ -23,6 +23,7 @@ setup(
         "scipy>=1.11",
         "tqdm>=4",
     ],
+    extras_require={"test": ["pytest", "hypothesis"]},
     zip_safe=True,
     maintainer="The viability bounds authors",
     maintainer_email="maintainers@viability-bounds.example.org",

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -31,10 +30,11 @@ from sim_bridge.nodes.joint_command import (
 )
 from sim_bridge.nodes.topics import CLOCK, PAUSE, RESET
 from sim_bridge.nodes.world_subscriber import WorldSubscriber
-from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import Diagnostics
 from viability_bounds_pkg.ros.parameters import NodeParameters
-from viability_bounds_pkg.ros.runtime import run, set_stamp, stamp_to_ns
+from viability_bounds_pkg.ros.program import run
+from viability_bounds_pkg.ros.runtime import set_stamp, stamp_to_ns
 from viability_bounds_pkg.ros.topics import JOINT_COMMANDS, JOINT_STATES, ROBOT_DESCRIPTION
 
 _RETRY_PERIOD = 0.2
@@ -42,7 +42,7 @@ _LATENCIES_KEPT = 100_000
 _CONTROL = {type(None): "brakes", TorqueCommand: "torque", PositionCommand: "position"}
 
 
-class BulletNode(Node):
+class BulletNode(ArmNode):
     """An arm that publishes ``joint_states`` and follows ``joint_commands``.
 
     A command with efforts sets the torques of the motors. One without efforts sets the positions,
@@ -58,15 +58,15 @@ class BulletNode(Node):
     The robot's brakes are on until the first command.
     """
 
+    NAME = "bullet_node"
+    PARAMETERS = BulletConfiguration
+
     def __init__(self, **node_arguments: Any) -> None:
-        super().__init__("bullet_node", **node_arguments)
-        try:
+        super().__init__(**node_arguments)
+        with self.starting(JOINT_STATES):
             self._node_parameters = NodeParameters(self, BulletConfiguration)
             config = self._node_parameters.configuration
             self._robot = make_robot(config)
-        except SettingError:
-            self.destroy_node()
-            raise
         self._config = config
         self._monitor = LimitMonitor(
             config.position_min, config.position_max, config.velocity_max, config.torque_max
@@ -101,6 +101,7 @@ class BulletNode(Node):
             self.create_timer(config.dt, self._tick, clock=steady)
         self.create_timer(_RETRY_PERIOD, self._retry, clock=steady)
         self._diagnostics = Diagnostics(self, self._report)
+        self.announce(config.joints, config.rate_hz, f"simulated, clock {config.clock}")
         self._next_state()
 
     def _restart(self) -> None:

@@ -15,7 +15,6 @@ import numpy as np
 import rclpy
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException
-from rclpy.node import Node
 
 from sim_bridge.nodes.run_listener import RunListener
 from sim_bridge.nodes.scenario_messages import (
@@ -32,9 +31,17 @@ from sim_bridge.nodes.scenario_messages import (
 from sim_bridge.scenario.events import ServiceEvent
 from sim_bridge.scenario.recording import RecordedRun
 from sim_bridge.scenario.scenario import ScenarioConfiguration
-from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError
+from viability_bounds_pkg.exceptions import ArmSafetyError
+from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.parameters import NodeParameters
-from viability_bounds_pkg.ros.runtime import leave, make_executor, report_refusal
+from viability_bounds_pkg.ros.program import (
+    initialise,
+    leave,
+    node_parser,
+    own_arguments,
+    report_refusal,
+)
+from viability_bounds_pkg.ros.runtime import make_executor
 
 _POLL_PERIOD = 0.02
 _SHOW_PERIOD = 0.5
@@ -49,7 +56,7 @@ class ScenarioRefused(ArmSafetyError, RuntimeError):
     """Another node refused a message or call of the scenario; the text says which and why."""
 
 
-class ScenarioNode(Node):
+class ScenarioNode(ArmNode):
     """Resets a paused robot, plays a scenario on it, and records the run.
 
     Goals, pushes and obstacles are sent before their time with the stamps at which they take
@@ -63,13 +70,13 @@ class ScenarioNode(Node):
         listener: the recorded messages and diagnostics of the other nodes.
     """
 
+    NAME = "scenario_node"
+    PARAMETERS = ScenarioConfiguration
+
     def __init__(self, **node_arguments: Any) -> None:
-        super().__init__("scenario_node", **node_arguments)
-        try:
+        super().__init__(**node_arguments)
+        with self.starting():
             config = NodeParameters(self, ScenarioConfiguration).configuration
-        except SettingError:
-            self.destroy_node()
-            raise
         self.config = config
         self.awaits = ""
         self.done = False
@@ -218,7 +225,7 @@ class ScenarioNode(Node):
         )
 
 
-def play(node: ScenarioNode, others: Sequence[Node] = (), *, quiet: bool = False) -> None:
+def play(node: ScenarioNode, others: Sequence[ArmNode] = (), *, quiet: bool = False) -> None:
     """Run the scenario to its end and print its state.
 
     Args:
@@ -263,10 +270,11 @@ def main(args: list[str] | None = None) -> int:
     Returns:
         0 when no limit was broken, 1 when one was, 2 when the scenario could not be played.
     """
-    argv = rclpy.utilities.remove_ros_args(args=sys.argv if args is None else args)
+    parser = node_parser(ScenarioNode)
+    parser.add_argument("--out", type=Path, metavar="DIRECTORY", help="where the report goes")
+    out = parser.parse_args(own_arguments(args)).out
     try:
-        out = _output_directory(argv)
-        rclpy.init(args=args)
+        initialise(args)
         node = ScenarioNode()
     except Exception as error:
         rclpy.try_shutdown()
@@ -288,16 +296,6 @@ def main(args: list[str] | None = None) -> int:
         return 130
     finally:
         leave(node)
-
-
-def _output_directory(argv: list[str]) -> Path | None:
-    """Return the value of ``--out``, or None without it."""
-    if "--out" not in argv:
-        return None
-    value = argv[argv.index("--out") + 1 :][:1]
-    if not value:
-        raise ValueError("--out needs a directory")
-    return Path(value[0])
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
@@ -27,15 +26,19 @@ from torque_safety_controller.parameters.controller_parameters import Controller
 from torque_safety_controller.qp.constraints import AccelerationRange
 from torque_safety_controller.safety.handover import Control, Handover, HandoverRefused
 from torque_safety_controller.safety.modes import Mode, ModeKeeper
-from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, Verdict
 from viability_bounds_pkg.ros.parameters import NodeParameters
-from viability_bounds_pkg.ros.runtime import run
-from viability_bounds_pkg.ros.topics import ACCELERATION_LIMITS, JOINT_STATES
+from viability_bounds_pkg.ros.program import run
+from viability_bounds_pkg.ros.topics import (
+    ACCELERATION_LIMITS,
+    JOINT_COMMANDS,
+    JOINT_STATES,
+)
 from viability_bounds_pkg.state import State
 
 
-class ControllerNode(Node):
+class ControllerNode(ArmNode):
     """Answers each joint state, once its acceleration limits are there, with torques.
 
     Subscribes to ``joint_states``, ``acceleration_limits`` and goals; publishes
@@ -43,15 +46,15 @@ class ControllerNode(Node):
     hands over between the robot's position control and torque.
     """
 
+    NAME = "controller_node"
+    PARAMETERS = ControllerConfiguration
+
     def __init__(self, **node_arguments: Any) -> None:
-        super().__init__("controller_node", **node_arguments)
-        try:
+        super().__init__(**node_arguments)
+        with self.starting(JOINT_COMMANDS):
             self._node_parameters = NodeParameters(self, ControllerConfiguration, self._configure)
             config = self._node_parameters.configuration
             self._controller, base = make_controller(config, self)
-        except SettingError:
-            self.destroy_node()
-            raise
         self._config = config
         self._handover = Handover(
             config.start_control,
@@ -94,6 +97,13 @@ class ControllerNode(Node):
             clock=Clock(clock_type=ClockType.STEADY_TIME),
         )
         self._diagnostics = Diagnostics(self, self._report)
+        avoiding = "with" if config.collision.collision_avoidance else "without"
+        self.announce(
+            config.joints,
+            config.rate_hz,
+            f"{config.start_control} control, integral action {config.integral.integral_action}, "
+            f"{avoiding} collision avoidance",
+        )
 
     def _configure(self, config: ControllerConfiguration) -> None:
         self._config = config

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rclpy.node import Node
 from ros_harness import overrides
 
 from viability_bounds_pkg.exceptions import SettingError
@@ -25,6 +24,7 @@ from viability_bounds_pkg.parameter import (
     whole_number,
 )
 from viability_bounds_pkg.robot_configuration import RobotConfiguration
+from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.parameters import NodeParameters
 
 
@@ -61,9 +61,12 @@ class Configuration:
 VALUES = {"joints": ["a", "b"], "limits": [1.0, 2.0], "rate": 100.0}
 
 
-class Tunable(Node):
+class Tunable(ArmNode):
+    NAME = "tunable"
+    PARAMETERS = Configuration
+
     def __init__(self, **node_arguments):
-        super().__init__("tunable", **node_arguments)
+        super().__init__(**node_arguments)
         self.changes = []
         self.parameters = NodeParameters(
             self, Configuration, lambda config: self.changes.append(config.changing), self.check

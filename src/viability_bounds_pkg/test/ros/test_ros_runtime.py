@@ -11,21 +11,29 @@ SCRIPT = """
 import sys
 import rclpy
 from numba import njit
-from rclpy.node import Node
-from viability_bounds_pkg.ros.runtime import run
+from dataclasses import dataclass
+from viability_bounds_pkg.ros.arm_node import ArmNode
+from viability_bounds_pkg.ros.program import run
 
 @njit
 def add(x):
     return x + 1
 
-def make():
-    node = Node("quick")
-    if "compile" in sys.argv:
-        add(1)
-    node.create_timer(0.01, rclpy.try_shutdown)
-    return node
+@dataclass
+class Nothing:
+    pass
 
-sys.exit(run(make, []))
+class Quick(ArmNode):
+    NAME = "quick"
+    PARAMETERS = Nothing
+
+    def __init__(self):
+        super().__init__()
+        if "compile" in sys.argv:
+            add(1)
+        self.create_timer(0.01, rclpy.try_shutdown)
+
+sys.exit(run(Quick, ["quick"]))
 """
 
 
@@ -48,13 +56,21 @@ def test_a_node_says_when_its_start_had_to_compile(compiles):
 INTERRUPTED = """
 import os
 import sys
-from rclpy.node import Node
+from dataclasses import dataclass
 from std_msgs.msg import Header
-from viability_bounds_pkg.ros.runtime import run
+from viability_bounds_pkg.ros.arm_node import ArmNode
+from viability_bounds_pkg.ros.program import run
 
-class Busy(Node):
+@dataclass
+class Nothing:
+    pass
+
+class Busy(ArmNode):
+    NAME = "busy"
+    PARAMETERS = Nothing
+
     def __init__(self):
-        super().__init__("busy")
+        super().__init__()
         self.out = self.create_publisher(Header, "out", 1)
         self.create_timer(0.01, self.work)
 
@@ -63,7 +79,7 @@ class Busy(Node):
         for _ in range(1000):
             self.out.publish(Header())
 
-sys.exit(run(Busy, []))
+sys.exit(run(Busy, ["busy"]))
 """
 
 

@@ -11,26 +11,25 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 from diagnostic_msgs.msg import DiagnosticStatus
-from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from viability_bounds_pkg import viability
-from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.node.bounds_parameters import (
     Bounds,
     BoundsConfiguration,
     make_bounds,
 )
 from viability_bounds_pkg.robot_configuration import RobotConfiguration, load_model
+from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, Verdict
 from viability_bounds_pkg.ros.parameters import NodeParameters
+from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.robot_urdf import robot_urdf
-from viability_bounds_pkg.ros.runtime import run
 from viability_bounds_pkg.ros.topics import ACCELERATION_LIMITS, JOINT_STATES
 
 
-class BoundsNode(Node):
+class BoundsNode(ArmNode):
     """Answers every joint state with the accelerations that keep the limits for ever.
 
     Subscribes to ``joint_states``; publishes ``acceleration_limits`` with the stamp of the
@@ -38,18 +37,18 @@ class BoundsNode(Node):
     upper, rad/s^2, in the order of the parameter ``joints``.
     """
 
+    NAME = "bounds_node"
+    PARAMETERS = BoundsConfiguration
+
     def __init__(self, **node_arguments: Any) -> None:
-        super().__init__("bounds_node", **node_arguments)
+        super().__init__(**node_arguments)
         self._model: pin.Model | None = None
-        try:
+        with self.starting(ACCELERATION_LIMITS):
             self._node_parameters = NodeParameters(
                 self, BoundsConfiguration, self._configure, self._make_bounds
             )
             config = self._node_parameters.configuration
             self._bounds = self._make_bounds(config)
-        except SettingError:
-            self.destroy_node()
-            raise
         joints = config.joints
         self._longest_ns = round(1.5e9 * config.dt)
         self._reader = JointStateReader(joints, config.state_timeout)
@@ -62,6 +61,9 @@ class BoundsNode(Node):
         JOINT_STATES.subscription(self, self._on_state)
         self._diagnostics = Diagnostics(self, self._report)
         self._warn_of_affected_joints(config)
+        self.announce(
+            joints, config.rate_hz, f"method {config.method}, limits {config.acceleration_limits}"
+        )
 
     def _load_model(self, robot: RobotConfiguration) -> pin.Model:
         """Return the model, loaded once: parameters that change it are read-only."""

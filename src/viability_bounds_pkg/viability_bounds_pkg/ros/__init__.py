@@ -3,8 +3,9 @@
 
 from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, StampGuard, Verdict
 from viability_bounds_pkg.ros.parameters import NodeParameters
+from viability_bounds_pkg.ros.program import run, spin
 from viability_bounds_pkg.ros.robot_urdf import robot_urdf
-from viability_bounds_pkg.ros.runtime import make_executor, run, spin
+from viability_bounds_pkg.ros.runtime import make_executor
 from viability_bounds_pkg.ros.topics import OfferedService, Topic
 
 __all__ = [

@@ -7,7 +7,7 @@ set while it runs, where an error refuses the change and the old value stays.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import (
@@ -17,9 +17,18 @@ from rcl_interfaces.msg import (
     SetParametersResult,
 )
 from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
 
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import REQUIRED, Parameter, parameter_table, read
+from viability_bounds_pkg.ros.arm_node import ArmNode
+from viability_bounds_pkg.ros.given_parameters import (
+    arguments_of,
+    given_parameters,
+    refuse_renamed,
+    refuse_unknown,
+    why_missing,
+)
 
 Configuration = TypeVar("Configuration")
 
@@ -42,15 +51,25 @@ class NodeParameters(Generic[Configuration]):
 
     def __init__(
         self,
-        node: Node,
+        node: ArmNode,
         kind: type[Configuration],
         on_change: Callable[[Configuration], None] | None = None,
         check: Callable[[Configuration], Any] | None = None,
     ) -> None:
         self._kind, self._on_change, self._check = kind, on_change, check
         table = parameter_table(kind)
+        arguments, name = arguments_of(node.context), node.get_fully_qualified_name()
+        refuse_renamed(arguments, name, node.NAME)
+        _settle(node, given_parameters(arguments, name), [row.name for row in table])
         self._values = {row.name: _declare(node, row) for row in table}
-        self.configuration = read(kind, self._values)
+        try:
+            self.configuration = read(kind, self._values)
+        except SettingError as error:
+            if error.value is not None:
+                raise
+            raise SettingError(
+                error.name, None, error.allowed + why_missing(arguments, name)
+            ) from error
         for row in table:
             node.set_descriptor(row.name, describe(row))
         node.add_on_set_parameters_callback(self._judge)
@@ -76,6 +95,24 @@ class NodeParameters(Generic[Configuration]):
         self.configuration = read(self._kind, self._values)
         if self._on_change is not None:
             self._on_change(self.configuration)
+
+
+def _settle(node: Node, given: Mapping[str, Any], known: Sequence[str]) -> None:
+    """Make rclpy declare the values that were given last; refuse names that nobody knows."""
+    values = node._parameter_overrides  # rclpy has no other way to tell
+    for name, value in given.items():
+        if value is None:
+            values.pop(name, None)
+        elif name not in values or _differs(values[name].value, value):
+            values[name] = RosParameter(name, value=value)
+    refuse_unknown(values, known)
+
+
+def _differs(read: Any, given: Any) -> bool:
+    """Return whether rcl read another value; arrays come as its own types."""
+    if isinstance(given, list):
+        return len(read or ()) != len(given) or any(map(_differs, read, given))
+    return type(read) is not type(given) or (read != given and given == given)
 
 
 def _declare(node: Node, row: Parameter) -> Any:

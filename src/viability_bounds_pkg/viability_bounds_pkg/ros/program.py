@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A node as a program: its command line, its start, its end by a signal."""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import signal
+import sys
+from collections.abc import Sequence
+
+import rclpy
+from numba.core.event import TimingListener, install_listener
+from rclpy.context import Context
+from rclpy.executors import Executor, ExternalShutdownException
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
+
+from viability_bounds_pkg.cli.command_line import Parser
+from viability_bounds_pkg.exceptions import ArmSafetyError
+from viability_bounds_pkg.parameter import parameter_table
+from viability_bounds_pkg.ros.arm_node import ArmNode
+from viability_bounds_pkg.ros.given_parameters import note_arguments
+from viability_bounds_pkg.ros.runtime import EventsExecutor, make_executor
+
+_SIGNAL_CHECK_PERIOD = 0.2
+
+_LEAVE_TIMEOUT = 5
+"""How long a node may take to leave the graph, s."""
+
+
+def spin(executor: Executor, context: Context | None = None) -> None:
+    """Run callbacks until the context is shut down or SIGINT or SIGTERM comes.
+
+    ``EventsExecutor.spin()`` of rclpy 7.1 runs no callback, and a wait without time-out does
+    not see signals, so this waits in turns on a future that is never set. A signal lets the
+    callback that it interrupts end: it may be about to publish. Call it from the main thread.
+    """
+    signals: list[int] = []
+    for each in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(each, lambda number, _: signals.append(number))
+    never: Future = Future()
+    while rclpy.ok(context=context) and not signals:
+        executor.spin_until_future_complete(never, timeout_sec=_SIGNAL_CHECK_PERIOD)
+
+
+def own_arguments(args: Sequence[str] | None) -> list[str]:
+    """Return those arguments, of the process if None, that are not for ROS.
+
+    The first is the program's name, as in `sys.argv`.
+    """
+    own: list[str] = rclpy.utilities.remove_ros_args(args=sys.argv if args is None else args)
+    return own[1:]
+
+
+def node_parser(kind: type[ArmNode]) -> Parser:
+    """Return the parser of a node's own arguments, whose help lists its parameters."""
+    rows = parameter_table(kind.PARAMETERS)
+    table = "\n".join(
+        f"  {row.name}: {row.description}" + (f" [{row.constraints}]" if row.constraints else "")
+        for row in rows
+    )
+    return Parser(
+        prog=kind.NAME,
+        description=(kind.__doc__ or "").strip().split("\n")[0],
+        usage="%(prog)s [-h] [--ros-args [--params-file FILE] [-p NAME:=VALUE] [-r FROM:=TO] "
+        "[--log-level LEVEL]]",
+        epilog=f"parameters:\n{table}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def initialise(args: Sequence[str] | None) -> None:
+    """Initialise rclpy with the arguments given, of the process if None."""
+    arguments = list(sys.argv if args is None else args)
+    # Its own signal handlers would shut down the context in the middle of a callback.
+    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    note_arguments(rclpy.get_default_context(), arguments)
+
+
+def run(make_node: type[ArmNode], args: list[str] | None = None) -> int:
+    """Start a node, run it until it is told to stop.
+
+    Returns:
+        The exit code: 0 after SIGINT, SIGTERM or shutdown; 1 when the node cannot start, after one
+        line on stderr that says why.
+    """
+    node_parser(make_node).parse_args(own_arguments(args))
+    try:
+        initialise(args)
+    except Exception as error:  # rclpy's own classes differ between releases
+        report_refusal(error)
+        return 1
+    node = None
+    try:
+        compiling = TimingListener()
+        with install_listener("numba:compile", compiling):
+            node = make_node()
+        if compiling.done:
+            node.get_logger().warning(
+                f"compiling took {compiling.duration:.1f} s of the start, which scripts/setup.sh "
+                "does ahead: no compiled code of these sources was kept"
+            )
+        executor = make_executor()
+        if EventsExecutor is None:
+            node.get_logger().warning(
+                "rclpy has no EventsExecutor; the single-threaded one adds about 2 ms a cycle"
+            )
+        executor.add_node(node)
+        # What exists by now lives until the end: the collector need not visit it in the control
+        # loop.
+        gc.collect()
+        gc.freeze()
+        spin(executor)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except ArmSafetyError as error:
+        report_refusal(error)
+        return 1
+    finally:
+        leave(node)
+        gc.unfreeze()
+    return 0
+
+
+def leave(node: Node | None) -> None:
+    """Destroy a node and shut ROS down at the end of a process; call it from the main thread.
+
+    When another process leaves at the same moment, Fast DDS 2.14 may wait for ever inside a call,
+    so that no Python code runs any more. So the system ends the process if this takes too long.
+    """
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    signal.alarm(_LEAVE_TIMEOUT)
+    if node is not None:
+        node.destroy_node()
+    rclpy.try_shutdown()
+    signal.alarm(0)
+
+
+def report_refusal(error: Exception) -> None:
+    """Print why something does not start, in one line on stderr."""
+    # rcl appends where in its own sources an error arose.
+    reason = str(error).split(", at /")[0]
+    if "Sequence should be of same type" in reason:
+        reason += " (all numbers of a list with a decimal point, or none)"
+    print(f"error: {' '.join(reason.split())}", file=sys.stderr)
