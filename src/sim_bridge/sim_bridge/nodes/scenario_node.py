@@ -272,8 +272,8 @@ def main(args: list[str] | None = None) -> int:
     """
     parser = node_parser(ScenarioNode)
     parser.add_argument("--out", type=Path, metavar="DIRECTORY", help="where the report goes")
-    out = parser.parse_args(own_arguments(args)).out
     try:
+        out = parser.parse_args(own_arguments(args)).out
         initialise(args)
         node = ScenarioNode()
     except Exception as error:

@@ -86,8 +86,8 @@ def run(make_node: type[ArmNode], args: list[str] | None = None) -> int:
         The exit code: 0 after SIGINT, SIGTERM or shutdown; 1 when the node cannot start, after one
         line on stderr that says why.
     """
-    node_parser(make_node).parse_args(own_arguments(args))
     try:
+        node_parser(make_node).parse_args(own_arguments(args))
         initialise(args)
     except Exception as error:  # rclpy's own classes differ between releases
         report_refusal(error)
