@@ -136,7 +136,7 @@ def main() -> None:
 
     def make(solver: str) -> Controller:
         robot = RobotModel(model, values["end_effector_frame"], 1.0 / values["rate_hz"])
-        gains = Gains(pose_kp=10.0, posture_kp=10.0)
+        gains = Gains(pose_kp=10.0, pose_kd=6.3, posture_kp=10.0, posture_kd=6.3)
         controller = Controller(robot, np.array(values["torque_max"]), gains, solver=solver)
         controller.reset(state.q)
         robot.update(State(state.q + 0.1, state.v), state.v)

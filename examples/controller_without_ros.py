@@ -39,7 +39,7 @@ def main() -> int:
     ).jerk
     margins = torque_margins(1.1 * jerk, DT)
     solver = BoundsSolver(tightened(limits, margins), 2 * DT, margins.acceleration, period=DT)
-    gains = Gains(pose_kp=100.0, posture_kp=10.0)
+    gains = Gains(pose_kp=100.0, posture_kp=10.0, posture_kd=6.0)
     controller = Controller(RobotModel(model, "effector_body", DT), tau_max, gains)
     q, v, data = np.full(n, 0.3), np.zeros(n), model.createData()
     controller.reset(q)

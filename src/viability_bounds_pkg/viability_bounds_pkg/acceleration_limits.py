@@ -67,38 +67,36 @@ class AccelerationLimits:
 class EmptyIntervalError(LimitEstimateError):
     """The torque limits leave a joint no acceleration interval in some state.
 
+    Args:
+        joint: index of the joint.
+        model: the robot.
+        space: what was searched.
+        worst: the outcome of the search.
+        suggestion: the velocity scale that gives every such joint an interval, or the posture
+            whose weight alone is too much.
+
     Attributes:
         joint: its name.
-        a_min: tightest lower limit found, rad/s^2; not negative, or `a_max` is not positive.
-        a_max: tightest upper limit found, rad/s^2.
         q: the state that empties the interval, shape (n,), rad.
         v: its velocity, shape (n,), rad/s.
         torque_max: the torque available, N m.
-        suggestion: the velocity scale that gives every such joint an interval, or the posture
-            whose weight alone is too much.
-        velocity_max: the velocity limits so scaled, shape (n,), rad/s.
+        suggestion: as given.
     """
 
     def __init__(
         self,
-        joint: str,
-        a_min: float,
-        a_max: float,
-        q: Array,
-        v: Array,
-        torque_max: float,
+        joint: int,
+        model: pin.Model,
+        space: StateSpace,
+        worst: WorstCases,
         suggestion: VelocityScale,
-        velocity_max: Array,
-    ):
-        self.joint = joint
-        self.a_min = a_min
-        self.a_max = a_max
-        self.q = q
-        self.v = v
-        self.torque_max = torque_max
+    ) -> None:
+        side = "a_max" if worst.a_max[joint] <= 0 else "a_min"
+        self.joint = model.names[1 + joint]
+        self.q: Array = getattr(worst, f"q_at_{side}")[joint]
+        self.v: Array = getattr(worst, f"v_at_{side}")[joint]
+        self.torque_max = float(space.tau_max[joint])
         self.suggestion = suggestion
-        self.velocity_max = velocity_max
-        side = f"a_max = {a_max:.3g}" if a_max <= 0 else f"a_min = {a_min:.3g}"
         if suggestion.scale == 0.0:
             remedy = (
                 f"lower velocities do not help: joint {suggestion.joint} takes "
@@ -108,14 +106,16 @@ class EmptyIntervalError(LimitEstimateError):
             )
         else:
             remedy = (
-                f"velocity limits scaled by {suggestion.scale:.3f}, to {_text(velocity_max)} "
-                f"rad/s, leave every joint {USEFUL_ACCELERATION:g} rad/s^2 either way; else "
-                "narrow the position limits or override "
+                f"velocity limits scaled by {suggestion.scale:.3f}, to "
+                f"{_text(suggestion.scale * space.v_max)} rad/s, leave every joint "
+                f"{USEFUL_ACCELERATION:g} rad/s^2 either way; else narrow the position limits or "
+                "override "
             )
-        remedy += f"the joint's acceleration limits (--override {joint}=MIN,MAX)"
         super().__init__(
-            f"joint {joint}: its torque of {torque_max:.4g} N m leaves no acceleration interval: "
-            f"{side} rad/s^2 at q = {_text(q)}, v = {_text(v)}; {remedy}"
+            f"joint {self.joint}: its torque of {self.torque_max:.4g} N m leaves no acceleration "
+            f"interval: {side} = {getattr(worst, side)[joint]:.3g} rad/s^2 at "
+            f"q = {_text(self.q)}, v = {_text(self.v)}; {remedy}the joint's acceleration limits "
+            f"(--override {self.joint}=MIN,MAX)"
         )
 
 
@@ -239,18 +239,8 @@ def limits_from_worst_cases(
     for j, joint in enumerate(names):
         if joint in overrides or worst.a_min[j] < 0 < worst.a_max[j]:
             continue
-        upper = worst.a_max[j] <= 0
         suggestion = largest_velocity_scale(model, space, ignore=overrides)
-        raise EmptyIntervalError(
-            joint,
-            float(worst.a_min[j]),
-            float(worst.a_max[j]),
-            (worst.q_at_a_max if upper else worst.q_at_a_min)[j],
-            (worst.v_at_a_max if upper else worst.v_at_a_min)[j],
-            float(space.tau_max[j]),
-            suggestion,
-            suggestion.scale * space.v_max,
-        )
+        raise EmptyIntervalError(j, model, space, worst, suggestion)
     bound = np.broadcast_to(np.inf if cap is None else np.asarray(cap, dtype=float), len(names))
     a_min, a_max = np.maximum(worst.a_min, -bound), np.minimum(worst.a_max, bound)
     for joint, (low, high) in overrides.items():

@@ -166,6 +166,8 @@ class Parameter:
     def _kind_name(self) -> str:
         if self.kind in (float, int, bool, str):
             return _SCALARS[self.kind]
+        if self.length is not None:
+            return self.constraints
         return "a list of numbers" if self.kind == list[float] else "a list of strings"
 
 

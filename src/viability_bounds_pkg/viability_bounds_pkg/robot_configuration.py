@@ -58,11 +58,12 @@ class RobotConfiguration:
             raise SettingError("locked_positions", positions, allowed)
         if not np.isfinite(positions).all():
             raise SettingError("locked_positions", positions, "finite numbers")
-        if np.isposinf(self.position_min).any():
-            raise SettingError("position_min", self.position_min, "numbers below .inf")
-        if not (self.position_min < self.position_max).all():
-            allowed = "above position_min everywhere"
-            raise SettingError("position_max", self.position_max, allowed)
+        low, high = self.position_min, self.position_max
+        if np.isposinf(low).any():
+            raise SettingError("position_min", low, "numbers below .inf")
+        # Of different lengths where one of them is left to the URDF.
+        if len(low) == len(high) and not (low < high).all():
+            raise SettingError("position_max", high, "above position_min everywhere")
 
     @property
     def locked(self) -> dict[str, float]:

@@ -30,37 +30,22 @@ class TorqueMargins(NamedTuple):
     position: NDArray[np.float64]
 
 
-def step_deviations(jerk: ArrayLike, dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the largest deviation from constant acceleration within a step.
+def torque_margins(jerk: ArrayLike, dt: float) -> TorqueMargins:
+    """Return the margins that make up for the change of acceleration within a step.
 
     The torque is right for the middle of the step, so that with jerk J the acceleration is
-    off by J (t - dt/2): the velocity by at most J dt^2 / 8, the position by J dt^3 / 12.
+    off by J (t - dt/2): the velocity by at most J dt^2 / 8, the position by D = J dt^3 / 12.
+    One half of the acceleration margin, J dt / 36, covers what is left of the error of the mean
+    acceleration, which is of second order in dt; the other half is a reserve of braking that
+    makes up for the position error D of each step as long as the joint is faster than the last
+    three steps of braking. In these the error adds up to at most 5 D.
 
     Args:
         jerk: greatest rate of change of acceleration under held torque, shape (n,), rad/s^3.
         dt: control period, s.
-
-    Returns:
-        Velocity, rad/s, and position, rad, each of shape (n,).
     """
-    jerk = np.asarray(jerk, dtype=float)
-    return jerk * dt**2 / 8.0, jerk * dt**3 / 12.0
-
-
-def torque_margins(jerk: ArrayLike, dt: float) -> TorqueMargins:
-    """Return the margins that make up for `step_deviations`.
-
-    One half of the acceleration margin, J dt / 36, covers what is left of the error of the mean
-    acceleration, which is of second order in dt; the other half is a reserve of braking that
-    makes up for the position error D = J dt^3 / 12 of each step as long as the joint is faster
-    than the last three steps of braking. In these the error adds up to at most 5 D.
-
-    Args:
-        jerk: under held torque, shape (n,), rad/s^3.
-        dt: control period, s.
-    """
-    velocity, position = step_deviations(jerk, dt)
-    return TorqueMargins(np.asarray(jerk, dtype=float) * dt / 18.0, velocity, 5.0 * position)
+    J = np.asarray(jerk, dtype=float)
+    return TorqueMargins(J * dt / 18.0, J * dt**2 / 8.0, 5.0 * (J * dt**3 / 12.0))
 
 
 def tightened(limits: JointLimits, margins: TorqueMargins) -> JointLimits:

@@ -224,7 +224,8 @@ def _contacts(points: Sequence[ContactPoint], model: pin.Model) -> Contacts | No
         its = [each for each in points if each.frame == frame]
         first = its[0]
         if not model.existFrame(frame):
-            raise SettingError(f"{first.label}.frame", frame, "a frame of the URDF")
+            label = f"contacts[{points.index(first)}].frame"
+            raise SettingError(label, frame, "a frame of the URDF")
         places = np.array([each.point for each in its])
         contacts.append(FrictionContact(frame, places, first.normal, first.friction))
     return Contacts(model, contacts) if contacts else None

@@ -12,23 +12,36 @@ from numpy.typing import NDArray
 
 from torque_safety_controller.collision.avoidance import CollisionSettings
 from torque_safety_controller.collision.bodies import SHAPES, CollisionBody, make_obstacle
-from torque_safety_controller.parameters.entries import Entry
+from torque_safety_controller.parameters.entries import read_entries
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import (
+    FINITE,
     NEGATIVE,
     POSITIVE,
     check_per_joint,
     group,
     joint_numbers,
+    numbers,
     switch,
+    text,
     texts,
 )
 from viability_bounds_pkg.robot_configuration import RobotConfiguration
 
 Array = NDArray[np.float64]
 
-_OBSTACLE_FIELDS = ("name", "shape", "size", "position", "rpy")
 _EQUAL = {"cylinder": 2, "sphere": 3}  # of the numbers of a size, how many are one diameter
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ObstacleEntry:
+    """One entry of ``obstacles``."""
+
+    name: str = text("what no other obstacle is called")
+    shape: str = text("what it is", choices=SHAPES)
+    size: Array = numbers("as in a Marker, m", POSITIVE, length=3, default=())
+    position: Array = numbers("of its centre, m", FINITE, length=3)
+    rpy: Array = numbers("about the axes x, y, z, rad", FINITE, length=3, default=(0.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -103,19 +116,19 @@ class CollisionConfiguration:
 
 def _obstacles(entries: Sequence[str]) -> tuple[CollisionBody, ...]:
     obstacles: dict[str, CollisionBody] = {}
-    for index, content in enumerate(entries):
-        entry = Entry("obstacles", index, content, _OBSTACLE_FIELDS)
-        name, shape = entry.text("name"), entry.text("shape")
-        if name in obstacles:
-            raise entry.refused("name", "a name that no other obstacle has")
-        if shape not in SHAPES:
-            raise entry.refused("shape", f"one of {', '.join(SHAPES)}")
-        size = np.zeros(3) if shape == "half_space" else entry.vector("size", within=POSITIVE)
-        if len(set(size[: _EQUAL.get(shape, 1)])) > 1:
-            raise entry.refused("size", f"the same diameter {_EQUAL[shape]} times")
-        rotation = pin.rpy.rpyToMatrix(entry.vector("rpy", (0.0, 0.0, 0.0)))
-        orientation = pin.Quaternion(rotation).coeffs()
-        obstacles[name] = make_obstacle(name, shape, size, entry.vector("position"), orientation)
+    for index, entry in enumerate(read_entries(ObstacleEntry, "obstacles", entries)):
+        label, name, size = f"obstacles[{index}]", entry.name, entry.size
+        if not name or name in obstacles:
+            raise SettingError(f"{label}.name", name, "a name that no other obstacle has")
+        if entry.shape == "half_space":
+            size = np.zeros(3)
+        elif not len(size):
+            raise SettingError(f"{label}.size", None, "3 finite numbers > 0")
+        if len(set(size[: _EQUAL.get(entry.shape, 1)])) > 1:
+            allowed = f"the same diameter {_EQUAL[entry.shape]} times"
+            raise SettingError(f"{label}.size", size, allowed)
+        orientation = pin.Quaternion(pin.rpy.rpyToMatrix(entry.rpy)).coeffs()
+        obstacles[name] = make_obstacle(name, entry.shape, size, entry.position, orientation)
     return tuple(obstacles.values())
 
 

@@ -5,20 +5,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torque_safety_controller.contact.interaction import InteractionSettings
 from torque_safety_controller.contact.wrench_sensor import SensorSettings
-from torque_safety_controller.parameters.entries import Entry
+from torque_safety_controller.parameters.entries import read_entries
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import (
+    FINITE,
     NOT_NEGATIVE,
     POSITIVE,
     Range,
     group,
+    number,
     numbers,
     switch,
     text,
@@ -30,25 +31,16 @@ Array = NDArray[np.float64]
 _AXES = "x, y, z and about x, y, z of the end effector's axes"
 
 _DEFAULTS = InteractionSettings()
-_CONTACT_FIELDS = ("frame", "point", "normal", "friction")
 
 
-class ContactPoint(NamedTuple):
-    """One entry of ``contacts``.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ContactPoint:
+    """One entry of ``contacts``."""
 
-    Attributes:
-        label: of the entry, in errors.
-        frame: name of the link.
-        point: in its axes, shape (3,), m.
-        normal: direction in which the environment pushes, shape (3,).
-        friction: coefficient.
-    """
-
-    label: str
-    frame: str
-    point: Array
-    normal: Array
-    friction: float
+    frame: str = text("name of the link")
+    point: Array = numbers("in its axes, m", FINITE, length=3, default=(0.0, 0.0, 0.0))
+    normal: Array = numbers("direction in which the environment pushes", FINITE, length=3)
+    friction: float = number("Coulomb's coefficient", NOT_NEGATIVE, default=0.0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -181,18 +173,15 @@ class InteractionConfiguration:
 
 
 def _contact_points(entries: Sequence[str]) -> tuple[ContactPoint, ...]:
-    points: list[ContactPoint] = []
-    for index, content in enumerate(entries):
-        entry = Entry("contacts", index, content, _CONTACT_FIELDS)
-        frame, normal = entry.text("frame"), entry.vector("normal")
-        friction = entry.number("friction", 0.0, NOT_NEGATIVE)
-        if np.abs(normal).max() <= 1e-9:
-            raise entry.refused("normal", "a direction, not zero")
-        for other in points:
-            if other.frame == frame and not np.array_equal(other.normal, normal):
-                raise entry.refused("normal", f"the same at all points of {frame!r}")
-            if other.frame == frame and other.friction != friction:
-                raise entry.refused("friction", f"the same at all points of {frame!r}")
-        point = entry.vector("point", (0.0, 0.0, 0.0))
-        points.append(ContactPoint(f"contacts[{index}]", frame, point, normal, friction))
-    return tuple(points)
+    points = read_entries(ContactPoint, "contacts", entries)
+    first: dict[str, ContactPoint] = {}
+    for index, point in enumerate(points):
+        other = first.setdefault(point.frame, point)
+        allowed = f"the same at all points of {point.frame!r}"
+        if np.abs(point.normal).max() <= 1e-9:
+            raise SettingError(f"contacts[{index}].normal", point.normal, "a direction, not zero")
+        if not np.array_equal(other.normal, point.normal):
+            raise SettingError(f"contacts[{index}].normal", point.normal, allowed)
+        if other.friction != point.friction:
+            raise SettingError(f"contacts[{index}].friction", point.friction, allowed)
+    return points

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from viability_bounds_pkg.joint_limits import JointLimits
-from viability_bounds_pkg.torque_margin import step_deviations, tightened, torque_margins
+from viability_bounds_pkg.torque_margin import tightened, torque_margins
 from viability_bounds_pkg.viability import BoundsSolver
 
 JOINTS = 200
@@ -29,7 +29,7 @@ def random_case(rng):
 
 def excess_in_units_of_d(rng, limits, dt, jerk, margins, factor):
     """The furthest that any joint goes beyond a limit, an adversary choosing everything."""
-    velocity_error, position_error = step_deviations(jerk, dt)
+    velocity_error, position_error = jerk * dt**2 / 8.0, jerk * dt**3 / 12.0
     mean_error = jerk * dt / 36.0
     inner = tightened(limits, margins)
     solver = BoundsSolver(inner, factor * dt, margins.acceleration, period=dt)
@@ -86,6 +86,6 @@ def test_deviations_are_those_of_constant_jerk():
     t = np.linspace(0.0, dt, 10001)
     velocity = J * (t**2 - t * dt) / 2.0
     position = J * (t**3 / 6.0 - t**2 * dt / 4.0)
-    E, D = step_deviations([J], dt)
+    E, D = np.array([J]) * dt**2 / 8.0, np.array([J]) * dt**3 / 12.0
     np.testing.assert_allclose(E[0], np.abs(velocity).max(), rtol=1e-6)
     np.testing.assert_allclose(D[0], np.abs(position).max(), rtol=1e-6)

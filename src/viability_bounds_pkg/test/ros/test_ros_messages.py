@@ -13,7 +13,6 @@ from ros_harness import joint_state
 from viability_bounds_pkg.ros.messages import (
     Diagnostics,
     JointStateReader,
-    StampGuard,
     Verdict,
 )
 from viability_bounds_pkg.ros.runtime import set_stamp, stamp_to_ns
@@ -148,11 +147,14 @@ def test_one_corrupt_stamp_in_the_future_does_not_lock_the_robot_out():
 
 
 def test_what_is_not_taken_does_not_count_as_heard():
-    guard = StampGuard(reset_after=1.0)
-    assert guard.check(100, 0.0) is Verdict.NEW  # looked at, but not accepted
-    assert guard.check(50, 0.1) is Verdict.NEW
-    guard.accept(100, 0.2)
-    assert guard.check(50, 0.3) is Verdict.REFUSED
+    reader = JointStateReader(JOINTS, reset_after=1.0)
+    late, early = joint_state(JOINTS, 100, Q, V), joint_state(JOINTS, 50, Q, V)
+    assert reader.read(joint_state(JOINTS[:2], 100, Q[:2], V[:2]), 0.0) is Verdict.REFUSED
+    assert reader.read(early, 0.1) is Verdict.NEW
+    assert reader.read(late, 0.2) is Verdict.NEW
+    assert reader.read(early, 0.3) is Verdict.REFUSED
+    assert reader.read(early, 1.1) is Verdict.REFUSED  # a refusal is no sign of life either
+    assert reader.read(early, 1.2) is Verdict.NEW
 
 
 @pytest.mark.parametrize("nanoseconds", [0, 999_999_999, SECOND, 1_795_235_306_814_914_975])

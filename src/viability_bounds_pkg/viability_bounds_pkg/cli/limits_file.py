@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import os
+import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +19,9 @@ import pinocchio as pin
 import yaml
 
 from viability_bounds_pkg.estimation.state_space import Array
-from viability_bounds_pkg.exceptions import ArmSafetyError
+from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError
+from viability_bounds_pkg.parameter import read, redeclared
+from viability_bounds_pkg.robot_configuration import LimitedRobotConfiguration
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 
 NODE = "/**/bounds_node"
@@ -33,6 +36,16 @@ DIGITS = 4
 
 class ParameterFileError(ArmSafetyError, ValueError):
     """A parameter file that cannot be read or lacks what is needed."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _EstimatedRobot(LimitedRobotConfiguration):
+    """The parameters of a robot whose limits may be left to its URDF."""
+
+    position_min: Array = redeclared(LimitedRobotConfiguration, "position_min", default=())
+    position_max: Array = redeclared(LimitedRobotConfiguration, "position_max", default=())
+    velocity_max: Array = redeclared(LimitedRobotConfiguration, "velocity_max", default=())
+    torque_max: Array = redeclared(LimitedRobotConfiguration, "torque_max", default=())
 
 
 @dataclass(frozen=True)
@@ -69,26 +82,19 @@ def read_robot(path: Path) -> Robot:
         RobotDescriptionError: the URDF cannot be found or loaded, or lacks a joint; a rotor
             inertia is negative.
     """
-    parameters = node_parameters(path)
-    for key in ("robot_description", "joints"):
-        if key not in parameters:
-            raise ParameterFileError(f"{path}: parameter '{key}' is missing")
-    if not isinstance(parameters["robot_description"], str):
-        raise ParameterFileError(f"{path}: parameter 'robot_description' must be a string")
-    joints = _texts(parameters, "joints", path)
-    locked = _texts(parameters, "locked_joints", path)
-    positions = _numbers(parameters, "locked_positions", len(locked), path)
-    locked_positions = dict(zip(locked, positions, strict=True)) if positions is not None else {}
-    urdf = read_urdf(parameters["robot_description"])
-    _check_limits(urdf, parameters["robot_description"])
-    rotor_inertia = _numbers(parameters, "rotor_inertia", len(joints), path)
-    model = build_model(urdf, joints, locked_positions, rotor_inertia)
+    try:
+        config = read(_EstimatedRobot, node_parameters(path))
+    except SettingError as error:
+        raise ParameterFileError(f"{path}: {error}") from error
+    urdf = read_urdf(config.robot_description)
+    _check_limits(urdf, config.robot_description)
+    model = build_model(urdf, config.joints, config.locked, config.rotor_inertia)
 
     def limit(key: str, from_urdf: Array) -> Array:
-        given = _numbers(parameters, key, len(joints), path)
-        if given is not None:
+        given: Array = getattr(config, key)
+        if len(given):
             return given
-        for joint, value in zip(joints, from_urdf, strict=True):
+        for joint, value in zip(config.joints, from_urdf, strict=True):
             if not key.startswith("position") and not (math.isfinite(value) and value > 0):
                 raise ParameterFileError(
                     f"{path}: joint {joint} has no limit in the URDF to use: "
@@ -148,26 +154,6 @@ def node_parameters(path: Path, node: str = NODE) -> dict[str, Any]:
     return parameters
 
 
-def _texts(parameters: Mapping[str, Any], key: str, path: Path) -> list[str]:
-    values = parameters.get(key, [])
-    if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
-        raise ParameterFileError(f"{path}: parameter '{key}' must be a list of names")
-    return values
-
-
-def _numbers(parameters: Mapping[str, Any], key: str, count: int, path: Path) -> Array | None:
-    values = parameters.get(key)
-    if values is None:
-        return None
-    if (
-        not isinstance(values, list)
-        or len(values) != count
-        or any(isinstance(value, bool) or not isinstance(value, int | float) for value in values)
-    ):
-        raise ParameterFileError(f"{path}: parameter '{key}' must be a list of {count} numbers")
-    return np.array(values, dtype=float)
-
-
 def overlay(parameters: Mapping[str, Array], notes: Sequence[str], node: str = NODE) -> str:
     """Return a parameter file that sets `parameters` of one node and nothing else.
 
@@ -216,21 +202,14 @@ def write_whole(path: Path, content: str | bytes) -> None:
         OSError: the file cannot be written; what was there before still is.
     """
     target = path.resolve()
-    mode = target.stat().st_mode & 0o777 if target.exists() else 0o666 & ~_umask()
-    descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+    fresh = target.with_name(f".{target.name}.{os.getpid()}")
     try:
-        with os.fdopen(descriptor, "wb") as file:
+        with fresh.open("wb") as file:
             file.write(content.encode() if isinstance(content, str) else content)
             file.flush()
-            os.fchmod(file.fileno(), mode)
             os.fsync(file.fileno())
-        os.replace(name, target)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+        if target.exists():
+            shutil.copymode(target, fresh)
+        fresh.replace(target)
+    finally:
+        fresh.unlink(missing_ok=True)

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pinocchio as pin
 
@@ -29,7 +31,7 @@ def mid_step_torque(model: pin.Model, q: Array, v: Array, a: Array, dt: float) -
         Torques, shape (batch, n), N m.
     """
     q_mid = q + 0.5 * dt * v + 0.125 * dt**2 * a
-    return _inverse_dynamics(model, q_mid, v + 0.5 * dt * a, a)
+    return _batch(pin.rnea, model, q_mid, v + 0.5 * dt * a, a)
 
 
 def jerk_under_held_torque(model: pin.Model, q: Array, v: Array, a: Array) -> tuple[Array, Array]:
@@ -81,35 +83,26 @@ def zero_order_hold_error(
     q_now, v_now = q, v
     error = np.zeros_like(q)
     for _ in range(substeps):
-        a_1 = _forward_dynamics(model, q_now, v_now, tau)
+        a_1 = _batch(pin.aba, model, q_now, v_now, tau)
         v_2 = v_now + 0.5 * step * a_1
-        a_2 = _forward_dynamics(model, q_now + 0.5 * step * v_now, v_2, tau)
+        a_2 = _batch(pin.aba, model, q_now + 0.5 * step * v_now, v_2, tau)
         v_3 = v_now + 0.5 * step * a_2
-        a_3 = _forward_dynamics(model, q_now + 0.5 * step * v_2, v_3, tau)
+        a_3 = _batch(pin.aba, model, q_now + 0.5 * step * v_2, v_3, tau)
         v_4 = v_now + step * a_3
-        a_4 = _forward_dynamics(model, q_now + step * v_3, v_4, tau)
+        a_4 = _batch(pin.aba, model, q_now + step * v_3, v_4, tau)
         error = np.maximum(error, np.abs(a_1 - a))
         q_now = q_now + step / 6 * (v_now + 2 * v_2 + 2 * v_3 + v_4)
         v_now = v_now + step / 6 * (a_1 + 2 * a_2 + 2 * a_3 + a_4)
-    error = np.maximum(error, np.abs(_forward_dynamics(model, q_now, v_now, tau) - a))
+    error = np.maximum(error, np.abs(_batch(pin.aba, model, q_now, v_now, tau) - a))
     mean = np.abs((v_now - v) / dt - a)
     position = np.abs(q_now - q - dt * v - 0.5 * dt**2 * a)
     return np.stack([error, mean, position], axis=1)
 
 
-def _inverse_dynamics(model: pin.Model, q: Array, v: Array, a: Array) -> Array:
-    """Return ``M(q) a + h(q, v)`` of a batch, every array of shape (batch, n)."""
+def _batch(dynamics: Callable[..., Array], model: pin.Model, *arrays: Array) -> Array:
+    """Return one of Pinocchio's algorithms on each row of arrays of shape (batch, n)."""
     data = model.createData()
-    tau = np.empty(q.shape)
-    for i in range(len(q)):
-        tau[i] = pin.rnea(model, data, q[i], v[i], a[i])
-    return tau
-
-
-def _forward_dynamics(model: pin.Model, q: Array, v: Array, tau: Array) -> Array:
-    """Return the accelerations that `tau` causes, every array of shape (batch, n)."""
-    data = model.createData()
-    a = np.empty(q.shape)
-    for i in range(len(q)):
-        a[i] = pin.aba(model, data, q[i], v[i], tau[i])
-    return a
+    result = np.empty(arrays[0].shape)
+    for i, row in enumerate(zip(*arrays, strict=True)):
+        result[i] = dynamics(model, data, *row)
+    return result

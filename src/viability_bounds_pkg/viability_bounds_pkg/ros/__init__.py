@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every ROS node of the project shares: parameters, topics, messages, running."""
 
-from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, StampGuard, Verdict
+from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, Verdict
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run, spin
 from viability_bounds_pkg.ros.robot_urdf import robot_urdf
@@ -13,7 +13,6 @@ __all__ = [
     "JointStateReader",
     "NodeParameters",
     "OfferedService",
-    "StampGuard",
     "Topic",
     "Verdict",
     "make_executor",

@@ -34,41 +34,16 @@ class Verdict(Enum):
     """Dropped and counted; the arrays hold what they held."""
 
 
-class StampGuard:
-    """Accepts only growing stamps, but also those of a source that has restarted.
-
-    A robot or simulation that restarts counts time from the beginning again, and one corrupt
-    stamp may lie far in the future. After `reset_after` seconds without an accepted stamp, any
-    stamp is accepted.
-    """
-
-    def __init__(self, reset_after: float) -> None:
-        self.last = -1
-        self._accepted_at = -math.inf
-        self._reset_after = reset_after
-
-    def check(self, stamp: int, now: float) -> Verdict:
-        """Judge a stamp in ns that arrived at `now`, in s on the steady clock."""
-        if stamp == self.last:
-            return Verdict.REPEAT
-        if stamp < self.last and not self.may_start_over(now):
-            return Verdict.REFUSED
-        return Verdict.NEW
-
-    def may_start_over(self, now: float) -> bool:
-        """Return whether the source has been silent for so long that any stamp is accepted."""
-        return now - self._accepted_at >= self._reset_after
-
-    def accept(self, stamp: int, now: float) -> None:
-        """Note that the message with this stamp was taken."""
-        self.last = stamp
-        self._accepted_at = now
-
-
 class JointStateReader:
     """Reads ``sensor_msgs/JointState`` into arrays in the order of `joints`.
 
-    Names may come in any order, and joints of other limbs with them.
+    Names may come in any order, and joints of other limbs with them. Only growing stamps are
+    accepted, but also those of a source that has restarted: a robot or simulation that restarts
+    counts time from the beginning again, and one corrupt stamp may lie far in the future.
+
+    Args:
+        joints: names of the n joints.
+        reset_after: time without an accepted message after which any stamp is accepted, s.
 
     Attributes:
         q, v: position and velocity of the last accepted message, shape (n,), rad and rad/s.
@@ -83,7 +58,8 @@ class JointStateReader:
         self.stamp = -1
         self.refused: Counter[str] = Counter()
         self._joints = tuple(joints)
-        self._guard = StampGuard(reset_after)
+        self._reset_after = reset_after
+        self._accepted_at = -math.inf
         self._names: list[str] | None = None
         self._index: NDArray[np.intp] | None = None
         self._accepted: tuple[JointState, NDArray[np.intp] | None] | None = None
@@ -94,8 +70,8 @@ class JointStateReader:
         if stamp == 0:
             # Later messages would have the same, and be taken for repeats of the first.
             return self._refuse("no stamp")
-        verdict = self._guard.check(stamp, now)
-        if verdict is Verdict.REFUSED:
+        restarted = now - self._accepted_at >= self._reset_after
+        if stamp < self.stamp and not restarted:
             return self._refuse("old stamp")
         if message.name != self._names and not self._match(message.name):
             return self._refuse("missing joint")
@@ -106,14 +82,14 @@ class JointStateReader:
             q, v = q[self._index], v[self._index]
         if not (np.isfinite(q).all() and np.isfinite(v).all()):
             return self._refuse("not finite")
-        if verdict is Verdict.REPEAT:
+        if stamp == self.stamp:
             if np.array_equal(q, self.q) and np.array_equal(v, self.v):
-                return verdict
-            if not self._guard.may_start_over(now):
+                return Verdict.REPEAT
+            if not restarted:
                 return self._refuse("other values under the same stamp")
         self.q, self.v, self.stamp = q, v, stamp
         self._accepted = message, self._index
-        self._guard.accept(stamp, now)
+        self._accepted_at = now
         return Verdict.NEW
 
     def effort(self) -> NDArray[np.float64] | None:
