@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The topic of the simulated force/torque sensor, with bias and noise."""
+"""The bias and noise of the simulated force/torque sensor, and its parameters."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import WrenchStamped
 from numpy.typing import NDArray
-from rclpy.node import Node
 
-from sim_bridge.bullet.robot import BulletRobot
+from sim_bridge.bullet.force_torque_sensor import ForceTorqueSensor
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.ros.parameters import (
     FINITE,
@@ -21,8 +19,6 @@ from viability_bounds_pkg.ros.parameters import (
     Range,
     given_or,
 )
-from viability_bounds_pkg.ros.runtime import set_stamp
-from viability_bounds_pkg.ros.topics import FT_WRENCH
 
 Array = NDArray[np.float64]
 
@@ -80,55 +76,18 @@ def sensor_configuration(values: Mapping[str, Any]) -> SensorConfiguration:
 
 
 class ForceTorqueReading:
-    """The reading of a robot's sensor: the simulated wrench, bias and noise.
+    """The reading of a sensor: the simulated wrench, bias and noise.
 
     Args:
-        robot: with a sensor.
+        sensor: of a robot.
         config: of that sensor.
     """
 
-    def __init__(self, robot: BulletRobot, config: SensorConfiguration) -> None:
-        self._robot, self._config = robot, config
-        self.restart()
-
-    def restart(self) -> None:
-        """Restart the noise from its seed."""
-        self._random = np.random.default_rng(self._config.seed)
+    def __init__(self, sensor: ForceTorqueSensor, config: SensorConfiguration) -> None:
+        self._sensor, self._config = sensor, config
+        self._random = np.random.default_rng(config.seed)
 
     def read(self) -> Array:
         """Return force and moment, shape (6,), N and N m, with new noise."""
         noise = self._config.noise * self._random.standard_normal(6)
-        return self._robot.sensor_wrench() + self._config.bias + noise
-
-
-class ForceTorquePublisher:
-    """Publishes ``ft_wrench``.
-
-    Args:
-        node: publishes.
-        robot: with a sensor.
-        config: of that sensor.
-    """
-
-    def __init__(self, node: Node, robot: BulletRobot, config: SensorConfiguration) -> None:
-        self._reading = ForceTorqueReading(robot, config)
-        self._message = WrenchStamped()
-        self._message.header.frame_id = config.frame
-        self._publisher = FT_WRENCH.publisher(node)
-
-    def restart(self) -> None:
-        """Restart the noise from its seed."""
-        self._reading.restart()
-
-    def publish(self, stamp: int) -> None:
-        """Publish a reading with `stamp`, ns."""
-        message = self._message
-        set_stamp(message.header.stamp, stamp)
-        force, torque = message.wrench.force, message.wrench.torque
-        wrench = self._reading.read().tolist()
-        force.x, force.y, force.z, torque.x, torque.y, torque.z = wrench
-        self._publisher.publish(message)
-
-    def repeat(self) -> None:
-        """Publish the last message again."""
-        self._publisher.publish(self._message)
+        return self._sensor.wrench + self._config.bias + noise
