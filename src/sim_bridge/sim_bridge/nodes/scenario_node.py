@@ -32,6 +32,7 @@ from sim_bridge.nodes.scenario_messages import (
 from sim_bridge.nodes.scenario_parameters import TABLE, make_configuration
 from sim_bridge.scenario.events import ServiceEvent
 from sim_bridge.scenario.recording import RecordedRun
+from viability_bounds_pkg.cli.command_line import Parser
 from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.runtime import leave, make_executor, report_refusal
@@ -264,8 +265,10 @@ def main(args: list[str] | None = None) -> int:
         0 when no limit was broken, 1 when one was, 2 when the scenario could not be played.
     """
     argv = rclpy.utilities.remove_ros_args(args=sys.argv if args is None else args)
+    parser = Parser(prog="scenario_node", description="Play a scenario on the robot.")
+    parser.add_argument("--out", type=Path, metavar="DIRECTORY", help="where the report goes")
+    out = parser.parse_args(argv[1:]).out
     try:
-        out = _output_directory(argv)
         rclpy.init(args=args)
         node = ScenarioNode()
     except Exception as error:
@@ -288,16 +291,6 @@ def main(args: list[str] | None = None) -> int:
         return 130
     finally:
         leave(node)
-
-
-def _output_directory(argv: list[str]) -> Path | None:
-    """Return the value of ``--out``, or None without it."""
-    if "--out" not in argv:
-        return None
-    value = argv[argv.index("--out") + 1 :][:1]
-    if not value:
-        raise ValueError("--out needs a directory")
-    return Path(value[0])
 
 
 if __name__ == "__main__":
