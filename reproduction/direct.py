@@ -73,8 +73,8 @@ class DirectLoop:
         self.sensing = True
         self._sensor = None
         interaction = self.controller.interaction
-        if config.sensor.ft_frame and interaction is not None and interaction.sensor is not None:
-            self._sensor = ForceTorqueReading(self.robot, config.sensor)
+        if self.robot.sensor and interaction is not None and interaction.sensor is not None:
+            self._sensor = ForceTorqueReading(self.robot.sensor, config.sensor)
         self.samples: list[Sample] = []
         self.t = 0.0
         self.robot.reset(config.start_positions, np.zeros(len(config.joints)))

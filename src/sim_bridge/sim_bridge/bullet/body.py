@@ -2,10 +2,8 @@
 """A robot in a PyBullet world of its own, without what PyBullet adds to rigid-body dynamics.
 
 PyBullet's Dantzig solver, a direct one, computes the constraint impulses of brakes, friction,
-rotors and contacts. They are coupled through the whole arm: sequential impulses, PyBullet's other
-solver, take several times as long and leave an error of some percent, while Dantzig's solver is
-exact to rounding (docs/simulated_robot.md). If it finds no solution, PyBullet falls back to
-sequential impulses.
+rotors and contacts, exact to rounding (docs/simulated_robot.md). If it finds no solution, PyBullet
+falls back to sequential impulses.
 """
 
 from __future__ import annotations
@@ -55,6 +53,7 @@ class BulletBody:
         description: URDF, moving joints, and where others are locked.
         obstacles: all other bodies in the world; the collision shapes of the robot's meshes, with
             which it touches them, are their convex hulls.
+        sensor: the force/torque sensor; None if there is none.
         client_id: PyBullet's physics client; -1 when closed.
         body_id: the robot in that client.
 
@@ -87,9 +86,9 @@ class BulletBody:
             mass_scales=mass_scales,
             rotor_inertias=rotor_inertias,
         )
-        self._sensor: ForceTorqueSensor | None = None
+        self.sensor: ForceTorqueSensor | None = None
         if sensor_frame:
-            self._sensor = ForceTorqueSensor(
+            self.sensor = ForceTorqueSensor(
                 *self.description, sensor_frame, mass_scales, gravity, physics_dt
             )
         self._frames = prepared.frames
@@ -200,9 +199,9 @@ class BulletBody:
 
     def _measure(self, q: Array, v: Array, v_next: Array) -> None:
         """Update the sensor, if there is one, by a step from (q, v) to v_next."""
-        if self._sensor is not None:
+        if self.sensor is not None:
             wrenches = [*self._wrenches.values(), *self.obstacles.wrenches()]
-            self._sensor.update(q, v, v_next, wrenches)
+            self.sensor.update(q, v, v_next, wrenches)
 
     # Links
 
@@ -243,21 +242,6 @@ class BulletBody:
         )
         principal = pin.SE3(pin.Quaternion(np.array(orientation)), np.array(centre))
         return principal * frame.placement
-
-    def sensor_wrench(self) -> Array:
-        """Return what the force/torque sensor measured in the last physics step.
-
-        Returns:
-            Force, N, and moment, N m, on the sensor of all links beyond it: contacts, external
-            wrenches, weight and inertia; at the origin of `sensor_frame`, in its axes, shape (6,).
-            After a reset it is that of zero accelerations.
-
-        Raises:
-            ValueError: there is no sensor.
-        """
-        if self._sensor is None:
-            raise ValueError("the robot has no force/torque sensor")
-        return self._sensor.wrench.copy()
 
     def close(self) -> None:
         """Disconnect from PyBullet; the robot cannot be used afterwards."""

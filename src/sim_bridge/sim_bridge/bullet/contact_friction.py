@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_bridge.bullet.obstacles import ContactMaterial
 from viability_bounds_pkg.compiled import compiled
 
 Array = NDArray[Any]
@@ -43,33 +44,33 @@ class Bristle:
 
     Args:
         physics_dt: the physics step h, s.
-        stiffness: of the obstacle, N/m, which k does not exceed.
+        material: of the obstacle, whose stiffness k does not exceed.
 
     Attributes:
+        points: where the link is touched, shape (m,), of `CONTACT_POINT`.
         force: on the link in the next step, shape (3,), N.
         point: where it acts, the centre of pressure, shape (3,), m.
     """
 
-    def __init__(self, physics_dt: float, stiffness: float) -> None:
-        self._dt = physics_dt
-        self._stiffness = min(stiffness, _STIFFNESS_MASS / physics_dt**2)
+    def __init__(self, physics_dt: float, material: ContactMaterial) -> None:
+        self._dt, self._friction = physics_dt, material.friction
+        self._stiffness = min(material.stiffness, _STIFFNESS_MASS / physics_dt**2)
         self._damping = _DAMPING_MASS / physics_dt
         self._deflection = np.zeros(3)
+        self.points: Array = np.zeros(0, CONTACT_POINT)
         self.force, self.point = np.zeros((2, 3))
 
-    def update(self, points: Array, motion: Array, friction: float) -> None:
+    def update(self, motion: Array) -> None:
         """Compute force and point in the next step from contacts and motion in the last.
 
         Args:
-            points: where the link is touched, shape (m,), of `CONTACT_POINT`.
             motion: of the link, shape (3, 3): centre of mass, m, its velocity, m/s, angular
                 velocity, rad/s.
-            friction: Coulomb's coefficient.
         """
         _update(
-            points,
+            self.points,
             motion,
-            friction,
+            self._friction,
             self._dt,
             self._stiffness,
             self._damping,

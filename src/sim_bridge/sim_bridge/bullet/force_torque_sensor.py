@@ -41,7 +41,9 @@ class ForceTorqueSensor:
         physics_dt: the physics step h, s.
 
     Attributes:
-        wrench: force, N, and moment, N m, of the load on the sensor, shape (6,).
+        wrench: force, N, and moment, N m, of the load on the sensor in the last physics step:
+            contacts, external wrenches, weight and inertia; shape (6,). After a reset it is that
+            of zero accelerations.
 
     Raises:
         RobotDescriptionError: there is no such link, or it carries nothing.

@@ -12,21 +12,13 @@ Stribeck velocity v_s, and takes any value up to F_s at rest:
     |f(0)| <= L(0) = F_s.
 
 Each physics step of length h takes the friction at its end, so that it neither chatters nor
-accelerates the joint: the impulse of dry friction, at most h L(v_k), is the one that stops the
-joint, if there is one; only the limit L is that of the velocity v_k at the beginning. Viscous
-friction is implicit too, without anything to solve: with -h d v_k+1 on the right,
+accelerates the joint; only the limit L is that of the velocity at the beginning. With -h d v_k+1
+on the right, viscous friction is implicit as well, an explicit torque and a larger inertia,
 
-    (M + I) (v_k+1 - v_k) = ... - h d v_k+1
-    <=>  (M + I + h d) (v_k+1 - v_k) = ... - h d v_k,
+    (M + I + h d) (v_k+1 - v_k) = ... - h d v_k.
 
-it is an explicit torque and a slightly larger inertia of the rotor, stable for every d.
-
-PyBullet knows no rotors. Each becomes a link of its own that turns about an axis fixed to the
-ground, coupled to its joint by a gear constraint of ratio one: its energy is I v^2 / 2, like that
-of I on the diagonal of M, and nothing else acts on it (a rotor carried by the arm would add
-gyroscopic torques of I / N, which Pinocchio's armature neglects too). Dry friction is a
-motor with velocity target zero and limited torque. Constraints, motors and contacts are one
-linear complementarity problem, so that an impact acts on rotor and friction as well.
+In PyBullet dry friction is a motor with velocity target zero and limited torque, and each rotor a
+link that a gear constraint couples to its joint; docs/simulated_robot.md has the reasons.
 """
 
 from __future__ import annotations

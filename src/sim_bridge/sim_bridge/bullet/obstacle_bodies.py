@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Obstacles in a PyBullet world, and their forces on the robot in it.
 
-An obstacle is stiff, but not rigid: contact forces between rigid ones and a robot with friction in
-its joints would not be unique, and the solver would jump between solutions. The obstacle's surface
-has no mass and moves by x against a spring and a damper,
+The surface of an obstacle has no mass and moves by x against a spring and a damper,
 
     F = k x+ + d v+,    x+ = x + h v+,
 
@@ -12,12 +10,8 @@ moves a body of mass m by m (v+ - v) = h (F + f), which is the same for
 
     m = h d + h^2 k,    f = -k x - (d + h k) v.
 
-Along the surface PyBullet's contacts are frictionless: its Dantzig solver replaces the cone of
-Coulomb's law by a box, whose size is that of the pressure without friction. `contact_friction` has
-that law.
-
-Dantzig's solver finds no solution for four points under a flat hand, one more than is needed. It
-does when all constraints have some softness, here far too little to be noticed.
+Along the surface PyBullet's contacts are frictionless; `contact_friction` has Coulomb's law.
+docs/simulated_robot.md tells why.
 """
 
 from __future__ import annotations
@@ -45,7 +39,9 @@ _OVERLAP_MAX = 1e-3  # m, with the robot, of an obstacle that is new
 _RELEASED = 1e-9  # m; a surface that is nearer to its place is put there
 _OBSTACLES_MEET_ROBOTS = (64, 1)  # collision group of the former, that of the latter
 _INERTIA = 1e15  # kg m^2: surfaces do not turn
-_SOFTNESS = 1e-11  # m/s of all constraints for each N (rad/s, N m), while there are obstacles
+# m/s of all constraints for each N (rad/s, N m), while there are obstacles: Dantzig's solver finds
+# no solution for four points under a flat hand, one more than is needed.
+_SOFTNESS = 1e-11
 
 
 class _Touching(NamedTuple):
@@ -99,7 +95,6 @@ class BulletObstacles:
         self._surfaces: dict[str, _Surface] = {}
         self._by_body: dict[int, _Surface] = {}
         self._bristles: dict[_Touching, Bristle] = {}
-        self._points: dict[_Touching, Array] = {}
         self._friction: dict[_Touching, LinkWrench] = {}
         self.force = self.force_max = 0.0
 
@@ -161,7 +156,6 @@ class BulletObstacles:
         self.force = 0.0
         for key in [key for key in self._bristles if key.body == surface.body]:
             del self._bristles[key]
-            self._points.pop(key, None)
         self._bullet.removeBody(surface.body)
         if not self._surfaces:
             self._bullet.setPhysicsEngineParameter(globalCFM=0.0)
@@ -193,7 +187,7 @@ class BulletObstacles:
         for key, bristle in self._bristles.items():
             centre, *_, v, omega = bullet.getLinkState(self._body, key.link, 1, 1)
             motion = np.array((*centre, *v, *omega)).reshape(3, 3)
-            bristle.update(self._points[key], motion, material.friction)
+            bristle.update(motion)
             force, point = bristle.force.copy(), bristle.point.copy()
             bullet.applyExternalForce(
                 self._body, key.link, force.tolist(), point.tolist(), pybullet.WORLD_FRAME
@@ -204,7 +198,6 @@ class BulletObstacles:
         """Release the robot, and reset the largest force."""
         self.force = self.force_max = 0.0
         self._bristles.clear()
-        self._points.clear()
         self._friction.clear()
         for surface in self._by_body.values():
             if surface.moved:
@@ -225,15 +218,12 @@ class BulletObstacles:
             if pressure > 0.0 and body in self._by_body:
                 row = (*position, *normal, pressure)
                 found.setdefault(_Touching(link, body), []).append(row)
-        self._points = {
-            key: np.array(rows).view(CONTACT_POINT)[:, 0] for key, rows in found.items()
-        }
-        known = self._bristles
+        known, total = self._bristles, dict[int, Array]()
         self._bristles = {
-            key: known.get(key) or Bristle(self._dt, self._material.stiffness) for key in found
+            key: known.get(key) or Bristle(self._dt, self._material) for key in found
         }
-        total: dict[int, Array] = {}
-        for key, points in self._points.items():
+        for key, bristle in self._bristles.items():
+            points = bristle.points = np.array(found[key]).view(CONTACT_POINT)[:, 0]
             total[key.body] = total.get(key.body, 0.0) + points["pressure"] @ points["normal"]
             self._by_body[key.body].moved = True
         for key, friction in self._friction.items():
@@ -245,21 +235,21 @@ class BulletObstacles:
         """Return all wrenches of obstacles on the robot in the last physics step."""
         contacts = [
             LinkWrench(self._links[key.link], position, pressure * normal)
-            for key, points in self._points.items()
-            for position, normal, pressure in points
+            for key, bristle in self._bristles.items()
+            for position, normal, pressure in bristle.points
         ]
         return contacts + list(self._friction.values())
 
     def contacts(self) -> list[Contact]:
         """Return the contact points of the last physics step."""
         found = []
-        for key, points in self._points.items():
+        for key, bristle in self._bristles.items():
             link, name = self._links[key.link], self._by_body[key.body].obstacle.name
             friction = self._friction.get(key)
             along = np.zeros(3) if friction is None else friction.force
             # The friction acts at the centre of pressure, as if distributed like this.
-            whole = points["pressure"].sum()
-            for position, normal, pressure in points:
+            whole = bristle.points["pressure"].sum()
+            for position, normal, pressure in bristle.points:
                 force = pressure * normal + pressure / whole * along
                 found.append(Contact(link, name, position, normal, force))
         return found

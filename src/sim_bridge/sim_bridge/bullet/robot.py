@@ -194,8 +194,6 @@ class BulletRobot(BulletBody):
         """Make physics steps under `_motor_torque`, the torques of `control`, or the brakes."""
         if substeps < 1:
             raise ValueError(f"substeps must be at least 1, not {substeps}")
-        # Otherwise the states between substeps need not be read.
-        state_matters = any((control, self._friction, self._sensor, self.monitor))
         for remaining in range(substeps, 0, -1):
             if control is not None:
                 self._motor_torque[:] = control()
@@ -205,8 +203,6 @@ class BulletRobot(BulletBody):
                 self._set_torques(self._motor_torque)
             self._step()
             self._stepped = True
-            if remaining > 1 and not state_matters:
-                continue
             before = self._q.copy(), self._v.copy()
             states = self._joint_states()
             self._q[:] = [state[0] for state in states]

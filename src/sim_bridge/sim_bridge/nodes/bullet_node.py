@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import WrenchStamped
 from rclpy.clock import Clock, ClockType
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import JointState
@@ -20,7 +21,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.nodes.bullet_parameters import BulletConfiguration, make_robot
-from sim_bridge.nodes.ft_sensor import ForceTorquePublisher
+from sim_bridge.nodes.ft_sensor import ForceTorqueReading
 from sim_bridge.nodes.joint_command import (
     CommandError,
     JointCommand,
@@ -35,7 +36,12 @@ from viability_bounds_pkg.ros.messages import Diagnostics
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.runtime import set_stamp, stamp_to_ns
-from viability_bounds_pkg.ros.topics import JOINT_COMMANDS, JOINT_STATES, ROBOT_DESCRIPTION
+from viability_bounds_pkg.ros.topics import (
+    FT_WRENCH,
+    JOINT_COMMANDS,
+    JOINT_STATES,
+    ROBOT_DESCRIPTION,
+)
 
 _RETRY_PERIOD = 0.2
 _LATENCIES_KEPT = 100_000
@@ -81,16 +87,14 @@ class BulletNode(ArmNode):
         self._world = WorldSubscriber(
             self, self._robot, config.external_wrench_timeout, self._refused
         )
-        self._ft_publisher = None
-        if config.sensor.ft_frame:
-            self._ft_publisher = ForceTorquePublisher(self, self._robot, config.sensor)
+        self._ft_wrench = WrenchStamped()
+        self._ft_wrench.header.frame_id = config.sensor.ft_frame
+        self._ft_publisher = FT_WRENCH.publisher(self) if self._robot.sensor else None
         self._restart()
 
         self._state = JointState(name=list(config.joints))
         self._state_publisher = JOINT_STATES.publisher(self)
-        self._clock_publisher = None
-        if config.publish_clock:
-            self._clock_publisher = CLOCK.publisher(self)
+        self._clock_publisher = CLOCK.publisher(self) if config.publish_clock else None
         description = ROBOT_DESCRIPTION.publisher(self)
         description.publish(String(data=config.urdf))
         JOINT_COMMANDS.subscription(self, self._on_command)
@@ -110,8 +114,8 @@ class BulletNode(ArmNode):
         n = len(config.joints)
         self._world.clear()
         self._robot.reset(config.start_positions, np.zeros(n))
-        if self._ft_publisher is not None:
-            self._ft_publisher.restart()
+        sensor = self._robot.sensor
+        self._sensor = ForceTorqueReading(sensor, config.sensor) if sensor else None
         self._monitor.reset()
         self._command: JointCommand | None = None
         self._missed_in_row = self._missed = self._braked = 0
@@ -141,8 +145,12 @@ class BulletNode(ArmNode):
         set_stamp(state.header.stamp, self._stamp)
         if self._clock_publisher is not None:
             self._clock_publisher.publish(ClockMessage(clock=state.header.stamp))
-        if self._ft_publisher is not None:  # first: subscribers use it with the state
-            self._ft_publisher.publish(self._stamp)
+        if self._ft_publisher and self._sensor:  # first: subscribers use it with the state
+            set_stamp(self._ft_wrench.header.stamp, self._stamp)
+            force, torque = self._ft_wrench.wrench.force, self._ft_wrench.wrench.torque
+            wrench = self._sensor.read().tolist()
+            force.x, force.y, force.z, torque.x, torque.y, torque.z = wrench
+            self._ft_publisher.publish(self._ft_wrench)
         self._published_at = time.monotonic()
         self._state_publisher.publish(state)
 
@@ -150,14 +158,14 @@ class BulletNode(ArmNode):
         """Simulate the current period under the last command or the brakes."""
         config = self._config
         self._world.apply_due(self._stamp)
-        if self._command is None:
+        command = self._command
+        if command is None:
             self._braked += 1
             self._robot.brake(config.substeps, config.torque_max)
-        elif isinstance(self._command, TorqueCommand):
-            self._robot.step(self._command.tau, config.substeps)
+        elif isinstance(command, TorqueCommand):
+            self._robot.step(command.tau, config.substeps)
         else:
-            q, v = self._command
-            self._robot.move(q, v, config.torque_max, config.velocity_max, config.substeps)
+            self._robot.move(*command, config.torque_max, config.velocity_max, config.substeps)
         self._periods += 1
         self._advanced = True
         if self._periods >= self._pause_at:
@@ -189,7 +197,7 @@ class BulletNode(ArmNode):
         waiting = self._paused or (self._config.lockstep and not self._advanced)
         if waiting and time.monotonic() - self._published_at > _RETRY_PERIOD:
             if self._ft_publisher is not None:
-                self._ft_publisher.repeat()
+                self._ft_publisher.publish(self._ft_wrench)
             self._state_publisher.publish(self._state)
 
     # Commands

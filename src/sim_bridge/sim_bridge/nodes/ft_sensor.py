@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The topic of the simulated force/torque sensor, with bias and noise."""
+"""The bias and noise of the simulated force/torque sensor, and its parameters."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from geometry_msgs.msg import WrenchStamped
 from numpy.typing import NDArray
-from rclpy.node import Node
 
-from sim_bridge.bullet.robot import BulletRobot
+from sim_bridge.bullet.force_torque_sensor import ForceTorqueSensor
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import (
     FINITE,
@@ -20,8 +18,6 @@ from viability_bounds_pkg.parameter import (
     text,
     whole_number,
 )
-from viability_bounds_pkg.ros.runtime import set_stamp
-from viability_bounds_pkg.ros.topics import FT_WRENCH
 
 Array = NDArray[np.float64]
 
@@ -35,77 +31,37 @@ class SensorConfiguration:
         "bias of the sensor, force and moment, N and N m; none if empty",
         FINITE,
         length=6,
-        default=(),
+        if_empty=0.0,
     )
     ft_noise: Array = numbers(
         "standard deviation of its noise, force and moment, N and N m; none if empty",
         NOT_NEGATIVE,
         length=6,
-        default=(),
+        if_empty=0.0,
     )
     ft_seed: int = whole_number("seed of that noise", Range(0, 2**31 - 1), default=0)
 
     def __post_init__(self) -> None:
         """Check that there is no bias or noise without a sensor."""
         for name in ("ft_bias", "ft_noise"):
-            if len(getattr(self, name)) and not self.ft_frame:
+            if getattr(self, name).any() and not self.ft_frame:
                 allowed = "only with a force/torque sensor, 'ft_frame'"
                 raise SettingError(name, getattr(self, name), allowed)
 
 
 class ForceTorqueReading:
-    """The reading of a robot's sensor: the simulated wrench, bias and noise.
+    """The reading of a sensor: the simulated wrench, bias and noise.
 
     Args:
-        robot: with a sensor.
+        sensor: of a robot.
         config: of that sensor.
     """
 
-    def __init__(self, robot: BulletRobot, config: SensorConfiguration) -> None:
-        self._robot, self._seed = robot, config.ft_seed
-        self._bias, self._noise = (
-            value if len(value) else np.zeros(6) for value in (config.ft_bias, config.ft_noise)
-        )
-        self.restart()
-
-    def restart(self) -> None:
-        """Restart the noise from its seed."""
-        self._random = np.random.default_rng(self._seed)
+    def __init__(self, sensor: ForceTorqueSensor, config: SensorConfiguration) -> None:
+        self._sensor, self._config = sensor, config
+        self._random = np.random.default_rng(config.ft_seed)
 
     def read(self) -> Array:
         """Return force and moment, shape (6,), N and N m, with new noise."""
-        noise = self._noise * self._random.standard_normal(6)
-        return self._robot.sensor_wrench() + self._bias + noise
-
-
-class ForceTorquePublisher:
-    """Publishes ``ft_wrench``.
-
-    Args:
-        node: publishes.
-        robot: with a sensor.
-        config: of that sensor.
-    """
-
-    def __init__(self, node: Node, robot: BulletRobot, config: SensorConfiguration) -> None:
-        self._reading = ForceTorqueReading(robot, config)
-        self._message = WrenchStamped()
-        self._message.header.frame_id = config.ft_frame
-        self._publisher = FT_WRENCH.publisher(node)
-
-    def restart(self) -> None:
-        """Restart the noise from its seed."""
-        self._reading.restart()
-
-    def publish(self, stamp: int) -> None:
-        """Publish a reading with `stamp`, ns."""
-        message = self._message
-        set_stamp(message.header.stamp, stamp)
-        force, torque = message.wrench.force, message.wrench.torque
-        wrench = self._reading.read().tolist()
-        force.x, force.y, force.z, torque.x, torque.y, torque.z = wrench
-        self._publisher.publish(message)
-
-    def repeat(self) -> None:
-        """Publish the last message again."""
-        self._publisher.publish(self._message)
+        noise = self._config.ft_noise * self._random.standard_normal(6)
+        return self._sensor.wrench + self._config.ft_bias + noise

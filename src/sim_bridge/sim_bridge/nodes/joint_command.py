@@ -45,10 +45,9 @@ def read_command(message: JointState, joints: list[str]) -> JointCommand:
     """
     if len(message.effort):
         return TorqueCommand(_in_order(message, message.effort, joints))
-    q = _in_order(message, message.position, joints)
-    if not len(message.velocity):
-        return PositionCommand(q, np.zeros(len(joints)))
-    return PositionCommand(q, _in_order(message, message.velocity, joints))
+    velocity = message.velocity or [0.0] * len(message.name)
+    q, v = (_in_order(message, values, joints) for values in (message.position, velocity))
+    return PositionCommand(q, v)
 
 
 def _in_order(message: JointState, values: list[float], joints: list[str]) -> Array:

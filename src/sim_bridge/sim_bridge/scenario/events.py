@@ -132,7 +132,8 @@ def read_event(content: Any, where: str) -> Event:
 
 def _posture(content: Any, where: str) -> Mapping[str, float]:
     joints = content if isinstance(content, dict) else ()
-    return read_fields(content, where, dict.fromkeys(joints, number))
+    fields = read_fields(content, where, dict.fromkeys(joints, number))
+    return {str(joint): position for joint, position in fields.items()}
 
 
 def _obstacle(content: Any, where: str) -> Obstacle:

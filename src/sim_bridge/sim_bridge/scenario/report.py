@@ -222,19 +222,14 @@ def _print_table(metrics: Metrics) -> None:
     if metrics["limits_kept"]:
         print("VERDICT: no limit was broken, at any physics step.")
         return
-    broken = [
-        f"position by {metrics['max_position_violation_rad']:.4g} rad"
-        f" ({metrics['most_violated_joint']})"
-        if metrics["max_position_violation_rad"] > TOLERANCE
-        else "",
-        f"speed by {metrics['max_velocity_violation_rad_s']:.4g} rad/s"
-        if metrics["max_velocity_violation_rad_s"] > TOLERANCE
-        else "",
-        f"torque, {metrics['max_torque_ratio']:.4g} of its limit"
-        if metrics["max_torque_ratio"] > 1.0 + TOLERANCE
-        else "",
-    ]
-    print(f"VERDICT: limits were BROKEN: {'; '.join(filter(None, broken))}.")
+    q, v = metrics["max_position_violation_rad"], metrics["max_velocity_violation_rad_s"]
+    tau = metrics["max_torque_ratio"]
+    broken = {
+        f"position by {q:.4g} rad ({metrics['most_violated_joint']})": q > TOLERANCE,
+        f"speed by {v:.4g} rad/s": v > TOLERANCE,
+        f"torque, {tau:.4g} of its limit": tau > 1.0 + TOLERANCE,
+    }
+    print(f"VERDICT: limits were BROKEN: {'; '.join(text for text in broken if broken[text])}.")
 
 
 def _draw(

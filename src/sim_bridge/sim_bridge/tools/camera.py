@@ -62,7 +62,7 @@ class Camera:
         for shape in bullet.getVisualShapeData(body):
             # Mirrored meshes would be seen from inside.
             bullet.changeVisualShape(body, shape[1], flags=pybullet.VISUAL_SHAPE_DOUBLE_SIDED)
-        self._shown: dict[str, tuple[Obstacle, int]] = {}
+        self._shown: list[int] = []  # bodies of the obstacles in the last picture
         if floor is not None:
             plate = Obstacle("floor", "box", [3.0, 3.0, 0.04], [0.0, 0.0, floor - 0.02])
             self._add_body(plate, _FLOOR_COLOR)
@@ -93,7 +93,12 @@ class Camera:
         positions = finite_vector("q", joints, len(self._joints)).tolist()
         for joint, position in zip(self._joints, positions, strict=True):
             bullet.resetJointState(self._body, joint, position)
-        self._update_obstacles()
+        for shown in self._shown:
+            bullet.removeBody(shown)
+        self._shown = [
+            self._add_body(obstacle, self._colors.get(name, _OBSTACLE_COLOR))
+            for name, obstacle in self._robot.obstacles.present.items()
+        ]
         eye, target = finite_vector("eye", eye, 3), finite_vector("target", target, 3)
         width, height = (_OVERSAMPLING * pixels for pixels in size)
         image = bullet.getCameraImage(
@@ -110,18 +115,6 @@ class Camera:
         picture = np.where(nothing[:, :, None], sky, picture)
         blocks = picture.reshape(size[1], _OVERSAMPLING, size[0], _OVERSAMPLING, 3)
         return np.round(blocks.mean(axis=(1, 3))).astype(np.uint8)
-
-    def _update_obstacles(self) -> None:
-        """Show the obstacles that the robot's world has now."""
-        present = self._robot.obstacles.present
-        for name, (shown, body) in list(self._shown.items()):
-            if present.get(name) is not shown:
-                self._bullet.removeBody(body)
-                del self._shown[name]
-        for name, obstacle in present.items():
-            if name not in self._shown:
-                color = self._colors.get(name, _OBSTACLE_COLOR)
-                self._shown[name] = obstacle, self._add_body(obstacle, color)
 
     def _add_body(self, obstacle: Obstacle, color: Sequence[float]) -> int:
         arguments = shape_arguments(obstacle)

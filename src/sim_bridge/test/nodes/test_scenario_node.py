@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import json
+import re
 import signal
 import subprocess
 from contextlib import contextmanager
@@ -40,7 +41,7 @@ def assert_refused(result, *names):
     assert result.returncode == 2
     lines = result.stderr.strip().splitlines()
     assert len(lines) == 1, result.stderr
-    assert lines[0].startswith("error: ")
+    assert re.match("(scenario_node: )?error: ", lines[0])
     assert all(name in lines[0] for name in names), lines[0]
 
 
