@@ -30,7 +30,11 @@ from torque_safety_controller.friction.joint_recording import (
     make_blocks,
 )
 from torque_safety_controller.friction.regression import JointRegression
-from torque_safety_controller.friction.settings import DEFAULT_STRIBECK_VELOCITY, FrictionModel
+from torque_safety_controller.friction.settings import (
+    COEFFICIENTS,
+    DEFAULT_STRIBECK_VELOCITY,
+    FrictionModel,
+)
 
 Array = NDArray[np.float64]
 
@@ -99,8 +103,8 @@ def identify(model: pin.Model, recording: Recording) -> Iterator[JointFit]:
 
 def friction_model(fits: Sequence[JointFit]) -> FrictionModel:
     """Return the friction model of all joints."""
-    names = ("coulomb", "static", "viscous", "stribeck_velocity")
-    return FrictionModel(*(np.array([getattr(fit, name) for fit in fits]) for name in names))
+    values = (np.array([getattr(fit, name) for fit in fits]) for name in COEFFICIENTS)
+    return FrictionModel(*values)
 
 
 def model_errors(model: pin.Model, blocks: Blocks) -> tuple[Array, Array]:
