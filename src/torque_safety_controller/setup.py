@@ -20,6 +20,7 @@ setup(
         "numpy>=1.26",
         "pin>=3",
         "proxsuite>=0.6",
+        "scipy>=1.11",
         "tqdm>=4",
         "viability_bounds_pkg",
     ],

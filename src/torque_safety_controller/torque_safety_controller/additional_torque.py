@@ -172,7 +172,20 @@ class AdditionalTorque:
         if not self._started:
             self._begin(robot, arm)
         known = 0.0 < elapsed <= LONGEST_GAP * robot.dt and not self._lost
-        jumped = known and action is not None and self._jumped(robot, v, a_last, elapsed)
+        jumped = (
+            known
+            and action is not None
+            and _jumped(
+                robot.M,
+                self._q_last,
+                robot.q,
+                self._v_last,
+                v,
+                a_last,
+                elapsed,
+                self._settings.disturbance_max,
+            )
+        )
         if action is not None and (jumped or not known):
             action.skip(arm, elapsed if 0.0 <= elapsed < math.inf else 0.0)
         self._lost = False
@@ -231,11 +244,6 @@ class AdditionalTorque:
         """Return what the actions need to know of the arm."""
         return ArmTerms(robot.M, robot.C, robot.J[self._rows], robot.J_dot[self._rows], v)
 
-    def _jumped(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> bool:
-        """Return whether nothing that the integral is for can have changed the state so."""
-        q_last, v_last, largest = self._q_last, self._v_last, self._settings.disturbance_max
-        return bool(_jumped(robot.M, q_last, robot.q, v_last, v, a_last, elapsed, largest))
-
     def _fade(self, torque: Array) -> None:
         self._fading = torque
         self._faded = bool(np.abs(torque).max() < _NEGLIGIBLE)
@@ -252,17 +260,9 @@ def _jumped(
     elapsed: float,
     disturbance_max: Array,
 ) -> bool:
-    """Return whether a joint's velocity or position changed by more than can be.
+    """Return whether velocity or position of a joint changed by more than is possible.
 
-    Args:
-        M: mass matrix, shape (n, n), kg m^2.
-        q_last: position, shape (n,), rad.
-        q: position in the next step, shape (n,), rad.
-        v_last: velocity, shape (n,), rad/s.
-        v: velocity in the next step, shape (n,), rad/s.
-        a_last: acceleration asked for in between, shape (n,), rad/s^2.
-        elapsed: time in between, s.
-        disturbance_max: what acts on a joint's own inertia at most, shape (n,), N m.
+    At most `disturbance_max`, shape (n,), N m, acts on a joint's own inertia besides `a_last`.
     """
     for i in range(len(v)):
         impulse = M[i, i] * abs(a_last[i] * elapsed - (v[i] - v_last[i]))

@@ -99,7 +99,7 @@ def test_the_task_asks_for_what_equation_27_says(seed):
     Kp, Kv = np.diag(np.repeat(gains.kp, 3)), np.diag(np.repeat(gains.kd, 3))
     expected = -Kp @ (F_ref - F) - Kv @ (F_ref_rate - F_rate)
     g = gains.acceleration(F_ref - F, F_ref_rate - F_rate, 50.0)
-    task = AdmittanceTask(g, 2.0).term(robot)
+    task = AdmittanceTask(g, 2.0, np.arange(6)).term(robot)
     a = np.linalg.lstsq(task.A, task.b, rcond=None)[0]
     np.testing.assert_allclose(robot.J @ a + robot.drift, expected, atol=1e-6)
     some = np.array([1, 2, 5])

@@ -546,12 +546,12 @@ def test_unusable_input_changes_nothing():
         value.flat[0] = np.nan
         with pytest.raises(ValueError, match="must be finite"):
             feedback.torque(arm._replace(**{name: value}), arm.v, DT)
-        with pytest.raises(ValueError, match="in place of"):
+        with pytest.raises(ValueError, match="broadcast"):
             feedback.torque(arm._replace(**{name: value[1:]}), arm.v, DT)
     with pytest.raises(ValueError, match="must be finite"):
         feedback.torque(arm, np.full(N, np.inf), DT)
-    with pytest.raises(ValueError, match="in place of"):
-        feedback.torque(arm, np.zeros(1), DT)
+    with pytest.raises(ValueError, match="broadcast"):
+        feedback.torque(arm, np.zeros(N + 1), DT)
     with pytest.raises(ValueError, match="v must be finite"):
         feedback.skip(arm._replace(v=np.full(N, np.nan)), 0.1)
     np.testing.assert_array_equal(np.array(feedback.memory), before)

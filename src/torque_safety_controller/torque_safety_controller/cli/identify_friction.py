@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Command line tool: the friction of a robot's joints from a recording of its motion.
+"""Command line tool that identifies the joint friction of a robot from a recorded motion.
 
-Reads a robot's parameter file and a recording, reports what it found and what not, and writes a
-parameter file for the controller.
+Reads the robot's parameter file and a recording, prints the identified coefficients with standard
+errors, and writes a parameter file for the controller.
 """
 
 from __future__ import annotations
@@ -15,12 +15,9 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from torque_safety_controller.friction.identification import (
-    JointFit,
-    friction_model,
-    identify,
-)
+from torque_safety_controller.friction.identification import JointFit, friction_model, identify
 from torque_safety_controller.friction.joint_recording import RecordingError, load_recording
+from torque_safety_controller.friction.settings import COEFFICIENTS
 from viability_bounds_pkg.cli.command_line import Parser, run_tool
 from viability_bounds_pkg.cli.limits_file import (
     ParameterFileError,
@@ -31,9 +28,8 @@ from viability_bounds_pkg.cli.limits_file import (
 )
 
 NODE = "/**/controller_node"
-"""The node whose parameters the friction is."""
+"""Node that the written parameters are for."""
 
-_NAMES = ("coulomb", "static", "viscous", "stribeck_velocity")
 _UNITS = ("N m", "N m", "N m s/rad", "rad/s")
 
 
@@ -44,7 +40,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         epilog="The recording holds arrays t (N,) in s, and q, v, tau (N, n) in rad, rad/s and "
         "N m of the motors, as in joint_states; perhaps joints, their names. Every joint is to "
         "pass the same positions both ways, slowly and fast; record_excitation makes one in "
-        "simulation. What the recording does not tell is left at zero, and said.",
+        "simulation. Coefficients that cannot be identified are left at zero, and reported.",
     )
     add = parser.add_argument
     add("parameters", type=Path, help="the robot's parameter file (ROS 2 YAML)")
@@ -83,13 +79,13 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def report(names: Sequence[str], fits: Sequence[JointFit]) -> None:
-    """Print what was found, with standard errors, and what not."""
+    """Print the identified coefficients with standard errors, and the notes."""
     for name, fit in zip(names, fits, strict=True):
         print(
             f"{name}: {fit.blocks} blocks, {fit.speeds[0]:.2g} to {fit.speeds[1]:.2g} rad/s, "
             f"residual {fit.residual:.2g} N m"
         )
-        for what, error, unit in zip(_NAMES, fit.errors, _UNITS, strict=True):
+        for what, error, unit in zip(COEFFICIENTS, fit.errors, _UNITS, strict=True):
             if np.isfinite(error):
                 print(f"  {what:18}{getattr(fit, what):10.4g} +- {error:.2g} {unit}")
         for note in fit.notes:
@@ -99,7 +95,7 @@ def report(names: Sequence[str], fits: Sequence[JointFit]) -> None:
 def overlay_text(
     names: Sequence[str], fits: Sequence[JointFit], options: argparse.Namespace
 ) -> str:
-    """Return the parameter file; it leaves the compensation switched as it is."""
+    """Return the text of the parameter file; it does not switch the compensation on or off."""
     notes = [
         f"Friction found by identify_friction in {options.recording.name}, to be passed as a "
         f"parameter file after {options.parameters.name}",
@@ -109,12 +105,11 @@ def overlay_text(
         f"{name}: {note}" for name, fit in zip(names, fits, strict=True) for note in fit.notes
     ]
     model = friction_model(fits)
-    found = {f"friction_model_{name}": _rounded(getattr(model, name)) for name in _NAMES}
+    found = {
+        f"friction_model_{name}": np.array([float(f"{x:.4g}") for x in getattr(model, name)])
+        for name in COEFFICIENTS
+    }
     return overlay(found, notes, NODE)
-
-
-def _rounded(values: np.ndarray) -> np.ndarray:
-    return np.array([float(f"{value:.4g}") for value in values])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -67,16 +67,14 @@ class AdmittanceTask:
     Attributes:
         acceleration: g_ob, shape (6,).
         weight: of the squared error of acceleration.
-        rows: directions in which it acts, shape (m,), indices; None for all.
+        rows: directions in which it acts, shape (m,), indices.
     """
 
     acceleration: Array
     weight: float
-    rows: NDArray[np.int64] | None = None
+    rows: NDArray[np.int64]
 
     def term(self, robot: RobotModel) -> TaskTerm:
         """Return ``J a = g_ob - J' v`` as a term of the cost."""
         b = self.acceleration - robot.drift
-        if self.rows is None:
-            return TaskTerm(robot.J, b, self.weight)
         return TaskTerm(robot.J[self.rows], b[self.rows], self.weight)

@@ -139,6 +139,7 @@ class Contacts:
             slice(int(end) - contact.W.shape[1], int(end))
             for contact, end in zip(contacts, ends, strict=True)
         ]
+        self._exerted = [c.W[:3] if len(c.points) == 1 else c.W for c in contacts]
         self._B = np.zeros((model.nv, self.r))
         self._rho_max = np.zeros(self.r)
 
@@ -158,24 +159,17 @@ class Contacts:
             self._rho_max[part] = np.inf if closed else 0.0
         return ContactForces(self._B, self._rho_max, tasks)
 
-    def wrench_task(
-        self, index: int, F_des: Array, weight: float, components: Sequence[int] | None = None
-    ) -> WrenchTerm:
+    def wrench_task(self, index: int, F_des: Array, weight: float) -> WrenchTerm:
         """Let the environment exert a wrench on a link: [Benallegue2021], III-E (a).
 
         Args:
             index: of the contact.
             F_des: desired wrench on the link, shape (6,), N and N m; the arm exerts its negative.
+                A single point can only exert its force.
             weight: of the squared error.
-            components: of the wrench that are meant, by index; None for the force of a point, or
-                all 6 of several points.
         """
-        contact = self.contacts[index]
-        if components is None:
-            components = range(3 if len(contact.points) == 1 else 6)
-        W = np.ascontiguousarray(contact.W[list(components)])
-        F_des = np.asarray(F_des, dtype=float)[list(components)]
-        return WrenchTerm(W, F_des, weight, self._slices[index].start)
+        W = self._exerted[index]
+        return WrenchTerm(W, F_des[: len(W)], weight, self._slices[index].start)
 
     def wrench(self, index: int, rho: Array) -> Array:
         """Return the environment's wrench on a link, shape (6,), N and N m.

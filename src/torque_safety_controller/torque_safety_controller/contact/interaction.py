@@ -132,7 +132,6 @@ class Interaction:
         self._turned |= not np.array_equal(settings.directions, self._settings.directions)
         self._settings = settings
         self._rows = np.flatnonzero(settings.directions)
-        self._mask = settings.directions.astype(float)
         self._shares = np.where(settings.directions, settings.stiffness, 1.0)
 
     def start(self) -> None:
@@ -266,11 +265,10 @@ class Interaction:
         F, rate = sensor.wrench, sensor.rate
         if self.state is Compliance.YIELDING:
             a = settings.yielding_gains.acceleration(-F, -rate, gains.pose_kd)
-            return [AdmittanceTask(a, weight)]
-        mask = self._mask
-        a = settings.gains.acceleration(
-            mask * (self.reference - F), mask * (self._goal_rate - rate), gains.pose_kd
-        )
+            return [AdmittanceTask(a, weight, np.arange(6))]
+        error, error_rate = self.reference - F, self._goal_rate - rate
+        mask = settings.directions
+        a = settings.gains.acceleration(mask * error, mask * error_rate, gains.pose_kd)
         return [AdmittanceTask(a, weight, self._rows)]
 
     def forces(self, robot: RobotModel) -> ContactForces | None:
@@ -300,11 +298,8 @@ class Interaction:
         self, robot: RobotModel, gains: Gains
     ) -> tuple[list[Task], ContactForces | None]:
         """Return tasks and forces of every kind that there may be, to compile what they need."""
-        zero, weight = np.zeros(6), max(gains.pose_weight, 1.0)
-        tasks: list[Task] = [
-            AdmittanceTask(zero, weight),
-            AdmittanceTask(zero, weight, np.arange(1)),
-        ]
+        zero = np.zeros(6)
+        tasks: list[Task] = [AdmittanceTask(zero, max(gains.pose_weight, 1.0), np.arange(6))]
         contacts = self.contacts
         if contacts is None:
             return tasks, None

@@ -20,7 +20,6 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from viability_bounds_pkg.compiled import compiled
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.parameter import above, number
 
@@ -83,10 +82,6 @@ class WrenchSensor:
         self._weight = np.vstack([R, pin.skew(tool.lever) @ R])
         self._gravity = np.asarray(gravity, dtype=np.float64)
         self.start()
-        # The first call compiles; let it be this one and not one in a control loop.
-        self.receive(np.zeros(6))
-        self.update(np.eye(3), 0.0)
-        self.start()
 
     def start(self) -> None:
         """Forget what was measured; the bias stays."""
@@ -123,19 +118,12 @@ class WrenchSensor:
         if self.silent or not time > 0.0:
             time = math.inf
         cut_off = 2.0 * math.pi * self.settings.filter_hz
-        self.wrench, self.rate = _measured(
-            self._raw,
-            self._weight,
-            rotation,
-            self._gravity,
-            self._action,
-            self.bias,
-            -math.expm1(-cut_off * time),
-            -math.expm1(-time / _TARE_TIME),
-            time,
-            self._filtered,
-            self._mean,
-        )
+        found = self._raw - self._weight.dot(self._gravity.dot(rotation))
+        change = -math.expm1(-cut_off * time) * (found - self._filtered)
+        self._filtered += change
+        self._mean -= math.expm1(-time / _TARE_TIME) * (found - self._mean)
+        self.wrench = self._action.dot(self._filtered - self.bias)
+        self.rate = self._action.dot(change / time)
         self._raw, self.silent = None, False
 
     def tare(self) -> Array:
@@ -148,53 +136,6 @@ class WrenchSensor:
         """
         if self.silent:
             raise WrenchError("the force/torque sensor is silent")
+        self.wrench = self.wrench + self._action @ (self.bias - self._mean)
         self.bias = self._mean.copy()
-        self.wrench = self._action @ (self._filtered - self.bias)
         return self.bias
-
-
-@compiled
-def _measured(
-    raw: Array,
-    weight: Array,
-    rotation: Array,
-    gravity: Array,
-    action: Array,
-    bias: Array,
-    share: float,
-    mean_share: float,
-    time: float,
-    filtered: Array,
-    mean: Array,
-) -> tuple[Array, Array]:
-    """Return the wrench at the end effector and its rate, shape (6,) each.
-
-    Compiled because NumPy takes 5 us more, of a control step of 60 us.
-
-    Args:
-        raw: measurement, shape (6,).
-        weight: from gravity in the end effector's axes to the wrench of the tool, shape (6, 3).
-        rotation: of the end effector in the root frame, shape (3, 3).
-        gravity: in the root frame, shape (3,), m/s^2.
-        action: of the sensor's placement on wrenches, shape (6, 6).
-        bias: shape (6,).
-        share: of the change that the filter lets through, 0 to 1.
-        mean_share: the same of the slow mean.
-        time: since the last measurement, s; inf if there was none.
-        filtered: shape (6,), updated.
-        mean: shape (6,), updated.
-    """
-    own = np.zeros(3)
-    for i in range(3):
-        for j in range(3):
-            own[i] += rotation[j, i] * gravity[j]
-    wrench, rate = np.zeros(6), np.zeros(6)
-    for k in range(6):
-        found = raw[k] - weight[k, 0] * own[0] - weight[k, 1] * own[1] - weight[k, 2] * own[2]
-        change = share * (found - filtered[k])
-        filtered[k] += change
-        mean[k] += mean_share * (found - mean[k])
-        for i in range(6):
-            wrench[i] += action[i, k] * (filtered[k] - bias[k])
-            rate[i] += action[i, k] * (change / time)
-    return wrench, rate

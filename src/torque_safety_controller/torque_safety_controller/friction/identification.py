@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Friction of each joint from a recorded motion, whatever the masses really are.
+"""Identification of joint friction from a recorded motion, also with wrong inertias.
 
-What the motors gave beyond what the model asks for,
+The motor torque minus the torque of the model is
 
     tau - rnea(q, v, a) = sign(v) (F_c + (F_s - F_c) exp(-(v / v_s)^2)) + d v + Y(q, v, a) x + b,
 
-is friction, an error x of masses, centres of mass, inertias and rotors, in which rigid-body
-dynamics are linear, and a bias b. Played backward a motion has the same Y and the opposite
-friction: where a joint passes the same positions both ways, the two cannot be taken for one
-another. So x and b are eliminated, in each joint by itself, and friction is fitted to what is
-left, by least squares with weights after Huber; v_s is searched (variable projection,
-[Golub1973]). Standard errors come from the scatter between pieces of the recording, as residuals
-next to each other are alike. `docs/friction.md` shows what comes out.
+the sum of friction, of the effect of errors x of masses, centres of mass, inertias and rotors, in
+which rigid-body dynamics are linear, and of a bias b. The same motion backward has the same Y and
+the opposite friction, so that the two can be separated where a joint passes the same positions in
+both directions. x and b are eliminated, for each joint alone, and friction is fitted to the rest
+by least squares with Huber's weights; v_s is found by a search (variable projection,
+[Golub1973]). Standard errors come from the scatter between pieces of the recording, because
+neighbouring residuals are correlated. `docs/friction.md` shows results.
 """
 
 from __future__ import annotations
@@ -30,7 +30,11 @@ from torque_safety_controller.friction.joint_recording import (
     make_blocks,
 )
 from torque_safety_controller.friction.regression import JointRegression
-from torque_safety_controller.friction.settings import DEFAULT_STRIBECK_VELOCITY, FrictionModel
+from torque_safety_controller.friction.settings import (
+    COEFFICIENTS,
+    DEFAULT_STRIBECK_VELOCITY,
+    FrictionModel,
+)
 
 Array = NDArray[np.float64]
 
@@ -38,15 +42,15 @@ BLOCK = 0.02
 """Duration of the blocks that are averaged over, s."""
 
 STANDING = 1e-3
-"""Below this speed, rad/s, or four times the noise, a joint may stand: the torque says little."""
+"""Speed, rad/s, below which a joint may stand still and is not used; or four times the noise."""
 
 SURE = 3.0
-"""Standard errors that a coefficient has to be away from zero to be told."""
+"""A coefficient is accepted if it is above zero by this many standard errors."""
 
 LEAST_LEFT = 0.05
-"""Share of the friction that must not look like an error of the model."""
+"""Least share of the friction that must remain when errors of the model are eliminated."""
 
-_BEND = 0.2  # of its speed that a joint may be off steady acceleration: else it stuck or slipped
+_BEND = 0.2  # deviation from steady acceleration, of the speed; with more it stuck or slipped
 _FEWEST = 20  # blocks in each direction
 _FEWEST_SLOW = 8  # blocks below half of v_s, without which stiction is a guess
 _BLOCKS_PER_UNKNOWN = 1.5
@@ -56,16 +60,16 @@ _CANDIDATES = np.geomspace(1.0, 300.0, 48)  # v_s in standing speeds
 
 @dataclass
 class JointFit:
-    """What was found about one joint.
+    """Identified friction of one joint.
 
     Attributes:
         coulomb, static, viscous, stribeck_velocity: as in `FrictionModel`; zero where nothing
-            was found, and static friction that of motion.
+            was found; `static` is then `coulomb`.
         errors: their standard errors in this order, shape (4,); NaN where nothing was found.
-        residual: standard deviation of what the fit leaves, N m.
-        blocks: how many entered.
+        residual: standard deviation of the residual, N m.
+        blocks: how many were used.
         speeds: least and greatest among them, rad/s.
-        notes: what could not be found, and why.
+        notes: what could not be identified, and why.
     """
 
     coulomb: float = 0.0
@@ -80,7 +84,7 @@ class JointFit:
 
 
 def identify(model: pin.Model, recording: Recording) -> Iterator[JointFit]:
-    """Fit one joint after the other.
+    """Identify the friction of one joint after the other.
 
     Args:
         model: nominal, n joints, rotors as armature.
@@ -98,13 +102,13 @@ def identify(model: pin.Model, recording: Recording) -> Iterator[JointFit]:
 
 
 def friction_model(fits: Sequence[JointFit]) -> FrictionModel:
-    """Return what was found as a model."""
-    names = ("coulomb", "static", "viscous", "stribeck_velocity")
-    return FrictionModel(*(np.array([getattr(fit, name) for fit in fits]) for name in names))
+    """Return the friction model of all joints."""
+    values = (np.array([getattr(fit, name) for fit in fits]) for name in COEFFICIENTS)
+    return FrictionModel(*values)
 
 
 def model_errors(model: pin.Model, blocks: Blocks) -> tuple[Array, Array]:
-    """Return the torque beyond the model's, and what errors of the model may have to do with it.
+    """Return the torque beyond the model's, and the regressor of errors of the model.
 
     Returns:
         Shape (B, n), N m, and the Y of each joint with its rotor and a bias, (B, n, 10 n + 2).
@@ -169,7 +173,7 @@ def fit_joint(blocks: Blocks, joint: int, beyond: Array, errors: Array) -> Joint
 
 
 def _fill(fit: JointFit, data: JointRegression, standing: float) -> None:
-    """Fit, and keep of it what is sure."""
+    """Fit the coefficients; drop those that are not significant."""
     candidates = standing * _CANDIDATES
     candidates = candidates[candidates < max(fit.speeds[1], 2.0 * standing)]
     kept = [0, 1, 2]

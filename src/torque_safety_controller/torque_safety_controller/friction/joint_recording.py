@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording of joint states, and the averages over short blocks of it that models are fitted to.
+"""Recorded joint states, and their averages over short blocks, which models are fitted to.
 
 Averages over a block from sample s to sample e need no derivative of a noisy velocity: the mean
 acceleration is (v_e - v_s) / (t_e - t_s). The torque of sample k is the one that was applied until
@@ -55,14 +55,11 @@ class Recording:
             object.__setattr__(self, key, value)
         if self.t.ndim != 1 or len(self.t) < 2:
             raise RecordingError(f"'t' must have shape (N,) with N > 1, has {self.t.shape}")
-        for key in KEYS[1:]:
-            shape = getattr(self, key).shape
-            if shape != (len(self.t), self.n):
-                raise RecordingError(
-                    f"'{key}' must have shape ({len(self.t)}, {self.n}), has {shape}"
-                )
         for key in KEYS:
-            if not np.isfinite(getattr(self, key)).all():
+            value, shape = getattr(self, key), (len(self.t), self.n)
+            if key != "t" and value.shape != shape:
+                raise RecordingError(f"'{key}' must have shape {shape}, has {value.shape}")
+            if not np.isfinite(value).all():
                 raise RecordingError(f"'{key}' has numbers that are not finite")
         late = np.flatnonzero(np.diff(self.t) <= 0.0)
         if late.size:

@@ -1,24 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Least squares for the friction of one joint, the errors of the model eliminated."""
+"""Robust least squares for the friction of one joint, with the model's errors eliminated."""
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 Array = NDArray[np.float64]
 
 _PIECE = 0.25  # s; residuals of one such piece count as one
 _RANK = 1e-7  # singular values of the model's error below this share are rounding
 _HUBER = 1.345  # standard deviations up to which a residual counts in full
-_SUBSETS = [s for k in range(1, 4) for s in itertools.combinations(range(3), k)]
 
 
 class JointRegression:
-    """One joint's blocks, and the least squares they are used in.
+    """Averaged blocks of one joint, and the regression on them.
 
     Args:
         samples: of the velocity, shape (B, m), rad/s.
@@ -75,21 +74,12 @@ class JointRegression:
 
     def solve(self, v_s: float, kept: Sequence[int] = (0, 1, 2)) -> tuple[float, Array]:
         """Return the least sum of squares with coefficients >= 0, and them, shape (3,)."""
-        X = self.reduce(self.columns(v_s))
-        G, b = X.T @ X, X.T @ self._y
-        gain, found = 0.0, np.zeros(3)
-        for subset in _SUBSETS:  # of three, all may be tried
-            if not set(subset) <= set(kept):
-                continue
-            rows = list(subset)
-            x = np.linalg.lstsq(G[np.ix_(rows, rows)], b[rows], rcond=None)[0]
-            if (x >= 0.0).all() and x @ b[rows] > gain:
-                gain, found = float(x @ b[rows]), np.zeros(3)
-                found[rows] = x
-        return float(self._y @ self._y) - gain, found
+        columns, x = list(kept), np.zeros(3)
+        x[columns], residual = nnls(self.reduce(self.columns(v_s)[:, columns]), self._y)
+        return float(residual) ** 2, x
 
     def reweight(self, v_s: float, x: Array) -> None:
-        """Make what is far off count less: Huber's weights."""
+        """Reduce the weight of blocks with large residuals: Huber's weights."""
         columns = self.columns(v_s)
         residual = (self._y - self.reduce(columns) @ x) / self.weights
         size = 1.4826 * float(np.median(np.abs(residual))) + 1e-12

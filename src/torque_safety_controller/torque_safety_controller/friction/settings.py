@@ -11,6 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from viability_bounds_pkg.exceptions import SettingError
 
+COEFFICIENTS = ("coulomb", "static", "viscous", "stribeck_velocity")
+"""Names of the coefficients of `FrictionModel`, in order."""
+
 DEFAULT_STRIBECK_VELOCITY = 0.01
 """rad/s."""
 
@@ -44,7 +47,7 @@ class FrictionModel:
 
     def __post_init__(self) -> None:
         n = np.size(self.coulomb)
-        for name in ("coulomb", "static", "viscous", "stribeck_velocity"):
+        for name in COEFFICIENTS:
             value = _finite_vector(name, getattr(self, name), n)
             if not (value >= 0.0).all():
                 raise SettingError(name, value, "numbers >= 0")

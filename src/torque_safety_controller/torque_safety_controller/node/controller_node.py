@@ -11,6 +11,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
 from torque_safety_controller.controller import ControlOutput
@@ -20,7 +21,7 @@ from torque_safety_controller.node.controller_report import LEVELS, StepRecord
 from torque_safety_controller.node.goals import GoalSubscriber
 from torque_safety_controller.node.joint_commands import JointCommands
 from torque_safety_controller.node.limits import LimitsReader
-from torque_safety_controller.node.torque_switch import TorqueSwitch
+from torque_safety_controller.node.topics import ENABLE_TORQUE
 from torque_safety_controller.node.wrenches import WrenchSubscriber
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.qp.constraints import AccelerationRange
@@ -81,15 +82,7 @@ class ControllerNode(ArmNode):
         self._commands = JointCommands(self, config.joints, config.ros2_control_topic)
         JOINT_STATES.subscription(self, self._on_state)
         ACCELERATION_LIMITS.subscription(self, self._on_limits)
-        TorqueSwitch(
-            self,
-            config,
-            self._handover,
-            self._states,
-            self._limits,
-            silence=lambda: time.monotonic() - self._state_at,
-            on_torque=self._expect_bounds,
-        )
+        ENABLE_TORQUE.serve(self, self._on_enable_torque)
         # Use the steady clock, so that watchdogs fire when /clock stops.
         self._watchdog = self.create_timer(
             min(config.bounds_timeout, config.state_timeout) / 4,
@@ -244,8 +237,28 @@ class ControllerNode(ArmNode):
         self.get_logger().error(self._handover.reason)
         self._enter(Mode.POSITION, self._handover.reason)
 
-    def _expect_bounds(self) -> None:
-        self._bounds_lost = False
+    def _on_enable_torque(
+        self, request: SetBool.Request, response: SetBool.Response
+    ) -> SetBool.Response:
+        """Start a handover, or say why not."""
+        states, config, silence = self._states, self._config, time.monotonic() - self._state_at
+        try:
+            if request.data:
+                # After a restart of the robot, earlier limits may have later stamps.
+                apart = 1e-9 * abs(states.stamp - self._limits.stamp)
+                bounds_fresh = self._limits.stamp >= 0 and apart <= config.bounds_timeout
+                fresh = silence < config.bounds_timeout
+                self._handover.to_torque(states.q, states.effort(), fresh, bounds_fresh)
+                self._bounds_lost = False
+                response.message = "torque control begins with the next state"
+            else:
+                self._handover.to_position(states.q, states.v, silence < config.state_timeout)
+                response.message = "position control begins when the arm is at rest"
+            response.success = True
+        except HandoverRefused as error:
+            response.message = str(error)
+            self.get_logger().warning(f"enable_torque refused: {error}")
+        return response
 
     # Watchdogs
 

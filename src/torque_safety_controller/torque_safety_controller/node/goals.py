@@ -126,16 +126,36 @@ def posture_from_message(
     return q_des
 
 
-class GoalQueue:
-    """Goals whose stamps lie ahead of the robot's time, until they are due.
+class GoalSubscriber:
+    """Subscribes to ``target_pose``, ``target_posture`` and ``target_trajectory``.
 
-    A stamp of zero, or one that has passed, takes effect with the next control step; one ahead
-    takes effect with the first state at or after it, which makes a plan of goals repeatable.
+    Goals wait until they are due: a stamp of zero, or one that has passed, takes effect with the
+    next control step; one ahead takes effect with the first state at or after it, which makes a
+    plan of goals repeatable.
+
+    Args:
+        node: listens and logs what is refused.
+        controller: is given the goals when they are due.
+        config: has the names and limits that they are checked by.
+        base: placement of the base frame in the URDF's root frame.
+
+    Attributes:
+        refused: how many goals were refused, by topic.
     """
 
-    def __init__(self) -> None:
-        self._pending: list[tuple[int, Callable[[], None]]] = []
+    def __init__(
+        self, node: Node, controller: Controller, config: ControllerConfiguration, base: pin.SE3
+    ) -> None:
         self.refused: Counter[str] = Counter()
+        self._pending: list[tuple[int, Callable[[], None]]] = []
+        self._controller, self._config, self._base = controller, config, base
+        self._logger = node.get_logger()
+        TARGET_POSE.subscription(node, self._on_pose)
+        TARGET_POSTURE.subscription(node, self._on_posture)
+        TARGET_TRAJECTORY.subscription(node, self._on_trajectory)
+        self._trajectory: PoseTrajectory | None = None
+        self._begin = 0
+        self._taken = controller.goals.taken
 
     def __len__(self) -> int:
         return len(self._pending)
@@ -150,45 +170,19 @@ class GoalQueue:
         self._pending.sort(key=lambda entry: entry[0])
 
     def apply_due(self, stamp: int) -> bool:
-        """Apply the goals that are due at `stamp`, ns; return whether there were any."""
+        """Apply the goals that are due at `stamp`, ns, and go on with a trajectory.
+
+        A trajectory ends where the arm has taken the pose where it was for its goal.
+
+        Returns:
+            Whether any were due, or a trajectory is followed.
+        """
+        if self._taken != self._controller.goals.taken:
+            self._taken, self._trajectory = self._controller.goals.taken, None
         due = False
         while self._pending and self._pending[0][0] <= stamp:
             self._pending.pop(0)[1]()
             due = True
-        return due
-
-
-class GoalSubscriber(GoalQueue):
-    """Subscribes to ``target_pose``, ``target_posture`` and ``target_trajectory``.
-
-    Args:
-        node: listens and logs what is refused.
-        controller: is given the goals when they are due.
-        config: has the names and limits that they are checked by.
-        base: placement of the base frame in the URDF's root frame.
-    """
-
-    def __init__(
-        self, node: Node, controller: Controller, config: ControllerConfiguration, base: pin.SE3
-    ) -> None:
-        super().__init__()
-        self._controller, self._config, self._base = controller, config, base
-        self._logger = node.get_logger()
-        TARGET_POSE.subscription(node, self._on_pose)
-        TARGET_POSTURE.subscription(node, self._on_posture)
-        TARGET_TRAJECTORY.subscription(node, self._on_trajectory)
-        self._trajectory: PoseTrajectory | None = None
-        self._begin = 0
-        self._taken = controller.goals.taken
-
-    def apply_due(self, stamp: int) -> bool:
-        """Apply the goals that are due at `stamp`, ns, and go on with a trajectory.
-
-        A trajectory ends where the arm has taken the pose where it was for its goal.
-        """
-        if self._taken != self._controller.goals.taken:
-            self._taken, self._trajectory = self._controller.goals.taken, None
-        due = super().apply_due(stamp)
         if self._trajectory is None:
             return due
         self._begin = self._begin or stamp

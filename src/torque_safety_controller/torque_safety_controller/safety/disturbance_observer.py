@@ -1,19 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What disturbs the joints' accelerations, seen one step later and kept out of the bounds.
+"""Disturbance observer: estimates acceleration errors and tightens the bounds by them.
 
-The acceleration bounds hold for the accelerations that the arm has; the controller chooses those
-that it asks for. What it does not know of lies between: friction, payloads, pushes, and integral
-torque that is no longer needed. Of the step that has just passed the difference is known,
+The acceleration bounds are for the real accelerations, the controller chooses the commanded ones.
+Friction, payloads, external forces and integral torque that is no longer needed make them differ.
+The difference of the last step is known,
 
     e = (v - v_last) / dt - a_last,
 
-and what lasts longer than a step acts in the next one too. So the bounds for what is asked are
-shifted by e, but only ever inward: for e > 0 the upper one, for e < 0 the lower one, with the
-other giving way if they cross. Friction, which opposes the motion, does not widen them.
+and disturbances that last longer than a step act in the next one too. The bounds for the commanded
+acceleration are therefore shifted by e, but only inward: for e > 0 the upper one, for e < 0 the
+lower one; if they cross, the other one follows. Friction, which opposes the motion, does not widen
+them.
 
-With a filter of time constant T for the noise of the velocity, what is left is the change of the
-disturbance within T: a step of it by d passes the bound by d exp(-t / T). `docs/disturbances.md`
-measures it.
+With a filter of time constant T for the noise of the velocity, the error that remains is the
+change of the disturbance within T: after a step by d the bound is exceeded by d exp(-t / T).
+`docs/disturbances.md` measures it.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ Array = NDArray[np.float64]
 
 
 class DisturbanceObserver:
-    """Watches the difference between accelerations asked for and had.
+    """Filtered difference between measured and commanded accelerations.
 
     Args:
         n: number of joints.
-        time_constant: of the filter, s, >= 0; None to watch nothing.
+        time_constant: of the filter, s, >= 0; None switches the observer off.
 
     Attributes:
         time_constant: may be changed between steps.
@@ -55,14 +56,14 @@ class DisturbanceObserver:
         self._begun = False
 
     def observe(self, v: Array, a_last: Array, elapsed: float, tau_max: Array, M: Array) -> None:
-        """Learn from the step that has just passed.
+        """Update the estimate with the step that has just passed.
 
         Args:
             v: velocity now, shape (n,), rad/s.
-            a_last: acceleration asked for in the step, shape (n,), rad/s^2.
-            elapsed: duration of the step, s; 0 if it is not known, which starts anew.
-            tau_max: torque limits, shape (n,), N m. More than a motor could counter is no force
-                that lasts but an impact.
+            a_last: acceleration commanded for the step, shape (n,), rad/s^2.
+            elapsed: duration of the step, s; 0 if it is not known, which resets.
+            tau_max: torque limits, shape (n,), N m. The estimate is limited to what the motors
+                could compensate: more than that is an impact, which does not last.
             M: mass matrix, shape (n, n), kg m^2.
         """
         if self.time_constant is None:
@@ -77,14 +78,14 @@ class DisturbanceObserver:
 
     @property
     def known(self) -> Array | None:
-        """The estimate; None while nothing is watched, or has been yet."""
+        """The estimate; None before the first step, or when switched off."""
         return None if self.time_constant is None or not self._begun else self.estimate
 
     def shift(self, lower: Array, upper: Array) -> tuple[Array, Array]:
-        """Return bounds for the accelerations to ask for.
+        """Return the bounds of the commanded accelerations.
 
         Args:
-            lower: bound of the accelerations to have, shape (n,), rad/s^2.
+            lower: bound of the real accelerations, shape (n,), rad/s^2.
             upper: shape (n,), rad/s^2, not below `lower`.
         """
         known = self.known
@@ -102,12 +103,12 @@ def _observe(
     tau_max: Array,
     M: Array,
 ) -> None:
-    """Let the estimate follow the error of the last step, at a rate `gain`; in place."""
+    """Filter the error of the last step with `gain`, in place."""
     for j in range(v.size):
         e = (v[j] - v_last[j]) / elapsed - a_last[j]
         e = estimate[j] + gain * (e - estimate[j])
         largest = tau_max[j] / M[j, j]
-        # A NaN is nothing to go by.
+        # A NaN resets the estimate.
         estimate[j] = min(max(e, -largest), largest) if e == e and largest > 0.0 else 0.0
 
 

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From position control by the robot's own drives to torque control and back, without a jolt.
+"""Bumpless handover between the robot's position control and torque control.
 
-[Benallegue2021], IV-A: the position reference is captured and held while the QP, at the arm's own
-configuration, makes its first torque; in the next step torque is what the robot is given. The
-integral action begins with the difference between the torque measured and the one computed, so
-that the torque goes on from what the drives applied (`Controller.bumpless_transfer`).
+[Benallegue2021], IV-A: the position reference is captured and held while the QP computes its
+first torque for the present configuration; from the next step on torque is commanded. The
+integral action starts with the difference between the measured and the computed torque, so that
+the commanded torque is continuous (`Controller.bumpless_transfer`).
 
-Drives brake an arm in motion as hard as they can. So on the way back it is brought to rest under
-torque control first.
+Position-controlled drives stop a moving arm as hard as they can. On the way back the arm is
+therefore first brought to rest under torque control.
 """
 
 from __future__ import annotations
@@ -15,39 +15,40 @@ from __future__ import annotations
 from enum import Enum
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from viability_bounds_pkg.exceptions import ArmSafetyError
 
-TORQUE_TOLERANCE = 0.01
-"""By how much of its limit a measured torque may exceed it: the step that is left is no larger."""
+Array = NDArray[np.float64]
 
+TORQUE_TOLERANCE = 0.01
+"""Share of its limit by which a measured torque may exceed it; the torque step is no larger."""
 
 REST_SPEED = 0.02
-"""Joints slower than this, rad/s, are at rest enough for drives to take them."""
+"""Speed below which a joint counts as at rest, rad/s."""
 
 PATIENCE = 2.0
-"""How long an arm is waited for to come to rest, s; one that somebody pushes may not."""
+"""Longest time to wait for the arm to come to rest, s; under external forces it may not."""
 
 
 class Control(Enum):
-    """Who is in command of the joints."""
+    """Which control commands the joints."""
 
     TORQUE = "torque"
     POSITION = "position"
-    """The drives, at positions that they are sent."""
+    """The drives hold the positions that they are sent."""
     TAKING_OVER = "taking over"
-    """Still the drives, while the QP makes its first torque."""
+    """Still position control, while the QP computes its first torque."""
     GIVING_BACK = "giving back"
-    """Torque still, which brings the arm to rest before the drives take it."""
+    """Still torque control, which brings the arm to rest."""
 
 
 class HandoverRefused(ArmSafetyError, ValueError):
-    """The control of the arm stays what it is; the text says why."""
+    """A change of control that is not possible now; the text says why."""
 
 
 class Handover:
-    """Keeps track of what controls the arm: its drives, or torque.
+    """State machine of the change between position and torque control.
 
     Args:
         control: ``torque`` or ``position``.
@@ -57,8 +58,8 @@ class Handover:
         tau_max: torque limits, shape (n,), N m.
 
     Attributes:
-        control: what controls the arm at present.
-        reason: why.
+        control: present control.
+        reason: of the last change.
     """
 
     def __init__(
@@ -71,7 +72,7 @@ class Handover:
     ) -> None:
         self.control = self._start = Control(control)
         self.reason = "as at start"
-        self._q_hold: np.ndarray | None = None
+        self._q_hold: Array | None = None
         self._waited = 0.0
         self._joints = joints
         self._q_min, self._q_max = np.asarray(q_min), np.asarray(q_max)
@@ -79,11 +80,11 @@ class Handover:
 
     @property
     def by_drives(self) -> bool:
-        """Whether positions are to be sent."""
+        """Whether positions are sent."""
         return self.control in (Control.POSITION, Control.TAKING_OVER)
 
-    def hold(self, q: np.ndarray) -> np.ndarray:
-        """Return where the drives are to hold the joints, captured at the first call.
+    def hold(self, q: Array) -> Array:
+        """Return the position to hold, captured at the first call.
 
         Args:
             q: position now, shape (n,), rad.
@@ -93,28 +94,26 @@ class Handover:
         return self._q_hold
 
     def robot_was_away(self) -> None:
-        """Begin anew, the robot having been silent or started over: never with torque unasked."""
+        """Reset after the robot was silent or restarted; never starts torque control by itself."""
         between = (Control.TAKING_OVER, Control.GIVING_BACK)
         back = self._start is Control.POSITION or self.control in between
         if back and self.control is not Control.POSITION:
             self._set(Control.POSITION, "the robot was silent or started over")
         self._q_hold = None
 
-    def to_torque(
-        self, q: np.ndarray, tau: np.ndarray | None, fresh: bool, bounds_fresh: bool
-    ) -> None:
+    def to_torque(self, q: Array, tau: Array | None, fresh: bool, bounds_fresh: bool) -> None:
         """Begin the handover to torque control; the next state with limits completes it.
 
-        One from torque that is under way is called off.
+        Cancels a handover to position control.
 
         Args:
             q: position, shape (n,), rad.
-            tau: torque of the motors, shape (n,), N m, or None if the robot does not tell.
-            fresh: whether joint states come.
-            bounds_fresh: whether acceleration limits come.
+            tau: torque of the motors, shape (n,), N m; None if it is not measured.
+            fresh: whether joint states arrive.
+            bounds_fresh: whether acceleration limits arrive.
 
         Raises:
-            HandoverRefused: it would not be safe, or smooth.
+            HandoverRefused: it would not be safe, or not smooth.
         """
         if self.control is Control.TORQUE:
             raise HandoverRefused("torque control is on already")
@@ -128,8 +127,8 @@ class Handover:
         self.check(q, tau)
         self._set(Control.TAKING_OVER, "enable_torque")
 
-    def check(self, q: np.ndarray, tau: np.ndarray | None) -> np.ndarray:
-        """Return `tau`, if torque control can begin in this state; see `to_torque`.
+    def check(self, q: Array, tau: Array | None) -> Array:
+        """Return `tau` if torque control can begin in this state; see `to_torque`.
 
         Raises:
             HandoverRefused: it cannot.
@@ -145,24 +144,24 @@ class Handover:
         return tau
 
     def taken_over(self) -> None:
-        """Note that torque is commanded from the next step on."""
+        """Enter torque control; the next step commands torque."""
         self._set(Control.TORQUE, "enable_torque")
         self._q_hold = None
 
     def failed(self, reason: str) -> None:
-        """Leave the arm to the drives, where they hold it."""
+        """Return to position control because the handover failed."""
         self._set(Control.POSITION, f"handover failed: {reason}")
 
-    def to_position(self, q: np.ndarray, v: np.ndarray, fresh: bool) -> None:
-        """Let the drives hold the arm where it is, or where it comes to rest.
+    def to_position(self, q: Array, v: Array, fresh: bool) -> None:
+        """Begin the handover to position control, which waits until the arm is at rest.
 
         Args:
             q: position, shape (n,), rad.
             v: velocity, shape (n,), rad/s.
-            fresh: whether joint states come.
+            fresh: whether joint states arrive.
 
         Raises:
-            HandoverRefused: they do so already, or nobody knows where it is.
+            HandoverRefused: position control is on, or the position is not known.
         """
         if self.control in (Control.POSITION, Control.GIVING_BACK):
             raise HandoverRefused("position control is on already")
@@ -175,13 +174,13 @@ class Handover:
         self._set(Control.GIVING_BACK, "enable_torque")
         self.slow_down(q, v, 0.0)
 
-    def slow_down(self, q: np.ndarray, v: np.ndarray, elapsed: float) -> None:
-        """Let the drives take the arm from the next state on if it is at rest, or was waited for.
+    def slow_down(self, q: Array, v: Array, elapsed: float) -> None:
+        """Enter position control if the arm is at rest, or after `PATIENCE`.
 
         Args:
             q: position, shape (n,), rad.
             v: velocity, shape (n,), rad/s.
-            elapsed: time since it was asked for last, s.
+            elapsed: time since the last call, s.
         """
         self._waited += elapsed
         if np.abs(v).max() <= REST_SPEED or self._waited > PATIENCE:
@@ -191,5 +190,5 @@ class Handover:
     def _set(self, control: Control, reason: str) -> None:
         self.control, self.reason = control, reason
 
-    def _names(self, flags: np.ndarray) -> str:
+    def _names(self, flags: NDArray[np.bool_]) -> str:
         return ", ".join(name for name, flag in zip(self._joints, flags, strict=True) if flag)

@@ -1,29 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which mode the controller is in, and why."""
+"""Modes of the controller node."""
 
 from __future__ import annotations
 
 from enum import Enum
 
 CONTROLS = ("torque", "position")
-"""What the robot's drives are commanded by."""
+"""Kinds of commands to the robot's drives."""
 
 
 class Mode(Enum):
-    """What the controller does."""
+    """Mode of the controller node."""
 
     TRACKING = "TRACKING"
-    """Serves its goals inside all limits."""
+    """Follows its goals inside all limits."""
     HOLD = "HOLD"
     """Brings the arm to rest: gravity compensation and damping inside the torque limits."""
     POSITION = "POSITION"
-    """The robot's own drives hold the position that they are sent."""
+    """The robot's own position control holds the position that it is sent."""
     STOPPED = "STOPPED"
-    """Publishes nothing, so that the robot's own watchdog brakes it."""
+    """Publishes nothing; the robot's own watchdog brakes it."""
 
 
 class ModeKeeper:
-    """Keeps the mode, its reason and how often it changed."""
+    """Present mode, its reason and the number of changes."""
 
     def __init__(self) -> None:
         self.mode = Mode.STOPPED

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What may be sent to the motors: finite torques within their limits and rates."""
+"""Limits of commanded torques and of their rates of change."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 
 class TorqueLimiter:
-    """Keeps torques within their limits, and within reach of the last one.
+    """Clips torques to their limits and to the rate limit; replaces those that are not finite.
 
     Args:
         tau_max: torque limits, shape (n,), N m.
@@ -19,7 +19,7 @@ class TorqueLimiter:
 
     Attributes:
         tau_max: as given.
-        last: torque sent last, shape (n,), N m; None before the first.
+        last: last commanded torque, shape (n,), N m; None before the first.
     """
 
     def __init__(self, tau_max: ArrayLike, tau_rate_max: ArrayLike | None, dt: float) -> None:
@@ -31,16 +31,16 @@ class TorqueLimiter:
         self.last: np.ndarray | None = None
 
     def reset(self) -> None:
-        """Forget the last torque: the next may be any within the limits."""
+        """Forget the last torque; the next is not rate-limited."""
         self.last = None
 
     def go_on_from(self, tau: np.ndarray) -> np.ndarray:
-        """Take `tau`, shape (n,), N m, within the limits, for the torque sent last; return it."""
+        """Set the last torque to `tau`, shape (n,), N m, clipped to the limits; return it."""
         self.last = np.clip(tau, self._tau_min, self.tau_max)
         return self.last
 
     def range(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the least and greatest torques that may follow, shape (n,) each, N m."""
+        """Return the limits of the next torque, shape (n,) each, N m."""
         if self.last is None or not self._rate_limited:
             return self._tau_min, self.tau_max
         return (
@@ -49,7 +49,7 @@ class TorqueLimiter:
         )
 
     def limited(self, tau: np.ndarray) -> np.ndarray:
-        """Return `tau` as it may be sent: whatever came before, finite and within the limits."""
+        """Return `tau` clipped to the limits; the last torque in place of one not finite."""
         if not math.isfinite(tau.dot(tau)):
             tau = np.zeros(self.tau_max.size) if self.last is None else self.last
         lower, upper = self.range()

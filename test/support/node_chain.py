@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The controller node of Baxter's arm between a robot, a bounds node and a user, for tests."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+from arms import load_arm
+from controller_chain import NODE, ControllerChain
+from geometry_msgs.msg import PoseStamped
+from ros_harness import read_config
+from sensor_msgs.msg import JointState
+
+from torque_safety_controller.controller import Controller, Gains
+from torque_safety_controller.tasks.gains import critical_damping
+from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp
+from viability_bounds_pkg.state import State
+
+ARM = load_arm("baxter_left_arm")
+# Watchdogs that do not bark while a busy machine runs the other tests.
+VALUES = read_config("baxter_left_arm", NODE) | {"bounds_timeout": 20.0, "state_timeout": 40.0}
+JOINTS = VALUES["joints"]
+GAINS = Gains(
+    pose_kp=VALUES["pose_kp"],
+    pose_kd=critical_damping(VALUES["pose_kp"]),
+    pose_weight=VALUES["pose_weight"],
+    posture_kp=VALUES["posture_kp"],
+    posture_kd=critical_damping(VALUES["posture_kp"]),
+    posture_weight=VALUES["posture_weight"],
+    posture_in_null_space=True,
+    hold_kd=VALUES["hold_kd"],
+)
+Q = ARM.q_start
+REST = np.zeros(ARM.n)
+V = 0.02 * ARM.v_max
+LOWER, UPPER = np.full(ARM.n, -2.0), np.full(ARM.n, 2.0)
+GOAL_Q = Q + 0.1
+SAME_TORQUE = 1e-6  # N m; two runs of the solver
+
+
+def expected(pose=None, posture=None, gains=GAINS) -> Controller:
+    """The node's core, set up by hand."""
+    controller = Controller(ARM.robot(), ARM.tau_max, gains)
+    controller.reset(Q)
+    if pose is not None:
+        controller.set_pose_goal(pose)
+    if posture is not None:
+        controller.set_posture_goal(posture)
+    return controller
+
+
+def pose_at(q) -> pin.SE3:
+    robot = ARM.robot(0.0)
+    robot.update(State(q, REST), REST)
+    return robot.pose.copy()
+
+
+GOAL = pose_at(GOAL_Q)
+
+
+def pose_message(pose: pin.SE3, frame="base", stamp=0) -> PoseStamped:
+    message = PoseStamped()
+    message.header.frame_id = frame
+    set_stamp(message.header.stamp, stamp)
+    p, o = message.pose.position, message.pose.orientation
+    p.x, p.y, p.z = map(float, pose.translation)
+    o.x, o.y, o.z, o.w = map(float, pin.Quaternion(pose.rotation).coeffs())
+    return message
+
+
+class NodeChain(ControllerChain):
+    """The other side of the controller: robot, bounds node and user."""
+
+    def __init__(self, ros, **changed) -> None:
+        super().__init__(ros, VALUES | changed)
+        self.poses = ros.talk(PoseStamped, "target_pose", GOAL_QOS)
+        self.postures = ros.talk(JointState, "target_posture", GOAL_QOS)
+
+    def state(self, stamp, q=Q, v=V) -> None:
+        self.send_state(stamp, q, v)
+
+    def bound(self, stamp, lower=LOWER, upper=UPPER) -> None:
+        self.send_limits(stamp, lower, upper)
+
+    def both(self, stamp, q=Q, v=V, lower=LOWER, upper=UPPER) -> None:
+        self.bound(stamp, lower, upper)
+        self.state(stamp, q, v)
+
+    def await_command(self, stamp, each=None) -> np.ndarray:
+        """Wait for the command with a stamp, ms; return its torques."""
+        command = super().await_command(stamp, each)
+        assert command.name == JOINTS
+        return np.array(command.effort)
+
+    def answer(self, stamp, q=Q, v=V, lower=LOWER, upper=UPPER) -> np.ndarray:
+        """Send a state and its limits until the command comes; return its torques."""
+        return self.await_command(stamp, lambda: self.both(stamp, q, v, lower, upper))
+
+    def await_mode(self, mode, reason="", each=None) -> None:
+        self.ros.wait_until(
+            lambda: self.reported("mode") == mode and reason in self.reported("reason"),
+            f"mode {mode} {reason}",
+            each=each,
+        )
+
+
+def give_goal(chain, message=None, first=1) -> int:
+    """Send a pose goal, step until it is tracked; return the next free stamp, ms."""
+    chain.poses.publish(pose_message(GOAL) if message is None else message)
+    stamps = iter(range(first, first + 1000))
+    current = first
+
+    def step():
+        nonlocal current
+        current = next(stamps)
+        chain.both(current)
+
+    chain.await_mode("TRACKING", each=step)
+    return current + 1
+
+
+def torque_for(q, a):
+    """Return the torque for accelerations `a` at velocity V."""
+    robot = ARM.robot()
+    robot.update(State(q, V), a)
+    return robot.torque(a)
