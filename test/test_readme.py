@@ -16,6 +16,7 @@ README = (ROOT / "README.md").read_text()
 # Shorter than by default: here it is only shown that they run.
 SHORTER = {
     "bash scripts/bench.sh chain": "bash scripts/bench.sh chain --cycles 200",
+    "bash scripts/bench.sh step": "bash scripts/bench.sh step --rounds 2",
     "bash scripts/bench.sh compliance": "bash scripts/bench.sh compliance --steps 200",
 }
 NOT_HERE = {"bash scripts/test.sh"}
@@ -49,7 +50,7 @@ def hurry(entry, factor):
 
 @pytest.fixture(scope="module")
 def hurried(tmp_path_factory):
-    """A tree like this one, with scenarios of a second; `test_demo.py` plays them in full."""
+    """A tree like this one, with scenarios of half a second; `test_demo.py` plays them in full."""
     tree = tmp_path_factory.mktemp("tree")
     (tree / "install").symlink_to(ROOT / "install")
     (tree / "scripts").mkdir()
@@ -58,7 +59,7 @@ def hurried(tmp_path_factory):
     shutil.copytree(ROOT / "config", tree / "config")
     for path in (tree / "config" / "scenarios").iterdir():
         scenario = yaml.safe_load(path.read_text())
-        factor = 1.0 / scenario["duration"]
+        factor = 0.5 / scenario["duration"]
         for entry in (scenario, *scenario["events"]):
             hurry(entry, factor)
         path.write_text(yaml.safe_dump(scenario))
