@@ -32,7 +32,7 @@ ALLOWED = 1.25
 
 
 def microseconds(
-    functions: dict[str, Callable[[], Any]], repetitions: int = 300, rounds: int = 20
+    functions: dict[str, Callable[[], Any]], rounds: int, repetitions: int = 300
 ) -> dict[str, float]:
     """Return the best mean times of calls, in turns: what each takes undisturbed."""
     best = dict.fromkeys(functions, float("inf"))
@@ -124,6 +124,7 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--robot", default="baxter_left_arm")
+    parser.add_argument("--rounds", type=int, default=20, help="of which the best counts")
     options = parser.parse_args()
     content = yaml.safe_load((ROOT / "config" / f"{options.robot}.yaml").read_text())
     values = {k: v for part in content.values() for k, v in part["ros__parameters"].items()}
@@ -162,7 +163,7 @@ def main() -> None:
     for solver in SOLVERS:
         steps[f"{solver} same"] = same(make(solver))
         steps[f"{solver} other"] = off_and_on(make(solver))
-    took = microseconds(steps)
+    took = microseconds(steps, options.rounds)
     print(f"model terms by Pinocchio{took['terms']:>35.1f} us")
     for kind, meaning in (
         ("same", "same bounds active as before"),
@@ -181,7 +182,7 @@ def main() -> None:
         "  torque of the middle of the step": lambda: robot.torque(state.v),
         "  limits and rate of torque": lambda: controller._limiter.limited(controller.tau_max),
     }
-    for name, time_us in microseconds(parts | qp_alone(controller, state)).items():
+    for name, time_us in microseconds(parts | qp_alone(controller, state), options.rounds).items():
         print(f"{name:<50} {time_us:8.1f} us")
 
 

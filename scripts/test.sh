@@ -16,6 +16,8 @@ cd "$root"
 # A ROS domain of its own, so that other nodes do not interfere.
 export ROS_DOMAIN_ID="${ROS_DOMAIN_ID:-$((1 + $$ % 100))}"
 export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
+# So that what is compiled of tests and sources to be imported is kept for the other processes.
+unset PYTHONDONTWRITEBYTECODE
 # One process more than cores, because some tests wait.
 [ $# -gt 0 ] || set -- -n "$(($(nproc) + 1))"
 exec python -m pytest "$@"

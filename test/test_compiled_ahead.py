@@ -15,9 +15,10 @@ PACKAGES = ("viability_bounds_pkg", "torque_safety_controller", "sim_bridge")
 OBSTACLES = yaml.safe_load((CONFIG / "obstacles" / "panda_wall.yaml").read_text())
 
 NOT_KEPT = """
-import importlib, pkgutil, sys
+import importlib, pkgutil, runpy, sys
 from viability_bounds_pkg.compiled import compiled_functions, is_kept
 
+runpy.run_path("scripts/compile.py", run_name="__main__")
 for name in sys.argv[1:]:
     package = importlib.import_module(name)
     for module in pkgutil.walk_packages(package.__path__, f"{name}."):
@@ -63,15 +64,16 @@ def run(*arguments):
     return result.stdout.strip()
 
 
-@pytest.fixture(scope="module", autouse=True)
-def set_up():
-    """Do what setup.sh does: nothing if it was done."""
-    run("scripts/compile.py")
+@pytest.fixture(scope="module")
+def not_kept():
+    """Do what setup.sh does, nothing if it was done; return what is not kept then."""
+    return run("-c", NOT_KEPT, *PACKAGES)
 
 
-def test_every_compiled_function_is_kept():
-    assert run("-c", NOT_KEPT, *PACKAGES) == ""
+def test_every_compiled_function_is_kept(not_kept):
+    assert not_kept == ""
 
 
+@pytest.mark.usefixtures("not_kept")
 def test_nodes_compile_nothing():
     assert run("-c", COMPILED_BY_NODES, yaml.safe_dump(PLAYED)) == ""

@@ -1,13 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demo as a user starts it."""
+"""The demo as a user starts it, and its scenarios without messages between the nodes."""
 
 import json
 import subprocess
 from pathlib import Path
 
+import numpy as np
+import pinocchio as pin
 import pytest
+import yaml
+from direct import DirectLoop, column, hand_errors
+
+from sim_bridge.scenario.events import ParameterChange, PoseGoal, Push
+from sim_bridge.scenario.scenario import load_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
+SCENARIOS = ROOT / "config" / "scenarios"
 KEYS = {
     "robot",
     "rate_hz",
@@ -32,21 +40,12 @@ def demo(*arguments):
     )
 
 
-SHOWN = (
-    ("baxter_left_arm", ()),
-    ("baxter_left_arm", ("--rate", "1000")),
-    ("panda", ()),
-)
-"""Robots and options; the README shows some, which need not run twice."""
-
-
-@pytest.mark.parametrize(("robot", "options"), SHOWN)
-def test_exact_bounds_break_no_limit(tmp_path, robot, options):
-    result = demo(robot, "--lockstep", "--out", tmp_path, *options)
+def test_exact_bounds_break_no_limit(tmp_path):
+    result = demo("baxter_left_arm", "--lockstep", "--out", tmp_path)
     assert result.returncode == 0, result.stdout + result.stderr
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert set(metrics) >= KEYS
-    assert metrics["robot"] == robot
+    assert metrics["robot"] == "baxter_left_arm"
     assert metrics["max_position_violation_rad"] <= 1e-9
     assert metrics["max_velocity_violation_rad_s"] <= 1e-9
     assert metrics["max_torque_ratio"] <= 1.0 + 1e-9
@@ -66,7 +65,12 @@ def test_exact_bounds_break_no_limit(tmp_path, robot, options):
 
 
 def test_naive_bounds_break_the_elbow_and_say_so(tmp_path):
-    result = demo("--bounds", "naive", "--lockstep", "--out", tmp_path)
+    # The first goal leads to the limit.
+    scenario = yaml.safe_load((SCENARIOS / "baxter_left_arm_demo.yaml").read_text())
+    path = tmp_path / "first_goal.yaml"
+    path.write_text(yaml.safe_dump({"duration": 1.0, "events": scenario["events"][:1]}))
+    options = ("--bounds", "naive", "--lockstep", "--out", tmp_path)
+    result = demo("baxter_left_arm", path, *options)
     assert result.returncode == 1, result.stdout + result.stderr
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["max_position_violation_rad"] > 0.01
@@ -91,3 +95,61 @@ def test_what_it_cannot_play_is_refused(tmp_path, arguments, names):
     assert len(errors) == 1
     assert names in errors[0]
     assert not (tmp_path / "metrics.json").exists()
+
+
+def begin(loop, event):
+    """Let an event of a scenario take effect."""
+    match event:
+        case PoseGoal():
+            rotation = pin.Quaternion(np.array(event.orientation)).toRotationMatrix()
+            loop.controller.set_pose_goal(pin.SE3(rotation, np.array(event.position)))
+        case Push():
+            loop.robot.apply_wrench(event.link, event.force, event.torque)
+        case ParameterChange():
+            loop.change(**event.values)
+
+
+def play(robot, name, changed):
+    """Return the loop and the samples of a scenario that is shipped, from begin to end."""
+    scenario = load_scenario(SCENARIOS / f"{robot}_{name}.yaml")
+    loop = DirectLoop(robot, changed)
+    pushes = [event for event in scenario.events if isinstance(event, Push)]
+
+    def each(t):
+        now = round(t / loop.dt)
+        for push in pushes:
+            if now == round((push.time + push.duration) / loop.dt):
+                loop.robot.clear_wrenches()
+        for event in scenario.events:
+            if now == round(event.time / loop.dt):
+                begin(loop, event)
+
+    return loop, loop.run(scenario.duration, each)
+
+
+@pytest.mark.parametrize(
+    ("robot", "changed", "remains", "near"),
+    [
+        ("baxter_left_arm", {"rate_hz": 1000.0}, 1e-3, 5e-3),
+        ("panda", {}, 1e-3, 5e-3),
+        # With friction, and a margin for torques that are held.
+        ("talos_left_arm", {}, 5e-3, 0.02),
+    ],
+)
+def test_other_demos_go_to_a_limit_and_break_none(robot, changed, remains, near):
+    loop, samples = play(robot, "demo", changed)
+    monitor = loop.robot.monitor
+    assert monitor.max_position_violation.max() <= 1e-9
+    assert monitor.max_velocity_violation.max() <= 1e-9
+    assert monitor.max_torque_ratio.max() <= 1.0 + 1e-9
+    assert [error[-1] < remains for error in hand_errors(samples)] == [True, True]
+    assert min(monitor.closest_to_q_min.min(), monitor.closest_to_q_max.min()) < near
+
+
+def test_a_pushed_elbow_gives_way_once_it_is_told_to():
+    loop, samples = play("talos_left_arm", "push_elbow", {})
+    assert not loop.robot.monitor.violated
+    t, q = column(samples, "t"), column(samples, "q")
+    stiff, compliant = (np.ptp(q[(t > begin) & (t < begin + 4.0)], axis=0) for begin in (0.9, 5.9))
+    assert compliant.max() > 10.0 * stiff.max()
+    assert hand_errors(samples)[0].max() < 3e-3

@@ -28,7 +28,7 @@ def error_at_rest(changed):
     errors = []
     for offset in ((0.05, 0.1, 0.15), (0.1, -0.1, -0.05)):
         goal(loop, start, offset)
-        errors.append(distance(loop.run(5.0))[-1000:].mean())
+        errors.append(distance(loop.run(3.5))[-1000:].mean())
     return np.mean(errors)
 
 
@@ -38,7 +38,7 @@ def test_steady_error_is_ten_times_smaller():
 
 @pytest.mark.parametrize("force", PUSHES)
 def test_push_and_release(force):
-    without, limited = push(UNLIMITED, force), push(PAPER, force)
+    without, limited = (push(changed, force, seconds=3.0) for changed in (UNLIMITED, PAPER))
     assert limited["share"] <= 1.0 + 1e-9 < 2.0 < without["share"]
     assert limited["overshoot"] <= without["overshoot"] / 3.0
     assert limited["recovery"] <= 1.0

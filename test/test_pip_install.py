@@ -73,7 +73,7 @@ def link_dependencies(requirements, site):
         assert requirement.specifier.contains(distribution.version, prereleases=True), name
         todo += distribution.requires or []
         for file in distribution.files:
-            if ".." in file.parts or {"include", "__pycache__", "tests"} & set(file.parts):
+            if ".." in file.parts or {"include", "tests"} & set(file.parts):
                 continue
             link = site / file
             link.parent.mkdir(parents=True, exist_ok=True)

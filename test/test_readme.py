@@ -3,11 +3,12 @@
 
 import json
 import re
+import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
-from test_demo import SHOWN
+import yaml
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text()
@@ -15,12 +16,11 @@ README = (ROOT / "README.md").read_text()
 # Shorter than by default: here it is only shown that they run.
 SHORTER = {
     "bash scripts/bench.sh chain": "bash scripts/bench.sh chain --cycles 200",
+    "bash scripts/bench.sh step": "bash scripts/bench.sh step --rounds 2",
     "bash scripts/bench.sh compliance": "bash scripts/bench.sh compliance --steps 200",
 }
-NOT_HERE = {"bash scripts/test.sh"} | {
-    " ".join(("bash scripts/demo.sh", robot, *options, "--lockstep")) for robot, options in SHOWN
-}
-"""What runs this test, and what another one runs."""
+NOT_HERE = {"bash scripts/test.sh"}
+"""What runs this test."""
 
 
 def commands():
@@ -33,10 +33,37 @@ def commands():
     return sorted({SHORTER.get(c, c) for c in found if c} - NOT_HERE)
 
 
-def run(command):
+def run(command, tree=ROOT):
     return subprocess.run(
-        command.split(), cwd=ROOT, capture_output=True, text=True, timeout=300, check=False
+        command.split(), cwd=tree, capture_output=True, text=True, timeout=300, check=False
     )
+
+
+def hurry(entry, factor):
+    """Let a scenario, or an entry in one, last another time."""
+    for key, value in entry.items():
+        if key in ("time", "duration", "period"):
+            entry[key] = factor * value
+        elif isinstance(value, dict):
+            hurry(value, factor)
+
+
+@pytest.fixture(scope="module")
+def hurried(tmp_path_factory):
+    """A tree like this one, with scenarios of half a second; `test_demo.py` plays them in full."""
+    tree = tmp_path_factory.mktemp("tree")
+    (tree / "install").symlink_to(ROOT / "install")
+    (tree / "scripts").mkdir()
+    (tree / "scripts" / "setup.sh").write_text(f"source '{ROOT}/scripts/setup.sh'\n")
+    (tree / "scripts" / "demo.sh").symlink_to(ROOT / "scripts" / "demo.sh")
+    shutil.copytree(ROOT / "config", tree / "config")
+    for path in (tree / "config" / "scenarios").iterdir():
+        scenario = yaml.safe_load(path.read_text())
+        factor = 0.5 / scenario["duration"]
+        for entry in (scenario, *scenario["events"]):
+            hurry(entry, factor)
+        path.write_text(yaml.safe_dump(scenario))
+    return tree
 
 
 def test_there_are_commands():
@@ -45,9 +72,16 @@ def test_there_are_commands():
 
 
 @pytest.mark.parametrize("command", commands())
-def test_command_runs(tmp_path, command):
-    # Only one of them writes where all do by default.
-    result = run(f"{command} --out {tmp_path}" if "--lockstep" in command else command)
+def test_command_runs(hurried, command):
+    if "--lockstep" in command:
+        result = run(command, hurried)
+        assert result.returncode == 0, result.stdout + result.stderr
+        metrics = json.loads((hurried / "results" / "demo" / "metrics.json").read_text())
+        assert metrics["robot"] in command
+        rate = re.search(r"--rate (\d+)", command)
+        assert rate is None or metrics["rate_hz"] == float(rate[1])
+        return
+    result = run(command)
     if command == "bash scripts/demo.sh":
         # In real time, on a machine that may be busy with anything: the promise is for a robot
         # that gets its commands.

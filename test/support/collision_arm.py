@@ -98,8 +98,9 @@ def least_relaxed(
 ) -> np.ndarray:
     """Return the accelerations nearest to those wanted; rows give way only to the bounds."""
     n, k = len(a_des), len(rows.lower)
-    if not k:
-        return np.clip(a_des, a_lower, a_upper)
+    nearest = np.clip(a_des, a_lower, a_upper)
+    if not k or (rows.G @ nearest >= rows.lower).all():
+        return nearest
     H = np.diag(np.r_[np.ones(n), np.full(k, 1e-6)])
     C = np.hstack([rows.G, np.eye(k)])
     qp = proxqp.dense.QP(n + k, 0, k, True)

@@ -2,7 +2,9 @@
 """The additional torque of an arm whose motors give what they are told, less a disturbance."""
 
 import math
+from copy import deepcopy
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -71,7 +73,12 @@ def relative(torque) -> float:
 
 
 def settled(mode, **changed) -> IntegralLoop:
-    """An arm whose additional torque carries a good part of the disturbance."""
+    """An arm whose additional torque carries a good part of the disturbance, to be moved on."""
+    return deepcopy(settled_once(mode, **changed))
+
+
+@cache
+def settled_once(mode, **changed) -> IntegralLoop:
     loop = IntegralLoop(mode, **changed).run(0.4)
     assert relative(loop.additional.last) > 0.03 or mode == "none"
     assert loop.steps(50) < 2e-4

@@ -160,7 +160,7 @@ def test_whole_torque_is_the_paper_s_where_there_is_no_coriolis_torque():
 def test_whole_torque_solves_the_extended_problem():
     rng = np.random.default_rng(3)
     active = 0
-    for _ in range(400):
+    for _ in range(200):
         M, C = random_dynamics(rng, speed=3.0)
         s, budget = rng.normal(size=N), rng.uniform(0.1, 5.0, N)
         torque, leak = uncorrected(IntegralSettings(budget), s, M, C)

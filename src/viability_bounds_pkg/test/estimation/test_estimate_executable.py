@@ -211,14 +211,14 @@ def call(capfd):
     return called
 
 
-def test_gravity_beyond_the_torque(robot, tmp_path):
+def test_gravity_beyond_the_torque(robot, call, tmp_path):
     output = tmp_path / "limits.yaml"
     path = robot(parameters="    torque_max: [5.0, 30.0]")
-    line = one_line(run(path, "--samples", 500, "-o", output))
+    line = one_line(call(path, "--samples", 500, "-o", output))
     assert "joint shoulder" in line and "5 N m" in line
     assert "lower velocities do not help" in line
     assert not output.exists()
-    ended = run(path, "--samples", 500, "-o", output, "--override", "shoulder=-1,1")
+    ended = call(path, "--samples", 500, "-o", output, "--override", "shoulder=-1,1")
     assert (ended.returncode, ended.stderr) == (0, "")
     assert "override, NOT available in" in ended.stdout
     assert parameters_in(output.read_text())["acceleration_max"][0] == 1.0
