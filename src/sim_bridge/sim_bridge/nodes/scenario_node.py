@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import signal
 import sys
 import time
 from collections import deque
@@ -275,6 +276,7 @@ def main(args: list[str] | None = None) -> int:
     try:
         out = parser.parse_args(own_arguments(args)).out
         initialise(args)
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
         node = ScenarioNode()
     except Exception as error:
         rclpy.try_shutdown()
