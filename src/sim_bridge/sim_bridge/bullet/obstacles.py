@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sim_bridge.bullet.vectors import finite_vector
 from viability_bounds_pkg.exceptions import ArmSafetyError
-from viability_bounds_pkg.parameter import Range, above, number
+from viability_bounds_pkg.parameter import Range, above, check, number
 
 Array = NDArray[np.float64]
 
@@ -97,7 +97,7 @@ class ContactMaterial:
     """Friction, stiffness and damping of obstacles; each obstacle moves as a whole.
 
     Raises:
-        ValueError: one of them is not finite, the stiffness not positive, another one negative.
+        SettingError: a value is out of range; named as the node's parameters.
     """
 
     friction: float = number(
@@ -110,8 +110,4 @@ class ContactMaterial:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        for name, low in (("friction", True), ("stiffness", False), ("damping", True)):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and (value > 0.0 or (low and value == 0.0))):
-                least = ">= 0" if low else "> 0"
-                raise ValueError(f"obstacle {name} must be finite and {least}, not {value}")
+        check(self, "obstacle_")

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,7 +26,7 @@ from torque_safety_controller.qp.constraints import AccelerationRange, LinearCon
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.kernel.one_sided_limit import JointTable, make_table
-from viability_bounds_pkg.parameter import Range, above, number
+from viability_bounds_pkg.parameter import Range, above, check, number
 
 Array = NDArray[np.float64]
 
@@ -59,12 +59,9 @@ class CollisionSettings:
     braking: float = 2.0
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise SettingError(f"collision_{f.name}", value, "a finite number >= 0")
-            if value == 0.0 and f.name != "margin":
-                raise SettingError(f"collision_{f.name}", value, "a finite number > 0")
+        check(self, "collision_")
+        if not (math.isfinite(self.braking) and self.braking > 0.0):
+            raise SettingError("collision_braking", self.braking, "a finite number > 0")
 
     @property
     def kept(self) -> float:
