@@ -77,10 +77,13 @@ class EmptyIntervalError(LimitEstimateError):
 
     Attributes:
         joint: its name.
+        a_min: tightest lower limit found, rad/s^2; not negative, or `a_max` is not positive.
+        a_max: tightest upper limit found, rad/s^2.
         q: the state that empties the interval, shape (n,), rad.
         v: its velocity, shape (n,), rad/s.
         torque_max: the torque available, N m.
         suggestion: as given.
+        velocity_max: the velocity limits so scaled, shape (n,), rad/s.
     """
 
     def __init__(
@@ -93,10 +96,12 @@ class EmptyIntervalError(LimitEstimateError):
     ) -> None:
         side = "a_max" if worst.a_max[joint] <= 0 else "a_min"
         self.joint = model.names[1 + joint]
+        self.a_min, self.a_max = float(worst.a_min[joint]), float(worst.a_max[joint])
         self.q: Array = getattr(worst, f"q_at_{side}")[joint]
         self.v: Array = getattr(worst, f"v_at_{side}")[joint]
         self.torque_max = float(space.tau_max[joint])
         self.suggestion = suggestion
+        self.velocity_max = suggestion.scale * space.v_max
         if suggestion.scale == 0.0:
             remedy = (
                 f"lower velocities do not help: joint {suggestion.joint} takes "
@@ -107,13 +112,13 @@ class EmptyIntervalError(LimitEstimateError):
         else:
             remedy = (
                 f"velocity limits scaled by {suggestion.scale:.3f}, to "
-                f"{_text(suggestion.scale * space.v_max)} rad/s, leave every joint "
+                f"{_text(self.velocity_max)} rad/s, leave every joint "
                 f"{USEFUL_ACCELERATION:g} rad/s^2 either way; else narrow the position limits or "
                 "override "
             )
         super().__init__(
             f"joint {self.joint}: its torque of {self.torque_max:.4g} N m leaves no acceleration "
-            f"interval: {side} = {getattr(worst, side)[joint]:.3g} rad/s^2 at "
+            f"interval: {side} = {getattr(self, side):.3g} rad/s^2 at "
             f"q = {_text(self.q)}, v = {_text(self.v)}; {remedy}the joint's acceleration limits "
             f"(--override {self.joint}=MIN,MAX)"
         )

@@ -298,6 +298,20 @@ def _make(kind: type[Configuration], prefix: str, values: Mapping[str, Any]) -> 
     return kind(**made)
 
 
+def check(settings: Any, prefix: str = "") -> None:
+    """Check the parameters of a dataclass that was perhaps not made by `read`.
+
+    Args:
+        settings: the dataclass.
+        prefix: of the parameters' names, as in `group`.
+
+    Raises:
+        SettingError: a value of another type, or not allowed.
+    """
+    for row in _table(type(settings), prefix):
+        row.coerce(getattr(settings, row.name.removeprefix(prefix)))
+
+
 def check_per_joint(name: str, value: Array, joints: Sequence[str]) -> None:
     """Check that parameter `name` has one number for each of `joints`.
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sim_bridge.bullet.vectors import finite_vector
 from viability_bounds_pkg.exceptions import ArmSafetyError
-from viability_bounds_pkg.parameter import Range, above, number
+from viability_bounds_pkg.parameter import Range, above, check, number
 
 Array = NDArray[np.float64]
 
@@ -94,7 +94,11 @@ class Contact(NamedTuple):
 
 @dataclass(frozen=True)
 class ContactMaterial:
-    """Friction, stiffness and damping of obstacles; each obstacle moves as a whole."""
+    """Friction, stiffness and damping of obstacles; each obstacle moves as a whole.
+
+    Raises:
+        SettingError: a value is out of range; named as the node's parameters.
+    """
 
     friction: float = number(
         "Coulomb's coefficient between robot and obstacles", Range(0.0, 10.0), default=0.5
@@ -103,3 +107,7 @@ class ContactMaterial:
         "stiffness of obstacles, N/m; 2e5: 0.5 mm at 100 N", above(0.0, 1e9), default=2e5
     )
     damping: float = number("damping of obstacles, N s/m", Range(0.0, 1e9), default=600.0)
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        check(self, "obstacle_")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arms of robot descriptions, and descriptions rewritten for PyBullet."""
+"""Robot descriptions rewritten for PyBullet."""
 
 from sim_bridge.urdf.preparation import FramePlacement, PreparedUrdf, prepare_urdf
 

@@ -25,7 +25,7 @@ from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.compiled import bound
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.kernel.one_sided_limit import make_table
-from viability_bounds_pkg.parameter import Range, above, number
+from viability_bounds_pkg.parameter import Range, above, check, number
 
 Array = NDArray[np.float64]
 
@@ -58,10 +58,7 @@ class CollisionSettings:
     speed_max: float = number("largest speed of approach, m/s", above(0.0, 10.0), default=1.0)
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.margin < math.inf:
-            raise SettingError("collision_margin", self.margin, "a finite number >= 0")
-        if not 0.0 < self.speed_max < math.inf:
-            raise SettingError("collision_speed_max", self.speed_max, "a finite number > 0")
+        check(self, "collision_")
 
     @property
     def kept(self) -> float:
