@@ -5,8 +5,8 @@
     python3 scripts/packages.py plan sourced|wheels    writes what is to be installed into .venv
     .venv/bin/python scripts/packages.py report        checks and lists what was installed
 
-Runs without any package. Beside a sourced ROS 2, a package of the system that is new enough is used
-instead of a wheel. NumPy always is: ROS' message packages are compiled for it.
+Runs without any package. Beside a sourced ROS 2, a package of the system is used where it is new
+enough, instead of a wheel. NumPy always is: ROS' message packages are compiled for it.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Package(NamedTuple):
 
 
 PACKAGES = (
-    Package("ros-jazzy-rclpy", "rclpy", use=MESSAGES, parts=r"ros-.*|rclpy|.*[-_]msgs|.*_interfaces"),
+    Package("ros-jazzy-rclpy", "rclpy", use=MESSAGES, parts=r"ros-.*|rclpy|.*-msgs|.*-interfaces"),
     Package("numpy", "numpy", "1.26"),
     Package("scipy", "scipy", "1.11", "import scipy.optimize, scipy.linalg"),
     Package("numba", "numba", "0.59", parts="numba|llvmlite"),
@@ -160,7 +160,8 @@ def report() -> None:
     Raises:
         SystemExit: a package does not run, or there is another NumPy than planned.
     """
-    venv, sizes = Path(sys.prefix), {}
+    venv = Path(sys.prefix)
+    sizes: dict[str, float] = {}
     site = next(path for path in sys.path if Path(path).is_relative_to(venv / "lib"))
     for each in metadata.distributions(path=[site]):
         size = sum(file.size or 0 for file in each.files or ())
@@ -179,9 +180,9 @@ def report() -> None:
             print(f"setup: {package.module:12} {module.version:9} system")
             continue
         parts = [n for n in sizes if re.fullmatch(package.parts or package.requirement.lower(), n)]
-        size = sum(sizes.pop(name) for name in parts)
-        print(f"setup: {package.module:12} {module.version:9} wheel {size:6.0f} MB")
-    models = sizes.pop("example-robot-data")
+        megabytes = sum(sizes.pop(name) for name in parts)
+        print(f"setup: {package.module:12} {module.version:9} wheel {megabytes:6.0f} MB")
+    models = sizes.pop("example-robot-data", 0.0)
     print(f"setup: {'robot descriptions':22} wheel {models:6.0f} MB")
     print(f"setup: {'the rest':22} wheel {sum(sizes.values()):6.0f} MB")
     print(f"setup: {'all of .venv':22}       {total:6.0f} MB")

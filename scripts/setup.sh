@@ -42,7 +42,7 @@ print(sys._base_executable if sys.prefix == sys.argv[1] else sys.executable)' "$
 
     # The inputs of an installation; when one of them changes, it is repeated.
     stamp="$venv/.installed"
-    inputs="$(cat "$root"/requirements/*.txt "$root/scripts/packages.py"; echo "$ros"
+    inputs="$(cat "$root"/requirements/*.txt; echo "$ros"
         "$python" --version; [ "$ros" = wheels ] || _packages fingerprint)"
     wanted="$(printf '%s' "$inputs" | sha256sum | cut -d' ' -f1)"
     if [ "$(cat "$stamp" 2>/dev/null)" != "$wanted" ]; then
@@ -90,7 +90,7 @@ _install() {
 }
 
 _pip() {
-    if ! output="$("$venv/bin/python" -m pip install --quiet --disable-pip-version-check \
+    if ! output="$("$venv/bin/python" -m pip install --disable-pip-version-check \
         --constraint "$venv/constraints.txt" "$@" 2>&1)"; then
         _explain "installing packages"
         return 1
@@ -106,15 +106,16 @@ _explain() {
         why+=" $(df -h --output=avail "${TMPDIR:-/tmp}" | tail -n 1) in ${TMPDIR:-/tmp}"
     elif [[ "$output" =~ 'connection broken'|'ConnectTimeout'|'ReadTimeout'|'Max retries' ]]; then
         why="the package index cannot be reached (network, proxy, or pip's configuration)"
-    elif [[ "$output" =~ 'No matching distribution' ]]; then
-        why="the package index has none for $("$python" --version) on $(uname -m)"
-    elif [[ "$output" =~ 'Python.h: No such file'|'g++'.*'No such file'|'gcc'.*'No such file' ]]; then
-        why="no compiler, or no Python headers"
+    elif [[ "$output" =~ 'No matching distribution'|'ResolutionImpossible' ]]; then
+        why="the package index has no versions that fit $("$python" --version) on $(uname -m)"
+    elif [[ "$output" =~ 'Python.h: No such file'|"No such file or directory: '"[^\']*(cc|[gc]\+\+)\' ]]
+    then
+        why="there is no compiler, or Python.h is missing; sudo apt install g++ python3-dev"
     else
         why="see above"
     fi
-    grep -E '^ *(error|ERROR|fatal)|: (fatal )?error[: ]' <<<"$output" | tail -n 3 |
-        cut -c 1-300 >&2
+    grep -E '^ *(error|ERROR|fatal)|: (fatal )?error[: ]|The user requested|^ .* depends on ' \
+        <<<"$output" | tail -n 4 | cut -c 1-300 >&2
     echo "setup: $1 failed: $why" >&2
 }
 

@@ -81,7 +81,7 @@ check_environment() {
     # What cmeel-boost asks for is known not to matter; nothing else may be inconsistent.
     .venv/bin/python -m pip check >"$work/consistency" || true
     cat "$work/consistency"
-    [ "$(grep -vc '^cmeel-boost .* has requirement numpy>=2' "$work/consistency")" -eq 0 ]
+    [ "$(grep -vc '^cmeel-boost .* has requirement numpy' "$work/consistency")" -eq 0 ]
 }
 
 run_tests() {
