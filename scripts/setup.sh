@@ -4,10 +4,10 @@
 #
 #     source scripts/setup.sh
 #
-# With ROS 2 Jazzy sourced, it makes .venv on top of that (system site packages) and adds what is
-# missing. Without, it installs the Jazzy wheels into .venv. Then it builds the three packages
-# with colcon, and compiles what Numba would otherwise compile at the first start of a node. What
-# is done already is not done again.
+# With ROS 2 Jazzy sourced, it makes .venv on top of that (system site packages), keeps the system's
+# NumPy, and adds what is missing. Without, it installs the Jazzy wheels into .venv. Then it builds
+# the three packages with colcon, and compiles what Numba would otherwise compile at the first start
+# of a node. What is done already is not done again. See docs/installation.md.
 
 _setup() {
     local root python venv stamp wanted inputs
@@ -76,7 +76,7 @@ _install() {
             "on Ubuntu: sudo apt install python3-venv" >&2
         return 1
     fi
-    echo "setup: this downloads about 0.6 GB, needs 2 GB in .venv, and takes minutes" >&2
+    echo "setup: this downloads up to 0.5 GB, fills up to 1.8 GB in .venv, and takes minutes" >&2
     if ! output="$("$python" -m venv --clear "${options[@]}" "$venv" 2>&1)"; then
         _explain "making .venv"
         return 1

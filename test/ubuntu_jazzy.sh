@@ -7,7 +7,7 @@
 #
 # The system is a copy of a Python 3.12 with NumPy 1.26.4 and PyBullet, as apt has them, and with
 # ROS' wheels in a folder of their own, found by the variables that sourcing sets. It is kept in the
-# user's cache folder, because building PyBullet takes minutes; remove the folder to start anew.
+# user's cache folder, because building PyBullet takes minutes.
 #
 # Python 3.12: PYTHON312, or python3.12 on PATH. Ends with 77 where there is none.
 set -euo pipefail
@@ -17,9 +17,12 @@ numpy=1.26.4
 say() { echo "ubuntu_jazzy: $*"; }
 
 stage() {
-    local name="$1" start=$SECONDS status=0
+    local name="$1" start=$SECONDS status
     shift
-    "$@" >"$log" 2>&1 || status=$?
+    set +e # `if` and `||` would switch it off inside, too
+    (set -e; "$@") >"$log" 2>&1
+    status=$?
+    set -e
     if [ "$status" -ne 0 ]; then
         cat "$log"
         say "$name: FAILED after $((SECONDS - start)) s"
@@ -54,7 +57,7 @@ make_system() {
     "${pip[@]}" numpy PyYAML
     "${pip[@]}" --prefix "$ros" -r "$root/requirements/wheels.txt"
     "${pip[@]}" pybullet
-    touch "$system/.complete"
+    printf '%s' "$key" >"$system/.complete"
 }
 
 # As /opt/ros/jazzy/setup.bash does.
@@ -77,43 +80,34 @@ check_environment() {
     version="$("$interpreter" -c 'import numpy; print(numpy.__version__, numpy.__file__)')"
     echo "NumPy of the nodes: $version"
     [[ "$version" == "$numpy $system/"* ]]
-    [ -z "$(find .venv -maxdepth 5 -iname 'numpy-*')" ]
+    [ -z "$(find .venv -maxdepth 5 -iname 'numpy-*')" ] # none of its own
     # What cmeel-boost asks for is known not to matter; nothing else may be inconsistent.
     .venv/bin/python -m pip check >"$work/consistency" || true
     cat "$work/consistency"
     [ "$(grep -vc '^cmeel-boost .* has requirement numpy' "$work/consistency")" -eq 0 ]
 }
 
-run_tests() {
-    (
-        set +eu
-        source scripts/setup.sh
-        python -m pytest -q -n "$(nproc)" -p no:cacheprovider src/*/test/node src/*/test/nodes \
-            src/*/test/ros test/test_startup.py
-    )
-}
-
 if ! prefix="$(find_python)"; then
     say "no Python 3.12 that can be copied; skipped (set PYTHON312 to one)"
     exit 77
 fi
-key="$({ cat "$0" "$root/requirements/wheels.txt"; echo "$prefix"; } | sha256sum | cut -c 1-12)"
-cache="${XDG_CACHE_HOME:-$HOME/.cache}/viability_bounds"
-system="$cache/ubuntu_jazzy-$key"
+key="$(cat "$root"/requirements/{wheels,constraints}.txt <(declare -f make_system; echo "$prefix") |
+    sha256sum)"
+system="${XDG_CACHE_HOME:-$HOME/.cache}/viability_bounds/ubuntu_jazzy"
 ros="$system/opt/ros/jazzy"
 work="$(mktemp -d)"
 log="$work/log"
 trap 'rm -rf "$work"' EXIT
-mkdir -p "$cache"
-
-exec {lock}>"$cache/lock"
+# Nobody makes it anew while another run uses it.
+mkdir -p "$(dirname "$system")"
+exec {lock}>"$system.lock"
 flock "$lock"
-if [ -e "$system/.complete" ]; then
+if [ "$(cat "$system/.complete" 2>/dev/null)" = "$key" ]; then
     say "system: kept from before"
 else
     stage "system (Python, NumPy $numpy, ROS' wheels, PyBullet from source)" make_system
 fi
-flock -u "$lock"
+flock --shared "$lock"
 [ "${1:-}" != --system ] || exit 0
 
 source_ros
@@ -122,11 +116,12 @@ mkdir "$work/copy"
 git -C "$root" ls-files -z | tar -C "$root" --null -T - -c | tar -C "$work/copy" -x
 cd "$work/copy"
 stage "set-up" set_up
-cat "$log"
+grep -v compiling "$log"
 stage "set-up again" set_up
 stage "NumPy and consistency" check_environment
 cat "$log"
-stage "tests of the nodes" run_tests
+stage "tests of the nodes" bash scripts/test.sh -q -n "$(nproc)" -p no:cacheprovider \
+    src/*/test/node src/*/test/nodes src/*/test/ros test/test_startup.py
 tail -n 1 "$log"
 stage "demo in lockstep" bash scripts/demo.sh --lockstep --out "$work/demo"
 stage "NumPy after all" check_environment
