@@ -130,6 +130,11 @@ def provided() -> dict[str, str]:
         else:
             why = module.error or f"{module.version} is older than {package.lowest}"
             print(f"setup: the system's {package.module} is not used: {why}")
+    if "pin" not in found and any(map(find_spec, ("eigenpy", "coal", "hppfcl"))):
+        raise SystemExit(
+            "the system's eigenpy or coal cannot be used without its Pinocchio; sudo apt install "
+            "ros-jazzy-pinocchio, or remove them"
+        )
     if "numpy" not in found:
         raise SystemExit("ROS 2 is sourced, but NumPy is missing: sudo apt install python3-numpy")
     return found

@@ -60,6 +60,15 @@ make_system() {
     printf '%s' "$key" >"$system/.complete"
 }
 
+# ROS has a plugin for pytest, with hooks that new versions of pytest do not know.
+add_pytest_plugin() {
+    mkdir -p "$1/launch_testing-1.dist-info"
+    printf 'Name: launch_testing\nVersion: 1\n' >"$1/launch_testing-1.dist-info/METADATA"
+    printf '[pytest11]\nlaunch_testing = launch_testing\n' \
+        >"$1/launch_testing-1.dist-info/entry_points.txt"
+    printf 'def pytest_pycollect_makemodule(path, parent):\n    pass\n' >"$1/launch_testing.py"
+}
+
 # As /opt/ros/jazzy/setup.bash does.
 source_ros() {
     export ROS_DISTRO=jazzy ROS_VERSION=2 ROS_PYTHON_VERSION=3
@@ -67,6 +76,8 @@ source_ros() {
     export PYTHONPATH="$ros/lib/python3.12/site-packages"
     export LD_LIBRARY_PATH="$ros/lib:$(printf '%s:' "$PYTHONPATH"/ros_*.libs)"
     unset VIRTUAL_ENV
+    add_pytest_plugin "$work/plugin"
+    PYTHONPATH+=":$work/plugin"
 }
 
 set_up() {
