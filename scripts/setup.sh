@@ -99,10 +99,12 @@ _pip() {
 
 # Says why a command failed, by its output.
 _explain() {
-    local why
-    if [[ "${output,,}" =~ 'no space left'|'errno 28'|'disk quota exceeded' ]]; then
-        why="no space is left. .venv needs 2 GB; free are"
-        why+=" $(df -h --output=avail "$root/.venv" | tail -n 1) in $root/.venv,"
+    local why free
+    mkdir -p "$venv" 2>/dev/null
+    free="$(df --output=avail "$venv" | tail -n 1)" # KB; ensurepip does not say that it has none
+    if [ "$free" -lt 20000 ] ||
+        [[ "${output,,}" =~ 'no space left'|'errno 28'|'disk quota exceeded' ]]; then
+        why="no space is left. .venv needs 2 GB; free are $((free / 1000)) MB in $venv and"
         why+=" $(df -h --output=avail "${TMPDIR:-/tmp}" | tail -n 1) in ${TMPDIR:-/tmp}"
     elif [[ "$output" =~ 'connection broken'|'ConnectTimeout'|'ReadTimeout'|'Max retries' ]]; then
         why="the package index cannot be reached (network, proxy, or pip's configuration)"

@@ -74,11 +74,16 @@ def test_an_index_out_of_reach(copy):
     assert "setup: installing packages failed: the package index cannot be reached (net" in said
 
 
-def test_a_full_disk(copy):
+@pytest.mark.parametrize(
+    ("size", "doing"), [("5m", "making .venv"), ("60m", "installing packages")]
+)
+def test_a_full_disk(copy, size, doing):
     venv = copy / ".venv"
     venv.mkdir()
     mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=60m", "none", venv], capture_output=True, check=False
+        ["mount", "-t", "tmpfs", "-o", f"size={size}", "none", venv],
+        capture_output=True,
+        check=False,
     )
     if mounted.returncode:
         pytest.skip(f"no small disk can be made here: {mounted.stderr.decode()}")
@@ -93,7 +98,7 @@ def test_a_full_disk(copy):
     finally:
         subprocess.run(["umount", venv], check=True)
     assert code == 1
-    assert "setup: installing packages failed: no space is left. .venv needs 2 GB" in said
+    assert f"setup: {doing} failed: no space is left. .venv needs 2 GB" in said
     assert "network" not in said
 
 
@@ -116,7 +121,19 @@ def test_a_build_without_a_compiler(copy):
     # Only what set-up itself calls.
     tools = copy / "tools"
     tools.mkdir()
-    for tool in ("bash", "cat", "cut", "dirname", "flock", "grep", "sha256sum", "tail", "uname"):
+    for tool in (
+        "bash",
+        "cat",
+        "cut",
+        "df",
+        "dirname",
+        "flock",
+        "grep",
+        "mkdir",
+        "sha256sum",
+        "tail",
+        "uname",
+    ):
         (tools / tool).symlink_to(shutil.which(tool))
     code, said = set_up(copy, PATH=str(tools))
     assert code == 1
