@@ -11,6 +11,7 @@ enough, instead of a wheel. NumPy always is: ROS' message packages are compiled 
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -115,20 +116,23 @@ def provided() -> dict[str, str]:
         SystemExit: a package of the system cannot be used, and would be in the way of its wheel.
     """
     found = {}
+    first = [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
     for package in PACKAGES:
-        if find_spec(package.module) is None:
+        spec = find_spec(package.module)
+        if spec is None:
             continue
         module = try_import(package)
+        why = module.error or f"{module.version} is older than {package.lowest}"
         if not module.error and numbers(module.version) >= numbers(package.lowest):
             found[package.requirement] = module.version
-        elif package.module in ("numpy", "rclpy", "pinocchio"):
-            why = module.error or f"{module.version} is older than {package.lowest}"
+        elif package.module in ("numpy", "rclpy", "pinocchio") or any(
+            Path(spec.origin or "").is_relative_to(path) for path in first
+        ):
             raise SystemExit(
                 f"the system's {package.module} cannot be used ({why}), and would be in the way "
                 "of another one; upgrade or remove it"
             )
         else:
-            why = module.error or f"{module.version} is older than {package.lowest}"
             print(f"setup: the system's {package.module} is not used: {why}")
     if "pin" not in found and any(map(find_spec, ("eigenpy", "coal", "hppfcl"))):
         raise SystemExit(

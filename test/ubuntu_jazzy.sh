@@ -109,6 +109,7 @@ ros="$system/opt/ros/jazzy"
 work="$(mktemp -d)"
 log="$work/log"
 trap 'rm -rf "$work"' EXIT
+trap 'exit 130' INT TERM
 # Nobody makes it anew while another run uses it.
 mkdir -p "$(dirname "$system")"
 exec {lock}>"$system.lock"
