@@ -4,10 +4,10 @@
 #
 #     source scripts/setup.sh
 #
-# With ROS 2 Jazzy sourced, it makes .venv on top of that (system site packages) and adds what is
-# missing. Without, it installs the Jazzy wheels into .venv. Then it builds the three packages
-# with colcon, and compiles what Numba would otherwise compile at the first start of a node. What
-# is done already is not done again.
+# With ROS 2 Jazzy sourced, it makes .venv on top of that (system site packages), keeps the system's
+# NumPy, and adds what is missing. Without, it installs the Jazzy wheels into .venv. Then it builds
+# the three packages with colcon, and compiles what Numba would otherwise compile at the first start
+# of a node. What is done already is not done again. See docs/installation.md.
 
 _setup() {
     local root python venv stamp wanted inputs
@@ -20,20 +20,30 @@ _setup() {
             "$("$python" --version 2>&1 || true). Set PYTHON to another one." >&2
         return 1
     fi
+    # With .venv active, the Python that it was made from.
+    python="$("$python" -c 'import sys
+print(sys._base_executable if sys.prefix == sys.argv[1] else sys.executable)' "$venv")"
 
-    local ros=wheels
-    if [ "${ROS_DISTRO:-}" = jazzy ] && "$python" -c 'import rclpy' 2>/dev/null; then
-        ros=sourced
-    elif [ -n "${ROS_DISTRO:-}" ] && [ "$ROS_DISTRO" != jazzy ]; then
+    local ros=wheels reason
+    if [ -n "${ROS_DISTRO:-}" ] && [ "$ROS_DISTRO" != jazzy ]; then
         echo "setup: ROS 2 '$ROS_DISTRO' is sourced, but this is for Jazzy;" \
             "open a shell without it." >&2
         return 1
+    elif [ -n "${ROS_DISTRO:-}" ]; then
+        if reason="$("$python" -c 'import rclpy' 2>&1)"; then
+            ros=sourced
+        elif [[ "$reason" != *"No module named 'rclpy'" ]]; then
+            echo "setup: ROS 2 Jazzy is sourced, but not for '$python'" \
+                "($("$python" --version 2>&1)): $(tail -n 1 <<<"$reason")." \
+                "Set PYTHON to the one that ROS uses, such as /usr/bin/python3." >&2
+            return 1
+        fi
     fi
 
     # The inputs of an installation; when one of them changes, it is repeated.
     stamp="$venv/.installed"
-    inputs="$(cat "$root/requirements/common.txt" "$root/requirements/$ros.txt" \
-        "$root/requirements/constraints.txt"; echo "$ros"; "$python" --version)"
+    inputs="$(cat "$root"/requirements/*.txt; echo "$ros"
+        "$python" --version; [ "$ros" = wheels ] || _packages fingerprint)"
     wanted="$(printf '%s' "$inputs" | sha256sum | cut -d' ' -f1)"
     if [ "$(cat "$stamp" 2>/dev/null)" != "$wanted" ]; then
         _install || return 1
@@ -48,49 +58,80 @@ _setup() {
     _compile
 }
 
+_packages() {
+    "$python" "$root/scripts/packages.py" "$@"
+}
+
 _install() {
-    local options=()
+    local options=() output
     if [ "$ros" = sourced ]; then
-        echo "setup: ROS 2 Jazzy is sourced; making .venv on top of it" >&2
+        echo "setup: ROS 2 Jazzy is sourced; making .venv on top of its Python packages" >&2
         options+=(--system-site-packages)
     else
-        if [ "${ROS_DISTRO:-}" = jazzy ]; then
-            echo "setup: ROS 2 Jazzy is sourced, but '$python' cannot import its rclpy" >&2
-        fi
+        [ -z "${ROS_DISTRO:-}" ] || echo "setup: '$python' has no rclpy" >&2
         echo "setup: no usable ROS 2; installing the Jazzy wheels into .venv" >&2
     fi
-    if ! "$python" -m venv --clear "${options[@]}" "$venv"; then
-        echo "setup: '$python -m venv' failed; on Ubuntu: sudo apt install python3-venv" >&2
+    if ! "$python" -c 'import ensurepip, venv' 2>/dev/null; then
+        echo "setup: '$python' cannot make virtual environments;" \
+            "on Ubuntu: sudo apt install python3-venv" >&2
         return 1
     fi
-    cp "$root/requirements/constraints.txt" "$venv/constraints.txt"
-    if [ "$ros" = sourced ]; then
-        # ROS' message packages are compiled for the system's NumPy, so that version is kept.
-        local numpy
-        numpy="$("$python" -c 'import numpy; print(numpy.__version__)')" || return 1
-        sed -i "s/^numpy==.*/numpy==$numpy/" "$venv/constraints.txt"
-    fi
-    local pip=("$venv/bin/python" -m pip install --quiet --disable-pip-version-check
-        --constraint "$venv/constraints.txt")
-    if ! "${pip[@]}" -r "$root/requirements/common.txt" -r "$root/requirements/$ros.txt"; then
-        echo "setup: installing packages failed (is there a network?); run it again to retry" >&2
+    echo "setup: this downloads up to 0.5 GB, fills up to 1.8 GB in .venv, and takes minutes" >&2
+    if ! output="$("$python" -m venv --clear "${options[@]}" "$venv" 2>&1)"; then
+        _explain "making .venv"
         return 1
     fi
-    _install_pybullet
+    _packages plan "$ros" >&2 || return 1
+    _install_pybullet || return 1
+    # Without dependencies what would replace the system's NumPy, see requirements/pinocchio.txt.
+    [ ! -s "$venv/no_deps.txt" ] || _pip --no-deps -r "$venv/no_deps.txt" || return 1
+    _pip -r "$venv/requirements.txt" || return 1
+    "$venv/bin/python" "$root/scripts/packages.py" report >&2
+}
+
+_pip() {
+    if ! output="$("$venv/bin/python" -m pip install --disable-pip-version-check \
+        --constraint "$venv/constraints.txt" "$@" 2>&1)"; then
+        _explain "installing packages"
+        return 1
+    fi
+}
+
+# Says why a command failed, by its output.
+_explain() {
+    local why free
+    mkdir -p "$venv" 2>/dev/null
+    free="$(df --output=avail "$venv" | tail -n 1)" # KB; ensurepip does not say that it has none
+    if [ "$free" -lt 20000 ] ||
+        [[ "${output,,}" =~ 'no space left'|'errno 28'|'disk quota exceeded' ]]; then
+        why="no space is left. .venv needs 2 GB; free are $((free / 1000)) MB in $venv and"
+        why+=" $(df -h --output=avail "${TMPDIR:-/tmp}" | tail -n 1) in ${TMPDIR:-/tmp}"
+    elif [[ "$output" =~ 'connection broken'|'ConnectTimeout'|'ReadTimeout'|'Max retries' ]]; then
+        why="the package index cannot be reached (network, proxy, or pip's configuration)"
+    elif [[ "$output" =~ 'No matching distribution'|'ResolutionImpossible' ]]; then
+        why="the package index has no versions that fit $("$python" --version) on $(uname -m)"
+    elif [[ "$output" =~ 'Python.h: No such file'|"No such file or directory: '"[^\']*(cc|[gc]\+\+)\' ]]
+    then
+        why="there is no compiler, or Python.h is missing; sudo apt install g++ python3-dev"
+    else
+        why="see above"
+    fi
+    grep -E '^ *(error|ERROR|fatal)|: (fatal )?error[: ]|The user requested|^ .* depends on ' \
+        <<<"$output" | tail -n 4 | cut -c 1-300 >&2
+    echo "setup: $1 failed: $why" >&2
 }
 
 _install_pybullet() {
-    if "$venv/bin/python" -c 'import pybullet' 2>/dev/null; then
+    if "$venv/bin/python" -c 'import pybullet' >/dev/null 2>&1; then
         return 0
     fi
-    if ! "$venv/bin/python" -c 'import sys; sys.exit(sys.version_info >= (3, 12))'; then
-        echo "setup: PyBullet has no wheel for this Python; building it takes minutes and g++." \
-            "On Ubuntu 'sudo apt install python3-pybullet' is faster." >&2
+    if "$python" -c 'import sys; sys.exit(sys.version_info >= (3, 12))'; then
+        _pip pybullet
+        return
     fi
-    if ! "${pip[@]}" pybullet; then
-        echo "setup: installing PyBullet failed; install g++, or python3-pybullet" >&2
-        return 1
-    fi
+    echo "setup: PyBullet has no wheel for this Python; building it takes 5 to 10 minutes, g++ and" \
+        "python3-dev. On Ubuntu 'sudo apt install python3-pybullet' is faster." >&2
+    _pip pybullet
 }
 
 _build() {
@@ -133,6 +174,6 @@ flock "$_lock"
 _setup
 _status=$?
 exec {_lock}>&-
-unset -f _setup _install _install_pybullet _build _compile
+unset -f _setup _packages _install _pip _explain _install_pybullet _build _compile
 unset _lock
 (exit $_status)

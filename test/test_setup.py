@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Set-up that cannot succeed says why, in a copy of its files and without a network.
+
+That it succeeds beside a sourced ROS 2 is for `test/ubuntu_jazzy.sh` to show.
+"""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PYTHON = sys._base_executable
+PYBULLET = "pybullet-3.2.7"
+
+
+@pytest.fixture
+def copy(tmp_path):
+    """What set-up needs until it builds, and an empty `index` where pip looks for packages."""
+    for folder in ("scripts", "requirements"):
+        shutil.copytree(ROOT / folder, tmp_path / folder)
+    (tmp_path / "index").mkdir()
+    return tmp_path
+
+
+def set_up(copy, **environment):
+    """Run set-up in a copy; return its exit code and what it said."""
+    away = ("VIRTUAL_ENV", "PYTHONPATH", "ROS_DISTRO", "AMENT_PREFIX_PATH")
+    inherited = {name: value for name, value in os.environ.items() if name not in away}
+    inherited = {n: value for n, value in inherited.items() if not n.startswith("PIP_")}
+    offline = {"PIP_CONFIG_FILE": os.devnull, "PIP_NO_INDEX": "1", "PIP_NO_CACHE_DIR": "1"}
+    ended = subprocess.run(
+        ["bash", "-c", "source scripts/setup.sh"],
+        cwd=copy,
+        env=inherited
+        | offline
+        | {"PYTHON": PYTHON, "PIP_FIND_LINKS": str(copy / "index")}
+        | {name: value for name, value in environment.items() if value is not None},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    return ended.returncode, ended.stdout + ended.stderr
+
+
+def python_with(folder, name, start):
+    """Make a folder for PYTHONPATH with a module or, as `sitecustomize`, code for each start."""
+    folder.mkdir()
+    (folder / f"{name}.py").write_text(start)
+    return str(folder)
+
+
+def test_an_index_without_the_package(copy):
+    code, said = set_up(copy)
+    assert code == 1
+    assert "setup: installing packages failed: the package index has no versions that fit" in said
+    assert "The user requested" in said
+    assert "pybullet==3.2.7" in said
+    assert "network" not in said
+
+
+def test_an_index_out_of_reach(copy):
+    # Nothing listens at port 9.
+    unreachable = {"PIP_NO_INDEX": "0", "PIP_INDEX_URL": "http://127.0.0.1:9/", "PIP_RETRIES": "1"}
+    code, said = set_up(copy, **unreachable)
+    assert code == 1
+    assert "setup: installing packages failed: the package index cannot be reached (net" in said
+
+
+@pytest.mark.parametrize(
+    ("size", "doing"), [("5m", "making .venv"), ("60m", "installing packages")]
+)
+def test_a_full_disk(copy, size, doing):
+    venv = copy / ".venv"
+    venv.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={size}", "none", venv],
+        capture_output=True,
+        check=False,
+    )
+    if mounted.returncode:
+        pytest.skip(f"no small disk can be made here: {mounted.stderr.decode()}")
+    try:
+        name = copy / "index" / f"{PYBULLET}-py3-none-any.whl"
+        with zipfile.ZipFile(name, "w", zipfile.ZIP_DEFLATED) as wheel:
+            wheel.writestr("pybullet_data.bin", bytes(100_000_000))
+            wheel.writestr(f"{PYBULLET}.dist-info/METADATA", "Name: pybullet\nVersion: 3.2.7\n")
+            wheel.writestr(f"{PYBULLET}.dist-info/WHEEL", "Wheel-Version: 1.0\n")
+            wheel.writestr(f"{PYBULLET}.dist-info/RECORD", "")
+        code, said = set_up(copy)
+    finally:
+        subprocess.run(["umount", venv], check=True)
+    assert code == 1
+    assert f"setup: {doing} failed: no space is left. .venv needs 2 GB" in said
+    assert "network" not in said
+
+
+def test_a_build_without_a_compiler(copy):
+    """A source package whose build calls the compiler, as PyBullet's does."""
+    source = copy / PYBULLET
+    source.mkdir()
+    (source / "PKG-INFO").write_text("Metadata-Version: 2.1\nName: pybullet\nVersion: 3.2.7\n")
+    (source / "pyproject.toml").write_text(
+        '[build-system]\nrequires = []\nbuild-backend = "build"\nbackend-path = ["."]\n'
+    )
+    # The way that PyBullet's own build ends.
+    (source / "build.py").write_text(
+        "import subprocess\ndef build_wheel(folder, settings=None, metadata=None):\n"
+        "    try:\n        subprocess.run(['g++', '--version'], check=True)\n"
+        "    except OSError as error:\n        raise SystemExit(f'error: {error}')\n"
+    )
+    with tarfile.open(copy / "index" / f"{PYBULLET}.tar.gz", "w:gz") as archive:
+        archive.add(source, arcname=PYBULLET)
+    # Only what set-up itself calls.
+    tools = copy / "tools"
+    tools.mkdir()
+    for tool in (
+        "bash",
+        "cat",
+        "cut",
+        "df",
+        "dirname",
+        "flock",
+        "grep",
+        "mkdir",
+        "sha256sum",
+        "tail",
+        "uname",
+    ):
+        (tools / tool).symlink_to(shutil.which(tool))
+    code, said = set_up(copy, PATH=str(tools))
+    assert code == 1
+    assert "No such file or directory: 'g++'" in said
+    assert "setup: installing packages failed: there is no compiler, or Python.h is" in said
+
+
+def test_a_python_that_cannot_make_environments(copy):
+    # As on Ubuntu without python3-venv.
+    blocked = python_with(
+        copy / "path", "sitecustomize", "import sys\nsys.modules['ensurepip']=None"
+    )
+    code, said = set_up(copy, PYTHONPATH=blocked)
+    assert code == 1
+    assert "cannot make virtual environments; on Ubuntu: sudo apt install python3-venv" in said
+
+
+def test_ros_for_another_python(copy):
+    path = python_with(
+        copy / "path", "rclpy", "raise ImportError('no module _rclpy for this one')"
+    )
+    code, said = set_up(copy, ROS_DISTRO="jazzy", PYTHONPATH=path)
+    assert code == 1
+    assert "setup: ROS 2 Jazzy is sourced, but not for" in said
+    assert "no module _rclpy for this one. Set PYTHON to the one that ROS uses" in said
+
+
+def test_another_ros(copy):
+    code, said = set_up(copy, ROS_DISTRO="humble")
+    assert code == 1
+    assert said.strip() == (
+        "setup: ROS 2 'humble' is sourced, but this is for Jazzy; open a shell without it."
+    )
+
+
+def test_a_system_package_in_the_way(copy):
+    """Libraries of a Pinocchio that cannot be used would be loaded by the wheel's."""
+    path = Path(python_with(copy / "path", "rclpy", ""))
+    (path / "sensor_msgs").mkdir()
+    (path / "sensor_msgs" / "__init__.py").write_text("")
+    (path / "sensor_msgs" / "msg.py").write_text("def JointState(position):\n    pass\n")
+    (path / "numpy.py").write_text("__version__ = '1.26.4'\n")
+    (path / "pinocchio.py").write_text("__version__ = '3.7.0'\n")
+    (path / "coal.py").write_text("raise ImportError('no coal here')\n")
+    code, said = set_up(copy, ROS_DISTRO="jazzy", PYTHONPATH=str(path))
+    assert code == 1
+    assert "setup: the system's pinocchio cannot be used (ImportError: no coal here)" in said
+
+
+def test_the_page_on_installation():
+    """Its commands run, and the lines that it explains are those that set-up says."""
+    page = (ROOT / "docs" / "installation.md").read_text()
+    commands = "".join(re.findall(r"```bash\n(.*?)```", page, re.DOTALL))
+    assert "setup.sh" in commands
+    ended = subprocess.run(
+        ["bash", "-ec", commands], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 0, ended.stderr
+    said = "".join((ROOT / "scripts" / name).read_text() for name in ("setup.sh", "packages.py"))
+    explained = re.findall(r"^\| `(.*?)` \|", page, re.MULTILINE)
+    assert len(explained) > 5
+    for line in explained:
+        for part in re.split(r" ?\.\.\.,? ?", line):
+            assert part in said, line
+
+
+def test_the_page_names_the_versions():
+    page = (ROOT / "docs" / "installation.md").read_text()
+    pins = (ROOT / "requirements" / "constraints.txt").read_text()
+    for label, package in {
+        "SciPy": "scipy",
+        "Numba": "numba",
+        "Pinocchio with coal": "pin",
+        "ProxSuite": "proxsuite",
+        "DAQP": "daqp",
+        "PyBullet": "pybullet",
+        "Matplotlib": "matplotlib",
+        "robot descriptions": "example-robot-data",
+    }.items():
+        (row,) = re.findall(rf"^\| {label} \|.*\|$", page, re.MULTILINE)
+        assert re.search(rf"^{package}==(\S+?);?(?: |$)", pins, re.MULTILINE)[1] in row
