@@ -124,7 +124,8 @@ DIAGNOSTICS = Topic(
     QoSProfile(depth=10),
     ("bounds_node", "controller_node", "bullet_node"),
     ("scenario_node",),
-    "mode and why, refused messages by reason, margins, latency, solver, closest approach",
+    "mode and why, refused messages by reason, margins, latency, solver, closest approach; the "
+    "name of a status is that of its node with the namespace, as in `left/bullet_node`",
 )
 SHARED_TOPICS = (
     JOINT_STATES,
