@@ -15,9 +15,16 @@ from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
 from sim_bridge.nodes.bullet_node import BulletNode
+from sim_bridge.nodes.topics import EXTERNAL_WRENCH, OBSTACLES
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import build_model, inertia_beyond, read_urdf
-from viability_bounds_pkg.ros.runtime import GOAL_QOS, LATCHED_QOS, set_stamp, stamp_to_ns
+from viability_bounds_pkg.ros.runtime import (
+    CONTROL_QOS,
+    GOAL_QOS,
+    LATCHED_QOS,
+    set_stamp,
+    stamp_to_ns,
+)
 
 ARM = load_arm("panda")
 VALUES = read_config("panda", "bullet_node")
@@ -435,6 +442,14 @@ def test_obstacles_that_cannot_be_are_dropped_and_counted(ros):
     ros.wait_until(lambda: "obstacles: 8;" in robot.reported("commands_refused"))
     assert not robot.node._robot.obstacles
     np.testing.assert_allclose(robot.q, Q, atol=1e-6)
+
+
+def test_a_publisher_of_pushes_or_obstacles_that_cannot_be_heard_is_refused(ros):
+    robot = RobotProbe(ros)
+    for topic in (EXTERNAL_WRENCH, OBSTACLES):
+        ros.probe.create_publisher(topic.message, topic.name, CONTROL_QOS)
+        refusal = f"{topic.name}: 1;"
+        ros.wait_until(lambda text=refusal: text in robot.reported("commands_refused"), refusal)
 
 
 @pytest.mark.parametrize(("link", "force"), [("no_such_link", 1.0), ("panda_link4", math.nan)])
