@@ -103,7 +103,8 @@ JOINT_STATES = Topic(
     ("bullet_node",),
     ("bounds_node", "controller_node", "scenario_node"),
     "positions, rad, and velocities, rad/s; `effort` is the torque of the motors, N m; joints in "
-    "any order, further joints are ignored; the stamp names the control step",
+    "any order, further joints are ignored; the stamp names the control step; `bullet_node` sends "
+    "the movable joints that are locked, too",
 )
 ACCELERATION_LIMITS = Topic(
     "acceleration_limits",
