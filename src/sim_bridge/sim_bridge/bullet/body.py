@@ -51,6 +51,7 @@ class BulletBody:
 
     Attributes:
         description: URDF, moving joints, and where others are locked.
+        locked: positions of all other movable joints by name, rad or m.
         obstacles: all other bodies in the world; the collision shapes of the robot's meshes, with
             which it touches them, are their convex hulls.
         sensor: the force/torque sensor; None if there is none.
@@ -91,7 +92,7 @@ class BulletBody:
             self.sensor = ForceTorqueSensor(
                 *self.description, sensor_frame, mass_scales, gravity, physics_dt
             )
-        self._frames = prepared.frames
+        self._frames, self.locked = prepared.frames, prepared.locked
         self._wrenches: dict[str, LinkWrench] = {}
         self._bullet = bullet = BulletClient()
         self.client_id = bullet.id

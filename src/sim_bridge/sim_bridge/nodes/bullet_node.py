@@ -92,7 +92,12 @@ class BulletNode(ArmNode):
         self._ft_publisher = FT_WRENCH.publisher(self) if self._robot.sensor else None
         self._restart()
 
-        self._state = JointState(name=list(config.joints))
+        # Joints that are locked, too: robot_state_publisher places no link without its joint.
+        locked = self._robot.locked
+        self._locked_at = array("d", locked.values())
+        self._at_rest = array("d", [0.0] * len(locked))
+        self._joints = list(config.joints)
+        self._state = JointState(name=[*self._joints, *locked])
         self._state_publisher = JOINT_STATES.publisher(self)
         self._clock_publisher = CLOCK.publisher(self) if config.publish_clock else None
         description = ROBOT_DESCRIPTION.publisher(self)
@@ -139,9 +144,9 @@ class BulletNode(ArmNode):
         self._advanced = False
         q, v, tau = self._robot.state()
         state = self._state
-        state.position = array("d", q.tobytes())
-        state.velocity = array("d", v.tobytes())
-        state.effort = array("d", tau.tobytes())
+        state.position = array("d", q.tobytes()) + self._locked_at
+        state.velocity = array("d", v.tobytes()) + self._at_rest
+        state.effort = array("d", tau.tobytes()) + self._at_rest
         set_stamp(state.header.stamp, self._stamp)
         if self._clock_publisher is not None:
             self._clock_publisher.publish(ClockMessage(clock=state.header.stamp))
@@ -210,7 +215,7 @@ class BulletNode(ArmNode):
         if self._paused:
             return
         try:
-            command = read_command(message, self._state.name)
+            command = read_command(message, self._joints)
         except CommandError as error:
             self._refused[str(error)] += 1
             return

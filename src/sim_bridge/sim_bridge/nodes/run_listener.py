@@ -32,7 +32,8 @@ class RunListener:
         stamp: of the last state, ns; -1 before the first.
         q: positions in it, shape (n,), rad.
         answered: stamp of the last command, ns; -1 before the first.
-        diagnostics: the last ones of each node, values by key, by node name.
+        diagnostics: the last ones of each node in the namespace of `node`, values by key, by node
+            name.
     """
 
     def __init__(self, node: Node, joints: Sequence[str]) -> None:
@@ -40,6 +41,10 @@ class RunListener:
         self.q: Array = np.zeros(len(joints))
         self.diagnostics: dict[str, dict[str, str]] = {
             name: {} for name in ("bullet_node", "controller_node", "bounds_node")
+        }
+        namespace = node.get_namespace().strip("/")
+        self._senders = {
+            f"{namespace}/{name}" if namespace else name: name for name in self.diagnostics
         }
         self._joints = tuple(joints)
         self._reader = JointStateReader(joints)
@@ -93,6 +98,6 @@ class RunListener:
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            if status.name in self.diagnostics:
+            if sender := self._senders.get(status.name):
                 values = {value.key: value.value for value in status.values}
-                self.diagnostics[status.name] = values
+                self.diagnostics[sender] = values

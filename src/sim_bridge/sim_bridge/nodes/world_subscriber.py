@@ -45,7 +45,7 @@ class WorldSubscriber:
         robot: that the wrenches and obstacles act on.
         wrench_timeout: duration of a wrench unless another message for its link has come or waits
             for its time, s of robot time.
-        refused: counts the refused messages by topic.
+        refused: counts the refused messages and publishers by topic.
 
     Attributes:
         wrench_ends: when the wrench on each link ends unless another message comes, ns.
@@ -59,8 +59,11 @@ class WorldSubscriber:
         self._wrench_timeout = round(1e9 * wrench_timeout)
         self._pending: list[_Change] = []
         self.wrench_ends: dict[str, int] = {}
-        EXTERNAL_WRENCH.subscription(node, self._on_wrench)
-        OBSTACLES.subscription(node, self._on_obstacles)
+        for topic, callback in (
+            (EXTERNAL_WRENCH, self._on_wrench),
+            (OBSTACLES, self._on_obstacles),
+        ):
+            topic.subscription(node, callback, partial(self._refuse, topic.name))
 
     def __len__(self) -> int:
         """Return the number of messages that wait for their time."""
@@ -150,9 +153,9 @@ class WorldSubscriber:
         if not self._robot.obstacles.remove(name):
             raise ObstacleError(f"there is no obstacle {name!r}")
 
-    def _refuse(self, topic: str, error: Exception) -> None:
+    def _refuse(self, topic: str, reason: Exception | str) -> None:
         self._refused[topic] += 1
-        self._logger.warning(f"{topic} refused: {error}")
+        self._logger.warning(f"{topic} refused: {reason}")
 
 
 def _placed(obstacle: Obstacle, frame: pin.SE3) -> Obstacle:

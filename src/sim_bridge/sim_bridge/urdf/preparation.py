@@ -69,6 +69,7 @@ class PreparedUrdf:
     principal_inertias: Mapping[str, Array]  # to set for each link left, shape (3,), kg m^2
     rotors: Mapping[str, str]  # the joint of the rotor that belongs to a joint, where there is one
     missing: Sequence[str]  # meshes of collision shapes that cannot be found and are left out
+    locked: Mapping[str, float]  # the other movable joints of the original URDF, rad or m
 
 
 @dataclass
@@ -176,15 +177,25 @@ def prepare_urdf(
         rotors[joint_name] = rotor = f"{joint_name} rotor"
         _append_rotor(output, bodies[0].name, rotor)
         inertias[rotor] = np.full(3, inertia)
-    return PreparedUrdf(tostring(output, encoding="unicode"), frames, inertias, rotors, missing)
+    others = {
+        name: locked.get(name, 0.0)
+        for name, kind in _joint_types(root).items()
+        if kind in _MOVABLE and name not in joints
+    }
+    text = tostring(output, encoding="unicode")
+    return PreparedUrdf(text, frames, inertias, rotors, missing, others)
+
+
+def _joint_types(root: Element) -> dict[str, str]:
+    return {joint.get("name", ""): joint.get("type", "") for joint in root.findall("joint")}
 
 
 def _check_joints(root: Element, joints: Sequence[str], locked: Mapping[str, float]) -> None:
     """Raise `RobotDescriptionError` unless each joint named exists and can do its part."""
-    types = {joint.get("name"): joint.get("type") for joint in root.findall("joint")}
+    types = _joint_types(root)
     for name in (*joints, *locked):
         if name not in types:
-            known = ", ".join(str(n) for n, kind in types.items() if kind != "fixed")
+            known = ", ".join(name for name, kind in types.items() if kind != "fixed")
             raise RobotDescriptionError(f"unknown joint {name!r}; the URDF has: {known}")
         if types[name] not in _MOVABLE:
             raise RobotDescriptionError(f"joint {name!r} is {types[name]}, none of {_MOVABLE}")

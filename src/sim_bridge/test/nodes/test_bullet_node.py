@@ -7,6 +7,7 @@ import pinocchio as pin
 import pytest
 from arms import load_arm
 from geometry_msgs.msg import WrenchStamped
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from ros_harness import ROOT, joint_state, names_parameter, read_config
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -15,9 +16,16 @@ from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
 from sim_bridge.nodes.bullet_node import BulletNode
+from sim_bridge.nodes.topics import EXTERNAL_WRENCH, OBSTACLES
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import build_model, inertia_beyond, read_urdf
-from viability_bounds_pkg.ros.runtime import GOAL_QOS, LATCHED_QOS, set_stamp, stamp_to_ns
+from viability_bounds_pkg.ros.runtime import (
+    CONTROL_QOS,
+    GOAL_QOS,
+    LATCHED_QOS,
+    set_stamp,
+    stamp_to_ns,
+)
 
 ARM = load_arm("panda")
 VALUES = read_config("panda", "bullet_node")
@@ -42,11 +50,15 @@ class RobotProbe:
 
     @property
     def q(self):
-        return np.array(self.states[-1].position)
+        return np.array(self.states[-1].position[:7])
 
     @property
     def v(self):
-        return np.array(self.states[-1].velocity)
+        return np.array(self.states[-1].velocity[:7])
+
+    @property
+    def tau(self):
+        return np.array(self.states[-1].effort[:7])
 
     def gravity(self):
         return pin.computeGeneralizedGravity(ARM.model, ARM.model.createData(), self.q)
@@ -96,7 +108,7 @@ def test_each_command_with_the_right_stamp_moves_time_by_one_period(ros):
     assert first == PERIOD
     robot.step(times=5)
     assert robot.stamp == first + 5 * PERIOD
-    assert robot.states[-1].name == JOINTS
+    assert robot.states[-1].name[:7] == JOINTS
     np.testing.assert_allclose(robot.q, Q, atol=1e-6)
 
 
@@ -159,7 +171,7 @@ def test_effort_is_the_torque_that_the_motors_gave(ros):
     robot = RobotProbe(ros)
     tau = robot.gravity() + 0.5
     robot.step(tau)
-    np.testing.assert_allclose(robot.states[-1].effort, tau, rtol=1e-12)
+    np.testing.assert_allclose(robot.tau, tau, rtol=1e-12)
 
 
 def test_other_joints_in_a_command_are_ignored(ros):
@@ -167,14 +179,14 @@ def test_other_joints_in_a_command_are_ignored(ros):
     stamp, tau = robot.stamp, robot.gravity()
     robot.send(stamp, [math.nan, *tau], ["other", *JOINTS])
     ros.wait_until(lambda: robot.stamp > stamp, "the next state")
-    np.testing.assert_allclose(robot.states[-1].effort, tau, rtol=1e-12)
+    np.testing.assert_allclose(robot.tau, tau, rtol=1e-12)
 
 
 def test_positions_are_held_by_the_drives(ros):
     robot = RobotProbe(ros)
     robot.move(Q, times=30)
     np.testing.assert_allclose(robot.q, Q, rtol=0.0, atol=1e-3)
-    np.testing.assert_allclose(robot.states[-1].effort, robot.gravity(), atol=0.05)
+    np.testing.assert_allclose(robot.tau, robot.gravity(), atol=0.05)
     robot.await_reported("control", "position")
     goal = Q + np.linspace(-0.1, 0.1, 7)
     robot.move(goal, times=400)
@@ -199,10 +211,10 @@ def test_positions_may_come_in_any_order_and_with_velocities(ros):
 def test_control_changes_at_any_time_without_a_jump(ros):
     robot = RobotProbe(ros)
     robot.step(times=5)
-    tau = np.array(robot.states[-1].effort)
+    tau = robot.tau
     q, v = robot.q, robot.v
     robot.move(q + v * PERIOD * 1e-9, v)
-    assert (np.abs(np.array(robot.states[-1].effort) - tau) < 1e-3 * np.abs(tau).max()).all()
+    assert (np.abs(robot.tau - tau) < 1e-3 * np.abs(tau).max()).all()
     robot.move(q, times=20)
     robot.send(robot.stamp, robot.gravity(), q=Q + 1.0)  # efforts win
     robot.await_reported("control", "torque")
@@ -274,7 +286,7 @@ def test_talos_stands_still_by_its_friction_alone(ros):
         stamp = stamp_to_ns(states[-1].header.stamp)
         commands.publish(joint_state(values["joints"], stamp, tau=tau))
         ros.wait_until(lambda s=stamp: stamp_to_ns(states[-1].header.stamp) > s)
-    np.testing.assert_allclose(states[-1].position, q, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(states[-1].position[: len(q)], q, rtol=0.0, atol=1e-12)
 
 
 def test_without_stiction_of_its_own_a_joint_has_that_of_coulomb(ros):
@@ -437,6 +449,14 @@ def test_obstacles_that_cannot_be_are_dropped_and_counted(ros):
     np.testing.assert_allclose(robot.q, Q, atol=1e-6)
 
 
+def test_a_publisher_of_pushes_or_obstacles_that_cannot_be_heard_is_refused(ros):
+    robot = RobotProbe(ros)
+    for topic in (EXTERNAL_WRENCH, OBSTACLES):
+        ros.probe.create_publisher(topic.message, topic.name, CONTROL_QOS)
+        refusal = f"{topic.name}: 1;"
+        ros.wait_until(lambda text=refusal: text in robot.reported("commands_refused"), refusal)
+
+
 @pytest.mark.parametrize(("link", "force"), [("no_such_link", 1.0), ("panda_link4", math.nan)])
 def test_a_push_that_cannot_be_is_refused(ros, link, force):
     robot = RobotProbe(ros)
@@ -508,6 +528,32 @@ def test_contacts_are_felt_by_motion_sensor_and_diagnostics(ros):
     tool = inertia_beyond(read_urdf(VALUES["robot_description"]), VALUES["ft_frame"])
     ros.wait_until(lambda: felt.stamps[-1] == robot.stamp)
     assert felt[-1].wrench.force.z == pytest.approx(9.81 * tool.mass - 15.0, abs=1.5)
+
+
+@pytest.mark.parametrize("robot", ["panda", "talos_left_arm"])
+def test_robot_state_publisher_can_place_every_link(ros, robot):
+    """It reads the description, and the joints by name: those that are locked, too."""
+    node = ros.start(BulletNode, read_config(robot, "bullet_node") | {"clock": "lockstep"})
+    states = ros.listen(JointState, "joint_states", qos_profile_sensor_data)
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    descriptions = ros.listen(String, "robot_description", latched)
+    ros.wait_until(lambda: states and descriptions)
+    state, model = states[-1], pin.buildModelFromXML(descriptions[0].data)
+    assert set(state.name) == set(model.names) - {"universe"}
+    q, data = pin.neutral(model), model.createData()
+    for name, position in zip(state.name, state.position, strict=True):
+        joint = model.joints[model.getJointId(name)]
+        angle = [math.cos(position), math.sin(position)]  # of a continuous joint
+        q[joint.idx_q : joint.idx_q + joint.nq] = [position] if joint.nq == 1 else angle
+    pin.framesForwardKinematics(model, data, q)
+    links = [f.name for f in model.frames if f.type == pin.FrameType.BODY and f.name != "universe"]
+    for link in links:
+        placed = data.oMf[model.getFrameId(link, pin.FrameType.BODY)]
+        simulated = node._robot.link_pose(link)
+        np.testing.assert_allclose(placed.homogeneous, simulated.homogeneous, atol=1e-6)
+    others = slice(len(node._config.joints), None)
+    assert not any(state.velocity[others]) and not any(state.effort[others])
+    assert len(state.velocity) == len(state.effort) == len(state.name)
 
 
 def test_robot_description_and_clock_are_published(ros):

@@ -28,7 +28,14 @@ from ros_harness import acceleration_limits, joint_state
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
+from torque_safety_controller.node.topics import (
+    TARGET_POSE,
+    TARGET_POSTURE,
+    TARGET_TRAJECTORY,
+    TARGET_WRENCH,
+)
 from torque_safety_controller.qp.constraints import AccelerationRange
+from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS
 from viability_bounds_pkg.state import State
 
 # Limits that cannot be used
@@ -192,13 +199,24 @@ def test_a_goal_that_is_not_renewed_is_given_up(ros):
     chain.await_mode("TRACKING", "goal", each=lambda: chain.both(next(stamps)))
 
 
+def test_a_publisher_of_goals_that_cannot_be_heard_is_refused_and_counted(ros, capfd):
+    chain = NodeChain(ros)
+    for topic in (TARGET_POSE, TARGET_POSTURE, TARGET_TRAJECTORY, TARGET_WRENCH):
+        ros.probe.create_publisher(topic.message, topic.name, CONTROL_QOS)
+        refusal = f"{topic.name}: 1;"
+        ros.wait_until(lambda text=refusal: text in chain.reported("goals_refused"), refusal)
+        line = f"{topic.name} refused: the quality of service of a publisher is best effort"
+        assert capfd.readouterr().err.count(line) == 1
+
+
 # Output
 
 
 def test_efforts_are_published_for_ros2_control_too(ros):
+    """Reliably, as its controllers may ask for."""
     topic = "/effort_controller/commands"
     chain = NodeChain(ros, ros2_control_topic=topic)
-    efforts = ros.listen(Float64MultiArray, topic)
+    efforts = ros.listen(Float64MultiArray, topic, GOAL_QOS)
     ros.hears(topic)
     tau = chain.answer(10)
     ros.wait_until(lambda: efforts, "efforts", each=lambda: chain.state(10))

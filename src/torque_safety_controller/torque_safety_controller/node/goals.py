@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -140,7 +141,7 @@ class GoalSubscriber:
         base: placement of the base frame in the URDF's root frame.
 
     Attributes:
-        refused: how many goals were refused, by topic.
+        refused: how many goals, and publishers of goals, were refused, by topic.
     """
 
     def __init__(
@@ -150,9 +151,12 @@ class GoalSubscriber:
         self._pending: list[tuple[int, Callable[[], None]]] = []
         self._controller, self._config, self._base = controller, config, base
         self._logger = node.get_logger()
-        TARGET_POSE.subscription(node, self._on_pose)
-        TARGET_POSTURE.subscription(node, self._on_posture)
-        TARGET_TRAJECTORY.subscription(node, self._on_trajectory)
+        for topic, callback in (
+            (TARGET_POSE, self._on_pose),
+            (TARGET_POSTURE, self._on_posture),
+            (TARGET_TRAJECTORY, self._on_trajectory),
+        ):
+            topic.subscription(node, callback, partial(self.refuse, topic))
         self._trajectory: PoseTrajectory | None = None
         self._begin = 0
         self._taken = controller.goals.taken
@@ -227,7 +231,7 @@ class GoalSubscriber:
             return self.refuse(TARGET_POSTURE, error)
         self.add(message, lambda: self._controller.set_posture_goal(q_des))
 
-    def refuse(self, topic: Topic, error: GoalRefused) -> None:
-        """Count and log a goal that cannot be followed."""
+    def refuse(self, topic: Topic, reason: GoalRefused | str) -> None:
+        """Count and log a goal that cannot be followed, or a publisher that cannot be heard."""
         self.refused[topic.name] += 1
-        self._logger.warning(f"{topic.name} refused: {error}")
+        self._logger.warning(f"{topic.name} refused: {reason}")

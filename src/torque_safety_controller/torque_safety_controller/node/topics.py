@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 from geometry_msgs.msg import PoseStamped, WrenchStamped
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS
+from viability_bounds_pkg.ros.runtime import GOAL_QOS
 from viability_bounds_pkg.ros.topics import USER, OfferedService, Topic
 
 _NODE = "controller_node"
@@ -51,11 +52,12 @@ TARGET_WRENCH = Topic(
 ROS2_CONTROL_EFFORTS = Topic(
     "<ros2_control_topic>",
     Float64MultiArray,
-    CONTROL_QOS,
+    QoSProfile(depth=1),
     (_NODE,),
     (USER,),
     "the efforts of `joint_commands` in `joints` order, for effort controllers of ros2_control; "
-    "the parameter `ros2_control_topic` names the topic; silent in position control",
+    "the parameter `ros2_control_topic` names the topic; silent in position control; reliable, "
+    "as those controllers may ask for",
 )
 TOPICS = (
     TARGET_POSE,

@@ -57,7 +57,7 @@ class WrenchSubscriber:
         self._logger = node.get_logger()
         self.refused: Counter[str] = Counter()
         self._changes = 0
-        TARGET_WRENCH.subscription(node, self._on_target)
+        TARGET_WRENCH.subscription(node, self._on_target, partial(goals.refuse, TARGET_WRENCH))
         if interaction is None or interaction.sensor is None:
             return
         sensor = interaction.sensor

@@ -193,3 +193,13 @@ def test_diagnostics_come_by_themselves_although_time_stands_still(ros):
         "level": DiagnosticStatus.WARN,
         "message": "so so",
     }
+
+
+def test_diagnostics_of_two_arms_are_told_apart(ros):
+    for namespace in ("left", "right"):
+        node = ros.add(Node("arm", context=ros.context, namespace=namespace))
+        report = DiagnosticStatus.OK, "", {"arm": namespace}
+        Diagnostics(node, lambda report=report: report, period=0.05)
+    for namespace in ("left", "right"):
+        ros.wait_until(lambda name=f"{namespace}/arm": ros.reported(name, "arm"), namespace)
+        assert ros.reported(f"{namespace}/arm", "arm") == namespace

@@ -129,7 +129,8 @@ class Diagnostics:
     """Publishes one status on ``/diagnostics``, regularly and when asked.
 
     Args:
-        node: the publishing node; its name is the status' name.
+        node: the publishing node; its name with the namespace, as in ``left/bounds_node``, is the
+            status' name, so that two arms are told apart.
         report: returns level (a constant of ``DiagnosticStatus``), a message and the values.
         period: seconds between two messages.
     """
@@ -147,7 +148,7 @@ class Diagnostics:
         level, message, values = self._report()
         status = DiagnosticStatus(
             level=level,
-            name=self._node.get_name(),
+            name=self._node.get_fully_qualified_name().removeprefix("/"),
             message=message,
             hardware_id=self._node.get_namespace(),
             values=[KeyValue(key=key, value=_text(value)) for key, value in values.items()],

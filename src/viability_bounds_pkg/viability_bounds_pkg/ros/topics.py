@@ -9,6 +9,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -22,6 +23,9 @@ from viability_bounds_pkg.ros.runtime import CONTROL_QOS, LATCHED_QOS
 
 USER = "user"
 """Stands for nodes of others."""
+
+BEST_EFFORT = "the quality of service of a publisher is best effort; allowed: reliable"
+"""Why nothing comes from a publisher."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +52,27 @@ class Topic:
         """Return a publisher; `name` is for topics that a parameter names."""
         return node.create_publisher(self.message, name or self.name, self.qos)
 
-    def subscription(self, node: Node, callback: Callable[[Any], None]) -> Subscription:
-        """Return a subscription."""
-        return node.create_subscription(self.message, self.name, callback, self.qos)
+    def subscription(
+        self,
+        node: Node,
+        callback: Callable[[Any], None],
+        refuse: Callable[[str], None] | None = None,
+    ) -> Subscription:
+        """Return a subscription.
+
+        Args:
+            node: subscribes.
+            callback: called with each message.
+            refuse: called with the reason when there is a publisher whose messages cannot come,
+                as it is best effort where the subscription is reliable; None leaves it to rclpy,
+                which logs it.
+        """
+        events = SubscriptionEventCallbacks()
+        if refuse is not None:
+            events.incompatible_qos = lambda _: refuse(BEST_EFFORT)
+        return node.create_subscription(
+            self.message, self.name, callback, self.qos, event_callbacks=events
+        )
 
 
 @dataclass(frozen=True)
@@ -81,7 +103,8 @@ JOINT_STATES = Topic(
     ("bullet_node",),
     ("bounds_node", "controller_node", "scenario_node"),
     "positions, rad, and velocities, rad/s; `effort` is the torque of the motors, N m; joints in "
-    "any order, further joints are ignored; the stamp names the control step",
+    "any order, further joints are ignored; the stamp names the control step; `bullet_node` sends "
+    "the movable joints that are locked, too",
 )
 ACCELERATION_LIMITS = Topic(
     "acceleration_limits",
@@ -124,7 +147,8 @@ DIAGNOSTICS = Topic(
     QoSProfile(depth=10),
     ("bounds_node", "controller_node", "bullet_node"),
     ("scenario_node",),
-    "mode and why, refused messages by reason, margins, latency, solver, closest approach",
+    "mode and why, refused messages by reason, margins, latency, solver, closest approach; the "
+    "name of a status is that of its node with the namespace, as in `left/bullet_node`",
 )
 SHARED_TOPICS = (
     JOINT_STATES,
