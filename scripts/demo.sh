@@ -68,8 +68,8 @@ set +u # ROS' own set-up scripts use unset variables
 source "$root/scripts/setup.sh"
 set -u
 
-# A ROS domain of its own, so that other robots and demos do not interfere.
-export ROS_DOMAIN_ID="${ROS_DOMAIN_ID:-$((1 + $$ % 100))}"
+# shellcheck disable=SC1091
+source "$root/scripts/domain.sh" || exit 2
 export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
 
 overrides=()

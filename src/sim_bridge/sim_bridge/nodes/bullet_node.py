@@ -35,6 +35,7 @@ from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import Diagnostics
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
+from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.runtime import set_stamp, stamp_to_ns
 from viability_bounds_pkg.ros.topics import (
     FT_WRENCH,
@@ -109,7 +110,11 @@ class BulletNode(ArmNode):
         if not config.lockstep:
             self.create_timer(config.dt, self._tick, clock=steady)
         self.create_timer(_RETRY_PERIOD, self._retry, clock=steady)
-        self._diagnostics = Diagnostics(self, self._report)
+        alone = [JOINT_STATES.name, JOINT_COMMANDS.name, FT_WRENCH.name]
+        if self._clock_publisher is not None:
+            alone.append(CLOCK.name)
+        self.publisher_watch = PublisherWatch(self, alone)
+        self._diagnostics = Diagnostics(self, self._report, watch=self.publisher_watch)
         self.announce(config.joints, config.rate_hz, f"simulated, clock {config.clock}")
         self._next_state()
 

@@ -17,6 +17,12 @@ from trajectory_msgs.msg import JointTrajectory
 from sim_bridge.scenario.recording import Array, RecordedRun
 from viability_bounds_pkg.ros.messages import JointStateReader, Verdict
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
+from viability_bounds_pkg.ros.topics import (
+    ACCELERATION_LIMITS,
+    FT_WRENCH,
+    JOINT_COMMANDS,
+    JOINT_STATES,
+)
 
 _RECORDING_QOS = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.BEST_EFFORT)
 
@@ -29,6 +35,7 @@ class RunListener:
         joints: joints to record, in this order.
 
     Attributes:
+        topics: names of those recorded.
         stamp: of the last state, ns; -1 before the first.
         q: positions in it, shape (n,), rad.
         answered: stamp of the last command, ns; -1 before the first.
@@ -46,19 +53,21 @@ class RunListener:
         self._senders = {
             f"{namespace}/{name}" if namespace else name: name for name in self.diagnostics
         }
+        self.topics: tuple[str, ...] = ()
         self._joints = tuple(joints)
         self._reader = JointStateReader(joints)
         self._states: dict[int, tuple[Array, Array]] = {}
         self._limits: dict[int, list[Sequence[float]]] = {}
         self._torques: dict[int, Sequence[float]] = {}
         self._wrenches: dict[int, Sequence[float]] = {}
-        for kind, topic, take in (
-            (JointState, "joint_states", self._on_state),
-            (JointTrajectory, "acceleration_limits", self._on_limits),
-            (JointState, "joint_commands", self._on_command),
-            (WrenchStamped, "ft_wrench", self._on_wrench),
+        for topic, take in (
+            (JOINT_STATES, self._on_state),
+            (ACCELERATION_LIMITS, self._on_limits),
+            (JOINT_COMMANDS, self._on_command),
+            (FT_WRENCH, self._on_wrench),
         ):
-            node.create_subscription(kind, topic, take, _RECORDING_QOS)
+            node.create_subscription(topic.message, topic.name, take, _RECORDING_QOS)
+            self.topics += (topic.name,)
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
 
     def run(self, first: int) -> RecordedRun:

@@ -42,6 +42,7 @@ from viability_bounds_pkg.ros.program import (
     own_arguments,
     report_refusal,
 )
+from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.runtime import make_executor
 
 _POLL_PERIOD = 0.02
@@ -77,12 +78,15 @@ class ScenarioNode(ArmNode):
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__(**node_arguments)
         with self.starting():
+            robot = self.resolve_service_name(RESET.service).rpartition("/")[0]
+            self.claim("plays a scenario on", robot)
             config = NodeParameters(self, ScenarioConfiguration).configuration
         self.config = config
         self.awaits = ""
         self.done = False
         self.failure: ScenarioRefused | None = None
         self.listener = RunListener(self, config.joints)
+        self._publisher_watch = PublisherWatch(self, self.listener.topics)
         self._first, self._period = 0, 1
         self._refused: dict[str, list[str]] | None = None  # when the messages begin; else None
         frames = config.base_frame, config.end_effector_frame
@@ -111,13 +115,15 @@ class ScenarioNode(ArmNode):
 
     def _proceed(self) -> None:
         try:
-            if self._refused is not None:
+            if self.failure is None:
+                self._check_publishers()
+            if self.failure is None and self._refused is not None:
                 self._check_refusals(self._refused)
             self.awaits = next(self._course)
         except StopIteration:
             self.done = True
         except ScenarioRefused as error:
-            self._refused, self._course = None, self._stop(error)
+            self.failure, self._course = error, self._stop()
 
     def _play(self) -> Iterator[str]:
         """Play the scenario; yield what must happen before it proceeds."""
@@ -149,10 +155,10 @@ class ScenarioNode(ArmNode):
                 yield "playing"
             begin = halt
 
-    def _stop(self, error: ScenarioRefused) -> Iterator[str]:
-        """Pause the robot, and end."""
-        yield from self._call(pause(True))
-        self.failure = error
+    def _stop(self) -> Iterator[str]:
+        """Pause the robot if the scenario has begun, and end."""
+        if self._refused is not None:
+            yield from self._call(pause(True))
 
     def _missing(self) -> list[str]:
         """Return what is missing before the scenario can begin."""
@@ -198,6 +204,11 @@ class ScenarioNode(ArmNode):
         """Return whether the robot reports that it has paused where period `halt` begins."""
         last = self._first + (halt - 1) * self._period
         return int(self.robot["stamp_ns"]) >= last and self.robot["paused"] == "True"
+
+    def _check_publishers(self) -> None:
+        """Refuse to record what several robots, bounds nodes or controllers publish."""
+        if trouble := self._publisher_watch.trouble:
+            raise ScenarioRefused(f"{trouble}; allowed: one")
 
     def _check_refusals(self, known: dict[str, list[str]]) -> None:
         for node, (key, topics) in _REFUSAL_COUNTS.items():

@@ -31,8 +31,10 @@ from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, Verdict
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
+from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.topics import (
     ACCELERATION_LIMITS,
+    FT_WRENCH,
     JOINT_COMMANDS,
     JOINT_STATES,
 )
@@ -89,7 +91,10 @@ class ControllerNode(ArmNode):
             self._watch,
             clock=Clock(clock_type=ClockType.STEADY_TIME),
         )
-        self._diagnostics = Diagnostics(self, self._report)
+        alone = [JOINT_COMMANDS.name, config.ros2_control_topic, JOINT_STATES.name]
+        alone += [ACCELERATION_LIMITS.name, FT_WRENCH.name]
+        self.publisher_watch = PublisherWatch(self, filter(None, alone))
+        self._diagnostics = Diagnostics(self, self._report, watch=self.publisher_watch)
         avoiding = "with" if config.collision.collision_avoidance else "without"
         self.announce(
             config.joints,

@@ -9,6 +9,7 @@ from rclpy.parameter import Parameter
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 from viability_bounds_pkg.parameter import parameter_table
+from viability_bounds_pkg.ros.claim import TakenError
 from viability_bounds_pkg.ros.given_parameters import (
     UnknownParameterError,
     given_parameters,
@@ -18,7 +19,6 @@ from viability_bounds_pkg.ros.given_parameters import (
     refuse_unknown,
     why_missing,
 )
-from viability_bounds_pkg.ros.topic_claim import TopicTakenError
 
 PLAIN = {
     "joints": ["one"],
@@ -177,7 +177,7 @@ def test_a_node_does_not_start_with_a_misspelt_parameter(ros):
 def test_a_second_publisher_of_the_limits_does_not_start(ros):
     values = PLAIN | {"rate_hz": 500.0}
     first = ros.start(BoundsNode, values)
-    with pytest.raises(TopicTakenError, match=r"publishes '/acceleration_limits' in ROS domain"):
+    with pytest.raises(TakenError, match=r"publishes '/acceleration_limits' in ROS domain"):
         ros.start(BoundsNode, values)
     ros.stop(first)
     ros.start(BoundsNode, values)

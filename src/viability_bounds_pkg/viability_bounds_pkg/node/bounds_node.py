@@ -25,6 +25,7 @@ from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, Verdict
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
+from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.robot_urdf import robot_urdf
 from viability_bounds_pkg.ros.topics import ACCELERATION_LIMITS, JOINT_STATES
 
@@ -59,7 +60,8 @@ class BoundsNode(ArmNode):
         )
         self._publisher = ACCELERATION_LIMITS.publisher(self)
         JOINT_STATES.subscription(self, self._on_state)
-        self._diagnostics = Diagnostics(self, self._report)
+        self.publisher_watch = PublisherWatch(self, [ACCELERATION_LIMITS.name, JOINT_STATES.name])
+        self._diagnostics = Diagnostics(self, self._report, watch=self.publisher_watch)
         self._warn_of_affected_joints(config)
         self.announce(
             joints, config.rate_hz, f"method {config.method}, limits {config.acceleration_limits}"

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 from rclpy.node import Node
 
 from viability_bounds_pkg.exceptions import ArmSafetyError
-from viability_bounds_pkg.ros.topic_claim import TopicClaim
+from viability_bounds_pkg.ros.claim import Claim
 from viability_bounds_pkg.ros.topics import Topic
 
 _TOPICS_OF_ROS = ("/rosout", "/parameter_events", "/clock")
@@ -28,7 +28,7 @@ class ArmNode(Node):
     PARAMETERS: ClassVar[type]
 
     def __init__(self, **node_arguments: Any) -> None:
-        self._claims: list[TopicClaim] = []
+        self._claims: list[Claim] = []
         super().__init__(self.NAME, **node_arguments)
 
     @contextmanager
@@ -36,15 +36,19 @@ class ArmNode(Node):
         """Claim topics, and take the node down again if what is done meanwhile is refused.
 
         Raises:
-            TopicTakenError: another node publishes one of the topics.
+            TakenError: another node publishes one of the topics.
         """
         try:
             for topic in topics:
-                self._claims.append(TopicClaim(self, topic.name))
+                self.claim("publishes", self.resolve_topic_name(topic.name))
             yield
         except ArmSafetyError:
             self.destroy_node()
             raise
+
+    def claim(self, does: str, name: str) -> None:
+        """Let no second node on this host do something while this one exists, see `Claim`."""
+        self._claims.append(Claim(self, does, name))
 
     def announce(self, joints: Sequence[str], rate: float, what: str) -> None:
         """Log in one line what the node does, for which joints, and the topics that it uses.

@@ -16,6 +16,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
+from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import DIAGNOSTICS
 
@@ -133,9 +134,17 @@ class Diagnostics:
             status' name, so that two arms are told apart.
         report: returns level (a constant of ``DiagnosticStatus``), a message and the values.
         period: seconds between two messages.
+        watch: its topics with several publishers are reported, too, as a warning.
     """
 
-    def __init__(self, node: Node, report: Report, period: float = 0.5) -> None:
+    def __init__(
+        self,
+        node: Node,
+        report: Report,
+        period: float = 0.5,
+        watch: PublisherWatch | None = None,
+    ) -> None:
+        self._watch = watch
         self._report = report
         self._node = node
         self._publisher = DIAGNOSTICS.publisher(node)
@@ -146,6 +155,11 @@ class Diagnostics:
     def publish(self) -> None:
         """Send the status now."""
         level, message, values = self._report()
+        if self._watch is not None:
+            values["topics_with_several_publishers"] = self._watch.trouble or "none"
+            if self._watch.rivals:
+                level = max(level, DiagnosticStatus.WARN)
+                message += f"; {self._watch.trouble}"
         status = DiagnosticStatus(
             level=level,
             name=self._node.get_fully_qualified_name().removeprefix("/"),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One publisher for a topic that an arm obeys: a second node on this host does not start."""
+"""Rights that one node holds: a second one on this host does not start."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from rclpy.node import Node
 from viability_bounds_pkg.exceptions import ArmSafetyError
 
 
-class TopicTakenError(ArmSafetyError, RuntimeError):
-    """Another node on this host publishes the topic in the same ROS domain."""
+class TakenError(ArmSafetyError, RuntimeError):
+    """Another node on this host holds the right in the same ROS domain."""
 
 
-class TopicClaim:
-    """The right to publish a topic in a ROS domain, as long as this object is open.
+class Claim:
+    """The right to do something in a ROS domain, as long as this object is open.
 
     A Unix socket with an abstract address holds it: the system lets one process have it, and frees
     it when the process ends, however that happens. Nodes on other hosts, and nodes of others, do
-    not take part.
+    not take part; `PublisherWatch` sees those.
 
     Args:
-        node: that is to publish it.
-        topic: name of the topic, before remapping.
+        node: that is to do it.
+        does: what, such as "publishes".
+        name: fully qualified name of the topic or node that it does it to.
 
     Raises:
-        TopicTakenError: another node has it.
+        TakenError: another node has it.
     """
 
-    def __init__(self, node: Node, topic: str) -> None:
-        name = node.resolve_topic_name(topic)
+    def __init__(self, node: Node, does: str, name: str) -> None:
         domain = node.context.get_domain_id()
         address = f"\0viability_bounds {domain} {name}"
         self._socket = socket.socket(socket.AF_UNIX)
@@ -40,13 +40,13 @@ class TopicClaim:
             self._socket.listen()
         except OSError as error:
             self._socket.close()
-            raise TopicTakenError(
-                f"{_holder(address)} publishes '{name}' in ROS domain {domain} already: stop it, "
+            raise TakenError(
+                f"{_holder(address)} {does} '{name}' in ROS domain {domain} already: stop it, "
                 "or set another ROS_DOMAIN_ID or namespace (-r __ns:=/name)"
             ) from error
 
     def close(self) -> None:
-        """Let another node have the topic."""
+        """Let another node have it."""
         self._socket.close()
 
 

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+import pytest
+from rclpy.node import Node
+from std_msgs.msg import String
+
+from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
+
+
+class Log:
+    """Counts what is logged."""
+
+    def __init__(self, node, monkeypatch):
+        self.warnings, self.infos = [], []
+        monkeypatch.setattr(node, "get_logger", lambda: self)
+
+    def warning(self, text):
+        self.warnings.append(text)
+
+    def info(self, text):
+        self.infos.append(text)
+
+
+@pytest.fixture
+def watched(ros, monkeypatch):
+    """A node in /left that publishes a topic and watches it."""
+    node = ros.add(Node("arm", context=ros.context, namespace="left"))
+    log = Log(node, monkeypatch)
+    node.create_publisher(String, "command", 1)
+    return node, PublisherWatch(node, ["command"]), log
+
+
+def rival_of(ros, name="rival", namespace="left", topic="command"):
+    rival = ros.add(Node(name, context=ros.context, namespace=namespace))
+    rival.create_publisher(String, topic, 1)
+    return rival
+
+
+def test_a_second_publisher_is_told_once_and_once_when_it_is_gone(ros, watched):
+    _, watch, log = watched
+    rival = rival_of(ros)
+    ros.wait_until(lambda: watch.rivals, "the rival")
+    assert watch.rivals == {"/left/command": ("/left/arm", "/left/rival")}
+    assert watch.trouble == "2 publishers of '/left/command': /left/arm, /left/rival"
+    for _ in range(5):
+        watch.look()
+    (text,) = log.warnings
+    assert text.startswith("'/left/command' has 2 publishers: /left/arm, /left/rival; stop ")
+    ros.stop(rival)
+    ros.wait_until(lambda: not watch.rivals, "its end")
+    watch.look()
+    assert log.infos == ["'/left/command' has no second publisher any more"]
+    assert watch.trouble == ""
+    rival_of(ros, "next")
+    ros.wait_until(lambda: watch.rivals, "the next one")
+    assert len(log.warnings) == 2
+
+
+def test_other_namespaces_and_topics_are_no_rivals(ros, watched):
+    _, watch, log = watched
+    rival_of(ros, namespace="right")
+    rival_of(ros, "other", topic="remark")
+    ros.hears("/right/command")
+    ros.hears("/left/remark")
+    watch.look()
+    assert not watch.rivals
+    assert not log.warnings
+
+
+def test_a_publisher_without_a_name_is_told_one_look_later(ros, watched, monkeypatch):
+    node, _, log = watched
+    rival_of(ros)
+    ros.hears("/left/command", 2)
+    found = node.get_publishers_info_by_topic("/left/command")
+    for endpoint in found:
+        if endpoint.node_name == "rival":
+            endpoint.node_name = "_NODE_NAME_UNKNOWN_"
+            endpoint.node_namespace = "_NODE_NAMESPACE_UNKNOWN_"
+    monkeypatch.setattr(node, "get_publishers_info_by_topic", lambda topic: found)
+    log.warnings.clear()
+    watch = PublisherWatch(node, ["command"])
+    watch.look()
+    assert not watch.rivals
+    watch.look()
+    assert len(watch.rivals["/left/command"]) == 2
+    assert len(log.warnings) == 1

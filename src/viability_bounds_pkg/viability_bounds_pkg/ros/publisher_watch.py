@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Notices a second publisher of a topic that may have one only, whoever it belongs to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+_PERIOD = 1.0
+_UNKNOWN = "_UNKNOWN_"
+"""Ends the names that rmw gives nodes which have not told theirs."""
+
+
+class PublisherWatch:
+    """Looks at the ROS graph for topics that more than one node publishes.
+
+    `Claim` keeps two nodes of this project on one host apart. This sees the others, too:
+    drivers of the user, nodes on other hosts, a ``ros2 topic pub``. It looks once a second on the
+    steady clock; counting the publishers of a topic takes some microseconds. A node that was
+    killed stays in the graph for up to 20 s.
+
+    Args:
+        node: logs a second publisher once when it has come, and once when it is gone.
+        topics: names of the topics, before remapping.
+
+    Attributes:
+        rivals: nodes that publish the same topic, by topic; only topics with several.
+    """
+
+    def __init__(self, node: Node, topics: Iterable[str]) -> None:
+        self.rivals: dict[str, tuple[str, ...]] = {}
+        self._node = node
+        self._topics = [node.resolve_topic_name(topic) for topic in topics]
+        self._nameless: set[str] = set()
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        node.create_timer(_PERIOD, self.look, clock=steady)
+
+    @property
+    def trouble(self) -> str:
+        """Topics with several publishers in words, empty if there is none."""
+        return "; ".join(
+            f"{len(names)} publishers of '{topic}': {', '.join(names)}"
+            for topic, names in self.rivals.items()
+        )
+
+    def look(self) -> None:
+        """Compare the graph with what was known."""
+        for topic in self._topics:
+            if self._node.count_publishers(topic) > 1:
+                self._note(topic)
+            elif self.rivals.pop(topic, None):
+                self._node.get_logger().info(f"'{topic}' has no second publisher any more")
+
+    def _note(self, topic: str) -> None:
+        names = sorted(map(_name, self._node.get_publishers_info_by_topic(topic)))
+        known, nameless = topic in self.rivals, any(_UNKNOWN in name for name in names)
+        if len(names) < 2 or (nameless and not known and topic not in self._nameless):
+            self._nameless.add(topic)  # a node tells its name a moment after its topics
+            return
+        self._nameless.discard(topic)
+        self.rivals[topic] = tuple(names)
+        if not known:
+            self._node.get_logger().warning(
+                f"'{topic}' has {len(names)} publishers: {', '.join(names)}; stop all but one, or "
+                "keep them apart by namespace or ROS_DOMAIN_ID"
+            )
+
+
+def _name(publisher: TopicEndpointInfo) -> str:
+    """Return the fully qualified name of the node that publishes."""
+    namespace: str = publisher.node_namespace
+    return f"{namespace.rstrip('/')}/{publisher.node_name}"

@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two robots, controllers or demos where there may be one: told, refused or kept apart."""
+
+import os
+import socket
+import subprocess
+from contextlib import contextmanager
+
+import pytest
+from chain import load_values
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.node import Node
+from ros_harness import ROOT, overrides
+from std_msgs.msg import Float64MultiArray
+
+from sim_bridge.nodes.bullet_node import BulletNode
+from sim_bridge.nodes.scenario_node import ScenarioNode, ScenarioRefused, play
+from torque_safety_controller.node.controller_node import ControllerNode
+from viability_bounds_pkg.node.bounds_node import BoundsNode
+from viability_bounds_pkg.ros.claim import Claim, TakenError
+from viability_bounds_pkg.ros.topics import (
+    ACCELERATION_LIMITS,
+    FT_WRENCH,
+    JOINT_COMMANDS,
+    JOINT_STATES,
+)
+
+VALUES = load_values("panda") | {"clock": "lockstep", "start_paused": True}
+VALUES["scenario"] = str(ROOT / "config" / "scenarios" / "panda_demo.yaml")
+
+
+def rival(ros, *topics):
+    """A node of somebody else that takes part in nothing but the ROS graph."""
+    node = ros.add(Node("driver", context=ros.context, namespace="theirs"))
+    for topic in topics:
+        topic.publisher(node, f"/{topic.name}")
+    return node
+
+
+@pytest.mark.parametrize(
+    ("kind", "own", "obeyed"),
+    [
+        (BoundsNode, [ACCELERATION_LIMITS], [JOINT_STATES]),
+        (ControllerNode, [JOINT_COMMANDS], [JOINT_STATES, ACCELERATION_LIMITS, FT_WRENCH]),
+        (BulletNode, [JOINT_STATES, FT_WRENCH], [JOINT_COMMANDS]),
+    ],
+)
+def test_each_node_reports_a_second_publisher_of_what_it_publishes_and_obeys(
+    ros, kind, own, obeyed
+):
+    node = ros.start(kind, VALUES)
+    usual = Node("usual", context=ros.context)  # what the node obeys in any case
+    for topic in obeyed:
+        topic.publisher(usual)
+    ros.add(usual)
+    other = rival(ros, *own, *obeyed)
+    key = "topics_with_several_publishers"
+    topics = [f"'/{topic.name}'" for topic in (*own, *obeyed)]
+
+    def told():
+        return all(topic in ros.reported(kind.NAME, key) for topic in topics)
+
+    ros.wait_until(told, "a report")
+    status = ros.diagnostics[kind.NAME]
+    assert status["level"] >= DiagnosticStatus.WARN
+    assert status["message"].endswith(status[key])
+    assert "/theirs/driver" in status[key]
+    assert sorted(node.publisher_watch.rivals) == sorted(topic.strip("'") for topic in topics)
+    ros.stop(other)
+    ros.wait_until(lambda: ros.reported(kind.NAME, key) == "none", "its end")
+
+
+def test_a_topic_of_ros2_control_is_watched_where_there_is_one(ros):
+    node = ros.start(ControllerNode, VALUES | {"ros2_control_topic": "/effort/commands"})
+    other = ros.add(Node("forward", context=ros.context))
+    other.create_publisher(Float64MultiArray, "/effort/commands", 1)
+    ros.wait_until(lambda: "/effort/commands" in node.publisher_watch.rivals)
+
+
+@pytest.mark.parametrize(
+    ("kind", "what"),
+    [
+        (BoundsNode, "publishes '/left/acceleration_limits'"),
+        (ControllerNode, "publishes '/left/joint_commands'"),
+        (BulletNode, "publishes '/left/joint_states'"),
+        (ScenarioNode, "plays a scenario on '/left/bullet_node'"),
+    ],
+)
+def test_a_second_node_of_a_kind_does_not_start(ros, kind, what):
+    def start(**more):
+        node = kind(context=ros.context, parameter_overrides=overrides(VALUES), **more)
+        return ros.add(node)
+
+    first = start(namespace="left")
+    start(namespace="right")
+    message = rf"^another node \(process {os.getpid()}\) {what} in ROS domain {ros.domain} already"
+    with pytest.raises(TakenError, match=message):
+        start(namespace="left")
+    ros.stop(first)
+    start(namespace="left")
+
+
+def test_a_run_that_others_mix_into_is_refused(ros):
+    rival(ros, JOINT_COMMANDS)
+    player = ros.start(ScenarioNode, VALUES)
+    ros.add(ControllerNode(context=ros.context, parameter_overrides=overrides(VALUES)))
+    ros.hears("/joint_commands", 2)
+    expected = (
+        r"^2 publishers of '/joint_commands': /controller_node, /theirs/driver; allowed: one"
+    )
+    ros.wait_until(lambda: player.done, "the end of the scenario")
+    with pytest.raises(ScenarioRefused, match=expected):
+        play(player, quiet=True)
+
+
+# The domain of a demo
+
+
+@contextmanager
+def domain(**environment):
+    """The domain that scripts/domain.sh sets, in a shell that lives on; or its error."""
+    given = {name: value for name, value in os.environ.items() if name != "ROS_DOMAIN_ID"}
+    script = ROOT / "scripts" / "domain.sh"
+    with subprocess.Popen(
+        ["bash", "-euc", f"source {script} || exit 2; echo $ROS_DOMAIN_ID; read -r"],
+        env=given | environment,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    ) as shell:
+        yield shell.stdout.readline().strip()
+        shell.communicate("\n")
+    refused = shell.returncode == 2
+    assert refused or shell.returncode == 0
+
+
+def refusal(domain_id):
+    return (
+        f"error: another robot or demo runs in ROS domain {domain_id}: stop it, or set another "
+        "ROS_DOMAIN_ID or none"
+    )
+
+
+def test_a_demo_beside_a_robot_is_refused_in_one_line(ros):
+    given = {"ROS_DOMAIN_ID": str(ros.domain)}
+    claim = Claim(ros.probe, "publishes", "/joint_states")
+    with domain(**given) as told:
+        assert told == refusal(ros.domain)
+    claim.close()
+    claim = Claim(ros.probe, "publishes", "/left/joint_states")
+    with domain(**given) as told:
+        assert told == str(ros.domain)
+    claim.close()
+
+
+def test_of_two_demos_in_one_domain_the_second_is_refused_in_one_line(ros):
+    given = {"ROS_DOMAIN_ID": str(ros.domain)}
+    with domain(**given) as first, domain(**given) as second:
+        assert first == str(ros.domain)
+        assert second == refusal(ros.domain)
+    with domain(**given) as third:
+        assert third == str(ros.domain)
+
+
+def test_demos_without_a_domain_are_kept_apart():
+    with domain() as first, domain() as second, domain() as third:
+        chosen = {int(first), int(second), int(third)}
+    assert len(chosen) == 3
+    assert min(chosen) >= 1
+    assert max(chosen) <= 100
+
+
+def test_a_domain_that_others_use_is_not_chosen():
+    with domain() as first:
+        pass
+    script = ROOT / "scripts" / "domain.sh"
+    port = 7410 + 250 * int(first)
+    with socket.socket(type=socket.SOCK_DGRAM) as used:
+        used.bind(("", port))
+        told = subprocess.run(
+            ["bash", "-c", f"source {script}; _is_used {first} && echo used"],
+            env=os.environ | {"ROS_DOMAIN_ID": first},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+    assert told.stdout.strip() == "used"
