@@ -135,7 +135,7 @@ def test_pressed_against_an_obstacle_an_arm_stays_at_rest():
     [
         ("sphere", [0.2, 0.2, 0.2], [0.42, 0.0, 0.6], 0.03),
         ("box", [0.6, 1.0, 0.1], [0.5, 0.0, 0.45], 0.03),
-        ("half_space", [0.0, 0.0, 0.0], [0.0, 0.0, 0.52], 0.05),
+        ("half_space", [], [0.0, 0.0, 0.52], 0.05),
     ],
 )
 def test_an_arm_that_overlaps_an_obstacle_at_start_moves_out(shape, size, position, depth):

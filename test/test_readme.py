@@ -54,8 +54,10 @@ def hurried(tmp_path_factory):
     tree = tmp_path_factory.mktemp("tree")
     (tree / "install").symlink_to(ROOT / "install")
     (tree / "scripts").mkdir()
+    for script in (ROOT / "scripts").glob("*.sh"):
+        (tree / "scripts" / script.name).symlink_to(script)
+    (tree / "scripts" / "setup.sh").unlink()
     (tree / "scripts" / "setup.sh").write_text(f"source '{ROOT}/scripts/setup.sh'\n")
-    (tree / "scripts" / "demo.sh").symlink_to(ROOT / "scripts" / "demo.sh")
     shutil.copytree(ROOT / "config", tree / "config")
     for path in (tree / "config" / "scenarios").iterdir():
         scenario = yaml.safe_load(path.read_text())
