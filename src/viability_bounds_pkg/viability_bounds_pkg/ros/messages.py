@@ -48,6 +48,7 @@ class JointStateReader:
     Attributes:
         q, v: position and velocity of the last accepted message, shape (n,), rad and rad/s.
         stamp: its stamp, ns.
+        heard_at: when it came, or was repeated last, s.
         refused: how many messages were dropped, by reason.
     """
 
@@ -56,6 +57,7 @@ class JointStateReader:
         self.q = np.zeros(n)
         self.v = np.zeros(n)
         self.stamp = -1
+        self.heard_at = -math.inf
         self.refused: Counter[str] = Counter()
         self._joints = tuple(joints)
         self._reset_after = reset_after
@@ -84,12 +86,13 @@ class JointStateReader:
             return self._refuse("not finite")
         if stamp == self.stamp:
             if np.array_equal(q, self.q) and np.array_equal(v, self.v):
+                self.heard_at = now
                 return Verdict.REPEAT
             if not restarted:
                 return self._refuse("other values under the same stamp")
         self.q, self.v, self.stamp = q, v, stamp
         self._accepted = message, self._index
-        self._accepted_at = now
+        self._accepted_at = self.heard_at = now
         return Verdict.NEW
 
     def effort(self) -> NDArray[np.float64] | None:
