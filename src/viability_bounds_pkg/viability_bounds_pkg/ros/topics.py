@@ -16,7 +16,7 @@ from rclpy.qos import QoSProfile
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
-from std_msgs.msg import String
+from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory
 
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, LATCHED_QOS, STATUS_QOS
@@ -162,6 +162,16 @@ DIAGNOSTICS = Topic(
     "mode and why, refused messages by reason, margins, latency, solver, closest approach; the "
     "name of a status is that of its node with the namespace, as in `left/bullet_node`",
 )
+VALUES = Topic(
+    "~/values",
+    Float64MultiArray,
+    STATUS_QOS,
+    ("bounds_node", "controller_node", "bullet_node"),
+    (USER,),
+    "the numbers in the node's diagnostics, to plot them: `data` has one quantity after the "
+    "other, `layout.dim` the key of each as `label` and how many numbers it has as `size`, not the "
+    "dimensions of one array; sent with `/diagnostics`",
+)
 SHARED_TOPICS = (
     JOINT_STATES,
     ACCELERATION_LIMITS,
@@ -170,5 +180,6 @@ SHARED_TOPICS = (
     LIMIT_DISTANCES,
     ROBOT_DESCRIPTION,
     DIAGNOSTICS,
+    VALUES,
 )
 """Topics between nodes of different packages, and those of the bounds node."""
