@@ -169,8 +169,8 @@ VALUES = Topic(
     ("bounds_node", "controller_node", "bullet_node"),
     (USER,),
     "the numbers in the node's diagnostics, to plot them: `data` has one quantity after the "
-    "other, `layout.dim` the key of each as `label` and how many numbers it has as `size`, not the "
-    "dimensions of one array; sent with `/diagnostics`",
+    "other, `layout.dim` the key of each as `label` and how many numbers it has as `size`, not "
+    "the dimensions of one array; sent with `/diagnostics`",
 )
 SHARED_TOPICS = (
     JOINT_STATES,
