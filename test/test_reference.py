@@ -62,6 +62,10 @@ def start(ros, name):
     return ros.start(NODES[name], given | EXTRA[name])
 
 
+def path_of(topic, node):
+    return "/" + topic.name.strip("<>/").replace("~", node)
+
+
 @pytest.mark.parametrize("name", NODES)
 def test_a_node_has_the_topics_and_services_of_the_tables_and_no_others(ros, name):
     node = start(ros, name)
@@ -72,7 +76,7 @@ def test_a_node_has_the_topics_and_services_of_the_tables_and_no_others(ros, nam
     sometimes = {"/robot_description"} if name != "bullet_node" else set()
     for found, ends in ((published, "source"), (subscribed, "sink")):
         listed = {
-            "/" + topic.name.strip("<>/"): topic
+            path_of(topic, name): topic
             for topic in make_reference.TOPICS
             if name in getattr(topic, ends)
         }
@@ -95,7 +99,7 @@ def test_a_node_has_the_topics_and_services_of_the_tables_and_no_others(ros, nam
 def test_topics_have_the_quality_of_service_of_the_tables(ros, name):
     node = start(ros, name)
     for topic in make_reference.TOPICS:
-        path = "/" + topic.name.strip("<>/")
+        path = path_of(topic, name)
         for ends, infos in (
             ("source", node.get_publishers_info_by_topic(path)),
             ("sink", node.get_subscriptions_info_by_topic(path)),

@@ -21,6 +21,7 @@ from torque_safety_controller.node.controller_report import LEVELS, StepRecord
 from torque_safety_controller.node.goals import GoalSubscriber
 from torque_safety_controller.node.joint_commands import JointCommands
 from torque_safety_controller.node.limits import LimitsReader
+from torque_safety_controller.node.state_publisher import StatePublisher
 from torque_safety_controller.node.topics import ENABLE_TORQUE
 from torque_safety_controller.node.wrenches import WrenchSubscriber
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
@@ -82,6 +83,7 @@ class ControllerNode(ArmNode):
         self._collision = CollisionReport(self.get_logger(), self._controller.constraints)
 
         self._commands = JointCommands(self, config.joints, config.ros2_control_topic)
+        self._published = StatePublisher(self, self._controller, config, base, self._states)
         JOINT_STATES.subscription(self, self._on_state)
         ACCELERATION_LIMITS.subscription(self, self._on_limits)
         ENABLE_TORQUE.serve(self, self._on_enable_torque)
@@ -301,8 +303,11 @@ class ControllerNode(ArmNode):
         return "joint states are refused: " + ", ".join(self._states.refused)
 
     def _enter(self, mode: Mode, reason: str) -> None:
+        before = self._modes.mode
         if not self._modes.set(mode, reason):
             return
+        if mode is not before:
+            self._published.mode(mode)
         text = f"{mode.value}: {reason}"
         # One call site per severity: rclpy ties the two together.
         if mode in (Mode.TRACKING, Mode.POSITION):

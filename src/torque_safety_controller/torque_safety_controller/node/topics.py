@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-from geometry_msgs.msg import PoseStamped, WrenchStamped
+from geometry_msgs.msg import PoseStamped, Vector3Stamped, WrenchStamped
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
+from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-from viability_bounds_pkg.ros.runtime import GOAL_QOS
+from viability_bounds_pkg.ros.runtime import GOAL_QOS, LATCHED_QOS, STATUS_QOS
 from viability_bounds_pkg.ros.topics import USER, OfferedService, Topic
 
 _NODE = "controller_node"
@@ -59,12 +59,51 @@ ROS2_CONTROL_EFFORTS = Topic(
     "the parameter `ros2_control_topic` names the topic; silent in position control; reliable, "
     "as those controllers may ask for",
 )
+HAND_POSE = Topic(
+    "hand_pose",
+    PoseStamped,
+    STATUS_QOS,
+    (_NODE,),
+    (USER,),
+    "pose of the end effector in `base_frame`, 20 times a second unless the mode is STOPPED; "
+    "stamp of the joint state",
+)
+HAND_POSITION_ERROR = Topic(
+    "hand_position_error",
+    Vector3Stamped,
+    STATUS_QOS,
+    (_NODE,),
+    (USER,),
+    "from the end effector to its goal, m, in the axes of `base_frame`; silent without a goal for "
+    "the pose; stamp as of `hand_pose`",
+)
+HAND_ORIENTATION_ERROR = Topic(
+    "hand_orientation_error",
+    Vector3Stamped,
+    STATUS_QOS,
+    (_NODE,),
+    (USER,),
+    "rotation from the end effector to its goal: axis times angle, rad, in the axes of "
+    "`base_frame`; silent and with a stamp as `hand_position_error`",
+)
+CONTROLLER_MODE = Topic(
+    "controller_mode",
+    String,
+    LATCHED_QOS,
+    (_NODE,),
+    (USER,),
+    "TRACKING, HOLD, POSITION or STOPPED, when it changes; the reasons are in `/diagnostics`",
+)
 TOPICS = (
     TARGET_POSE,
     TARGET_POSTURE,
     TARGET_TRAJECTORY,
     TARGET_WRENCH,
     ROS2_CONTROL_EFFORTS,
+    HAND_POSE,
+    HAND_POSITION_ERROR,
+    HAND_ORIENTATION_ERROR,
+    CONTROLLER_MODE,
 )
 
 ENABLE_TORQUE = OfferedService(

@@ -70,6 +70,22 @@ class PoseTask:
         return feedforward
 
 
+class PoseDifference(NamedTuple):
+    """How far a pose is from a goal, in the axes of the frame that both are given in."""
+
+    translation: Array
+    """From the pose to the goal, shape (3,), m."""
+    rotation: Array
+    """From the pose to the goal, axis times angle, shape (3,), rad."""
+
+
+def pose_difference(pose: pin.SE3, pose_des: pin.SE3) -> PoseDifference:
+    """Return how far `pose` is from `pose_des`."""
+    return PoseDifference(
+        pose_des.translation - pose.translation, pin.log3(pose_des.rotation @ pose.rotation.T)
+    )
+
+
 def pose_error(pose: pin.SE3, pose_des: pin.SE3) -> Array:
     """Return ``log(H^-1 H_des)``, shape (6,): m, then rad, in the end effector's axes."""
     error: Array = pin.log6(pose.actInv(pose_des)).vector

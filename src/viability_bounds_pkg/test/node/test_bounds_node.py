@@ -17,6 +17,7 @@ from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
 from viability_bounds_pkg.parameter import parameter_table, read
+from viability_bounds_pkg.ros.runtime import STATUS_QOS
 from viability_bounds_pkg.state_dependent.limits import StateDependentBounds
 from viability_bounds_pkg.torque_margin import tightened, torque_margins
 from viability_bounds_pkg.viability import acceleration_bounds
@@ -115,6 +116,27 @@ def test_joints_in_any_order_and_others_with_them(ros):
         [*(JOINTS[i] for i in order), "other"],
     )
     check(answer, exact(q, v))
+
+
+def test_distances_to_limits_are_shown_by_joint_until_the_robot_is_silent(ros):
+    robot = BoundsProbe(ros, torque_max=[10.0, 20.0, 30.0])
+    shown = ros.listen(JointState, "limit_distances", STATUS_QOS)
+
+    def show(stamp, tau):
+        state = joint_state(JOINTS, stamp, [0.9, -0.6, 50.0], [0.5, -2.5, 0.0], tau)
+        ros.wait_until(lambda: stamp in shown.stamps, each=lambda: robot.states.publish(state))
+        return shown[-1]
+
+    message = show(10 * MS, [1.0, -2.0, 40.0])
+    assert message.name == JOINTS
+    np.testing.assert_allclose(message.position, [0.1, -0.1, math.inf])
+    np.testing.assert_allclose(message.velocity, [0.5, -0.5, 3.0])
+    np.testing.assert_allclose(message.effort, [9.0, 18.0, -10.0])
+    assert not len(show(20 * MS, []).effort)
+    ros.run_for(VALUES["state_timeout"] + 0.1)
+    shown.clear()
+    ros.run_for(0.2)
+    assert not shown
 
 
 def test_the_same_state_again_gets_the_same_answer_again(ros):

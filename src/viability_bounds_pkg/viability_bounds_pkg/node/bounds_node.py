@@ -20,6 +20,7 @@ from viability_bounds_pkg.node.bounds_parameters import (
     BoundsConfiguration,
     make_bounds,
 )
+from viability_bounds_pkg.node.limit_distances import LimitDistances
 from viability_bounds_pkg.robot_configuration import RobotConfiguration, load_model
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, Verdict
@@ -61,6 +62,7 @@ class BoundsNode(ArmNode):
         self._publisher = ACCELERATION_LIMITS.publisher(self)
         JOINT_STATES.subscription(self, self._on_state)
         self.publisher_watch = PublisherWatch(self, [ACCELERATION_LIMITS.name, JOINT_STATES.name])
+        self._distances = LimitDistances(self, config, self._reader)
         self._diagnostics = Diagnostics(self, self._report, watch=self.publisher_watch)
         self._warn_of_affected_joints(config)
         self.announce(

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from typing import Any
 
@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
-from viability_bounds_pkg.ros.topics import DIAGNOSTICS
+from viability_bounds_pkg.ros.topics import DIAGNOSTICS, VALUES
 
 Report = Callable[[], tuple[bytes, str, dict[str, Any]]]
 """Returns level, message and values of a status."""
@@ -49,6 +50,7 @@ class JointStateReader:
     Attributes:
         q, v: position and velocity of the last accepted message, shape (n,), rad and rad/s.
         stamp: its stamp, ns.
+        heard_at: when it came, or was repeated last, s.
         refused: how many messages were dropped, by reason.
     """
 
@@ -57,6 +59,7 @@ class JointStateReader:
         self.q = np.zeros(n)
         self.v = np.zeros(n)
         self.stamp = -1
+        self.heard_at = -math.inf
         self.refused: Counter[str] = Counter()
         self._joints = tuple(joints)
         self._reset_after = reset_after
@@ -88,12 +91,13 @@ class JointStateReader:
             return self._refuse("not finite")
         if stamp == self.stamp:
             if np.array_equal(q, self.q) and np.array_equal(v, self.v):
+                self.heard_at = now
                 return Verdict.REPEAT
             if not restarted:
                 return self._refuse("other values under the same stamp")
         self.q, self.v, self.stamp = q, v, stamp
         self._accepted = message, self._index
-        self._accepted_at = now
+        self._accepted_at = self.heard_at = now
         return Verdict.NEW
 
     def effort(self) -> NDArray[np.float64] | None:
@@ -129,6 +133,8 @@ class JointStateReader:
 class Diagnostics:
     """Publishes one status on ``/diagnostics``, regularly and when asked.
 
+    What is a number in it is also sent on ``~/values``, as a number, where that is subscribed to.
+
     Args:
         node: the publishing node; its name with the namespace, as in ``left/bounds_node``, is the
             status' name, so that two arms are told apart.
@@ -148,6 +154,7 @@ class Diagnostics:
         self._report = report
         self._node = node
         self._publisher = DIAGNOSTICS.publisher(node)
+        self._values_publisher = VALUES.publisher(node)
         # The steady clock, so that it is sent when /clock stops, too.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = node.create_timer(period, self.publish, clock=steady)
@@ -170,6 +177,20 @@ class Diagnostics:
         array = DiagnosticArray(status=[status])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(array)
+        if self._values_publisher.get_subscription_count():
+            self._values_publisher.publish(_numbers(values))
+
+
+def _numbers(values: Mapping[str, Any]) -> Float64MultiArray:
+    """Return the numbers and arrays among `values`, one after the other, labelled by key."""
+    message = Float64MultiArray()
+    for key, value in values.items():
+        if isinstance(value, int | float | np.ndarray):
+            numbers = np.atleast_1d(value)
+            size = len(numbers)
+            message.layout.dim.append(MultiArrayDimension(label=key, size=size, stride=size))
+            message.data.extend(numbers.tolist())
+    return message
 
 
 def _text(value: Any) -> str:

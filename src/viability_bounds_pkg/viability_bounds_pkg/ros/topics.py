@@ -16,10 +16,10 @@ from rclpy.qos import QoSProfile
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
-from std_msgs.msg import String
+from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory
 
-from viability_bounds_pkg.ros.runtime import CONTROL_QOS, LATCHED_QOS
+from viability_bounds_pkg.ros.runtime import CONTROL_QOS, LATCHED_QOS, STATUS_QOS
 
 USER = "user"
 """Stands for nodes of others."""
@@ -133,6 +133,18 @@ FT_WRENCH = Topic(
     "what the wrist's sensor measures, tool and bias included, in the axes of `ft_frame`, N and "
     "N m; positive is what acts on the arm; only where `ft_frame` is set",
 )
+LIMIT_DISTANCES = Topic(
+    "limit_distances",
+    JointState,
+    STATUS_QOS,
+    ("bounds_node",),
+    (USER,),
+    "by how much joints are inside the limits of `bounds_node`, negative outside, in the fields "
+    "of a joint state: `position` to the nearer of position_min and position_max, rad, .inf "
+    "without them; `velocity` to velocity_max, rad/s; `effort` from the motors' torque to "
+    "torque_max, N m, where both are known; 20 times a second, silent when the robot is; stamp of "
+    "the joint state",
+)
 ROBOT_DESCRIPTION = Topic(
     "robot_description",
     String,
@@ -144,18 +156,30 @@ ROBOT_DESCRIPTION = Topic(
 DIAGNOSTICS = Topic(
     "/diagnostics",
     DiagnosticArray,
-    QoSProfile(depth=10),
+    STATUS_QOS,
     ("bounds_node", "controller_node", "bullet_node"),
     ("scenario_node",),
     "mode and why, refused messages by reason, margins, latency, solver, closest approach; the "
     "name of a status is that of its node with the namespace, as in `left/bullet_node`",
+)
+VALUES = Topic(
+    "~/values",
+    Float64MultiArray,
+    STATUS_QOS,
+    ("bounds_node", "controller_node", "bullet_node"),
+    (USER,),
+    "the numbers in the node's diagnostics, to plot them: `data` has one quantity after the "
+    "other, `layout.dim` the key of each as `label` and how many numbers it has as `size`, not "
+    "the dimensions of one array; sent with `/diagnostics`",
 )
 SHARED_TOPICS = (
     JOINT_STATES,
     ACCELERATION_LIMITS,
     JOINT_COMMANDS,
     FT_WRENCH,
+    LIMIT_DISTANCES,
     ROBOT_DESCRIPTION,
     DIAGNOSTICS,
+    VALUES,
 )
-"""Topics between nodes of different packages."""
+"""Topics between nodes of different packages, and those of the bounds node."""
