@@ -55,7 +55,8 @@ def hurried(tmp_path_factory):
     (tree / "install").symlink_to(ROOT / "install")
     (tree / "scripts").mkdir()
     (tree / "scripts" / "setup.sh").write_text(f"source '{ROOT}/scripts/setup.sh'\n")
-    (tree / "scripts" / "demo.sh").symlink_to(ROOT / "scripts" / "demo.sh")
+    for script in ("demo.sh", "domain.sh"):
+        (tree / "scripts" / script).symlink_to(ROOT / "scripts" / script)
     shutil.copytree(ROOT / "config", tree / "config")
     for path in (tree / "config" / "scenarios").iterdir():
         scenario = yaml.safe_load(path.read_text())
