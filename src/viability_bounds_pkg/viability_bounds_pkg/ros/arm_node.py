@@ -29,7 +29,8 @@ class ArmNode(Node):
 
     def __init__(self, **node_arguments: Any) -> None:
         self._claims: list[Claim] = []
-        super().__init__(self.NAME, **node_arguments)
+        # With the services that `rqt_logger_level` uses.
+        super().__init__(self.NAME, enable_logger_service=True, **node_arguments)
 
     @contextmanager
     def starting(self, *topics: Topic) -> Iterator[None]:

@@ -116,10 +116,13 @@ def refuse_unknown(given: Iterable[str], known: Iterable[str]) -> None:
     every = {*known, *_names_in_project()}
     unknown = [name for name in given if name not in every and not _OF_ROS.fullmatch(name)]
     if unknown:
-        raise UnknownParameterError("; ".join(_question(name, every) for name in sorted(unknown)))
+        raise UnknownParameterError(
+            "; ".join(unknown_parameter(name, every) for name in sorted(unknown))
+        )
 
 
-def _question(name: str, known: Iterable[str]) -> str:
+def unknown_parameter(name: str, known: Iterable[str]) -> str:
+    """Return what to say of an unknown name, with the one of those known that is most alike."""
     alike = difflib.get_close_matches(name, sorted(known), n=1, cutoff=0.6)
     return f"unknown parameter '{name}'" + (f"; did you mean '{alike[0]}'?" if alike else "")
 

@@ -16,10 +16,11 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
+from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
-from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError
 from viability_bounds_pkg.parameter import REQUIRED, Parameter, parameter_table, read
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.given_parameters import (
@@ -27,10 +28,18 @@ from viability_bounds_pkg.ros.given_parameters import (
     given_parameters,
     refuse_renamed,
     refuse_unknown,
+    unknown_parameter,
     why_missing,
 )
 
 Configuration = TypeVar("Configuration")
+
+
+class UndeclaredParameterError(ArmSafetyError, ParameterNotDeclaredException):
+    """A parameter is to be set that the node has not; rclpy's own text (7.1) names none."""
+
+    def __init__(self, text: str) -> None:
+        Exception.__init__(self, text)
 
 
 class NodeParameters(Generic[Configuration]):
@@ -72,11 +81,20 @@ class NodeParameters(Generic[Configuration]):
             ) from error
         for row in table:
             node.set_descriptor(row.name, describe(row))
+        self._node = node
+        node.add_pre_set_parameters_callback(self._refuse_undeclared)
         node.add_on_set_parameters_callback(self._judge)
         node.add_post_set_parameters_callback(self._apply)
 
     def _changed(self, parameters: Sequence[Any]) -> dict[str, Any]:
         return {p.name: p.value for p in parameters if p.name in self._values}
+
+    def _refuse_undeclared(self, parameters: list[RosParameter]) -> list[RosParameter]:
+        for parameter in parameters:
+            if not self._node.has_parameter(parameter.name):
+                declared = self._node.list_parameters([], 0).names
+                raise UndeclaredParameterError(unknown_parameter(parameter.name, declared))
+        return parameters
 
     def _judge(self, parameters: Sequence[Any]) -> SetParametersResult:
         try:
