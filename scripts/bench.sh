@@ -1,21 +1,30 @@
 #!/usr/bin/env bash
 # SPDX-License-Identifier: Apache-2.0
-# Measures run times and prints them. Ratios compare programs that run in turns in one process.
-#
-#     bash scripts/bench.sh chain     from state to command through both nodes, against empty relays
-#     bash scripts/bench.sh step      one controller step, part by part
-#     bash scripts/bench.sh bounds    acceleration bounds: one arm, and batches; with --tsid
-#                                     also TSID's, which is installed into .venv-tsid
-#     bash scripts/bench.sh robot     physics steps of the simulated robot, and their accuracy
-#     bash scripts/bench.sh collision pairs of shapes, and controller steps with and without them
-#     bash scripts/bench.sh antiwindup  limits on the integral torque, in closed form and by a solver
-#     bash scripts/bench.sh compliance  controller steps with integral action, sensor and contacts
+# Measures run times and prints them.
 set -eu
+usage() {
+    cat <<'USAGE'
+usage: bash scripts/bench.sh NAME [options]
+
+Ratios compare programs that run in turns in one process. NAME --help lists options.
+
+  chain       from state to command through both nodes, against empty relays
+  step        one controller step, part by part
+  bounds      acceleration bounds: one arm, and batches; with --tsid also TSID's, which is
+              installed into .venv-tsid
+  robot       physics steps of the simulated robot, and their accuracy
+  collision   pairs of shapes, and controller steps with and without them
+  antiwindup  limits on the integral torque, in closed form and by a solver
+  compliance  controller steps with integral action, sensor and contacts
+  nullspace   a step of null-space compliance; with --motion also how far the hand gives way
+USAGE
+}
 root="$(cd "$(dirname "$0")/.." && pwd)"
 name="${1:-}"
+case "$name" in -h | --help) usage; exit 0 ;; esac
 if [ -z "$name" ] || [ ! -f "$root/benchmarks/bench_$name.py" ]; then
     known="$(cd "$root/benchmarks" && ls bench_*.py | sed 's/bench_//; s/.py//' | tr '\n' ' ')"
-    echo "usage: bash scripts/bench.sh NAME [options]; there are: $known" >&2
+    echo "error: no benchmark '$name'; there are: $known" >&2
     exit 2
 fi
 shift

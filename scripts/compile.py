@@ -8,8 +8,9 @@ is kept from the same sources is not compiled again.
 
 from __future__ import annotations
 
+import argparse
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Event, Thread
@@ -22,6 +23,7 @@ from direct import DirectLoop
 from sim_bridge.bullet.obstacles import Obstacle
 from torque_safety_controller.anti_windup import project_to_limits
 from torque_safety_controller.node.limits import LimitsReader
+from viability_bounds_pkg.cli.command_line import INTERRUPTED
 from viability_bounds_pkg.compiled import compilations, compiled_functions, is_kept
 from viability_bounds_pkg.ros.messages import JointStateReader
 
@@ -30,8 +32,20 @@ TABLE = Obstacle("table", "box", (0.2, 0.6, 0.1), (0.30702, 0.0, 0.42237), (0.0,
 """5 mm below Panda's fingertips at its start."""
 
 
-def main() -> None:
-    """Compile everything, and say how far it is."""
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Compile everything, and say how far it is; return the exit code, 130 after SIGINT."""
+    argparse.ArgumentParser(
+        prog="compile.py", description=(__doc__ or "").splitlines()[0]
+    ).parse_args(arguments)
+    try:
+        compile_all()
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    return 0
+
+
+def compile_all() -> None:
+    """Let each function be called with the types that it has in use."""
     (wall,) = yaml.safe_load((CONFIG / "obstacles" / "panda_wall.yaml").read_text()).values()
     with progress():
         for path in sorted(CONFIG.glob("*.yaml")):
@@ -84,4 +98,4 @@ def progress() -> Iterator[None]:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

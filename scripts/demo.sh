@@ -4,38 +4,51 @@
 set -eu
 usage() {
     cat <<'USAGE'
-usage: bash scripts/demo.sh [robot] [scenario] [--bounds exact|naive] [--rate HZ] [--lockstep]
+usage: bash scripts/demo.sh [robot] [scenario] [--bounds METHOD] [--rate HZ] [--real-time]
                             [--params FILE] [--out DIRECTORY]
 
   robot        a parameter file in config/ that has a scenario: baxter_left_arm (default), panda,
                talos_left_arm
   scenario     the name in config/scenarios/<robot>_<scenario>.yaml, or the path of a file,
                see docs/scenarios.md (default: demo)
-  --bounds     how acceleration limits are computed; naive violates the limits (default: exact)
+  --bounds     how acceleration limits are computed: exact (default), or naive, which violates the
+               limits, decre, rubrecht, damper
   --rate       control rate in Hz (default: the robot's own)
-  --lockstep   the simulation waits for each command: as fast as the machine can, and repeatable
+  --real-time  by the wall clock; without, in lockstep: the simulation waits for each command, so
+               that it is as fast as the machine can, repeatable, and misses no deadline
   --params     a second parameter file, such as config/obstacles/panda_wall.yaml
-  --out        where figure, data and metrics go (default: results/demo)
+  --out        where figure, data and metrics go (default: results/<robot>_<scenario>; then
+               results/demo is a link to it)
 
 Exits with 0 when no limit was violated, 1 when one was, 2 when it could not run.
 USAGE
 }
 
+refuse() {
+    echo "error: $*" >&2
+    exit 2
+}
+value() {
+    [ $# -gt 1 ] || refuse "$1 needs a value"
+    echo "$2"
+}
+
 root="$(cd "$(dirname "$0")/.." && pwd)"
-robot='' scenario='' bounds=exact rate='' params='' clock=real_time out="$root/results/demo"
+robot='' scenario='' bounds=exact rate=default params='' clock=lockstep out=''
 while [ $# -gt 0 ]; do
     case "$1" in
-    --bounds) bounds="${2:?--bounds needs a value}"; shift ;;
-    --rate) rate="${2:?--rate needs a value}"; shift ;;
-    --params) params="${2:?--params needs a value}"; shift ;;
-    --out) out="${2:?--out needs a value}"; shift ;;
+    --bounds) bounds="$(value "$@")"; shift ;;
+    --rate) rate="$(value "$@")"; shift ;;
+    --params) params="$(value "$@")"; shift ;;
+    --out) out="$(value "$@")"; shift ;;
     --lockstep) clock=lockstep ;;
+    --real-time) clock=real_time ;;
     -h | --help) usage; exit 0 ;;
-    -*) echo "error: unknown option '$1'" >&2; usage >&2; exit 2 ;;
+    -*) refuse "unknown option '$1'; --help lists them" ;;
     *)
         if [ -z "$robot" ]; then robot="$1"
         elif [ -z "$scenario" ]; then scenario="$1"
-        else echo "error: unknown argument '$1'" >&2; usage >&2; exit 2
+        else refuse "unknown argument '$1'; see --help"
         fi
         ;;
     esac
@@ -46,21 +59,30 @@ scenarios="$root/config/scenarios"
 config="$root/config/$robot.yaml"
 if [ ! -f "$config" ] || [ ! -f "$scenarios/${robot}_demo.yaml" ]; then
     known="$(cd "$scenarios" && ls -- *_demo.yaml | sed 's/_demo.yaml//' | tr '\n' ' ')"
-    echo "error: unknown robot '$robot'; there are: $known" >&2
-    exit 2
+    refuse "unknown robot '$robot'; there are: $known"
 fi
 if [ -f "$scenarios/${robot}_$scenario.yaml" ]; then
     scenario="$scenarios/${robot}_$scenario.yaml"
 elif [ ! -f "$scenario" ]; then
     known="$(cd "$scenarios" && ls -- "${robot}"_*.yaml)"
     known="$(sed "s/^${robot}_//; s/.yaml$//" <<<"$known" | tr '\n' ' ')"
-    echo "error: unknown scenario '$scenario' of $robot; there are: $known" >&2
-    exit 2
+    refuse "unknown scenario '$scenario' of $robot; there are: $known"
 fi
 
-if [ -n "$params" ] && [ ! -f "$params" ]; then
-    echo "error: no parameter file '$params'" >&2
-    exit 2
+[ -z "$params" ] || [ -f "$params" ] || refuse "no parameter file '$params'"
+case "$bounds" in
+exact | naive | decre | rubrecht | damper) ;;
+*) refuse "--bounds is '$bounds'; allowed: exact, naive, decre, rubrecht, damper" ;;
+esac
+if [ "$rate" != default ] && ! { [[ "$rate" =~ ^[0-9]*\.?[0-9]+$|^[0-9]+\.$ ]] &&
+    awk -v rate="$rate" 'BEGIN { exit !(0 < rate && rate <= 10000) }'; }; then
+    refuse "--rate is '$rate'; allowed: a number of Hz above 0, at most 10000"
+fi
+link=''
+if [ -z "$out" ]; then
+    name="$(basename "$scenario" .yaml)"
+    out="$root/results/${robot}_${name#"${robot}_"}"
+    link="$root/results/demo"
 fi
 
 set +u # ROS' own set-up scripts use unset variables
@@ -75,7 +97,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
 overrides=()
 [ -z "$params" ] || overrides+=(--params-file "$params")
 overrides+=(-p "clock:=$clock" -p "bounds_node:method:=$bounds" -p start_paused:=true)
-[ -z "$rate" ] || overrides+=(-p "rate_hz:=$rate")
+[ "$rate" = default ] || overrides+=(-p "rate_hz:=$rate")
 if [ "$clock" = lockstep ]; then
     # The robot waits for the nodes, so long time-outs are safe and a busy machine causes none.
     overrides+=(-p bounds_timeout:=5.0 -p state_timeout:=10.0)
@@ -88,12 +110,14 @@ start() {
     pids+=($!)
 }
 stop() {
-    trap - EXIT INT TERM
-    kill "${pids[@]}" 2>/dev/null || true
-    wait "${pids[@]}" 2>/dev/null || true
+    trap - EXIT INT TERM HUP
+    local running
+    mapfile -t running < <(jobs -p)
+    kill "${running[@]}" 2>/dev/null || true
+    wait 2>/dev/null || true
 }
 trap stop EXIT
-trap 'exit 130' INT TERM
+trap 'exit 130' INT TERM HUP
 
 start viability_bounds_pkg bounds_node
 start torque_safety_controller controller_node
@@ -105,9 +129,10 @@ play=$!
 # The scenario ends by itself; a node that ends before it could not start.
 status=0
 wait -n -p ended "$play" "${pids[@]}" || status=$?
-if [ "$ended" != "$play" ]; then
-    kill "$play" 2>/dev/null || true
-    wait "$play" 2>/dev/null || true
-    exit 2
+[ "$ended" = "$play" ] || exit 2
+if [ -n "$link" ] && [ "$status" -le 1 ]; then
+    # Before there was a folder for each scenario, this was one.
+    [ -L "$link" ] || [ ! -e "$link" ] || mv --backup=numbered -T "$link" "$link.old"
+    ln -sfnT "$(basename "$out")" "$link"
 fi
 exit "$status"

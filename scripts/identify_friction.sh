@@ -14,14 +14,23 @@ usage: bash scripts/identify_friction.sh [robot] [-o FILE] [--recording FILE]
 USAGE
 }
 
+refuse() {
+    echo "error: $*" >&2
+    exit 2
+}
+value() {
+    [ $# -gt 1 ] || refuse "$1 needs a value"
+    realpath -m -- "$2"
+}
+
 root="$(cd "$(dirname "$0")/.." && pwd)"
 robot=talos_left_arm output='' recording=''
 while [ $# -gt 0 ]; do
     case "$1" in
-    -o | --output) output="$(realpath -m -- "${2:?$1 needs a value}")"; shift ;;
-    --recording) recording="$(realpath -m -- "${2:?--recording needs a value}")"; shift ;;
+    -o | --output) output="$(value "$@")"; shift ;;
+    --recording) recording="$(value "$@")"; shift ;;
     -h | --help) usage; exit 0 ;;
-    -*) echo "error: unknown option '$1'" >&2; usage >&2; exit 2 ;;
+    -*) refuse "unknown option '$1'; --help lists them" ;;
     *) robot="$1" ;;
     esac
     shift
@@ -29,8 +38,7 @@ done
 config="$root/config/$robot.yaml"
 if [ ! -f "$config" ]; then
     known="$(cd "$root/config" && ls -- *.yaml | sed 's/\.yaml//' | tr '\n' ' ')"
-    echo "error: unknown robot '$robot'; there are: $known" >&2
-    exit 2
+    refuse "unknown robot '$robot'; there are: $known"
 fi
 if [ -z "$output" ]; then
     output="$root/results/friction/$robot.yaml"

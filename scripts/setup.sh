@@ -9,6 +9,17 @@
 # the three packages with colcon, and compiles what Numba would otherwise compile at the first start
 # of a node. What is done already is not done again. See docs/installation.md.
 
+_usage() {
+    cat <<'USAGE'
+usage: source scripts/setup.sh
+
+Makes .venv with what the packages need, builds the packages into install/, compiles what Numba
+compiles, and activates all of it in this shell. What is done already is not done again.
+
+  PYTHON    the Python to make .venv of (default: python3)
+USAGE
+}
+
 _setup() {
     local root python venv stamp wanted inputs
     root="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
@@ -138,7 +149,7 @@ _build() {
     # Sources are symlinked, so only changes of these files need a new build.
     local built="$root/install/.built" now
     now="$(cat "$root"/src/*/setup.py "$root"/src/*/setup.cfg "$root"/src/*/package.xml \
-        "$root/colcon.meta" "$stamp" <(cd "$root" && find config | sort) |
+        "$root/colcon.meta" "$stamp" <(cd "$root" && find config/ | sort) |
         sha256sum | cut -d' ' -f1) $root"
     if [ "$(cat "$built" 2>/dev/null)" = "$now" ]; then
         return 0
@@ -155,7 +166,7 @@ _build() {
 
 _compile() {
     local compiled="$root/install/.compiled" now
-    now="$(find "$root/src" "$root/config" "$root/scripts/compile.py" \
+    now="$(find "$root/src" "$root/scripts/compile.py" \
         -path '*/test/*' -prune -o \( -name '*.py' -o -name '*.yaml' \) -print0 |
         LC_ALL=C sort -z | xargs -0 sha256sum | cat - "$stamp" | sha256sum)"
     if [ "$(cat "$compiled" 2>/dev/null)" = "$now" ]; then
@@ -168,12 +179,19 @@ _compile() {
     printf '%s' "$now" >"$compiled"
 }
 
+# Scripts source it with their own arguments in place.
+if [ -z "${BASH_SOURCE[1]:-}" ] && [[ "${1:-}" =~ ^(-h|--help)$ ]]; then
+    _usage
+    unset -f _usage _setup _install _install_pybullet _build _compile
+    return 0 2>/dev/null || exit 0
+fi
+
 # One at a time: two shells may source this at once.
 exec {_lock}>"$(dirname "${BASH_SOURCE[0]}")/../.setup.lock"
 flock "$_lock"
 _setup
 _status=$?
 exec {_lock}>&-
-unset -f _setup _packages _install _pip _explain _install_pybullet _build _compile
+unset -f _usage _setup _packages _install _pip _explain _install_pybullet _build _compile
 unset _lock
 (exit $_status)

@@ -1,12 +1,22 @@
 #!/usr/bin/env bash
 # SPDX-License-Identifier: Apache-2.0
-# Runs the tests, setting itself up first. Arguments go to pytest:
-#
-#     bash scripts/test.sh                  all of them, in several processes
-#     bash scripts/test.sh -k viability     some of them, in one
-#     bash scripts/test.sh -n 2             as many as you say; 0 for one
-#     bash scripts/test.sh --hypothesis-profile=explore    with other examples than last time
+# Runs the tests, setting itself up first.
 set -eu
+case "${1:-}" in
+-h | --help)
+    cat <<'USAGE'
+usage: bash scripts/test.sh [options of pytest]
+
+  bash scripts/test.sh                  all tests, in several processes
+  bash scripts/test.sh -k viability     some of them, in one
+  bash scripts/test.sh -n 2             in so many processes; 0 for this one
+  bash scripts/test.sh --hypothesis-profile=explore    with other examples than last time
+
+`python -m pytest --help`, after `source scripts/setup.sh`, lists the options.
+USAGE
+    exit 0
+    ;;
+esac
 root="$(cd "$(dirname "$0")/.." && pwd)"
 set +u
 # shellcheck disable=SC1091

@@ -2,7 +2,10 @@
 """The demo as a user starts it, and its scenarios without messages between the nodes."""
 
 import json
+import os
+import signal
 import subprocess
+import time
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +16,10 @@ from direct import DirectLoop, column, hand_errors
 
 from sim_bridge.scenario.events import ParameterChange, PoseGoal, Push
 from sim_bridge.scenario.scenario import load_scenario
+from viability_bounds_pkg.node.bounds_parameters import METHODS
 
 ROOT = Path(__file__).resolve().parent.parent
+DEMO = ROOT / "scripts" / "demo.sh"
 SCENARIOS = ROOT / "config" / "scenarios"
 KEYS = {
     "robot",
@@ -32,7 +37,7 @@ KEYS = {
 
 def demo(*arguments):
     return subprocess.run(
-        ["bash", ROOT / "scripts" / "demo.sh", *map(str, arguments)],
+        ["bash", DEMO, *map(str, arguments)],
         capture_output=True,
         text=True,
         timeout=120,
@@ -41,7 +46,7 @@ def demo(*arguments):
 
 
 def test_exact_bounds_break_no_limit(tmp_path):
-    result = demo("baxter_left_arm", "--lockstep", "--out", tmp_path)
+    result = demo("baxter_left_arm", "--out", tmp_path)
     assert result.returncode == 0, result.stdout + result.stderr
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert set(metrics) >= KEYS
@@ -57,10 +62,14 @@ def test_exact_bounds_break_no_limit(tmp_path):
         for row in metrics["joints"].values()
     )
     assert closest < 5e-3
-    assert metrics["deadline_misses"] == 0
+    assert metrics["clock"] == "lockstep"
+    assert metrics["deadline_misses"] == metrics["braked_periods"] == 0
     assert (tmp_path / "figure.png").stat().st_size > 50_000
     assert (tmp_path / "data.npz").exists()
     assert "no limit was broken" in result.stdout
+    # In a file the progress is a few lines.
+    assert result.stdout.count("TRACKING") <= 5
+    assert "nan" not in result.stdout
     assert all(name in result.stdout for name in metrics["joints"])
 
 
@@ -85,16 +94,82 @@ def test_naive_bounds_break_the_elbow_and_say_so(tmp_path):
         (["no_such_robot"], "no_such_robot"),
         (["panda", "no_such_scenario"], "no_such_scenario"),
         (["--no-such-option"], "--no-such-option"),
-        (["--bounds", "guessed", "--lockstep"], "method"),
+        (["panda", "demo", "more"], "more"),
+        (["--bounds", "guessed"], "--bounds is 'guessed'"),
+        (["--rate", "abc"], "--rate is 'abc'"),
+        (["--rate", "-1"], "--rate is '-1'"),
+        (["--rate", "0"], "--rate is '0'"),
+        (["--rate", "0.0"], "--rate is '0.0'"),
+        (["--rate", "10001"], "--rate is '10001'"),
+        (["--rate", ""], "--rate is ''"),
+        (["--params", "no/such.yaml"], "no/such.yaml"),
+        (["--rate"], "--rate needs a value"),
     ],
 )
-def test_what_it_cannot_play_is_refused(tmp_path, arguments, names):
-    result = demo(*arguments, "--out", tmp_path)
+def test_what_it_cannot_play_is_refused_in_one_line(tmp_path, arguments, names):
+    result = demo("--out", tmp_path, *arguments)
     assert result.returncode == 2
-    errors = [line for line in result.stderr.splitlines() if line.startswith("error:")]
-    assert len(errors) == 1
-    assert names in errors[0]
-    assert not (tmp_path / "metrics.json").exists()
+    assert result.stdout == ""
+    (error,) = result.stderr.splitlines()
+    assert error.startswith("error: ")
+    assert names in error
+
+
+def test_it_knows_the_bounds_there_are():
+    assert f"\n{' | '.join(METHODS)}) ;;\n" in DEMO.read_text()
+
+
+@pytest.mark.parametrize(
+    ("when", "sent"), [("nodes start", signal.SIGINT), ("it runs", signal.SIGTERM)]
+)
+def test_a_signal_takes_down_all_of_it(tmp_path, when, sent):
+    environment = os.environ | {"DEMO_UNDER_TEST": str(tmp_path)}
+    process = subprocess.Popen(
+        ["bash", DEMO, "panda", "--out", tmp_path],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        # Started from a job in the background, SIGINT is ignored by inheritance.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+
+    def nodes():
+        return [pid for pid in started_by(environment["DEMO_UNDER_TEST"]) if pid != process.pid]
+
+    try:
+        if when == "nodes start":
+            deadline = time.monotonic() + 60.0
+            while len(nodes()) < 4 and process.poll() is None:
+                assert time.monotonic() < deadline, "the nodes did not start"
+        else:
+            assert any("TRACKING" in line for line in process.stdout)
+        process.send_signal(sent)
+        _, errors = process.communicate(timeout=30)
+        assert process.returncode == 130, errors
+        assert nodes() == []
+        assert "Traceback" not in errors
+        assert "Error" not in errors
+        assert "FATAL" not in errors
+    finally:
+        process.kill()
+        for pid in nodes():
+            os.kill(pid, signal.SIGKILL)
+
+
+def started_by(mark):
+    """Return the nodes whose environment names a mark."""
+    found = []
+    for path in Path("/proc").iterdir():
+        if path.name.isdigit():
+            try:
+                if b"/lib/" in (path / "cmdline").read_bytes() and (
+                    f"DEMO_UNDER_TEST={mark}\0".encode() in (path / "environ").read_bytes()
+                ):
+                    found.append(int(path.name))
+            except OSError:  # gone, or another user's
+                continue
+    return found
 
 
 def begin(loop, event):

@@ -27,9 +27,9 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "bullet_node = sim_bridge.nodes.bullet_node:main",
-            "record_excitation = sim_bridge.tools.record_excitation:main",
-            "scenario_node = sim_bridge.nodes.scenario_node:main",
+            "bullet_node = sim_bridge.cli.ros_program:bullet_node",
+            "record_excitation = sim_bridge.cli.ros_program:record_excitation",
+            "scenario_node = sim_bridge.cli.ros_program:scenario_node",
         ],
     },
 )

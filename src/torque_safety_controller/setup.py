@@ -33,7 +33,7 @@ setup(
     entry_points={
         "console_scripts": [
             "controller_node = torque_safety_controller.cli.ros_program:controller_node",
-            "identify_friction = torque_safety_controller.cli.identify_friction:main",
+            "identify_friction = torque_safety_controller.cli.ros_program:identify_friction",
         ],
     },
 )

@@ -33,7 +33,7 @@ setup(
         "console_scripts": [
             "bounds_node = viability_bounds_pkg.cli.ros_program:bounds_node",
             "estimate_acceleration_limits = "
-            "viability_bounds_pkg.cli.estimate_acceleration_limits:main",
+            "viability_bounds_pkg.cli.ros_program:estimate_acceleration_limits",
         ],
     },
 )

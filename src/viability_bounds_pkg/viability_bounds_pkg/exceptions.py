@@ -6,8 +6,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 
 class ArmSafetyError(Exception):
     """Base class of all errors that this project raises on purpose."""
@@ -35,7 +33,7 @@ class SettingError(ArmSafetyError, ValueError):
 def _show(value: Any) -> str:
     if value is None:
         return "not set"
-    if isinstance(value, np.ndarray):
+    if hasattr(value, "tolist"):  # an array; NumPy takes too long to import for entry points
         value = value.tolist()
     if isinstance(value, str):
         return repr(value)

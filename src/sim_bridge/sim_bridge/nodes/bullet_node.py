@@ -21,6 +21,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.nodes.bullet_parameters import BulletConfiguration, make_robot
+from sim_bridge.nodes.command_outage import CommandOutage
 from sim_bridge.nodes.ft_sensor import ForceTorqueReading
 from sim_bridge.nodes.joint_command import (
     CommandError,
@@ -129,6 +130,7 @@ class BulletNode(ArmNode):
         self._monitor.reset()
         self._command: JointCommand | None = None
         self._missed_in_row = self._missed = self._braked = 0
+        self._outage = CommandOutage(config.command_timeout, math.ceil(config.rate_hz))
         self._periods = 0
         self._plan_pause()
         self._torque_ratio = 0.0
@@ -176,6 +178,8 @@ class BulletNode(ArmNode):
             self._robot.step(command.tau, config.substeps)
         else:
             self._robot.move(*command, config.torque_max, config.velocity_max, config.substeps)
+        if news := self._outage.count(command is None):
+            self.get_logger().warning(news)
         self._periods += 1
         self._advanced = True
         if self._periods >= self._pause_at:
@@ -192,9 +196,6 @@ class BulletNode(ArmNode):
                 self._missed_in_row += 1
                 if self._missed_in_row > self._config.command_timeout:
                     self._command = None
-                    self.get_logger().warning(
-                        f"no command for {self._missed_in_row} periods: braking"
-                    )
             self._advance()
         self._next_state()
 

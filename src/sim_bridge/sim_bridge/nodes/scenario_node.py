@@ -9,6 +9,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import rclpy
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException
 
+from sim_bridge.nodes.progress import Progress
 from sim_bridge.nodes.run_listener import RunListener
 from sim_bridge.nodes.scenario_messages import (
     RESET,
@@ -32,6 +34,7 @@ from sim_bridge.nodes.scenario_messages import (
 from sim_bridge.scenario.events import ServiceEvent
 from sim_bridge.scenario.recording import RecordedRun
 from sim_bridge.scenario.scenario import ScenarioConfiguration
+from viability_bounds_pkg.cli.command_line import INTERRUPTED
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.parameters import NodeParameters
@@ -165,10 +168,10 @@ class ScenarioNode(ArmNode):
         clients = self._service_clients.items()
         topics = self._goals.without_subscriber() + self._world.without_subscriber()
         return (
-            ([] if self.robot.get("paused") == "True" else ["a paused robot"])
+            ([] if self.robot.get("paused") == "True" else ["paused robot"])
             + ([] if self.listener.answered >= 0 else ["joint commands"])
             + [f"service {name}" for name, client in clients if not client.service_is_ready()]
-            + [f"a subscriber of {topic}" for topic in topics]
+            + [f"subscriber of {topic}" for topic in topics]
         )
 
     def _call(self, request: ServiceRequest, when: str = "") -> Iterator[str]:
@@ -219,61 +222,70 @@ class ScenarioNode(ArmNode):
 
     # Output
 
-    def live_line(self) -> str:
-        """Return the state of the run in one line."""
-        q = self.listener.q
-        if self.awaits.startswith("getting ready") or self.listener.stamp < 0:
-            return "waiting for the nodes"
-        distance = np.minimum(q - self.config.position_min, self.config.position_max - q)
+    def show(self, progress: Progress) -> None:
+        """Show the state of the run."""
+        if self._refused is None:
+            progress.wait(self.awaits)
+            return
+        distance = np.minimum(
+            self.listener.q - self.config.position_min, self.config.position_max - self.listener.q
+        )
         nearest = int(np.argmin(distance))
         controller = self.listener.diagnostics["controller_node"]
-        error = float(controller.get("position_error_m", "nan"))
-        return (
-            f"{max(0.0, (self.listener.stamp - self._first) * 1e-9):6.2f} s  "
-            f"{controller.get('mode', '?'):<8}  "
-            f"nearest limit {self.config.joints[nearest]} {distance[nearest]:+.4f} rad  "
-            f"pose error {1e3 * error:7.2f} mm  "
-            f"{float(self.robot.get('rate_hz', 'nan')):5.0f} Hz"
+        state = (
+            f"{controller.get('mode', '')}  "
+            f"nearest limit {self.config.joints[nearest]} {distance[nearest]:+.4f} rad"
         )
+        error = float(controller.get("position_error_m", "nan"))
+        if np.isfinite(error):  # there is a goal
+            state += f"  pose error {1e3 * error:.2f} mm"
+        state += f"  {float(self.robot['rate_hz']):.0f} Hz"
+        # With the period that the last state begins.
+        played = 1e-9 * (self.listener.stamp - self._first + self._period)
+        progress.show(max(0.0, played), state)
 
 
-def play(node: ScenarioNode, others: Sequence[ArmNode] = (), *, quiet: bool = False) -> None:
+def play(
+    node: ScenarioNode,
+    others: Sequence[ArmNode] = (),
+    *,
+    signals: Sequence[int] = (),
+    quiet: bool = False,
+) -> None:
     """Run the scenario to its end and print its state.
 
     Args:
         node: the scenario.
         others: nodes to run in the same process.
+        signals: received so far; one more ends the run early.
         quiet: print nothing.
 
     Raises:
         TimeoutError: the other nodes did not start, or stopped answering.
         ScenarioRefused: another node refused a message or call of the scenario.
-        ExternalShutdownException: shut down before the end.
+        ExternalShutdownException: shut down, or a signal received, before the end.
     """
     executor = make_executor(node.context)
     for each in (node, *others):
         executor.add_node(each)
-    terminal = sys.stdout.isatty()
-    shown_at = -math.inf
-    progress, moved_at = None, time.monotonic()
-    while not node.done and rclpy.ok(context=node.context):
-        executor.spin_once(timeout_sec=0.1)
-        now = time.monotonic()
-        if (node.listener.stamp, node.awaits) != progress:
-            progress, moved_at = (node.listener.stamp, node.awaits), now
-        elif now - moved_at > node.config.ready_timeout:
-            raise TimeoutError(
-                f"nothing has moved for {node.config.ready_timeout:g} s ({node.awaits})"
-            )
-        if not quiet and now - shown_at > _SHOW_PERIOD:
-            shown_at = now
-            print(node.live_line(), end="\r" if terminal else "\n", flush=True)
+    seen, moved_at, shown_at = None, time.monotonic(), -math.inf
+    with nullcontext() if quiet else Progress(node.config.plan.duration) as progress:
+        while not (node.done or signals) and rclpy.ok(context=node.context):
+            executor.spin_once(timeout_sec=0.1)
+            now = time.monotonic()
+            if (node.listener.stamp, node.awaits) != seen:
+                seen, moved_at = (node.listener.stamp, node.awaits), now
+            elif now - moved_at > node.config.ready_timeout:
+                raise TimeoutError(
+                    f"nothing has moved for {node.config.ready_timeout:g} s ({node.awaits})"
+                )
+            if progress and (node.done or now - shown_at > _SHOW_PERIOD):
+                shown_at = now
+                node.show(progress)
     if node.failure is not None:
         raise node.failure
     if not node.done:
         raise ExternalShutdownException
-    if not quiet:
-        print(node.live_line(), flush=True)
 
 
 def main(args: list[str] | None = None) -> int:
@@ -282,19 +294,24 @@ def main(args: list[str] | None = None) -> int:
     Returns:
         0 when no limit was broken, 1 when one was, 2 when the scenario could not be played.
     """
-    parser = node_parser(ScenarioNode)
-    parser.add_argument("--out", type=Path, metavar="DIRECTORY", help="where the report goes")
+    node = None
     try:
-        out = parser.parse_args(own_arguments(args)).out
-        initialise(args)
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
-        node = ScenarioNode()
-    except Exception as error:
-        rclpy.try_shutdown()
-        report_refusal(error)
-        return 2
-    try:
-        play(node)
+        try:
+            parser = node_parser(ScenarioNode)
+            parser.add_argument("--out", type=Path, metavar="DIRECTORY", help="of the report")
+            out = parser.parse_args(own_arguments(args)).out
+            initialise(args)
+            # An exception in a callback is more than the executor reports in one line.
+            signals: list[int] = []
+            for each in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(each, lambda number, _: signals.append(number))
+            node = ScenarioNode()
+        except Exception as error:
+            report_refusal(error)
+            return 2
+        play(node, signals=signals)
+        for each in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(each, signal.default_int_handler)
         if out is None:
             return 0
         from sim_bridge.scenario.report import write_report  # matplotlib takes a second to import
@@ -302,11 +319,11 @@ def main(args: list[str] | None = None) -> int:
         bounds = node.listener.diagnostics["bounds_node"]
         kept = write_report(out, node.config, node.recorded_run(), node.robot, bounds)
         return 0 if kept else 1
-    except (TimeoutError, ScenarioRefused) as error:
+    except (TimeoutError, ScenarioRefused, OSError) as error:
         report_refusal(error)
         return 2
     except (KeyboardInterrupt, ExternalShutdownException):
-        return 130
+        return INTERRUPTED
     finally:
         leave(node)
 

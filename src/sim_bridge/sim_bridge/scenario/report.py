@@ -171,8 +171,9 @@ def _metrics(
         "max_trajectory_error_m": _or_none(_trajectory_error(config, run, errors)),
         "max_contact_force_n": _or_none(float(robot.get("contact_force_max_n", "nan"))),
         "deadline_misses": int(robot["deadline_misses"]),
-        "latency_p50_us": float(robot["latency_p50_us"]),
-        "latency_p99_us": float(robot["latency_p99_us"]),
+        "braked_periods": int(robot["braked_periods"]),
+        "latency_p50_us": _or_none(float(robot["latency_p50_us"])),
+        "latency_p99_us": _or_none(float(robot["latency_p99_us"])),
         "recording_lost_periods": run.lost,
         "joints": {
             name: {
@@ -214,14 +215,22 @@ def _print_table(metrics: Metrics) -> None:
         print(f"off the trajectory: {1e3 * metrics['max_trajectory_error_m']:.3f} mm at most")
     if metrics["max_contact_force_n"]:
         print(f"contact force with obstacles: {metrics['max_contact_force_n']:.1f} N at most")
-    print(
-        f"{metrics['steps']} control periods, {metrics['deadline_misses']} deadlines missed, "
-        f"command latency {metrics['latency_p50_us']:.0f} us (median), "
-        f"{metrics['latency_p99_us']:.0f} us (99%)"
-    )
-    if metrics["limits_kept"]:
-        print("VERDICT: no limit was broken, at any physics step.")
-        return
+    periods = f"{metrics['steps']} control periods"
+    if metrics["latency_p50_us"] is not None:
+        periods += (
+            f", command latency {metrics['latency_p50_us']:.0f} us (median), "
+            f"{metrics['latency_p99_us']:.0f} us (99%)"
+        )
+    print(periods)
+    print(f"VERDICT: {verdict(metrics)}")
+
+
+def verdict(metrics: Metrics) -> str:
+    """Return which limits were broken, if any, and whether every command came in time.
+
+    Args:
+        metrics: as in ``metrics.json``.
+    """
     q, v = metrics["max_position_violation_rad"], metrics["max_velocity_violation_rad_s"]
     tau = metrics["max_torque_ratio"]
     broken = {
@@ -229,7 +238,23 @@ def _print_table(metrics: Metrics) -> None:
         f"speed by {v:.4g} rad/s": v > TOLERANCE,
         f"torque, {tau:.4g} of its limit": tau > 1.0 + TOLERANCE,
     }
-    print(f"VERDICT: limits were BROKEN: {'; '.join(text for text in broken if broken[text])}.")
+    said = "no limit was broken, at any physics step"
+    if not metrics["limits_kept"]:
+        said = f"limits were BROKEN: {'; '.join(text for text in broken if broken[text])}"
+    missed, braked, steps = (
+        metrics[key] for key in ("deadline_misses", "braked_periods", "steps")
+    )
+    if metrics["clock"] == "real_time" or missed:
+        said += f"; {missed} of {steps} deadlines were missed"
+    if braked:
+        said += f"; the robot braked without commands for {braked} of {steps} periods"
+    exact = metrics["bounds_method"] == "exact"  # the others promise nothing
+    if exact and not metrics["limits_kept"] and (missed or braked):
+        said += (
+            ": the promise needs a command in every period (give the nodes their own cores, or "
+            "lower rate_hz)"
+        )
+    return said + "."
 
 
 def _draw(
@@ -240,10 +265,10 @@ def _draw(
     j = int(np.argmin(clearance))
     t = run.t
     figure, axes = plt.subplots(4, 2, figsize=(12, 10), sharex=True, layout="constrained")
-    verdict = "no limit broken" if metrics["limits_kept"] else "LIMITS BROKEN"
+    outcome = "no limit broken" if metrics["limits_kept"] else "LIMITS BROKEN"
     figure.suptitle(
         f"{config.robot_name}: {metrics['bounds_method']} bounds, {metrics['rate_hz']:g} Hz, "
-        f"{metrics['clock']}: {verdict}"
+        f"{metrics['clock']}: {outcome}"
     )
     one, every = axes[:, 0], axes[:, 1]
     limit = {"color": "tab:red", "linestyle": "--", "linewidth": 1.2}

@@ -1,21 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Entry points of programs that need ROS 2, which say so in one line where it is missing."""
+"""Entry points of programs: they say in one line that ROS 2 is missing, or end by SIGINT."""
 
 from __future__ import annotations
 
+import signal
 import sys
+from collections.abc import Callable
 from importlib import import_module
+
+from viability_bounds_pkg.cli.command_line import INTERRUPTED
+
+
+def run_program(module: str) -> int:
+    """Import a module, run its `main` and return its exit code; 130 after SIGINT.
+
+    Args:
+        module: dotted name of the module.
+    """
+    return _run(_load(module))
 
 
 def run_with_ros(program: str, module: str) -> int:
-    """Run the `main` of a module that imports ROS 2; return its exit code, 1 without ROS 2.
+    """Run a program that imports ROS 2, as `run_program`; return 1 without ROS 2.
 
     Args:
         program: its name, for the message.
         module: dotted name of the module.
     """
     try:
-        main = import_module(module).main
+        main = _load(module)
     except ModuleNotFoundError as error:
         missing = error.name or str(error)
         if missing.split(".")[0] == module.split(".")[0]:
@@ -26,10 +39,34 @@ def run_with_ros(program: str, module: str) -> int:
             file=sys.stderr,
         )
         return 1
-    code: int = main()
-    return code
+    return _run(main)
+
+
+def _load(module: str) -> Callable[[], int]:
+    """Import a module and return its `main`; until that runs SIGINT just ends the process.
+
+    An import that is interrupted by an exception may fail with any other.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    main: Callable[[], int] = import_module(module).main
+    return main
+
+
+def _run(main: Callable[[], int]) -> int:
+    try:
+        if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        return main()
+    except KeyboardInterrupt:
+        return INTERRUPTED
 
 
 def bounds_node() -> int:
     """Run the bounds node."""
     return run_with_ros("bounds_node", "viability_bounds_pkg.node.bounds_node")
+
+
+def estimate_acceleration_limits() -> int:
+    """Run the estimator of acceleration limits."""
+    return run_program("viability_bounds_pkg.cli.estimate_acceleration_limits")

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Entry points of the package's programs."""

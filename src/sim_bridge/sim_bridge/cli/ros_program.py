@@ -1,0 +1,21 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Entry points of the package's programs, which import nothing heavy themselves."""
+
+from __future__ import annotations
+
+from viability_bounds_pkg.cli.ros_program import run_with_ros
+
+
+def bullet_node() -> int:
+    """Run the robot node."""
+    return run_with_ros("bullet_node", "sim_bridge.nodes.bullet_node")
+
+
+def record_excitation() -> int:
+    """Run the recording of a motion that excites joint friction."""
+    return run_with_ros("record_excitation", "sim_bridge.tools.record_excitation")
+
+
+def scenario_node() -> int:
+    """Run the scenario node."""
+    return run_with_ros("scenario_node", "sim_bridge.nodes.scenario_node")

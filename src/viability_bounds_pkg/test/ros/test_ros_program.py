@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Entry points: what they import may be interrupted."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import viability_bounds_pkg
+
+PACKAGES = str(Path(viability_bounds_pkg.__file__).resolve().parents[1])
+INTERRUPT = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n"
+CALL = "import sys; from viability_bounds_pkg.cli.ros_program import {0}; sys.exit({0}({1}))"
+
+
+def call(directory, program, function, arguments):
+    (directory / "slow_program.py").write_text(program)
+    return subprocess.run(
+        [sys.executable, "-c", CALL.format(function, arguments)],
+        env=os.environ | {"PYTHONPATH": f"{directory}{os.pathsep}{PACKAGES}"},
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+        # Started from a job in the background, SIGINT is ignored by inheritance.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+
+
+@pytest.mark.parametrize(
+    ("program", "code"),
+    [
+        (INTERRUPT + "main = int\n", -signal.SIGINT),
+        (f"def main():\n    {INTERRUPT.replace(chr(10), chr(10) + '    ')}return 0\n", 130),
+        ("def main(): return 3\n", 3),
+    ],
+    ids=["imports", "main", "undisturbed"],
+)
+@pytest.mark.parametrize(
+    ("function", "arguments"),
+    [("run_program", "'slow_program'"), ("run_with_ros", "'slow', 'slow_program'")],
+)
+def test_an_interrupt_leaves_no_traceback(tmp_path, function, arguments, program, code):
+    result = call(tmp_path, program, function, arguments)
+    assert (result.returncode, result.stderr) == (code, "")
+
+
+def test_before_the_program_nothing_heavy_is_imported():
+    code = (
+        "import sys, viability_bounds_pkg.cli.ros_program\n"
+        "sys.exit(not {'numpy', 'rclpy', 'numba'}.isdisjoint(sys.modules))"
+    )
+    environment = os.environ | {"PYTHONPATH": PACKAGES}
+    assert (
+        subprocess.run([sys.executable, "-c", code], env=environment, check=False).returncode == 0
+    )

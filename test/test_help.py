@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every script and executable says with --help what it is for."""
+
+import importlib.util
+import subprocess
+import sys
+from importlib.metadata import distribution
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+SCRIPTS = ROOT / "scripts"
+EXECUTABLES = {
+    entry.name: entry
+    for package in ("viability_bounds_pkg", "torque_safety_controller", "sim_bridge")
+    for entry in distribution(package).entry_points
+    if entry.group == "console_scripts"
+}
+
+
+@pytest.mark.parametrize("script", sorted(SCRIPTS.glob("*.sh")), ids=lambda path: path.name)
+def test_help_of_a_shell_script(script):
+    result = subprocess.run(
+        ["bash", script, "--help"], capture_output=True, text=True, timeout=30, check=False
+    )
+    assert (result.returncode, result.stderr) == (0, "")
+    assert result.stdout.startswith("usage: ")
+    assert script.name in result.stdout.splitlines()[0]
+
+
+def test_help_of_a_script_that_is_sourced():
+    result = subprocess.run(
+        ["bash", "-c", f"source {SCRIPTS}/setup.sh --help && echo it goes on"],
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
+    assert result.stdout.startswith("usage: source scripts/setup.sh")
+    assert result.stdout.endswith("it goes on\n")
+
+
+@pytest.mark.parametrize("script", sorted(SCRIPTS.glob("*.py")), ids=lambda path: path.name)
+def test_help_of_a_python_script(script, capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", [str(script), "--help"])
+    spec = importlib.util.spec_from_file_location(f"script_{script.stem}", script)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    with pytest.raises(SystemExit) as end:
+        module.main()
+    assert end.value.code == 0
+    assert capsys.readouterr().out.startswith(f"usage: {script.name}")
+
+
+def test_there_are_executables():
+    assert len(EXECUTABLES) >= 7
+
+
+@pytest.mark.parametrize("name", EXECUTABLES)
+def test_help_of_an_executable(name, capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", [name, "--help"])
+    with pytest.raises(SystemExit) as end:
+        EXECUTABLES[name].load()()
+    assert end.value.code == 0
+    out = capsys.readouterr().out
+    assert out.startswith(f"usage: {name}")
+    assert len(out.splitlines()) > 3
