@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from collections.abc import Callable
@@ -49,6 +50,8 @@ def _load(module: str) -> Callable[[], int]:
     """
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
+    # Matrices here are small: more threads only wait for each other, and keep cores busy with it.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     main: Callable[[], int] = import_module(module).main
     return main
 
