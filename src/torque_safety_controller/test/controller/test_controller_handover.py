@@ -376,8 +376,9 @@ class HandoverArm:
         states = dict(zip(self.states.stamps, self.states, strict=True))
         commands = dict(zip(self.commands.stamps, self.commands, strict=True))
         stamps = sorted(states)[:-1]
-        q = np.array([states[s].position for s in stamps])
-        tau = np.array([states[s].effort for s in stamps])
+        n = len(self.tau_max)  # the joints after these are locked
+        q = np.array([states[s].position[:n] for s in stamps])
+        tau = np.array([states[s].effort[:n] for s in stamps])
         return q, tau, np.array([len(commands[s].effort) > 0 for s in stamps])
 
 
