@@ -214,11 +214,11 @@ def test_packages_declare_what_they_import(package):
     text = (ROOT / "src" / package / "package.xml").read_text()
     own = {path.stem for path in (ROOT / "src" / package / "test" / "support").glob("*.py")}
     needs = {"exec": set(), "test": set()}
-    for path in (ROOT / "src" / package).rglob("*.py"):
+    shared = (ROOT / "src").glob("*/*/testing/*.py")  # all tests need what these import
+    for path in {*(ROOT / "src" / package).rglob("*.py"), *shared}:
         if path.name == "setup.py":
             continue
-        rooms = path.relative_to(ROOT / "src" / package).parts[:-1]
-        kind = "test" if {"test", "testing"} & set(rooms) else "exec"
+        kind = "test" if {"test", "testing"} & set(path.relative_to(ROOT).parts) else "exec"
         needs[kind] |= {name.split(".")[0] for name in imports(path)}
     for kind, names in needs.items():
         names -= sys.stdlib_module_names | own | {package}
