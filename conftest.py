@@ -1,21 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fixtures and settings for the tests of all packages."""
+"""How several processes share the tests."""
 
-import os
 from typing import Any
 
 import pytest
-from hypothesis import settings
-
-# Matrices here are small: a thread for each core only keeps other tests from running.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-pytest_plugins = ["ros_harness", "arms"]
-
-# Every run tries the same examples; with --hypothesis-profile=explore it tries others.
-settings.register_profile("same", deadline=None, derandomize=True, print_blob=True)
-settings.register_profile("explore", deadline=None, print_blob=True)
-settings.load_profile("same")
 
 SPREAD = {"test/test_demo.py", "test/test_readme.py", "test/test_startup.py"}
 """Files of tests that share nothing and take long, for any process that has time."""

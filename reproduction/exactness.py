@@ -25,7 +25,7 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 import numpy as np
 from tqdm import tqdm
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test" / "support"))
+sys.path.insert(0, f"{Path(__file__).resolve().parents[1]}/src/viability_bounds_pkg/test/support")
 
 from adversary import (
     POLICIES,

@@ -7,12 +7,13 @@ bash scripts/reproduce.sh paper0 fig5    one figure
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-import paper_algorithms
 import yaml
 from chain import ROOT, ChainResult, load_values, run_chain
 from figure import Figure, joint_axes, reproduce, table
@@ -22,6 +23,10 @@ from viability_bounds_pkg import baselines, viability
 from viability_bounds_pkg.acceleration_limits import estimate_acceleration_limits
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.robot_description import build_model, read_urdf
+
+sys.path.insert(0, f"{Path(__file__).resolve().parents[1]}/src/viability_bounds_pkg/test/support")
+
+import paper_algorithms
 
 
 def one_joint(q: float, v: float, a: float) -> JointLimits:

@@ -6,9 +6,9 @@ import pinocchio as pin
 import pytest
 import yaml
 from chain import load_values, run_chain
-from ros_harness import CONFIG
 
 from viability_bounds_pkg.robot_description import build_model, read_urdf
+from viability_bounds_pkg.testing.ros_harness import config_folder
 
 ROBOTS = ("baxter_left_arm", "panda")
 
@@ -90,7 +90,9 @@ def test_an_arm_outside_its_limits_moves_back_in(robot, goal):
 
 def test_naive_bounds_break_the_limits_that_exact_ones_keep():
     values = load_values("baxter_left_arm")
-    scenario = yaml.safe_load((CONFIG / "scenarios" / "baxter_left_arm_demo.yaml").read_text())
+    scenario = yaml.safe_load(
+        (config_folder() / "scenarios" / "baxter_left_arm_demo.yaml").read_text()
+    )
     scenario = {"duration": 1.0, "events": scenario["events"][:1]}
     elbow = values["joints"].index("left_e1")
     assert_no_limit_broken(run_chain(values, scenario, {}))

@@ -7,7 +7,6 @@ import pinocchio as pin
 import pytest
 import yaml
 from direct import DirectLoop, column
-from ros_harness import CONFIG
 
 from sim_bridge.scenario.events import AddObstacle, PoseGoal
 from sim_bridge.scenario.scenario import load_scenario
@@ -15,6 +14,7 @@ from torque_safety_controller.collision.geometry import load_geometry
 from torque_safety_controller.qp.constraints import AccelerationRange
 from viability_bounds_pkg.robot_description import read_urdf
 from viability_bounds_pkg.state import State
+from viability_bounds_pkg.testing.ros_harness import config_folder
 
 MARGIN = 0.02  # m
 RESERVE = 0.002  # m; not to be used up by much
@@ -89,8 +89,8 @@ def assert_no_limit_broken(loop):
 
 
 def around_the_wall():
-    scenario = load_scenario(CONFIG / "scenarios" / "panda_behind_obstacle.yaml")
-    document = yaml.safe_load((CONFIG / "obstacles" / "panda_wall.yaml").read_text())
+    scenario = load_scenario(config_folder() / "scenarios" / "panda_behind_obstacle.yaml")
+    document = yaml.safe_load((config_folder() / "obstacles" / "panda_wall.yaml").read_text())
     return scenario, document["/**/controller_node"]["ros__parameters"]
 
 
@@ -154,7 +154,7 @@ def test_an_arm_that_overlaps_an_obstacle_at_start_moves_out(shape, size, positi
 
 
 def test_talos_reaches_the_goal_of_its_demo_and_keeps_itself_apart():
-    events = load_scenario(CONFIG / "scenarios" / "talos_left_arm_demo.yaml").events
+    events = load_scenario(config_folder() / "scenarios" / "talos_left_arm_demo.yaml").events
     loop = DirectLoop("talos_left_arm", {"collision_avoidance": True})
     distances, _ = play(loop, 2.0, events[:1])
     assert distances.min() > MARGIN

@@ -18,7 +18,7 @@ NOT_KEPT = """
 import importlib, pkgutil, runpy, sys
 from viability_bounds_pkg.compiled import compiled_functions, is_kept
 
-runpy.run_path("scripts/compile.py", run_name="__main__")
+runpy.run_path("scripts/compile.py")["compile_all"]()
 for name in sys.argv[1:]:
     package = importlib.import_module(name)
     for module in pkgutil.walk_packages(package.__path__, f"{name}."):

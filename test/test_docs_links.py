@@ -3,9 +3,13 @@
 
 import re
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import yaml
+
+from sim_bridge.scenario.events import Event
+from sim_bridge.scenario.scenario import load_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = "viability_bounds_pkg|torque_safety_controller|sim_bridge"
@@ -93,3 +97,12 @@ def test_release_has_one_version():
     assert (citation["version"], citation["date-released"]) == (version, date)
     for package in PACKAGES.split("|"):
         assert f"<version>{version}<" in (ROOT / "src" / package / "package.xml").read_text()
+
+
+def test_the_scenarios_shown_load_and_leave_no_event_out(tmp_path):
+    path, events = tmp_path / "scenario.yaml", []
+    text = (ROOT / "docs" / "scenarios.md").read_text()
+    for example in re.findall(r"```yaml\n(.*?)```", text, re.DOTALL):
+        path.write_text(example)
+        events += load_scenario(path).events
+    assert {type(event) for event in events} == set(get_args(Event))

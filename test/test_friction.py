@@ -9,7 +9,6 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from direct import DirectLoop, column
-from ros_harness import CONFIG, read_config
 
 from sim_bridge.nodes.bullet_parameters import BulletConfiguration, make_robot
 from sim_bridge.tools.excitation import excitation
@@ -20,6 +19,7 @@ from torque_safety_controller.friction.joint_recording import Recording
 from torque_safety_controller.tasks.gains import critical_damping
 from viability_bounds_pkg.cli.limits_file import read_robot
 from viability_bounds_pkg.parameter import read
+from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
 
 ROBOT = "talos_left_arm"
 GIVEN = read_config(ROBOT, "bullet_node")
@@ -38,7 +38,7 @@ def found():
     with closing(make_robot(config)) as robot:
         recorded, monitor = record(robot, config, *motion)
     assert not monitor.violated
-    model = read_robot(CONFIG / f"{ROBOT}.yaml").model
+    model = read_robot(config_folder() / f"{ROBOT}.yaml").model
     fits = list(identify(model, Recording(**recorded)))
     assert [fit.notes for fit in fits] == [[]] * N
     return friction_model(fits)
@@ -118,7 +118,7 @@ def test_the_gain_leaves_room_for_sampling_and_delay(robot):
     values = read_config(robot, "controller_node")
     kp, kd, dt = values["pose_kp"], values["pose_kd"], 1.0 / values["rate_hz"]
     kd = critical_damping(kp) if kd == -1.0 else kd
-    described = read_robot(CONFIG / f"{robot}.yaml")
+    described = read_robot(config_folder() / f"{robot}.yaml")
     data = described.model.createData()
     rng = np.random.default_rng(0)
     couplings = []

@@ -3,11 +3,11 @@
 
 import importlib.util
 from collections import defaultdict
+from pathlib import Path
 
 import numpy as np
 import pytest
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-from ros_harness import CONFIG, ROOT, read_config
 
 from sim_bridge.nodes.bullet_node import BulletNode
 from sim_bridge.nodes.scenario_node import ScenarioNode
@@ -15,7 +15,9 @@ from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.parameter import REQUIRED, read
 from viability_bounds_pkg.ros.parameters import describe
+from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
 
+ROOT = Path(__file__).resolve().parent.parent
 _SPEC = importlib.util.spec_from_file_location(
     "make_reference", ROOT / "scripts" / "make_reference.py"
 )
@@ -33,7 +35,7 @@ EXTRA = {
     "controller_node": {"ros2_control_topic": "ros2_control_topic"},
     "bullet_node": {"publish_clock": True, "start_paused": True, "clock": "lockstep"},
     "scenario_node": {
-        "scenario": str(CONFIG / "scenarios" / "panda_press_on_table.yaml"),
+        "scenario": str(config_folder() / "scenarios" / "panda_press_on_table.yaml"),
         "robot_name": "panda",
     },
 }
@@ -153,7 +155,7 @@ def test_each_parameter_says_what_it_is_and_what_is_allowed(node, row):
         assert row.coerce(None) is not None
 
 
-@pytest.mark.parametrize("robot", sorted(path.stem for path in CONFIG.glob("*.yaml")))
+@pytest.mark.parametrize("robot", sorted(path.stem for path in config_folder().glob("*.yaml")))
 def test_parameter_files_have_only_parameters_that_nodes_have(robot):
     known = {name: {row.name for row in table} for name, table in make_reference.TABLES.items()}
     for name in make_reference.TABLES:

@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """A scenario with everything in it, played by the nodes and without them: the same numbers."""
 
+import json
+
 import numpy as np
 import pinocchio as pin
 import pytest
 import yaml
 from chain import load_values, run_chain
 from direct import DirectLoop, column
-from ros_harness import CONFIG
 
 from sim_bridge.bullet.obstacles import Obstacle
-from sim_bridge.nodes.scenario_node import ScenarioRefused
+from sim_bridge.nodes.scenario_node import ScenarioNode, ScenarioRefused
+from sim_bridge.scenario.report import write_report
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory, circle
+from viability_bounds_pkg.testing.ros_harness import config_folder
 
 ROBOT = "panda"
 DURATION = 0.9
@@ -87,7 +90,9 @@ def test_the_nodes_play_what_a_loop_without_messages_plays():
 
 def test_a_hand_presses_on_a_table_as_hard_as_it_is_told():
     """The beginning of the scenario that is shipped: a table, parameters, tare, a wrench."""
-    scenario = yaml.safe_load((CONFIG / "scenarios" / "panda_press_on_table.yaml").read_text())
+    scenario = yaml.safe_load(
+        (config_folder() / "scenarios" / "panda_press_on_table.yaml").read_text()
+    )
     scenario = {
         "duration": 2.5,
         "events": [event for event in scenario["events"] if event["time"] < 2.5],
@@ -169,3 +174,39 @@ def test_what_is_refused_ends_the_scenario_and_says_why(event, names):
         )
     for name in names:
         assert name in str(error.value)
+
+
+def test_a_push_lasts_as_long_as_it_is_meant_to():
+    """Longer than the robot holds a push that it hears no more of."""
+    values = load_values(ROBOT)
+    timeout, duration = 0.2, 1.0  # s
+    push = {"link": "panda_link5", "duration": duration, "force": [0.0, 3.0, 0.0]}
+    events = [{"time": 0.2, "push": push}, {"time": 0.0, "posture": rest()}]
+    per_node = {"bullet_node": {"external_wrench_timeout": timeout}}
+    result = run_chain(values, {"duration": 2.5, "events": events}, per_node)
+    moved = np.abs(result.run.q - values["start_positions"]).max(axis=1)
+    t = result.run.t
+    # Pushes are sent by the wall clock, so that they may begin and end a bit late.
+    at_timeout, at_end = moved[t < 0.2 + timeout][-1], moved[t < 0.2 + duration][-1]
+    assert at_end > 2.0 * at_timeout
+    assert at_end > 0.8 * moved.max()
+    assert moved[-1] < 0.2 * moved.max()
+    # The end of a push is nothing that the robot would refuse.
+    assert "external_wrench" not in result.robot["commands_refused"]
+
+
+def test_a_run_without_a_pose_has_metrics_without_a_pose_error(tmp_path, ros):
+    scenario = {"duration": 0.1, "events": [{"time": 0.0, "posture": rest()}]}
+    path = tmp_path / "scenario.yaml"
+    path.write_text(yaml.safe_dump(scenario))
+    result = run_chain(load_values(ROBOT), scenario, {})
+    config = ros.start(ScenarioNode, load_values(ROBOT) | {"scenario": str(path)}).config
+    assert write_report(tmp_path / "out", config, result.run, result.robot, {"method": "exact"})
+
+    def refuse(word):
+        raise AssertionError(f"{word} is not JSON")
+
+    text = (tmp_path / "out" / "metrics.json").read_text()
+    metrics = json.loads(text, parse_constant=refuse)
+    assert metrics["final_position_error_m"] is None
+    assert metrics["limits_kept"]

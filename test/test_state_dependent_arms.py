@@ -4,7 +4,6 @@
 import numpy as np
 import pytest
 from arms import load_arm
-from ros_harness import read_config
 
 from torque_safety_controller.controller import Controller, Gains
 from torque_safety_controller.qp.constraints import AccelerationRange
@@ -12,6 +11,7 @@ from viability_bounds_pkg.estimation.discretisation_margin import discretisation
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.state_dependent.limits import StateDependentBounds
+from viability_bounds_pkg.testing.ros_harness import read_config
 from viability_bounds_pkg.torque_margin import tightened, torque_margins
 from viability_bounds_pkg.viability import BoundsSolver
 

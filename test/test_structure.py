@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 import ast
+import re
+import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 import rclpy
+import yaml
 from rclpy.node import Node
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -29,7 +33,7 @@ ROS = {
 }
 
 
-ROS_ROOMS = {"node", "nodes", "ros", "parameters", "tools"}
+ROS_ROOMS = {"node", "nodes", "ros", "parameters", "testing", "tools"}
 """Folders whose modules may import ROS."""
 
 
@@ -160,15 +164,72 @@ def test_nodes_take_no_name_that_rclpy_uses_itself(path):
     assert own & taken <= {"destroy_node"}  # extended on purpose
 
 
-def test_packages_are_described_alike():
-    for package in PACKAGES:
-        folder = ROOT / "src" / package
-        text = (folder / "package.xml").read_text()
-        assert "<build_type>ament_python</build_type>" in text
-        assert f"<name>{package}</name>" in text
-        assert "<license>Apache-2.0</license>" in text
-        assert (folder / "resource" / package).exists()
-        assert f"script_dir=$base/lib/{package}" in (folder / "setup.cfg").read_text()
+def setup_arguments(package):
+    """Return the arguments of a package's setup() that are written out."""
+    tree = ast.parse((ROOT / "src" / package / "setup.py").read_text())
+    (call,) = (
+        n
+        for n in ast.walk(tree)
+        if isinstance(n, ast.Call) and n.func.__dict__.get("id") == "setup"
+    )
+    return {k.arg: k.value.value for k in call.keywords if isinstance(k.value, ast.Constant)}
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_packages_are_described_alike(package):
+    folder = ROOT / "src" / package
+    described = ElementTree.parse(folder / "package.xml").getroot()
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    arguments = setup_arguments(package)
+    assert described.findtext("name") == package
+    assert described.findtext("export/build_type") == "ament_python"
+    assert described.findtext("version") == arguments["version"] == citation["version"]
+    assert f"## [{citation['version']}]" in (ROOT / "CHANGELOG.md").read_text()
+    assert described.findtext("description") == arguments["description"]
+    (author,) = citation["authors"]
+    for role in ("maintainer", "author"):
+        assert described.findtext(role) == arguments[role] == author["name"]
+        mail = described.find(role).get("email")
+        assert mail == arguments[f"{role}_email"] == author["email"]
+    assert described.findtext("url") == arguments.get("url") == citation.get("url")
+    assert described.findtext("license") == arguments["license"] == citation["license"]
+    licence = described.find("license").get("file")
+    assert (folder / licence).read_text() == (ROOT / "LICENSE").read_text()
+    assert (folder / "resource" / package).exists()
+    assert f"script_dir=$base/lib/{package}" in (folder / "setup.cfg").read_text()
+
+
+KEYS = {
+    name: f"python3-{name}"
+    for name in ("hypothesis", "matplotlib", "numba", "numpy", "pytest", "scipy", "tqdm", "yaml")
+} | {"pybullet": "python3-pybullet-pip"}
+"""Keys of rosdep that are not named like the module."""
+
+KEYLESS = {"daqp": "daqp"}
+"""Modules without a key of rosdep; a comment tells what to install."""
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_packages_declare_what_they_import(package):
+    text = (ROOT / "src" / package / "package.xml").read_text()
+    own = {path.stem for path in (ROOT / "src" / package / "test" / "support").glob("*.py")}
+    needs = {"exec": set(), "test": set()}
+    shared = (ROOT / "src").glob("*/*/testing/*.py")  # all tests need what these import
+    for path in {*(ROOT / "src" / package).rglob("*.py"), *shared}:
+        if path.name == "setup.py":
+            continue
+        kind = "test" if {"test", "testing"} & set(path.relative_to(ROOT).parts) else "exec"
+        needs[kind] |= {name.split(".")[0] for name in imports(path)}
+    for kind, names in needs.items():
+        names -= sys.stdlib_module_names | own | {package}
+        for name in names & KEYLESS.keys():
+            assert f"pip install {KEYLESS[name]}" in text
+        needs[kind] = {KEYS.get(name, name) for name in names - KEYLESS.keys()}
+    declared = {
+        kind: set(re.findall(f"<{kind}_depend>(.*)</{kind}_depend>", text)) for kind in needs
+    }
+    assert needs["exec"] == declared["exec"]
+    assert needs["test"] - needs["exec"] == declared["test"]
 
 
 def test_parameter_files_and_scenarios_are_installed():
@@ -182,7 +243,7 @@ def test_parameter_files_and_scenarios_are_installed():
 
 
 def test_every_source_names_its_licence():
-    folders = ("src", "test", "reproduction", "benchmarks", "examples", "scripts", "config")
+    folders = ("src", "test", "reproduction", "benchmarks", "examples", "scripts")
     found = [
         p for f in folders for end in ("py", "sh", "yaml") for p in (ROOT / f).rglob(f"*.{end}")
     ]

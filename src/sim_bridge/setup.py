@@ -21,10 +21,14 @@ setup(
     install_requires=["setuptools"],
     extras_require={"test": ["pytest", "hypothesis"]},
     zip_safe=True,
-    maintainer="The viability bounds authors",
-    maintainer_email="maintainers@viability-bounds.example.org",
-    description="A torque-controlled robot played by PyBullet over ROS 2 topics.",
+    author="Seed 356f0f4f maintainers",
+    author_email="maintainers@users.noreply.h-seed-356f0f4f.example",
+    maintainer="Seed 356f0f4f maintainers",
+    maintainer_email="maintainers@users.noreply.h-seed-356f0f4f.example",
+    description="A torque-controlled arm simulated by PyBullet at a fixed rate, and "
+    "scenarios to drive it.",
     license="Apache-2.0",
+    license_files=["LICENSE"],
     entry_points={
         "console_scripts": [
             "bullet_node = sim_bridge.cli.ros_program:bullet_node",

@@ -26,10 +26,14 @@ setup(
     ],
     extras_require={"test": ["pytest", "hypothesis"]},
     zip_safe=True,
-    maintainer="The viability bounds authors",
-    maintainer_email="maintainers@viability-bounds.example.org",
-    description="Inverse-dynamics QP torque control inside joint and torque limits.",
+    author="Seed 356f0f4f maintainers",
+    author_email="maintainers@users.noreply.h-seed-356f0f4f.example",
+    maintainer="Seed 356f0f4f maintainers",
+    maintainer_email="maintainers@users.noreply.h-seed-356f0f4f.example",
+    description="Inverse-dynamics QP torque control that stays inside acceleration "
+    "bounds and torque limits (Benallegue et al., IROS 2021).",
     license="Apache-2.0",
+    license_files=["LICENSE"],
     entry_points={
         "console_scripts": [
             "controller_node = torque_safety_controller.cli.ros_program:controller_node",

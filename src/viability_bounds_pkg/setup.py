@@ -25,10 +25,14 @@ setup(
     ],
     extras_require={"test": ["pytest", "hypothesis"]},
     zip_safe=True,
-    maintainer="The viability bounds authors",
-    maintainer_email="maintainers@viability-bounds.example.org",
-    description="Exact joint acceleration bounds as a library and a ROS 2 node.",
+    author="Seed 356f0f4f maintainers",
+    author_email="maintainers@users.noreply.h-seed-356f0f4f.example",
+    maintainer="Seed 356f0f4f maintainers",
+    maintainer_email="maintainers@users.noreply.h-seed-356f0f4f.example",
+    description="Exact joint acceleration bounds from position, velocity and "
+    "acceleration limits (Del Prete, RA-L 2018), as a library and a ROS 2 node.",
     license="Apache-2.0",
+    license_files=["LICENSE"],
     entry_points={
         "console_scripts": [
             "bounds_node = viability_bounds_pkg.cli.ros_program:bounds_node",

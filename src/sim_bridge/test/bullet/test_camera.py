@@ -5,12 +5,12 @@ from contextlib import closing
 
 import numpy as np
 import pytest
-from ros_harness import read_config
 
 from sim_bridge.bullet.obstacles import Obstacle
 from sim_bridge.bullet.robot import BulletRobot
 from sim_bridge.tools.camera import Camera
 from viability_bounds_pkg.robot_description import read_urdf
+from viability_bounds_pkg.testing.ros_harness import read_config
 
 CONFIG = read_config("panda", "bullet_node")
 Q = np.array(CONFIG["start_positions"])

@@ -6,7 +6,6 @@ from contextlib import closing
 import numpy as np
 import pinocchio as pin
 import pytest
-from ros_harness import read_config
 
 from sim_bridge.bullet.joint_friction import JointFriction
 from sim_bridge.bullet.obstacles import Obstacle
@@ -16,6 +15,7 @@ from viability_bounds_pkg.robot_description import (
     inertia_beyond,
     read_urdf,
 )
+from viability_bounds_pkg.testing.ros_harness import read_config
 
 G = np.array([0.0, 0.0, -9.81])
 CONFIG = {robot: read_config(robot, "bullet_node") for robot in ("panda", "talos_left_arm")}

@@ -6,7 +6,6 @@ from contextlib import closing
 import numpy as np
 import pinocchio as pin
 import pytest
-from ros_harness import read_config
 
 from sim_bridge.bullet.joint_friction import JointFriction
 from sim_bridge.bullet.obstacles import ContactMaterial, Obstacle, ObstacleError
@@ -16,6 +15,7 @@ from viability_bounds_pkg.robot_description import (
     build_model,
     read_urdf,
 )
+from viability_bounds_pkg.testing.ros_harness import read_config
 
 H = 1e-3  # s
 STIFFNESS = ContactMaterial().stiffness

@@ -5,10 +5,8 @@ import re
 import numpy as np
 import pinocchio as pin
 import pytest
-from arms import load_arm
 from geometry_msgs.msg import WrenchStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
-from ros_harness import ROOT, joint_state, names_parameter, read_config
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -26,10 +24,11 @@ from viability_bounds_pkg.ros.runtime import (
     set_stamp,
     stamp_to_ns,
 )
+from viability_bounds_pkg.testing.ros_harness import joint_state, names_parameter, read_config
 
-ARM = load_arm("panda")
 VALUES = read_config("panda", "bullet_node")
 JOINTS = VALUES["joints"]
+MODEL = build_model(read_urdf(VALUES["robot_description"]), JOINTS)
 Q = np.array(VALUES["start_positions"])
 PERIOD = 2_000_000  # ns, of the configured 500 Hz
 
@@ -61,7 +60,7 @@ class RobotProbe:
         return np.array(self.states[-1].effort[:7])
 
     def gravity(self):
-        return pin.computeGeneralizedGravity(ARM.model, ARM.model.createData(), self.q)
+        return pin.computeGeneralizedGravity(MODEL, MODEL.createData(), self.q)
 
     def step(self, tau=None, times=1):
         """Answer states, by default with gravity compensation, and await the next ones."""
@@ -515,10 +514,10 @@ def test_contacts_are_felt_by_motion_sensor_and_diagnostics(ros):
     floor.pose.orientation.w = 1.0
     ros.talk(MarkerArray, "obstacles", GOAL_QOS).publish(MarkerArray(markers=[floor]))
     ros.wait_until(lambda: len(robot.node._world) == 1, "the floor")
-    data, frame = ARM.model.createData(), ARM.model.getFrameId("panda_hand")
+    data, frame = MODEL.createData(), MODEL.getFrameId("panda_hand")
     for _ in range(300):
         q, v = robot.q, robot.v
-        J = pin.computeFrameJacobian(ARM.model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
+        J = pin.computeFrameJacobian(MODEL, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
         robot.step(robot.gravity() + J.T @ [0.0, 0.0, -15.0, 0.0, 0.0, 0.0] - 5.0 * v)
     assert arm.obstacles.contacts()
     ros.diagnostics.clear()
@@ -633,7 +632,7 @@ def test_the_first_period_after_a_pause_is_a_whole_one(ros):
         ),
         ({"locked_joints": ["panda_finger_joint1"]}, "locked_positions", "1 numbers"),
         ({"robot_description": "/no/such.urdf"}, "robot_description", "no such file"),
-        ({"robot_description": str(ROOT / "README.md")}, "robot_description", "not well-formed"),
+        ({"robot_description": __file__}, "robot_description", "not well-formed"),
         ({"robot_description": "topic"}, "robot_description", "topic"),
         ({"position_min": VALUES["position_max"]}, "position_max", "above position_min"),
         ({"position_max": [1.0]}, "position_max", "7 numbers"),

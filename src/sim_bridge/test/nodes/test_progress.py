@@ -34,8 +34,11 @@ def test_on_a_terminal_it_is_one_line():
             for k in range(1, 9):
                 shown.show(float(k), "TRACKING")
         terminal.flush()
-        text = os.read(reader, 10_000).decode()
+        written = b""
+        while b"\n" not in written:
+            written += os.read(reader, 10_000)
     os.close(reader)
+    text = written.decode()
     assert text.count("\n") == 1
     assert text.count("\r") > 8
     assert "100% |" in text

@@ -1,19 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-import json
 import re
 import signal
 import subprocess
 from contextlib import contextmanager
 
-import numpy as np
 import pytest
 import yaml
-from chain import load_values, run_chain
-from ros_harness import CONFIG, ROOT, read_config
+from ament_index_python.packages import get_package_prefix
 
 from sim_bridge.nodes.scenario_node import ScenarioNode
-from sim_bridge.scenario.report import write_report
 from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
 
 DEADLINE = 30.0  # s
 VALUES = read_config("panda", "scenario_node")
@@ -27,12 +24,12 @@ def write(directory, duration, *events) -> str:
 
 
 def command(*arguments):
-    executable = ROOT / "install" / "sim_bridge" / "lib" / "sim_bridge" / "scenario_node"
+    executable = f"{get_package_prefix('sim_bridge')}/lib/sim_bridge/scenario_node"
     return [executable, *map(str, arguments)]
 
 
 def parameters(*changes):
-    yield from ("--ros-args", "--params-file", CONFIG / "panda.yaml")
+    yield from ("--ros-args", "--params-file", config_folder() / "panda.yaml")
     for change in changes:
         yield from ("-p", change)
 
@@ -100,39 +97,3 @@ def test_told_to_stop_it_judges_nothing(tmp_path, sent):
     assert process.returncode == 130, errors
     assert "Traceback" not in errors
     assert not (tmp_path / "out").exists()
-
-
-def test_a_push_lasts_as_long_as_it_is_meant_to():
-    """Longer than the robot holds a push that it hears no more of."""
-    values = load_values("panda")
-    timeout, duration = 0.2, 1.0  # s
-    push = {"link": "panda_link5", "duration": duration, "force": [0.0, 3.0, 0.0]}
-    events = [{"time": 0.2, "push": push}, {"time": 0.0, "posture": REST}]
-    per_node = {"bullet_node": {"external_wrench_timeout": timeout}}
-    result = run_chain(values, {"duration": 2.5, "events": events}, per_node)
-    moved = np.abs(result.run.q - values["start_positions"]).max(axis=1)
-    t = result.run.t
-    # Pushes are sent by the wall clock, so that they may begin and end a bit late.
-    at_timeout, at_end = moved[t < 0.2 + timeout][-1], moved[t < 0.2 + duration][-1]
-    assert at_end > 2.0 * at_timeout
-    assert at_end > 0.8 * moved.max()
-    assert moved[-1] < 0.2 * moved.max()
-    # The end of a push is nothing that the robot would refuse.
-    assert "external_wrench" not in result.robot["commands_refused"]
-
-
-def test_a_run_without_a_pose_has_metrics_without_a_pose_error(tmp_path, ros):
-    values = load_values("panda") | {
-        "scenario": write(tmp_path, 0.1, {"time": 0.0, "posture": REST})
-    }
-    result = run_chain(values, {"duration": 0.1, "events": [{"time": 0.0, "posture": REST}]}, {})
-    config = ros.start(ScenarioNode, values).config
-    assert write_report(tmp_path / "out", config, result.run, result.robot, {"method": "exact"})
-
-    def refuse(word):
-        raise AssertionError(f"{word} is not JSON")
-
-    text = (tmp_path / "out" / "metrics.json").read_text()
-    metrics = json.loads(text, parse_constant=refuse)
-    assert metrics["final_position_error_m"] is None
-    assert metrics["limits_kept"]

@@ -12,19 +12,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ros_harness import CONFIG, read_config
 
 import sim_bridge
 import viability_bounds_pkg
 from sim_bridge.tools.excitation import PARTS, ROOM, ExcitationError, excitation
 from sim_bridge.tools.record_excitation import main
-from torque_safety_controller.friction.joint_recording import load_recording
 from viability_bounds_pkg.robot_configuration import LimitedRobotConfiguration
+from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
 
 PACKAGES = [
     str(Path(package.__file__).resolve().parents[1])
     for package in (sim_bridge, viability_bounds_pkg)
 ]
+FILE = config_folder() / "panda.yaml"
 PANDA = read_config("panda", "bullet_node")
 JOINTS = tuple(PANDA["joints"])
 Q_MIN, Q_MAX, V_MAX, START = (
@@ -126,17 +126,19 @@ def call(capsys):
 
 def test_a_recording_is_what_the_robot_reported(short, call, tmp_path):
     output = tmp_path / "run.npz"
-    code, out, errors = call(CONFIG / "panda.yaml", "-o", output, "--speed", "0.3")
+    code, out, errors = call(FILE, "-o", output, "--speed", "0.3")
     assert (code, errors) == (0, "")
     assert re.search(rf"1 s of motion written to {output}; torque at most 0\.\d\d", out)
-    recording = load_recording(output, JOINTS)
-    q, v = motion(speed=0.3)
-    np.testing.assert_allclose(np.diff(recording.t), DT)
-    np.testing.assert_allclose(recording.q, q, atol=5e-3)
-    np.testing.assert_allclose(recording.v[50:], v[50:], atol=0.05)
+    with np.load(output) as recording:
+        assert tuple(recording["joints"]) == JOINTS
+        t, tau = recording["t"], recording["tau"]
+        q, v = motion(speed=0.3)
+        np.testing.assert_allclose(np.diff(t), DT)
+        np.testing.assert_allclose(recording["q"], q, atol=5e-3)
+        np.testing.assert_allclose(recording["v"][50:], v[50:], atol=0.05)
     # It holds gravity.
-    assert np.abs(recording.tau[:, 1]).max() > 5.0
-    assert (np.abs(recording.tau) <= PANDA["torque_max"]).all()
+    assert np.abs(tau[:, 1]).max() > 5.0
+    assert (np.abs(tau) <= PANDA["torque_max"]).all()
 
 
 @pytest.mark.parametrize(
@@ -153,7 +155,7 @@ def test_a_recording_is_what_the_robot_reported(short, call, tmp_path):
     ],
 )
 def test_what_cannot_be_done_is_told_in_one_line(call, tmp_path, arguments, code, message):
-    text = (CONFIG / "panda.yaml").read_text()
+    text = FILE.read_text()
     row = re.search(r"^ *start_positions: \[([^,]*),.*$", text, re.MULTILINE)
     (tmp_path / "bad.yaml").write_text(text.replace(row[0], ""))
     stuck = row[0].replace(f"[{row[1]},", "[9.0,")
@@ -190,7 +192,7 @@ sys.exit(tool.main())
 
 def test_an_interrupt_leaves_nothing_behind(tmp_path):
     ended = subprocess.run(
-        [sys.executable, "-c", INTERRUPTIBLE, CONFIG / "panda.yaml", "-o", tmp_path / "run.npz"],
+        [sys.executable, "-c", INTERRUPTIBLE, FILE, "-o", tmp_path / "run.npz"],
         capture_output=True,
         text=True,
         env=environment(),

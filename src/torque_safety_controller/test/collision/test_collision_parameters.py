@@ -4,7 +4,6 @@ import pinocchio as pin
 import pytest
 import yaml
 from collision_arm import panda
-from ros_harness import read_config
 
 from torque_safety_controller.collision.avoidance import CollisionSettings
 from torque_safety_controller.collision.bodies import SHAPES, make_obstacle
@@ -13,6 +12,7 @@ from torque_safety_controller.parameters import ControllerConfiguration
 from torque_safety_controller.parameters.collision_parameters import CollisionConfiguration
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import parameter_table, read
+from viability_bounds_pkg.testing.ros_harness import read_config
 
 PANDA = read_config("panda", "controller_node")
 THINGS = [

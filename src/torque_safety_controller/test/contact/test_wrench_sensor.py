@@ -7,7 +7,6 @@ import pinocchio as pin
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from ros_harness import read_config
 
 from torque_safety_controller.contact.wrench_sensor import (
     SensorSettings,
@@ -19,6 +18,7 @@ from viability_bounds_pkg.robot_description import (
     inertia_beyond,
     read_urdf,
 )
+from viability_bounds_pkg.testing.ros_harness import read_config
 
 DT = 1e-3
 GRAVITY = np.array([0.0, 0.0, -9.81])

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from arms import load_arm
-from ros_harness import acceleration_limits, joint_state, names_parameter, read_config
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
@@ -28,6 +27,12 @@ from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import group, read
 from viability_bounds_pkg.robot_configuration import RobotConfiguration
 from viability_bounds_pkg.state import State
+from viability_bounds_pkg.testing.ros_harness import (
+    acceleration_limits,
+    joint_state,
+    names_parameter,
+    read_config,
+)
 
 NODE = "controller_node"
 MS = 1_000_000

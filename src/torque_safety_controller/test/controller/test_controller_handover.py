@@ -7,10 +7,8 @@ import math
 
 import numpy as np
 import pytest
-from chain import load_values
 from controller_chain import NODE, ControllerChain
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from ros_harness import read_config
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool
@@ -20,6 +18,7 @@ from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.ros.runtime import GOAL_QOS
+from viability_bounds_pkg.testing.ros_harness import read_config
 
 SERVICE = f"{NODE}/enable_torque"
 
@@ -339,7 +338,7 @@ class HandoverArm:
     """A robot in lockstep with bounds and controller, all of them real; recorded."""
 
     def __init__(self, ros, robot, **changed) -> None:
-        values = load_values(robot) | {
+        values = read_config(robot, "bounds_node", NODE, "bullet_node") | {
             "clock": "lockstep",
             "bounds_timeout": 20.0,
             "state_timeout": 40.0,

@@ -9,7 +9,6 @@ import re
 import numpy as np
 import pytest
 from arms import load_arm
-from ros_harness import acceleration_limits, joint_state, names_parameter, read_config
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
@@ -24,6 +23,12 @@ from torque_safety_controller.qp.constraints import AccelerationRange
 from torque_safety_controller.tasks.gains import critical_damping
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.state import State
+from viability_bounds_pkg.testing.ros_harness import (
+    acceleration_limits,
+    joint_state,
+    names_parameter,
+    read_config,
+)
 
 NODE = "controller_node"
 MS = 1_000_000

@@ -7,11 +7,11 @@ from arms import load_arm
 from controller_chain import MS, NODE, ControllerChain
 from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import Log
-from ros_harness import joint_state, read_config
 
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.state import State
+from viability_bounds_pkg.testing.ros_harness import joint_state, read_config
 
 ARM = load_arm("panda")
 VALUES = read_config("panda", NODE) | {

@@ -24,7 +24,6 @@ from node_chain import (
     pose_message,
     torque_for,
 )
-from ros_harness import acceleration_limits, joint_state
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
@@ -37,6 +36,7 @@ from torque_safety_controller.node.topics import (
 from torque_safety_controller.qp.constraints import AccelerationRange
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS
 from viability_bounds_pkg.state import State
+from viability_bounds_pkg.testing.ros_harness import acceleration_limits, joint_state
 
 # Limits that cannot be used
 

@@ -27,11 +27,11 @@ from node_chain import (
     pose_message,
     torque_for,
 )
-from ros_harness import joint_state
 
 from torque_safety_controller.qp.constraints import AccelerationRange
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.state import State
+from viability_bounds_pkg.testing.ros_harness import joint_state
 
 # Modes
 

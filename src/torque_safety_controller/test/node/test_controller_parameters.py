@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from controller_chain import NODE
 from node_chain import ARM, GOAL, JOINTS, VALUES, NodeChain, Q, V, expected, pose_message
-from ros_harness import ROOT, joint_state, names_parameter, read_config
 from std_msgs.msg import String
 
 from torque_safety_controller.node.controller_node import ControllerNode
@@ -19,6 +18,7 @@ from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import read_urdf
 from viability_bounds_pkg.ros.runtime import LATCHED_QOS
 from viability_bounds_pkg.state import State
+from viability_bounds_pkg.testing.ros_harness import joint_state, names_parameter, read_config
 
 # Parameters
 
@@ -107,7 +107,7 @@ def test_geometry_limits_and_rates_are_read_only(ros, name, value):
     assert "read-only" in ros.refuses(NODE, **{name: value})
 
 
-BROKEN_URDF = str(ROOT / "pyproject.toml")
+BROKEN_URDF = __file__
 
 
 @pytest.mark.parametrize(

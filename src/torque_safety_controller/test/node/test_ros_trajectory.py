@@ -8,7 +8,6 @@ import pinocchio as pin
 import pytest
 from arms import load_arm
 from geometry_msgs.msg import Transform, Twist
-from ros_harness import acceleration_limits, joint_state, read_config
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import (
     JointTrajectory,
@@ -21,6 +20,7 @@ from torque_safety_controller.node.goals import GoalRefused, trajectory_from_mes
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory, circle
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp
 from viability_bounds_pkg.state import State
+from viability_bounds_pkg.testing.ros_harness import acceleration_limits, joint_state, read_config
 
 MS = 1_000_000
 PLANE = [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]  # from the lowest point towards y

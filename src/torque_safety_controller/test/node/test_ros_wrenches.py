@@ -11,7 +11,6 @@ from arms import load_arm
 from controller_chain import NODE, ControllerChain
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from ros_harness import read_config
 from std_srvs.srv import Trigger
 
 from torque_safety_controller.contact import interaction
@@ -21,6 +20,7 @@ from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import parameter_table, read
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS, set_stamp
 from viability_bounds_pkg.state import State
+from viability_bounds_pkg.testing.ros_harness import read_config
 
 ARM = load_arm("panda")
 KNOWN = {row.name for row in parameter_table(ControllerConfiguration)}

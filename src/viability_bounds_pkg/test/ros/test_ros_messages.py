@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from ros_harness import joint_state
 from std_msgs.msg import Float64MultiArray
 
 from viability_bounds_pkg.ros.messages import (
@@ -17,6 +16,7 @@ from viability_bounds_pkg.ros.messages import (
     Verdict,
 )
 from viability_bounds_pkg.ros.runtime import STATUS_QOS, set_stamp, stamp_to_ns
+from viability_bounds_pkg.testing.ros_harness import joint_state
 
 JOINTS = ("a", "b", "c")
 Q, V = [0.1, 0.2, 0.3], [1.0, 2.0, 3.0]

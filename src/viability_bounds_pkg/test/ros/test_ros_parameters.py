@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ros_harness import overrides
 
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import (
@@ -26,6 +25,7 @@ from viability_bounds_pkg.parameter import (
 from viability_bounds_pkg.robot_configuration import RobotConfiguration
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.parameters import NodeParameters
+from viability_bounds_pkg.testing.ros_harness import overrides
 
 
 @dataclass(frozen=True)

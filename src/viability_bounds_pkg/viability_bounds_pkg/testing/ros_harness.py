@@ -20,9 +20,9 @@ from typing import Any
 
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
-import pytest
 import rclpy
 import yaml
+from ament_index_python.packages import get_package_share_directory
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import SetParameters
 from rclpy.logging import LoggingSeverity, set_logger_level
@@ -35,8 +35,14 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, make_executor, set_stamp, stamp_to_ns
 
-ROOT = Path(__file__).resolve().parents[2]
-CONFIG = ROOT / "config"
+
+def config_folder() -> Path:
+    """Return the folder of the robots' parameter files: this repository's, or the installed."""
+    here = Path(__file__).resolve().parents[3] / "sim_bridge" / "config"
+    if here.is_dir():
+        return here
+    return Path(get_package_share_directory("sim_bridge")) / "config"
+
 
 TIMEOUT = 10.0
 """How long anything may take before a test fails, s; far more than it takes."""
@@ -81,10 +87,10 @@ def _in_use(domain: int) -> bool:
     return False
 
 
-def read_config(robot: str, node: str) -> dict[str, Any]:
-    """Return the parameters that ``config/<robot>.yaml`` has for a node."""
-    document = yaml.safe_load((CONFIG / f"{robot}.yaml").read_text(encoding="utf-8"))
-    sections = [document.get(key, {}) for key in ("/**", f"/**/{node}")]
+def read_config(robot: str, *nodes: str) -> dict[str, Any]:
+    """Return the parameters that ``config/<robot>.yaml`` has for nodes."""
+    document = yaml.safe_load((config_folder() / f"{robot}.yaml").read_text(encoding="utf-8"))
+    sections = [document.get(key, {}) for key in ("/**", *(f"/**/{node}" for node in nodes))]
     return {k: v for section in sections for k, v in section.get("ros__parameters", {}).items()}
 
 
@@ -283,22 +289,3 @@ def acceleration_limits(joints, stamp: int, lower, upper) -> JointTrajectory:
     )
     set_stamp(message.header.stamp, stamp)
     return message
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _graph_of_its_own() -> Iterator[None]:
-    """Keep what tests start with the default context, or as processes, to themselves."""
-    with private_domain() as domain, pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROS_DOMAIN_ID", str(domain))
-        yield
-
-
-@pytest.fixture
-def ros() -> Iterator[RosHarness]:
-    """A harness without nodes other than the probe."""
-    with private_domain() as domain:
-        harness = RosHarness(domain)
-        try:
-            yield harness
-        finally:
-            harness.close()

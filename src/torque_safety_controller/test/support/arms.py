@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 import pytest
-from ros_harness import read_config
 
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.robot_description import build_model, read_urdf
+from viability_bounds_pkg.testing.ros_harness import read_config
 
 ROBOTS = ("baxter_left_arm", "panda")
 

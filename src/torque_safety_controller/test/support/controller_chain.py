@@ -6,11 +6,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from ros_harness import RosHarness, acceleration_limits, joint_state
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
 from torque_safety_controller.node.controller_node import ControllerNode
+from viability_bounds_pkg.testing.ros_harness import RosHarness, acceleration_limits, joint_state
 
 MS = 1_000_000
 NODE = "controller_node"

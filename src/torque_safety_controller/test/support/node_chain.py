@@ -8,13 +8,13 @@ import pinocchio as pin
 from arms import load_arm
 from controller_chain import NODE, ControllerChain
 from geometry_msgs.msg import PoseStamped
-from ros_harness import read_config
 from sensor_msgs.msg import JointState
 
 from torque_safety_controller.controller import Controller, Gains
 from torque_safety_controller.tasks.gains import critical_damping
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp
 from viability_bounds_pkg.state import State
+from viability_bounds_pkg.testing.ros_harness import read_config
 
 ARM = load_arm("baxter_left_arm")
 # Watchdogs that do not bark while a busy machine runs the other tests.

@@ -9,7 +9,6 @@ import numpy as np
 import pinocchio as pin
 from arms import Arm, load_arm
 from proxsuite import proxqp
-from ros_harness import read_config
 
 from torque_safety_controller.collision.avoidance import (
     CollisionAvoidance,
@@ -21,6 +20,7 @@ from torque_safety_controller.collision.geometry import load_geometry
 from torque_safety_controller.collision.model import CollisionModel, build_collision_model
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.robot_description import build_model, read_urdf
+from viability_bounds_pkg.testing.ros_harness import read_config
 from viability_bounds_pkg.viability import BoundsSolver
 
 SURROUNDINGS = (

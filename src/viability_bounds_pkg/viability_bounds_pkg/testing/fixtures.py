@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fixtures and settings of the tests of all packages; each `conftest.py` imports the fixtures."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+# Matrices here are small: a thread for each core only keeps other tests from running.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import pytest
+from hypothesis import settings
+
+from viability_bounds_pkg.testing.ros_harness import RosHarness, private_domain
+
+# Every run tries the same examples; with --hypothesis-profile=explore it tries others.
+settings.register_profile("same", deadline=None, derandomize=True, print_blob=True)
+settings.register_profile("explore", deadline=None, print_blob=True)
+settings.load_profile("same")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def graph_of_its_own() -> Iterator[None]:
+    """Keep what tests start with the default context, or as processes, to themselves."""
+    with private_domain() as domain, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_DOMAIN_ID", str(domain))
+        yield
+
+
+@pytest.fixture
+def ros() -> Iterator[RosHarness]:
+    """A harness without nodes other than the probe."""
+    with private_domain() as domain:
+        harness = RosHarness(domain)
+        try:
+            yield harness
+        finally:
+            harness.close()

@@ -1,0 +1,8 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fixtures of the tests here."""
+
+from arms import arm
+
+from viability_bounds_pkg.testing.fixtures import graph_of_its_own, ros
+
+__all__ = ["arm", "graph_of_its_own", "ros"]

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A package as a release has it: a copy of its folder alone, built and tested by colcon."""
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def colcon(workspace, *arguments):
+    ended = subprocess.run(
+        ["colcon", "--log-base", workspace / "log", *arguments],
+        cwd=workspace,
+        # Options of these tests are not for those of the copy.
+        env={k: v for k, v in os.environ.items() if not k.startswith("PYTEST_")},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    return ended.stdout
+
+
+def copied(folder, package):
+    """Return a workspace with a copy of a package, built without links to its sources."""
+    unwanted = shutil.ignore_patterns("__pycache__", "*.egg-info", "build")
+    shutil.copytree(ROOT / "src" / package, folder / "src" / package, ignore=unwanted)
+    colcon(folder, "build", "--packages-select", package)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("package", "files", "least"),
+    [
+        # With a node, and with the package's own support.
+        ("viability_bounds_pkg", ["node/test_bounds_node.py", "kernel/test_baselines.py"], 40),
+        # With a robot's parameter file, and with the executable.
+        ("sim_bridge", ["nodes/test_scenario_node.py", "nodes/test_command_outage.py"], 8),
+    ],
+)
+def test_colcon_tests_a_copy_of_a_package(tmp_path, package, files, least):
+    workspace = copied(tmp_path, package)
+    tests = [f"test/{file}" for file in files]
+    some = ["-k", "parameter or answers or scenario or outage or baselines"]
+    colcon(workspace, "test", "--packages-select", package, "--pytest-args", *tests, *some)
+    summary = colcon(workspace, "test-result")
+    number = int(summary.split("Summary: ")[1].split(" tests")[0])
+    assert number >= least
+    assert "0 errors, 0 failures" in summary
+
+
+def test_a_copy_has_what_it_installs(tmp_path):
+    share = copied(tmp_path, "sim_bridge") / "install" / "sim_bridge" / "share" / "sim_bridge"
+    own = {path.relative_to(ROOT / "config") for path in (ROOT / "config").rglob("*.yaml")}
+    installed = {path.relative_to(share / "config") for path in share.rglob("*.yaml")}
+    assert installed == own
+    assert not any(path.is_symlink() for path in share.rglob("*.yaml"))
+    licence = tmp_path / "src" / "sim_bridge" / "LICENSE"
+    assert licence.read_text() == (ROOT / "LICENSE").read_text()
