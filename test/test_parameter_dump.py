@@ -2,6 +2,7 @@
 """Parameters through a node's services, as ``ros2 param describe`` and ``dump`` read them."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,6 @@ import yaml
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
 from rclpy.parameter import parameter_value_to_python
 from rclpy.signals import SignalHandlerOptions
-from ros_harness import CONFIG, overrides, private_domain, read_config
 
 from sim_bridge.nodes.bullet_node import BulletNode
 from sim_bridge.nodes.scenario_node import ScenarioNode
@@ -18,6 +18,10 @@ from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.parameter import parameter_table
 from viability_bounds_pkg.ros.given_parameters import note_arguments
+from viability_bounds_pkg.testing.ros_harness import overrides, private_domain, read_config
+
+ROOT = Path(__file__).resolve().parent.parent
+CONFIG = ROOT / "config"
 
 NODES = {node.NAME: node for node in (BoundsNode, ControllerNode, BulletNode, ScenarioNode)}
 EXTRA = {

@@ -4,6 +4,8 @@
 Topics, their types, QoS and the parameters' descriptions are in test_reference.py.
 """
 
+from pathlib import Path
+
 import pytest
 from chain import load_values
 from node_chain import GOAL, NodeChain, give_goal, pose_message
@@ -19,7 +21,6 @@ from rcl_interfaces.srv import (
 )
 from rclpy.logging import LoggingSeverity
 from rclpy.parameter import Parameter, parameter_value_to_python
-from ros_harness import ROOT, joint_state, overrides
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
@@ -30,6 +31,9 @@ from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.parameter import parameter_table
 from viability_bounds_pkg.ros.runtime import set_stamp
+from viability_bounds_pkg.testing.ros_harness import joint_state, overrides
+
+ROOT = Path(__file__).resolve().parent.parent
 
 VALUES = load_values("panda") | {
     "scenario": str(ROOT / "config" / "scenarios" / "panda_demo.yaml"),

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import yaml
 from chain import load_values
-from ros_harness import RosHarness, overrides, private_domain
 from std_srvs.srv import Trigger
 
 from sim_bridge.nodes.bullet_node import BulletNode
 from sim_bridge.nodes.scenario_node import ScenarioNode
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
+from viability_bounds_pkg.testing.ros_harness import RosHarness, overrides, private_domain
 
 LOCKSTEP = {
     "clock": "lockstep",

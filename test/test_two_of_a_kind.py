@@ -5,12 +5,12 @@ import os
 import socket
 import subprocess
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 from chain import load_values
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
-from ros_harness import ROOT, overrides
 from std_msgs.msg import Float64MultiArray
 
 from sim_bridge.nodes.bullet_node import BulletNode
@@ -24,6 +24,9 @@ from viability_bounds_pkg.ros.topics import (
     JOINT_COMMANDS,
     JOINT_STATES,
 )
+from viability_bounds_pkg.testing.ros_harness import overrides
+
+ROOT = Path(__file__).resolve().parent.parent
 
 VALUES = load_values("panda") | {"clock": "lockstep", "start_paused": True}
 VALUES["scenario"] = str(ROOT / "config" / "scenarios" / "panda_demo.yaml")
