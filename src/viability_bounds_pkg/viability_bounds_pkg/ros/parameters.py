@@ -24,6 +24,7 @@ from viability_bounds_pkg.parameter import REQUIRED, Parameter, parameter_table,
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.given_parameters import (
     arguments_of,
+    foreign_sections,
     given_parameters,
     refuse_renamed,
     refuse_unknown,
@@ -60,6 +61,11 @@ class NodeParameters(Generic[Configuration]):
         table = parameter_table(kind)
         arguments, name = arguments_of(node.context), node.get_fully_qualified_name()
         refuse_renamed(arguments, name, node.NAME)
+        for section in foreign_sections(arguments, name):
+            node.get_logger().warning(
+                f"the section '{section}' of a parameter file is not for this node, '{name}'; "
+                f"'/**{section[section.rindex('/') :]}' is for all namespaces"
+            )
         _settle(node, given_parameters(arguments, name), [row.name for row in table])
         self._values = {row.name: _declare(node, row) for row in table}
         try:
@@ -111,7 +117,8 @@ def _settle(node: Node, given: Mapping[str, Any], known: Sequence[str]) -> None:
 def _differs(read: Any, given: Any) -> bool:
     """Return whether rcl read another value; arrays come as its own types."""
     if isinstance(given, list):
-        return len(read or ()) != len(given) or any(map(_differs, read, given))
+        read = read or ()
+        return len(read) != len(given) or any(map(_differs, read, given))
     return type(read) is not type(given) or (read != given and given == given)
 
 
