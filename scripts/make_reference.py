@@ -110,7 +110,7 @@ A robot of your own takes the place of `bullet_node`.
 
 def mistakes_page() -> str:
     """Return the text of docs/mistakes.md."""
-    text = """<!-- Made by scripts/make_reference.py of test/mistakes.yaml: change that instead. -->
+    text = """<!-- Made by scripts/make_reference.py from test/mistakes.yaml: change that. -->
 
 # Mistakes, and the lines they get
 
