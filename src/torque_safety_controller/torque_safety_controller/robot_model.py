@@ -8,7 +8,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from torque_safety_controller.linalg.dense_kernels import middle_of_step
-from viability_bounds_pkg.robot_description import RobotDescriptionError
+from viability_bounds_pkg.robot_description import unknown_name
 from viability_bounds_pkg.state import State
 
 Array = NDArray[np.float64]
@@ -52,8 +52,7 @@ class RobotModel:
 
     def __init__(self, model: pin.Model, frame: str, dt: float) -> None:
         if not model.existFrame(frame):
-            known = ", ".join(f.name for f in model.frames)
-            raise RobotDescriptionError(f"unknown frame {frame!r}; the URDF has: {known}")
+            raise unknown_name("frame", frame, (each.name for each in model.frames))
         self.model = model
         self.frame = frame
         self.dt = dt

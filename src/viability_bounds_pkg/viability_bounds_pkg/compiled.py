@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 _functions: list[Any] = []
 
-_NOT_CALLED = {"node", "nodes", "ros", "parameters", "cli", "tools", "__pycache__"}
+_NOT_CALLED = {"node", "nodes", "ros", "parameters", "cli", "tools", "user_input", "__pycache__"}
 """Folders that compiled functions never call: the maths does not import them."""
 
 

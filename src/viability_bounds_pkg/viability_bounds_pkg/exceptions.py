@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import difflib
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 
@@ -30,9 +31,24 @@ class SettingError(ArmSafetyError, ValueError):
         self.allowed = allowed
 
 
+def did_you_mean(name: str, known: Iterable[str], alike: float = 0.6) -> str:
+    """Return "; did you mean ...?" with the known name that is most like `name`; empty if none is.
+
+    Args:
+        name: which is not known.
+        known: what it may be; case and slashes at the ends do not count.
+        alike: from 0, anything, to 1, the same.
+    """
+    plain = {each.strip("/").lower(): each for each in sorted(known, reverse=True)}
+    found = difflib.get_close_matches(name.strip("/").lower(), plain, n=1, cutoff=alike)
+    return f"; did you mean '{plain[found[0]]}'?" if found else ""
+
+
 def _show(value: Any) -> str:
     if value is None:
         return "not set"
+    if isinstance(value, bool):
+        return str(value).lower()
     if hasattr(value, "tolist"):  # an array; NumPy takes too long to import for entry points
         value = value.tolist()
     if isinstance(value, str):

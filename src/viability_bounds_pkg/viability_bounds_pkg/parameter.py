@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.exceptions import SettingError, did_you_mean
 
 Array = NDArray[np.float64]
 Configuration = TypeVar("Configuration")
@@ -110,7 +110,8 @@ class Parameter:
             return np.array(self.default) if self.kind == list[float] else self.default
         converted = self._convert(value)
         if not self._allows(converted):
-            raise SettingError(self.name, value, self.constraints)
+            hint = did_you_mean(value, self.choices) if self.choices else ""
+            raise SettingError(self.name, value, self.constraints + hint)
         return converted
 
     @property

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -19,11 +19,24 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from viability_bounds_pkg.exceptions import ArmSafetyError
+from viability_bounds_pkg.exceptions import ArmSafetyError, did_you_mean
 
 
 class RobotDescriptionError(ArmSafetyError, ValueError):
     """A URDF that cannot be found or loaded, or that does not fit what is asked of it."""
+
+
+def unknown_name(kind: str, name: str, known: Iterable[str]) -> RobotDescriptionError:
+    """Return the error of a name that the URDF does not have.
+
+    Args:
+        kind: what it names, such as "joint".
+        name: which is not there.
+        known: names that are.
+    """
+    names = list(known)
+    hint = did_you_mean(name, names) or f"; the URDF has: {', '.join(names)}"
+    return RobotDescriptionError(f"unknown {kind} {name!r}{hint}")
 
 
 def package_directories() -> Iterator[Path]:
@@ -52,11 +65,20 @@ def resolve_uri(uri: str) -> Path:
             if path.is_file():
                 return path
         package = relative.split("/", 1)[0]
-        raise RobotDescriptionError(f"{uri}: no package {package!r} holds this file")
+        hint = _other_file(*(directory / relative for directory in package_directories()))
+        raise RobotDescriptionError(f"{uri}: no package {package!r} holds this file{hint}")
     path = Path(uri.removeprefix("file://")).expanduser()
     if not path.is_file():
-        raise RobotDescriptionError(f"{uri}: no such file")
+        raise RobotDescriptionError(f"{uri}: no such file{_other_file(path)}")
     return path
+
+
+def _other_file(*paths: Path) -> str:
+    """Return a hint at a file beside one that does not exist; empty if none has such a name."""
+    beside = [path.parent for path in paths if path.parent.is_dir()]
+    return did_you_mean(
+        paths[0].name, [each.name for folder in beside for each in folder.iterdir()]
+    )
 
 
 def read_urdf(uri: str) -> str:
@@ -82,6 +104,10 @@ def check_urdf(text: str, source: str) -> None:
         raise RobotDescriptionError(f"{source}: not well-formed XML ({error})") from error
     if root.tag != "robot":
         raise RobotDescriptionError(f"{source}: root element is <{root.tag}>, not <robot>")
+    if any("xacro}" in element.tag for element in root.iter() if isinstance(element.tag, str)):
+        raise RobotDescriptionError(f"{source}: is for xacro; xacro {source} > robot.urdf")
+    if root.find("link") is None:
+        raise RobotDescriptionError(f"{source}: there is no <link> in it")
 
 
 def build_model(
@@ -118,8 +144,7 @@ def build_model(
     names = list(full.names)
     for name in (*joints, *(locked_positions or ())):
         if name not in names:
-            known = ", ".join(names[1:])
-            raise RobotDescriptionError(f"unknown joint {name!r}; the URDF has: {known}")
+            raise unknown_name("joint", name, names[1:])
     for name, position in (locked_positions or {}).items():
         joint = full.joints[full.getJointId(name)]
         if joint.nq != 1:

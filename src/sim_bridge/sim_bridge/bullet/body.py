@@ -22,7 +22,7 @@ from sim_bridge.bullet.obstacle_bodies import BulletObstacles
 from sim_bridge.bullet.obstacles import ContactMaterial, LinkWrench
 from sim_bridge.bullet.vectors import finite_vector
 from sim_bridge.urdf.preparation import FramePlacement, PreparedUrdf, prepare_urdf
-from viability_bounds_pkg.robot_description import RobotDescriptionError
+from viability_bounds_pkg.robot_description import RobotDescriptionError, unknown_name
 
 Array = NDArray[np.float64]
 
@@ -253,6 +253,5 @@ class BulletBody:
     def _frame(self, link: str) -> FramePlacement:
         """Return the placement of `link`, or raise `RobotDescriptionError`."""
         if link not in self._frames:
-            known = ", ".join(self._frames)
-            raise RobotDescriptionError(f"unknown link {link!r}; the URDF has: {known}")
+            raise unknown_name("link", link, self._frames)
         return self._frames[link]

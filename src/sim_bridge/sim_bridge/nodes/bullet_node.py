@@ -37,6 +37,7 @@ from viability_bounds_pkg.ros.messages import Diagnostics
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
+from viability_bounds_pkg.ros.robot_urdf import warn_of_unusual
 from viability_bounds_pkg.ros.runtime import set_stamp, stamp_to_ns
 from viability_bounds_pkg.ros.topics import (
     FT_WRENCH,
@@ -46,6 +47,7 @@ from viability_bounds_pkg.ros.topics import (
 )
 
 _RETRY_PERIOD = 0.2
+_STRAYS = 50
 _LATENCIES_KEPT = 100_000
 _CONTROL = {type(None): "brakes", TorqueCommand: "torque", PositionCommand: "position"}
 
@@ -74,6 +76,7 @@ class BulletNode(ArmNode):
         with self.starting(JOINT_STATES):
             self._node_parameters = NodeParameters(self, BulletConfiguration)
             config = self._node_parameters.configuration
+            warn_of_unusual(self, config, config.urdf)
             self._robot = make_robot(config)
         self._config = config
         self._monitor = LimitMonitor(
@@ -129,7 +132,7 @@ class BulletNode(ArmNode):
         self._sensor = ForceTorqueReading(sensor, config.sensor) if sensor else None
         self._monitor.reset()
         self._command: JointCommand | None = None
-        self._missed_in_row = self._missed = self._braked = 0
+        self._missed_in_row = self._missed = self._braked = self._strays = 0
         self._outage = CommandOutage(config.command_timeout, math.ceil(config.rate_hz))
         self._periods = 0
         self._plan_pause()
@@ -216,7 +219,7 @@ class BulletNode(ArmNode):
     def _on_command(self, message: JointState) -> None:
         if stamp_to_ns(message.header.stamp) != self._stamp or self._advanced:
             if not self._paused:
-                self._refused["not for this period"] += 1
+                self._note_stray(stamp_to_ns(message.header.stamp))
             return
         if self._paused:
             return
@@ -224,7 +227,10 @@ class BulletNode(ArmNode):
             command = read_command(message, self._joints)
         except CommandError as error:
             self._refused[str(error)] += 1
+            if self._refused[str(error)] == 1:
+                self.get_logger().warning(f"joint_commands refused: {error}")
             return
+        self._strays = 0
         self._latencies.append(time.monotonic() - self._published_at)
         self._missed_in_row = 0
         if isinstance(command, TorqueCommand):
@@ -237,6 +243,17 @@ class BulletNode(ArmNode):
         # After a pause by itself the next state is not published: time stops for all nodes.
         if self._config.lockstep and not self._paused:
             self._next_state()
+
+    def _note_stray(self, stamp: int) -> None:
+        """Count a command that is not for this period; warn when no other comes."""
+        self._refused["not for this period"] += 1
+        self._strays += 1
+        if self._strays == _STRAYS:
+            self.get_logger().warning(
+                f"joint_commands refused: {_STRAYS} in a row do not have the stamp of the present "
+                f"joint state; the last one has {1e-9 * stamp:.9g} s instead of "
+                f"{1e-9 * self._stamp:.9g} s"
+            )
 
     # Services
 

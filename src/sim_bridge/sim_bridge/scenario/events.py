@@ -20,7 +20,9 @@ from sim_bridge.scenario.fields import (
     vector,
 )
 from sim_bridge.scenario.trajectory import read_trajectory
+from viability_bounds_pkg.exceptions import did_you_mean
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory
+from viability_bounds_pkg.user_input.known_names import graph_names, unknown_parameters
 
 _ZERO = (0.0, 0.0, 0.0)
 
@@ -120,14 +122,22 @@ def read_event(content: Any, where: str) -> Event:
     """
     kinds = set(content) - {"time"} if isinstance(content, dict) else set()
     if len(kinds) != 1 or "time" not in content or not kinds <= set(_KINDS):
-        raise ScenarioError(f"{where} must have 'time' and one of {', '.join(_KINDS)}")
+        wrong = [str(kind) for kind in sorted(map(str, kinds)) if kind not in _KINDS]
+        hint = did_you_mean(wrong[0], {"time", *_KINDS}) if wrong else ""
+        raise ScenarioError(f"{where} must have 'time' and one of {', '.join(_KINDS)}{hint}")
     kind = kinds.pop()
     time = not_negative(content["time"], f"{where}.time")
     event, read = _KINDS[kind]
     place = f"{where}.{kind}"
     if callable(read):
         return event(time, read(content[kind], place))
-    return event(time, **read_fields(content[kind], place, read, event._field_defaults))
+    fields = read_fields(content[kind], place, read, event._field_defaults)
+    if kind == "push" and not {"force", "torque"} & set(fields):
+        raise ScenarioError(f"{place} has no force and no torque; allowed: one of them or both")
+    own_node = kind == "parameters" and fields["node"].rpartition("/")[2] in graph_names("node")
+    if own_node and (unknown := unknown_parameters(fields["values"])):
+        raise ScenarioError(f"{place}.values: {unknown}")
+    return event(time, **fields)
 
 
 def _posture(content: Any, where: str) -> Mapping[str, float]:
@@ -152,6 +162,23 @@ def _true_or_false(value: Any, where: str) -> bool:
 def _trigger(value: Any, where: str) -> str:
     if value != "trigger":
         raise refuse(where, value, "trigger")
+    return value
+
+
+def _node(value: Any, where: str) -> str:
+    known = graph_names("node")
+    if hint := did_you_mean(name(value, where), known) if value not in known else "":
+        raise refuse(where, value, f"the name of a node{hint}")
+    return value
+
+
+def _service(value: Any, where: str) -> str:
+    node, _, service = name(value, where).rpartition("/")
+    if node:
+        _node(node, where)
+    known = graph_names("service")
+    if service not in known and (hint := did_you_mean(service, known)):
+        raise refuse(where, value, f"a service{hint}")
     return value
 
 
@@ -189,7 +216,7 @@ _KINDS: dict[str, tuple[Any, Check | Mapping[str, Check]]] = {
     "obstacle": (AddObstacle, _obstacle),
     "remove_obstacle": (RemoveObstacle, {"name": name}),
     "enable_torque": (EnableTorque, _true_or_false),
-    "parameters": (ParameterChange, {"node": name, "values": _parameters}),
-    "call": (TriggerCall, {"service": name, "type": _trigger}),
+    "parameters": (ParameterChange, {"node": _node, "values": _parameters}),
+    "call": (TriggerCall, {"service": _service, "type": _trigger}),
 }
 """By the entry's name: the event, and its fields or a function that reads its only field."""

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
-from viability_bounds_pkg.exceptions import ArmSafetyError
+from viability_bounds_pkg.exceptions import ArmSafetyError, did_you_mean
 
 _QUATERNION_TOLERANCE = 1e-3
 
@@ -40,7 +40,8 @@ def read_fields(
     unknown = [str(key) for key in content if key not in checks]
     if unknown:
         place, names = where or "the file", ", ".join(checks)
-        raise ScenarioError(f"{place} has {', '.join(unknown)}; allowed: {names}")
+        hint = did_you_mean(unknown[0], checks)
+        raise ScenarioError(f"{place} has {', '.join(unknown)}; allowed: {names}{hint}")
     return {
         key: check(content.get(key), f"{where}.{key}".lstrip("."))
         for key, check in checks.items()

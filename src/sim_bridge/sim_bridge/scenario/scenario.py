@@ -6,8 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-
-import yaml
+from xml.etree import ElementTree
 
 from sim_bridge.scenario.events import (
     AddObstacle,
@@ -19,9 +18,10 @@ from sim_bridge.scenario.events import (
     read_event,
 )
 from sim_bridge.scenario.fields import ScenarioError, positive, read_fields, refuse
-from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.exceptions import SettingError, did_you_mean
 from viability_bounds_pkg.parameter import above, number, text
 from viability_bounds_pkg.robot_configuration import LimitedRobotConfiguration, TaskFrames
+from viability_bounds_pkg.user_input.yaml_file import YamlError, read_yaml
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,11 @@ class ScenarioConfiguration(TaskFrames, LimitedRobotConfiguration):
         try:
             plan = load_scenario(self.scenario)
         except ScenarioError as error:
-            raise SettingError("scenario", self.scenario, str(error)) from error
+            reason = str(error).removeprefix(f"scenario {self.scenario}").lstrip(":, ")
+            raise SettingError("scenario", self.scenario, f"a scenario ({reason})") from error
+        object.__setattr__(self, "plan", plan)
+        object.__setattr__(self, "urdf", self.read_urdf())
+        links = [each.get("name", "") for each in ElementTree.fromstring(self.urdf).iter("link")]
         frames = self.end_effector_frame, self.base_frame
         for event in plan.events:
             allowed = ""
@@ -69,15 +73,21 @@ class ScenarioConfiguration(TaskFrames, LimitedRobotConfiguration):
                 allowed = (
                     f"postures of all 'joints'; at {event.time:g} s there is none of {missing}"
                 )
+            elif isinstance(event, PostureGoal) and set(event.positions) - set(self.joints):
+                others = ", ".join(name for name in event.positions if name not in self.joints)
+                allowed = f"postures of 'joints'; at {event.time:g} s there is one of {others}"
             if isinstance(event, WrenchGoal) and event.frame not in ("", *frames):
                 allowed = (
                     f"wrenches in the axes of {' or '.join(frames)}; at {event.time:g} s there "
                     f"is one in those of {event.frame!r}"
                 )
+            if isinstance(event, Push) and event.link not in links:
+                allowed = (
+                    f"pushes of links of the URDF; at {event.time:g} s there is one of "
+                    f"'{event.link}'{did_you_mean(event.link, links)}"
+                )
             if allowed:
                 raise SettingError("scenario", self.scenario, allowed)
-        object.__setattr__(self, "plan", plan)
-        object.__setattr__(self, "urdf", self.read_urdf())
 
 
 def load_scenario(path: str | Path) -> Scenario:
@@ -88,9 +98,9 @@ def load_scenario(path: str | Path) -> Scenario:
             range; the message names file, entry and what is allowed.
     """
     try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ScenarioError(f"scenario {path}: {error}") from error
+        content = read_yaml(path)
+    except YamlError as error:
+        raise ScenarioError(f"scenario {error}") from error
     try:
         fields = read_fields(content, "", {"duration": positive, "events": _events}, ("events",))
         duration, events = fields["duration"], fields.get("events", [])

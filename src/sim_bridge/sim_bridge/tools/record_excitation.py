@@ -28,12 +28,12 @@ from sim_bridge.nodes.bullet_parameters import (
 from sim_bridge.tools.excitation import ExcitationError, excitation
 from viability_bounds_pkg.cli.command_line import Parser, positive, run_tool
 from viability_bounds_pkg.cli.limits_file import (
-    ParameterFileError,
     check_writable,
     node_parameters,
     write_whole,
 )
 from viability_bounds_pkg.parameter import read
+from viability_bounds_pkg.user_input.parameter_files import ParameterFileError
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from viability_bounds_pkg.robot_description import RobotDescriptionError
+from viability_bounds_pkg.robot_description import RobotDescriptionError, unknown_name
 
 Array = NDArray[np.float64]
 
@@ -69,7 +69,7 @@ def joints_on(root: Element, link: str) -> list[Element]:
     """
     known = [element.get("name", "") for element in root.findall("link")]
     if link not in known:
-        raise RobotDescriptionError(f"unknown link {link!r}; the URDF has: {', '.join(known)}")
+        raise unknown_name("link", link, known)
     joints = [joint for joint in root.findall("joint") if link_at(joint, "parent") == link]
     if not joints:
         raise RobotDescriptionError(f"link {link!r} carries no other link to measure")
@@ -85,7 +85,7 @@ def scale_masses(root: Element, scales: Mapping[str, float]) -> None:
     links = {link.get("name", ""): link for link in root.findall("link")}
     for name, scale in scales.items():
         if name not in links:
-            raise RobotDescriptionError(f"unknown link {name!r}; the URDF has: {', '.join(links)}")
+            raise unknown_name("link", name, links)
         if not (math.isfinite(scale) and scale > 0.0):
             raise RobotDescriptionError(f"the mass of link {name!r} cannot be scaled by {scale}")
         for inertial in links[name].findall("inertial"):

@@ -40,7 +40,11 @@ from sim_bridge.urdf.elements import (
     scale_masses,
     transform_of,
 )
-from viability_bounds_pkg.robot_description import RobotDescriptionError, resolve_uri
+from viability_bounds_pkg.robot_description import (
+    RobotDescriptionError,
+    resolve_uri,
+    unknown_name,
+)
 
 _MOVABLE = ("revolute", "continuous", "prismatic")
 # PyBullet makes no stop where lower > upper.
@@ -195,8 +199,8 @@ def _check_joints(root: Element, joints: Sequence[str], locked: Mapping[str, flo
     types = _joint_types(root)
     for name in (*joints, *locked):
         if name not in types:
-            known = ", ".join(name for name, kind in types.items() if kind != "fixed")
-            raise RobotDescriptionError(f"unknown joint {name!r}; the URDF has: {known}")
+            movable = (str(each) for each, kind in types.items() if kind != "fixed")
+            raise unknown_name("joint", name, movable)
         if types[name] not in _MOVABLE:
             raise RobotDescriptionError(f"joint {name!r} is {types[name]}, none of {_MOVABLE}")
     if not joints or len(set(joints)) != len(joints):

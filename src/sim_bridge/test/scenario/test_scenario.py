@@ -67,9 +67,9 @@ events:
   - {time: 3, enable_torque: false}
   - {time: 4, parameters: {node: n, values: {a: 1, b: [1, 2.5], c: x, d: true, e: [x, y]}}}
   - {time: 5, call: {service: controller_node/tare_ft_sensor, type: trigger}}
-  - {time: 6, push: {link: a, duration: 2}}
-  - {time: 6.5, push: {link: b, duration: 2}}
-  - {time: 8, push: {link: a, duration: 2}}
+  - {time: 6, push: {link: a, duration: 2, force: [0, 0, 1]}}
+  - {time: 6.5, push: {link: b, duration: 2, force: [0, 0, 1]}}
+  - {time: 8, push: {link: a, duration: 2, force: [0, 0, 1]}}
 """,
         )
     )
@@ -114,6 +114,7 @@ events:
 
 CIRCLE = "centre: [0, 0, 0], radius: 1, plane: [y, z], period: 1, orientation: [0, 0, 0, 1]"
 POINT = "position: [0, 0, 0], orientation: [0, 0, 0, 1]"
+OVAL = "sphere, size: [1, 1, 2]"
 BOX = "name: a, shape: box, size: [1, 1, 1], position: [0, 0, 0]"
 
 
@@ -137,19 +138,27 @@ BOX = "name: a, shape: box, size: [1, 1, 1], position: [0, 0, 0]"
             "{time: 1, position: [0, 0, 0], orientation: [1, 0, 0, 0]}]}",
             "trajectory.points[1] is turned by 3.14 rad from the last one",
         ),
-        ("trajectory", f"{{circle: {{{CIRCLE}, radius: -1}}}}", "circle.radius"),
+        (
+            "trajectory",
+            f"{{circle: {{{CIRCLE.replace('s: 1', 's: -1')}}}}}",
+            "circle.radius",
+        ),
         ("trajectory", f"{{circle: {{{CIRCLE}, diameter: 1}}}}", "radius and diameter"),
         ("trajectory", f"{{circle: {{{CIRCLE}, start: [0, 0, 0]}}}}", "centre and start"),
         ("trajectory", f"{{circle: {{{CIRCLE}, normal: [0, 0, 1]}}}}", "plane and normal"),
-        ("trajectory", f"{{circle: {{{CIRCLE}, plane: [y, -y]}}}}", "circle.plane"),
-        ("trajectory", f"{{circle: {{{CIRCLE}, plane: [y, w]}}}}", "two of x, y, z"),
+        ("trajectory", f"{{circle: {{{CIRCLE.replace('[y, z]', '[y, -y]')}}}}}", "circle.plane"),
+        ("trajectory", f"{{circle: {{{CIRCLE.replace('[y, z]', '[y, w]')}}}}}", "two of x, y, z"),
         ("trajectory", f"{{circle: {{{CIRCLE}, turns: 0}}}}", "circle.turns"),
         ("trajectory", f"{{circle: {{{CIRCLE}, ramp: 1.5}}}}", "ramp is 1.5; allowed: at most 1"),
         ("trajectory", f"{{circle: {{{CIRCLE}, colour: 1}}}}", "circle has colour"),
         ("wrench", "{force: [1, 2]}", "wrench.force"),
         ("wrench", "{frame: 1}", "wrench.frame"),
-        ("obstacle", f"{{{BOX}, shape: cone}}", "none of box, sphere, cylinder"),
-        ("obstacle", f"{{{BOX}, shape: sphere, size: [1, 1, 2]}}", "round"),
+        ("obstacle", f"{{{BOX.replace('box', 'cone')}}}", "none of box, sphere, cylinder"),
+        (
+            "obstacle",
+            f"{{{BOX.replace('box, size: [1, 1, 1]', OVAL)}}}",
+            "round",
+        ),
         ("obstacle", f"{{{BOX}, size: [1, 1, 0]}}", "size"),
         ("obstacle", f"{{{BOX}, mass: 1}}", "obstacle has mass"),
         ("remove_obstacle", "{name: a}", "names 'a'; there are: none"),
@@ -192,8 +201,8 @@ def test_an_event_that_cannot_be_is_named(tmp_path, kind, content, names):
         ("duration: 1\nevents: [{time: 0}]", "events[0]"),
         ("duration: 1\nevents: [{time: 1, posture: {a: 0}}]", "less than 1, the end"),
         (
-            "duration: 9\nevents: [{time: 0, push: {link: a, duration: 2}}, "
-            "{time: 1, push: {link: a, duration: 2}}]",
+            "duration: 9\nevents: [{time: 0, push: {link: a, duration: 2, force: [1, 0, 0]}}, "
+            "{time: 1, push: {link: a, duration: 2, force: [1, 0, 0]}}]",
             "the push of a at 1 s begins before",
         ),
         ("duration: 1\nevents: [{time: 0, dance: {}}]", "events[0]"),

@@ -20,12 +20,12 @@ from torque_safety_controller.friction.joint_recording import RecordingError, lo
 from torque_safety_controller.friction.settings import COEFFICIENTS
 from viability_bounds_pkg.cli.command_line import Parser, run_tool
 from viability_bounds_pkg.cli.limits_file import (
-    ParameterFileError,
     check_writable,
     overlay,
     read_robot,
     write_whole,
 )
+from viability_bounds_pkg.user_input.parameter_files import ParameterFileError
 
 NODE = "/**/controller_node"
 """Node that the written parameters are for."""

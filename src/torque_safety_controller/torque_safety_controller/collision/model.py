@@ -17,7 +17,7 @@ from torque_safety_controller.collision.distances import Pairs, pair_distances
 from torque_safety_controller.collision.geometry import link_shapes
 from torque_safety_controller.collision.motion import Bodies, Kinematics
 from viability_bounds_pkg.compiled import bound
-from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.exceptions import SettingError, did_you_mean
 
 Array = NDArray[np.float64]
 
@@ -194,6 +194,7 @@ def _link_pairs(
         for link in pair:
             if link not in joint_of:
                 allowed = f"links with collision geometry: {', '.join(sorted(joint_of))}"
+                allowed += did_you_mean(link, joint_of)
                 raise SettingError("collision_pairs", link, allowed)
         if len(pair) != 2 or joint_of[pair[0]] == joint_of[pair[1]]:
             raise SettingError("collision_pairs", pair, "two links that move to each other")

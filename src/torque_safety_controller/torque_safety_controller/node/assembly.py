@@ -20,10 +20,10 @@ from torque_safety_controller.controller import Controller
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parameters.interaction_parameters import ContactPoint
 from torque_safety_controller.robot_model import RobotModel
-from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.exceptions import SettingError, did_you_mean
 from viability_bounds_pkg.robot_configuration import load_model
 from viability_bounds_pkg.robot_description import RobotDescriptionError, inertia_beyond
-from viability_bounds_pkg.ros.robot_urdf import robot_urdf
+from viability_bounds_pkg.ros.robot_urdf import robot_urdf, warn_of_unusual
 
 if TYPE_CHECKING:
     from rclpy.node import Node
@@ -100,6 +100,8 @@ def load_robot(config: ControllerConfiguration, node: Node | None = None) -> Loa
     """
     urdf = robot_urdf(config, node)
     model = load_model(config, urdf)
+    if node is not None:
+        warn_of_unusual(node, config, urdf)
     frame = config.end_effector_frame
     try:
         robot = RobotModel(model, frame, config.dt)
@@ -111,8 +113,9 @@ def load_robot(config: ControllerConfiguration, node: Node | None = None) -> Loa
 
 def _base_placement(model: pin.Model, frame: str) -> pin.SE3:
     if not model.existFrame(frame):
-        known = ", ".join(f.name for f in model.frames if f.parentJoint == 0)
-        raise SettingError("base_frame", frame, f"a frame fixed to the root: {known}")
+        known = [each.name for each in model.frames if each.parentJoint == 0]
+        allowed = f"a frame fixed to the root: {', '.join(known)}{did_you_mean(frame, known)}"
+        raise SettingError("base_frame", frame, allowed)
     found = model.frames[model.getFrameId(frame)]
     if found.parentJoint != 0:
         raise SettingError("base_frame", frame, "a frame fixed to the root, not a moving one")
@@ -204,7 +207,9 @@ def _sensor(config: ControllerConfiguration, robot: RobotModel, urdf: str) -> Wr
     if not frame:
         return None
     if not model.existFrame(frame, pin.FrameType.BODY):
-        raise SettingError("ft_frame", frame, "a link of the URDF, or empty")
+        links = [each.name for each in model.frames if each.type == pin.FrameType.BODY]
+        allowed = f"a link of the URDF, or empty{did_you_mean(frame, links)}"
+        raise SettingError("ft_frame", frame, allowed)
     if _joint_of(model, frame) != _joint_of(model, robot.frame):
         raise SettingError("ft_frame", frame, f"a link fixed to {robot.frame!r}")
     if len(tool):
@@ -225,7 +230,8 @@ def _contacts(points: Sequence[ContactPoint], model: pin.Model) -> Contacts | No
         first = its[0]
         if not model.existFrame(frame):
             label = f"contacts[{points.index(first)}].frame"
-            raise SettingError(label, frame, "a frame of the URDF")
+            hint = did_you_mean(frame, (each.name for each in model.frames))
+            raise SettingError(label, frame, f"a frame of the URDF{hint}")
         places = np.array([each.point for each in its])
         contacts.append(FrictionContact(frame, places, first.normal, first.friction))
     return Contacts(model, contacts) if contacts else None

@@ -29,7 +29,7 @@ from torque_safety_controller.qp.constraints import AccelerationRange
 from torque_safety_controller.safety.handover import Control, Handover, HandoverRefused
 from torque_safety_controller.safety.modes import Mode, ModeKeeper
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, Verdict
+from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, PeriodCheck, Verdict
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
@@ -67,8 +67,9 @@ class ControllerNode(ArmNode):
             config.position_max,
             config.torque_max,
         )
-        self._states = JointStateReader(config.joints, config.state_timeout)
-        self._limits = LimitsReader(config.joints)
+        self._states = JointStateReader(config.joints, config.state_timeout, self._warn)
+        self._period = PeriodCheck(config.dt, self._warn)
+        self._limits = LimitsReader(config.joints, self._warn)
         self._goals = GoalSubscriber(self, self._controller, config, base)
         self._wrenches = WrenchSubscriber(
             self, self._controller.interaction, self._goals, config, base
@@ -97,6 +98,11 @@ class ControllerNode(ArmNode):
         alone += [ACCELERATION_LIMITS.name, FT_WRENCH.name]
         self.publisher_watch = PublisherWatch(self, filter(None, alone))
         self._diagnostics = Diagnostics(self, self._report, watch=self.publisher_watch)
+        if config.collision.bodies and not config.collision.collision_avoidance:
+            self.get_logger().warning(
+                "parameter 'obstacles' is given, but 'collision_avoidance' is false: the arm does "
+                "not avoid them"
+            )
         avoiding = "with" if config.collision.collision_avoidance else "without"
         self.announce(
             config.joints,
@@ -108,6 +114,9 @@ class ControllerNode(ArmNode):
     def _configure(self, config: ControllerConfiguration) -> None:
         self._config = config
         configure(self._controller, config)
+
+    def _warn(self, text: str) -> None:
+        self.get_logger().warning(text)
 
     # Streams
 
@@ -319,6 +328,7 @@ class ControllerNode(ArmNode):
     # Diagnostics
 
     def _report(self) -> tuple[bytes, str, dict[str, Any]]:
+        self._period.look(self._states)
         values = self._record.values(
             self._config.joints, self._controller, self._limits.lower, self._limits.upper
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from trajectory_msgs.msg import JointTrajectory
@@ -16,13 +16,18 @@ from viability_bounds_pkg.ros.runtime import stamp_to_ns
 class LimitsReader:
     """Reads ``acceleration_limits`` into arrays in the order of `joints`.
 
+    Args:
+        joints: names of the n joints.
+        warn: told in words when a message is dropped for a reason for the first time.
+
     Attributes:
         lower, upper: of the last accepted message, shape (n,), rad/s^2.
         stamp: of the state that they belong to, ns.
         refused: how many messages were dropped, by reason.
     """
 
-    def __init__(self, joints: Sequence[str]) -> None:
+    def __init__(self, joints: Sequence[str], warn: Callable[[str], object] | None = None) -> None:
+        self._warn = warn
         self.lower = np.zeros(len(joints))
         self.upper = np.zeros(len(joints))
         self.stamp = -1
@@ -39,8 +44,8 @@ class LimitsReader:
             return self._refuse("wrong size")
         if message.joint_names != self._joints:
             where = {name: i for i, name in enumerate(message.joint_names)}
-            if any(joint not in where for joint in self._joints):
-                return self._refuse("missing joint")
+            if missing := next((joint for joint in self._joints if joint not in where), ""):
+                return self._refuse("missing joint", f": there is no '{missing}'")
             index = [where[joint] for joint in self._joints]
             lower, upper = lower[index], upper[index]
         # The sum is the quick test, NumPy's the exact one, of the joints that count.
@@ -54,6 +59,8 @@ class LimitsReader:
         self.stamp = stamp_to_ns(message.header.stamp)
         return True
 
-    def _refuse(self, reason: str) -> bool:
+    def _refuse(self, reason: str, detail: str = "") -> bool:
         self.refused[reason] += 1
+        if self._warn is not None and self.refused[reason] == 1:
+            self._warn(f"acceleration_limits refused: {reason}{detail}")
         return False

@@ -85,9 +85,9 @@ class WrenchSubscriber:
             if not np.isfinite(wrench).all():
                 raise GoalRefused("wrench is not finite")
             frame = message.header.frame_id
-            allowed = ("", config.end_effector_frame, config.base_frame)
-            if frame not in allowed:
-                raise GoalRefused(f"frame_id is '{frame}'; allowed: {allowed[1:]} or empty")
+            hand, base = config.end_effector_frame, config.base_frame
+            if frame not in ("", hand, base):
+                raise GoalRefused(f"frame_id is '{frame}'; allowed: '{hand}', '{base}' or empty")
         except GoalRefused as error:
             self._goals.refuse(TARGET_WRENCH, error)
             return

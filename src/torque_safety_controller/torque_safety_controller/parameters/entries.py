@@ -3,25 +3,14 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from typing import TypeVar
 
-import yaml
-
-from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.exceptions import SettingError, did_you_mean
 from viability_bounds_pkg.parameter import parameter_table, read
+from viability_bounds_pkg.user_input.yaml_file import YamlError, load_yaml
 
 Entry = TypeVar("Entry")
-
-
-class _Loader(yaml.SafeLoader):
-    """Takes 1e-3 for a number, which YAML 1.1 takes for a string."""
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9.]+[eE][-+]?[0-9]+$"), list("-+.0123456789")
-)
 
 
 def read_entries(kind: type[Entry], parameter: str, entries: Sequence[str]) -> tuple[Entry, ...]:
@@ -40,12 +29,16 @@ def read_entries(kind: type[Entry], parameter: str, entries: Sequence[str]) -> t
 
 def _read(kind: type[Entry], label: str, text: str) -> Entry:
     fields = [row.name for row in parameter_table(kind)]
+    reason = ""
     try:
-        values = yaml.load(text, _Loader)
-    except (yaml.YAMLError, ValueError):
-        values = None
+        values = load_yaml(text)
+    except YamlError as error:
+        values, reason = None, f" ({error})"
     if not isinstance(values, dict) or not set(values) <= set(fields):
-        raise SettingError(label, text, f"a YAML mapping with the fields {', '.join(fields)}")
+        for name in values if isinstance(values, dict) else ():
+            reason = reason or ("" if name in fields else did_you_mean(str(name), fields))
+        allowed = f"a YAML mapping with the fields {', '.join(fields)}{reason}"
+        raise SettingError(label, text, allowed)
     try:
         return read(kind, values)
     except SettingError as error:

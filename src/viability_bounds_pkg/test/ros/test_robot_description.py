@@ -6,7 +6,7 @@ import pinocchio as pin
 import pytest
 import yaml
 
-from viability_bounds_pkg.cli.limits_file import ParameterFileError, read_robot
+from viability_bounds_pkg.cli.limits_file import read_robot
 from viability_bounds_pkg.estimation.worst_case_search import torque_terms
 from viability_bounds_pkg.robot_description import (
     RobotDescriptionError,
@@ -16,6 +16,7 @@ from viability_bounds_pkg.robot_description import (
     read_urdf,
     resolve_uri,
 )
+from viability_bounds_pkg.user_input.parameter_files import ParameterFileError
 
 PANDA = "package://example-robot-data/robots/panda_description/urdf/panda.urdf"
 JOINTS = [f"panda_joint{i}" for i in range(1, 8)]

@@ -139,7 +139,7 @@ def test_a_change_arrives_once_and_all_of_it(ros):
         ("count", 6, "Parameter count out of range. Min: 1, Max: 5, value: 6"),
         ("pair", [1.0], "parameter 'pair' is [1]; allowed: 2 numbers"),
         ("gain", "high", "parameter 'gain' is 'high'; allowed: a number"),
-        ("gain", True, "parameter 'gain' is True; allowed: a number"),
+        ("gain", True, "parameter 'gain' is true; allowed: a number"),
         ("gain", [1.0, 2.0], "parameter 'gain' is [1, 2]; allowed: a number"),
         ("count", 1.5, "parameter 'count' is 1.5; allowed: a whole number"),
         ("enabled", 1, "parameter 'enabled' is 1; allowed: true or false"),
@@ -201,7 +201,7 @@ def test_parameters_of_others_are_left_alone(ros):
         ({"joints": [1, 2]}, "parameter 'joints' is [1, 2]; allowed: a list of strings"),
         ({"limits": 1.0}, "parameter 'limits' is 1; allowed: a list of numbers"),
         ({"limits": ["x"]}, "parameter 'limits' is ['x']; allowed: a list of numbers"),
-        ({"limits": [True, False]}, "parameter 'limits' is [True, False]; allowed: a list of "),
+        ({"limits": [True, False]}, "parameter 'limits' is [true, false]; allowed: a list of "),
         ({"limits": [1.0]}, "parameter 'limits' is [1]; allowed: 2 numbers, one for each of "),
         ({"joints": ["a", "a"]}, "parameter 'joints' is ['a', 'a']; allowed: at least one joint "),
         ({"joints": ["a", ""]}, "parameter 'joints' is ['a', '']; allowed: at least one joint "),
@@ -256,7 +256,7 @@ def test_descriptions_tell_what_may_change_and_to_what(ros):
         (("a", "b"), "['a', 'b']"),
         (0.1, "0.1"),
         (7, "7"),
-        (False, "False"),
+        (False, "false"),
     ],
 )
 def test_values_are_shown_as_they_are_written(value: Any, shown: str):

@@ -8,10 +8,13 @@ import sys
 from collections.abc import Callable
 from typing import NoReturn
 
-from viability_bounds_pkg.exceptions import ArmSafetyError
+from viability_bounds_pkg.exceptions import ArmSafetyError, did_you_mean
 
 INTERRUPTED = 130
 """Exit code of a program ended by SIGINT, as shells report it."""
+
+
+ROS_FLAGS = ("-p", "--param", "-r", "--remap", "--params-file", "--log-level")
 
 
 class Parser(argparse.ArgumentParser):
@@ -19,15 +22,33 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print what is wrong, and exit with 2."""
-        self.exit(2, f"{self.prog}: error: {message}\n")
+        self.exit(2, f"{self.prog}: error: {message}{self._hint(message)}\n")
+
+    def _hint(self, message: str) -> str:
+        kind, _, words = message.partition(": ")
+        if kind != "unrecognized arguments":
+            return ""
+        word = words.split()[0]
+        if word in ROS_FLAGS:
+            return "; arguments for ROS follow --ros-args"
+        known = [option for option in self._option_string_actions if option.startswith("--")]
+        return did_you_mean(word.partition("=")[0], known)
 
 
 def positive(text: str) -> float:
     """Return an argument that must be a finite number above 0."""
-    value = float(text)
+    value = number(text)
     if not 0.0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"must be positive, is {text}")
     return value
+
+
+def number(text: str) -> float:
+    """Return an argument that must be a number."""
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be a number, is '{text}'") from None
 
 
 def run_tool(name: str, tool: Callable[[], int]) -> int:

@@ -25,9 +25,8 @@ from viability_bounds_pkg.acceleration_limits import (
     limits_from_worst_cases,
     unavailable_share,
 )
-from viability_bounds_pkg.cli.command_line import INTERRUPTED, Parser, positive, run_tool
+from viability_bounds_pkg.cli.command_line import INTERRUPTED, Parser, number, positive, run_tool
 from viability_bounds_pkg.cli.limits_file import (
-    ParameterFileError,
     Robot,
     check_writable,
     read_robot,
@@ -40,17 +39,18 @@ from viability_bounds_pkg.estimation.discretisation_margin import (
 )
 from viability_bounds_pkg.estimation.state_space import Array, LimitEstimateError, StateSpace
 from viability_bounds_pkg.estimation.worst_case_search import WorstCases
+from viability_bounds_pkg.user_input.parameter_files import ParameterFileError
 
 
 def _count(text: str) -> int:
-    value = int(text)
+    value = int(number(text))
     if value < 1:
         raise argparse.ArgumentTypeError(f"must be at least 1, is {value}")
     return value
 
 
 def _fraction(text: str) -> float:
-    value = float(text)
+    value = number(text)
     if not 0 <= value < 1:
         raise argparse.ArgumentTypeError(f"must be at least 0 and less than 1, is {text}")
     return value

@@ -16,13 +16,19 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
-import yaml
 
 from viability_bounds_pkg.estimation.state_space import Array
-from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError
+from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import read, redeclared
 from viability_bounds_pkg.robot_configuration import LimitedRobotConfiguration
 from viability_bounds_pkg.robot_description import build_model, read_urdf
+from viability_bounds_pkg.user_input.known_names import unknown_parameters
+from viability_bounds_pkg.user_input.parameter_files import (
+    ParameterFileError,
+    check_parameter_files,
+    sections_of,
+)
+from viability_bounds_pkg.user_input.yaml_file import read_yaml
 
 NODE = "/**/bounds_node"
 """The node whose parameters the limits are."""
@@ -32,10 +38,6 @@ CONTROLLER = "/**/controller_node"
 
 DIGITS = 4
 """Significant digits written."""
-
-
-class ParameterFileError(ArmSafetyError, ValueError):
-    """A parameter file that cannot be read or lacks what is needed."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -130,25 +132,17 @@ def node_parameters(path: Path, node: str = NODE) -> dict[str, Any]:
         node: ``/**/name``; sections ``name`` and ``/name`` count as well.
 
     Raises:
-        ParameterFileError: the file cannot be read, is no parameter file, or has none for `node`.
+        YamlError: the file cannot be read, is no YAML, or has a key twice.
+        ParameterFileError: the file is no parameter file, has none for `node`, or a misspelt one.
     """
-    try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ParameterFileError(f"{path}: {error}") from error
-    except yaml.YAMLError as error:
-        reason = " ".join(str(error).split())
-        raise ParameterFileError(f"{path}: not a YAML file ({reason})") from error
-    parameters: dict[str, Any] = {}
+    check_parameter_files([str(path)])
     name = node.rpartition("/")[2]
-    for key in ("/**", name, f"/{name}", node):
-        section = document.get(key) if isinstance(document, Mapping) else None
-        if section is None:
-            continue
-        values = section.get("ros__parameters") if isinstance(section, Mapping) else None
-        if not isinstance(values, Mapping):
-            raise ParameterFileError(f"{path}: '{key}' has no 'ros__parameters'")
-        parameters.update(values)
+    parameters: dict[str, Any] = {}
+    for section, values in sections_of(read_yaml(path)):
+        if section in ("/**", f"/{name}", node):
+            parameters.update(values)
+    if unknown := unknown_parameters(parameters):
+        raise ParameterFileError(f"{path}: {unknown}")
     if not parameters:
         raise ParameterFileError(f"{path}: no parameters under '/**' or '{node}'")
     return parameters

@@ -23,11 +23,11 @@ from viability_bounds_pkg.node.bounds_parameters import (
 from viability_bounds_pkg.node.limit_distances import LimitDistances
 from viability_bounds_pkg.robot_configuration import RobotConfiguration, load_model
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, Verdict
+from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, PeriodCheck, Verdict
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
-from viability_bounds_pkg.ros.robot_urdf import robot_urdf
+from viability_bounds_pkg.ros.robot_urdf import TOPIC, robot_urdf, warn_of_unusual
 from viability_bounds_pkg.ros.topics import ACCELERATION_LIMITS, JOINT_STATES
 
 
@@ -50,10 +50,13 @@ class BoundsNode(ArmNode):
                 self, BoundsConfiguration, self._configure, self._make_bounds
             )
             config = self._node_parameters.configuration
+            if config.robot_description not in ("", TOPIC):
+                warn_of_unusual(self, config, config.read_urdf())
             self._bounds = self._make_bounds(config)
         joints = config.joints
         self._longest_ns = round(1.5e9 * config.dt)
-        self._reader = JointStateReader(joints, config.state_timeout)
+        self._reader = JointStateReader(joints, config.state_timeout, self._warn)
+        self._period = PeriodCheck(config.dt, self._warn)
         self._answered = 0
         self._outside = np.zeros(len(joints), dtype=int)
         self._answer = JointTrajectory(
@@ -68,6 +71,9 @@ class BoundsNode(ArmNode):
         self.announce(
             joints, config.rate_hz, f"method {config.method}, limits {config.acceleration_limits}"
         )
+
+    def _warn(self, text: str) -> None:
+        self.get_logger().warning(text)
 
     def _load_model(self, robot: RobotConfiguration) -> pin.Model:
         """Return the model, loaded once: parameters that change it are read-only."""
@@ -118,6 +124,7 @@ class BoundsNode(ArmNode):
 
     def _report(self) -> tuple[bytes, str, dict[str, Any]]:
         config = self._node_parameters.configuration
+        self._period.look(self._reader)
         silent = self._reader.stamp < 0
         values = {
             "method": config.method,

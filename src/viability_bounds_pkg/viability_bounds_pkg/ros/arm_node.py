@@ -7,11 +7,24 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, ClassVar
 
+from rclpy.clock import Clock, ClockType
+from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.node import Node
 
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.ros.claim import Claim
+from viability_bounds_pkg.ros.given_parameters import arguments_of
+from viability_bounds_pkg.ros.ros_arguments import (
+    RosArgumentError,
+    is_known_remapping,
+    ros_rules,
+)
 from viability_bounds_pkg.ros.topics import Topic
+
+CLOCK_TIMEOUT = 5.0
+"""How long ``/clock`` may be silent at start before a node warns, s."""
+
+_TYPE_PERIOD = 2.0  # s
 
 _TOPICS_OF_ROS = ("/rosout", "/parameter_events", "/clock")
 
@@ -29,8 +42,11 @@ class ArmNode(Node):
 
     def __init__(self, **node_arguments: Any) -> None:
         self._claims: list[Claim] = []
-        # With the services that `rqt_logger_level` uses.
-        super().__init__(self.NAME, enable_logger_service=True, **node_arguments)
+        try:
+            # With the services that `rqt_logger_level` uses.
+            super().__init__(self.NAME, enable_logger_service=True, **node_arguments)
+        except InvalidParameterTypeException as error:  # of use_sim_time: rclpy declares it
+            raise RosArgumentError(str(error).rpartition(": ")[0]) from error
 
     @contextmanager
     def starting(self, *topics: Topic) -> Iterator[None]:
@@ -71,6 +87,51 @@ class ArmNode(Node):
             f"{len(joints)} joints ({joints[0]} to {joints[-1]}) at {rate:g} Hz, {what}; "
             f"subscribes to {heard}; publishes {published}"
         )
+        for flag, rule in ros_rules(arguments_of(self.context)):
+            new = self.resolve_topic_name(rule.partition(":=")[2]) if flag == "-r" else ""
+            if new and not is_known_remapping(rule) and new not in f"{heard} {published}".split():
+                self.get_logger().warning(f"'-r {rule}' changes no topic of this node")
+        if self.get_parameter("use_sim_time").value:
+            self._expect_clock()
+        self._watch_types(*here)
+
+    def _expect_clock(self) -> None:
+        """Warn once if nothing publishes ``/clock``: stamps of what is published stay zero."""
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+
+        def look() -> None:
+            timer.cancel()
+            if not self.count_publishers("/clock"):
+                self.get_logger().warning(
+                    f"use_sim_time is true, but nothing has published /clock for {CLOCK_TIMEOUT:g}"
+                    " s: set it to false, or start the simulation that publishes it"
+                )
+
+        timer = self.create_timer(CLOCK_TIMEOUT, look, clock=steady)
+
+    def _watch_types(self, name: str, namespace: str) -> None:
+        """Warn of topics that others use with another type: the middleware keeps them apart."""
+        own = {
+            topic: types[0]
+            for topics in (
+                self.get_publisher_names_and_types_by_node(name, namespace),
+                self.get_subscriber_names_and_types_by_node(name, namespace),
+            )
+            for topic, types in topics
+        }
+
+        def look() -> None:
+            for topic, types in self.get_topic_names_and_types():
+                others = [each for each in types if each != own.get(topic, each)]
+                if others:
+                    kind = own.pop(topic)
+                    self.get_logger().warning(
+                        f"'{topic}' is {kind} here; what is {' or '.join(others)} elsewhere is "
+                        "not received"
+                    )
+
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(_TYPE_PERIOD, look, clock=steady)
 
     def destroy_node(self) -> None:
         """Give up the claims, too."""

@@ -8,36 +8,20 @@ names that no node has. Here the last value given counts, null is none, and all 
 
 from __future__ import annotations
 
-import difflib
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import cache
-from importlib.resources import files
-from pathlib import Path
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 from weakref import WeakKeyDictionary
 
-import yaml
-
 from viability_bounds_pkg.exceptions import ArmSafetyError
-
-_OF_ROS = re.compile(r"use_sim_time|start_type_description_service|qos_overrides\..*")
-"""Parameters that rclpy declares by itself where it wants them."""
+from viability_bounds_pkg.ros.ros_arguments import ros_rules
+from viability_bounds_pkg.user_input.known_names import unknown_parameters
+from viability_bounds_pkg.user_input.parameter_files import flat, sections_of
+from viability_bounds_pkg.user_input.yaml_file import load_yaml, read_yaml
 
 
 class UnknownParameterError(ArmSafetyError, ValueError):
     """A parameter was given that no node of this project has."""
-
-
-class _Loader(yaml.SafeLoader):
-    """Reads numbers as rcl does: 1e-3 is one."""
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$"),
-    list("-+.0123456789"),
-)
 
 
 def given_parameters(arguments: Sequence[str], node: str) -> dict[str, Any]:
@@ -95,11 +79,28 @@ def refuse_renamed(arguments: Sequence[str], node: str, usual: str) -> None:
         )
 
 
+def foreign_sections(arguments: Sequence[str], node: str) -> list[str]:
+    """Return sections for a node of this name elsewhere, in files that have none for this one.
+
+    Args:
+        arguments: of the command line.
+        node: its fully qualified name.
+    """
+    foreign: list[str] = []
+    name = node.rpartition("/")[2]
+    for flag, path in ros_rules(arguments):
+        sections = _sections_of_files(["--ros-args", flag, path])
+        named = [each for each in sections if each.rpartition("/")[2] == name]
+        if not any(is_section_of(each, node) for each in named):
+            foreign += named
+    return foreign
+
+
 def _sections_of_files(arguments: Sequence[str]) -> list[str]:
     """Return the names of the sections that parameter files have, each once."""
     files_only = [
         word
-        for flag, value in _rules(arguments)
+        for flag, value in ros_rules(arguments)
         if flag == "--params-file"
         for word in ("--ros-args", flag, value)
     ]
@@ -113,38 +114,8 @@ def refuse_unknown(given: Iterable[str], known: Iterable[str]) -> None:
         given: names of parameters for which there are values.
         known: names of those that the node has.
     """
-    every = {*known, *_names_in_project()}
-    unknown = [name for name in given if name not in every and not _OF_ROS.fullmatch(name)]
-    if unknown:
-        raise UnknownParameterError(
-            "; ".join(unknown_parameter(name, every) for name in sorted(unknown))
-        )
-
-
-def unknown_parameter(name: str, known: Iterable[str]) -> str:
-    """Return what to say of an unknown name, with the one of those known that is most alike."""
-    alike = difflib.get_close_matches(name, sorted(known), n=1, cutoff=0.6)
-    return f"unknown parameter '{name}'" + (f"; did you mean '{alike[0]}'?" if alike else "")
-
-
-@cache
-def _names_in_project() -> frozenset[str]:
-    """Return the names of the parameters of all nodes; `scripts/make_reference.py` writes them."""
-    text = files("viability_bounds_pkg.ros").joinpath("parameter_names.txt").read_text("utf-8")
-    return frozenset(text.split())
-
-
-def _rules(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Yield parameter rules and files in their order: flag and value."""
-    ros, flag = False, ""
-    for word in arguments:
-        if flag:
-            yield flag, word
-            flag = ""
-        elif word in ("--ros-args", "--"):
-            ros = word == "--ros-args"
-        elif ros and word in ("-p", "--param", "--params-file"):
-            flag = "--params-file" if word == "--params-file" else "-p"
+    if unknown := unknown_parameters(given, known):
+        raise UnknownParameterError(unknown)
 
 
 def _sections(arguments: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -152,40 +123,17 @@ def _sections(arguments: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
 
     What cannot be read is left out: rcl has refused it already, with a message of its own.
     """
-    for flag, text in _rules(arguments):
+    for flag, text in ros_rules(arguments):
         try:
-            if flag == "-p":
+            if flag == "--params-file":
+                yield from sections_of(read_yaml(text))
+            elif flag == "-p":
                 name, value = text.split(":=", 1)
                 node, _, name = name.rpartition(":")
                 section = f"/**/{node.strip('/')}" if node else "/**"
-                yield section, _flat({name: yaml.load(value, _Loader)})
-            else:
-                content = yaml.load(Path(text).read_text(encoding="utf-8"), _Loader)
-                yield from _nodes("", content)
-        except (OSError, ValueError, yaml.YAMLError):
+                yield section, flat({name: load_yaml(value)})
+        except ValueError:
             continue
-
-
-def _nodes(path: str, content: Any) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the sections below a namespace."""
-    if not isinstance(content, Mapping):
-        return
-    for key, value in content.items():
-        if key == "ros__parameters":
-            yield path, _flat(value)
-        else:
-            yield from _nodes(f"{path}/{str(key).strip('/')}", value)
-
-
-def _flat(values: Any, prefix: str = "") -> dict[str, Any]:
-    """Return nested values by dotted name."""
-    if not isinstance(values, Mapping):
-        return {}
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        name = f"{prefix}{key}"
-        flat |= _flat(value, f"{name}.") if isinstance(value, Mapping) else {name: value}
-    return flat
 
 
 def is_section_of(section: str, node: str) -> bool:

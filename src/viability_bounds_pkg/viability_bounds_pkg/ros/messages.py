@@ -17,12 +17,17 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
+from viability_bounds_pkg.exceptions import did_you_mean
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import DIAGNOSTICS, VALUES
 
 Report = Callable[[], tuple[bytes, str, dict[str, Any]]]
 """Returns level, message and values of a status."""
+
+
+_PERIODS_SEEN = 20
+"""Fewer states do not tell their period."""
 
 
 class Verdict(Enum):
@@ -46,16 +51,25 @@ class JointStateReader:
     Args:
         joints: names of the n joints.
         reset_after: time without an accepted message after which any stamp is accepted, s.
+        warn: told in words when a message is dropped for a reason for the first time.
 
     Attributes:
+        accepted: how many new states were accepted.
         q, v: position and velocity of the last accepted message, shape (n,), rad and rad/s.
         stamp: its stamp, ns.
         heard_at: when it came, or was repeated last, s.
         refused: how many messages were dropped, by reason.
     """
 
-    def __init__(self, joints: Sequence[str], reset_after: float = 1.0) -> None:
+    def __init__(
+        self,
+        joints: Sequence[str],
+        reset_after: float = 1.0,
+        warn: Callable[[str], object] | None = None,
+    ) -> None:
         n = len(joints)
+        self.accepted = 0
+        self._warn = warn
         self.q = np.zeros(n)
         self.v = np.zeros(n)
         self.stamp = -1
@@ -73,14 +87,20 @@ class JointStateReader:
         stamp = stamp_to_ns(message.header.stamp)
         if stamp == 0:
             # Later messages would have the same, and be taken for repeats of the first.
-            return self._refuse("no stamp")
+            return self._refuse("no stamp", "header.stamp is zero")
         restarted = now - self._accepted_at >= self._reset_after
         if stamp < self.stamp and not restarted:
-            return self._refuse("old stamp")
-        if message.name != self._names and not self._match(message.name):
-            return self._refuse("missing joint")
+            ago = 1e-9 * (self.stamp - stamp)
+            return self._refuse("old stamp", f"{ago:.3g} s before that of the last one")
+        if message.name != self._names and (missing := self._match(message.name)):
+            hint = did_you_mean(missing, message.name)
+            return self._refuse("missing joint", f"there is no '{missing}'{hint}")
         if not len(message.position) == len(message.velocity) == len(message.name):
-            return self._refuse("wrong size")
+            sizes = (
+                f"{len(message.name)} names, {len(message.position)} positions, "
+                f"{len(message.velocity)} velocities"
+            )
+            return self._refuse("wrong size", sizes)
         q, v = np.array(message.position), np.array(message.velocity)
         if self._index is not None:
             q, v = q[self._index], v[self._index]
@@ -88,7 +108,7 @@ class JointStateReader:
         if not math.isfinite(sum(message.position) + sum(message.velocity)) and not (
             np.isfinite(q).all() and np.isfinite(v).all()
         ):
-            return self._refuse("not finite")
+            return self._refuse("not finite", "a position or velocity")
         if stamp == self.stamp:
             if np.array_equal(q, self.q) and np.array_equal(v, self.v):
                 self.heard_at = now
@@ -98,6 +118,7 @@ class JointStateReader:
         self.q, self.v, self.stamp = q, v, stamp
         self._accepted = message, self._index
         self._accepted_at = self.heard_at = now
+        self.accepted += 1
         return Verdict.NEW
 
     def effort(self) -> NDArray[np.float64] | None:
@@ -115,19 +136,50 @@ class JointStateReader:
             tau = tau[index]
         return tau if np.isfinite(tau).all() else None
 
-    def _match(self, names: Sequence[str]) -> bool:
+    def _match(self, names: Sequence[str]) -> str:
+        """Take the order of joints from `names`; return the first that is missing, or nothing."""
         where = {name: i for i, name in enumerate(names)}
-        if any(joint not in where for joint in self._joints):
-            return False
+        if missing := next((joint for joint in self._joints if joint not in where), ""):
+            return missing
         self._names = list(names)
         index = [where[joint] for joint in self._joints]
         same_order = index == list(range(len(names)))
         self._index = None if same_order else np.array(index)
-        return True
+        return ""
 
-    def _refuse(self, reason: str) -> Verdict:
+    def _refuse(self, reason: str, detail: str = "") -> Verdict:
         self.refused[reason] += 1
+        if self._warn is not None and self.refused[reason] == 1:
+            self._warn(f"joint_states refused: {reason}" + (f": {detail}" if detail else ""))
         return Verdict.REFUSED
+
+
+class PeriodCheck:
+    """Compares the period of the states' stamps with that of a node's ``rate_hz``.
+
+    Args:
+        dt: control period of the node, s.
+        warn: told once, in words, when they differ.
+    """
+
+    def __init__(self, dt: float, warn: Callable[[str], object]) -> None:
+        self._dt, self._warn = dt, warn
+        self._count, self._stamp, self._wrong = 0, -1, 0
+
+    def look(self, states: JointStateReader) -> None:
+        """Look at the states that came since the last look; two looks must agree to warn."""
+        count, span = states.accepted - self._count, 1e-9 * (states.stamp - self._stamp)
+        known, self._count, self._stamp = self._stamp >= 0, states.accepted, states.stamp
+        if not known or count < _PERIODS_SEEN or span <= 0.0 or self._wrong > 1:
+            return
+        period = span / count
+        self._wrong = 0 if 0.8 < period / self._dt < 1.25 else self._wrong + 1
+        if self._wrong > 1:
+            self._warn(
+                f"joint states come every {1e3 * period:.2g} ms by their stamps, but rate_hz "
+                f"{1.0 / self._dt:g} means {1e3 * self._dt:.3g} ms: rates differ, or states are "
+                "lost"
+            )
 
 
 class Diagnostics:

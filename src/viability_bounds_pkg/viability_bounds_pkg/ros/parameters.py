@@ -20,15 +20,15 @@ from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
-from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError
+from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError, did_you_mean
 from viability_bounds_pkg.parameter import REQUIRED, Parameter, parameter_table, read
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.given_parameters import (
     arguments_of,
+    foreign_sections,
     given_parameters,
     refuse_renamed,
     refuse_unknown,
-    unknown_parameter,
     why_missing,
 )
 
@@ -69,6 +69,11 @@ class NodeParameters(Generic[Configuration]):
         table = parameter_table(kind)
         arguments, name = arguments_of(node.context), node.get_fully_qualified_name()
         refuse_renamed(arguments, name, node.NAME)
+        for section in foreign_sections(arguments, name):
+            node.get_logger().warning(
+                f"the section '{section}' of a parameter file is not for this node, '{name}'; "
+                f"'/**{section[section.rindex('/') :]}' is for all namespaces"
+            )
         _settle(node, given_parameters(arguments, name), [row.name for row in table])
         self._values = {row.name: _declare(node, row) for row in table}
         try:
@@ -93,7 +98,10 @@ class NodeParameters(Generic[Configuration]):
         for parameter in parameters:
             if not self._node.has_parameter(parameter.name):
                 declared = self._node.list_parameters([], 0).names
-                raise UndeclaredParameterError(unknown_parameter(parameter.name, declared))
+                name = parameter.name
+                raise UndeclaredParameterError(
+                    f"unknown parameter '{name}'{did_you_mean(name, declared)}"
+                )
         return parameters
 
     def _judge(self, parameters: Sequence[Any]) -> SetParametersResult:
@@ -129,7 +137,8 @@ def _settle(node: Node, given: Mapping[str, Any], known: Sequence[str]) -> None:
 def _differs(read: Any, given: Any) -> bool:
     """Return whether rcl read another value; arrays come as its own types."""
     if isinstance(given, list):
-        return len(read or ()) != len(given) or any(map(_differs, read, given))
+        read = read or ()
+        return len(read) != len(given) or any(map(_differs, read, given))
     return type(read) is not type(given) or (read != given and given == given)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import gc
+import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -22,7 +23,9 @@ from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.parameter import parameter_table
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.given_parameters import note_arguments
+from viability_bounds_pkg.ros.ros_arguments import check_ros_arguments, ros_rules
 from viability_bounds_pkg.ros.runtime import EventsExecutor, make_executor
+from viability_bounds_pkg.user_input.parameter_files import check_parameter_files
 
 _SIGNAL_CHECK_PERIOD = 0.2
 
@@ -46,11 +49,19 @@ def spin(executor: Executor, context: Context | None = None) -> None:
 
 
 def own_arguments(args: Sequence[str] | None) -> list[str]:
-    """Return those arguments, of the process if None, that are not for ROS.
+    """Return those arguments, of the process if None, that are not for ROS; check the others.
 
     The first is the program's name, as in `sys.argv`.
+
+    Raises:
+        ArmSafetyError: a ROS argument or a parameter file that cannot be used.
     """
-    own: list[str] = rclpy.utilities.remove_ros_args(args=sys.argv if args is None else args)
+    arguments = list(sys.argv if args is None else args)
+    check_ros_arguments(arguments, os.environ)
+    check_parameter_files(
+        [value for flag, value in ros_rules(arguments) if flag == "--params-file"]
+    )
+    own: list[str] = rclpy.utilities.remove_ros_args(args=arguments)
     return own[1:]
 
 
@@ -142,6 +153,4 @@ def report_refusal(error: Exception) -> None:
     """Print why something does not start, in one line on stderr."""
     # rcl appends where in its own sources an error arose.
     reason = str(error).split(", at /")[0]
-    if "Sequence should be of same type" in reason:
-        reason += " (all numbers of a list with a decimal point, or none)"
     print(f"error: {' '.join(reason.split())}", file=sys.stderr)

@@ -12,6 +12,7 @@ from viability_bounds_pkg.robot_configuration import RobotConfiguration
 from viability_bounds_pkg.robot_description import RobotDescriptionError, check_urdf
 from viability_bounds_pkg.ros.runtime import make_executor
 from viability_bounds_pkg.ros.topics import ROBOT_DESCRIPTION
+from viability_bounds_pkg.user_input.urdf_check import check_with_urdf
 
 TOPIC = "topic"
 """Value of ``robot_description`` that asks for what the topic of that name carries."""
@@ -40,6 +41,16 @@ def robot_urdf(config: RobotConfiguration, node: Node | None = None) -> str:
     return text
 
 
+def warn_of_unusual(node: Node, config: RobotConfiguration, urdf: str) -> None:
+    """Log what of the parameters is unusual for a URDF.
+
+    Raises:
+        SettingError: a joint that the URDF does not have, or angles that must be degrees.
+    """
+    for line in check_with_urdf(config, urdf):
+        node.get_logger().warning(line)
+
+
 def _urdf_from_topic(node: Node) -> str:
     received: Future = Future()
 
@@ -48,6 +59,7 @@ def _urdf_from_topic(node: Node) -> str:
             received.set_result(message.data)
 
     subscription = ROBOT_DESCRIPTION.subscription(node, take)
+    node.get_logger().info(f"waiting for a URDF on {subscription.topic_name}")
     executor = make_executor(node.context)
     executor.add_node(node)
     executor.spin_until_future_complete(received, timeout_sec=_TOPIC_TIMEOUT)

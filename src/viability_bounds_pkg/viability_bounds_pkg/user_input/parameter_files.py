@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameter files: their sections, and the mistakes in them that rcl ignores or does not name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from viability_bounds_pkg.exceptions import ArmSafetyError, did_you_mean
+from viability_bounds_pkg.user_input.known_names import graph_names
+from viability_bounds_pkg.user_input.yaml_file import read_yaml
+
+_VALUES = "ros__parameters"
+
+
+class ParameterFileError(ArmSafetyError, ValueError):
+    """A parameter file that is none, lacks what is needed, or says what no node reads."""
+
+
+def sections_of(content: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the sections of a parameter file, below a namespace: name, and values by parameter."""
+    if not isinstance(content, Mapping):
+        return
+    for key, value in content.items():
+        if key == _VALUES:
+            yield path, flat(value)
+        else:
+            yield from sections_of(value, f"{path}/{str(key).strip('/')}")
+
+
+def flat(values: Any, prefix: str = "") -> dict[str, Any]:
+    """Return nested values by dotted name."""
+    if not isinstance(values, Mapping):
+        return {}
+    result: dict[str, Any] = {}
+    for key, value in values.items():
+        name = f"{prefix}{key}"
+        result |= flat(value, f"{name}.") if isinstance(value, Mapping) else {name: value}
+    return result
+
+
+def check_parameter_files(paths: Sequence[str]) -> None:
+    """Check parameter files, in the order in which they are given.
+
+    Raises:
+        YamlError: a file cannot be read, is no YAML, or has a key twice.
+        ParameterFileError: a file is no parameter file, has a section whose name is misspelt, or
+            is for another robot than one before it.
+    """
+    robots: dict[str, str] = {}
+    for path in paths:
+        content = read_yaml(path)
+        if not isinstance(content, Mapping) or not content:
+            raise ParameterFileError(f"{path}: there are no parameters in it")
+        _check_shape(content, path, "")
+        for section, values in sections_of(content):
+            _check_section(section, path)
+            for name, value in values.items():
+                check_list(value, f"{path}: parameter '{name}'")
+            if "robot_name" in values:
+                robots[str(values["robot_name"])] = path
+    if len(robots) > 1:
+        places = " and ".join(f"'{name}' in {path}" for name, path in robots.items())
+        raise ParameterFileError(f"the parameter files are for several robots: {places}")
+
+
+def _check_shape(content: Mapping[Any, Any], path: str, section: str) -> None:
+    """Refuse values outside 'ros__parameters', and a section without any."""
+    for key, value in content.items():
+        if key == _VALUES:
+            if not isinstance(value, Mapping):
+                raise ParameterFileError(f"{path}: '{section}' has no parameters")
+            continue
+        hint = did_you_mean(str(key), [_VALUES], alike=0.85)
+        if isinstance(value, Mapping) and value and not hint:
+            _check_shape(value, path, f"{section}/{str(key).strip('/')}")
+            continue
+        place = f"'{key}' of '{section}'" if section else f"'{key}'"
+        form = "; a file reads /**: {ros__parameters: {NAME: VALUE}}"
+        raise ParameterFileError(f"{path}: {place} is not below '{_VALUES}'{hint or form}")
+
+
+def _check_section(section: str, path: str) -> None:
+    """Refuse a section whose name is that of a node but for a letter or two."""
+    name = section.rpartition("/")[2]
+    nodes = graph_names("node")
+    if "*" in name or any(node in name for node in nodes):
+        return
+    if hint := did_you_mean(name, nodes, alike=0.85):
+        raise ParameterFileError(f"{path}: section '{section}' is for no node{hint}")
+
+
+def check_list(value: Any, what: str) -> None:
+    """Raise `ParameterFileError`, naming `what`, for a list of several types: rcl reads none."""
+    if isinstance(value, list) and len({type(item) for item in value}) > 1:
+        only_numbers = {type(item) for item in value} == {int, float}
+        allowed = "all with a decimal point, or none" if only_numbers else "items of one type"
+        raise ParameterFileError(f"{what} is {value}; allowed: {allowed}")

@@ -1,0 +1,293 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Each mistake of test/mistakes.yaml gets the line that the page for users says."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from importlib import import_module
+from typing import Any
+
+import pytest
+import yaml
+from geometry_msgs.msg import PoseStamped
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from ros_harness import ROOT, RosHarness, joint_state, private_domain, read_config
+from rosidl_parser.definition import Array, BasicType, NamespacedType, UnboundedSequence
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from viability_bounds_pkg.ros.topic_claim import TopicTakenError
+
+from sim_bridge.nodes import bullet_node, scenario_node
+from sim_bridge.nodes.bullet_node import BulletNode
+from torque_safety_controller.cli import identify_friction
+from torque_safety_controller.node import controller_node
+from torque_safety_controller.node.controller_node import ControllerNode
+from viability_bounds_pkg.cli import estimate_acceleration_limits
+from viability_bounds_pkg.node import bounds_node
+from viability_bounds_pkg.node.bounds_node import BoundsNode
+from viability_bounds_pkg.ros import arm_node, program
+from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS, stamp_to_ns
+
+PANDA = read_config("panda", "bounds_node")
+JOINTS = PANDA["joints"]
+N = len(JOINTS)
+REST = PANDA["start_positions"]
+ZERO = [0.0] * N
+MS = 1_000_000
+WORDS = {"JOINTS": JOINTS, "ZEROS": ZERO, "ONES": [1.0] * N, "NANS": [float("nan")] * N}
+PROGRAMS = {
+    "bounds_node": bounds_node.main,
+    "controller_node": controller_node.main,
+    "bullet_node": bullet_node.main,
+    "scenario_node": scenario_node.main,
+    "estimate_acceleration_limits": lambda a: estimate_acceleration_limits.main(a[1:]),
+    "identify_friction": lambda a: identify_friction.main(a[1:]),
+}
+ALL = [
+    mistake
+    for group in yaml.safe_load((ROOT / "test" / "mistakes.yaml").read_text(encoding="utf-8"))
+    for mistake in group["mistakes"]
+]
+URDF = import_module("viability_bounds_pkg.ros.robot_urdf")  # the function has its name, too
+LOG = re.compile(r"\[[A-Z]+\] \[[\d.]+\] \[[\w.]+\]: ")
+
+
+def of_kind(*kinds: str) -> list[Any]:
+    return [pytest.param(m, id=m["did"]) for m in ALL if set(kinds) & set(m)]
+
+
+def test_there_are_many_and_no_two_are_the_same():
+    assert len(ALL) >= 100
+    assert len({mistake["did"] for mistake in ALL}) == len(ALL)
+    keys = ("run", "send", "set", "call", "scene", "twice")
+    assert all(len(set(keys) & set(mistake)) == 1 for mistake in ALL)
+
+
+# Command lines
+
+
+@pytest.mark.parametrize("mistake", of_kind("run"))
+def test_on_a_command_line(mistake, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "config").symlink_to(ROOT / "config")
+    for name, content in mistake.get("files", {}).items():
+        (tmp_path / name).write_text(content)
+    # A node that starts all the same ends at once.
+    monkeypatch.setattr(program, "spin", lambda *_: None)
+    monkeypatch.setattr(scenario_node, "play", lambda *_: None)
+    monkeypatch.setattr(URDF, "_TOPIC_TIMEOUT", 0.1)
+    words = shlex.split(mistake["run"])
+    while "=" in words[0]:
+        monkeypatch.setenv(*words.pop(0).split("=", 1))
+    try:
+        code = PROGRAMS[words[0]](words)
+    except SystemExit as end:
+        code = end.code
+    lines = capfd.readouterr().err.strip().splitlines()
+    texts = [LOG.sub("", line) for line in lines if not line.startswith("[INFO]")]
+    texts = [text.replace("for 0.1 s", "for 10 s") for text in texts]
+    assert texts == [mistake["line"]]
+    assert (code != 0) == texts[0].startswith(("error: ", f"{words[0]}: "))
+
+
+# Running nodes
+
+
+class Running:
+    """Nodes in this process, and a user."""
+
+    def __init__(self, harness: RosHarness) -> None:
+        self.ros = harness
+        self.other: RosHarness | None = None
+        self.topics: dict[str, Any] = {}
+
+    def publish(self, topic: str, message: Any) -> None:
+        """Publish a message as the nodes' subscribers want it."""
+        if topic not in self.topics:
+            stream = topic in ("joint_states", "joint_commands", "ft_wrench")
+            qos = CONTROL_QOS if stream else GOAL_QOS
+            self.topics[topic] = self.ros.talk(type(message), topic, qos)
+        self.topics[topic].publish(message)
+
+    def start(self, make: Any, **changed: Any) -> None:
+        """Start a node of Panda's."""
+        self.ros.start(make, read_config("panda", make.NAME) | changed)
+
+
+@pytest.fixture
+def gets(capfd):
+    """Wait until nodes have logged a line."""
+    logged: list[str] = []
+
+    def look(line: str) -> bool:
+        logged.extend(LOG.sub("", each) for each in capfd.readouterr().err.splitlines())
+        return line in logged
+
+    def wait(running: Running, line: str, each=None) -> None:
+        try:
+            running.ros.wait_until(lambda: look(line), each=each)
+        except AssertionError:
+            assert line in logged
+
+    return wait
+
+
+@pytest.fixture(scope="module")
+def nodes():
+    """A bounds node and a controller without a robot."""
+    with private_domain() as domain:
+        running = Running(RosHarness(domain))
+        running.start(BoundsNode)
+        running.start(ControllerNode)
+        yield running
+        running.ros.close()
+
+
+@pytest.fixture(scope="module")
+def robot():
+    """A robot in lockstep that waits for its first command."""
+    with private_domain() as domain:
+        running = Running(RosHarness(domain))
+        running.start(BulletNode, clock="lockstep")
+        yield running
+        running.ros.close()
+
+
+def imported(name: str) -> Any:
+    package, kind, message = name.split("/")
+    return getattr(import_module(f"{package}.{kind}"), message)
+
+
+def filled(message: Any, content: dict[str, Any]) -> Any:
+    """Fill a message as ``ros2 topic pub`` does."""
+    kinds = dict(zip(message.get_fields_and_field_types(), message.SLOT_TYPES, strict=True))
+    for name, value in content.items():
+        kind = kinds[name]
+        if isinstance(kind, NamespacedType):
+            filled(getattr(message, name), value)
+            continue
+        if isinstance(kind, UnboundedSequence) and isinstance(kind.value_type, NamespacedType):
+            element = imported("/".join(kind.value_type.namespaced_name()))
+            value = [filled(element(), each) for each in value]
+        elif isinstance(kind, Array | UnboundedSequence) and isinstance(
+            kind.value_type, BasicType
+        ):
+            value = list(map(float, value))
+        setattr(message, name, value)
+    return message
+
+
+@pytest.mark.parametrize("mistake", of_kind("send"))
+def test_in_a_message(mistake, nodes, robot, gets):
+    sent = mistake["send"]
+    text = sent["message"]
+    for word, value in WORDS.items():
+        text = text.replace(word, yaml.safe_dump(value, default_flow_style=True).strip())
+    message = filled(imported(sent["type"])(), yaml.safe_load(text))
+    heard = robot if sent["topic"] in ("external_wrench", "obstacles") else nodes
+    gets(heard, mistake["line"], each=lambda: heard.publish(sent["topic"], message))
+
+
+@pytest.mark.parametrize("mistake", of_kind("set"))
+def test_in_a_parameter_of_a_running_node(mistake, nodes):
+    given = mistake["set"]
+    assert nodes.ros.refuses(given["node"], **{given["name"]: given["value"]}) == mistake["line"]
+
+
+@pytest.mark.parametrize("mistake", of_kind("call"))
+def test_in_a_call(mistake, nodes):
+    given = mistake["call"]
+    kind = imported(given["type"])
+    request = filled(kind.Request(), yaml.safe_load(given["request"]))
+    response = nodes.ros.call(kind, given["service"], request)
+    assert not response.success
+    assert response.message == mistake["line"]
+
+
+# What needs more than that
+
+
+def old_stamp(running):
+    running.start(BoundsNode)
+    stamps = iter([2000, *[1500] * 1000])
+    return lambda: running.publish(
+        "joint_states", joint_state(JOINTS, next(stamps) * MS, REST, ZERO)
+    )
+
+
+def same_stamp(running):
+    running.start(BoundsNode)
+    states = [joint_state(JOINTS, MS, q, ZERO) for q in (REST, ZERO)] * 500
+    return lambda: running.publish("joint_states", states.pop())
+
+
+def other_rate(running):
+    running.start(BoundsNode)
+    stamps = iter(range(4, 100_000, 4))
+
+    def send():
+        for _ in range(5):
+            running.publish("joint_states", joint_state(JOINTS, next(stamps) * MS, REST, ZERO))
+            running.ros.spin()
+
+    return send
+
+
+def short_command(running):
+    states = running.ros.listen(JointState, "joint_states")
+    running.start(BulletNode, clock="lockstep")
+    running.ros.wait_until(lambda: states, "a joint state")
+    stamp = stamp_to_ns(states[-1].header.stamp)
+    command = joint_state(JOINTS[1:], stamp, tau=ZERO[1:])
+    return lambda: running.publish("joint_commands", command)
+
+
+def stray_commands(running):
+    running.start(BulletNode, clock="lockstep")
+
+    def send():
+        for _ in range(10):
+            running.publish("joint_commands", joint_state(JOINTS, 7_000 * MS, tau=ZERO))
+            running.ros.spin()
+
+    return send
+
+
+def best_effort_goal(running):
+    running.start(ControllerNode)
+    best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+    running.ros.probe.create_publisher(PoseStamped, "target_pose", best_effort)
+
+
+def other_type(running):
+    running.start(ControllerNode)
+    running.other = RosHarness(running.ros.domain)  # one context cannot have two types of a topic
+    running.other.probe.create_publisher(String, "target_pose", GOAL_QOS)
+
+
+def no_clock(running):
+    running.start(BoundsNode, use_sim_time=True)
+
+
+@pytest.mark.parametrize("mistake", of_kind("scene"))
+def test_in_a_scene(mistake, ros, gets, monkeypatch):
+    monkeypatch.setattr(arm_node, "CLOCK_TIMEOUT", 0.1)
+    monkeypatch.setattr(arm_node, "_TYPE_PERIOD", 0.1)
+    running = Running(ros)
+    try:
+        each = globals()[mistake["scene"]](running)
+        gets(running, mistake["line"].replace("for 5 s", "for 0.1 s"), each)
+    finally:
+        if running.other is not None:
+            running.other.close()
+
+
+@pytest.mark.parametrize("mistake", of_kind("twice"))
+def test_in_two_nodes_of_a_kind(mistake, ros):
+    running = Running(ros)
+    running.start(BulletNode)
+    with pytest.raises(TopicTakenError) as caught:
+        running.start(BulletNode)
+    line = re.sub(r"process \d+", "process N", str(caught.value))
+    assert line.replace(f"domain {ros.domain} ", "domain D ") == mistake["line"]
