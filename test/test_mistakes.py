@@ -6,13 +6,13 @@ from __future__ import annotations
 import re
 import shlex
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 from geometry_msgs.msg import PoseStamped
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from ros_harness import ROOT, RosHarness, joint_state, private_domain, read_config
 from rosidl_parser.definition import Array, BasicType, NamespacedType, UnboundedSequence
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -28,7 +28,14 @@ from viability_bounds_pkg.node import bounds_node
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.ros import arm_node, program
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS, stamp_to_ns
+from viability_bounds_pkg.testing.ros_harness import (
+    RosHarness,
+    joint_state,
+    private_domain,
+    read_config,
+)
 
+ROOT = Path(__file__).resolve().parent.parent
 PANDA = read_config("panda", "bounds_node")
 JOINTS = PANDA["joints"]
 N = len(JOINTS)

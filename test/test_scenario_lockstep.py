@@ -14,7 +14,11 @@ from sim_bridge.bullet.obstacles import Obstacle
 from sim_bridge.nodes.scenario_node import ScenarioNode, ScenarioRefused
 from sim_bridge.scenario.report import write_report
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory, circle
+<<<<<<< HEAD
 from viability_bounds_pkg.testing.ros_harness import config_folder
+=======
+from viability_bounds_pkg.robot_description import read_urdf
+>>>>>>> w-mistakes
 
 ROBOT = "panda"
 DURATION = 0.9
@@ -160,17 +164,21 @@ def test_torque_control_is_handed_over_and_back():
             ("refused by controller_node: target_posture: 1",),
         ),
         (
-            {"time": 0.1, "push": {"link": "no_link", "duration": 1.0}},
+            {"time": 0.1, "push": {"link": "no_link", "duration": 1.0, "force": [1.0, 0.0, 0.0]}},
             ("refused by bullet_node: external_wrench: ",),
         ),
     ],
 )
-def test_what_is_refused_ends_the_scenario_and_says_why(event, names):
+def test_what_is_refused_ends_the_scenario_and_says_why(tmp_path, event, names):
+    # The scenario node believes in a link that the robot does not have.
+    urdf = read_urdf(load_values(ROBOT)["robot_description"])
+    other = tmp_path / "other.urdf"
+    other.write_text(urdf.replace("</robot>", '<link name="no_link"/></robot>'))
     with pytest.raises((ScenarioRefused, TimeoutError)) as error:
         run_chain(
             load_values(ROBOT),
             {"duration": 0.3, "events": [event]},
-            {"scenario_node": {"ready_timeout": 1.0}},
+            {"scenario_node": {"ready_timeout": 1.0, "robot_description": str(other)}},
         )
     for name in names:
         assert name in str(error.value)
