@@ -14,11 +14,8 @@ from sim_bridge.bullet.obstacles import Obstacle
 from sim_bridge.nodes.scenario_node import ScenarioNode, ScenarioRefused
 from sim_bridge.scenario.report import write_report
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory, circle
-<<<<<<< HEAD
-from viability_bounds_pkg.testing.ros_harness import config_folder
-=======
 from viability_bounds_pkg.robot_description import read_urdf
->>>>>>> w-mistakes
+from viability_bounds_pkg.testing.ros_harness import config_folder
 
 ROBOT = "panda"
 DURATION = 0.9
