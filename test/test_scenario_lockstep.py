@@ -200,7 +200,7 @@ def test_a_push_lasts_as_long_as_it_is_meant_to():
     assert "external_wrench" not in result.robot["commands_refused"]
 
 
-def test_a_run_without_a_pose_has_metrics_without_a_pose_error(tmp_path, ros):
+def test_a_run_without_a_pose_has_metrics_without_a_pose_error(tmp_path, ros, capfd):
     scenario = {"duration": 0.1, "events": [{"time": 0.0, "posture": rest()}]}
     path = tmp_path / "scenario.yaml"
     path.write_text(yaml.safe_dump(scenario))
@@ -215,3 +215,6 @@ def test_a_run_without_a_pose_has_metrics_without_a_pose_error(tmp_path, ros):
     metrics = json.loads(text, parse_constant=refuse)
     assert metrics["final_position_error_m"] is None
     assert metrics["limits_kept"]
+    printed = capfd.readouterr().out
+    assert "nan" not in printed
+    assert printed.count("VERDICT: no limit was broken") == 1

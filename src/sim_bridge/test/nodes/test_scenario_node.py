@@ -97,3 +97,35 @@ def test_told_to_stop_it_judges_nothing(tmp_path, sent):
     assert process.returncode == 130, errors
     assert "Traceback" not in errors
     assert not (tmp_path / "out").exists()
+
+
+class Shown:
+    """Takes what would be on the screen."""
+
+    def wait(self, reason):
+        self.text = reason
+
+    def show(self, played, state):
+        self.text = state
+
+
+@pytest.mark.parametrize(
+    ("reported", "shown"),
+    [
+        ({}, ""),
+        ({"mode": "HOLD", "position_error_m": "nan"}, ""),
+        ({"mode": "TRACKING", "position_error_m": "0.002"}, "  pose error 2.00 mm"),
+    ],
+)
+def test_without_a_goal_no_pose_error_is_shown(ros, tmp_path, reported, shown):
+    node = ros.start(ScenarioNode, VALUES | {"scenario": write(tmp_path, 1.0)})
+    screen = Shown()
+    ros.wait_until(lambda: node.awaits)
+    node.show(screen)
+    assert screen.text == node.awaits
+    assert "there is no paused robot, no joint commands" in screen.text
+    node._refused = {}
+    node.listener.diagnostics |= {"bullet_node": {"rate_hz": "500"}, "controller_node": reported}
+    node.show(screen)
+    assert screen.text.startswith(f"{reported.get('mode', '')}  nearest limit panda_joint")
+    assert screen.text.endswith(f" rad{shown}  500 Hz")
