@@ -16,7 +16,6 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosidl_parser.definition import Array, BasicType, NamespacedType, UnboundedSequence
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from viability_bounds_pkg.ros.topic_claim import TopicTakenError
 
 from sim_bridge.nodes import bullet_node, scenario_node
 from sim_bridge.nodes.bullet_node import BulletNode
@@ -27,6 +26,7 @@ from viability_bounds_pkg.cli import estimate_acceleration_limits
 from viability_bounds_pkg.node import bounds_node
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.ros import arm_node, program
+from viability_bounds_pkg.ros.claim import TakenError
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS, stamp_to_ns
 from viability_bounds_pkg.testing.ros_harness import (
     RosHarness,
@@ -294,7 +294,7 @@ def test_in_a_scene(mistake, ros, gets, monkeypatch):
 def test_in_two_nodes_of_a_kind(mistake, ros):
     running = Running(ros)
     running.start(BulletNode)
-    with pytest.raises(TopicTakenError) as caught:
+    with pytest.raises(TakenError) as caught:
         running.start(BulletNode)
     line = re.sub(r"process \d+", "process N", str(caught.value))
     assert line.replace(f"domain {ros.domain} ", "domain D ") == mistake["line"]
