@@ -11,6 +11,7 @@ enough, instead of a wheel. NumPy always is: ROS' message packages are compiled 
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
 import subprocess
@@ -197,16 +198,26 @@ def report() -> None:
     print(f"setup: {'all of .venv':22}       {total:6.0f} MB")
 
 
+def main() -> None:
+    """Do what the command line says."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    tasks = parser.add_subparsers(dest="task", required=True)
+    tasks.add_parser("fingerprint")
+    tasks.add_parser("plan").add_argument("kind", choices=["sourced", "wheels"])
+    tasks.add_parser("report")
+    options = parser.parse_args()
+    if options.task == "fingerprint":
+        print(fingerprint())
+    elif options.task == "plan":
+        plan(options.kind)
+    else:
+        report()
+
+
 if __name__ == "__main__":
     try:
-        match sys.argv[1:]:
-            case ["fingerprint"]:
-                print(fingerprint())
-            case ["plan", ("sourced" | "wheels") as kind]:
-                plan(kind)
-            case ["report"]:
-                report()
-            case _:
-                raise SystemExit(__doc__)
+        main()
     except SystemExit as end:
-        raise SystemExit(f"setup: {end}") from None
+        raise SystemExit(f"setup: {end}" if isinstance(end.code, str) else end.code) from None

@@ -3,6 +3,7 @@ import pytest
 from rclpy.node import Node
 from std_msgs.msg import String
 
+from viability_bounds_pkg.ros import publisher_watch
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 
 
@@ -82,4 +83,17 @@ def test_a_publisher_without_a_name_is_told_one_look_later(ros, watched, monkeyp
     assert not watch.rivals
     watch.look()
     assert len(watch.rivals["/left/command"]) == 2
+    assert len(log.warnings) == 1
+
+
+def test_a_second_one_of_the_same_name_is_told_when_it_stays(ros, watched, monkeypatch):
+    _, watch, log = watched
+    rival_of(ros, "arm")
+    ros.hears("/left/command", 2)
+    watch.look()
+    assert not watch.rivals
+    now = publisher_watch.time.monotonic()
+    monkeypatch.setattr(publisher_watch.time, "monotonic", lambda: now + 30.0)
+    watch.look()
+    assert watch.rivals == {"/left/command": ("/left/arm", "/left/arm")}
     assert len(log.warnings) == 1

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable
 
 from rclpy.clock import Clock, ClockType
@@ -10,6 +11,8 @@ from rclpy.node import Node
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 _PERIOD = 1.0
+_GHOST_TIME = 20.0
+"""How long a node that was killed, or has just ended, may stay in the graph, s."""
 _UNKNOWN = "_UNKNOWN_"
 """Ends the names that rmw gives nodes which have not told theirs."""
 
@@ -19,8 +22,9 @@ class PublisherWatch:
 
     `Claim` keeps two nodes of this project on one host apart. This sees the others, too:
     drivers of the user, nodes on other hosts, a ``ros2 topic pub``. It looks once a second on the
-    steady clock; counting the publishers of a topic takes some microseconds. A node that was
-    killed stays in the graph for up to 20 s.
+    steady clock; counting the publishers of a topic takes some microseconds. Publishers of one
+    and the same name count only after `_GHOST_TIME`: mostly one has replaced the other, and that
+    one has not left the graph yet.
 
     Args:
         node: logs a second publisher once when it has come, and once when it is gone.
@@ -35,6 +39,7 @@ class PublisherWatch:
         self._node = node
         self._topics = [node.resolve_topic_name(topic) for topic in topics]
         self._nameless: set[str] = set()
+        self._ghosts: dict[str, float] = {}  # when several of one name were first seen
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         node.create_timer(_PERIOD, self.look, clock=steady)
 
@@ -51,7 +56,9 @@ class PublisherWatch:
         for topic in self._topics:
             if self._node.count_publishers(topic) > 1:
                 self._note(topic)
-            elif self.rivals.pop(topic, None):
+                continue
+            self._ghosts.pop(topic, None)
+            if self.rivals.pop(topic, None):
                 self._node.get_logger().info(f"'{topic}' has no second publisher any more")
 
     def _note(self, topic: str) -> None:
@@ -61,6 +68,10 @@ class PublisherWatch:
             self._nameless.add(topic)  # a node tells its name a moment after its topics
             return
         self._nameless.discard(topic)
+        if len(set(names)) == 1:
+            since = self._ghosts.setdefault(topic, time.monotonic())
+            if not known and time.monotonic() - since < _GHOST_TIME:
+                return
         self.rivals[topic] = tuple(names)
         if not known:
             self._node.get_logger().warning(
