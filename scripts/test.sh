@@ -7,8 +7,9 @@ case "${1:-}" in
     cat <<'USAGE'
 usage: bash scripts/test.sh [options of pytest]
 
-  bash scripts/test.sh                  all tests, in several processes
+  bash scripts/test.sh                  all tests but those of set-up, in several processes
   bash scripts/test.sh -k viability     some of them, in one
+  bash scripts/test.sh -m packaging     those of set-up and of copies of packages
   bash scripts/test.sh -n 2             in so many processes; 0 for this one
   bash scripts/test.sh --hypothesis-profile=explore    with other examples than last time
 

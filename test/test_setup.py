@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.packaging
 ROOT = Path(__file__).resolve().parent.parent
 PYTHON = sys._base_executable
 PYBULLET = "pybullet-3.2.7"
