@@ -20,6 +20,7 @@ from rcl_interfaces.srv import (
     SetParametersAtomically,
 )
 from rclpy.logging import LoggingSeverity
+from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -111,9 +112,10 @@ def test_topics_are_remapped(ros):
     state = joint_state(joints, 10, VALUES["start_positions"], [0.0] * len(joints))
     ros.wait_until(lambda: limits, "limits", each=lambda: states.publish(state))
     assert limits.stamps[0] == 10
-    second = ros.probe.create_publisher(JointState, "/franka/joint_states", 1)
+    ros.add(Node("rival", context=ros.context)).create_publisher(
+        JointState, "/franka/joint_states", 1
+    )
     ros.wait_until(lambda: "/franka/joint_states" in node.publisher_watch.rivals)
-    ros.probe.destroy_publisher(second)
 
 
 @pytest.mark.parametrize("kind", KINDS)
