@@ -83,9 +83,11 @@ class ArmNode(Node):
                 self.get_subscriber_names_and_types_by_node(*here),
             )
         )
+        # A parameter of the scenario node, which robots' files have for all nodes.
+        name = self._parameter_overrides.get("robot_name")
         self.get_logger().info(
-            f"{len(joints)} joints ({joints[0]} to {joints[-1]}) at {rate:g} Hz, {what}; "
-            f"subscribes to {heard}; publishes {published}"
+            f"{name.value if name else 'robot'}, {len(joints)} joints ({joints[0]} to "
+            f"{joints[-1]}) at {rate:g} Hz, {what}; subscribes to {heard}; publishes {published}"
         )
         for flag, rule in ros_rules(arguments_of(self.context)):
             new = self.resolve_topic_name(rule.partition(":=")[2]) if flag == "-r" else ""
