@@ -20,8 +20,16 @@ from sim_bridge.nodes.scenario_node import ScenarioNode, play
 from sim_bridge.scenario.recording import RecordedRun
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
+from viability_bounds_pkg.node.estimator_node import EstimatorNode
 
 ROOT = Path(__file__).resolve().parent.parent
+NODES = {
+    "bounds_node": BoundsNode,
+    "controller_node": ControllerNode,
+    "estimator_node": EstimatorNode,
+    "bullet_node": BulletNode,
+    "scenario_node": ScenarioNode,
+}
 
 
 @dataclass(frozen=True)
@@ -31,10 +39,12 @@ class ChainResult:
     Attributes:
         run: states, bounds and torques by control period.
         robot: the robot's last diagnostics, by key: it saw every physics step.
+        q: the true positions at the end, shape (n,), rad.
     """
 
     run: RecordedRun
     robot: dict[str, str]
+    q: np.ndarray
 
     def vector(self, key: str) -> np.ndarray:
         """Return a per-joint value of the robot's diagnostics."""
@@ -45,6 +55,22 @@ def load_values(robot: str) -> dict[str, Any]:
     """Return the parameters of all nodes in a robot's file, by name."""
     content = yaml.safe_load((ROOT / "config" / f"{robot}.yaml").read_text())
     return {k: v for part in content.values() for k, v in part["ros__parameters"].items()}
+
+
+def load_node_values(robot: str, *overlays: str) -> dict[str, dict[str, Any]]:
+    """Return the parameters of each node, by its name, as it gets them from files.
+
+    Args:
+        robot: name of a file in ``config/``.
+        overlays: of further files there, whose values count more.
+    """
+    values: dict[str, dict[str, Any]] = {name: {} for name in NODES}
+    for each in (robot, *overlays):
+        content = yaml.safe_load((ROOT / "config" / f"{each}.yaml").read_text())
+        for name, own in values.items():
+            for section in ("/**", f"/**/{name}"):
+                own |= content.get(section, {}).get("ros__parameters", {})
+    return values
 
 
 @contextmanager
@@ -65,7 +91,8 @@ def run_chain(
     Args:
         values: parameters of all nodes, by name.
         scenario: content of a scenario file.
-        per_node: parameters that differ for one node, by node name.
+        per_node: parameters that differ for one node, by node name; with ``estimator_node`` among
+            them this node runs too.
     """
     lockstep = {
         "clock": "lockstep",
@@ -73,23 +100,20 @@ def run_chain(
         "bounds_timeout": 5.0,
         "state_timeout": 10.0,
     }
-    kinds = {
-        "bounds_node": BoundsNode,
-        "controller_node": ControllerNode,
-        "bullet_node": BulletNode,
-        "scenario_node": ScenarioNode,
-    }
     with tempfile.TemporaryDirectory() as directory, _context():
         path = Path(directory) / "scenario.yaml"
         path.write_text(yaml.safe_dump(scenario))
-        nodes = []
-        for name, kind in kinds.items():
+        nodes = {}
+        for name, kind in NODES.items():
+            if name == "estimator_node" and name not in per_node:
+                continue
             own = values | lockstep | {"scenario": str(path)} | per_node.get(name, {})
             overrides = [Parameter(key, value=value) for key, value in own.items() if value != []]
-            nodes.append(kind(parameter_overrides=overrides))
+            nodes[name] = kind(parameter_overrides=overrides)
         try:
-            play(nodes[-1], others=nodes[:-1], quiet=True)
-            return ChainResult(nodes[-1].recorded_run(), nodes[-1].robot)
+            player = nodes["scenario_node"]
+            play(player, others=[each for each in nodes.values() if each is not player], quiet=True)
+            return ChainResult(player.recorded_run(), player.robot, nodes["bullet_node"].true_q)
         finally:
-            for node in nodes:
+            for node in nodes.values():
                 node.destroy_node()

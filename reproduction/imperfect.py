@@ -1,0 +1,351 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Limits of three imperfect robots: late, coarse and noisy, with and without what is done about it.
+
+bash scripts/reproduce.sh imperfect                 the tables, and docs/reproduction_imperfect.md
+bash scripts/reproduce.sh imperfect panda           those of one robot
+bash scripts/reproduce.sh imperfect --minutes 1     quicker: 1 minute each in place of 10
+
+The real nodes in one process, in lockstep, with `config/imperfect/<robot>.yaml`. Each minute has
+its own seed: goals anew each second, half of the joints at their limits, pushes, and rests in which
+joints lie on their limits. Every second minute has a posture task so stiff that the limits decide.
+Limits are checked at each physics step, against the true state.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from chain import ROOT, load_node_values, run_chain
+from figure import RESULTS, table
+
+from viability_bounds_pkg.robot_description import build_model, read_urdf
+
+ROBOTS = ("panda", "talos_left_arm", "baxter_left_arm")
+MINUTE = 60.0  # s
+FAST = 8  # goals of a second each
+REST = 6.0  # s of a goal that is kept
+SETTLED = 5.0  # s after which the torque steps of such a goal count
+STIFF = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
+"""A posture task that drives each joint to its limits, whatever the hand does."""
+
+HOLDABLE: dict[str, dict[str, Any]] = {
+    # With the elbow this much bent, left_s1 can hold and accelerate the arm in all states, so that
+    # no limit of its acceleration has to be set by hand:
+    #   estimate_acceleration_limits --cap 5 --margin-dt 0.01
+    "baxter_left_arm": {
+        "position_min": [-1.7016, -2.147, -3.0541, 2.0, -3.059, -1.5707, -3.059],
+        "velocity_max": [1.0, 0.8, 1.0, 1.0, 2.0, 2.0, 2.0],
+        "acceleration_min": [-5.0, -3.3, -5.0, -5.0, -5.0, -5.0, -5.0],
+        "acceleration_max": [5.0, 5.0, 5.0, 5.0, 5.0, 5.0, 5.0],
+        "acceleration_drift": [528.0, 147.0, 610.0, 302.0, 1903.0, 572.0, 2007.0],
+        "start_positions": [-0.036, -0.753, -0.544, 2.2, -0.091, -0.151, -0.136],
+    }
+}
+PUSHED = {
+    "panda": ("panda_hand", "panda_link4"),
+    "talos_left_arm": ("wrist_left_ft_tool_link", "arm_left_4_link"),
+    "baxter_left_arm": ("left_gripper", "left_lower_elbow"),
+}
+"""Links that are pushed."""
+
+Values = dict[str, dict[str, Any]]
+"""Parameters by node."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is spoilt, and what is done about it.
+
+    Attributes:
+        title: of the row.
+        spoilt: how many times the imperfections of the file are simulated: 0, 1 or 2.
+        overlay: nodes that get the file of the imperfect robot.
+        changed: parameters that differ, by node.
+        outages: whether the commands fail now and then for longer than is declared.
+    """
+
+    title: str
+    spoilt: int
+    overlay: tuple[str, ...] = ("bounds_node", "controller_node", "estimator_node")
+    changed: Mapping[str, Mapping[str, Any]] | None = None
+    outages: bool = False
+
+
+NOTHING_DECLARED: dict[str, Any] = {
+    "position_error": [],
+    "velocity_error": [],
+    "delay": 0,
+    "delay_jitter": 0,
+    "missed_deadlines": 0,
+    "motor_bandwidth": [],
+    "bounds_dt_factor": 2.0,
+}
+CASES = {
+    "ideal": Case("nothing spoilt, nothing done", 0, ()),
+    "ideal_remedies": Case("nothing spoilt, all done", 0),
+    "nothing": Case("spoilt, nothing done", 1, ()),
+    "no_margins": Case("spoilt, all but margins and horizon", 1, changed={"bounds_node": NOTHING_DECLARED}),
+    "no_prediction": Case(
+        "spoilt, all but prediction", 1, changed={"estimator_node": {"delay": 0, "motor_bandwidth": []}}
+    ),
+    "no_observer": Case(
+        "spoilt, all but the observer", 1, changed={"estimator_node": {"velocity_estimation": False}}
+    ),
+    "all": Case("spoilt, all done", 1),
+    "twice": Case("spoilt twice as much as declared, all done", 2),
+    "outage_brake": Case(
+        "spoilt, all done; commands fail for up to 0.2 s; brakes",
+        1,
+        changed={"bullet_node": {"acceleration_min": [], "acceleration_max": []}},
+        outages=True,
+    ),
+    "outage_stop": Case("spoilt, all done; commands fail for up to 0.2 s; stop", 1, outages=True),
+}
+DOUBLED = (
+    "encoder_resolution",
+    "position_noise",
+    "velocity_noise",
+    "state_delay",
+    "command_delay",
+    "torque_constant_error",
+    "torque_ripple",
+    "current_noise",
+    "missed_in_row",
+)
+HALVED = ("motor_bandwidth", "velocity_filter_hz")
+
+
+def scaled(imperfections: Mapping[str, Any], factor: float) -> dict[str, Any]:
+    """Return imperfections that are `factor` times as bad."""
+
+    def times(value: Any, by: float) -> Any:
+        if isinstance(value, list):
+            return [times(item, by) for item in value]
+        return round(value * by) if isinstance(value, int) else value * by
+
+    result = dict(imperfections)
+    for name in DOUBLED:
+        if name in result:
+            result[name] = times(result[name], factor)
+    for name in HALVED:
+        if name in result:
+            result[name] = times(result[name], 1.0 / factor)
+    return result
+
+
+def node_values(robot: str, case: Case) -> Values:
+    """Return the parameters of all nodes."""
+    plain, imperfect = load_node_values(robot), load_node_values(robot, f"imperfect/{robot}")
+    values: Values = {}
+    for node, own in plain.items():
+        chosen = imperfect[node] if node in case.overlay else own
+        if node == "bullet_node" and case.spoilt:
+            chosen = own | scaled(
+                {k: v for k, v in imperfect[node].items() if own.get(k) != v}, case.spoilt
+            )
+            if case.outages:
+                chosen |= {"missed_in_row": round(0.2 * chosen["rate_hz"])}
+        values[node] = chosen | HOLDABLE.get(robot, {}) | dict((case.changed or {}).get(node, {}))
+    return values
+
+
+class Course:
+    """A minute of goals and pushes, the same for each case.
+
+    Args:
+        values: of the controller node.
+        robot: name of its file.
+        seed: of the random numbers.
+
+    Attributes:
+        scenario: as in a scenario file.
+        rests: from when to when torque steps count as those at rest, s.
+        hand: the last pose goal.
+    """
+
+    def __init__(self, values: Mapping[str, Any], robot: str, seed: int) -> None:
+        self._rng = np.random.default_rng(seed)
+        self._joints = list(values["joints"])
+        self._low, self._high = (np.array(values[f"position_{end}"]) for end in ("min", "max"))
+        locked = dict(zip(values.get("locked_joints", []), values.get("locked_positions", []), strict=True))
+        self._model = build_model(read_urdf(values["robot_description"]), self._joints, locked)
+        self._data = self._model.createData()
+        self._frames = values["base_frame"], values["end_effector_frame"]
+        self.rests: list[tuple[float, float]] = []
+        events: list[dict[str, Any]] = []
+        time = 0.0
+        for block in range(4):
+            for _ in range(FAST):
+                events += self._goal(time, self._at_limits())
+                if block % 2:
+                    events.append(self._push(time, PUSHED[robot]))
+                time += 1.0
+            if block < 3:
+                events += self._goal(time, self._at_limits())
+                self.rests.append((time + SETTLED, time + REST))
+                time += REST
+        middle = 0.5 * (self._low + self._high)
+        q = middle + 0.5 * (self._rng.uniform(self._low, self._high) - middle)
+        events += self._goal(time, q)
+        self.hand = self.pose(q)
+        self.rests.append((MINUTE - REST + SETTLED, MINUTE))
+        self.scenario = {"duration": MINUTE, "events": events}
+
+    def pose(self, q: np.ndarray) -> pin.SE3:
+        """Return the pose of the hand in the base frame."""
+        pin.framesForwardKinematics(self._model, self._data, q)
+        base, hand = (self._data.oMf[self._model.getFrameId(name)] for name in self._frames)
+        return base.actInv(hand)
+
+    def _at_limits(self) -> np.ndarray:
+        """Return a posture with half of the joints at their limits."""
+        low, high, rng = self._low, self._high, self._rng
+        n = low.size
+        ends = np.where(rng.random(n) < 0.5, low, high)
+        return np.where(rng.random(n) < 0.5, ends, rng.uniform(low, high))
+
+    def _goal(self, time: float, q: np.ndarray) -> Iterator[dict[str, Any]]:
+        pose = self.pose(q)
+        position, orientation = pose.translation, pin.Quaternion(pose.rotation).coeffs()
+        yield {"time": time, "posture": dict(zip(self._joints, q.tolist(), strict=True))}
+        yield {
+            "time": time,
+            "pose": {"position": position.tolist(), "orientation": orientation.tolist()},
+        }
+
+    def _push(self, time: float, links: tuple[str, ...]) -> dict[str, Any]:
+        direction = self._rng.standard_normal(3)
+        force = 20.0 * direction / np.linalg.norm(direction)
+        link = links[self._rng.integers(len(links))]
+        push = {"link": link, "force": force.tolist(), "duration": 0.3}
+        return {"time": time + self._rng.uniform(0.0, 0.7), "push": push}
+
+
+@dataclass(frozen=True)
+class Minute:
+    """What a minute showed; the largest of all joints.
+
+    Attributes:
+        position, speed: how far beyond the limits, rad and rad/s.
+        torque: share of torque_max.
+        step: largest change of torque in a period, share of torque_max.
+        step_at_rest: the same, at rest.
+        hand: distance from the last goal, m; NaN where the hand has no goal.
+        stopped: periods in which the robot stopped by itself.
+    """
+
+    position: float
+    speed: float
+    torque: float
+    step: float
+    step_at_rest: float
+    hand: float
+    stopped: int
+
+
+def play(robot: str, name: str, seed: int) -> Minute:
+    """Play a minute of a case."""
+    case = CASES[name]
+    values = node_values(robot, case)
+    course = Course(values["controller_node"], robot, seed)
+    if stiff := seed % 2:
+        values["controller_node"] |= STIFF
+    values["bullet_node"] |= {"imperfection_seed": seed}
+    if not values["controller_node"].get("use_estimated_states"):
+        del values["estimator_node"]
+    result = run_chain({}, course.scenario, values)
+    run = result.run
+    steps = np.abs(np.diff(run.tau, axis=0)) / values["controller_node"]["torque_max"]
+    at_rest = np.zeros(len(steps), dtype=bool)
+    for begin, end in course.rests:
+        at_rest |= (run.t[1:] >= begin) & (run.t[1:] < end)
+    hand = np.linalg.norm(course.pose(result.q).translation - course.hand.translation)
+    return Minute(
+        float(result.vector("position_violation_rad").max()),
+        float(result.vector("velocity_violation_rad_s").max()),
+        float(result.vector("torque_ratio").max()),
+        float(np.nanmax(steps)),
+        float(np.nanmax(steps[at_rest])),
+        np.nan if stiff else float(hand),
+        int(result.robot["braked_periods"]),
+    )
+
+
+HEADS = (
+    "what is spoilt, and what is done",
+    "minutes",
+    "position, rad",
+    "speed, rad/s",
+    "torque, of tau_max",
+    "torque step, of tau_max",
+    "at rest",
+    "hand at rest, mm",
+)
+
+
+def row(case: Case, minutes: list[Minute]) -> tuple[str, ...]:
+    """Return a row of the table: the worst of the minutes."""
+
+    def worst(name: str) -> float:
+        return float(np.nanmax([getattr(minute, name) for minute in minutes]))
+
+    hands = [1e3 * minute.hand for minute in minutes if np.isfinite(minute.hand)]
+    return (
+        case.title,
+        str(len(minutes)),
+        f"{worst('position'):.2g}",
+        f"{worst('speed'):.2g}",
+        f"{worst('torque'):.3f}",
+        f"{worst('step'):.2f}",
+        f"{worst('step_at_rest'):.3f}",
+        f"{np.median(hands):.2f}, at most {np.max(hands):.2f}",
+    )
+
+
+def _own_domain() -> None:
+    """Let the nodes of this process see no others."""
+    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+
+
+def main() -> int:
+    """Play all cases, print the tables, and tell whether what is declared kept all limits."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("robot", nargs="?", default="all", choices=("all", *ROBOTS))
+    parser.add_argument("--case", choices=tuple(CASES), help="only this row")
+    parser.add_argument("--minutes", type=int, default=10, help="of each robot, as declared")
+    parser.add_argument("--others", type=int, default=2, help="minutes of the other rows")
+    given = parser.parse_args()
+    robots = ROBOTS if given.robot == "all" else (given.robot,)
+    names = (given.case,) if given.case else tuple(CASES)
+    lengths = {name: given.minutes if name == "all" else given.others for name in names}
+    fine, pages = True, []
+    with ProcessPoolExecutor(
+        max(1, os.cpu_count() or 1), get_context("spawn"), initializer=_own_domain
+    ) as pool:
+        runs = {
+            (robot, name): [pool.submit(play, robot, name, seed) for seed in range(minutes)]
+            for robot in robots
+            for name, minutes in lengths.items()
+        }
+        for robot in robots:
+            rows = []
+            for name in names:
+                minutes = [each.result() for each in runs[robot, name]]
+                rows.append(row(CASES[name], minutes))
+                print(robot, *rows[-1], sep=" | ", flush=True)
+                if name in ("all", "outage_stop"):
+                    fine &= all(m.position <= 0 and m.speed <= 0 and m.torque <= 1 + 1e-9 for m in minutes)
+            pages.append((robot, rows))
+    return 0 if fine else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
