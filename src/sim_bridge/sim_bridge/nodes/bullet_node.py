@@ -205,7 +205,8 @@ class BulletNode(ArmNode):
         self._world.apply_due(self._stamp)
         command = self._command
         if command is None:
-            self._braked += 1
+            # No command can have arrived before the first one's delay.
+            self._braked += self._periods >= config.imperfections.command_delay
             self._robot.brake(config.substeps, config.torque_max)
         elif isinstance(command, TorqueCommand):
             self._robot.step(command.tau, config.substeps)
