@@ -5,7 +5,7 @@ set -eu
 usage() {
     cat <<'USAGE'
 usage: bash scripts/demo.sh [robot] [scenario] [--bounds METHOD] [--rate HZ] [--real-time]
-                            [--params FILE] [--out DIRECTORY]
+                            [--imperfect] [--params FILE] [--out DIRECTORY]
 
   robot        a parameter file in config/ that has a scenario: baxter_left_arm (default), panda,
                talos_left_arm
@@ -16,7 +16,9 @@ usage: bash scripts/demo.sh [robot] [scenario] [--bounds METHOD] [--rate HZ] [--
   --rate       control rate in Hz (default: the robot's own)
   --real-time  by the wall clock; without, in lockstep: the simulation waits for each command, so
                that it is as fast as the machine can, repeatable, and misses no deadline
-  --params     a second parameter file, such as config/obstacles/panda_wall.yaml
+  --imperfect  with encoders, delays, motors and lost commands like those of a real robot, from
+               config/imperfect/<robot>.yaml; see docs/simulated_robot.md
+  --params     a further parameter file, such as config/obstacles/panda_wall.yaml
   --out        where figure, data and metrics go (default: results/<robot>_<scenario>; then
                results/demo is a link to it)
 
@@ -34,13 +36,14 @@ value() {
 }
 
 root="$(cd "$(dirname "$0")/.." && pwd)"
-robot='' scenario='' bounds=exact rate=default params='' clock=lockstep out=''
+robot='' scenario='' bounds=exact rate=default params='' imperfect='' clock=lockstep out=''
 while [ $# -gt 0 ]; do
     case "$1" in
     --bounds) bounds="$(value "$@")"; shift ;;
     --rate) rate="$(value "$@")"; shift ;;
     --params) params="$(value "$@")"; shift ;;
     --out) out="$(value "$@")"; shift ;;
+    --imperfect) imperfect=yes ;;
     --lockstep) clock=lockstep ;;
     --real-time) clock=real_time ;;
     -h | --help) usage; exit 0 ;;
@@ -69,6 +72,8 @@ elif [ ! -f "$scenario" ]; then
     refuse "unknown scenario '$scenario' of $robot; there are: $known"
 fi
 
+[ -z "$imperfect" ] || imperfect="$root/config/imperfect/$robot.yaml"
+[ -z "$imperfect" ] || [ -f "$imperfect" ] || refuse "there is no $imperfect"
 [ -z "$params" ] || [ -f "$params" ] || refuse "no parameter file '$params'"
 case "$bounds" in
 exact | naive | decre | rubrecht | damper) ;;
@@ -81,7 +86,7 @@ fi
 link=''
 if [ -z "$out" ]; then
     name="$(basename "$scenario" .yaml)"
-    out="$root/results/${robot}_${name#"${robot}_"}"
+    out="$root/results/${robot}_${name#"${robot}_"}${imperfect:+_imperfect}"
     link="$root/results/demo"
 fi
 
@@ -95,6 +100,7 @@ source "$root/scripts/domain.sh" || exit 2
 export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
 
 overrides=()
+[ -z "$imperfect" ] || overrides+=(--params-file "$imperfect")
 [ -z "$params" ] || overrides+=(--params-file "$params")
 overrides+=(-p "clock:=$clock" -p "bounds_node:method:=$bounds" -p start_paused:=true)
 [ "$rate" = default ] || overrides+=(-p "rate_hz:=$rate")

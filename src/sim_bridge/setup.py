@@ -6,7 +6,7 @@ from glob import glob
 from setuptools import find_packages, setup
 
 PACKAGE = "sim_bridge"
-CONFIG = ("config", "config/obstacles", "config/scenarios")
+CONFIG = ("config", "config/imperfect", "config/obstacles", "config/scenarios")
 
 setup(
     name=PACKAGE,

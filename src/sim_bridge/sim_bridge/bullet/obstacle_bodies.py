@@ -17,7 +17,7 @@ docs/simulated_robot.md tells why.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,7 @@ from sim_bridge.bullet.obstacles import (
 from viability_bounds_pkg.robot_description import RobotDescriptionError
 
 Array = NDArray[Any]
+Kept = TypeVar("Kept")
 
 _OVERLAP_MAX = 1e-3  # m, with the robot, of an obstacle that is new
 _RELEASED = 1e-9  # m; a surface that is nearer to its place is put there
@@ -160,6 +161,24 @@ class BulletObstacles:
         if not self._surfaces:
             self._bullet.setPhysicsEngineParameter(globalCFM=0.0)
         return True
+
+    def follow(self, body: int, links: Mapping[int, str]) -> None:
+        """Go on with the robot loaded anew; contacts go on, too.
+
+        Args:
+            body: the robot in PyBullet.
+            links: names of its links, by PyBullet's indices.
+        """
+        indices = {link: index for index, link in links.items()}
+
+        def renamed(old: Mapping[_Touching, Kept]) -> dict[_Touching, Kept]:
+            return {
+                key._replace(link=indices[self._links[key.link]]): kept
+                for key, kept in old.items()
+            }
+
+        self._bristles, self._friction = renamed(self._bristles), renamed(self._friction)
+        self._body, self._links = body, links
 
     def clear(self) -> None:
         """Remove all obstacles."""

@@ -36,6 +36,7 @@ from sim_bridge.bullet.joint_friction import JointFriction
 from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.bullet.position_drive import PositionDrive
 from sim_bridge.bullet.vectors import finite_vector
+from sim_bridge.hardware.motors import Motors
 
 Array = NDArray[np.float64]
 
@@ -60,6 +61,7 @@ class BulletRobot(BulletBody):
     Args:
         urdf_text, joints, physics_dt: as of `BulletBody`; all arrays are in the order of `joints`.
         joint_friction: friction, rotors and torque biases of the joints; none by default.
+        motors: what the torques of `step` and of the drives pass through; ideal by default.
         body: further options of `BulletBody`: locked joints, gravity, obstacles, masses, a sensor.
 
     Attributes:
@@ -77,6 +79,7 @@ class BulletRobot(BulletBody):
         *,
         physics_dt: float,
         joint_friction: JointFriction | None = None,
+        motors: Motors | None = None,
         **body: Any,
     ) -> None:
         n = len(joints)
@@ -97,6 +100,7 @@ class BulletRobot(BulletBody):
         self._friction = None if friction.ideal else friction
         # PyBullet's position, half a step ahead of the velocity; see the module.
         self._q, self._v, self._motor_torque = np.zeros((3, n))
+        self._asked, self._motors = np.zeros(n), motors
         self._brakes = np.zeros(n)
         self._drive: PositionDrive | None = None  # made when first needed: it builds a model
         self._driving = False
@@ -114,6 +118,8 @@ class BulletRobot(BulletBody):
         self._set_state(raw, v)
         self._q[:], self._v[:] = raw, v
         self._motor_torque.fill(0.0)
+        if self._motors is not None:
+            self._motors.reset()
         self._driving = self._stepped = False
 
     def step(self, tau: ArrayLike, substeps: int = 1) -> None:
@@ -126,7 +132,7 @@ class BulletRobot(BulletBody):
         tau = finite_vector("tau", tau, len(self.joints))
         self._driving = False
         self._release_brakes()
-        self._motor_torque[:] = tau
+        self._asked[:] = tau
         self._advance(substeps)
 
     def move(
@@ -157,7 +163,7 @@ class BulletRobot(BulletBody):
             *self.description, self._rotor_inertia, self.physics_dt
         )
         if not self._driving:
-            last = self._motor_torque if self._stepped else None
+            last = self.believed_torque if self._stepped else None
             drive.reset(*self.state()[:2], tau_max, last)
             self._driving = True
 
@@ -178,6 +184,8 @@ class BulletRobot(BulletBody):
         """
         limits = finite_vector("torque_limits", torque_limits, len(self.joints), signed=False)
         self._driving = False
+        if self._motors is not None:
+            self._motors.switch_off()
         self._brakes[:] = limits
         if self._friction is None:
             self._set_brakes(limits)
@@ -188,15 +196,24 @@ class BulletRobot(BulletBody):
         q = self._q - 0.5 * self.physics_dt * self._v
         return RobotState(q, self._v.copy(), self._motor_torque.copy())
 
+    @property
+    def believed_torque(self) -> Array:
+        """Torque that the drives believe their motors to give; of brakes, the true one, N m."""
+        believed = None if self._motors is None else self._motors.believed
+        return self._motor_torque if believed is None else believed
+
     def _advance(
         self, substeps: int, control: Callable[[], Array] | None = None, braking: bool = False
     ) -> None:
-        """Make physics steps under `_motor_torque`, the torques of `control`, or the brakes."""
+        """Make physics steps under `_asked`, the torques of `control`, or the brakes."""
         if substeps < 1:
             raise ValueError(f"substeps must be at least 1, not {substeps}")
         for remaining in range(substeps, 0, -1):
             if control is not None:
-                self._motor_torque[:] = control()
+                self._asked[:] = control()
+            if not braking:
+                motors, asked = self._motors, self._asked
+                self._motor_torque[:] = asked if motors is None else motors.step(asked, self._q)
             if self._friction is not None:
                 self._apply_friction(self._friction, braking)
             elif not braking:

@@ -20,6 +20,8 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from sim_bridge.bullet.limit_monitor import LimitMonitor
+from sim_bridge.hardware.communication import CommandPath
+from sim_bridge.hardware.sensing import JointReading, Sensing
 from sim_bridge.nodes.bullet_parameters import BulletConfiguration, make_robot
 from sim_bridge.nodes.command_outage import CommandOutage
 from sim_bridge.nodes.ft_sensor import ForceTorqueReading
@@ -66,6 +68,9 @@ class BulletNode(ArmNode):
     time.
 
     The robot's brakes are on until the first command.
+
+    Imperfections that parameters switch on stand between the messages and the robot: states are
+    reported by `Sensing`, commands arrive by a `CommandPath`, torques are those of `Motors`.
     """
 
     NAME = "bullet_node"
@@ -95,6 +100,10 @@ class BulletNode(ArmNode):
         self._ft_wrench = WrenchStamped()
         self._ft_wrench.header.frame_id = config.sensor.ft_frame
         self._ft_publisher = FT_WRENCH.publisher(self) if self._robot.sensor else None
+        imperfect = config.imperfections
+        self._sensing = (
+            Sensing(imperfect, config.torque_max, config.dt) if imperfect.of_sensing else None
+        )
         self._restart()
 
         # Joints that are locked, too: robot_state_publisher places no link without its joint.
@@ -128,6 +137,8 @@ class BulletNode(ArmNode):
         n = len(config.joints)
         self._world.clear()
         self._robot.reset(config.start_positions, np.zeros(n))
+        self._reading = self._sensing.reset(*self._true_state()) if self._sensing else None
+        self._path: CommandPath[JointCommand] = CommandPath(config.imperfections)
         sensor = self._robot.sensor
         self._sensor = ForceTorqueReading(sensor, config.sensor) if sensor else None
         self._monitor.reset()
@@ -152,7 +163,7 @@ class BulletNode(ArmNode):
         """Begin a control period and publish the state at its start."""
         self._stamp += self._dt_ns
         self._advanced = False
-        q, v, tau = self._robot.state()
+        q, v, tau = self._reading or self._true_state()
         state = self._state
         state.position = array("d", q.tobytes()) + self._locked_at
         state.velocity = array("d", v.tobytes()) + self._at_rest
@@ -169,13 +180,33 @@ class BulletNode(ArmNode):
         self._published_at = time.monotonic()
         self._state_publisher.publish(state)
 
+    def _true_state(self) -> JointReading:
+        q, v, _ = self._robot.state()
+        return JointReading(q, v, self._robot.believed_torque)
+
+    def _receive(self, sent: JointCommand | None) -> None:
+        """Take the command that arrives in the current period, or hold the last one.
+
+        Args:
+            sent: the one sent in it; None if there is none.
+        """
+        arrived = self._path.arriving(sent)
+        if arrived is not None:
+            self._command = arrived
+            self._missed_in_row = 0
+        elif self._command is not None:
+            self._missed_in_row += 1
+            if self._missed_in_row > self._config.command_timeout:
+                self._command = None
+
     def _advance(self) -> None:
-        """Simulate the current period under the last command or the brakes."""
+        """Simulate the current period under the command that arrived last, or the brakes."""
         config = self._config
         self._world.apply_due(self._stamp)
         command = self._command
         if command is None:
-            self._braked += 1
+            # No command can have arrived before the first one's delay.
+            self._braked += self._periods >= config.imperfections.command_delay
             self._robot.brake(config.substeps, config.torque_max)
         elif isinstance(command, TorqueCommand):
             self._robot.step(command.tau, config.substeps)
@@ -183,6 +214,8 @@ class BulletNode(ArmNode):
             self._robot.move(*command, config.torque_max, config.velocity_max, config.substeps)
         if news := self._outage.count(command is None):
             self.get_logger().warning(news)
+        if self._sensing is not None:
+            self._reading = self._sensing.read(*self._true_state())
         self._periods += 1
         self._advanced = True
         if self._periods >= self._pause_at:
@@ -196,9 +229,7 @@ class BulletNode(ArmNode):
         if not self._advanced:
             if self._command is not None:
                 self._missed += 1
-                self._missed_in_row += 1
-                if self._missed_in_row > self._config.command_timeout:
-                    self._command = None
+            self._receive(None)
             self._advance()
         self._next_state()
 
@@ -232,13 +263,12 @@ class BulletNode(ArmNode):
             return
         self._strays = 0
         self._latencies.append(time.monotonic() - self._published_at)
-        self._missed_in_row = 0
         if isinstance(command, TorqueCommand):
             tau, tau_max = command.tau, self._config.torque_max
             self._torque_ratio = max(self._torque_ratio, float(np.max(np.abs(tau) / tau_max)))
             # The motors do not exceed their limits, whatever the command.
             command = TorqueCommand(np.clip(tau, -tau_max, tau_max))
-        self._command = command
+        self._receive(command)
         self._advance()
         # After a pause by itself the next state is not published: time stops for all nodes.
         if self._config.lockstep and not self._paused:
@@ -298,6 +328,8 @@ class BulletNode(ArmNode):
             "rate_hz": (self._periods - self._played) / elapsed,
             "physics_steps_per_period": self._config.substeps,
             "deadline_misses": self._missed,
+            "missed_deadlines_injected": self._path.missed,
+            "imperfections": ", ".join(self._config.imperfections.names) or "none",
             "braked_periods": self._braked,
             "commands_refused": self._refused,
             "world_changes_pending": len(self._world),

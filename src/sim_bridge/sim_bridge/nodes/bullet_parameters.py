@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from sim_bridge.bullet.joint_friction import DEFAULT_STRIBECK_VELOCITY, JointFriction
 from sim_bridge.bullet.obstacles import ContactMaterial
 from sim_bridge.bullet.robot import BulletRobot
+from sim_bridge.hardware.imperfections import Imperfections
+from sim_bridge.hardware.motors import Motors
 from sim_bridge.nodes.ft_sensor import SensorConfiguration
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import (
@@ -105,6 +107,7 @@ class BulletConfiguration(ControlRate, LimitedRobotConfiguration):
     )
     material: ContactMaterial = group(ContactMaterial, "obstacle_")
     sensor: SensorConfiguration = group(SensorConfiguration)
+    imperfections: Imperfections = group(Imperfections)
     urdf: str = field(init=False)
 
     def __post_init__(self) -> None:
@@ -119,6 +122,7 @@ class BulletConfiguration(ControlRate, LimitedRobotConfiguration):
         if len(links) != len(scales):
             allowed = f"{len(links)} numbers, one for each of 'mass_scale_links'"
             raise SettingError("mass_scales", scales, allowed)
+        self.imperfections.check_rate(self.rate_hz)
         object.__setattr__(self, "urdf", self.read_urdf())
 
     @property
@@ -131,6 +135,11 @@ class BulletConfiguration(ControlRate, LimitedRobotConfiguration):
         """Physics steps of a control period."""
         # The rounding keeps 1 kHz with steps of 1 ms from becoming two steps of 0.5 ms.
         return max(1, math.ceil(self.dt / self.physics_step_max - 1e-9))
+
+    @property
+    def physics_dt(self) -> float:
+        """Physics step, s."""
+        return self.dt / self.substeps
 
     @property
     def scaled_links(self) -> dict[str, float]:
@@ -158,13 +167,16 @@ def make_robot(config: BulletConfiguration) -> BulletRobot:
     Raises:
         SettingError: a URDF that does not load, or a joint or link that it does not have.
     """
+    imperfections = config.imperfections
+    motors = Motors(imperfections, config.torque_max, config.physics_dt)
     try:
         return BulletRobot(
             config.urdf,
             config.joints,
             locked_positions=config.locked,
-            physics_dt=config.dt / config.substeps,
+            physics_dt=config.physics_dt,
             joint_friction=config.joint_friction,
+            motors=motors if imperfections.of_motors else None,
             mass_scales=config.scaled_links,
             material=config.material,
             sensor_frame=config.sensor.ft_frame,

@@ -20,6 +20,7 @@ from sim_bridge.scenario.fields import (
     vector,
 )
 from sim_bridge.scenario.trajectory import read_trajectory
+from sim_bridge.urdf.payload import PayloadError, payload_inertia
 from viability_bounds_pkg.exceptions import did_you_mean
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory
 from viability_bounds_pkg.user_input.known_names import graph_names, unknown_parameters
@@ -68,6 +69,16 @@ class Push(NamedTuple):
     torque: tuple[float, ...] = _ZERO  # N m
 
 
+class PayloadChange(NamedTuple):
+    """A load on a link of the robot from `time` on; the controller does not know of it."""
+
+    time: float
+    link: str
+    mass: float  # kg; 0: none any more
+    centre: tuple[float, ...] = _ZERO  # of mass, in the link's frame, m
+    inertia: tuple[float, ...] = 2 * _ZERO  # xx, xy, xz, yy, yz, zz about its centre, kg m^2
+
+
 class AddObstacle(NamedTuple):
     """An obstacle in the robot's world; the controller does not know of it."""
 
@@ -107,7 +118,7 @@ class TriggerCall(NamedTuple):
 
 Goal = PoseGoal | PostureGoal | TrajectoryGoal | WrenchGoal
 """Sent to the controller before their time."""
-WorldEvent = Push | AddObstacle | RemoveObstacle
+WorldEvent = Push | PayloadChange | AddObstacle | RemoveObstacle
 """Sent to the robot before their time."""
 ServiceEvent = EnableTorque | ParameterChange | TriggerCall
 """Services that take effect at once, called at their time."""
@@ -134,10 +145,25 @@ def read_event(content: Any, where: str) -> Event:
     fields = read_fields(content[kind], place, read, event._field_defaults)
     if kind == "push" and not {"force", "torque"} & set(fields):
         raise ScenarioError(f"{place} has no force and no torque; allowed: one of them or both")
+    if kind == "payload":
+        _check_payload(event(time, **fields), place)
     own_node = kind == "parameters" and fields["node"].rpartition("/")[2] in graph_names("node")
     if own_node and (unknown := unknown_parameters(fields["values"])):
         raise ScenarioError(f"{place}.values: {unknown}")
     return event(time, **fields)
+
+
+def _check_payload(payload: PayloadChange, where: str) -> None:
+    _, link, mass, centre, inertia = payload
+    try:
+        if mass > 0.0:
+            payload_inertia(link, mass, centre, inertia)
+    except PayloadError as error:
+        raise ScenarioError(f"{where}: {error}") from None
+
+
+def _moments(value: Any, where: str) -> tuple[float, ...]:
+    return vector(value, where, 6)
 
 
 def _posture(content: Any, where: str) -> Mapping[str, float]:
@@ -213,6 +239,10 @@ _KINDS: dict[str, tuple[Any, Check | Mapping[str, Check]]] = {
     "trajectory": (TrajectoryGoal, read_trajectory),
     "wrench": (WrenchGoal, {"force": vector, "torque": vector, "frame": name}),
     "push": (Push, {"link": name, "duration": positive, "force": vector, "torque": vector}),
+    "payload": (
+        PayloadChange,
+        {"link": name, "mass": not_negative, "centre": vector, "inertia": _moments},
+    ),
     "obstacle": (AddObstacle, _obstacle),
     "remove_obstacle": (RemoveObstacle, {"name": name}),
     "enable_torque": (EnableTorque, _true_or_false),
