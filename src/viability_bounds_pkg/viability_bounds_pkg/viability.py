@@ -25,10 +25,12 @@ from viability_bounds_pkg.joint_limits import ROUNDING, JointLimits, JointLimits
 from viability_bounds_pkg.kernel.bounds_kernel import AccelerationBounds, solve
 from viability_bounds_pkg.kernel.discrete_kernel import StoppingCurve, stopping_curves
 from viability_bounds_pkg.kernel.discrete_time_condition import (
+    checked_errors,
     checked_margin,
     checked_step,
     discrete_time_condition,
     kernel_braking,
+    without_position_error,
 )
 from viability_bounds_pkg.kernel.one_sided_limit import JointTable, highest_speeds, make_table
 
@@ -56,16 +58,19 @@ class BoundsSolver:
             period up to `dt` where condition (11) holds. Where it does not, the kernel of
             discrete time belongs to one period only: with a shorter one, the bounds fall back
             to a smaller kernel that suits them all.
+        position_error: shape (n,), rad, or None for zeros. The bounds then hold although the
+            true position differs from the one that they are asked for by up to this much.
+        velocity_error: shape (n,), rad/s, or None for zeros; the same for the velocity.
 
     Attributes:
         limits: as given.
         dt: as given, s.
         exact: shape (n,), bool; False where the kernel is an inner approximation, because
-            (11) fails and either a margin or a shorter period is asked for.
+            (11) fails and a margin, an error or a shorter period is asked for.
         table: the constants that `solve` takes.
 
     Raises:
-        JointLimitsError: `dt`, `margin` or `period` is unusable; the message names the joint.
+        JointLimitsError: an argument is unusable; the message names the joint.
     """
 
     def __init__(
@@ -74,6 +79,9 @@ class BoundsSolver:
         dt: float,
         margin: ArrayLike | None = None,
         period: float | None = None,
+        *,
+        position_error: ArrayLike | None = None,
+        velocity_error: ArrayLike | None = None,
     ):
         self.limits = limits
         self.dt = checked_step(dt)
@@ -82,10 +90,16 @@ class BoundsSolver:
             raise JointLimitsError("period", None, period, f"must be at most dt = {self.dt:g} s")
         same = period >= self.dt * (1.0 - ROUNDING)
         margins = checked_margin(margin, limits)
-        braking = kernel_braking(limits, self.dt, margins, exact=same)
-        self.exact = braking.holds | (same & (margins == 0.0))
+        off = checked_errors("position_error", position_error, limits)
+        errors = checked_errors("velocity_error", velocity_error, limits)
+        inner = without_position_error(limits, off)
+        certain = (margins == 0.0) & (errors == 0.0) & (off == 0.0)
+        braking = kernel_braking(inner, self.dt, margins, errors, exact=same & certain)
+        self.exact = braking.holds | (same & certain)
         curved = self.exact & ~braking.holds
-        self.table = _make_table(limits, self.dt, margins, braking.deceleration, curved)
+        self.table = _make_table(inner, self.dt, margins, errors, braking.deceleration, curved)
+        # A joint counts as inside if it may be.
+        self.table.limits["tolerance"] += 2.0 * off[:, None]
         # The first call compiles; let it be this one and not one in a control loop.
         self.bounds(np.zeros(len(limits)), np.zeros(len(limits)))
 
@@ -138,11 +152,14 @@ def acceleration_bounds(
     dt: float,
     margin: ArrayLike | None = None,
     period: float | None = None,
+    *,
+    position_error: ArrayLike | None = None,
+    velocity_error: ArrayLike | None = None,
 ) -> AccelerationBounds:
     """Return the largest interval of accelerations that keeps the limits for ever: problem (4).
 
-    A function for `BoundsSolver(limits, dt, margin, period).bounds(q, v)`, which documents the
-    arguments; the solver is kept for the next call with the same settings.
+    A function for `BoundsSolver(limits, dt, ...).bounds(q, v)`, which documents the arguments;
+    the solver is kept for the next call with the same settings.
 
     Args:
         q: shape (n,) or (batch, n), rad.
@@ -151,20 +168,38 @@ def acceleration_bounds(
         dt: step, s.
         margin: shape (n,), rad/s^2, or None.
         period: control period, s, at most `dt`; None means `dt`.
+        position_error: shape (n,), rad, or None.
+        velocity_error: shape (n,), rad/s, or None.
 
     Raises:
-        JointLimitsError: `dt`, `margin` or `period` is unusable, or the shapes of `q` and `v`.
+        JointLimitsError: an argument is unusable, or the shapes of `q` and `v`.
     """
-    if margin is not None:
-        margin = tuple(checked_margin(margin, limits).tolist())
-    return _solver(limits, dt, margin, period).bounds(q, v)
+    margin = None if margin is None else tuple(checked_margin(margin, limits).tolist())
+    off, error = (
+        None if errors is None else tuple(checked_errors(field, errors, limits).tolist())
+        for field, errors in (
+            ("position_error", position_error),
+            ("velocity_error", velocity_error),
+        )
+    )
+    return _solver(limits, dt, margin, period, off, error).bounds(q, v)
+
+
+_Numbers = tuple[float, ...] | None
 
 
 @lru_cache(maxsize=32)
 def _solver(
-    limits: JointLimits, dt: float, margin: tuple[float, ...] | None, period: float | None
+    limits: JointLimits,
+    dt: float,
+    margin: _Numbers,
+    period: float | None,
+    position_error: _Numbers,
+    velocity_error: _Numbers,
 ) -> BoundsSolver:
-    return BoundsSolver(limits, dt, margin, period)
+    return BoundsSolver(
+        limits, dt, margin, period, position_error=position_error, velocity_error=velocity_error
+    )
 
 
 def viable_velocity_range(
@@ -194,7 +229,12 @@ def viable_velocity_range(
 
 
 def _make_table(
-    limits: JointLimits, dt: float, margins: Array, braking: Array, curved: NDArray[np.bool_]
+    limits: JointLimits,
+    dt: float,
+    margins: Array,
+    velocity_errors: Array,
+    braking: Array,
+    curved: NDArray[np.bool_],
 ) -> JointTable:
     """Return the kernel's table; `braking` is of shape (n, 2), towards upper and lower limit.
 
@@ -202,6 +242,7 @@ def _make_table(
         limits: of n joints.
         dt: step, s.
         margins: shape (n,), rad/s^2.
+        velocity_errors: shape (n,), rad/s.
         braking: shape (n, 2), rad/s^2.
         curved: joints whose kernel is the one of discrete time, shape (n,).
     """
@@ -221,6 +262,7 @@ def _make_table(
         low=np.stack([limits.a_min, -limits.a_max], axis=1),
         high=np.stack([limits.a_max, -limits.a_min], axis=1),
         margin=margins[:, None],
+        velocity_error=velocity_errors[:, None],
         tolerance=ROUNDING * (largest + np.minimum(v_max * v_max / (2.0 * braking), length)),
         curves=curves,
     )

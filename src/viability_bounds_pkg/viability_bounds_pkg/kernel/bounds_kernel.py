@@ -27,8 +27,9 @@ class AccelerationBounds(NamedTuple):
     Attributes:
         lower: shape of the state, rad/s^2; ``a_min <= lower <= upper <= a_max``.
         upper: shape of the state, rad/s^2.
-        viable: shape of the state, bool; False where the joint is outside the kernel, so that
-            a limit is or will be broken whatever is done, and the interval brings it back.
+        viable: shape of the state, bool; False where the joint is outside the kernel, whatever
+            the errors of the state, so that a limit is or will be broken whatever is done, and
+            the interval brings it back.
     """
 
     lower: Array
@@ -93,7 +94,11 @@ def joint_bounds(
     low = -low
     if low > high:
         low = high = _resolve_conflict(room_above, room_below, v, low, high, above)
-    return low, high, keeps_high and keeps_low and abs(v) <= above.v_max * _WITHIN
+    return (
+        low,
+        high,
+        keeps_high and keeps_low and abs(v) - above.velocity_error <= above.v_max * _WITHIN,
+    )
 
 
 @compiled(error_model="numpy")
@@ -104,7 +109,8 @@ def _bound_towards(
 
     Args:
         room: distance to the limit, rad; negative outside.
-        v: velocity towards it, rad/s.
+        v: velocity towards it, rad/s; the acceleration is for the highest within its error, what
+            is kept for the lowest.
         limit: a `ONE_SIDED_LIMIT`.
         curves: of `JointTable`.
 
@@ -113,6 +119,7 @@ def _bound_towards(
         joint is inside the position limit and can stop before it.
     """
     dt = limit.dt
+    v += limit.velocity_error
     # Room that is left if the step ends at rest.
     budget = room - limit.half_dt * v
     if budget >= limit.free:
@@ -132,6 +139,7 @@ def _bound_towards(
     elif a < limit.low:
         a = limit.low
     room += limit.tolerance
+    v -= 2.0 * limit.velocity_error
     if v <= 0.0:
         return a, room >= 0.0
     viable = v * v <= limit.twice_braking * room
@@ -189,7 +197,8 @@ def _resolve_conflict(
         a = upper
     else:
         a = 0.5 * (lower + upper)
-    dt, v_max, margin = limit.dt, limit.v_max, limit.margin
+    dt, v_max = limit.dt, limit.v_max
+    margin = limit.margin + limit.velocity_error / dt
     a = max(min(a, (v_max - v) / dt - margin), (-v_max - v) / dt + margin)
     clipped: float = max(min(a, limit.high), limit.low)
     return clipped

@@ -2,15 +2,21 @@
 """The discrete-time condition (11) of [DelPrete2018]: when braking at full rate is safe.
 
 Asymmetric limits, a margin for disturbances and continuous joints are worked out in
-`docs/bounds.md`. With B_up, B_lo the decelerations that the kernel counts on towards the upper
-and the lower limit, W the margin and L = q_max - q_min, it reads, for both ends,
+`docs/bounds.md`, errors of the state in `docs/uncertainty.md`. With B_up, B_lo the decelerations
+that the kernel counts on towards the upper and the lower limit, W the margin, E_q and E_v the
+largest errors of position and velocity, and
 
-    (B_up + 2 W) dt <= v_max,    L >= dt^2 / 2 (B_up + 2 W) (1 + (B_up + 2 W) / B_lo).
+    b = B_up + 2 W + 2 E_v / dt,    L = q_max - q_min - 2 E_q - E_v dt,
+
+it reads, for both ends,
+
+    b dt <= v_max,    L >= dt^2 / 2 b (1 + b / B_lo).
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -40,7 +46,12 @@ class KernelBraking(NamedTuple):
 
 
 def discrete_time_condition(
-    limits: JointLimits, dt: float, margin: ArrayLike | None = None
+    limits: JointLimits,
+    dt: float,
+    margin: ArrayLike | None = None,
+    *,
+    position_error: ArrayLike | None = None,
+    velocity_error: ArrayLike | None = None,
 ) -> NDArray[np.bool_]:
     """Return for which joints one braking step at either end stays inside the limits: eq. (11).
 
@@ -51,38 +62,53 @@ def discrete_time_condition(
         limits: of n joints.
         dt: step, s.
         margin: shape (n,), rad/s^2, or None for zeros.
+        position_error: shape (n,), rad, or None for zeros.
+        velocity_error: shape (n,), rad/s, or None for zeros.
 
     Returns:
         shape (n,), bool.
 
     Raises:
-        JointLimitsError: `dt` or `margin` is unusable in itself.
+        JointLimitsError: an argument is unusable in itself.
     """
-    return _holds(limits, checked_step(dt), checked_margin(margin, limits))
+    dt = checked_step(dt)
+    errors = checked_errors("velocity_error", velocity_error, limits)
+    off = checked_errors("position_error", position_error, limits)
+    inner = without_position_error(limits, off)
+    return _holds(inner, dt, checked_margin(margin, limits), errors)
 
 
-def kernel_braking(limits: JointLimits, dt: float, margins: Array, exact: bool) -> KernelBraking:
+def kernel_braking(
+    limits: JointLimits,
+    dt: float,
+    margins: Array,
+    velocity_errors: Array,
+    exact: NDArray[np.bool_],
+) -> KernelBraking:
     """Return the decelerations that the kernel of each joint counts on.
 
     Args:
-        limits: of n joints.
+        limits: of n joints, those of position without the errors of position.
         dt: step, s.
         margins: shape (n,), rad/s^2, checked.
-        exact: where (11) fails, keep the full braking of a joint without margin, because the
-            caller computes the kernel of discrete time. Otherwise reduce it until (11) holds,
-            as the paper suggests, which gives a smaller kernel.
+        velocity_errors: shape (n,), rad/s, checked.
+        exact: shape (n,), bool: where (11) fails, keep the full braking, because the caller
+            computes the kernel of discrete time. Otherwise reduce it until (11) holds, as the
+            paper suggests, which gives a smaller kernel.
 
     Raises:
-        JointLimitsError: a margin is too large for any kernel of this form.
+        JointLimitsError: a margin or an error is too large for any kernel of this form.
     """
     w = margins[:, None]
-    holds = _holds(limits, dt, margins)
+    holds = _holds(limits, dt, margins, velocity_errors)
     deceleration = np.stack([-limits.a_min, limits.a_max], axis=1) - w
-    for j in np.flatnonzero(~holds & ~(exact & (margins == 0.0))):
-        reduced = _reduced_braking(limits, int(j), dt, float(margins[j]))
+    for j in np.flatnonzero(~holds & ~exact):
+        margin, error = float(margins[j]), float(velocity_errors[j])
+        reduced = _reduced_braking(limits, int(j), dt, margin, error)
         if reduced is None:
             allowed = f"must be smaller, or the step of {dt:g} s shorter, to leave any kernel"
-            raise JointLimitsError("margin", limits.names[j], float(margins[j]), allowed)
+            field, value = ("velocity_error", error) if error > 0.0 else ("margin", margin)
+            raise JointLimitsError(field, limits.names[j], value, allowed)
         deceleration[j] = reduced
     return KernelBraking(deceleration, holds)
 
@@ -122,28 +148,68 @@ def checked_margin(margin: ArrayLike | None, limits: JointLimits) -> Array:
     return margins
 
 
-def _holds(limits: JointLimits, dt: float, margins: Array) -> NDArray[np.bool_]:
+def checked_errors(field: str, errors: ArrayLike | None, limits: JointLimits) -> Array:
+    """Return the largest error of each joint's position or velocity, shape (n,), zeros for None.
+
+    Raises:
+        JointLimitsError: negative or infinite.
+    """
+    if errors is None:
+        return np.zeros(len(limits))
+    checked = joint_array(field, errors, limits.names)
+    for name, error in zip(limits.names, checked.tolist(), strict=True):
+        if not 0.0 <= error < math.inf:
+            raise JointLimitsError(field, name, error, "must be finite and at least 0")
+    return checked
+
+
+def without_position_error(limits: JointLimits, errors: Array) -> JointLimits:
+    """Return the limits in which a reported position must be for the true one to be in `limits`.
+
+    Args:
+        limits: of n joints.
+        errors: of reported positions, shape (n,), rad, checked.
+
+    Raises:
+        JointLimitsError: nothing is left of the range.
+    """
+    if not errors.any():
+        return limits
+    half = 0.5 * (limits.q_max - limits.q_min)
+    for name, error, most in zip(limits.names, errors.tolist(), half.tolist(), strict=True):
+        if not error < most:
+            allowed = f"must be below half of the range, {most:g} rad"
+            raise JointLimitsError("position_error", name, error, allowed)
+    return replace(limits, q_min=limits.q_min + errors, q_max=limits.q_max - errors)
+
+
+def _holds(
+    limits: JointLimits, dt: float, margins: Array, velocity_errors: Array
+) -> NDArray[np.bool_]:
     """Return whether (11) holds for full braking, shape (n,)."""
     w = margins[:, None]
+    spread = margins + velocity_errors / dt
     full = np.stack([-limits.a_min, limits.a_max], axis=1)
     exists = np.isfinite(np.stack([limits.q_max, limits.q_min], axis=1))
     with np.errstate(over="ignore"):  # steps of any length
         # Speed at the end of a step whose braking was needed only at its beginning.
-        back = (full + w) * dt
-        room = 0.5 * dt * back * (1.0 + (full + w) / (full[:, ::-1] - w))
-    v_max, length = limits.v_max, limits.q_max - limits.q_min
+        hardest = full + w + 2.0 * velocity_errors[:, None] / dt
+        back = hardest * dt
+        room = 0.5 * dt * back * (1.0 + hardest / (full[:, ::-1] - w))
+    v_max, length = limits.v_max, limits.q_max - limits.q_min - dt * velocity_errors
     slow = back <= (v_max * (1.0 + ROUNDING))[:, None]
     fits = room <= (length * (1.0 + ROUNDING))[:, None]
     bounded = ((slow & fits) | ~exists).all(axis=1)
-    return np.where(exists.any(axis=1), bounded, margins * dt <= v_max)
+    return np.where(exists.any(axis=1), bounded, spread * dt <= v_max)
 
 
 def _reduced_braking(
-    limits: JointLimits, j: int, dt: float, w: float
+    limits: JointLimits, j: int, dt: float, margin: float, velocity_error: float
 ) -> tuple[float, float] | None:
     """Return braking of joint j towards both limits with which (11) holds, or None.
 
-    First the largest B for both: the position part is B^2 + (3 W - L / dt^2) B + 2 W^2 <= 0.
+    First the largest B for both: the position part is B^2 + (3 w - L / dt^2) B + 2 w^2 <= 0 with
+    w = W + E_v / dt.
     Where the weaker side cannot use more, the stronger is then given what (11) leaves it, which
     only makes (11) easier for the weaker one.
     """
@@ -151,9 +217,10 @@ def _reduced_braking(
     if math.isinf(q_min) and math.isinf(q_max):
         return None
     full = (-float(limits.a_min[j]), float(limits.a_max[j]))
+    w = margin + velocity_error / dt
     fastest = float(limits.v_max[j]) / dt - 2.0 * w
-    b = min(*full, fastest + w) - w
-    steps = (q_max - q_min) / dt / dt
+    b = min(*full, fastest + margin) - margin
+    steps = (q_max - q_min - dt * velocity_error) / dt / dt
     spare = steps - 3.0 * w
     if spare < math.inf:
         root = spare * spare - 8.0 * w * w
@@ -165,9 +232,9 @@ def _reduced_braking(
         b = min(b, largest)
     if b <= 0.0:
         return None
-    # (B + 2 W)^2 / b + (B + 2 W) <= 2 L / dt^2 for the stronger side, without a difference.
+    # (B + 2 w)^2 / b + (B + 2 w) <= 2 L / dt^2 for the stronger side, without a difference.
     stronger = (
         4.0 * steps / (1.0 + math.sqrt(1.0 + 8.0 * steps / b)) if steps < math.inf else steps
     )
-    stronger = max(b, min(stronger - 2.0 * w, fastest, max(full) - w))
+    stronger = max(b, min(stronger - 2.0 * w, fastest, max(full) - margin))
     return (stronger, b) if full[0] > full[1] else (b, stronger)

@@ -35,6 +35,7 @@ ONE_SIDED_LIMIT = np.dtype(
         ("low", np.float64),
         ("high", np.float64),
         ("margin", np.float64),
+        ("velocity_error", np.float64),
         ("tolerance", np.float64),
         ("first", np.int64),
         ("points", np.int64),
@@ -53,6 +54,7 @@ ONE_SIDED_LIMIT = np.dtype(
 - v_max: speed limit, rad/s.
 - low, high: hardest accelerations away from the limit and towards it, rad/s^2.
 - margin: acceleration kept back for disturbances, rad/s^2.
+- velocity_error: by which a velocity may be higher or lower than it is said to be, rad/s.
 - tolerance: room that a state may lack and still count as viable, rad.
 - first, points: where its inverse stopping curve begins in `JointTable.curves`, and its length;
   0 points where the stopping curve U is the parabola ``v^2 / (2 B)``.
@@ -85,6 +87,7 @@ def make_table(
     low: ArrayLike,
     high: ArrayLike,
     margin: ArrayLike = 0.0,
+    velocity_error: ArrayLike = 0.0,
     tolerance: ArrayLike = 0.0,
     curves: Sequence[Sequence[StoppingCurve | None]] = (),
 ) -> JointTable:
@@ -98,6 +101,7 @@ def make_table(
         low: rad/s^2.
         high: rad/s^2.
         margin: rad/s^2.
+        velocity_error: rad/s.
         tolerance: rad.
         curves: for each joint the stopping curves of its limits in units of the step, None for
             the parabola; parabolas only if empty.
@@ -107,6 +111,7 @@ def make_table(
     limits["position"] = position
     limits["dt"], limits["half_dt"] = dt, 0.5 * dt
     limits["v_max"], limits["margin"], limits["tolerance"] = v_max, margin, tolerance
+    limits["velocity_error"] = velocity_error
     shape = limits.shape
     set_braking(limits, *(np.broadcast_to(x, shape).astype(float) for x in (braking, low, high)))
     points: list[NDArray[np.void]] = [np.zeros(0, dtype=CURVE_POINT)]
