@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Velocity from coarse positions and known accelerations: observers with guaranteed errors.
+
+Each joint is a double integrator with an acceleration a that is known up to d, |d| <= W, and a
+position that is measured up to n, |n| <= Delta. The observer predicts and corrects,
+
+    q- = q^ + dt v^ + dt^2 a / 2,   v- = v^ + dt a,   r = q_measured - q-,
+    q^ = q- + l1 r,                 v^ = v- + l2 r,
+
+with both poles of its error at p: l1 = 1 - p^2, l2 = (1 - p)^2 / dt. The largest error that n and
+d can cause is the sum over the impulse responses' magnitudes (their L1 norm): bang-bang
+disturbances with the signs of the response reach it, and nothing within Delta and W exceeds it.
+`docs/state_estimation.md` compares it with other observers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from viability_bounds_pkg.state import State
+
+Array = NDArray[np.float64]
+
+LEAST_ACCELERATION_ERROR = 0.1
+"""What gains are chosen for at least, rad/s^2: with none, an error at the start would stay."""
+
+_POLES = np.concatenate(([0.0], np.exp(-np.geomspace(7.0, 5e-3, 300))))
+"""Poles to choose from: 2.5 % between two in frequency: costs less than 1e-4 of the error."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObserverDesign:
+    """Gains of the observers of n joints, and what they guarantee; arrays of shape (n,).
+
+    Attributes:
+        position_gain: l1.
+        velocity_gain: l2, 1/s.
+        position_error: largest error of the estimated position, rad.
+        velocity_error: largest error of the estimated velocity, rad/s.
+        innovation: largest difference between measured and predicted position, rad.
+        lag: by which velocities that no known acceleration explains come late, s.
+        noise: standard deviation of the velocity where errors of the position are independent and
+            uniform within their limits, rad/s.
+    """
+
+    position_gain: Array
+    velocity_gain: Array
+    position_error: Array
+    velocity_error: Array
+    innovation: Array
+    lag: Array
+    noise: Array
+
+
+def design_observer(
+    dt: float, position_error: ArrayLike, acceleration_error: ArrayLike
+) -> ObserverDesign:
+    """Return the observers whose largest error of the velocity is least.
+
+    Where positions are exact, the poles are at zero: the velocity is right after two periods.
+    Gains are chosen for an error of the acceleration of at least `LEAST_ACCELERATION_ERROR`; what
+    is guaranteed is for the errors given, so that it is zero where both are.
+
+    Args:
+        dt: control period, s.
+        position_error: largest error of a measured position, shape (n,), rad.
+        acceleration_error: largest error of the known acceleration, also within a period, shape
+            (n,), rad/s^2.
+    """
+    delta, w = np.atleast_1d(*np.broadcast_arrays(position_error, acceleration_error))
+    table = _worst_cases()
+    from_position, from_acceleration = table.velocity
+    # In units of the period: the choice depends on the ratio of the two only.
+    least = np.maximum(w, LEAST_ACCELERATION_ERROR) * dt**2
+    chosen = np.argmin(np.outer(delta, from_position) + np.outer(least, from_acceleration), axis=1)
+
+    def worst(responses: _Norms) -> Array:
+        return (
+            responses.to_position[chosen] * delta + responses.to_acceleration[chosen] * w * dt**2
+        )
+
+    p = _POLES[chosen]
+    return ObserverDesign(
+        position_gain=1.0 - p**2,
+        velocity_gain=(1.0 - p) ** 2 / dt,
+        position_error=worst(table.position),
+        velocity_error=worst(table.velocity) / dt,
+        innovation=worst(table.innovation),
+        lag=dt * (2.0 / (1.0 - p) - 1.5),
+        noise=table.noise[chosen] * delta / (np.sqrt(3.0) * dt),
+    )
+
+
+class Observer:
+    """Estimates positions and velocities of n joints from positions and accelerations.
+
+    Args:
+        design: gains.
+        dt: control period, s.
+
+    Attributes:
+        state: the estimate; set it to start anew.
+    """
+
+    def __init__(self, design: ObserverDesign, dt: float) -> None:
+        n = len(design.position_gain)
+        self._l1, self._l2, self._dt = design.position_gain, design.velocity_gain, dt
+        self.state = State(np.zeros(n), np.zeros(n))
+
+    def predict(self, a: Array) -> None:
+        """Go on by a period with mean acceleration `a`, shape (n,), rad/s^2."""
+        q, v = self.state
+        dv = self._dt * a
+        self.state = State(q + self._dt * (v + 0.5 * dv), v + dv)
+
+    def innovation(self, q: Array) -> Array:
+        """Return how far measured positions `q` are from the estimate, shape (n,), rad."""
+        difference: Array = q - self.state.q
+        return difference
+
+    def correct(self, innovation: Array) -> None:
+        """Correct the estimate by what `innovation` returned."""
+        q, v = self.state
+        self.state = State(q + self._l1 * innovation, v + self._l2 * innovation)
+
+
+class _Norms(NamedTuple):
+    """L1 norms of the responses to both errors for each of `_POLES`, with a period of 1."""
+
+    to_position: Array
+    to_acceleration: Array
+
+
+class _WorstCases(NamedTuple):
+    """Norms for each of `_POLES`; `noise` is the L2 norm from position errors to velocity."""
+
+    position: _Norms
+    velocity: _Norms
+    innovation: _Norms
+    noise: Array
+
+
+@cache
+def _worst_cases() -> _WorstCases:
+    """Return the norms, with a period of 1.
+
+    The error e = (q - q^, v - v^) follows e+ = A e + B(s) d(s) - L n with A = (I - L C) F,
+    B(s) = (I - L C) (1 - s, 1) for d at time s of the period. Powers of a 2 x 2 matrix with a
+    double eigenvalue p are A^i = p^i I + i p^(i-1) (A - p I).
+    """
+    rows = np.array([_norms(p) for p in _POLES])
+    position, velocity, innovation = (_Norms(*rows[:, i : i + 2].T) for i in (0, 2, 4))
+    return _WorstCases(position, velocity, innovation, rows[:, 6])
+
+
+def _norms(p: float) -> tuple[float, ...]:
+    l1, l2 = 1.0 - p * p, (1.0 - p) ** 2
+    corrected = np.array([[1.0 - l1, 0.0], [-l2, 1.0]])
+    step = np.array([[1.0, 1.0], [0.0, 1.0]])
+    count = 2 if p == 0.0 else 3 + int(35.0 / -np.log(p))
+    i = np.arange(count)
+    power = p**i
+    slope = i * p ** np.maximum(i - 1, 0)
+    rest = corrected @ step - p * np.eye(2)
+    powers = power[:, None, None] * np.eye(2) + slope[:, None, None] * rest
+    from_noise = powers @ np.array([l1, l2])
+    # The response to d(s) is linear in s: its values at both ends of the period.
+    ends = powers @ corrected @ np.array([[1.0, 0.0], [1.0, 1.0]])
+    before = step[0]  # position before the correction, of the error one period earlier
+    q, v = (_integral(ends[:, k]) for k in (0, 1))
+    innovation = _integral(before @ ends) + 0.5
+    return (
+        float(np.abs(from_noise[:, 0]).sum()),
+        q,
+        float(np.abs(from_noise[:, 1]).sum()),
+        v,
+        float(np.abs(from_noise @ before).sum()) + 1.0,
+        innovation,
+        float(np.sqrt((from_noise[:, 1] ** 2).sum())),
+    )
+
+
+def _integral(ends: Array) -> float:
+    """Return the sum of integrals of |f| over periods, f linear with values `ends`, (count, 2)."""
+    first, last = ends.T
+    total = np.abs(first) + np.abs(last)
+    crossing = first * last < 0.0
+    both = np.where(total > 0.0, total, 1.0)
+    return float(np.sum(np.where(crossing, (first**2 + last**2) / (2.0 * both), 0.5 * total)))
