@@ -18,6 +18,7 @@ from viability_bounds_pkg.parameter import (
     joint_numbers,
     number,
     numbers,
+    switch,
     text,
     texts,
 )
@@ -100,6 +101,15 @@ class ControlRate:
     def dt(self) -> float:
         """Control period, s."""
         return 1.0 / self.rate_hz
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StateSource:
+    """Which joint states a node works on."""
+
+    use_estimated_states: bool = switch(
+        "work on estimated_joint_states of estimator_node, not on joint_states", default=False
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -101,10 +101,20 @@ JOINT_STATES = Topic(
     JointState,
     CONTROL_QOS,
     ("bullet_node",),
-    ("bounds_node", "controller_node", "scenario_node"),
+    ("bounds_node", "controller_node", "estimator_node", "scenario_node"),
     "positions, rad, and velocities, rad/s; `effort` is the torque of the motors, N m; joints in "
     "any order, further joints are ignored; the stamp names the control step; `bullet_node` sends "
     "the movable joints that are locked, too",
+)
+ESTIMATED_JOINT_STATES = Topic(
+    "estimated_joint_states",
+    JointState,
+    CONTROL_QOS,
+    ("estimator_node",),
+    ("bounds_node", "controller_node"),
+    "positions, rad, and velocities, rad/s, expected at the instant when the command that answers "
+    "them begins to act; `effort` and stamp are those of the joint state they are made of; only "
+    "where `use_estimated_states` is set",
 )
 ACCELERATION_LIMITS = Topic(
     "acceleration_limits",
@@ -120,7 +130,7 @@ JOINT_COMMANDS = Topic(
     JointState,
     CONTROL_QOS,
     ("controller_node",),
-    ("bullet_node", "scenario_node"),
+    ("bullet_node", "estimator_node", "scenario_node"),
     "`effort` in N m; or `position` (and `velocity`) without effort: position control by the "
     "drives; stamp of the state they answer",
 )
@@ -174,6 +184,7 @@ VALUES = Topic(
 )
 SHARED_TOPICS = (
     JOINT_STATES,
+    ESTIMATED_JOINT_STATES,
     ACCELERATION_LIMITS,
     JOINT_COMMANDS,
     FT_WRENCH,

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The parameters by which users declare what is uncertain about their robot.
+
+They are what the bounds and the state estimation hold against; `docs/uncertainty.md` derives what
+follows from them. All zero: states are exact, commands act at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viability_bounds_pkg.parameter import NOT_NEGATIVE, Range, joint_numbers, whole_number
+
+Array = NDArray[np.float64]
+
+MOST_PERIODS = 100
+"""Longest delay and row of missed deadlines that can be declared, control periods."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DeclaredUncertainty:
+    """Largest errors of states, times and accelerations; arrays of shape (n,)."""
+
+    position_error: Array = joint_numbers(
+        "largest error of a reported position, rad: resolution and noise of the encoder; 0 if "
+        "empty",
+        NOT_NEGATIVE,
+        if_empty=0.0,
+    )
+    velocity_error: Array = joint_numbers(
+        "largest error of a reported velocity, rad/s; 0 if empty",
+        NOT_NEGATIVE,
+        if_empty=0.0,
+        note="not used with use_estimated_states, where the observer's own error counts",
+    )
+    acceleration_disturbance: Array = joint_numbers(
+        "how much more than commanded the joints may accelerate by what the model does not know, "
+        "friction, payloads, pushes, rad/s^2; the bounds are tightened by it; 0 if empty",
+        NOT_NEGATIVE,
+        if_empty=0.0,
+    )
+    delay: int = whole_number(
+        "control periods from the instant of a reported state to the one when the command that "
+        "answers it begins to act",
+        Range(0, MOST_PERIODS),
+        default=0,
+    )
+    delay_jitter: int = whole_number(
+        "control periods by which the delay may be longer at times",
+        Range(0, MOST_PERIODS),
+        default=0,
+    )
+    missed_deadlines: int = whole_number(
+        "longest row of control periods in which no new command arrives and the robot keeps the "
+        "last one",
+        Range(0, MOST_PERIODS),
+        default=0,
+    )
+    motor_bandwidth: Array = joint_numbers(
+        "bandwidth of the motors' torque as a first-order lag, Hz; 0 or empty: no lag",
+        NOT_NEGATIVE,
+        if_empty=0.0,
+    )
+
+    @property
+    def motor_lag(self) -> Array:
+        """Time constant of the motors' torque, shape (n,), s; 0 without a lag."""
+        bandwidth = 2.0 * np.pi * self.motor_bandwidth
+        return np.divide(1.0, bandwidth, out=np.zeros_like(bandwidth), where=bandwidth > 0.0)
