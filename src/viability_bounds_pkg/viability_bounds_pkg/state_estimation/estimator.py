@@ -27,14 +27,18 @@ SUDDEN = 0.1
 for a period, or that hit something, is found by it."""
 
 
+DISAGREES = 0.1
+"""From which difference on the torque that is reported is believed, and not a command, in torque
+limits, root sum square over the joints: brakes, or drives that stop by themselves."""
+
+
 class StateEstimator:
     """Estimates the velocity, and predicts the state at the instant when a command will act.
 
     A state that comes with stamp k is of an earlier instant, and the command that answers it acts
     at a later one, `delay` periods apart. Between them the commands with the stamps k - delay to
-    k - 1 act. The torque that is reported with a state is that of the period before its instant:
-    it leads the observer to it, whatever commands were lost. `docs/state_estimation.md` has the
-    derivation.
+    k - 1 act. In the period before that instant it was command k - delay - 1, unless it was lost:
+    the torque that is reported with the state tells. See `docs/state_estimation.md`.
 
     Args:
         model: n joints with one coordinate each.
@@ -43,6 +47,7 @@ class StateEstimator:
         motor_lag: time constants of the motors' torques, shape (n,), s; 0 without a lag.
         observers: that estimate the velocities; None takes those that are reported.
         velocity_max: speed limits, shape (n,), rad/s; tells jumps from motion.
+        torque_max: torque limits, shape (n,), N m.
         longest_gap: control periods between two states that are bridged by the model.
 
     Attributes:
@@ -58,6 +63,7 @@ class StateEstimator:
         motor_lag: Array,
         observers: ObserverDesign | None,
         velocity_max: Array,
+        torque_max: Array,
         longest_gap: int = 1,
     ) -> None:
         zero = np.zeros(model.nv)
@@ -72,7 +78,9 @@ class StateEstimator:
             self._observer = Observer(observers, dt, State(zero, zero))
             self._jump = np.maximum(UNEXPECTED * observers.innovation, SUDDEN * dt * velocity_max)
         self._stamp = -1
-        self._tau = zero
+        self._tau = zero  # of the motors at the instant of the last state
+        self._acting: Array | None = None  # the command that acts then
+        self._torque_share = 1.0 / torque_max
         self.resets: Counter[str] = Counter()
         self.innovation = zero.copy()
 
@@ -96,14 +104,9 @@ class StateEstimator:
         self._commands.open(stamp, periods)
         acted, *coming = self._commands.torques()
         if effort is not None and self._commands.silent:
-            coming = [None] * len(coming)
+            acted, coming = None, [None] * len(coming)
         before = self._tau
-        if effort is not None:
-            self._tau = effort
-        elif acted is not None:
-            self._tau = self._lag.end(before, acted)
-        else:
-            self._tau = self._model.torque_at(reported)
+        self._tau = self._torque(before, acted, reported, effort)
         state = reported
         if self._observer is not None:
             observer, mean = self._observer, self._lag.mean(before, self._tau)
@@ -120,6 +123,30 @@ class StateEstimator:
         if not np.isfinite(answer).all():
             return self._restart("the model diverged", stamp, reported, effort)
         return answer
+
+    def _torque(
+        self, before: Array, command: Array | None, reported: State, effort: Array | None
+    ) -> Array:
+        """Return the motors' torque now, one period after `before`, shape (n,), N m.
+
+        A command is without the noise of what is reported, which only tells whether it came.
+        """
+        kept, self._acting = self._acting, command
+        if command is None:
+            return self._model.torque_at(reported) if effort is None else effort
+        expected = self._lag.end(before, command)
+        if effort is None:
+            return expected
+        off = self._distance(effort, expected)
+        if kept is not None and kept is not command:
+            unchanged = self._lag.end(before, kept)
+            if (off_unchanged := self._distance(effort, unchanged)) < off:
+                expected, off, self._acting = unchanged, off_unchanged, kept
+        return expected if off < DISAGREES**2 else effort
+
+    def _distance(self, effort: Array, expected: Array) -> float:
+        share = self._torque_share * (effort - expected)
+        return float(share @ share)
 
     def _periods_since_last(self, stamp: int) -> int:
         """Return how many periods a state is after the last one; 0 to start anew."""
@@ -140,6 +167,7 @@ class StateEstimator:
         self._commands.clear()
         self._commands.open(stamp)
         self._model.a = np.zeros(len(self._tau))
+        self._acting = None
         self._tau = self._model.torque_at(reported) if effort is None else effort
         if self._observer is not None:
             self._observer.state = reported
