@@ -24,6 +24,7 @@ from sim_bridge.scenario.scenario import ScenarioConfiguration
 from torque_safety_controller.node import topics as controller_topics
 from torque_safety_controller.parameters import ControllerConfiguration
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
+from viability_bounds_pkg.node.estimator_parameters import EstimatorConfiguration
 from viability_bounds_pkg.parameter import REQUIRED, Parameter, parameter_table
 from viability_bounds_pkg.ros.topics import SHARED_TOPICS, OfferedService, Topic
 
@@ -31,6 +32,7 @@ ROOT = Path(__file__).resolve().parent.parent
 MISTAKES = ROOT / "test" / "mistakes.yaml"
 CONFIGURATIONS = {
     "bounds_node": BoundsConfiguration,
+    "estimator_node": EstimatorConfiguration,
     "controller_node": ControllerConfiguration,
     "bullet_node": BulletConfiguration,
     "scenario_node": ScenarioConfiguration,

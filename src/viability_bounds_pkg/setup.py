@@ -36,6 +36,7 @@ setup(
     entry_points={
         "console_scripts": [
             "bounds_node = viability_bounds_pkg.cli.ros_program:bounds_node",
+            "estimator_node = viability_bounds_pkg.cli.ros_program:estimator_node",
             "estimate_acceleration_limits = "
             "viability_bounds_pkg.cli.ros_program:estimate_acceleration_limits",
         ],

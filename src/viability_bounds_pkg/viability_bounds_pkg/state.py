@@ -19,3 +19,8 @@ class State(NamedTuple):
 
     q: NDArray[np.float64]
     v: NDArray[np.float64]
+
+    def after(self, a: NDArray[np.float64], dt: float) -> State:
+        """Return the state after time `dt` at constant acceleration `a`, shape (n,), rad/s^2."""
+        dv = dt * a
+        return State(self.q + dt * (self.v + 0.5 * dv), self.v + dv)

@@ -25,16 +25,16 @@ from sim_bridge.hardware.sensing import JointReading, Sensing
 from sim_bridge.nodes.bullet_parameters import BulletConfiguration, make_robot
 from sim_bridge.nodes.command_outage import CommandOutage
 from sim_bridge.nodes.ft_sensor import ForceTorqueReading
-from sim_bridge.nodes.joint_command import (
+from sim_bridge.nodes.topics import CLOCK, PAUSE, RESET
+from sim_bridge.nodes.world_subscriber import WorldSubscriber
+from viability_bounds_pkg.ros.arm_node import ArmNode
+from viability_bounds_pkg.ros.joint_command import (
     CommandError,
     JointCommand,
     PositionCommand,
     TorqueCommand,
     read_command,
 )
-from sim_bridge.nodes.topics import CLOCK, PAUSE, RESET
-from sim_bridge.nodes.world_subscriber import WorldSubscriber
-from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import Diagnostics
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run

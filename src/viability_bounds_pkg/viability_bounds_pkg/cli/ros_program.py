@@ -70,6 +70,11 @@ def bounds_node() -> int:
     return run_with_ros("bounds_node", "viability_bounds_pkg.node.bounds_node")
 
 
+def estimator_node() -> int:
+    """Run the estimator node."""
+    return run_with_ros("estimator_node", "viability_bounds_pkg.node.estimator_node")
+
+
 def estimate_acceleration_limits() -> int:
     """Run the estimator of acceleration limits."""
     return run_program("viability_bounds_pkg.cli.estimate_acceleration_limits")

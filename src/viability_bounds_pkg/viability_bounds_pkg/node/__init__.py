@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bounds node and its parameters."""
+"""The bounds node and the estimator node, and their parameters."""

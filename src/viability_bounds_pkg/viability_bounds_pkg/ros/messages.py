@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from array import array
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
@@ -21,6 +22,7 @@ from viability_bounds_pkg.exceptions import did_you_mean
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import DIAGNOSTICS, VALUES
+from viability_bounds_pkg.state import State
 
 Report = Callable[[], tuple[bytes, str, dict[str, Any]]]
 """Returns level, message and values of a status."""
@@ -135,6 +137,22 @@ class JointStateReader:
         if index is not None:
             tau = tau[index]
         return tau if np.isfinite(tau).all() else None
+
+    def with_state(self, state: State) -> JointState:
+        """Return the last accepted message with another state of the joints, all else as it is."""
+        if self._accepted is None:
+            raise LookupError("no message was accepted yet")
+        message, index = self._accepted
+        q, v = np.array(message.position), np.array(message.velocity)
+        q[slice(None) if index is None else index] = state.q
+        v[slice(None) if index is None else index] = state.v
+        return JointState(
+            header=message.header,
+            name=message.name,
+            position=array("d", q.tobytes()),
+            velocity=array("d", v.tobytes()),
+            effort=message.effort,
+        )
 
     def _match(self, names: Sequence[str]) -> str:
         """Take the order of joints from `names`; return the first that is missing, or nothing."""

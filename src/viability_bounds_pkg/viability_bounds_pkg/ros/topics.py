@@ -160,14 +160,14 @@ ROBOT_DESCRIPTION = Topic(
     String,
     LATCHED_QOS,
     ("bullet_node",),
-    ("bounds_node", "controller_node"),
+    ("bounds_node", "estimator_node", "controller_node"),
     "the URDF; read at start where the parameter `robot_description` is `topic`",
 )
 DIAGNOSTICS = Topic(
     "/diagnostics",
     DiagnosticArray,
     STATUS_QOS,
-    ("bounds_node", "controller_node", "bullet_node"),
+    ("bounds_node", "estimator_node", "controller_node", "bullet_node"),
     ("scenario_node",),
     "mode and why, refused messages by reason, margins, latency, solver, closest approach; the "
     "name of a status is that of its node with the namespace, as in `left/bullet_node`",
@@ -176,7 +176,7 @@ VALUES = Topic(
     "~/values",
     Float64MultiArray,
     STATUS_QOS,
-    ("bounds_node", "controller_node", "bullet_node"),
+    ("bounds_node", "estimator_node", "controller_node", "bullet_node"),
     (USER,),
     "the numbers in the node's diagnostics, to plot them: `data` has one quantity after the "
     "other, `layout.dim` the key of each as `label` and how many numbers it has as `size`, not "

@@ -102,21 +102,19 @@ class Observer:
     Args:
         design: gains.
         dt: control period, s.
+        state: to begin with.
 
     Attributes:
-        state: the estimate; set it to start anew.
+        state: the estimate.
     """
 
-    def __init__(self, design: ObserverDesign, dt: float) -> None:
-        n = len(design.position_gain)
+    def __init__(self, design: ObserverDesign, dt: float, state: State) -> None:
         self._l1, self._l2, self._dt = design.position_gain, design.velocity_gain, dt
-        self.state = State(np.zeros(n), np.zeros(n))
+        self.state = state
 
     def predict(self, a: Array) -> None:
         """Go on by a period with mean acceleration `a`, shape (n,), rad/s^2."""
-        q, v = self.state
-        dv = self._dt * a
-        self.state = State(q + self._dt * (v + 0.5 * dv), v + dv)
+        self.state = self.state.after(a, self._dt)
 
     def innovation(self, q: Array) -> Array:
         """Return how far measured positions `q` are from the estimate, shape (n,), rad."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -34,7 +35,7 @@ class PositionCommand(NamedTuple):
 JointCommand = TorqueCommand | PositionCommand
 
 
-def read_command(message: JointState, joints: list[str]) -> JointCommand:
+def read_command(message: JointState, joints: Sequence[str]) -> JointCommand:
     """Return the command for `joints`; further joints in the message are ignored.
 
     With efforts it is a torque command, and positions and velocities are ignored. Without efforts
@@ -50,7 +51,7 @@ def read_command(message: JointState, joints: list[str]) -> JointCommand:
     return PositionCommand(q, v)
 
 
-def _in_order(message: JointState, values: list[float], joints: list[str]) -> Array:
+def _in_order(message: JointState, values: list[float], joints: Sequence[str]) -> Array:
     """Return the `values` of `joints`, shape (n,)."""
     if len(values) != len(message.name):
         raise CommandError("wrong size")

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The estimator node: joint states in, joint states as commands will meet them out."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import Counter
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+from sensor_msgs.msg import JointState
+
+from viability_bounds_pkg.node.estimator_parameters import (
+    EstimatorConfiguration,
+    make_estimator,
+)
+from viability_bounds_pkg.robot_configuration import load_model
+from viability_bounds_pkg.ros.arm_node import ArmNode
+from viability_bounds_pkg.ros.joint_command import CommandError, TorqueCommand, read_command
+from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, PeriodCheck, Verdict
+from viability_bounds_pkg.ros.parameters import NodeParameters
+from viability_bounds_pkg.ros.program import run
+from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
+from viability_bounds_pkg.ros.robot_urdf import TOPIC, robot_urdf, warn_of_unusual
+from viability_bounds_pkg.ros.runtime import stamp_to_ns
+from viability_bounds_pkg.ros.topics import ESTIMATED_JOINT_STATES, JOINT_COMMANDS, JOINT_STATES
+from viability_bounds_pkg.state import State
+
+
+class EstimatorNode(ArmNode):
+    """Answers every joint state with the one in which the command that answers it will act.
+
+    Subscribes to ``joint_states`` and ``joint_commands``; publishes ``estimated_joint_states``
+    with the stamp and the effort of the state that it answers, and all other joints as they came.
+    """
+
+    NAME = "estimator_node"
+    PARAMETERS = EstimatorConfiguration
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__(**node_arguments)
+        with self.starting(ESTIMATED_JOINT_STATES):
+            parameters = NodeParameters(self, EstimatorConfiguration)
+            config = self._config = parameters.configuration
+            urdf = robot_urdf(config, self)
+            if config.robot_description != TOPIC:
+                warn_of_unusual(self, config, urdf)
+            self._estimator = make_estimator(config, load_model(config, urdf))
+        joints = config.joints
+        self._joints = list(joints)
+        self._observers = config.observers
+        self._reader = JointStateReader(joints, config.state_timeout, self._warn)
+        self._period = PeriodCheck(config.dt, self._warn)
+        self._refused: Counter[str] = Counter()
+        self._answered = self._restarts = 0
+        self._answer = JointState()
+        self._publisher = ESTIMATED_JOINT_STATES.publisher(self)
+        JOINT_STATES.subscription(self, self._on_state)
+        JOINT_COMMANDS.subscription(self, self._on_command)
+        self.publisher_watch = PublisherWatch(
+            self, [ESTIMATED_JOINT_STATES.name, JOINT_STATES.name, JOINT_COMMANDS.name]
+        )
+        self._diagnostics = Diagnostics(self, self._report, watch=self.publisher_watch)
+        source = "estimated" if config.velocity_estimation else "as reported"
+        lag = 1e3 * config.declared.motor_lag
+        self.announce(
+            joints,
+            config.rate_hz,
+            f"velocities {source}, delay of {config.declared.delay} periods, motors' lag of "
+            f"{lag.min():.3g} to {lag.max():.3g} ms",
+        )
+
+    def _warn(self, text: str) -> None:
+        self.get_logger().warning(text)
+
+    def _on_state(self, message: JointState) -> None:
+        reader = self._reader
+        verdict = reader.read(message, time.monotonic())
+        if verdict is Verdict.REFUSED:
+            return
+        if verdict is Verdict.NEW:
+            reported = State(reader.q, reader.v)
+            state = self._estimator.step(reader.stamp, reported, reader.effort())
+            self._answer = reader.with_state(state)
+            self._answered += 1
+        self._publisher.publish(self._answer)
+        if verdict is Verdict.NEW and self._estimator.resets.total() != self._restarts:
+            self._tell_restart()
+
+    def _tell_restart(self) -> None:
+        resets = self._estimator.resets
+        self._restarts = resets.total()
+        if self._restarts == 1:
+            (reason,) = resets
+            self._warn(f"starts anew from the reported state: {reason}; later ones are counted")
+
+    def _on_command(self, message: JointState) -> None:
+        try:
+            command = read_command(message, self._joints)
+        except CommandError as error:
+            self._refused[str(error)] += 1
+            if self._refused[str(error)] == 1:
+                self._warn(f"joint_commands refused: {error}")
+            return
+        tau = None
+        if isinstance(command, TorqueCommand):
+            tau_max = self._config.torque_max  # motors do not exceed it, whatever the command
+            tau = np.clip(command.tau, -tau_max, tau_max)
+        self._estimator.answer(stamp_to_ns(message.header.stamp), tau)
+
+    def _report(self) -> tuple[bytes, str, dict[str, Any]]:
+        config, estimator, reader = self._config, self._estimator, self._reader
+        self._period.look(reader)
+        values: dict[str, Any] = {
+            "velocity_estimation": config.velocity_estimation,
+            "delay_periods": config.declared.delay,
+            "motor_lag_s": config.declared.motor_lag,
+            "states_answered": self._answered,
+            "states_refused": reader.refused,
+            "commands_refused": self._refused,
+            "resets": estimator.resets,
+            "age_s": time.monotonic() - reader.heard_at,
+        }
+        if (design := self._observers) is not None:
+            values |= {
+                "velocity_lag_s": design.lag,
+                "velocity_noise_rad_s": design.noise,
+                "position_error_rad": design.position_error,
+                "velocity_error_rad_s": design.velocity_error,
+                "innovation_declared_rad": design.innovation,
+                "innovation_max_rad": estimator.innovation,
+            }
+        if reader.stamp < 0:
+            return DiagnosticStatus.WARN, "no joint state yet", values
+        if reader.refused:
+            return DiagnosticStatus.WARN, "joint states were refused", values
+        if estimator.resets:
+            return DiagnosticStatus.WARN, "started anew since the start", values
+        if design is not None and config.declared.position_error.any():
+            over = estimator.innovation > design.innovation
+            if over.any():
+                joint = self._joints[int(np.argmax(over))]
+                return DiagnosticStatus.WARN, f"errors of {joint} larger than declared", values
+        return DiagnosticStatus.OK, "answering", values
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the estimator node until it is told to stop."""
+    return run(EstimatorNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

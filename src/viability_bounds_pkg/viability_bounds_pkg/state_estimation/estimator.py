@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Joint states as reported in, joint states as commands will meet them out."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from viability_bounds_pkg.state import State
+from viability_bounds_pkg.state_estimation.observer import Observer, ObserverDesign
+from viability_bounds_pkg.state_estimation.prediction import (
+    ForwardModel,
+    MotorLag,
+    TorquesUnderWay,
+)
+
+Array = NDArray[np.float64]
+
+UNEXPECTED = 10.0
+"""Innovation from which on a state is taken for a jump, in what the declared errors explain."""
+
+SUDDEN = 0.1
+"""The same at least, in the way of a period at the greatest speed: a robot whose time stood still
+for a period, or that hit something, is found by it."""
+
+
+DISAGREES = 0.1
+"""From which difference on the torque that is reported is believed, and not a command, in torque
+limits, root sum square over the joints: brakes, or drives that stop by themselves."""
+
+
+class StateEstimator:
+    """Estimates the velocity, and predicts the state at the instant when a command will act.
+
+    A state that comes with stamp k is of an earlier instant, and the command that answers it acts
+    at a later one, `delay` periods apart. Between them the commands with the stamps k - delay to
+    k - 1 act. In the period before that instant it was command k - delay - 1, unless it was lost:
+    the torque that is reported with the state tells. See `docs/state_estimation.md`.
+
+    Args:
+        model: n joints with one coordinate each.
+        dt: control period, s.
+        delay: control periods from the instant of a state to that when its command begins to act.
+        motor_lag: time constants of the motors' torques, shape (n,), s; 0 without a lag.
+        observers: that estimate the velocities; None takes those that are reported.
+        velocity_max: speed limits, shape (n,), rad/s; tells jumps from motion.
+        torque_max: torque limits, shape (n,), N m.
+        longest_gap: control periods between two states that are bridged by the model.
+
+    Attributes:
+        resets: how often it started anew, by reason.
+        innovation: largest one seen since then, shape (n,), rad; not those of jumps.
+    """
+
+    def __init__(
+        self,
+        model: pin.Model,
+        dt: float,
+        delay: int,
+        motor_lag: Array,
+        observers: ObserverDesign | None,
+        velocity_max: Array,
+        torque_max: Array,
+        longest_gap: int = 1,
+    ) -> None:
+        zero = np.zeros(model.nv)
+        self._dt, self._dt_ns = dt, 1e9 * dt
+        self._longest_gap = longest_gap
+        self._model = ForwardModel(model, dt)
+        self._lag = MotorLag(motor_lag, dt)
+        self._commands = TorquesUnderWay(delay)
+        self._observer: Observer | None = None
+        self._jump = zero
+        if observers is not None:
+            self._observer = Observer(observers, dt, State(zero, zero))
+            self._jump = np.maximum(UNEXPECTED * observers.innovation, SUDDEN * dt * velocity_max)
+        self._stamp = -1
+        self._tau = zero  # of the motors at the instant of the last state
+        self._acting: Array | None = None  # the command that acts then
+        self._torque_share = 1.0 / torque_max
+        self.resets: Counter[str] = Counter()
+        self.innovation = zero.copy()
+
+    def answer(self, stamp: int, tau: Array | None) -> None:
+        """Take note of a command, see `TorquesUnderWay.answer`."""
+        self._commands.answer(stamp, tau)
+
+    def step(self, stamp: int, reported: State, effort: Array | None) -> State:
+        """Return the state at the instant when the command that answers `reported` will act.
+
+        Args:
+            stamp: of the reported state, another than that of the last one, ns.
+            reported: state of the joints.
+            effort: torque of the motors that is reported with it, shape (n,), N m; None where
+                there is none.
+        """
+        periods = self._periods_since_last(stamp)
+        self._stamp = stamp
+        if not periods:
+            return self._start(stamp, reported, effort)
+        self._commands.open(stamp, periods)
+        acted, *coming = self._commands.torques()
+        if effort is not None and self._commands.silent:
+            acted, coming = None, [None] * len(coming)
+        before = self._tau
+        self._tau = self._torque(before, acted, reported, effort)
+        state = reported
+        if self._observer is not None:
+            observer, mean = self._observer, self._lag.mean(before, self._tau)
+            for _ in range(periods):
+                observer.predict(self._model.acceleration(observer.state, mean))
+            innovation = observer.innovation(reported.q)
+            size = np.abs(innovation)
+            if not (size <= self._jump).all():
+                return self._restart("the state jumped", stamp, reported, effort)
+            np.maximum(self.innovation, size, out=self.innovation)
+            observer.correct(innovation)
+            state = observer.state
+        answer = self._predict(state, coming)
+        if not np.isfinite(answer).all():
+            return self._restart("the model diverged", stamp, reported, effort)
+        return answer
+
+    def _torque(
+        self, before: Array, command: Array | None, reported: State, effort: Array | None
+    ) -> Array:
+        """Return the motors' torque now, one period after `before`, shape (n,), N m.
+
+        A command is without the noise of what is reported, which only tells whether it came.
+        """
+        kept, self._acting = self._acting, command
+        if command is None:
+            return self._model.torque_at(reported) if effort is None else effort
+        expected = self._lag.end(before, command)
+        if effort is None:
+            return expected
+        off = self._distance(effort, expected)
+        if kept is not None and kept is not command:
+            unchanged = self._lag.end(before, kept)
+            if (off_unchanged := self._distance(effort, unchanged)) < off:
+                expected, off, self._acting = unchanged, off_unchanged, kept
+        return expected if off < DISAGREES**2 else effort
+
+    def _distance(self, effort: Array, expected: Array) -> float:
+        share = self._torque_share * (effort - expected)
+        return float(share @ share)
+
+    def _periods_since_last(self, stamp: int) -> int:
+        """Return how many periods a state is after the last one; 0 to start anew."""
+        if self._stamp < 0:
+            return 0
+        periods = max(1, round((stamp - self._stamp) / self._dt_ns))
+        if stamp > self._stamp and periods <= self._longest_gap:
+            return periods
+        self.resets["stamps jumped"] += 1
+        return 0
+
+    def _restart(self, why: str, stamp: int, reported: State, effort: Array | None) -> State:
+        self.resets[why] += 1
+        return self._start(stamp, reported, effort)
+
+    def _start(self, stamp: int, reported: State, effort: Array | None) -> State:
+        """Start anew from a reported state; nothing is known to be under way."""
+        self._commands.clear()
+        self._commands.open(stamp)
+        self._model.a = np.zeros(len(self._tau))
+        self._acting = None
+        self._tau = self._model.torque_at(reported) if effort is None else effort
+        if self._observer is not None:
+            self._observer.state = reported
+        answer = self._predict(reported, self._commands.torques()[1:])
+        return answer if np.isfinite(answer).all() else reported
+
+    def _predict(self, state: State, coming: list[Array | None]) -> State:
+        """Return a state after the commands that are under way, None for the torque as it is."""
+        model, lag, tau = self._model, self._lag, self._tau
+        accelerations = [model.a]
+        for command in coming:
+            after = tau if command is None else lag.end(tau, command)
+            accelerations.append(model.acceleration(state, lag.mean(tau, after)))
+            state = state.after(model.a, self._dt)
+            tau = after
+        if lag.any:
+            state = lag.lead(state, model.acceleration_at(state, tau))
+        # That of the period which the next state ends.
+        model.a = accelerations[min(1, len(coming))]
+        return state

@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The state in which a command will act: through the torques under way and the motors' lag."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from viability_bounds_pkg.state import State
+
+Array = NDArray[np.float64]
+
+
+class ForwardModel:
+    """Mean accelerations of an arm under torques held for a period.
+
+    They are those in the middle of the period, to which the last acceleration leads: of second
+    order in the period, as the torques of the controller are (`docs/torque_margin.md`).
+
+    Args:
+        model: n joints with one coordinate each.
+        dt: control period, s.
+
+    Attributes:
+        a: the last acceleration, shape (n,), rad/s^2.
+    """
+
+    def __init__(self, model: pin.Model, dt: float) -> None:
+        self._model, self._data, self._half = model, model.createData(), 0.5 * dt
+        self.a = np.zeros(model.nv)
+
+    def acceleration(self, state: State, tau: Array) -> Array:
+        """Return the mean acceleration of a period, shape (n,), rad/s^2.
+
+        Args:
+            state: at its beginning.
+            tau: mean torque, shape (n,), N m.
+        """
+        middle = state.after(self.a, self._half)
+        self.a = np.array(pin.aba(self._model, self._data, middle.q, middle.v, tau))
+        return self.a
+
+    def acceleration_at(self, state: State, tau: Array) -> Array:
+        """Return the acceleration at an instant, shape (n,), rad/s^2."""
+        a: Array = pin.aba(self._model, self._data, state.q, state.v, tau)
+        return a
+
+    def torque_at(self, state: State) -> Array:
+        """Return the torque under which the joints do not accelerate, shape (n,), N m."""
+        return np.array(pin.nonLinearEffects(self._model, self._data, state.q, state.v))
+
+
+class MotorLag:
+    """First-order lag of the motors' torques.
+
+    Args:
+        time_constant: of each motor, shape (n,), s; 0 without a lag.
+        dt: control period, s.
+
+    Attributes:
+        any: whether any motor has a lag.
+    """
+
+    def __init__(self, time_constant: Array, dt: float) -> None:
+        self._lag = time_constant
+        self.any = bool(time_constant.any())
+        self._remains = np.exp(-dt / np.where(time_constant > 0.0, time_constant, 1e-9 * dt))
+        # The mean of an exponential between two values: the integral of the torque's equation,
+        # lag tau' = command - tau, over the period.
+        self._before = time_constant / dt - self._remains / (1.0 - self._remains)
+
+    def end(self, tau: Array, command: Array) -> Array:
+        """Return the torque after a period of `command` from `tau` on, shape (n,), N m."""
+        return command + self._remains * (tau - command) if self.any else command
+
+    def mean(self, before: Array, after: Array) -> Array:
+        """Return the mean torque of a period between those at its ends, shape (n,), N m."""
+        return after + self._before * (before - after) if self.any else after
+
+    def lead(self, state: State, a: Array) -> State:
+        """Return (q + lag v, v + lag a): the double integrator that the commands drive.
+
+        Args:
+            state: of the joints.
+            a: their acceleration, shape (n,), rad/s^2.
+        """
+        return State(state.q + self._lag * state.v, state.v + self._lag * a)
+
+
+class TorquesUnderWay:
+    """The commands that have been sent but do not act yet, and the one that acted last.
+
+    Each joint state opens a slot for the command that answers it. A slot without an answer keeps
+    the torque of the one before, as the robot does.
+
+    Args:
+        delay: control periods from the instant of a state to that when its command begins to act.
+    """
+
+    def __init__(self, delay: int) -> None:
+        # That of the state that came last is not under way yet.
+        self._slots: deque[_Slot] = deque(maxlen=delay + 2)
+        self._held: Array | None = None
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all commands."""
+        self._held = None
+        self._slots.extend(_Slot(-1) for _ in range(self._slots.maxlen or 0))
+
+    def open(self, stamp: int, periods: int = 1) -> None:
+        """Take note of a joint state.
+
+        Args:
+            stamp: its stamp, ns.
+            periods: since the last one; those between were lost, and nothing answers them.
+        """
+        for each in (*[-1] * (periods - 1), stamp):
+            oldest = self._slots[0]
+            if oldest.answered:
+                self._held = oldest.tau
+            self._slots.append(_Slot(each))
+
+    def answer(self, stamp: int, tau: Array | None) -> None:
+        """Take note of a command; of several for one state the first counts, as at the robot.
+
+        Args:
+            stamp: of the state that it answers, ns; others are ignored.
+            tau: torques, shape (n,), N m; None where the drives control positions.
+        """
+        for slot in self._slots:
+            if slot.stamp == stamp and not slot.answered:
+                slot.answered, slot.tau = True, tau
+
+    def torques(self) -> list[Array | None]:
+        """Return what acted in the period before the last state, and what acts in the next ones.
+
+        As many as the delay is long, and one; None where no torque is known.
+        """
+        held, commands = self._held, []
+        for slot in self._slots:
+            if slot.answered:
+                held = slot.tau
+            commands.append(held)
+        return commands[:-1]
+
+    @property
+    def silent(self) -> bool:
+        """Whether none of the states whose commands act now or later was answered."""
+        return not any(slot.answered for slot in self._slots)
+
+
+class _Slot:
+    """The command that answers one joint state."""
+
+    __slots__ = ("answered", "stamp", "tau")
+
+    def __init__(self, stamp: int) -> None:
+        self.stamp, self.answered = stamp, False
+        self.tau: Array | None = None
