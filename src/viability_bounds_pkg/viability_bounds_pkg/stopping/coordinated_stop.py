@@ -41,6 +41,9 @@ HORIZON = 2.0
 MARGIN = 0.05
 """Share of the acceleration limits that is the margin where none is given."""
 
+RETURN_SPEED = 0.1
+"""Speed of the way back from outside the position limits, as a share of the speed limit."""
+
 HOLD_GAIN = 30.0
 """omega, 1/s."""
 
@@ -152,18 +155,30 @@ class CoordinatedStop:
         if self._share:
             self._observe(q, v)
         h = self._dt
-        bounds = self._solver.bounds(q, v)
-        a = np.minimum(np.maximum(self._wanted(q, v), bounds.lower), bounds.upper)
+        lower, upper = self._interval(q, v)
+        a = np.minimum(np.maximum(self._wanted(q, v), lower), upper)
         q_mid, v_mid = q + 0.5 * h * v + 0.125 * h * h * a, v + 0.5 * h * a
         tau = self._inverse_dynamics(q_mid, v_mid, a) - self._disturbance
         feasible = bool((np.abs(tau) <= self._tau_max).all())
         if self._share or not feasible:
             self._M = self._mass_matrix(q_mid)
         if not feasible:
-            tau, a = self._limited(tau, a, bounds.lower, bounds.upper)
+            tau, a = self._limited(tau, a, lower, upper)
         self.acceleration = a
         self._expected = v + h * a
         return tau
+
+    def _interval(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return the exact bounds; a joint that is back from outside need not hurry further in."""
+        lower, upper, _ = self._solver.bounds(q, v)
+        above, below = q > self._limits.q_max, q < self._limits.q_min
+        if above.any() or below.any():
+            speed, time = RETURN_SPEED * self._limits.v_max, HORIZON * self._dt
+            gentle = np.minimum((-speed - v) / time, self._limits.a_max)
+            upper = np.where(above & (v <= 0.0), np.maximum(upper, gentle), upper)
+            gentle = np.maximum((speed - v) / time, self._limits.a_min)
+            lower = np.where(below & (v >= 0.0), np.minimum(lower, gentle), lower)
+        return lower, upper
 
     def _wanted(self, q: Array, v: Array) -> Array:
         """Return accelerations that stop the arm, or hold it, regardless of its limits."""
@@ -192,6 +207,9 @@ class CoordinatedStop:
         """Return torques within their limits, and accelerations that they give."""
         M, tau_max = self._M, self._tau_max
         assert M is not None
+        # More than the acceleration limits costs no other limit.
+        lower = np.where(lower <= self._limits.a_min, -np.inf, lower)
+        upper = np.where(upper >= self._limits.a_max, np.inf, upper)
         nearest = within_torque_limits(a, lower, upper, self._scale, M, tau, tau_max)
         given = np.clip(tau + M @ (nearest - a), -tau_max, tau_max)
         return given, a + np.linalg.solve(M, given - tau)

@@ -10,13 +10,13 @@ from viability_bounds_pkg.compiled import compiled
 
 Array = NDArray[np.float64]
 
-ROUNDS = 300
+ROUNDS = 500
 """Largest number of passes over all limits."""
 
 ACCURACY = 1e-9
 """Change in a pass, as a share of an acceleration limit, at which the iteration ends."""
 
-STIFFNESS = 100.0
+STIFFNESS = 1000.0
 """How much a departure from the interval counts beside one from the wanted acceleration."""
 
 
