@@ -37,6 +37,7 @@ from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.bullet.position_drive import PositionDrive
 from sim_bridge.bullet.vectors import finite_vector
 from sim_bridge.hardware.motors import Motors
+from viability_bounds_pkg.stopping.coordinated_stop import CoordinatedStop
 
 Array = NDArray[np.float64]
 
@@ -103,7 +104,7 @@ class BulletRobot(BulletBody):
         self._asked, self._motors = np.zeros(n), motors
         self._brakes = np.zeros(n)
         self._drive: PositionDrive | None = None  # made when first needed: it builds a model
-        self._driving = False
+        self._driving = self._stopping = False
         self._stepped = False  # since the last reset
 
     def reset(self, q: ArrayLike, v: ArrayLike) -> None:
@@ -120,7 +121,7 @@ class BulletRobot(BulletBody):
         self._motor_torque.fill(0.0)
         if self._motors is not None:
             self._motors.reset()
-        self._driving = self._stepped = False
+        self._driving = self._stopping = self._stepped = False
 
     def step(self, tau: ArrayLike, substeps: int = 1) -> None:
         """Apply joint torques for some physics steps.
@@ -130,7 +131,7 @@ class BulletRobot(BulletBody):
             substeps: how many physics steps, at least 1.
         """
         tau = finite_vector("tau", tau, len(self.joints))
-        self._driving = False
+        self._driving = self._stopping = False
         self._release_brakes()
         self._asked[:] = tau
         self._advance(substeps)
@@ -158,6 +159,7 @@ class BulletRobot(BulletBody):
         q_des, v_des = finite_vector("q", q, n), finite_vector("v", v, n)
         v_max = finite_vector("speed_limits", speed_limits, n, signed=False)
         tau_max = finite_vector("torque_limits", torque_limits, n, signed=False)
+        self._stopping = False
         self._release_brakes()
         drive = self._drive = self._drive or PositionDrive(
             *self.description, self._rotor_inertia, self.physics_dt
@@ -183,13 +185,28 @@ class BulletRobot(BulletBody):
             torque_limits: greatest torque of each brake, shape (n,), N m, not negative.
         """
         limits = finite_vector("torque_limits", torque_limits, len(self.joints), signed=False)
-        self._driving = False
+        self._driving = self._stopping = False
         if self._motors is not None:
             self._motors.switch_off()
         self._brakes[:] = limits
         if self._friction is None:
             self._set_brakes(limits)
         self._advance(substeps, braking=True)
+
+    def stop(self, law: CoordinatedStop, substeps: int = 1) -> None:
+        """Let the drives bring the arm to rest within its limits, and hold it there.
+
+        Args:
+            law: for the joints of this robot in their order, with its physics step; a stop begins
+                when the last call was of another method.
+            substeps: how many physics steps, at least 1.
+        """
+        if not self._stopping:
+            self._driving = False
+            self._release_brakes()
+            law.begin(*self.state()[:2])
+            self._stopping = True
+        self._advance(substeps, lambda: law.torque(*self.state()[:2]))
 
     def state(self) -> RobotState:
         """Return the joint state, in new arrays."""

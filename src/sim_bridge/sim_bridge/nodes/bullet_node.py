@@ -22,7 +22,7 @@ from std_srvs.srv import SetBool, Trigger
 from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.hardware.communication import CommandPath
 from sim_bridge.hardware.sensing import JointReading, Sensing
-from sim_bridge.nodes.bullet_parameters import BulletConfiguration, make_robot
+from sim_bridge.nodes.bullet_parameters import BulletConfiguration, make_robot, make_stop
 from sim_bridge.nodes.command_outage import CommandOutage
 from sim_bridge.nodes.ft_sensor import ForceTorqueReading
 from sim_bridge.nodes.topics import CLOCK, PAUSE, RESET
@@ -51,7 +51,7 @@ from viability_bounds_pkg.ros.topics import (
 _RETRY_PERIOD = 0.2
 _STRAYS = 50
 _LATENCIES_KEPT = 100_000
-_CONTROL = {type(None): "brakes", TorqueCommand: "torque", PositionCommand: "position"}
+_CONTROL = {TorqueCommand: "torque", PositionCommand: "position"}
 
 
 class BulletNode(ArmNode):
@@ -63,9 +63,9 @@ class BulletNode(ArmNode):
 
     With ``clock: real_time`` each control period has its duration on the wall clock. A command
     that comes within the period of the state with its stamp acts during that period; without one
-    the last command is held, and after ``command_timeout`` periods the robot brakes. With
-    ``clock: lockstep`` a period ends when the command with its stamp has come, without a limit of
-    time.
+    the last command is held, and after ``command_timeout`` periods the robot stops itself: within
+    its limits where acceleration limits are given, by its brakes where not. With ``clock:
+    lockstep`` a period ends when the command with its stamp has come, without a limit of time.
 
     The robot's brakes are on until the first command.
 
@@ -83,6 +83,7 @@ class BulletNode(ArmNode):
             config = self._node_parameters.configuration
             warn_of_unusual(self, config, config.urdf)
             self._robot = make_robot(config)
+            self._stop = make_stop(config)
         self._config = config
         self._monitor = LimitMonitor(
             config.position_min, config.position_max, config.velocity_max, config.torque_max
@@ -207,7 +208,10 @@ class BulletNode(ArmNode):
         if command is None:
             # No command can have arrived before the first one's delay.
             self._braked += self._periods >= config.imperfections.command_delay
-            self._robot.brake(config.substeps, config.torque_max)
+            if self._stop is not None and self._outage.commanded:
+                self._robot.stop(self._stop, config.substeps)
+            else:
+                self._robot.brake(config.substeps, config.torque_max)
         elif isinstance(command, TorqueCommand):
             self._robot.step(command.tau, config.substeps)
         else:
@@ -312,16 +316,24 @@ class BulletNode(ArmNode):
 
     # Diagnostics
 
+    def _control(self) -> str:
+        """Return what moves or holds the robot."""
+        if self._command is not None:
+            return _CONTROL[type(self._command)]
+        if self._stop is None or not self._outage.commanded:
+            return "brakes"
+        return "stopped" if self._stop.at_rest else "stopping"
+
     def _report(self) -> tuple[bytes, str, dict[str, Any]]:
         monitor = self._monitor
         latencies = np.array(self._latencies) if self._latencies else np.full(1, np.nan)
         median, slow = np.percentile(latencies, (50, 99)) * 1e6
         elapsed = time.monotonic() - self._started_at
-        obstacles = self._robot.obstacles
+        obstacles, control = self._robot.obstacles, self._control()
         values = {
             "clock": "lockstep" if self._config.lockstep else "real_time",
             "paused": self._paused,
-            "control": _CONTROL[type(self._command)],
+            "control": control,
             "stamp_ns": self._stamp,
             "period_s": self._config.dt,
             "periods": self._periods,
@@ -349,7 +361,8 @@ class BulletNode(ArmNode):
         if self._paused:
             return DiagnosticStatus.OK, "paused", values
         if self._command is None:
-            return DiagnosticStatus.WARN, "braking: no commands", values
+            doing = "braking" if control == "brakes" else control
+            return DiagnosticStatus.WARN, f"{doing}: no commands", values
         return DiagnosticStatus.OK, "running", values
 
     def destroy_node(self) -> None:

@@ -19,8 +19,10 @@ from sim_bridge.hardware.imperfections import Imperfections
 from sim_bridge.hardware.motors import Motors
 from sim_bridge.nodes.ft_sensor import SensorConfiguration
 from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
 from viability_bounds_pkg.parameter import (
     FINITE,
+    NEGATIVE,
     NOT_NEGATIVE,
     POSITIVE,
     Range,
@@ -35,11 +37,19 @@ from viability_bounds_pkg.parameter import (
     whole_number,
 )
 from viability_bounds_pkg.robot_configuration import ControlRate, LimitedRobotConfiguration
-from viability_bounds_pkg.robot_description import RobotDescriptionError
+from viability_bounds_pkg.robot_description import (
+    RobotDescriptionError,
+    build_model,
+    kinematic_order,
+)
+from viability_bounds_pkg.stopping.coordinated_stop import CoordinatedStop
 
 Array = NDArray[np.float64]
 
 CLOCKS = ("real_time", "lockstep")
+
+_OBSERVER_TIME = 0.002
+"""Of the drives' own stop, s: their velocities are exact."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -58,9 +68,22 @@ class BulletConfiguration(ControlRate, LimitedRobotConfiguration):
         choices=CLOCKS,
     )
     command_timeout: int = whole_number(
-        "control periods that the last command is held for before the robot brakes",
+        "control periods that the last command is held for before the robot stops itself",
         Range(1, 1000),
         default=5,
+    )
+    acceleration_min: Array = joint_numbers(
+        "lower acceleration limits when the robot stops itself, rad/s^2; it brakes with all its "
+        "torque if empty",
+        NEGATIVE,
+        default=(),
+        note="together with acceleration_max",
+    )
+    acceleration_max: Array = joint_numbers(
+        "upper acceleration limits when the robot stops itself, rad/s^2",
+        POSITIVE,
+        default=(),
+        note="together with acceleration_min",
     )
     start_paused: bool = switch("wait for the pause service before moving", default=False)
     pause_after: float = number(
@@ -116,6 +139,10 @@ class BulletConfiguration(ControlRate, LimitedRobotConfiguration):
         static = self.friction_static
         if len(static) and not (static >= self.friction_coulomb).all():
             raise SettingError("friction_static", static, "at least friction_coulomb everywhere")
+        if len(self.acceleration_min) != len(self.acceleration_max):
+            name = "acceleration_max" if len(self.acceleration_min) else "acceleration_min"
+            allowed = f"{len(self.joints)} numbers, because the other limit is given"
+            raise SettingError(name, getattr(self, name), allowed)
         links, scales = self.mass_scale_links, self.mass_scales
         if len(set(links)) != len(links):
             raise SettingError("mass_scale_links", links, "links of the URDF, each once")
@@ -184,6 +211,37 @@ def make_robot(config: BulletConfiguration) -> BulletRobot:
     except RobotDescriptionError as error:
         name, value, allowed = _culprit(config)
         raise SettingError(name, value, f"{allowed} ({error})") from error
+
+
+def make_stop(config: BulletConfiguration) -> CoordinatedStop | None:
+    """Return the law by which the robot stops itself; None without acceleration limits.
+
+    It keeps the robot's positions clear of the limits by the way that a joint can make from rest
+    in a physics step: PyBullet's are that much ahead at most.
+
+    Raises:
+        SettingError: limits that a physics step is too long for.
+    """
+    if not len(config.acceleration_min):
+        return None
+    dt, order = config.dt / config.substeps, kinematic_order(config.urdf, config.joints)
+    inertia = config.rotor_inertia[[config.joints.index(name) for name in order]]
+    model = build_model(config.urdf, order, config.locked, inertia)
+    a_min, a_max = config.acceleration_min, config.acceleration_max
+    clearance = 0.5 * dt * dt * np.maximum(-a_min, a_max)
+    try:
+        limits = JointLimits(
+            config.joints,
+            config.position_min + clearance,
+            config.position_max - clearance,
+            config.velocity_max,
+            a_min,
+            a_max,
+        )
+        return CoordinatedStop(model, limits, config.torque_max, dt, observer_time=_OBSERVER_TIME)
+    except JointLimitsError as error:
+        allowed = f"limits that can be kept in steps of {dt:g} s ({error})"
+        raise SettingError("acceleration_max", a_max, allowed) from error
 
 
 def _culprit(config: BulletConfiguration) -> tuple[str, Any, str]:

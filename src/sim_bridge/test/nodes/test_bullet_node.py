@@ -30,6 +30,8 @@ VALUES = read_config("panda", "bullet_node")
 JOINTS = VALUES["joints"]
 MODEL = build_model(read_urdf(VALUES["robot_description"]), JOINTS)
 Q = np.array(VALUES["start_positions"])
+BRAKES = {"acceleration_min": [], "acceleration_max": []}
+"""Without acceleration limits the robot brakes when commands stop."""
 PERIOD = 2_000_000  # ns, of the configured 500 Hz
 
 
@@ -222,7 +224,7 @@ def test_control_changes_at_any_time_without_a_jump(ros):
 
 
 def test_positions_are_held_for_the_time_out_and_then_braked(ros):
-    robot = RobotProbe(ros, clock="real_time", rate_hz=100.0, command_timeout=3)
+    robot = RobotProbe(ros, clock="real_time", rate_hz=100.0, command_timeout=3, **BRAKES)
     ros.wait_until(
         lambda: robot.reported("control") == "position",
         each=lambda: robot.send(robot.stamp, q=Q),
@@ -566,7 +568,7 @@ def test_robot_description_and_clock_are_published(ros):
 
 
 def test_in_real_time_it_keeps_its_rate_and_brakes_without_commands(ros):
-    robot = RobotProbe(ros, clock="real_time", rate_hz=100.0, command_timeout=3)
+    robot = RobotProbe(ros, clock="real_time", rate_hz=100.0, command_timeout=3, **BRAKES)
     # Not one command yet: the brakes hold it, and no deadline has been missed.
     ros.wait_until(lambda: int(robot.reported("braked_periods") or 0) > 10)
     assert robot.reported("deadline_misses") == "0"

@@ -2,8 +2,8 @@
 from sim_bridge.nodes.command_outage import CommandOutage
 
 
-def news(outage, *braked):
-    return [text for each in braked if (text := outage.count(each))]
+def news(outage, *silent):
+    return [text for each in silent if (text := outage.count(each))]
 
 
 def test_nothing_is_said_before_the_first_command():
@@ -12,9 +12,9 @@ def test_nothing_is_said_before_the_first_command():
 
 def test_an_outage_is_told_once_when_it_begins_and_once_when_it_is_over():
     outage = CommandOutage(5, 3)
-    assert news(outage, False, True) == ["no command for 6 periods: braking until they are back"]
+    assert news(outage, False, True) == ["no command for 6 periods: stopping until they are back"]
     # A busy machine: commands come and go, none for as long as it takes to count as back.
     assert news(outage, *[True, False, True, False, False] * 100, True) == []
     (end,) = news(outage, *[False] * 50)
-    assert end == "commands are back; the robot braked for 202 periods"
+    assert end == "commands are back; the robot stopped itself for 202 periods"
     assert len(news(outage, True, *[False] * 3)) == 2

@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Brings an arm to rest with all limits kept: `docs/stopping.md` derives and proves it.
+
+At each step of the drive, h, the joints slow down in proportion to their speeds, so that the arm
+keeps its direction and all joints come to rest together, as soon as their acceleration limits
+allow:
+
+    T = max_i abs(v_i) / A_i,    a_i = -v_i / max(T, h),
+
+where A_i is a_max for a joint that moves backwards and -a_min otherwise. A joint whose limits need
+more braking brakes more: a is clipped to the exact acceleration bounds. The torque is that of the
+inverse dynamics in the middle of the step. Where a motor cannot give it the accelerations change
+by the least amount, see `within_torque_limits`.
+
+At rest the joints hold the place where they are, by the same law with another wish,
+
+    a = omega^2 (q_rest - q) - 2 omega v.
+
+With an observer, what the joints accelerate more than commanded is attributed to a torque that
+acts on the joints (friction, a payload, a push), and this torque is balanced.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError, joint_array
+from viability_bounds_pkg.stopping.torque_limits import within_torque_limits
+from viability_bounds_pkg.viability import BoundsSolver
+
+Array = NDArray[np.float64]
+
+HORIZON = 2.0
+"""Horizon of the bounds in steps: one late call is covered, and the bounds do not chatter."""
+
+MARGIN = 0.05
+"""Share of the acceleration limits that is the margin where none is given."""
+
+RETURN_SPEED = 0.1
+"""Speed of the way back from outside the position limits, as a share of the speed limit."""
+
+HOLD_GAIN = 30.0
+"""omega, 1/s."""
+
+HOLD_WINDOW = 2e-4
+"""Distance from the place held within which the observer rests, rad: no stick-slip."""
+
+GIVE_WAY = 0.02
+"""Distance from the place held at which the arm stops anew instead of going back, rad."""
+
+
+class CoordinatedStop:
+    """A law for the drives of an arm that brings it to rest and holds it, without commands.
+
+    Call `begin` once when commands stop, then `torque` at each step of the drive. Arrays are of
+    shape (n,), in the order of `limits.names`.
+
+    Args:
+        model: the arm, with the joints of `limits` in any order, one degree of freedom each.
+        limits: those of the arm that must be kept; accelerations that the motors can give.
+        tau_max: torque limits of the motors, N m.
+        dt: step of the drive, between two calls of `torque`, s.
+        margin: how far accelerations may be off within a step, rad/s^2; 5 % of the smaller
+            acceleration limit where not given.
+        observer_time: time constant of the observer of disturbances, s; inf for none. It needs
+            velocities whose noise is far below the acceleration limits times this time.
+        rest_speed: the arm is at rest when no joint is faster, rad/s; above the noise of the
+            velocities.
+
+    Attributes:
+        acceleration: chosen in the last step, rad/s^2.
+        at_rest: whether the arm came to rest and is held.
+
+    Raises:
+        JointLimitsError: other joints in `limits` than in `model`, or numbers that cannot be.
+        SettingError: a time or a speed that is not positive.
+    """
+
+    def __init__(
+        self,
+        model: pin.Model,
+        limits: JointLimits,
+        tau_max: ArrayLike,
+        dt: float,
+        margin: ArrayLike | None = None,
+        *,
+        observer_time: float = math.inf,
+        rest_speed: float = 1e-3,
+    ) -> None:
+        names = list(model.names)[1:]
+        if sorted(names) != sorted(limits.names) or model.nv != len(names):
+            allowed = f"must be the joints of the model: {', '.join(names)}"
+            raise JointLimitsError("names", None, list(limits.names), allowed)
+        torques = joint_array("tau_max", tau_max, limits.names)
+        for name, value in zip(limits.names, torques.tolist(), strict=True):
+            if not (math.isfinite(value) and value > 0.0):
+                raise JointLimitsError("tau_max", name, value, "must be finite and positive")
+        for setting, value in (("observer_time", observer_time), ("rest_speed", rest_speed)):
+            if not value > 0.0:
+                raise SettingError(setting, value, "a number > 0")
+        if margin is None:
+            margin = MARGIN * np.minimum(-limits.a_min, limits.a_max)
+        self._solver = BoundsSolver(limits, HORIZON * dt, margin, period=dt)
+        self._limits, self._dt, self._tau_max = limits, dt, torques
+        # Where the joints of the model are in the caller's arrays, and the other way round.
+        self._order = np.array([limits.names.index(name) for name in names])
+        self._back = np.argsort(self._order)
+        self._in_order = bool((self._order == np.arange(len(names))).all())
+        self._model, self._data = model, model.createData()
+        self._share = 0.0 if math.isinf(observer_time) else -math.expm1(-dt / observer_time)
+        self._rest_speed = rest_speed
+        self._scale = 0.5 * (limits.a_max - limits.a_min)
+        self.begin(np.zeros(len(names)), np.zeros(len(names)))
+
+    def begin(self, q: ArrayLike, v: ArrayLike) -> None:
+        """Begin a stop; what an earlier one held and observed is forgotten.
+
+        Args:
+            q: positions, rad.
+            v: velocities, rad/s.
+        """
+        n = len(self._limits)
+        q = joint_array("q", q, self._limits.names)
+        v = joint_array("v", v, self._limits.names)
+        self.acceleration: Array = np.zeros(n)
+        self.at_rest = False
+        self._place = q.copy()
+        self._disturbance = np.zeros(n)
+        self._expected = v.copy()
+        self._M: Array | None = None
+
+    def time_to_rest(self, v: Array) -> float:
+        """Return how long the arm takes from velocities `v` to rest at most, but for a few steps.
+
+        Args:
+            v: velocities, rad/s.
+        """
+        braking = np.where(v > 0.0, -self._limits.a_min, self._limits.a_max)
+        return float((np.abs(v) / braking).max())
+
+    def torque(self, q: Array, v: Array) -> Array:
+        """Return the torques of the motors for the next step of the drive, N m.
+
+        They are finite and within the torque limits for every finite state.
+
+        Args:
+            q: positions, rad.
+            v: velocities, rad/s.
+        """
+        if self._share:
+            self._observe(q, v)
+        h = self._dt
+        lower, upper = self._interval(q, v)
+        a = np.minimum(np.maximum(self._wanted(q, v), lower), upper)
+        q_mid, v_mid = q + 0.5 * h * v + 0.125 * h * h * a, v + 0.5 * h * a
+        tau = self._inverse_dynamics(q_mid, v_mid, a) - self._disturbance
+        feasible = bool((np.abs(tau) <= self._tau_max).all())
+        if self._share or not feasible:
+            self._M = self._mass_matrix(q_mid)
+        if not feasible:
+            tau, a = self._limited(tau, a, lower, upper)
+        self.acceleration = a
+        self._expected = v + h * a
+        return tau
+
+    def _interval(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return the exact bounds; a joint that is back from outside need not hurry further in."""
+        lower, upper, _ = self._solver.bounds(q, v)
+        above, below = q > self._limits.q_max, q < self._limits.q_min
+        if above.any() or below.any():
+            speed, time = RETURN_SPEED * self._limits.v_max, HORIZON * self._dt
+            gentle = np.minimum((-speed - v) / time, self._limits.a_max)
+            upper = np.where(above & (v <= 0.0), np.maximum(upper, gentle), upper)
+            gentle = np.maximum((speed - v) / time, self._limits.a_min)
+            lower = np.where(below & (v >= 0.0), np.minimum(lower, gentle), lower)
+        return lower, upper
+
+    def _wanted(self, q: Array, v: Array) -> Array:
+        """Return accelerations that stop the arm, or hold it, regardless of its limits."""
+        if not self.at_rest and float(np.abs(v).max()) <= self._rest_speed:
+            self.at_rest = True
+            self._place = np.clip(q, self._limits.q_min, self._limits.q_max)
+        if self.at_rest:
+            off = self._place - q
+            if float(np.abs(off).max()) <= GIVE_WAY:
+                return HOLD_GAIN * (HOLD_GAIN * off - 2.0 * v)
+            self.at_rest = False
+        return -v / max(self.time_to_rest(v), self._dt)
+
+    def _observe(self, q: Array, v: Array) -> None:
+        """Attribute what the last step's velocity is off to a torque, but for a joint at rest."""
+        if self._M is None:
+            return
+        torque = self._M @ ((v - self._expected) / self._dt)
+        change = self._disturbance + self._share * torque
+        settled = self.at_rest & (np.abs(self._place - q) < HOLD_WINDOW)
+        self._disturbance = np.where(
+            settled, self._disturbance, np.clip(change, -self._tau_max, self._tau_max)
+        )
+
+    def _limited(self, tau: Array, a: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+        """Return torques within their limits, and accelerations that they give."""
+        M, tau_max = self._M, self._tau_max
+        assert M is not None
+        # More than the acceleration limits costs no other limit.
+        lower = np.where(lower <= self._limits.a_min, -np.inf, lower)
+        upper = np.where(upper >= self._limits.a_max, np.inf, upper)
+        nearest = within_torque_limits(a, lower, upper, self._scale, M, tau, tau_max)
+        given = np.clip(tau + M @ (nearest - a), -tau_max, tau_max)
+        return given, a + np.linalg.solve(M, given - tau)
+
+    def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
+        if self._in_order:
+            return np.array(pin.rnea(self._model, self._data, q, v, a))
+        order = self._order
+        tau: Array = pin.rnea(self._model, self._data, q[order], v[order], a[order])
+        return tau[self._back]
+
+    def _mass_matrix(self, q: Array) -> Array:
+        """Return the symmetric mass matrix, shape (n, n), in the caller's order."""
+        M: Array = pin.crba(self._model, self._data, q[self._order])
+        return M[np.ix_(self._back, self._back)]
