@@ -73,7 +73,9 @@ def main() -> None:
             {"integral_action": "task", "friction_compensation": 1.0}, False, None
         ),
         "yielding to a pull": Timed(
-            FORCES | {"integral_action": "task", "dual_compliance": True}, False, 5.0 * PUSH
+            FORCES | {"integral_action": "task", "yield_threshold": [10.0, 2.0]},
+            False,
+            5.0 * PUSH,
         ),
         "pressing: admittance and a contact's force": Timed(
             FORCES | {"integral_action": "task"}, True, PUSH

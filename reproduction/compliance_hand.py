@@ -16,7 +16,7 @@ from figure import Figure, verdict
 from sim_bridge.bullet.obstacles import Obstacle
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory, TrajectoryPoint
 
-DUAL = {"integral_action": "task", "dual_compliance": True}
+DUAL = {"integral_action": "task", "yield_threshold": [10.0, 2.0]}
 PULL = np.array([20.0, 0.0, 0.0])  # N
 ELBOW_PUSH = np.array([60.0, 72.0, 37.0])  # N; the null space yields there
 TARE = 0.5  # s

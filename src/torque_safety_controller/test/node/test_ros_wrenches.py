@@ -29,7 +29,7 @@ FORCES = {
     "ft_tool": [0.0, 0.0, 0.0, 0.0],
     "ft_timeout": 0.021,
     "force_directions": [0.0, 0.0, 1.0, 0.0, 0.0, 0.0],
-    "dual_compliance": True,
+    "yield_threshold": [10.0, 2.0],
     "contacts": ["{frame: panda_hand, point: [0, 0, 0.1], normal: [0, 0, -1], friction: 0.5}"],
 }
 VALUES = {k: v for k, v in (read_config("panda", NODE) | FORCES).items() if k in KNOWN} | {
@@ -108,6 +108,16 @@ def test_a_pull_is_yielded_to_until_the_sensor_falls_silent(ros):
     hand.until("compliance", "holding")
 
 
+def test_yielding_is_switched_by_the_threshold_and_an_empty_one_is_off(ros):
+    hand = WrenchChain(ros, yield_threshold=[])
+    hand.feels = wrench(force=(0.0, 30.0, 0.0))
+    hand.give_pose()
+    hand.until("compliance", "off")
+    for threshold, found in (([10.0, 2.0], "yielding"), ([], "off")):
+        assert ros.set_parameters(NODE, yield_threshold=threshold)[0].successful
+        hand.until("compliance", found)
+
+
 def test_measurements_that_are_none_are_dropped_counted_and_named(ros):
     hand = WrenchChain(ros)
     hand.feels = wrench(force=(0.0, 30.0, math.nan), frame="panda_link8")
@@ -123,7 +133,7 @@ def test_a_target_is_exerted_and_torques_say_so(ros, monkeypatch):
     """In contact with what gives exactly that back, the motors carry it."""
     monkeypatch.setattr(interaction, "WRENCH_TIME", 1e-3)
     monkeypatch.setattr(interaction, "FORCE_STEP", 20.0)
-    hand = WrenchChain(ros, dual_compliance=False)
+    hand = WrenchChain(ros, yield_threshold=[])
     hand.feels = wrench()
     hand.give_pose()
     before = hand.step()
@@ -147,7 +157,7 @@ def test_a_target_is_exerted_and_torques_say_so(ros, monkeypatch):
         (wrench(force=(0.0, 0.0, 10.0)), {"force_directions": [0.0] * 6}),
         (
             wrench(force=(0.0, 0.0, 10.0)),
-            {"ft_frame": "", "force_directions": [0.0] * 6, "dual_compliance": False},
+            {"ft_frame": "", "force_directions": [0.0] * 6, "yield_threshold": []},
         ),
     ],
 )
@@ -196,7 +206,7 @@ def contact(**changed):
         ({"ft_frame": "moon"}, "ft_frame"),
         ({"ft_frame": "panda_link3"}, "ft_frame"),
         ({"ft_frame": ""}, "force_directions"),
-        ({"ft_frame": "", "force_directions": []}, "dual_compliance"),
+        ({"ft_frame": "", "force_directions": []}, "yield_threshold"),
         ({"ft_tool": [-2.0, 0.0, 0.0, 0.0]}, "ft_tool"),
         ({"ft_tool": [1.0, 0.0, 1.0]}, "ft_tool"),
         ({"ft_tool": [1.0, 0.0, 1.0, math.nan]}, "ft_tool"),
@@ -255,7 +265,7 @@ def test_each_parameter_reaches_the_settings():
         9.0,
         0.5,
     )
-    assert build(dual_compliance=False).interaction.settings.yield_threshold is None
+    assert build(yield_threshold=[]).interaction.settings.yield_threshold is None
 
 
 def test_what_a_tool_weighs_is_that_of_the_parameter_or_of_the_urdf():
@@ -297,5 +307,5 @@ def test_points_of_one_link_are_one_contact():
 
 
 def test_without_sensor_and_contacts_there_is_nothing_to_do():
-    controller = build(contacts=[], ft_frame="", force_directions=[], dual_compliance=False)
+    controller = build(contacts=[], ft_frame="", force_directions=[], yield_threshold=[])
     assert controller.interaction is None

@@ -14,3 +14,8 @@ def controller_node() -> int:
 def identify_friction() -> int:
     """Run the identification of joint friction."""
     return run_program("torque_safety_controller.cli.identify_friction")
+
+
+def gain_limits() -> int:
+    """Run the check of a robot's gains."""
+    return run_program("torque_safety_controller.cli.gain_limits")

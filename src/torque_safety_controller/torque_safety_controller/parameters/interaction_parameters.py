@@ -21,7 +21,6 @@ from viability_bounds_pkg.parameter import (
     group,
     number,
     numbers,
-    switch,
     text,
     texts,
 )
@@ -90,17 +89,12 @@ class InteractionConfiguration:
         default=(0.01, 0.05),
         live=True,
     )
-    dual_compliance: bool = switch(
-        "whether the hand yields to wrenches above yield_threshold, and stays where it is when "
-        "they end",
-        default=False,
-        live=True,
-    )
     yield_threshold: Array = numbers(
-        "force, N, and moment, N m, above which the hand yields; it stops below half of both",
+        "force, N, and moment, N m, above which the hand yields; below half of both it stops, and "
+        "stays where it is then; it never yields if empty",
         POSITIVE,
         length=2,
-        default=(10.0, 2.0),
+        default=(),
         live=True,
     )
     yield_kp: Array = numbers(
@@ -140,7 +134,7 @@ class InteractionConfiguration:
         if len(tool) and not (np.isfinite(tool).all() and tool[0] >= 0.0):
             raise SettingError("ft_tool", tool, "4 finite numbers [mass, x, y, z] with mass >= 0")
         object.__setattr__(self, "points", _contact_points(self.contacts))
-        for name in ("force_directions", "dual_compliance"):
+        for name in ("force_directions", "yield_threshold"):
             if np.any(getattr(self, name)) and not self.ft_frame:
                 allowed = "only with a force/torque sensor, 'ft_frame'"
                 raise SettingError(name, getattr(self, name), allowed)
@@ -153,7 +147,7 @@ class InteractionConfiguration:
         if not set(self.closed_contacts) <= set(frames):
             allowed = f"frames of 'contacts': {', '.join(frames) or 'none'}"
             raise SettingError("closed_contacts", self.closed_contacts, allowed)
-        threshold = tuple(self.yield_threshold.tolist())
+        threshold = tuple(self.yield_threshold.tolist()) or None
         return InteractionSettings(
             directions=self.force_directions == 1.0,
             stiffness=self.force_stiffness,
@@ -163,7 +157,7 @@ class InteractionConfiguration:
                 speed_max=tuple(self.admittance_speed_max.tolist()),
             ),
             closed=tuple(map(frames.index, self.closed_contacts)),
-            yield_threshold=threshold if self.dual_compliance else None,
+            yield_threshold=threshold,
             yielding_gains=replace(
                 _DEFAULTS.yielding_gains,
                 kp=tuple(self.yield_kp.tolist()),

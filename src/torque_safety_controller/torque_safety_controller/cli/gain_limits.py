@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Command line tool that prints gains beside the largest that a robot bears.
+
+Reads a robot's parameter files: delay, bandwidth of the motors and resolution of the encoders, as
+declared for bounds_node and estimator_node, and the gains of controller_node.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torque_safety_controller.loop_margins.gain_check import (
+    LIMIT_MARGIN,
+    MARGIN,
+    TORQUE_STEP,
+    GainCheck,
+    GainLimit,
+)
+from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
+from torque_safety_controller.parameters.loop_parameters import (
+    LoopConfiguration,
+    gain_check,
+    read_loop,
+)
+from viability_bounds_pkg.cli.command_line import Parser, run_tool
+from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.parameter import parameter_table, read
+from viability_bounds_pkg.robot_configuration import load_model
+from viability_bounds_pkg.ros.given_parameters import given_parameters, refuse_unknown
+from viability_bounds_pkg.user_input.parameter_files import (
+    ParameterFileError,
+    check_parameter_files,
+)
+
+
+def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = Parser(
+        prog="gain_limits",
+        description="Print a robot's gains beside the largest that its delay, its motors and the "
+        "resolution of its encoders permit.",
+        epilog=f"The loop of a joint keeps a modulus margin of {MARGIN:g}, that of a joint at its "
+        f"limit {LIMIT_MARGIN:g}; at rest a step of the encoders changes no torque by more than "
+        f"{TORQUE_STEP:.0%} of torque_max a period. docs/gains.md derives both. Exit code 1: a "
+        "gain is beyond its limit.",
+    )
+    parser.add_argument(
+        "--params-file",
+        type=Path,
+        action="append",
+        required=True,
+        metavar="FILE",
+        help="parameter file of the robot (ROS 2 YAML); repeatable, later ones win",
+    )
+    return parser.parse_args(arguments)
+
+
+def _run(options: argparse.Namespace) -> int:
+    files = [str(path) for path in options.params_file]
+    check_parameter_files(files)
+    arguments = ["--ros-args", *(word for path in files for word in ("--params-file", path))]
+
+    def sections(node: str) -> dict[str, Any]:
+        given = given_parameters(arguments, f"/{node}")
+        refuse_unknown(given, [row.name for row in parameter_table(LoopConfiguration)])
+        return given
+
+    try:
+        config = read(ControllerConfiguration, sections("controller_node"))
+        loop = read_loop(sections)
+        model = load_model(config, config.read_urdf())
+    except SettingError as error:
+        raise ParameterFileError(f"{', '.join(files)}: {error}") from error
+    check = gain_check(config, loop, model)
+    limits = list(check.limits())
+    report(limits)
+    print(
+        f"modulus margin with the gains given: {check.stiffest_margin():.2g}, of a joint on its "
+        f"limit {check.limit_margin(loop.bounds_dt_factor):.2g}"
+    )
+    calm = _report_steps(config, check, loop.bounds_dt_factor)
+    return 1 if any(limit.exceeded for limit in limits) or not calm else 0
+
+
+def report(limits: Sequence[GainLimit]) -> None:
+    """Print the gains, what margin and resolution permit, and which are beyond."""
+    print(f"{'':18}{'given':>10}{'by margin':>14}{'by resolution':>16}")
+    for limit in limits:
+        sign = ">=" if limit.smallest else "<="
+        margin, resolution = (
+            f"{sign} {value:.4g}" if np.isfinite(value) and value > 0.0 else "-"
+            for value in (limit.by_margin, limit.by_resolution)
+        )
+        verdict = "  exceeded" if limit.exceeded else ""
+        print(f"{limit.name:18}{limit.value:10.4g}{margin:>14}{resolution:>16}{verdict}")
+
+
+def _report_steps(config: ControllerConfiguration, check: GainCheck, factor: float) -> bool:
+    """Print the torque steps that the resolution makes; return whether they are small enough."""
+    calm = True
+    for where, steps in (
+        ("at rest, all gains together", check.step_at_rest()),
+        ("on a joint limit, what acts there together", check.step_at_limits(factor)),
+    ):
+        worst = int(np.argmax(steps))
+        beyond = steps[worst] > TORQUE_STEP
+        print(
+            f"torque step by the resolution {where}: at most {steps[worst]:.2%} of torque_max a "
+            f"period ({config.joints[worst]})" + ("  exceeded" if beyond else "")
+        )
+        calm &= not beyond
+    return calm
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the tool; return its exit code: 0, 1 if a gain is beyond its limit, or for an error."""
+    options = _parse(arguments)
+    return run_tool("gain_limits", lambda: _run(options))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
