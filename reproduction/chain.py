@@ -113,7 +113,7 @@ def run_chain(
         try:
             player = nodes["scenario_node"]
             play(player, others=[each for each in nodes.values() if each is not player], quiet=True)
-            return ChainResult(player.recorded_run(), player.robot, nodes["bullet_node"].true_q)
+            return ChainResult(player.recorded_run(), player.robot, nodes["bullet_node"].true_positions)
         finally:
             for node in nodes.values():
                 node.destroy_node()

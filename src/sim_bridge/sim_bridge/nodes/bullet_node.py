@@ -11,6 +11,7 @@ from collections import Counter, deque
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
 from rclpy.clock import Clock, ClockType
@@ -157,6 +158,11 @@ class BulletNode(ArmNode):
         """Compute the period at which to pause, `pause_after` from now."""
         periods = round(self._node_parameters.configuration.pause_after / self._config.dt)
         self._pause_at: float = self._periods + periods if periods else math.inf
+
+    @property
+    def true_positions(self) -> NDArray[np.float64]:
+        """Positions of the joints as they are, whatever is reported, shape (n,), rad."""
+        return self._robot.state().q
 
     # Control periods
 
