@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Horizon of the bounds, and errors of the state, that follow from what is declared.
+
+`docs/uncertainty.md` derives all of this. The bounds are asked for a state that belongs to the
+instant when the command begins to act if it is not late; its error is that of the state for its
+own instant, what the acceleration may be off until then, and what other commands than those
+expected may do.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viability_bounds_pkg.joint_limits import JointLimits
+from viability_bounds_pkg.state import State
+from viability_bounds_pkg.state_estimation.observer import design_observer
+from viability_bounds_pkg.uncertainty.declared import DeclaredUncertainty
+
+Array = NDArray[np.float64]
+
+
+class UncertaintyMargins(NamedTuple):
+    """What the bounds must hold for.
+
+    Attributes:
+        horizon: longest time for which a command may act, s.
+        position_error: E_q, largest error of the state's position, shape (n,), rad.
+        velocity_error: E_v, largest error of its velocity, shape (n,), rad/s.
+    """
+
+    horizon: float
+    position_error: Array
+    velocity_error: Array
+
+
+def reported_errors(declared: DeclaredUncertainty) -> State:
+    """Return the largest errors of position and velocity of a reported state."""
+    return State(declared.position_error, declared.velocity_error)
+
+
+def observer_errors(declared: DeclaredUncertainty, dt: float) -> State:
+    """Return the largest errors of an observed state for its own instant.
+
+    Args:
+        declared: errors of the positions and accelerations from which it is observed.
+        dt: control period, s.
+    """
+    design = design_observer(dt, declared.position_error, declared.acceleration_disturbance)
+    return State(design.position_error, design.velocity_error)
+
+
+def uncertainty_margins(
+    declared: DeclaredUncertainty,
+    dt: float,
+    limits: JointLimits,
+    acceleration_error: Array,
+    errors: State,
+    predicted: bool,
+) -> UncertaintyMargins:
+    """Return what the bounds must hold for.
+
+    Args:
+        declared: delay and its jitter, rows of missed deadlines, lag of the motors.
+        dt: control period, s.
+        limits: of n joints; of the accelerations commanded.
+        acceleration_error: W, how far the acceleration may be from the one commanded, shape (n,),
+            rad/s^2.
+        errors: largest errors of position and velocity of a state for its own instant.
+        predicted: whether the state is predicted to the instant when the command begins to act,
+            lag of the motors included; otherwise the bounds take it as it is.
+    """
+    jitter, stale = declared.delay_jitter, declared.delay_jitter + declared.missed_deadlines
+    late, later = declared.delay * dt, jitter * dt
+    lag = declared.motor_lag
+    spread = limits.a_max - limits.a_min
+    if predicted:
+        uncertain = declared.delay + jitter
+        # Of 1 + stale periods in a row, at least one sees a command that was expected to act.
+        wrong = uncertain - uncertain // (1 + stale)
+        velocity = errors.v + acceleration_error * (late + lag) + wrong * dt * spread
+        position = errors.q + errors.v * (late + lag)
+        position += acceleration_error * late * (0.5 * late + lag)
+        if wrong:
+            position += 0.5 * spread * (late**2 + later**2)
+    else:
+        fastest = np.maximum(-limits.a_min, limits.a_max) + acceleration_error
+        velocity = errors.v + fastest * (late + lag) + spread * later
+        position = errors.q + limits.v_max * (late + lag) + 0.5 * spread * later**2
+    return UncertaintyMargins((1 + stale) * dt, position, velocity)
