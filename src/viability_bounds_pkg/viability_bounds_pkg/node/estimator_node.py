@@ -34,6 +34,9 @@ class EstimatorNode(ArmNode):
 
     Subscribes to ``joint_states`` and ``joint_commands``; publishes ``estimated_joint_states``
     with the stamp and the effort of the state that it answers, and all other joints as they came.
+
+    Attributes:
+        commands_heard: how many commands came, refused ones included.
     """
 
     NAME = "estimator_node"
@@ -54,7 +57,7 @@ class EstimatorNode(ArmNode):
         self._reader = JointStateReader(joints, config.state_timeout, self._warn)
         self._period = PeriodCheck(config.dt, self._warn)
         self._refused: Counter[str] = Counter()
-        self._answered = self._restarts = 0
+        self._answered = self._restarts = self.commands_heard = 0
         self._answer = JointState()
         self._publisher = ESTIMATED_JOINT_STATES.publisher(self)
         JOINT_STATES.subscription(self, self._on_state)
@@ -97,6 +100,7 @@ class EstimatorNode(ArmNode):
             self._warn(f"starts anew from the reported state: {reason}; later ones are counted")
 
     def _on_command(self, message: JointState) -> None:
+        self.commands_heard += 1
         try:
             command = read_command(message, self._joints)
         except CommandError as error:
@@ -119,6 +123,7 @@ class EstimatorNode(ArmNode):
             "motor_lag_s": config.declared.motor_lag,
             "states_answered": self._answered,
             "states_refused": reader.refused,
+            "commands_heard": self.commands_heard,
             "commands_refused": self._refused,
             "resets": estimator.resets,
             "age_s": time.monotonic() - reader.heard_at,

@@ -1,0 +1,315 @@
+# SPDX-License-Identifier: Apache-2.0
+import math
+import re
+import time
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from sensor_msgs.msg import JointState
+from true_arm import model
+
+from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.node.estimator_node import EstimatorNode
+from viability_bounds_pkg.ros.claim import TakenError
+from viability_bounds_pkg.state import State
+from viability_bounds_pkg.state_estimation.estimator import StateEstimator
+from viability_bounds_pkg.state_estimation.observer import design_observer
+from viability_bounds_pkg.testing.ros_harness import joint_state, read_config
+
+NODE = "estimator_node"
+VALUES = read_config("panda") | {"state_timeout": 0.2}
+JOINTS = VALUES["joints"]
+N = len(JOINTS)
+PERIOD = 2_000_000  # ns
+DT = 1e-9 * PERIOD
+HOME = np.array(VALUES["start_positions"])
+STILL = np.zeros(N)
+COARSE = {"position_error": [1e-4] * N, "acceleration_disturbance": [5.0] * N}
+
+
+class EstimatorProbe:
+    """The other side: sends states and commands, keeps answers."""
+
+    def __init__(self, ros, **changed) -> None:
+        self.ros = ros
+        self.node = ros.start(EstimatorNode, VALUES | changed)
+        self.answers = ros.listen(JointState, "estimated_joint_states")
+        self.states = ros.talk(JointState, "joint_states")
+        self.commands = ros.talk(JointState, "joint_commands")
+        ros.hears("estimated_joint_states")
+
+    def ask(self, message) -> JointState:
+        """Send a state until it is answered, return the answer."""
+        self.answers.clear()
+        self.ros.wait_until(
+            lambda: self.answers,
+            "an answer",
+            each=lambda: self.states.publish(message),
+            period=0.1,
+        )
+        return self.answers[-1]
+
+    def state(self, k, q=HOME, v=STILL, tau=()):
+        """Ask with joints in the usual order, return the estimate."""
+        answer = self.ask(joint_state(JOINTS, k * PERIOD, q, v, tau))
+        assert self.answers.stamps[-1] == k * PERIOD
+        assert answer.name == JOINTS
+        return State(np.array(answer.position), np.array(answer.velocity))
+
+    def command(self, k, tau=(), q=(), joints=JOINTS) -> None:
+        """Send a command that the node reads."""
+        before = self.node.commands_heard
+        message = joint_state(joints, k * PERIOD, q, (), tau)
+        self.ros.wait_until(
+            lambda: self.node.commands_heard > before,
+            "the command",
+            each=lambda: self.commands.publish(message),
+            period=0.1,
+        )
+
+    def reported(self, key):
+        return self.ros.reported(NODE, key)
+
+
+def reference(delay=0, lag=0.0, coarse=True):
+    """Return the estimator that a node should have."""
+    design = design_observer(DT, np.full(N, 1e-4 * coarse), np.full(N, 5.0 * coarse))
+    return StateEstimator(
+        model(),
+        DT,
+        delay,
+        np.full(N, lag),
+        design,
+        np.array(VALUES["velocity_max"]),
+        np.array(VALUES["torque_max"]),
+    )
+
+
+def test_answers_are_those_of_the_estimator_with_stamp_and_effort_of_the_state(ros):
+    arm = EstimatorProbe(ros, delay=2, motor_bandwidth=[100.0] * N, **COARSE)
+    ours = reference(2, 1.0 / (2.0 * math.pi * 100.0))
+    rng = np.random.default_rng(1)
+    tau = np.array([0.0, -10.0, 0.0, 20.0, 0.0, 2.0, 0.0])
+    for k in range(1, 13):
+        q, v = HOME + rng.uniform(-1e-4, 1e-4, N), rng.uniform(-0.1, 0.1, N)
+        got = arm.state(k, q, v, tau)
+        np.testing.assert_allclose(got, ours.step(k * PERIOD, State(q, v), tau), atol=1e-12)
+        np.testing.assert_array_equal(arm.answers[-1].effort, tau)
+        command = tau + rng.uniform(-2.0, 2.0, N)
+        arm.command(k, command)
+        ours.answer(k * PERIOD, command)
+    assert not ours.resets
+
+
+def test_nothing_declared_and_velocities_reported_states_pass_exactly(ros):
+    arm = EstimatorProbe(ros, velocity_estimation=False)
+    rng = np.random.default_rng(1)
+    for k in range(1, 8):
+        q, v = rng.uniform(-2, 2, (2, N))
+        np.testing.assert_array_equal(arm.state(k, q, v, np.ones(N)), [q, v])
+        arm.command(k, np.ones(N))
+    ros.wait_until(lambda: arm.reported("states_answered") == "7")
+    assert arm.reported("message") == "answering"
+    assert arm.reported("resets") == "none"
+
+
+def test_joints_in_any_order_and_others_with_them(ros):
+    arm = EstimatorProbe(ros, delay=1, velocity_estimation=False)
+    order = [3, 0, 6, 1, 2, 5, 4]
+    names = [*(JOINTS[i] for i in order[:4]), "finger", *(JOINTS[i] for i in order[4:])]
+    v = np.linspace(0.1, 0.7, N)
+
+    def placed(values, finger):
+        shuffled = np.array(values)[order]
+        return [*shuffled[:4], finger, *shuffled[4:]]
+
+    message = joint_state(
+        names, PERIOD, placed(HOME, 0.04), placed(v, -0.5), placed(STILL + 3.0, 9.0)
+    )
+    message.header.frame_id = "base"
+    answer = arm.ask(message)
+    assert answer.name == names
+    assert answer.header == message.header
+    assert answer.effort == message.effort
+    assert answer.position[4] == 0.04
+    assert answer.velocity[4] == -0.5
+    expected = reference(1, coarse=False)
+    state = expected.step(PERIOD, State(HOME, v), STILL + 3.0)
+    np.testing.assert_allclose(answer.position, placed(state.q, 0.04), atol=1e-12)
+    np.testing.assert_allclose(answer.velocity, placed(state.v, -0.5), atol=1e-12)
+
+
+def test_commands_with_joints_in_another_order(ros):
+    answers = []
+    tau = np.array([5.0, -20.0, 3.0, 30.0, 1.0, 2.0, 0.5])
+    for order in (slice(None), [3, 0, 6, 1, 2, 5, 4]):
+        arm = EstimatorProbe(ros, delay=1, velocity_estimation=False)
+        for k in (1, 2, 3):
+            answer = arm.state(k)
+            arm.command(k, tau[order], joints=list(np.array(JOINTS)[order]))
+        answers.append(answer)
+        ros.stop(arm.node)
+    np.testing.assert_array_equal(*answers)
+    assert abs(answers[0].v).max() > 1e-3
+
+
+def test_a_repeated_state_gets_the_same_answer_and_no_step(ros):
+    arm = EstimatorProbe(ros, delay=1, **COARSE)
+    tau = np.array([5.0, -20.0, 3.0, 30.0, 1.0, 2.0, 0.5])
+    arm.state(1)
+    arm.command(1, tau)
+    first = arm.state(2, HOME + 1e-4)
+    arm.command(2, 2.0 * tau)
+    for _ in range(3):
+        np.testing.assert_array_equal(arm.state(2, HOME + 1e-4), first)
+    ros.wait_until(lambda: arm.reported("states_answered") == "2")
+
+
+def test_a_missing_command_holds_the_last(ros):
+    tau = np.array([5.0, -20.0, 3.0, 30.0, 1.0, 2.0, 0.5])
+    answers = []
+    for missing in (False, True):
+        arm = EstimatorProbe(ros, delay=2, velocity_estimation=False)
+        for k in range(1, 6):
+            answer = arm.state(k)
+            if not (missing and k == 4):
+                arm.command(k, tau)
+        answers.append(answer)
+        ros.stop(arm.node)
+    np.testing.assert_array_equal(*answers)
+
+
+def test_position_commands_take_the_reported_torque_as_held(ros):
+    arm = EstimatorProbe(ros, delay=2, velocity_estimation=False)
+    tau = np.array([5.0, -20.0, 3.0, 30.0, 1.0, 2.0, 0.5])
+    for k in (1, 2, 3, 4):
+        answer = arm.state(k, tau=tau)
+        arm.command(k, q=HOME)
+    ours = reference(2, coarse=False)
+    expected = ours.step(PERIOD, State(HOME, STILL), tau)
+    np.testing.assert_allclose(answer, expected, atol=1e-5)
+
+
+def test_torques_beyond_the_limits_of_the_motors_are_those_limits(ros):
+    answers = []
+    for tau in (np.array(VALUES["torque_max"]), np.full(N, 1e6)):
+        arm = EstimatorProbe(ros, delay=1, velocity_estimation=False)
+        for k in (1, 2, 3):
+            answer = arm.state(k)
+            arm.command(k, tau)
+        answers.append(answer)
+        ros.stop(arm.node)
+    np.testing.assert_array_equal(*answers)
+
+
+def test_a_jump_and_a_gap_start_anew_and_are_told_once(ros):
+    arm = EstimatorProbe(ros, **COARSE)
+    for k in (1, 2, 3):
+        arm.state(k)
+    elsewhere = HOME + 0.3
+    np.testing.assert_allclose(arm.state(4, elsewhere, STILL + 0.2), [elsewhere, STILL + 0.2])
+    arm.state(5, elsewhere, STILL + 0.2)
+    np.testing.assert_allclose(arm.state(20, elsewhere, STILL), [elsewhere, STILL])
+    ros.wait_until(lambda: "stamps jumped: 1" in arm.reported("resets"))
+    assert "the state jumped: 1" in arm.reported("resets")
+    assert ros.diagnostics[NODE]["level"] == DiagnosticStatus.WARN
+    assert arm.reported("message") == "started anew since the start"
+
+
+def test_a_robot_that_starts_over_is_answered_after_the_time_out(ros):
+    arm = EstimatorProbe(ros, **COARSE)
+    begin = time.monotonic()
+    arm.state(5000)
+    np.testing.assert_array_equal(arm.state(1, HOME + 0.5), [HOME + 0.5, STILL])
+    assert time.monotonic() - begin >= VALUES["state_timeout"]
+
+
+@pytest.mark.parametrize(
+    ("q", "v", "reason"),
+    [
+        ([math.nan, *HOME[1:]], STILL, "not finite"),
+        (HOME, [*STILL[1:], math.inf], "not finite"),
+        (HOME[:3], STILL, "wrong size"),
+    ],
+)
+def test_states_that_are_wrong_are_dropped_and_counted(ros, q, v, reason):
+    arm = EstimatorProbe(ros, state_timeout=30.0)
+    arm.state(1)
+    arm.answers.clear()
+    ros.wait_until(
+        lambda: re.search(f"{reason}: [1-9]", arm.reported("states_refused")),
+        each=lambda: arm.states.publish(joint_state(JOINTS, 2 * PERIOD, q, v)),
+    )
+    assert not arm.answers
+    assert np.isfinite(arm.state(2)).all()
+
+
+@pytest.mark.parametrize(
+    ("tau", "joints", "reason"),
+    [
+        ([math.nan] * N, JOINTS, "not finite"),
+        ([1.0] * (N - 1), JOINTS, "wrong size"),
+        ([1.0] * (N - 1), JOINTS[1:], "missing joint"),
+    ],
+)
+def test_commands_that_are_wrong_are_dropped_and_counted(ros, tau, joints, reason):
+    arm = EstimatorProbe(ros, delay=1)
+    arm.state(1)
+    arm.command(1, tau, joints=joints)
+    assert np.isfinite(arm.state(2)).all()
+    ros.wait_until(lambda: f"{reason}: " in arm.reported("commands_refused"))
+
+
+def test_an_effort_that_is_not_finite_is_none(ros):
+    arm = EstimatorProbe(ros, delay=1, **COARSE)
+    for k in (1, 2, 3):
+        assert np.isfinite(arm.state(k, tau=[math.nan] * N)).all()
+
+
+def test_diagnostics_tell_lag_noise_and_errors(ros):
+    arm = EstimatorProbe(ros, delay=1, **COARSE)
+    ros.wait_until(lambda: arm.reported("message") == "no joint state yet")
+    design = design_observer(DT, np.full(N, 1e-4), np.full(N, 5.0))
+    arm.state(1)
+    ros.wait_until(lambda: arm.reported("message") == "answering")
+    for key, value in (
+        ("velocity_lag_s", design.lag),
+        ("velocity_noise_rad_s", design.noise),
+        ("velocity_error_rad_s", design.velocity_error),
+        ("position_error_rad", design.position_error),
+        ("innovation_declared_rad", design.innovation),
+    ):
+        np.testing.assert_allclose([float(x) for x in arm.reported(key).split()], value, rtol=1e-6)
+    arm.state(2, HOME + 5e-4)
+    larger = f"errors of {JOINTS[0]} larger than declared"
+    ros.wait_until(lambda: arm.reported("message") == larger)
+    assert ros.diagnostics[NODE]["level"] == DiagnosticStatus.WARN
+    assert float(arm.reported("innovation_max_rad").split()[0]) >= 4e-4
+
+
+def test_a_second_one_does_not_start(ros):
+    EstimatorProbe(ros)
+    with pytest.raises(TakenError, match="estimated_joint_states"):
+        ros.start(EstimatorNode, VALUES)
+
+
+@pytest.mark.parametrize(
+    ("changed", "name"),
+    [
+        ({"delay": -1}, "delay"),
+        ({"delay": 1.5}, "delay"),
+        ({"position_error": [1e-4]}, "position_error"),
+        ({"position_error": [-1e-4] * N}, "position_error"),
+        ({"acceleration_disturbance": [math.nan] * N}, "acceleration_disturbance"),
+        ({"velocity_max": None}, "velocity_max"),
+        ({"robot_description": None}, "robot_description"),
+        ({"robot_description": "/no/such.urdf"}, "robot_description"),
+        ({"joints": [*JOINTS[:-1], "elbow"]}, "joints"),
+    ],
+)
+def test_it_does_not_start_with_bad_parameters(ros, changed, name):
+    with pytest.raises(SettingError) as refusal:
+        ros.start(EstimatorNode, VALUES | changed)
+    assert refusal.value.name == name
+    assert "\n" not in str(refusal.value)
