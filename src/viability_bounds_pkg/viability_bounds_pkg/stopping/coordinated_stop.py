@@ -12,6 +12,9 @@ more braking brakes more: a is clipped to the exact acceleration bounds. The tor
 inverse dynamics in the middle of the step. Where a motor cannot give it the accelerations change
 by the least amount, see `within_torque_limits`.
 
+A joint outside its kernel, after a push for example, brakes harder than its acceleration limits
+where that still keeps a limit and the motors can; one beyond a position limit comes back slowly.
+
 At rest the joints hold the place where they are, by the same law with another wish,
 
     a = omega^2 (q_rest - q) - 2 omega v.
@@ -40,6 +43,12 @@ HORIZON = 2.0
 
 MARGIN = 0.05
 """Share of the acceleration limits that is the margin where none is given."""
+
+HARDER = 3.0
+"""Hardest braking outside the kernel in units of the acceleration limits, where motors can."""
+
+RESERVE = 1.1
+"""Braking outside the kernel in units of what would just be enough."""
 
 RETURN_SPEED = 0.1
 """Speed of the way back from outside the position limits, as a share of the speed limit."""
@@ -140,8 +149,7 @@ class CoordinatedStop:
         Args:
             v: velocities, rad/s.
         """
-        braking = np.where(v > 0.0, -self._limits.a_min, self._limits.a_max)
-        return float((np.abs(v) / braking).max())
+        return float((np.abs(v) / self._braking(v)).max())
 
     def torque(self, q: Array, v: Array) -> Array:
         """Return the torques of the motors for the next step of the drive, N m.
@@ -155,30 +163,60 @@ class CoordinatedStop:
         if self._share:
             self._observe(q, v)
         h = self._dt
-        lower, upper = self._interval(q, v)
+        lower, upper, viable = self._solver.bounds(q, v)
+        outside = not viable.all()
+        if outside:
+            lower, upper = self._gentle_return(q, v, lower, upper)
         a = np.minimum(np.maximum(self._wanted(q, v), lower), upper)
+        if outside:
+            a = np.where(viable, a, self._harder(q, v, a))
         q_mid, v_mid = q + 0.5 * h * v + 0.125 * h * h * a, v + 0.5 * h * a
         tau = self._inverse_dynamics(q_mid, v_mid, a) - self._disturbance
         feasible = bool((np.abs(tau) <= self._tau_max).all())
         if self._share or not feasible:
-            self._M = self._mass_matrix(q_mid)
-        if not feasible:
-            tau, a = self._limited(tau, a, lower, upper)
+            self._M = M = self._mass_matrix(q_mid)
+            if not feasible:
+                tau, a = self._limited(tau, a, lower, upper, M)
         self.acceleration = a
         self._expected = v + h * a
         return tau
 
-    def _interval(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return the exact bounds; a joint that is back from outside need not hurry further in."""
-        lower, upper, _ = self._solver.bounds(q, v)
-        above, below = q > self._limits.q_max, q < self._limits.q_min
-        if above.any() or below.any():
-            speed, time = RETURN_SPEED * self._limits.v_max, HORIZON * self._dt
-            gentle = np.minimum((-speed - v) / time, self._limits.a_max)
-            upper = np.where(above & (v <= 0.0), np.maximum(upper, gentle), upper)
-            gentle = np.maximum((speed - v) / time, self._limits.a_min)
-            lower = np.where(below & (v >= 0.0), np.minimum(lower, gentle), lower)
-        return lower, upper
+    def _gentle_return(
+        self, q: Array, v: Array, lower: Array, upper: Array
+    ) -> tuple[Array, Array]:
+        """Return bounds by which joints come back from outside at `RETURN_SPEED`, not at once."""
+        limits, time = self._limits, HORIZON * self._dt
+        speed = RETURN_SPEED * limits.v_max
+        down = np.minimum((-speed - v) / time, limits.a_max)
+        up = np.maximum((speed - v) / time, limits.a_min)
+        above, below = (q > limits.q_max) & (v <= 0.0), (q < limits.q_min) & (v >= 0.0)
+        return (
+            np.where(below, np.minimum(lower, up), lower),
+            np.where(above, np.maximum(upper, down), upper),
+        )
+
+    def _harder(self, q: Array, v: Array, a: Array) -> Array:
+        """Return `a`, or more braking where that stops a joint outside its kernel in time.
+
+        Args:
+            q: positions, rad.
+            v: velocities, rad/s.
+            a: accelerations within the bounds, rad/s^2.
+        """
+        limits, speed = self._limits, np.abs(v)
+        room = np.where(v > 0.0, limits.q_max - q, q - limits.q_min)
+        at_once = speed / self._dt
+        with np.errstate(divide="ignore", invalid="ignore"):
+            needed = np.where(room > 0.0, 0.5 * v * v / room, at_once)
+        needed = RESERVE * np.maximum(needed, (speed - limits.v_max) / self._dt)
+        most = self._braking(v)
+        braking = np.where(needed > RESERVE * most, np.minimum(needed, HARDER * most), 0.0)
+        braking = np.minimum(braking, at_once)
+        return np.where(v > 0.0, np.minimum(a, -braking), np.maximum(a, braking))
+
+    def _braking(self, v: Array) -> Array:
+        """Return the hardest braking within the acceleration limits, rad/s^2."""
+        return np.where(v > 0.0, -self._limits.a_min, self._limits.a_max)
 
     def _wanted(self, q: Array, v: Array) -> Array:
         """Return accelerations that stop the arm, or hold it, regardless of its limits."""
@@ -203,10 +241,11 @@ class CoordinatedStop:
             settled, self._disturbance, np.clip(change, -self._tau_max, self._tau_max)
         )
 
-    def _limited(self, tau: Array, a: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
-        """Return torques within their limits, and accelerations that they give."""
-        M, tau_max = self._M, self._tau_max
-        assert M is not None
+    def _limited(
+        self, tau: Array, a: Array, lower: Array, upper: Array, M: Array
+    ) -> tuple[Array, Array]:
+        """Return torques within their limits, and the accelerations that they give."""
+        tau_max = self._tau_max
         # More than the acceleration limits costs no other limit.
         lower = np.where(lower <= self._limits.a_min, -np.inf, lower)
         upper = np.where(upper >= self._limits.a_max, np.inf, upper)
