@@ -215,9 +215,12 @@ class BulletRobot(BulletBody):
 
     @property
     def believed_torque(self) -> Array:
-        """Torque that the drives believe their motors to give; of brakes, the true one, N m."""
+        """Torques that the drives believe their motors to give; of brakes, the true ones, N m.
+
+        A new array of shape (n,).
+        """
         believed = None if self._motors is None else self._motors.believed
-        return self._motor_torque if believed is None else believed
+        return (self._motor_torque if believed is None else believed).copy()
 
     def _advance(
         self, substeps: int, control: Callable[[], Array] | None = None, braking: bool = False

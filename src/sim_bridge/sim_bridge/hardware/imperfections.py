@@ -97,7 +97,7 @@ class Imperfections:
             SettingError: it does not.
         """
         if not self.velocity_filter_hz < 0.5 * rate_hz:
-            allowed = f"a number of Hz below half of rate_hz, {0.5 * rate_hz:g}; 0: no filter"
+            allowed = f"a number below half of rate_hz, {0.5 * rate_hz:g}; 0: no filter"
             raise SettingError("velocity_filter_hz", self.velocity_filter_hz, allowed)
 
     @property

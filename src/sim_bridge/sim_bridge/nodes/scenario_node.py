@@ -52,7 +52,7 @@ _POLL_PERIOD = 0.02
 _SHOW_PERIOD = 0.5
 _REFUSAL_COUNTS: dict[str, tuple[str, str | tuple[str, ...]]] = {
     "controller_node": ("goals_refused", "target_"),
-    "bullet_node": ("commands_refused", ("external_wrench", "obstacles")),
+    "bullet_node": ("commands_refused", ("external_wrench", "obstacles", "payload")),
 }
 """By node, the diagnostics key that counts refusals by topic, and the topics of a scenario."""
 
@@ -64,9 +64,9 @@ class ScenarioRefused(ArmSafetyError, RuntimeError):
 class ScenarioNode(ArmNode):
     """Resets a paused robot, plays a scenario on it, and records the run.
 
-    Goals, pushes and obstacles are sent before their time with the stamps at which they take
-    effect. In lockstep the robot is paused where a service must be called, until it has answered;
-    so a run in lockstep is the same each time.
+    Goals, pushes, payloads and obstacles are sent before their time with the stamps at which they
+    take effect. In lockstep the robot is paused where a service must be called, until it has
+    answered; so a run in lockstep is the same each time.
 
     Attributes:
         awaits: what it waits for.
@@ -141,7 +141,7 @@ class ScenarioNode(ArmNode):
         self._first = self.listener.stamp + self._period
         self._refused = {}
         while not self._load():
-            yield "loading: there is no report that goals, pushes and obstacles were received"
+            yield "loading: there is no report that the messages of the scenario were received"
         lockstep = self.robot["clock"] == "lockstep"
         begin, end = 0, round(1e9 * self.config.plan.duration / self._period)
         while begin < end:

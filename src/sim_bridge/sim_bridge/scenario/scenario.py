@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scenario: goals, pushes, obstacles and service calls over time, read from YAML."""
+"""A scenario: goals, pushes, payloads, obstacles and service calls over time, read from YAML."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 from sim_bridge.scenario.events import (
     AddObstacle,
     Event,
+    PayloadChange,
     PostureGoal,
     Push,
     RemoveObstacle,
@@ -81,9 +82,10 @@ class ScenarioConfiguration(TaskFrames, LimitedRobotConfiguration):
                     f"wrenches in the axes of {' or '.join(frames)}; at {event.time:g} s there "
                     f"is one in those of {event.frame!r}"
                 )
-            if isinstance(event, Push) and event.link not in links:
+            if isinstance(event, Push | PayloadChange) and event.link not in links:
+                kind = "pushes" if isinstance(event, Push) else "payloads"
                 allowed = (
-                    f"pushes of links of the URDF; at {event.time:g} s there is one of "
+                    f"{kind} of links of the URDF; at {event.time:g} s there is one of "
                     f"'{event.link}'{did_you_mean(event.link, links)}"
                 )
             if allowed:

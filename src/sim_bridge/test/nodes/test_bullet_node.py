@@ -7,6 +7,7 @@ import pinocchio as pin
 import pytest
 from geometry_msgs.msg import WrenchStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from robot_probe import JOINTS, MODEL, PERIOD, VALUES, Q, RobotProbe
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -26,81 +27,8 @@ from viability_bounds_pkg.ros.runtime import (
 )
 from viability_bounds_pkg.testing.ros_harness import joint_state, names_parameter, read_config
 
-VALUES = read_config("panda", "bullet_node")
-JOINTS = VALUES["joints"]
-MODEL = build_model(read_urdf(VALUES["robot_description"]), JOINTS)
-Q = np.array(VALUES["start_positions"])
 BRAKES = {"acceleration_min": [], "acceleration_max": []}
 """Without acceleration limits the robot brakes when commands stop."""
-PERIOD = 2_000_000  # ns, of the configured 500 Hz
-
-
-class RobotProbe:
-    """The node, and what a controller sees and sends."""
-
-    def __init__(self, ros, **changes):
-        self.ros = ros
-        self.states = ros.listen(JointState, "joint_states")
-        self.node = ros.start(BulletNode, VALUES | {"clock": "lockstep"} | changes)
-        self.commands = ros.talk(JointState, "joint_commands")
-        ros.wait_until(lambda: self.states, "a state")
-
-    @property
-    def stamp(self):
-        return stamp_to_ns(self.states[-1].header.stamp)
-
-    @property
-    def q(self):
-        return np.array(self.states[-1].position[:7])
-
-    @property
-    def v(self):
-        return np.array(self.states[-1].velocity[:7])
-
-    @property
-    def tau(self):
-        return np.array(self.states[-1].effort[:7])
-
-    def gravity(self):
-        return pin.computeGeneralizedGravity(MODEL, MODEL.createData(), self.q)
-
-    def step(self, tau=None, times=1):
-        """Answer states, by default with gravity compensation, and await the next ones."""
-        for _ in range(times):
-            stamp = self.stamp
-            self.send(stamp, self.gravity() if tau is None else tau)
-            self.ros.wait_until(lambda s=stamp: self.stamp > s, "the next state")
-
-    def send(self, stamp, tau=None, joints=JOINTS, *, q=None, v=None):
-        message = joint_state(joints, stamp, tau=[] if tau is None else tau)
-        message.position = [] if q is None else list(map(float, q))
-        message.velocity = [] if v is None else list(map(float, v))
-        self.commands.publish(message)
-
-    def move(self, q, v=None, times=1):
-        """Answer states with positions, and await the next ones."""
-        for _ in range(times):
-            stamp = self.stamp
-            self.send(stamp, q=q, v=v)
-            self.ros.wait_until(lambda s=stamp: self.stamp > s, "the next state")
-
-    def push(self, link, force, stamp=0):
-        """Push along y and wait until the robot knows."""
-        pushes = self.ros.talk(WrenchStamped, "external_wrench", GOAL_QOS)
-        message = WrenchStamped()
-        message.header.frame_id = link
-        message.wrench.force.y = force
-        set_stamp(message.header.stamp, stamp)
-        before = len(self.node._world)
-        pushes.publish(message)
-        self.ros.wait_until(lambda: len(self.node._world) > before, "the push")
-        self.ros.probe.destroy_publisher(pushes)
-
-    def reported(self, key):
-        return self.ros.reported("bullet_node", key)
-
-    def await_reported(self, key, value):
-        self.ros.wait_until(lambda: self.reported(key) == value, f"{key} {value}")
 
 
 def test_each_command_with_the_right_stamp_moves_time_by_one_period(ros):

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+from itertools import groupby
+
+import pytest
+
+from sim_bridge.hardware.communication import CommandPath, MissedDeadlines
+from sim_bridge.hardware.imperfections import Imperfections
+
+
+def drawn(probability, longest, count=40_000, seed=0):
+    deadlines = MissedDeadlines(probability, longest, seed)
+    return [deadlines.next() for _ in range(count)]
+
+
+@pytest.mark.parametrize(("probability", "longest"), [(0.05, 4), (0.3, 4), (0.3, 1), (0.9, 3)])
+def test_deadlines_are_missed_as_often_as_asked_and_never_in_longer_rows(probability, longest):
+    missed = drawn(probability, longest)
+    rows = [len(list(group)) for value, group in groupby(missed) if value]
+    assert max(rows) == longest
+    # The stationary share of a chain that goes on with that probability and ends at the longest.
+    all_of_row = probability ** (longest + 1)
+    expected = (probability - all_of_row) / (1.0 - all_of_row)
+    assert sum(missed) / len(missed) == pytest.approx(expected, abs=0.012)
+
+
+def test_none_is_missed_without_a_probability():
+    assert not any(drawn(0.0, 4, 100))
+
+
+def test_the_seed_decides_which():
+    assert drawn(0.3, 4, 200) == drawn(0.3, 4, 200)
+    assert drawn(0.3, 4, 200) != drawn(0.3, 4, 200, seed=1)
+
+
+@pytest.mark.parametrize("delay", [0, 1, 4])
+def test_a_command_arrives_so_many_periods_later(delay):
+    path = CommandPath(Imperfections(command_delay=delay))
+    arrived = [path.arriving(k) for k in range(8)]
+    assert arrived == [None] * delay + list(range(8 - delay))
+    assert path.missed == 0
+
+
+def test_a_missed_command_arrives_neither_in_time_nor_later():
+    path = CommandPath(Imperfections(command_delay=2, missed_probability=0.4, missed_in_row=3))
+    arrived = [path.arriving(k) for k in range(300)]
+    missed = [k for k, each in enumerate(drawn(0.4, 3, 300)) if each]
+    assert path.missed == len(missed) > 50
+    assert arrived == [None, None] + [None if k in missed else k for k in range(298)]
+
+
+def test_a_period_without_a_command_is_not_a_missed_one():
+    path = CommandPath(Imperfections(missed_probability=0.9, missed_in_row=100))
+    assert [path.arriving(None) for _ in range(50)] == [None] * 50
+    assert path.missed == 0
