@@ -37,7 +37,7 @@ from viability_bounds_pkg.ros.topics import (
     ACCELERATION_LIMITS,
     FT_WRENCH,
     JOINT_COMMANDS,
-    JOINT_STATES,
+    state_topic,
 )
 from viability_bounds_pkg.state import State
 
@@ -45,9 +45,9 @@ from viability_bounds_pkg.state import State
 class ControllerNode(ArmNode):
     """Answers each joint state, once its acceleration limits are there, with torques.
 
-    Subscribes to ``joint_states``, ``acceleration_limits`` and goals; publishes
-    ``joint_commands`` with the stamp of the state answered. The service ``~/enable_torque``
-    hands over between the robot's position control and torque.
+    Subscribes to ``joint_states`` or ``estimated_joint_states``, to ``acceleration_limits`` and
+    goals; publishes ``joint_commands`` with the stamp of the state answered. The service
+    ``~/enable_torque`` hands over between the robot's position control and torque.
     """
 
     NAME = "controller_node"
@@ -85,7 +85,8 @@ class ControllerNode(ArmNode):
 
         self._commands = JointCommands(self, config.joints, config.ros2_control_topic)
         self._published = StatePublisher(self, self._controller, config, base, self._states)
-        JOINT_STATES.subscription(self, self._on_state)
+        states = state_topic(config.use_estimated_states)
+        states.subscription(self, self._on_state)
         ACCELERATION_LIMITS.subscription(self, self._on_limits)
         ENABLE_TORQUE.serve(self, self._on_enable_torque)
         # Use the steady clock, so that watchdogs fire when /clock stops.
@@ -94,7 +95,7 @@ class ControllerNode(ArmNode):
             self._watch,
             clock=Clock(clock_type=ClockType.STEADY_TIME),
         )
-        alone = [JOINT_COMMANDS.name, config.ros2_control_topic, JOINT_STATES.name]
+        alone = [JOINT_COMMANDS.name, config.ros2_control_topic, states.name]
         alone += [ACCELERATION_LIMITS.name, FT_WRENCH.name]
         self.publisher_watch = PublisherWatch(self, filter(None, alone))
         self._diagnostics = Diagnostics(self, self._report, watch=self.publisher_watch)

@@ -21,6 +21,7 @@ from viability_bounds_pkg.parameter import Range, above, group, joint_numbers, n
 from viability_bounds_pkg.robot_configuration import (
     ControlRate,
     RobotConfiguration,
+    StateSource,
     TaskFrames,
 )
 
@@ -31,7 +32,7 @@ DISTURBANCE_MAX = 2.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ControllerConfiguration(ControlRate, TaskFrames, RobotConfiguration):
+class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfiguration):
     """Parameters of the controller node; arrays of shape (n,) in `joints` order.
 
     Attributes:

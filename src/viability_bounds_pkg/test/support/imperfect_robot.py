@@ -94,9 +94,7 @@ class ImperfectRobot:
         self._lag = declared.motor_lag
         # The command that acts, and those under way, each with the periods until it arrives.
         self._held = np.zeros(shape)
-        self._coming = deque(
-            [np.zeros(shape), np.full(shape, d)] for d in range(declared.delay)
-        )
+        self._coming = deque([np.zeros(shape), np.full(shape, d)] for d in range(declared.delay))
         self._row = np.zeros(shape, dtype=int)
         self._towards = rng.choice([-1.0, 1.0], shape)
         self.seen, self.lost = Violations(limits), 0

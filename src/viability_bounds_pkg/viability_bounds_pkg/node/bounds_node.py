@@ -28,15 +28,16 @@ from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.robot_urdf import TOPIC, robot_urdf, warn_of_unusual
-from viability_bounds_pkg.ros.topics import ACCELERATION_LIMITS, JOINT_STATES
+from viability_bounds_pkg.ros.topics import ACCELERATION_LIMITS, state_topic
 
 
 class BoundsNode(ArmNode):
     """Answers every joint state with the accelerations that keep the limits for ever.
 
-    Subscribes to ``joint_states``; publishes ``acceleration_limits`` with the stamp of the
-    state that it answers: ``points[0].accelerations`` lower, ``points[1].accelerations``
-    upper, rad/s^2, in the order of the parameter ``joints``.
+    Subscribes to ``joint_states`` or ``estimated_joint_states``; publishes
+    ``acceleration_limits`` with the stamp of the state that it answers:
+    ``points[0].accelerations`` lower, ``points[1].accelerations`` upper, rad/s^2, in the order of
+    the parameter ``joints``.
     """
 
     NAME = "bounds_node"
@@ -63,8 +64,9 @@ class BoundsNode(ArmNode):
             joint_names=list(joints), points=[JointTrajectoryPoint(), JointTrajectoryPoint()]
         )
         self._publisher = ACCELERATION_LIMITS.publisher(self)
-        JOINT_STATES.subscription(self, self._on_state)
-        self.publisher_watch = PublisherWatch(self, [ACCELERATION_LIMITS.name, JOINT_STATES.name])
+        states = state_topic(config.use_estimated_states)
+        states.subscription(self, self._on_state)
+        self.publisher_watch = PublisherWatch(self, [ACCELERATION_LIMITS.name, states.name])
         self._distances = LimitDistances(self, config, self._reader)
         self._diagnostics = Diagnostics(self, self._report, watch=self.publisher_watch)
         self._warn_of_affected_joints(config)
@@ -94,7 +96,12 @@ class BoundsNode(ArmNode):
                 f"method '{config.method}' does not keep the limits; it is for comparison"
             )
             return
-        holds = viability.discrete_time_condition(config.limits, config.horizon)
+        holds = viability.discrete_time_condition(
+            config.limits,
+            config.horizon,
+            position_error=config.uncertainty.position_error,
+            velocity_error=config.uncertainty.velocity_error,
+        )
         for name, fine in zip(config.joints, holds, strict=True):
             if not fine:
                 self.get_logger().warning(
@@ -133,6 +140,8 @@ class BoundsNode(ArmNode):
             "position_margin_rad": config.margins.position,
             "velocity_margin_rad_s": config.margins.velocity,
             "acceleration_margin_rad_s2": config.margins.acceleration,
+            "position_error_rad": config.uncertainty.position_error,
+            "velocity_error_rad_s": config.uncertainty.velocity_error,
             "states_answered": self._answered,
             "states_refused": self._reader.refused,
             "states_outside_kernel_by_joint": self._outside,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from viability_bounds_pkg import baselines, viability
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.joint_limits import JointLimits
+from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
 from viability_bounds_pkg.parameter import (
     NEGATIVE,
     NOT_NEGATIVE,
@@ -22,6 +22,7 @@ from viability_bounds_pkg.parameter import (
     Range,
     above,
     check_per_joint,
+    group,
     joint_numbers,
     number,
     redeclared,
@@ -31,9 +32,13 @@ from viability_bounds_pkg.robot_configuration import (
     ControlRate,
     LimitedRobotConfiguration,
     RobotConfiguration,
+    StateSource,
 )
 from viability_bounds_pkg.state_dependent.limits import StateDependentBounds
 from viability_bounds_pkg.torque_margin import TorqueMargins, tightened, torque_margins
+from viability_bounds_pkg.uncertainty.declared import DeclaredUncertainty, VelocityEstimation
+from viability_bounds_pkg.uncertainty.feasible import refusal
+from viability_bounds_pkg.uncertainty.margins import Loop, UncertaintyMargins
 
 Array = NDArray[np.float64]
 
@@ -52,12 +57,13 @@ PEAK = 3.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class BoundsConfiguration(ControlRate, LimitedRobotConfiguration):
+class BoundsConfiguration(VelocityEstimation, StateSource, ControlRate, LimitedRobotConfiguration):
     """Parameters of the bounds node; the torque limits are empty where none are needed.
 
     Attributes:
         limits: of the joints.
         margins: what the exact bounds keep back.
+        uncertainty: what else they hold for, by what is declared.
     """
 
     robot_description: str = redeclared(RobotConfiguration, "robot_description", default="")
@@ -70,12 +76,7 @@ class BoundsConfiguration(ControlRate, LimitedRobotConfiguration):
         NOT_NEGATIVE,
         if_empty=0.0,
     )
-    acceleration_disturbance: Array = joint_numbers(
-        "how much more than commanded the joints may accelerate by what the model does not know, "
-        "friction, payloads, pushes, rad/s^2; the bounds are tightened by it; 0 if empty",
-        NOT_NEGATIVE,
-        if_empty=0.0,
-    )
+    declared: DeclaredUncertainty = group(DeclaredUncertainty)
     position_margin: float = number(
         "how much further inside the position limits to keep the joints, rad: what the robot or "
         "its sensors may be off",
@@ -83,7 +84,8 @@ class BoundsConfiguration(ControlRate, LimitedRobotConfiguration):
         default=0.0,
     )
     bounds_dt_factor: float = number(
-        "horizon of the bounds in control periods; 2 avoids chatter",
+        "horizon of the bounds in control periods, longer where missed deadlines are declared; 2 "
+        "avoids chatter",
         Range(1.0, 1e3),
         default=2.0,
         live=True,
@@ -119,6 +121,7 @@ class BoundsConfiguration(ControlRate, LimitedRobotConfiguration):
     )
     limits: JointLimits = field(init=False)
     margins: TorqueMargins = field(init=False)
+    uncertainty: UncertaintyMargins = field(init=False)
 
     def __post_init__(self) -> None:
         """Make limits and margins, which must leave something to move with."""
@@ -133,24 +136,42 @@ class BoundsConfiguration(ControlRate, LimitedRobotConfiguration):
         )
         object.__setattr__(self, "limits", limits)
         object.__setattr__(self, "margins", self._margins(limits))
+        object.__setattr__(self, "uncertainty", self.loop.margins(self.declared))
 
     @property
     def horizon(self) -> float:
         """How long an acceleration is assumed to last, s."""
-        return self.bounds_dt_factor * self.dt
+        return self.uncertainty.horizon
+
+    @property
+    def loop(self) -> Loop:
+        """The control loop that the bounds are for."""
+        return Loop(
+            self.limits,
+            self._torque_margins(),
+            self.dt,
+            self.bounds_dt_factor * self.dt,
+            self.use_estimated_states,
+            self.use_estimated_states and self.velocity_estimation,
+        )
+
+    def _torque_margins(self) -> TorqueMargins:
+        margins = torque_margins(self.acceleration_drift, self.dt)
+        margins.position[:] += self.position_margin
+        return margins
 
     def _margins(self, limits: JointLimits) -> TorqueMargins:
-        margins = torque_margins(self.acceleration_drift, self.dt)
-        disturbance = self.acceleration_disturbance
+        margins, disturbance = self._torque_margins(), self.declared.acceleration_disturbance
         margins.acceleration[:] += disturbance
         braking = np.minimum(-limits.a_min, limits.a_max)
         if not (margins.acceleration < braking).all():
-            name = "acceleration_disturbance" if disturbance.any() else "acceleration_drift"
+            name, value = "acceleration_drift", self.acceleration_drift
+            if disturbance.any():
+                name, value = "acceleration_disturbance", disturbance
             allowed = (
                 f"less than what there is to brake with, {braking}, by the margins for the rate"
             )
-            raise SettingError(name, getattr(self, name), allowed)
-        margins.position[:] += self.position_margin
+            raise SettingError(name, value, allowed)
         for name, margin, room in (
             ("velocity_max", margins.velocity, limits.v_max),
             ("position_max", margins.position, 0.5 * (limits.q_max - limits.q_min)),
@@ -186,16 +207,18 @@ def make_bounds(
         load_model: returns the arm's model, asked for only where it is needed.
 
     Raises:
-        SettingError: state-dependent limits without what they need.
+        SettingError: state-dependent limits without what they need; declarations that leave no
+            bounds.
     """
-    limits, margins, horizon = config.limits, config.margins, config.horizon
+    limits, horizon = config.limits, config.horizon
     if config.method == "exact" and config.acceleration_limits == "state_dependent":
         state_dependent = _state_dependent(config, load_model)
         return Bounds(state_dependent.bounds, state_dependent)
     if config.method == "exact":
-        inner = tightened(limits, margins)
-        solver = viability.BoundsSolver(inner, horizon, margins.acceleration, period=config.dt)
-        return Bounds(solver.bounds)
+        try:
+            return Bounds(config.loop.bounds(config.declared).bounds)
+        except JointLimitsError as error:
+            raise refusal(config.loop, config.declared, error) from error
     own = {"influence": config.damper_influence, "gain": config.damper_gain}
     settings = own if config.method == "damper" else {}
     return Bounds(partial(BASELINES[config.method], limits=limits, dt=horizon, **settings))
@@ -208,6 +231,9 @@ def _state_dependent(
     if not config.robot_description:
         allowed = "a URDF, for state-dependent acceleration limits"
         raise SettingError("robot_description", config.robot_description, allowed)
+    if any(map(np.any, config.uncertainty[1:])):
+        allowed = "worst_case, where errors of the states or delays are declared"
+        raise SettingError("acceleration_limits", config.acceleration_limits, allowed)
     worst = np.maximum(-limits.a_min, limits.a_max)
     peak = config.acceleration_peak if len(config.acceleration_peak) else PEAK * worst
     if (peak < worst).any():

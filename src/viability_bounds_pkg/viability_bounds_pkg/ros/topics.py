@@ -182,6 +182,13 @@ VALUES = Topic(
     "other, `layout.dim` the key of each as `label` and how many numbers it has as `size`, not "
     "the dimensions of one array; sent with `/diagnostics`",
 )
+
+
+def state_topic(estimated: bool) -> Topic:
+    """Return the topic of the joint states that a node works on: estimated ones, or reported."""
+    return ESTIMATED_JOINT_STATES if estimated else JOINT_STATES
+
+
 SHARED_TOPICS = (
     JOINT_STATES,
     ESTIMATED_JOINT_STATES,

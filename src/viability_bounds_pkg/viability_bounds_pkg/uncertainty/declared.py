@@ -12,12 +12,29 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from viability_bounds_pkg.parameter import NOT_NEGATIVE, Range, joint_numbers, whole_number
+from viability_bounds_pkg.parameter import (
+    NOT_NEGATIVE,
+    Range,
+    joint_numbers,
+    switch,
+    whole_number,
+)
 
 Array = NDArray[np.float64]
 
 MOST_PERIODS = 100
 """Longest delay and row of missed deadlines that can be declared, control periods."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class VelocityEstimation:
+    """Where the velocities in estimated joint states come from."""
+
+    velocity_estimation: bool = switch(
+        "whether velocities are estimated from positions and torques; false takes those that the "
+        "robot reports",
+        default=True,
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.state_estimation.observer import design_observer
+from viability_bounds_pkg.torque_margin import TorqueMargins, tightened
 from viability_bounds_pkg.uncertainty.declared import DeclaredUncertainty
+from viability_bounds_pkg.viability import BoundsSolver
 
 Array = NDArray[np.float64]
 
@@ -90,3 +92,61 @@ def uncertainty_margins(
         velocity = errors.v + fastest * (late + lag) + spread * later
         position = errors.q + limits.v_max * (late + lag) + 0.5 * spread * later**2
     return UncertaintyMargins((1 + stale) * dt, position, velocity)
+
+
+class Loop(NamedTuple):
+    """A control loop, without what is uncertain in it.
+
+    Attributes:
+        limits: of n joints.
+        torque_margins: off these limits, for the torque held in a control period.
+        dt: control period, s.
+        least_horizon: of the bounds, s.
+        predicted: as in `uncertainty_margins`.
+        observed: whether velocities are observed, not reported.
+    """
+
+    limits: JointLimits
+    torque_margins: TorqueMargins
+    dt: float
+    least_horizon: float
+    predicted: bool = False
+    observed: bool = False
+
+    def margins(self, declared: DeclaredUncertainty) -> UncertaintyMargins:
+        """Return what the bounds must hold for; the horizon is that of the bounds."""
+        errors = observer_errors(declared, self.dt) if self.observed else reported_errors(declared)
+        w = self.torque_margins.acceleration + declared.acceleration_disturbance
+        margins = uncertainty_margins(declared, self.dt, self.limits, w, errors, self.predicted)
+        return margins._replace(horizon=max(self.least_horizon, margins.horizon))
+
+    def bounds(self, declared: DeclaredUncertainty) -> BoundsSolver:
+        """Return the bounds that hold for what is declared.
+
+        Raises:
+            JointLimitsError: there are none.
+        """
+        horizon, position_error, velocity_error = self.margins(declared)
+        return BoundsSolver(
+            tightened(self.limits, self.torque_margins),
+            horizon,
+            self.torque_margins.acceleration + declared.acceleration_disturbance,
+            self.dt,
+            position_error=position_error,
+            velocity_error=velocity_error,
+        )
+
+    def of_joint(self, j: int) -> Loop:
+        """Return the loop of joint j alone."""
+        one, limits = slice(j, j + 1), self.limits
+        return self._replace(
+            limits=JointLimits(
+                limits.names[one],
+                limits.q_min[one],
+                limits.q_max[one],
+                limits.v_max[one],
+                limits.a_min[one],
+                limits.a_max[one],
+            ),
+            torque_margins=TorqueMargins(*(each[one] for each in self.torque_margins)),
+        )
