@@ -210,9 +210,9 @@ class CoordinatedStop:
             needed = np.where(room > 0.0, 0.5 * v * v / room, at_once)
         needed = RESERVE * np.maximum(needed, (speed - limits.v_max) / self._dt)
         most = self._braking(v)
-        braking = np.where(needed > RESERVE * most, np.minimum(needed, HARDER * most), 0.0)
-        braking = np.minimum(braking, at_once)
-        return np.where(v > 0.0, np.minimum(a, -braking), np.maximum(a, braking))
+        braking = np.minimum(np.minimum(needed, HARDER * most), at_once)
+        harder = np.where(v > 0.0, np.minimum(a, -braking), np.maximum(a, braking))
+        return np.where(needed > RESERVE * most, harder, a)
 
     def _braking(self, v: Array) -> Array:
         """Return the hardest braking within the acceleration limits, rad/s^2."""
