@@ -167,7 +167,7 @@ def test_contacts_go_on_when_a_payload_comes():
         links = {contact.link for contact in robot.obstacles.contacts()}
         before = robot.obstacles.force
         assert before == pytest.approx(20.0, rel=0.05)
-        robot.set_payload(arm.hand, payload_inertia(arm.hand, 1.0, [0.0, 0.0, 0.05], POINT))
+        robot.set_payload(arm.sensor, payload_inertia(arm.sensor, 1.0, [0.0, 0.0, 0.1], POINT))
         assert {contact.link for contact in robot.obstacles.contacts()} == links
         settle(1500)
         assert {contact.link for contact in robot.obstacles.contacts()} == links
