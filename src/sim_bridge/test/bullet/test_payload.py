@@ -200,6 +200,13 @@ def test_payloads_on_what_does_not_move_are_refused():
             robot.set_payload("panda_link0", body)
         with pytest.raises(RobotDescriptionError, match="panda_lnik5"):
             robot.set_payload("panda_lnik5", body)
+        robot.set_payload("panda_hand", body)
+        for refused in (
+            lambda: robot.set_payload("panda_hand payload", body),
+            lambda: robot.apply_wrench("panda_hand payload", [0.0] * 3, [0.0] * 3),
+        ):
+            with pytest.raises(RobotDescriptionError, match="'panda_hand payload'"):
+                refused()
 
 
 @pytest.mark.parametrize(
