@@ -16,6 +16,8 @@ from sim_bridge.bullet.joint_friction import JointFriction
 from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.bullet.obstacles import Obstacle
 from sim_bridge.bullet.robot import BulletRobot
+from sim_bridge.hardware.imperfections import Imperfections
+from sim_bridge.hardware.motors import Motors
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -47,6 +49,18 @@ class Configured:
         self.masses = dict(
             zip(values.get("mass_scale_links", []), values.get("mass_scales", []), strict=True)
         )
+
+    @property
+    def motors(self) -> Motors:
+        """Motors with all imperfections."""
+        n = np.zeros(len(self.joints))
+        imperfections = Imperfections(
+            motor_bandwidth=n + 100.0,
+            torque_constant_error=n + 0.02,
+            torque_ripple=n + 0.01,
+            current_noise=n + 0.005,
+        )
+        return Motors(imperfections, self.tau_max, H)
 
     def robot(
         self, body: dict[str, object] | None = None, *, masses: bool = False, **friction: object
@@ -180,6 +194,8 @@ def main() -> None:
         with closing(arm.robot()) as robot:
             bare[name] = cost(arm, robot)
             print(f"  {name:16s} as the URDF has it            {bare[name]:6.1f}")
+        with closing(arm.robot({"motors": arm.motors})) as robot:
+            print(f"  {'':16s} with imperfect motors         {cost(arm, robot):6.1f}")
         with closing(arm.robot()) as robot:
             print(f"  {'':16s} under its drives              {cost(arm, robot, drives=True):6.1f}")
     cases = {

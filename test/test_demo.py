@@ -115,6 +115,16 @@ def test_what_it_cannot_play_is_refused_in_one_line(tmp_path, arguments, names):
     assert names in error
 
 
+def test_an_imperfect_robot_may_have_further_parameters(tmp_path):
+    """At half the rate its own filter passes too much: both files are read."""
+    further = tmp_path / "further.yaml"
+    further.write_text("/**: {ros__parameters: {rate_hz: 150.0}}")
+    result = demo("panda", "--imperfect", "--params", str(further), "--out", str(tmp_path))
+    assert result.returncode == 2
+    line = "parameter 'velocity_filter_hz' is 100; allowed: a number below half of rate_hz, 75"
+    assert line in result.stderr
+
+
 def test_it_knows_the_bounds_there_are():
     assert f"\n{' | '.join(METHODS)}) ;;\n" in DEMO.read_text()
 

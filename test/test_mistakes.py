@@ -192,7 +192,7 @@ def test_in_a_message(mistake, nodes, robot, gets):
     for word, value in WORDS.items():
         text = text.replace(word, yaml.safe_dump(value, default_flow_style=True).strip())
     message = filled(imported(sent["type"])(), yaml.safe_load(text))
-    heard = robot if sent["topic"] in ("external_wrench", "obstacles") else nodes
+    heard = robot if sent["topic"] in ("external_wrench", "obstacles", "payload") else nodes
     gets(heard, mistake["line"], each=lambda: heard.publish(sent["topic"], message))
 
 

@@ -21,7 +21,7 @@ from sim_bridge.bullet.force_torque_sensor import ForceTorqueSensor
 from sim_bridge.bullet.obstacle_bodies import BulletObstacles
 from sim_bridge.bullet.obstacles import ContactMaterial, LinkWrench
 from sim_bridge.bullet.vectors import finite_vector
-from sim_bridge.urdf.payload import PayloadError, with_payloads
+from sim_bridge.urdf.payload import PayloadError, payload_link, with_payloads
 from sim_bridge.urdf.preparation import FramePlacement, PreparedUrdf, prepare_urdf
 from viability_bounds_pkg.robot_description import RobotDescriptionError, unknown_name
 
@@ -136,7 +136,10 @@ class BulletBody:
     def _load(self, prepared: PreparedUrdf) -> None:
         """Load the robot, its motors and brakes off."""
         bullet = self._bullet
-        self._frames = prepared.frames
+        payloads = set(map(payload_link, self._payloads))
+        self._frames = {
+            link: frame for link, frame in prepared.frames.items() if link not in payloads
+        }
         try:
             self.body_id = body = bullet.load_urdf(
                 prepared.text, flags=pybullet.URDF_USE_INERTIA_FROM_FILE
@@ -261,10 +264,11 @@ class BulletBody:
     def _reload(self) -> None:
         states = self._joint_states()
         measured = self.sensor.wrench if self.sensor else None
+        prepared = self._prepared()
         for gear in self._gears:
             self._bullet.removeConstraint(gear)
         self._bullet.removeBody(self.body_id)
-        self._load(self._prepared())
+        self._load(prepared)
         if self.sensor and measured is not None:  # until the next step
             self.sensor.wrench = measured
         self._place(*np.array([state[:2] for state in states]).T)

@@ -101,7 +101,8 @@ class BulletRobot(BulletBody):
         self._friction = None if friction.ideal else friction
         # PyBullet's position, half a step ahead of the velocity; see the module.
         self._q, self._v, self._motor_torque = np.zeros((3, n))
-        self._asked, self._motors = np.zeros(n), motors
+        self._motors = motors
+        self._asked = self._motor_torque if motors is None else np.zeros(n)
         self._brakes = np.zeros(n)
         self._drive: PositionDrive | None = None  # made when first needed: it builds a model
         self._driving = self._stopping = False
@@ -231,9 +232,8 @@ class BulletRobot(BulletBody):
         for remaining in range(substeps, 0, -1):
             if control is not None:
                 self._asked[:] = control()
-            if not braking:
-                motors, asked = self._motors, self._asked
-                self._motor_torque[:] = asked if motors is None else motors.step(asked, self._q)
+            if self._motors is not None and not braking:
+                self._motor_torque[:] = self._motors.step(self._asked, self._q)
             if self._friction is not None:
                 self._apply_friction(self._friction, braking)
             elif not braking:

@@ -11,9 +11,9 @@ from collections import Counter, deque
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
+from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import JointState
@@ -22,7 +22,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.hardware.communication import CommandPath
-from sim_bridge.hardware.sensing import JointReading, Sensing
+from sim_bridge.hardware.sensing import Sensing
 from sim_bridge.nodes.bullet_parameters import BulletConfiguration, make_robot, make_stop
 from sim_bridge.nodes.command_outage import CommandOutage
 from sim_bridge.nodes.ft_sensor import ForceTorqueReading
@@ -48,6 +48,8 @@ from viability_bounds_pkg.ros.topics import (
     JOINT_STATES,
     ROBOT_DESCRIPTION,
 )
+
+Array = NDArray[np.float64]
 
 _RETRY_PERIOD = 0.2
 _STRAYS = 50
@@ -103,9 +105,8 @@ class BulletNode(ArmNode):
         self._ft_wrench.header.frame_id = config.sensor.ft_frame
         self._ft_publisher = FT_WRENCH.publisher(self) if self._robot.sensor else None
         imperfect = config.imperfections
-        self._sensing = (
-            Sensing(imperfect, config.torque_max, config.dt) if imperfect.of_sensing else None
-        )
+        senses = imperfect.of_sensing or imperfect.of_motors
+        self._sensing = Sensing(imperfect, config.torque_max, config.dt) if senses else None
         self._restart()
 
         # Joints that are locked, too: robot_state_publisher places no link without its joint.
@@ -170,7 +171,7 @@ class BulletNode(ArmNode):
         """Begin a control period and publish the state at its start."""
         self._stamp += self._dt_ns
         self._advanced = False
-        q, v, tau = self._reading or self._true_state()
+        q, v, tau = self._reading or self._robot.state()
         state = self._state
         state.position = array("d", q.tobytes()) + self._locked_at
         state.velocity = array("d", v.tobytes()) + self._at_rest
@@ -187,9 +188,10 @@ class BulletNode(ArmNode):
         self._published_at = time.monotonic()
         self._state_publisher.publish(state)
 
-    def _true_state(self) -> JointReading:
+    def _true_state(self) -> tuple[Array, Array, Array]:
+        """Return the state of the joints, and the torques that the drives believe to give."""
         q, v, _ = self._robot.state()
-        return JointReading(q, v, self._robot.believed_torque)
+        return q, v, self._robot.believed_torque
 
     def _receive(self, sent: JointCommand | None) -> None:
         """Take the command that arrives in the current period, or hold the last one.

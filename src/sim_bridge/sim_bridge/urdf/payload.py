@@ -53,6 +53,11 @@ def payload_inertia(link: str, mass: float, centre: ArrayLike, moments: ArrayLik
     return pin.Inertia(mass, c, matrix)
 
 
+def payload_link(link: str) -> str:
+    """Return the name of the link that the payload of `link` is in `with_payloads`."""
+    return f"{link} payload"
+
+
 def with_payloads(urdf: str, payloads: Mapping[str, pin.Inertia]) -> str:
     """Return a URDF with payloads, each a link of its own.
 
@@ -64,7 +69,7 @@ def with_payloads(urdf: str, payloads: Mapping[str, pin.Inertia]) -> str:
         return urdf
     root = fromstring(urdf)
     for link, payload in payloads.items():
-        name = f"{link} payload"
+        name = payload_link(link)
         inertial = SubElement(SubElement(root, "link", name=name), "inertial")
         SubElement(inertial, "origin", xyz=number_text(payload.lever))
         SubElement(inertial, "mass", value=number_text([payload.mass]))

@@ -167,7 +167,7 @@ def test_contacts_go_on_when_a_payload_comes():
         links = {contact.link for contact in robot.obstacles.contacts()}
         before = robot.obstacles.force
         assert before == pytest.approx(20.0, rel=0.05)
-        robot.set_payload(arm.hand, payload_inertia(arm.hand, 1.0, [0.0, 0.0, 0.05], POINT))
+        robot.set_payload(arm.sensor, payload_inertia(arm.sensor, 1.0, [0.0, 0.0, 0.1], POINT))
         assert {contact.link for contact in robot.obstacles.contacts()} == links
         settle(1500)
         assert {contact.link for contact in robot.obstacles.contacts()} == links
@@ -200,6 +200,13 @@ def test_payloads_on_what_does_not_move_are_refused():
             robot.set_payload("panda_link0", body)
         with pytest.raises(RobotDescriptionError, match="panda_lnik5"):
             robot.set_payload("panda_lnik5", body)
+        robot.set_payload("panda_hand", body)
+        for refused in (
+            lambda: robot.set_payload("panda_hand payload", body),
+            lambda: robot.apply_wrench("panda_hand payload", [0.0] * 3, [0.0] * 3),
+        ):
+            with pytest.raises(RobotDescriptionError, match="'panda_hand payload'"):
+                refused()
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pinocchio as pin
 import pytest
-from geometry_msgs.msg import WrenchStamped
+from geometry_msgs.msg import InertiaStamped, WrenchStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from robot_probe import JOINTS, MODEL, PERIOD, VALUES, Q, RobotProbe
 from rosgraph_msgs.msg import Clock
@@ -16,6 +16,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from sim_bridge.nodes.bullet_node import BulletNode
 from sim_bridge.nodes.topics import EXTERNAL_WRENCH, OBSTACLES
+from sim_bridge.urdf.payload import payload_inertia
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import build_model, inertia_beyond, read_urdf
 from viability_bounds_pkg.ros.runtime import (
@@ -617,6 +618,23 @@ def test_the_first_period_after_a_pause_is_a_whole_one(ros):
         ({"ft_noise": [math.inf] * 6}, "ft_noise", "6 finite numbers"),
         ({"ft_noise": [-0.1] * 6}, "ft_noise", ">= 0"),
         ({"ft_seed": -1}, "ft_seed", ">= 0"),
+        ({"encoder_resolution": [1e-4]}, "encoder_resolution", "7 numbers"),
+        ({"encoder_resolution": [-1e-4] * 7}, "encoder_resolution", ">= 0"),
+        ({"position_noise": [math.nan] * 7}, "position_noise", "nan"),
+        ({"velocity_source": "encoders"}, "velocity_source", "did you mean 'encoder'?"),
+        ({"velocity_filter_hz": 250.0}, "velocity_filter_hz", "half of rate_hz, 250"),
+        ({"velocity_filter_hz": -1.0}, "velocity_filter_hz", ">= 0"),
+        ({"velocity_noise": [0.1] * 6}, "velocity_noise", "7 numbers"),
+        ({"state_delay": -1}, "state_delay", ">= 0"),
+        ({"state_delay": 1.5}, "state_delay", "a whole number"),
+        ({"command_delay": 101}, "command_delay", "<= 100"),
+        ({"motor_bandwidth": [-1.0] * 7}, "motor_bandwidth", ">= 0"),
+        ({"torque_constant_error": [1.0] * 7}, "torque_constant_error", "<= 0.5"),
+        ({"torque_ripple": [1.0] * 7}, "torque_ripple", "<= 0.5"),
+        ({"current_noise": [1.0] * 7}, "current_noise", "<= 0.2"),
+        ({"missed_probability": 1.0}, "missed_probability", "< 1"),
+        ({"missed_in_row": 0}, "missed_in_row", ">= 1"),
+        ({"imperfection_seed": -1}, "imperfection_seed", ">= 0"),
     ],
 )
 def test_it_does_not_start_with_bad_parameters(ros, changed, name, shown):
@@ -645,3 +663,50 @@ def test_a_broken_limit_is_an_error_in_diagnostics(ros):
     violation = [float(x) for x in robot.reported("velocity_violation_rad_s").split()]
     assert violation[6] > 0.1
     assert max(violation[:5]) < 0.1
+
+
+def test_payloads_come_and_go_with_their_stamps(ros):
+    """Gravity is compensated without them, so that they accelerate the arm."""
+    robot = RobotProbe(ros)
+    payloads = ros.talk(InertiaStamped, "payload", GOAL_QOS)
+
+    def send(link, mass, stamp=0, inertia=0.0):
+        message = InertiaStamped()
+        message.header.frame_id = link
+        message.inertia.m, message.inertia.com.z, message.inertia.izz = mass, 0.1, inertia
+        set_stamp(message.header.stamp, stamp)
+        payloads.publish(message)
+
+    start = robot.stamp
+    send("panda_hand", 2.0, start + 3 * PERIOD)
+    send("panda_hand", 0.0, start + 6 * PERIOD)
+    send("panda_hand", -2.0)
+    send("panda_hand", 1.0, inertia=0.5)
+    send("panda_lnik5", 1.0)
+    send("panda_link0", 1.0)
+    send("panda_hand", math.nan)
+    ros.wait_until(lambda: len(robot.node._world) == 2, "the payloads")
+    robot.await_reported("world_changes_pending", "2")
+    assert "payload: 5;" in robot.reported("commands_refused")
+    robot.step(times=20)
+    velocities = {}
+    for stamp, state in zip(robot.states.stamps, robot.states, strict=True):
+        velocities[stamp] = np.array(state.velocity[:7])
+    v = np.array([velocities[start + k * PERIOD] for k in range(21)])
+    changes = np.abs(np.diff(v, axis=0)).max(axis=1)
+    payload = payload_inertia("panda_hand", 2.0, [0.0, 0.0, 0.1], [0.0] * 6)
+    model = build_model(read_urdf(VALUES["robot_description"]), JOINTS)
+    frame = model.frames[model.getFrameId("panda_hand", pin.FrameType.BODY)]
+    hold = pin.computeGeneralizedGravity(model, model.createData(), Q)
+    model.appendBodyToJoint(frame.parentJoint, payload, frame.placement)
+    a = pin.aba(model, model.createData(), Q, np.zeros(7), hold)
+    assert max(changes[:3]) < 1e-9
+    np.testing.assert_allclose(changes[3], np.abs(a).max() * PERIOD * 1e-9, rtol=0.02)
+    assert min(changes[3:6]) > 0.9 * changes[3]
+    assert max(changes[6:]) < 0.1 * changes[3]
+    send("panda_hand", 2.0)
+    ros.wait_until(lambda: len(robot.node._world) == 1, "the payload")
+    robot.step()
+    assert robot.node._robot._payloads
+    assert ros.call(Trigger, "bullet_node/reset", Trigger.Request()).success
+    assert not robot.node._robot._payloads
