@@ -215,6 +215,8 @@ def random_plan(rng, joints, shortest=1e-3, shares=(1.0, 1.0), predicted=True, *
     margins = TorqueMargins(*np.zeros((3, joints)))
     loop = Loop(limits, margins, dt, 0.0, predicted)
     good = [j for j in range(joints) if _has_bounds(loop.of_joint(j), joint_of(declared, j))]
+    if not good:
+        return random_plan(rng, joints, shortest, shares, predicted, **kinds)
     chosen = {
         name: value[good] if isinstance(value, np.ndarray) else value
         for name, value in vars(declared).items()

