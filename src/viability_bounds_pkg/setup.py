@@ -38,6 +38,7 @@ setup(
             "bounds_node = viability_bounds_pkg.cli.ros_program:bounds_node",
             "estimate_acceleration_limits = "
             "viability_bounds_pkg.cli.ros_program:estimate_acceleration_limits",
+            "uncertainty_cost = viability_bounds_pkg.cli.ros_program:uncertainty_cost",
         ],
     },
 )
