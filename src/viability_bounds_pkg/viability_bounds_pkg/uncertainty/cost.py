@@ -24,7 +24,7 @@ class Reach(NamedTuple):
             shape (n, 2), rad/s^2.
         speed: highest speed that is kept, rad/s.
         rest: distance at which joints come to rest before the upper and the lower limit, shape
-            (n, 2), rad.
+            (n, 2), rad; 0 without a limit.
         move_time: of a move from rest to rest across half the range, half a turn where there are
             no limits, with the speed and the braking above, s.
     """
@@ -54,6 +54,7 @@ def reach_of(loop: Loop, declared: DeclaredUncertainty) -> Reach:
     rest = (gained**2)[:, None] / (2.0 * braking)
     rest += (position_error + 0.5 * horizon * (velocity_error + gained))[:, None]
     rest += loop.torque_margins.position[:, None]
+    rest[~np.isfinite(table["position"])] = 0.0
     speed = table["v_max"][:, 0] - gained
     return Reach(braking, speed, rest, _move_time(loop, speed, braking.min(axis=1)))
 
