@@ -6,13 +6,13 @@ import re
 import numpy as np
 import pytest
 
-from viability_bounds_pkg.cli.uncertainty_cost import main
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.joint_limits import JointLimitsError
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.state_estimation.observer import design_observer
 from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
+from viability_bounds_pkg.tools.uncertainty_cost import main
 from viability_bounds_pkg.uncertainty.cost import reach_of, shares_of
 from viability_bounds_pkg.uncertainty.feasible import none_of
 

@@ -77,4 +77,4 @@ def estimate_acceleration_limits() -> int:
 
 def uncertainty_cost() -> int:
     """Run the tool that prints what declared uncertainty costs."""
-    return run_program("viability_bounds_pkg.cli.uncertainty_cost")
+    return run_program("viability_bounds_pkg.tools.uncertainty_cost")
