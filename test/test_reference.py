@@ -73,9 +73,11 @@ def test_a_node_has_the_topics_and_services_of_the_tables_and_no_others(ros, nam
     node = start(ros, name)
     published = defaultdict(set, node.get_publisher_names_and_types_by_node(name, "/"))
     subscribed = dict(node.get_subscriber_names_and_types_by_node(name, "/"))
-    # The pages speak of what may be there: the URDF's topic is read at start only, and the
-    # scenario node publishes what its scenario has.
+    # The pages speak of what may be there: the URDF's topic is read at start only, estimated
+    # states are a setting, and the scenario node publishes what its scenario has.
     sometimes = {"/robot_description"} if name != "bullet_node" else set()
+    if name in ("bounds_node", "controller_node"):
+        sometimes.add("/estimated_joint_states")
     for found, ends in ((published, "source"), (subscribed, "sink")):
         listed = {
             path_of(topic, name): topic

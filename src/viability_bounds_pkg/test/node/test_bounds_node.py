@@ -61,11 +61,11 @@ def exact(q, v, factor=2.0):
 class BoundsProbe:
     """The other side: sends states, keeps answers."""
 
-    def __init__(self, ros, **changed) -> None:
+    def __init__(self, ros, states="joint_states", **changed) -> None:
         self.ros = ros
         self.node = ros.start(BoundsNode, VALUES | changed)
         self.answers = ros.listen(JointTrajectory, "acceleration_limits")
-        self.states = ros.talk(JointState, "joint_states")
+        self.states = ros.talk(JointState, states)
         ros.hears("acceleration_limits")
 
     def send(self, stamp, q, v, joints=JOINTS) -> None:
@@ -208,6 +208,67 @@ def test_diagnostics(ros):
     assert report["states_outside_kernel_by_joint"] == "0 2 1"
     assert float(report["control_period_s"]) == pytest.approx(PERIOD)
     assert float(report["bounds_period_s"]) == pytest.approx(2.0 * PERIOD)
+
+
+DECLARED = {
+    "position_error": [1e-3, 2e-3, 0.0],
+    "velocity_error": [0.02, 0.0, 0.1],
+    "missed_deadlines": 3,
+}
+
+
+def test_it_holds_for_what_is_declared(ros):
+    robot = BoundsProbe(ros, **DECLARED)
+    q, v = map(np.array, NEAR)
+    errors = {name: DECLARED[name] for name in ("position_error", "velocity_error")}
+    bounds = acceleration_bounds(q, v, LIMITS, 4.0 * PERIOD, None, PERIOD, **errors)
+    assert (bounds.upper < exact(q, v).upper).all(), "what is declared has no effect here"
+    check(robot.ask(10 * MS, q, v), bounds)
+    ros.wait_until(lambda: ros.reported(NODE, "states_answered") == "1")
+    report = ros.diagnostics[NODE]
+    assert float(report["bounds_period_s"]) == pytest.approx(4.0 * PERIOD)
+    assert [float(x) for x in report["position_error_rad"].split()] == errors["position_error"]
+    assert [float(x) for x in report["velocity_error_rad_s"].split()] == errors["velocity_error"]
+
+
+def test_a_shorter_horizon_than_declared_is_not_taken(ros):
+    robot = BoundsProbe(ros, **DECLARED)
+    ros.accepts(NODE, bounds_dt_factor=1.0)
+    ros.wait_until(lambda: ros.reported(NODE, "bounds_period_s") != "")
+    q, v = map(np.array, NEAR)
+    errors = {name: DECLARED[name] for name in ("position_error", "velocity_error")}
+    bounds = acceleration_bounds(q, v, LIMITS, 4.0 * PERIOD, None, PERIOD, **errors)
+    check(robot.ask(10 * MS, q, v), bounds)
+
+
+def test_it_answers_estimated_states_where_it_is_told_to(ros):
+    robot = BoundsProbe(ros, states="estimated_joint_states", use_estimated_states=True)
+    check(robot.ask(10 * MS, *NEAR), exact(*map(np.array, NEAR)))
+    names = {name for name, _ in robot.node.get_topic_names_and_types()}
+    assert "/joint_states" not in names
+
+
+@pytest.mark.parametrize(
+    ("changed", "line"),
+    [
+        (
+            {"velocity_error": [0.1, 1.2, 0.1]},
+            "'velocity_error' is 1.2; allowed: at most 0.99[0-9] for 'lift' at 100 Hz",
+        ),
+        (
+            {"position_error": [1.5, 0.0, 0.0], "missed_deadlines": 1},
+            "'position_error' is 1.5; allowed: at most 0.99[0-9] for 'turn' at 100 Hz, with "
+            "missed_deadlines 1",
+        ),
+        ({"missed_deadlines": -1}, "'missed_deadlines' is -1; allowed: a whole number"),
+        ({"delay": 101}, "'delay' is 101; allowed: a whole number"),
+        ({"velocity_error": [0.1]}, r"'velocity_error' is \[0.1\]; allowed: 3 numbers"),
+        ({"motor_bandwidth": [-1.0, 1.0, 1.0]}, "'motor_bandwidth' is .* >= 0"),
+    ],
+)
+def test_it_does_not_start_with_declarations_that_leave_nothing(ros, changed, line):
+    with pytest.raises(SettingError, match=line):
+        ros.start(BoundsNode, VALUES | changed)
 
 
 def test_method_and_horizon_change_while_it_runs(ros):

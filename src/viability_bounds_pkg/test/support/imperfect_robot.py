@@ -14,10 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 from adversary import Violations, advance
 
-from viability_bounds_pkg.joint_limits import JointLimits
+from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
 from viability_bounds_pkg.state import State
+from viability_bounds_pkg.torque_margin import TorqueMargins
 from viability_bounds_pkg.uncertainty.declared import DeclaredUncertainty
-from viability_bounds_pkg.uncertainty.margins import uncertainty_margins
+from viability_bounds_pkg.uncertainty.feasible import joint_of
+from viability_bounds_pkg.uncertainty.margins import Loop, uncertainty_margins
 from viability_bounds_pkg.viability import BoundsSolver
 
 SAMPLES = np.linspace(0.0, 1.0, 9)[1:]
@@ -32,7 +34,6 @@ class Plan:
         limits: of n joints.
         dt: control period, s.
         declared: what may go wrong.
-        errors: largest errors of a state for its own instant, shape (n,) each.
         solver: the bounds.
         predicted: whether states are predicted to the instant at which commands act.
     """
@@ -40,12 +41,11 @@ class Plan:
     limits: JointLimits
     dt: float
     declared: DeclaredUncertainty
-    errors: State
     solver: BoundsSolver
     predicted: bool
 
 
-def plan(limits, dt, declared, predicted=True, factor=1.0, shares=(1.0, 1.0), errors=None):
+def plan(limits, dt, declared, predicted=True, shares=(1.0, 1.0)):
     """Return a plan with the margins that follow from what is declared.
 
     Args:
@@ -53,22 +53,20 @@ def plan(limits, dt, declared, predicted=True, factor=1.0, shares=(1.0, 1.0), er
         dt: control period, s.
         declared: what may go wrong.
         predicted: as in `Plan`.
-        factor: least horizon, control periods.
         shares: of the margins E_q and E_v to be kept; below 1 is less than needed.
-        errors: as in `Plan`; those declared if None.
     """
-    errors = errors or State(declared.position_error, declared.velocity_error)
+    errors = State(declared.position_error, declared.velocity_error)
     w = declared.acceleration_disturbance
     margins = uncertainty_margins(declared, dt, limits, w, errors, predicted)
     solver = BoundsSolver(
         limits,
-        max(factor * dt, margins.horizon),
+        margins.horizon,
         w,
         dt,
         position_error=shares[0] * margins.position_error,
         velocity_error=shares[1] * margins.velocity_error,
     )
-    return Plan(limits, dt, declared, errors, solver, predicted)
+    return Plan(limits, dt, declared, solver, predicted)
 
 
 class ImperfectRobot:
@@ -115,18 +113,19 @@ class ImperfectRobot:
 
     def _report(self):
         """Return the state that is told: mostly too far from the limit, and too slow."""
-        errors, size = self._plan.errors, np.ones(2)
+        declared, size = self._plan.declared, np.ones(2)
         if self._rng.random() < 0.3:
             size = self._rng.random(2)
-        q = self.q - size[0] * errors.q * self._harm()
-        return State(q, self.v - size[1] * errors.v * self._harm())
+        q = self.q - size[0] * declared.position_error * self._harm()
+        return State(q, self.v - size[1] * declared.velocity_error * self._harm())
 
     def _answer(self, state):
         """Return the command: mostly as fast as the bounds allow."""
         plan, (q, v) = self._plan, state
         if plan.predicted:
             q, v = q + self._lag * v, v + self._lag * self._a
-            for command, _ in list(self._coming)[len(self._coming) - plan.declared.delay :]:
+            newest = len(self._coming) - plan.declared.delay
+            for command, _ in list(self._coming)[newest:]:
                 q, v = q + plan.dt * v + 0.5 * plan.dt**2 * command, v + plan.dt * command
         lower, upper, viable = plan.solver.bounds(q, v)
         self.lost += int((~viable).sum())
@@ -186,18 +185,22 @@ class ImperfectRobot:
             self.seen.see(self.q, self.q, self.v)
 
 
-def random_robot(rng, joints, **kinds):
-    """Return limits, control period and declarations of random joints.
+def random_plan(rng, joints, shortest=1e-3, shares=(1.0, 1.0), predicted=True, **kinds):
+    """Return a plan for random joints, those for which there are bounds, and their rates.
 
     Args:
         rng: random generator.
-        joints: how many.
-        kinds: values of `DeclaredUncertainty` that are given.
+        joints: how many to choose from; the last ones that are left out make it fewer.
+        shortest: control period, s; up to ten times as long.
+        shares: as for `plan`.
+        predicted: as for `plan`.
+        kinds: values of `DeclaredUncertainty` that are given; a bandwidth is the lowest.
     """
-    dt = 10.0 ** rng.uniform(-3.0, -2.0)
+    dt = shortest * 10.0 ** rng.uniform(0.0, 1.0)
     a_min, a_max = -rng.uniform(2.0, 20.0, joints), rng.uniform(2.0, 20.0, joints)
     half, v_max = rng.uniform(0.2, 2.0, joints), rng.uniform(0.5, 4.0, joints)
     weakest = np.minimum(-a_min, a_max)
+    bandwidth = kinds.get("motor_bandwidth", 0.0) * rng.uniform(1.0, 10.0, joints)
     own = {
         "position_error": half * 10.0 ** rng.uniform(-5.0, -2.0, joints),
         "velocity_error": v_max * 10.0 ** rng.uniform(-3.0, -1.5, joints),
@@ -205,8 +208,27 @@ def random_robot(rng, joints, **kinds):
         "delay": 0,
         "delay_jitter": 0,
         "missed_deadlines": 0,
-        "motor_bandwidth": np.zeros(joints),
     }
-    names = [f"joint{j}" for j in range(joints)]
+    declared = DeclaredUncertainty(**{**own, **kinds, "motor_bandwidth": bandwidth})
+    names = tuple(f"joint{j}" for j in range(joints))
     limits = JointLimits(names, -half, half, v_max, a_min, a_max)
-    return limits, dt, DeclaredUncertainty(**{**own, **kinds})
+    margins = TorqueMargins(*np.zeros((3, joints)))
+    loop = Loop(limits, margins, dt, 0.0, predicted)
+    good = [j for j in range(joints) if _has_bounds(loop.of_joint(j), joint_of(declared, j))]
+    if not good:
+        return random_plan(rng, joints, shortest, shares, predicted, **kinds)
+    chosen = {
+        name: value[good] if isinstance(value, np.ndarray) else value
+        for name, value in vars(declared).items()
+    }
+    names = tuple(names[j] for j in good)
+    limits = JointLimits(names, -half[good], half[good], v_max[good], a_min[good], a_max[good])
+    return plan(limits, dt, DeclaredUncertainty(**chosen), predicted, shares)
+
+
+def _has_bounds(loop, declared):
+    try:
+        loop.bounds(declared)
+    except JointLimitsError:
+        return False
+    return True

@@ -78,3 +78,8 @@ def estimator_node() -> int:
 def estimate_acceleration_limits() -> int:
     """Run the estimator of acceleration limits."""
     return run_program("viability_bounds_pkg.cli.estimate_acceleration_limits")
+
+
+def uncertainty_cost() -> int:
+    """Run the tool that prints what declared uncertainty costs."""
+    return run_program("viability_bounds_pkg.tools.uncertainty_cost")

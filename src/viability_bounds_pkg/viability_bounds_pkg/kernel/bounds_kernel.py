@@ -188,17 +188,23 @@ def _resolve_conflict(
     That happens outside the kernel, or by rounding on its edge. The limit that is still kept is
     not given up for the one that is broken: a joint on its way back keeps its speed limit, and
     one that cannot stop in time stops as soon as it can without being thrown against the other
-    limit. The broken one is told by the position or, inside, by the direction of motion. The
-    result is also clipped to the velocity limit; `limit` is the upper one.
+    limit. The broken one is told by the position or, inside, by the direction of motion, that in
+    which the joint may have to stop within the step. The result is also clipped to the velocity
+    limit; `limit` is the upper one.
     """
-    if room_above < 0.0 or (room_below >= 0.0 and v > 0.0):
+    dt, v_max, error = limit.dt, limit.v_max, limit.velocity_error
+    direction = v
+    if room_above < limit.half_dt * (v + error):
+        direction = v + error
+    elif room_below < limit.half_dt * (error - v):
+        direction = v - error
+    if room_above < 0.0 or (room_below >= 0.0 and direction > 0.0):
         a = lower
-    elif room_below < 0.0 or v < 0.0:
+    elif room_below < 0.0 or direction < 0.0:
         a = upper
     else:
         a = 0.5 * (lower + upper)
-    dt, v_max = limit.dt, limit.v_max
-    margin = limit.margin + limit.velocity_error / dt
+    margin = limit.margin + error / dt
     a = max(min(a, (v_max - v) / dt - margin), (-v_max - v) / dt + margin)
     clipped: float = max(min(a, limit.high), limit.low)
     return clipped

@@ -74,14 +74,11 @@ def uncertainty_margins(
         predicted: whether the state is predicted to the instant when the command begins to act,
             lag of the motors included; otherwise the bounds take it as it is.
     """
-    jitter, stale = declared.delay_jitter, declared.delay_jitter + declared.missed_deadlines
-    late, later = declared.delay * dt, jitter * dt
+    late, later = declared.delay * dt, declared.delay_jitter * dt
     lag = declared.motor_lag
     spread = limits.a_max - limits.a_min
     if predicted:
-        uncertain = declared.delay + jitter
-        # Of 1 + stale periods in a row, at least one sees a command that was expected to act.
-        wrong = uncertain - uncertain // (1 + stale)
+        wrong = wrong_periods(declared)
         velocity = errors.v + acceleration_error * (late + lag) + wrong * dt * spread
         position = errors.q + errors.v * (late + lag)
         position += acceleration_error * late * (0.5 * late + lag)
@@ -91,7 +88,21 @@ def uncertainty_margins(
         fastest = np.maximum(-limits.a_min, limits.a_max) + acceleration_error
         velocity = errors.v + fastest * (late + lag) + spread * later
         position = errors.q + limits.v_max * (late + lag) + 0.5 * spread * later**2
-    return UncertaintyMargins((1 + stale) * dt, position, velocity)
+    longest = 1 + declared.delay_jitter + declared.missed_deadlines
+    return UncertaintyMargins(longest * dt, position, velocity)
+
+
+def wrong_periods(declared: DeclaredUncertainty) -> int:
+    """Return in how many periods, at most, other commands act than the prediction expects.
+
+    From the instant of a state to the one when the command that answers it begins to act. Where
+    that is late, the prediction expects it to act already. Of any row of periods that is one
+    longer than a command may be old, one period has a command that is expected in that row, so
+    that only the order differs.
+    """
+    uncertain = declared.delay + declared.delay_jitter
+    oldest = declared.delay_jitter + declared.missed_deadlines
+    return uncertain - uncertain // (1 + oldest)
 
 
 class Loop(NamedTuple):

@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What follows from declarations, what they cost, and which leave no bounds."""
+
+import re
+
+import numpy as np
+import pytest
+
+from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.joint_limits import JointLimitsError
+from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
+from viability_bounds_pkg.parameter import read
+from viability_bounds_pkg.state_estimation.observer import design_observer
+from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
+from viability_bounds_pkg.tools.uncertainty_cost import main
+from viability_bounds_pkg.uncertainty.cost import reach_of, shares_of
+from viability_bounds_pkg.uncertainty.feasible import none_of
+
+PANDA = read_config("panda", "bounds_node")
+DECLARED = {
+    "position_error": [1e-4] * 7,
+    "velocity_error": [0.02] * 7,
+    "acceleration_disturbance": [1.0, 0.3, 1.0, 1.0, 1.0, 1.0, 1.0],
+    "delay": 1,
+    "delay_jitter": 1,
+    "missed_deadlines": 2,
+    "motor_bandwidth": [50.0] * 7,
+}
+ESTIMATED = {"use_estimated_states": True}
+
+
+def configured(**changed):
+    return read(BoundsConfiguration, PANDA | changed)
+
+
+@pytest.mark.parametrize("more", [{}, ESTIMATED])
+def test_nothing_declared_keeps_nothing_back(more):
+    config = configured(**more)
+    assert not config.uncertainty.position_error.any()
+    assert not config.uncertainty.velocity_error.any()
+    assert config.horizon == config.bounds_dt_factor * config.dt
+
+
+@pytest.mark.parametrize("name", DECLARED)
+@pytest.mark.parametrize("more", [{}, ESTIMATED, {**ESTIMATED, "velocity_estimation": False}])
+def test_each_declaration_takes_something(name, more):
+    config = configured(**DECLARED, **more)
+    whole = reach_of(config.loop, config.declared)
+    less = configured(**{**DECLARED, name: 0 if isinstance(DECLARED[name], int) else []}, **more)
+    left = reach_of(less.loop, less.declared)
+    if name == "velocity_error" and more == ESTIMATED:
+        np.testing.assert_array_equal(left.rest, whole.rest)
+    else:
+        assert (left.rest < whole.rest).all()
+
+
+def test_observed_velocities_have_the_errors_of_the_observer():
+    config = configured(position_error=[1e-4] * 7, acceleration_disturbance=[0.2] * 7, **ESTIMATED)
+    design = design_observer(config.dt, [1e-4] * 7, [0.2] * 7)
+    np.testing.assert_array_equal(config.uncertainty.position_error, design.position_error)
+    np.testing.assert_array_equal(config.uncertainty.velocity_error, design.velocity_error)
+
+
+def test_rows_of_missed_deadlines_and_late_commands_lengthen_the_horizon():
+    assert configured(missed_deadlines=1).horizon == 2.0 * 0.002
+    assert configured(missed_deadlines=4).horizon == pytest.approx(5.0 * 0.002)
+    assert configured(missed_deadlines=4, delay_jitter=2).horizon == pytest.approx(7.0 * 0.002)
+
+
+@pytest.mark.parametrize("more", [{}, ESTIMATED])
+def test_joints_rest_and_keep_a_speed_where_the_tool_says(more):
+    config = configured(**DECLARED, **more)
+    bounds, reach = make_bounds(config, None).solve, reach_of(config.loop, config.declared)
+    limits, still = config.limits, np.zeros(7)
+    np.testing.assert_allclose(
+        bounds(limits.q_max - reach.rest[:, 0], still).upper, 0.0, atol=1e-7
+    )
+    np.testing.assert_allclose(
+        bounds(limits.q_min + reach.rest[:, 1], still).lower, 0.0, atol=1e-7
+    )
+    middle = 0.5 * (limits.q_min + limits.q_max)
+    np.testing.assert_allclose(bounds(middle, reach.speed).upper, 0.0, atol=1e-9)
+    ideal = reach_of(config.loop, none_of(config.declared))
+    assert (ideal.move_time < reach.move_time).all()
+
+
+def test_shares_are_what_one_would_gain():
+    config = configured(**DECLARED)
+    shares = shares_of(config.loop, config.declared)
+    assert {share.name for share in shares} == set(DECLARED)
+    assert [s.weight for s in shares] == sorted((s.weight for s in shares), reverse=True)
+    whole = reach_of(config.loop, config.declared)
+    (share,) = (share for share in shares if share.name == "motor_bandwidth")
+    less = configured(**{**DECLARED, "motor_bandwidth": []})
+    gained = reach_of(less.loop, less.declared).speed - whole.speed
+    assert share.speed == pytest.approx(gained[share.joint])
+
+
+@pytest.mark.parametrize(
+    ("changed", "name", "joint"),
+    [
+        ({"velocity_error": [0.1] * 6 + [1.2]}, "velocity_error", "panda_joint7"),
+        ({"position_error": [0.1] * 3 + [2.0] * 4}, "position_error", "panda_joint4"),
+        ({"missed_deadlines": 90, "velocity_error": [0.8] * 7}, "velocity_error", "panda_joint1"),
+        ({"delay": 90, "missed_deadlines": 1, **ESTIMATED}, "delay", "panda_joint1"),
+        ({"delay_jitter": 40}, "delay_jitter", "panda_joint1"),
+        ({"motor_bandwidth": [50.0] * 2 + [1.0] * 5}, "motor_bandwidth", "panda_joint3"),
+    ],
+)
+def test_declarations_without_bounds_are_refused_with_what_would_do(changed, name, joint):
+    with pytest.raises(SettingError) as refused:
+        make_bounds(configured(**changed), None)
+    text = str(refused.value)
+    assert "\n" not in text
+    pattern = (
+        rf"parameter '{name}' is (\S+); allowed: at (most|least) (\S+) for '{joint}' at 500 Hz"
+    )
+    match = re.match(pattern, text)
+    assert match, text
+    given, _, limit = match.groups()
+    value = changed[name]
+    j = PANDA["joints"].index(joint)
+    assert float(given) == pytest.approx(value if isinstance(value, int) else value[j])
+    for tried, good in ((float(limit), True), (1.01 * float(limit), False)):
+        if isinstance(value, int):
+            new = int(limit) + (not good)
+        else:
+            tried = tried if name != "motor_bandwidth" or good else 0.99 * float(limit)
+            new = [0.0] * 7
+            new[j] = tried
+        one = configured(**{**changed, name: new})
+        if good:
+            make_bounds(configured(**_of_joint(changed | {name: new}, j)), None)
+        else:
+            with pytest.raises((SettingError, JointLimitsError)):
+                make_bounds(one, None)
+
+
+def _of_joint(changed, j):
+    """Return the declarations of joint j alone, nothing of the others."""
+    return {
+        key: [x if i == j else 0.0 for i, x in enumerate(value)]
+        if isinstance(value, list)
+        else value
+        for key, value in changed.items()
+    }
+
+
+def test_two_declarations_that_are_both_too_large():
+    with pytest.raises(SettingError, match="less for 'panda_joint1' at 500 Hz, and less of vel"):
+        make_bounds(configured(position_error=[3.0] * 7, velocity_error=[3.0] * 7), None)
+
+
+def test_state_dependent_limits_do_not_know_errors():
+    config = configured(position_error=[1e-4] * 7, acceleration_limits="state_dependent")
+    with pytest.raises(SettingError, match="worst_case, where errors of the states"):
+        make_bounds(config, None)
+
+
+def overlay(tmp_path, text):
+    path = tmp_path / "more.yaml"
+    path.write_text("/**:\n  ros__parameters:\n" + "".join(f"    {line}\n" for line in text))
+    return ["--params-file", str(config_folder() / "panda.yaml"), "--params-file", str(path)]
+
+
+def test_the_tool_prints_what_each_joint_and_each_declaration_costs(tmp_path, capsys):
+    lines = [f"{name}: {value}" for name, value in DECLARED.items()]
+    assert main(overlay(tmp_path, lines)) == 0
+    shown, errors = capsys.readouterr()
+    assert errors == ""
+    for name in (*PANDA["joints"], *DECLARED):
+        assert re.search(rf"^{name} ", shown, re.MULTILINE), name
+    config = configured(**DECLARED)
+    reach = reach_of(config.loop, config.declared)
+    assert f"{reach.speed[6]:.3f}" in shown
+    assert f"look {1e3 * config.horizon:.3g} ms ahead, 4 ms without" in shown
+    assert f"most: {shares_of(config.loop, config.declared)[0].name}\n" in shown
+
+
+def test_the_tool_without_declarations(capsys):
+    assert main(["--params-file", str(config_folder() / "panda.yaml")]) == 0
+    assert "nothing is declared" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        (
+            "velocity_error: [1.2, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1]",
+            "'velocity_error' is 1.2; allowed",
+        ),
+        ("velocity_error: [0.1]", "'velocity_error' is [0.1]; allowed: 7 numbers"),
+        ("delay: 1.5", "'delay' is 1.5; allowed: a whole number"),
+        ("dealy: 1", "unknown parameter 'dealy'"),
+    ],
+)
+def test_the_tool_says_in_one_line_what_is_wrong(tmp_path, capsys, line, said):
+    assert main(overlay(tmp_path, [line])) == 1
+    shown, errors = capsys.readouterr()
+    assert shown == ""
+    assert errors.startswith("uncertainty_cost: ")
+    assert said in errors
+    assert errors.count("\n") == 1
+
+
+def test_the_tool_needs_a_file(capsys):
+    with pytest.raises(SystemExit) as end:
+        main([])
+    assert end.value.code == 2
+    assert "--params-file" in capsys.readouterr().err
