@@ -12,9 +12,9 @@ d can cause is the sum over the impulse responses' magnitudes (their L1 norm): b
 disturbances with the signs of the response reach it, and nothing within Delta and W exceeds it.
 
 A lasting d, such as friction at rest, leaves a lasting error of the velocity. So an integrator of
-r may learn a part c^, |c^| <= C, that is added to a. To the observer, d - c^ is the disturbance:
-the guarantee is that of W + C, whatever is learned. `docs/state_estimation.md` compares it with
-other observers.
+r may learn a part c^, |c^| <= C, that is added to a. To the observer, d - c^ is the disturbance,
+which W has to cover; W >= |d| + C covers it whatever is learned. `docs/state_estimation.md`
+compares the observer with others.
 """
 
 from __future__ import annotations
@@ -78,8 +78,8 @@ def design_observer(
     Args:
         dt: control period, s.
         position_error: largest error of a measured position, shape (n,), rad.
-        acceleration_error: largest error of the known acceleration, also within a period, and of
-            what is learned of it, W + C, shape (n,), rad/s^2.
+        acceleration_error: largest error of the known acceleration, less what is learned of it,
+            also within a period, shape (n,), rad/s^2.
     """
     delta, w = np.atleast_1d(*np.broadcast_arrays(position_error, acceleration_error))
     table = _worst_cases()

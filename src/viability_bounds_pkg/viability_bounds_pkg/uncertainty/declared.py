@@ -43,9 +43,9 @@ class DeclaredUncertainty:
         if_empty=0.0,
     )
     lasting_disturbance: Array = joint_numbers(
-        "part of acceleration_disturbance that lasts, friction, payloads, wrong masses, rad/s^2: "
-        "the estimator learns it, up to that, so that velocities of joints at rest are without "
-        "bias, but its largest errors are those for the sum of both; 0 if empty",
+        "up to which the estimator learns what the model does not know and lasts, friction, "
+        "payloads, wrong masses, rad/s^2, so that velocities of joints at rest have no bias; its "
+        "errors are guaranteed where acceleration_disturbance covers the rest; 0 if empty",
         NOT_NEGATIVE,
         if_empty=0.0,
     )
@@ -71,11 +71,6 @@ class DeclaredUncertainty:
         NOT_NEGATIVE,
         if_empty=0.0,
     )
-
-    @property
-    def estimated_acceleration_error(self) -> Array:
-        """Largest error of the acceleration that the estimator reckons with, (n,), rad/s^2."""
-        return self.acceleration_disturbance + self.lasting_disturbance
 
     @property
     def motor_lag(self) -> Array:
