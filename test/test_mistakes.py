@@ -23,7 +23,7 @@ from torque_safety_controller.cli import identify_friction
 from torque_safety_controller.node import controller_node
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.cli import estimate_acceleration_limits
-from viability_bounds_pkg.node import bounds_node
+from viability_bounds_pkg.node import bounds_node, estimator_node
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.ros import arm_node, program
 from viability_bounds_pkg.ros.claim import TakenError
@@ -45,6 +45,7 @@ MS = 1_000_000
 WORDS = {"JOINTS": JOINTS, "ZEROS": ZERO, "ONES": [1.0] * N, "NANS": [float("nan")] * N}
 PROGRAMS = {
     "bounds_node": bounds_node.main,
+    "estimator_node": estimator_node.main,
     "controller_node": controller_node.main,
     "bullet_node": bullet_node.main,
     "scenario_node": scenario_node.main,

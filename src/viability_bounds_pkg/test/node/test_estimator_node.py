@@ -83,6 +83,7 @@ def reference(delay=0, lag=0.0, coarse=True):
         design,
         np.array(VALUES["velocity_max"]),
         np.array(VALUES["torque_max"]),
+        np.zeros(N),
     )
 
 

@@ -27,7 +27,7 @@ class Loop:
         self.delay = sensing + acting
         self.design = design_observer(DT, np.full(N, 0.5 * RESOLUTION), np.full(N, W))
         self.estimator = StateEstimator(
-            model(), DT, self.delay, self.lag, self.design, np.full(N, 2.0), TAU_MAX
+            model(), DT, self.delay, self.lag, self.design, np.full(N, 2.0), TAU_MAX, np.zeros(N)
         )
         hold = np.array(pin.rnea(model(), model().createData(), HOME, 0 * HOME, 0 * HOME))
         rng = np.random.default_rng(4)
@@ -117,7 +117,7 @@ def test_without_prediction_the_errors_are_larger():
     with_prediction = loop.errors(300)[1]
     blind = Loop(1, 1, 100.0)
     blind.estimator = StateEstimator(
-        model(), DT, 0, np.zeros(N), blind.design, np.full(N, 2.0), TAU_MAX
+        model(), DT, 0, np.zeros(N), blind.design, np.full(N, 2.0), TAU_MAX, np.zeros(N)
     )
     assert (blind.errors(300)[1] > 1.5 * with_prediction).any()
 

@@ -17,6 +17,12 @@ CASES = [
 STEPS = 2500
 
 
+def observer_at(design, dt, state, lasting=0.0):
+    observer = Observer(design, dt, np.full(len(state.q), lasting))
+    observer.start(state)
+    return observer
+
+
 def responses(design, dt):
     """Return the responses of the error to one wrong measurement, and to d at times in a step.
 
@@ -26,7 +32,7 @@ def responses(design, dt):
 
     def follow(error_q, error_v, n):
         # The truth rests at zero, so that the error is minus the estimate.
-        observer = Observer(design, dt, State(np.array([-error_q]), np.array([-error_v])))
+        observer = observer_at(design, dt, State(np.array([-error_q]), np.array([-error_v])))
         rows = []
         for measured in (n, *np.zeros(STEPS - 1)):
             observer.correct(observer.innovation(np.array([measured])))
@@ -59,7 +65,7 @@ def test_an_adversary_comes_near_the_guaranteed_errors_but_not_beyond(dt, delta,
     count = 1500
     n = delta * np.sign(noise[:count, target])[::-1]
     d = w * np.sign(pulses[:count].mean(axis=1)[:, target])[::-1]
-    observer = Observer(design, dt, State(np.zeros(1), np.zeros(1)))
+    observer = observer_at(design, dt, State(np.zeros(1), np.zeros(1)))
     truth = State(np.zeros(1), np.zeros(1))
     guaranteed = design.position_error[0], design.velocity_error[0]
     for k in range(count):
@@ -80,7 +86,7 @@ def test_guarantees_hold_under_quantisation_noise_and_changing_accelerations():
     dt, resolution, w = 0.001, 1e-4, 4.0
     design = design_observer(dt, np.full(50, 0.5 * resolution), np.full(50, w))
     start = State(rng.uniform(-1, 1, 50), np.zeros(50))
-    observer, truth = Observer(design, dt, start), start
+    observer, truth = observer_at(design, dt, start), start
     largest = np.zeros(50)
     for k in range(4000):
         d = w * np.sign(np.sin(rng.uniform(2.0, 60.0) * k * dt + np.arange(50)))
@@ -139,7 +145,7 @@ def test_exact_positions_give_an_observer_that_is_right_after_two_periods():
     assert design.position_error[0] == 0.0
     assert design.velocity_error[0] == pytest.approx(3.0 * dt / 2)
     assert design.lag[0] == pytest.approx(dt / 2)
-    observer = Observer(design, dt, State(np.array([0.3]), np.array([-4.0])))
+    observer = observer_at(design, dt, State(np.array([0.3]), np.array([-4.0])))
     truth = State(np.array([1.0]), np.array([0.5]))
     for _ in range(2):
         truth = truth.after(np.ones(1), dt)
@@ -157,7 +163,7 @@ def test_nothing_declared_guarantees_that_there_is_no_error():
 def test_an_error_at_the_start_decays_where_accelerations_are_declared_exact():
     dt = 0.001
     design = design_observer(dt, [1e-3], [0.0])
-    observer = Observer(design, dt, State(np.zeros(1), np.ones(1)))
+    observer = observer_at(design, dt, State(np.zeros(1), np.ones(1)))
     for _ in range(2000):
         observer.predict(np.zeros(1))
         observer.correct(observer.innovation(np.zeros(1)))
@@ -167,7 +173,7 @@ def test_an_error_at_the_start_decays_where_accelerations_are_declared_exact():
 def test_lag_and_noise_are_those_that_are_measured():
     dt, delta = 0.001, 1e-4
     design = design_observer(dt, [delta], [3.0])
-    observer = Observer(design, dt, State(np.zeros(1), np.zeros(1)))
+    observer = observer_at(design, dt, State(np.zeros(1), np.zeros(1)))
     truth = observer.state
     for _ in range(500):  # an acceleration that nothing tells of
         truth = truth.after(np.ones(1), dt)
@@ -176,10 +182,57 @@ def test_lag_and_noise_are_those_that_are_measured():
     assert truth.v[0] - observer.state.v[0] == pytest.approx(design.lag[0], rel=1e-6)
 
     rng = np.random.default_rng(2)
-    observer = Observer(design, dt, State(np.zeros(1), np.zeros(1)))
+    observer = observer_at(design, dt, State(np.zeros(1), np.zeros(1)))
     seen = []
     for n in rng.uniform(-delta, delta, 20000):
         observer.predict(np.zeros(1))
         observer.correct(observer.innovation(np.array([n])))
         seen.append(observer.state.v[0])
     assert np.std(seen) == pytest.approx(design.noise[0], rel=0.03)
+
+
+def test_a_lasting_disturbance_is_learned_up_to_what_is_declared():
+    dt = 0.001
+    for lasting, left in ((0.0, 1.0), (2.0, 1.0 / 3.0), (3.0, 0.0)):
+        design = design_observer(dt, [5e-5], [3.0 + lasting])
+        observer = observer_at(design, dt, State(np.zeros(1), np.zeros(1)), lasting)
+        truth = observer.state
+        for _ in range(3000):
+            truth = truth.after(np.full(1, 3.0), dt)
+            observer.predict(np.zeros(1))
+            observer.correct(observer.innovation(truth.q))
+        assert observer.disturbance[0] == pytest.approx(min(lasting, 3.0), rel=1e-3)
+        expected = left * 3.0 * design.lag[0]
+        assert truth.v[0] - observer.state.v[0] == pytest.approx(expected, rel=1e-2, abs=1e-5)
+
+
+def test_the_guarantee_holds_while_disturbances_are_learned():
+    rng = np.random.default_rng(6)
+    dt, resolution, w = 0.001, 1e-4, 4.0
+    design = design_observer(dt, np.full(30, 0.5 * resolution), np.full(30, 2.0 * w))
+    observer = observer_at(design, dt, State(np.zeros(30), np.zeros(30)), w)
+    truth = observer.state
+    largest = np.zeros(30)
+    for k in range(6000):
+        if k % 300 == 0:  # the worst is a change of sign after the other one was learned
+            d = w * rng.choice([-1.0, 1.0], 30)
+        truth = truth.after(d, dt)
+        observer.predict(np.zeros(30))
+        innovation = observer.innovation(resolution * np.rint(truth.q / resolution))
+        assert (abs(innovation) <= design.innovation).all()
+        observer.correct(innovation)
+        np.maximum(largest, abs(truth.v - observer.state.v), out=largest)
+        assert (abs(truth.q - observer.state.q) <= design.position_error).all()
+    assert (largest <= design.velocity_error).all()
+    assert (largest > 0.5 * design.velocity_error).any()
+
+
+@pytest.mark.parametrize("delta", [0.0, 1e-7, 1e-5, 1e-3])
+def test_learning_is_stable_for_any_poles(delta):
+    design = design_observer(0.001, [delta], [3.0])
+    observer = observer_at(design, 0.001, State(np.full(1, 1e-3), np.ones(1)), 1e9)
+    for _ in range(30000):
+        observer.predict(np.zeros(1))
+        observer.correct(observer.innovation(np.zeros(1)))
+    assert abs(observer.state.v[0]) < 1e-6
+    assert abs(observer.disturbance[0]) < 1e-3

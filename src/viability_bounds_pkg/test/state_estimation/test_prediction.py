@@ -21,7 +21,7 @@ STILL = np.array([0.1, -0.6, 0.2, -1.9, 0.3, 1.2, 0.4])
 
 def estimator(delay=0, dt=DT, lag=0.0, observers=None, longest_gap=1):
     lags = np.full(N, lag)
-    return StateEstimator(model(), dt, delay, lags, observers, FAST, MAX, longest_gap)
+    return StateEstimator(model(), dt, delay, lags, observers, FAST, MAX, np.zeros(N), longest_gap)
 
 
 def gravity(state):

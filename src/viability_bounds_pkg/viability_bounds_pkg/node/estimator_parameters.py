@@ -53,5 +53,6 @@ def make_estimator(config: EstimatorConfiguration, model: pin.Model) -> StateEst
         config.observers,
         config.velocity_max,
         config.torque_max,
+        declared.lasting_disturbance,
         1 + declared.missed_deadlines,
     )

@@ -48,6 +48,7 @@ class StateEstimator:
         observers: that estimate the velocities; None takes those that are reported.
         velocity_max: speed limits, shape (n,), rad/s; tells jumps from motion.
         torque_max: torque limits, shape (n,), N m.
+        lasting: up to which the observers learn a lasting disturbance, shape (n,), rad/s^2.
         longest_gap: control periods between two states that are bridged by the model.
 
     Attributes:
@@ -64,6 +65,7 @@ class StateEstimator:
         observers: ObserverDesign | None,
         velocity_max: Array,
         torque_max: Array,
+        lasting: Array,
         longest_gap: int = 1,
     ) -> None:
         zero = np.zeros(model.nv)
@@ -75,7 +77,7 @@ class StateEstimator:
         self._observer: Observer | None = None
         self._jump = zero
         if observers is not None:
-            self._observer = Observer(observers, dt, State(zero, zero))
+            self._observer = Observer(observers, dt, lasting)
             self._jump = np.maximum(UNEXPECTED * observers.innovation, SUDDEN * dt * velocity_max)
         self._stamp = -1
         self._tau = zero  # of the motors at the instant of the last state
@@ -170,21 +172,22 @@ class StateEstimator:
         self._acting = None
         self._tau = self._model.torque_at(reported) if effort is None else effort
         if self._observer is not None:
-            self._observer.state = reported
+            self._observer.start(reported)
         answer = self._predict(reported, self._commands.torques()[1:])
         return answer if np.isfinite(answer).all() else reported
 
     def _predict(self, state: State, coming: list[Array | None]) -> State:
         """Return a state after the commands that are under way, None for the torque as it is."""
         model, lag, tau = self._model, self._lag, self._tau
+        learned = 0.0 if self._observer is None else self._observer.disturbance
         accelerations = [model.a]
         for command in coming:
             after = tau if command is None else lag.end(tau, command)
             accelerations.append(model.acceleration(state, lag.mean(tau, after)))
-            state = state.after(model.a, self._dt)
+            state = state.after(model.a + learned, self._dt)
             tau = after
         if lag.any:
-            state = lag.lead(state, model.acceleration_at(state, tau))
+            state = lag.lead(state, model.acceleration_at(state, tau) + learned)
         # That of the period which the next state ends.
         model.a = accelerations[min(1, len(coming))]
         return state

@@ -10,7 +10,11 @@ position that is measured up to n, |n| <= Delta. The observer predicts and corre
 with both poles of its error at p: l1 = 1 - p^2, l2 = (1 - p)^2 / dt. The largest error that n and
 d can cause is the sum over the impulse responses' magnitudes (their L1 norm): bang-bang
 disturbances with the signs of the response reach it, and nothing within Delta and W exceeds it.
-`docs/state_estimation.md` compares it with other observers.
+
+A lasting d, such as friction at rest, leaves a lasting error of the velocity. So an integrator of
+r may learn a part c^, |c^| <= C, that is added to a. To the observer, d - c^ is the disturbance,
+which W has to cover; W >= |d| + C covers it whatever is learned. `docs/state_estimation.md`
+compares the observer with others.
 """
 
 from __future__ import annotations
@@ -29,6 +33,9 @@ Array = NDArray[np.float64]
 LEAST_ACCELERATION_ERROR = 0.1
 """What gains are chosen for at least, rad/s^2: with none, an error at the start would stay."""
 
+LEARNING = 0.1
+"""Frequency at which lasting disturbances are learned, in that of the observer's poles."""
+
 _POLES = np.concatenate(([0.0], np.exp(-np.geomspace(7.0, 5e-3, 300))))
 """Poles to choose from: 2.5 % between two in frequency: costs less than 1e-4 of the error."""
 
@@ -40,6 +47,7 @@ class ObserverDesign:
     Attributes:
         position_gain: l1.
         velocity_gain: l2, 1/s.
+        learning_gain: by which the innovation changes the disturbance that is learned, 1/s^2.
         position_error: largest error of the estimated position, rad.
         velocity_error: largest error of the estimated velocity, rad/s.
         innovation: largest difference between measured and predicted position, rad.
@@ -50,6 +58,7 @@ class ObserverDesign:
 
     position_gain: Array
     velocity_gain: Array
+    learning_gain: Array
     position_error: Array
     velocity_error: Array
     innovation: Array
@@ -69,8 +78,8 @@ def design_observer(
     Args:
         dt: control period, s.
         position_error: largest error of a measured position, shape (n,), rad.
-        acceleration_error: largest error of the known acceleration, also within a period, shape
-            (n,), rad/s^2.
+        acceleration_error: largest error of the known acceleration, less what is learned of it,
+            also within a period, shape (n,), rad/s^2.
     """
     delta, w = np.atleast_1d(*np.broadcast_arrays(position_error, acceleration_error))
     table = _worst_cases()
@@ -88,6 +97,7 @@ def design_observer(
     return ObserverDesign(
         position_gain=1.0 - p**2,
         velocity_gain=(1.0 - p) ** 2 / dt,
+        learning_gain=LEARNING * (1.0 - p) ** 3 / dt**2,
         position_error=worst(table.position),
         velocity_error=worst(table.velocity) / dt,
         innovation=worst(table.innovation),
@@ -102,19 +112,31 @@ class Observer:
     Args:
         design: gains.
         dt: control period, s.
-        state: to begin with.
+        lasting: C, up to which a lasting disturbance is learned, shape (n,), rad/s^2.
 
     Attributes:
         state: the estimate.
+        disturbance: c^, what was learned, shape (n,), rad/s^2.
     """
 
-    def __init__(self, design: ObserverDesign, dt: float, state: State) -> None:
-        self._l1, self._l2, self._dt = design.position_gain, design.velocity_gain, dt
+    def __init__(self, design: ObserverDesign, dt: float, lasting: Array) -> None:
+        self._l1, self._l2, self._l3 = (
+            design.position_gain,
+            design.velocity_gain,
+            design.learning_gain,
+        )
+        self._dt, self._lasting = dt, lasting
+        self._learns = bool(lasting.any())
+        self.start(State(np.zeros_like(lasting), np.zeros_like(lasting)))
+
+    def start(self, state: State) -> None:
+        """Start anew from a state, without a disturbance."""
         self.state = state
+        self.disturbance = np.zeros_like(self._lasting)
 
     def predict(self, a: Array) -> None:
-        """Go on by a period with mean acceleration `a`, shape (n,), rad/s^2."""
-        self.state = self.state.after(a, self._dt)
+        """Go on by a period with mean acceleration `a` of the model, shape (n,), rad/s^2."""
+        self.state = self.state.after(a + self.disturbance, self._dt)
 
     def innovation(self, q: Array) -> Array:
         """Return how far measured positions `q` are from the estimate, shape (n,), rad."""
@@ -125,6 +147,9 @@ class Observer:
         """Correct the estimate by what `innovation` returned."""
         q, v = self.state
         self.state = State(q + self._l1 * innovation, v + self._l2 * innovation)
+        if self._learns:
+            learned = self.disturbance + self._l3 * innovation
+            self.disturbance = np.minimum(np.maximum(learned, -self._lasting), self._lasting)
 
 
 class _Norms(NamedTuple):

@@ -59,6 +59,13 @@ class DeclaredUncertainty:
         NOT_NEGATIVE,
         if_empty=0.0,
     )
+    lasting_disturbance: Array = joint_numbers(
+        "up to which the estimator learns what the model does not know and lasts, friction, "
+        "payloads, wrong masses, rad/s^2, so that velocities of joints at rest have no bias; its "
+        "errors are guaranteed where acceleration_disturbance covers the rest; 0 if empty",
+        NOT_NEGATIVE,
+        if_empty=0.0,
+    )
     delay: int = whole_number(
         "control periods from the instant of a reported state to the one when the command that "
         "answers it begins to act",
