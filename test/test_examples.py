@@ -13,6 +13,7 @@ SAYS = {
     "bounds_alone": r"exact bounds 0\.0e\+00, naive bounds [1-9]",
     "chain_of_nodes": r"positions at most 0 rad beyond their\nlimits, speeds 0 rad/s",
     "controller_without_ros": r"rad, .* rad/s, .* N m inside\njoints at rest on a limit: \['",
+    "driver_that_stops": r"at rest after 0\.5\d\d s.*\nnearest to a limit: \d.*e-0[67] rad, \d",
     "limits_from_urdf": r"torque does not suffice: 0 of 5000",
 }
 

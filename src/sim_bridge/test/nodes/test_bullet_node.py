@@ -518,6 +518,44 @@ def test_in_real_time_it_keeps_its_rate_and_brakes_without_commands(ros):
     assert "braking" in robot.reported("message")
 
 
+def test_when_commands_fail_it_stops_within_its_limits_and_goes_on_when_they_return(ros):
+    robot = RobotProbe(ros, clock="real_time", rate_hz=100.0, command_timeout=2)
+    robot.await_reported("control", "brakes")  # there was no command yet
+    push = np.array([8.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+    def answer():
+        robot.send(robot.stamp, robot.gravity() + push)
+
+    ros.wait_until(lambda: robot.v[0] > 0.3, "motion under commands", each=answer, period=0.001)
+    robot.await_reported("control", "stopped")
+    ros.wait_until(lambda: np.abs(robot.v).max() < 1e-6, "rest")
+    assert robot.reported("message") == "stopped: no commands"
+    assert int(robot.reported("braked_periods")) > 2
+    assert max(map(float, robot.reported("velocity_violation_rad_s").split())) == 0.0
+    held, q = robot.tau, robot.q
+    np.testing.assert_allclose(held, robot.gravity(), atol=0.05)  # of the motors: no brakes
+    # Back at rest: the torque that holds it goes on.
+    ros.wait_until(
+        lambda: robot.reported("control") == "torque",
+        "commands",
+        each=lambda: robot.send(robot.stamp, held),
+        period=0.001,
+    )
+    np.testing.assert_allclose(robot.q, q, atol=1e-3)
+
+
+def test_the_brakes_hold_it_again_after_a_reset(ros):
+    robot = RobotProbe(ros, clock="real_time", rate_hz=100.0, command_timeout=1)
+    ros.wait_until(
+        lambda: robot.reported("control") == "torque",
+        each=lambda: robot.send(robot.stamp, robot.gravity()),
+        period=0.001,
+    )
+    robot.await_reported("control", "stopped")
+    ros.call(Trigger, "bullet_node/reset", Trigger.Request())
+    robot.await_reported("control", "brakes")
+
+
 def test_the_first_period_after_a_pause_is_a_whole_one(ros):
     """Resumed anywhere between two ticks, a robot leaves time to answer before the next."""
     robot = RobotProbe(ros, clock="real_time", rate_hz=5.0)
@@ -568,6 +606,9 @@ def test_the_first_period_after_a_pause_is_a_whole_one(ros):
         ({"position_min": VALUES["position_max"]}, "position_max", "above position_min"),
         ({"position_max": [1.0]}, "position_max", "7 numbers"),
         ({"velocity_max": [0.0] * 7}, "velocity_max", "> 0"),
+        ({"acceleration_min": [1.0] * 7}, "acceleration_min", "< 0"),
+        ({"acceleration_max": [15.0] * 3}, "acceleration_max", "7 numbers"),
+        ({"acceleration_max": []}, "acceleration_max", "the other limit is given"),
         ({"velocity_max": [math.nan] * 7}, "velocity_max", "nan"),
         ({"torque_max": [-1.0] * 7}, "torque_max", "> 0"),
         ({"start_positions": [0.0] * 6}, "start_positions", "7 numbers"),

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands fail at random moments of fast motions, and the robot stops within its limits."""
+
+from contextlib import closing
+
+import numpy as np
+import pytest
+from direct import DirectLoop
+from sensor_msgs.msg import JointState
+
+from sim_bridge.bullet.limit_monitor import LimitMonitor
+from sim_bridge.nodes.bullet_node import BulletNode
+from sim_bridge.nodes.bullet_parameters import make_robot, make_stop
+from torque_safety_controller.node.controller_node import ControllerNode
+from viability_bounds_pkg.node.bounds_node import BoundsNode
+from viability_bounds_pkg.ros.runtime import GOAL_QOS
+from viability_bounds_pkg.testing.ros_harness import joint_state, read_config
+
+HASTE = {"posture_kp": 100.0, "posture_kd": -1.0, "posture_weight": 10.0, "pose_weight": 0.0}
+MOMENTS = 20
+
+
+def goals(values, rng):
+    """Postures at the joints' limits."""
+    low, high = np.array(values["position_min"]), np.array(values["position_max"])
+    while True:
+        yield np.where(rng.random(len(low)) < 0.5, low, high)
+
+
+@pytest.mark.parametrize("robot", ["panda", "talos_left_arm"])
+def test_no_limit_is_passed_when_commands_fail_at_a_random_moment(robot):
+    rng = np.random.default_rng(0)
+    loop = DirectLoop(robot, HASTE)
+    config = loop.config
+    postures = goals(read_config(robot), rng)
+    law = make_stop(config)
+    limits = config.position_min, config.position_max, config.velocity_max, config.torque_max
+    fastest, thrown = 0.0, 0.0
+    with closing(loop.robot), closing(make_robot(config)) as other:
+        monitor = other.monitor = LimitMonitor(*limits)
+        for _ in range(MOMENTS):
+            loop.controller.set_posture_goal(next(postures))
+            (*_, last) = loop.run(rng.uniform(0.1, 0.3))
+            q, v, _ = loop.robot.state()
+            fastest = max(fastest, float((np.abs(v) / config.velocity_max).max()))
+            for brake in (False, True):
+                other.reset(q, v)
+                monitor.reset()
+                other.step(last.tau, config.substeps)  # held for a period that was missed
+                time = law.time_to_rest(other.state().v) + 0.05
+                if brake:
+                    other.brake(round(time / other.physics_dt), config.torque_max)
+                    thrown = max(thrown, monitor.max_velocity_violation.max())
+                else:
+                    other.stop(law, round(time / other.physics_dt))
+                    assert law.at_rest
+                    assert not monitor.violated
+    assert fastest > 0.9, "the arm was hardly driven"
+    assert thrown > 0.05, "the brakes would have done"
+
+
+@pytest.mark.parametrize("robot", ["panda", "talos_left_arm"])
+def test_the_chain_of_nodes_goes_on_when_commands_return(ros, robot):
+    values = read_config(robot, "bullet_node")
+    arm = ros.start(BulletNode, values | {"clock": "lockstep"})
+    ros.start(BoundsNode, read_config(robot, "bounds_node"))
+    ros.start(ControllerNode, read_config(robot, "controller_node") | HASTE)
+    rng = np.random.default_rng(1)
+    postures = goals(values, rng)
+    user = ros.talk(JointState, "target_posture", GOAL_QOS)
+
+    def reach_for(posture, periods):
+        user.publish(joint_state(values["joints"], 0, posture))
+        end = arm._periods + periods
+        ros.wait_until(lambda: arm._periods >= end, "control periods", timeout=60.0)
+
+    for _ in range(2):
+        reach_for(next(postures), round(rng.uniform(0.2, 0.4) * values["rate_hz"]))
+        assert np.abs(arm._robot.state().v).max() > 0.5
+        speed = arm._stop.time_to_rest(arm._robot.state().v)
+        for _ in range(round((speed + 0.02) * values["rate_hz"])):  # the controller is not heard
+            arm._command = None
+            arm._advance()
+            arm._next_state()
+        assert arm._stop.at_rest
+        ros.wait_until(lambda: arm._command is not None, "commands")
+    reach_for(np.array(values["start_positions"]), round(0.3 * values["rate_hz"]))
+    assert not arm._monitor.violated
