@@ -55,6 +55,7 @@ class ControllerNode(ArmNode):
     PARAMETERS = ControllerConfiguration
 
     def __init__(self, **node_arguments: Any) -> None:
+        self._gains: GainWatch | None = None
         super().__init__(**node_arguments)
         with self.starting(JOINT_COMMANDS):
             self._node_parameters = NodeParameters(self, ControllerConfiguration, self._configure)
@@ -114,10 +115,17 @@ class ControllerNode(ArmNode):
             f"{avoiding} collision avoidance",
         )
 
+    def destroy_node(self) -> None:
+        """End what runs beside the callbacks, too."""
+        if self._gains is not None:  # else the start failed
+            self._gains.close()
+        super().destroy_node()
+
     def _configure(self, config: ControllerConfiguration) -> None:
         self._config = config
         configure(self._controller, config)
-        self._gains.look(config)
+        if self._gains is not None:
+            self._gains.look(config)
 
     def _warn(self, text: str) -> None:
         self.get_logger().warning(text)

@@ -51,10 +51,14 @@ class GainWatch:
             self._check = gain_check(config, self._loop, self._inertia)
             threading.Thread(target=self._judge, args=(self._check,), daemon=True).start()
 
+    def close(self) -> None:
+        """Say nothing more."""
+        self._check = None
+
     def _judge(self, check: GainCheck) -> None:
         for limit in check.limits():
             if check is not self._check:
-                return  # the gains have changed again
+                return  # the gains have changed again, or the node is gone
             key = limit.name, limit.value
             if limit.exceeded and key not in self._told:
                 self._told.add(key)
