@@ -79,6 +79,21 @@ CASES = [
 ]
 
 
+@pytest.mark.parametrize("bandwidth", [math.inf, 1000.0, 60.0])
+def test_a_period_of_motion_is_that_of_many_small_steps(bandwidth):
+    pieces = 20_000
+    x, h = np.array([0.1, -0.2, 3.0]), DT / pieces
+    exact = motion(Link(DT, 0, bandwidth))
+    expected = exact.A @ x + exact.b * 7.0
+    for _ in range(pieces):
+        a = 7.0 if math.isinf(bandwidth) else x[2]
+        change = 0.0 if math.isinf(bandwidth) else bandwidth * (7.0 - a)
+        x = x + h * np.array([x[1] + 0.5 * h * a, a + 0.5 * h * change, change])
+    if math.isinf(bandwidth):
+        x[2] = 7.0
+    np.testing.assert_allclose(x, expected, rtol=0.0, atol=1e-4 * DT)
+
+
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("factor", [1.0, 1.25])
 def test_the_matrices_are_those_of_the_loop_written_out(case, factor):
