@@ -22,6 +22,7 @@ from sim_bridge.nodes.bullet_node import BulletNode
 from torque_safety_controller.cli import identify_friction
 from torque_safety_controller.node import controller_node
 from torque_safety_controller.node.controller_node import ControllerNode
+from torque_safety_controller.tools import gain_limits
 from viability_bounds_pkg.cli import estimate_acceleration_limits
 from viability_bounds_pkg.node import bounds_node, estimator_node
 from viability_bounds_pkg.node.bounds_node import BoundsNode
@@ -50,6 +51,7 @@ PROGRAMS = {
     "bullet_node": bullet_node.main,
     "scenario_node": scenario_node.main,
     "estimate_acceleration_limits": lambda a: estimate_acceleration_limits.main(a[1:]),
+    "gain_limits": lambda a: gain_limits.main(a[1:]),
     "identify_friction": lambda a: identify_friction.main(a[1:]),
 }
 ALL = [

@@ -4,7 +4,9 @@ import pytest
 
 from torque_safety_controller.safety.handover import (
     PATIENCE,
+    REST_PATIENCE,
     REST_SPEED,
+    TORQUE_ERROR,
     Control,
     Handover,
     HandoverRefused,
@@ -18,7 +20,7 @@ Q, TAU = np.array([0.5, 9.0, 1.0]), np.array([-10.0, 20.0, 0.0])
 
 
 def make(control="position") -> Handover:
-    return Handover(control, JOINTS, Q_MIN, Q_MAX, TAU_MAX)
+    return Handover(control, JOINTS, Q_MIN, Q_MAX, TAU_MAX, 0.01)
 
 
 def taking_over() -> Handover:
@@ -151,7 +153,7 @@ def test_an_arm_in_motion_comes_to_rest_before_the_drives_take_it():
 
 def test_an_arm_that_does_not_come_to_rest_is_not_waited_for_for_ever():
     handover = giving_back()
-    handover.slow_down(Q, np.ones(3), PATIENCE)
+    handover.slow_down(Q, np.ones(3), REST_PATIENCE)
     assert handover.control is Control.GIVING_BACK
     handover.slow_down(Q, np.ones(3), 0.01)
     assert handover.control is Control.POSITION
@@ -166,3 +168,41 @@ def test_giving_back_can_be_called_off_and_ends_when_the_robot_was_away():
     handover = giving_back()
     handover.robot_was_away()
     assert handover.control is Control.POSITION
+
+
+def test_a_torque_without_noise_is_known_from_the_state_after_the_call():
+    np.testing.assert_array_equal(taking_over().average(Q, TAU), TAU)
+
+
+def test_noise_is_averaged_until_the_mean_is_known_well_enough():
+    random = np.random.default_rng(1)
+    handover, tau, waited = make(), None, 0
+    handover.to_torque(Q, TAU + 0.005 * TAU_MAX, True, True)
+    while tau is None:
+        tau = handover.average(Q, TAU + 0.005 * TAU_MAX * random.standard_normal(3))
+        waited += 1
+    assert 10 < waited < 100
+    assert handover.torque.samples == waited + 1
+    assert (np.abs(tau - TAU) <= TORQUE_ERROR * TAU_MAX).all()
+    assert (handover.torque.error <= TORQUE_ERROR).all()
+
+
+def test_a_torque_that_stays_unknown_is_refused_after_some_time():
+    random = np.random.default_rng(1)
+    handover = make()
+    handover.to_torque(Q, 0.5 * TAU + 1.0, True, True)
+    periods = 0
+    with pytest.raises(HandoverRefused, match=r"torque of b is known to \d+\.\d+% of torque_max"):
+        while periods < 10_000:
+            noise = np.array([0.0, 5.0, 0.0]) * random.standard_normal(3)
+            assert handover.average(Q, 0.5 * TAU + noise) is None
+            periods += 1
+    assert periods == pytest.approx(PATIENCE / 0.01, abs=1)
+
+
+def test_a_handover_asked_for_again_begins_to_average_anew():
+    handover = taking_over()
+    handover.average(Q, -TAU)
+    handover.failed("a reason")
+    handover.to_torque(Q, -TAU, True, True)
+    np.testing.assert_array_equal(handover.average(Q, -TAU), -TAU)

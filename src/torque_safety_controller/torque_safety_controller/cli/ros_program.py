@@ -18,4 +18,4 @@ def identify_friction() -> int:
 
 def gain_limits() -> int:
     """Run the check of a robot's gains."""
-    return run_program("torque_safety_controller.cli.gain_limits")
+    return run_program("torque_safety_controller.tools.gain_limits")

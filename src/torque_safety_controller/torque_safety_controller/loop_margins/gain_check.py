@@ -160,6 +160,17 @@ class GainLimit(NamedTuple):
         beyond = self.limit - self.value if self.smallest else self.value - self.limit
         return beyond > 1e-3 * abs(self.value)  # as near as the limit is found
 
+    def __str__(self) -> str:
+        """Return what to tell of a gain that is beyond its limit."""
+        if math.isinf(self.limit) or self.limit == 0.0:
+            least = "no value is"
+        else:
+            least = f"{self.limit:.3g} is the {'least' if self.smallest else 'most'}"
+        return (
+            f"parameter '{self.name}' is {self.value:.4g}, but with the delay, motors and "
+            f"encoders declared {least} allowed: see gain_limits and docs/gains.md"
+        )
+
 
 HORIZON, OBSERVER = "bounds_dt_factor", "disturbance_time"
 """What must be at least, not at most, as large as its limit."""

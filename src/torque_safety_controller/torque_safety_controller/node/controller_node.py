@@ -18,6 +18,7 @@ from torque_safety_controller.controller import ControlOutput
 from torque_safety_controller.node.assembly import configure, make_controller
 from torque_safety_controller.node.collision_report import CollisionReport
 from torque_safety_controller.node.controller_report import LEVELS, StepRecord
+from torque_safety_controller.node.gain_watch import GainWatch
 from torque_safety_controller.node.goals import GoalSubscriber
 from torque_safety_controller.node.joint_commands import JointCommands
 from torque_safety_controller.node.limits import LimitsReader
@@ -54,6 +55,7 @@ class ControllerNode(ArmNode):
     PARAMETERS = ControllerConfiguration
 
     def __init__(self, **node_arguments: Any) -> None:
+        self._gains: GainWatch | None = None
         super().__init__(**node_arguments)
         with self.starting(JOINT_COMMANDS):
             self._node_parameters = NodeParameters(self, ControllerConfiguration, self._configure)
@@ -66,6 +68,7 @@ class ControllerNode(ArmNode):
             config.position_min,
             config.position_max,
             config.torque_max,
+            config.dt,
         )
         self._states = JointStateReader(config.joints, config.state_timeout, self._warn)
         self._period = PeriodCheck(config.dt, self._warn)
@@ -84,6 +87,7 @@ class ControllerNode(ArmNode):
         self._collision = CollisionReport(self.get_logger(), self._controller.constraints)
 
         self._commands = JointCommands(self, config.joints, config.ros2_control_topic)
+        self._gains = GainWatch(self, self._controller.robot.model, config)
         self._published = StatePublisher(self, self._controller, config, base, self._states)
         states = state_topic(config.use_estimated_states)
         states.subscription(self, self._on_state)
@@ -112,9 +116,17 @@ class ControllerNode(ArmNode):
             f"{avoiding} collision avoidance",
         )
 
+    def destroy_node(self) -> None:
+        """End what runs beside the callbacks, too."""
+        if self._gains is not None:  # else the start failed
+            self._gains.close()
+        super().destroy_node()
+
     def _configure(self, config: ControllerConfiguration) -> None:
         self._config = config
         configure(self._controller, config)
+        if self._gains is not None:
+            self._gains.look(config)
 
     def _warn(self, text: str) -> None:
         self.get_logger().warning(text)
@@ -232,14 +244,19 @@ class ControllerNode(ArmNode):
         self._enter(Mode.POSITION, self._handover.reason)
 
     def _take_over(self) -> None:
-        """Prepare to go on with torque from the next state; this one is still the drives'."""
+        """Prepare to go on with torque from the next state; this one is still the drives'.
+
+        Not before the torque of the motors is known.
+        """
         states = self._states
         if self._goals.apply_due(states.stamp):
             self.get_logger().warning("goals from before the handover are dropped")
         try:
-            tau = self._handover.check(states.q, states.effort())
+            tau = self._handover.average(states.q, states.effort())
         except HandoverRefused as error:
             self._fail_handover(str(error))
+            return
+        if tau is None:
             return
         state = State(states.q, states.v)
         step = self._controller.bumpless_transfer(state, self._bounds(), tau)
@@ -248,6 +265,11 @@ class ControllerNode(ArmNode):
             return
         self._goal_at = time.monotonic()
         self._handover.taken_over()
+        found = self._handover.torque
+        self.get_logger().info(
+            f"torque of the motors at the handover: from {found.samples} states, off by at most "
+            f"{found.error.max():.2%} of torque_max"
+        )
 
     def _fail_handover(self, reason: str) -> None:
         self._handover.failed(reason)
@@ -267,7 +289,7 @@ class ControllerNode(ArmNode):
                 fresh = silence < config.bounds_timeout
                 self._handover.to_torque(states.q, states.effort(), fresh, bounds_fresh)
                 self._bounds_lost = False
-                response.message = "torque control begins with the next state"
+                response.message = "torque control begins when the torque of the motors is known"
             else:
                 self._handover.to_position(states.q, states.v, silence < config.state_timeout)
                 response.message = "position control begins when the arm is at rest"

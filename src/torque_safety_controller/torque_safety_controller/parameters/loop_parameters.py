@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
 from torque_safety_controller.loop_margins.arm_inertia import ArmInertia
@@ -89,14 +88,14 @@ def read_loop(sections: Callable[[str], Mapping[str, Any]]) -> LoopConfiguration
 
 
 def gain_check(
-    config: ControllerConfiguration, loop: LoopConfiguration, model: pin.Model
+    config: ControllerConfiguration, loop: LoopConfiguration, inertia: ArmInertia
 ) -> GainCheck:
     """Return the check of a controller's gains.
 
     Args:
         config: of the controller.
         loop: of the robot.
-        model: of the arm.
+        inertia: of the arm.
     """
     gains, integral = config.gains, config.additional.integral
     tasks = {
@@ -112,6 +111,5 @@ def gain_check(
         (integral.slow_leak_rate, integral.fast_leak_rate, integral.mu),
         gains.disturbance_time,
     )
-    inertia = ArmInertia.of(model, config.position_min, config.position_max)
     estimated = getattr(config, "use_estimated_states", False)
     return GainCheck(settings, loop.timing(estimated), inertia, config.torque_max)

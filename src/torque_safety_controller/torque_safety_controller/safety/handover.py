@@ -4,7 +4,8 @@
 [Benallegue2021], IV-A: the position reference is captured and held while the QP computes its
 first torque for the present configuration; from the next step on torque is commanded. The
 integral action starts with the difference between the measured and the computed torque, so that
-the commanded torque is continuous (`Controller.bumpless_transfer`).
+the commanded torque is continuous (`Controller.bumpless_transfer`). The measured torque is an
+average: positions are held until it is known well enough.
 
 Position-controlled drives stop a moving arm as hard as they can. On the way back the arm is
 therefore first brought to rest under torque control.
@@ -17,6 +18,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from torque_safety_controller.safety.torque_average import TorqueAverage
 from viability_bounds_pkg.exceptions import ArmSafetyError
 
 Array = NDArray[np.float64]
@@ -27,7 +29,16 @@ TORQUE_TOLERANCE = 0.01
 REST_SPEED = 0.02
 """Speed below which a joint counts as at rest, rad/s."""
 
+TORQUE_ERROR = 0.005
+"""Share of its limit by which the averaged torque of a motor may be off at the handover."""
+
+AVERAGING_TIME = 1.0
+"""Longest time that the torque of the motors is averaged over, s."""
+
 PATIENCE = 2.0
+"""Longest time to wait for the torque of the motors to be known, s."""
+
+REST_PATIENCE = 2.0
 """Longest time to wait for the arm to come to rest, s; under external forces it may not."""
 
 
@@ -56,10 +67,12 @@ class Handover:
         q_min: lower position limits, shape (n,), rad.
         q_max: upper position limits, shape (n,), rad.
         tau_max: torque limits, shape (n,), N m.
+        dt: control period, s.
 
     Attributes:
         control: present control.
         reason: of the last change.
+        torque: of the motors, averaged for the handover, as far as it is known.
     """
 
     def __init__(
@@ -69,6 +82,7 @@ class Handover:
         q_min: ArrayLike,
         q_max: ArrayLike,
         tau_max: ArrayLike,
+        dt: float,
     ) -> None:
         self.control = self._start = Control(control)
         self.reason = "as at start"
@@ -77,6 +91,9 @@ class Handover:
         self._joints = joints
         self._q_min, self._q_max = np.asarray(q_min), np.asarray(q_max)
         self._tau_max = np.asarray(tau_max)
+        self._dt = dt
+        self._average = TorqueAverage(self._tau_max, round(AVERAGING_TIME / dt))
+        self.torque = self._average.best()
 
     @property
     def by_drives(self) -> bool:
@@ -102,7 +119,7 @@ class Handover:
         self._q_hold = None
 
     def to_torque(self, q: Array, tau: Array | None, fresh: bool, bounds_fresh: bool) -> None:
-        """Begin the handover to torque control; the next state with limits completes it.
+        """Begin the handover to torque control; `average` completes it.
 
         Cancels a handover to position control.
 
@@ -124,20 +141,46 @@ class Handover:
         if self.control is Control.GIVING_BACK:
             self._set(Control.TORQUE, "enable_torque")
             return
-        self.check(q, tau)
+        tau = self._within_limits(self._measured(q, tau))
+        self._average.clear()
+        self._average.add(tau)
+        self._waited = 0.0
         self._set(Control.TAKING_OVER, "enable_torque")
 
-    def check(self, q: Array, tau: Array | None) -> Array:
-        """Return `tau` if torque control can begin in this state; see `to_torque`.
+    def average(self, q: Array, tau: Array | None) -> Array | None:
+        """Return the torque that torque control can begin with, or None if it is to wait.
+
+        To be called with each state while it is being taken over.
+
+        Args:
+            q: position, shape (n,), rad.
+            tau: torque of the motors, shape (n,), N m; None if it is not measured.
 
         Raises:
-            HandoverRefused: it cannot.
+            HandoverRefused: it cannot begin.
         """
+        self._average.add(self._measured(q, tau))
+        self._waited += self._dt
+        self.torque = self._average.best()
+        worst = int(np.argmax(self.torque.error))
+        if (error := self.torque.error[worst]) <= TORQUE_ERROR:
+            return self._within_limits(self.torque.mean)
+        if self._waited > PATIENCE:
+            raise HandoverRefused(
+                f"after {PATIENCE:g} s the torque of {self._joints[worst]} is known to "
+                f"{error:.2%} of torque_max only, by noise or motion; allowed: {TORQUE_ERROR:.2%}"
+            )
+        return None
+
+    def _measured(self, q: Array, tau: Array | None) -> Array:
         outside = (q < self._q_min) | (q > self._q_max)
         if outside.any():
             raise HandoverRefused(f"outside the position limits: {self._names(outside)}")
         if tau is None:
             raise HandoverRefused("joint_states carry no motor torque (effort)")
+        return tau
+
+    def _within_limits(self, tau: Array) -> Array:
         beyond = np.abs(tau) > (1.0 + TORQUE_TOLERANCE) * self._tau_max
         if beyond.any():
             raise HandoverRefused(f"motor torque beyond torque_max: {self._names(beyond)}")
@@ -175,7 +218,7 @@ class Handover:
         self.slow_down(q, v, 0.0)
 
     def slow_down(self, q: Array, v: Array, elapsed: float) -> None:
-        """Enter position control if the arm is at rest, or after `PATIENCE`.
+        """Enter position control if the arm is at rest, or after `REST_PATIENCE`.
 
         Args:
             q: position, shape (n,), rad.
@@ -183,7 +226,7 @@ class Handover:
             elapsed: time since the last call, s.
         """
         self._waited += elapsed
-        if np.abs(v).max() <= REST_SPEED or self._waited > PATIENCE:
+        if np.abs(v).max() <= REST_SPEED or self._waited > REST_PATIENCE:
             self._q_hold = q.copy()
             self._set(Control.POSITION, "enable_torque")
 

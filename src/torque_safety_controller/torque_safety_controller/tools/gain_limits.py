@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from torque_safety_controller.loop_margins.arm_inertia import ArmInertia
 from torque_safety_controller.loop_margins.gain_check import (
     LIMIT_MARGIN,
     MARGIN,
@@ -76,7 +77,8 @@ def _run(options: argparse.Namespace) -> int:
         model = load_model(config, config.read_urdf())
     except SettingError as error:
         raise ParameterFileError(f"{', '.join(files)}: {error}") from error
-    check = gain_check(config, loop, model)
+    inertia = ArmInertia.of(model, config.position_min, config.position_max)
+    check = gain_check(config, loop, inertia)
     limits = list(check.limits())
     report(limits)
     print(

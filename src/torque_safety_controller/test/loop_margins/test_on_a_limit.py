@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Arms that rest on a joint limit in the simulation: commands late, encoders coarse."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from sim_bridge.nodes.bullet_parameters import BulletConfiguration, make_robot
+from torque_safety_controller.loop_margins.gain_check import TORQUE_STEP
+from torque_safety_controller.loop_margins.joint_loop import observer_gains
+from torque_safety_controller.node.assembly import make_controller
+from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
+from torque_safety_controller.parameters.loop_parameters import LoopConfiguration
+from torque_safety_controller.qp.constraints import AccelerationRange
+from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
+from viability_bounds_pkg.parameter import read
+from viability_bounds_pkg.robot_configuration import load_model
+from viability_bounds_pkg.state import State
+from viability_bounds_pkg.testing.ros_harness import read_config
+
+POSTURE = {"pose_weight": 0.0, "posture_kp": 100.0, "posture_kd": 20.0}
+
+
+class Encoders:
+    """Positions in steps, and the state that observers make of them and of the torque."""
+
+    def __init__(self, model: pin.Model, loop: LoopConfiguration, q: np.ndarray) -> None:
+        rates = loop.timing(estimated=True).observer_rates
+        self.gains = observer_gains(rates, loop.dt)
+        self.model, self.data, self.dt = model, model.createData(), loop.dt
+        self.step = 2.0 * loop.position_error
+        self.state = State(q, np.zeros(len(q)))
+
+    def read(self, q: np.ndarray, tau: np.ndarray | None) -> State:
+        expected = self.state
+        if tau is not None:
+            a = pin.aba(self.model, self.data, *self.state, tau)
+            q_now, v_now = self.state
+            move = v_now + 0.5 * self.dt * a
+            expected = State(q_now + self.dt * move, v_now + self.dt * a)
+        error = np.round(q / self.step) * self.step - expected.q
+        self.state = State(
+            expected.q + self.gains.position * error, expected.v + self.gains.velocity * error
+        )
+        return self.state
+
+
+def largest_step(robot, joint, seconds, delay=0, **changed) -> float:
+    """Return the largest step of the torque at the end, of the limit.
+
+    Args:
+        robot: name of its file.
+        joint: that is sent beyond its upper limit.
+        seconds: of robot time; the last fifth of it counts.
+        delay: of commands, in control periods.
+        changed: parameters.
+    """
+
+    def configured(kind, node):
+        return read(kind, read_config(robot, node) | POSTURE | changed)
+
+    bullet = configured(BulletConfiguration, "bullet_node")
+    bounds = configured(BoundsConfiguration, "bounds_node")
+    config = configured(ControllerConfiguration, "controller_node")
+    arm = make_robot(bullet)
+    model = load_model(bullet, bullet.urdf)
+    solve = make_bounds(bounds, lambda _: model).solve
+    controller, _ = make_controller(config)
+    q = np.array(bullet.start_positions)
+    arm.reset(q, np.zeros(len(q)))
+    controller.reset(q)
+    goal = q.copy()
+    goal[joint] = bounds.position_max[joint] + 0.3
+    controller.set_posture_goal(goal)
+    encoders = None
+    if "position_error" in changed:
+        encoders = Encoders(model, configured(LoopConfiguration, "bounds_node"), q)
+    under_way: deque[np.ndarray] = deque()
+    torques: list[np.ndarray] = []
+    for _ in range(round(seconds / bullet.dt)):
+        q, v, _ = arm.state()
+        state = State(q, v)
+        if encoders is not None:
+            state = encoders.read(q, torques[-1] if torques else None)
+        limits = solve(*state)
+        step = controller.step(state, AccelerationRange(limits.lower, limits.upper))
+        torques.append(step.tau)
+        under_way.append(step.tau)
+        arm.step(under_way.popleft() if len(under_way) > delay else torques[0], bullet.substeps)
+    last = np.array(torques[-len(torques) // 5 :])
+    return float((np.abs(np.diff(last, axis=0)) / config.torque_max).max())
+
+
+@pytest.mark.parametrize(
+    ("changed", "low", "high"),
+    [
+        ({"integral_lambda": 100.0}, 0.3, 1.0),
+        ({"integral_lambda": 50.0}, 0.0, 0.01),
+        ({"integral_lambda": 100.0, "bounds_dt_factor": 6.0}, 0.0, 0.01),
+        ({"integral_lambda": 100.0, "disturbance_time": -1.0}, 0.0, 0.01),
+    ],
+    ids=["100", "50", "longer horizon", "no observer"],
+)
+def test_late_commands_make_a_limit_cycle_of_the_file_s_gains(changed, low, high):
+    """TALOS' wrist, commands two periods late and not compensated: 42% of the limit."""
+    assert low <= largest_step("talos_left_arm", 8, 1.5, delay=2, **changed) < high
+
+
+@pytest.mark.parametrize(("factor", "calm"), [(2.0, False), (4.0, True)])
+def test_the_horizon_that_the_tool_prints_leaves_coarse_encoders_calm(factor, calm):
+    """Panda's wrist, encoders of 16 bits: at least 3.9 periods by `gain_limits`."""
+    coarse = {"position_error": [4.8e-5] * 7, "rotor_inertia": [0.1] * 7}
+    found = largest_step("panda", 6, 4.0, bounds_dt_factor=factor, **coarse)
+    assert (found < TORQUE_STEP) == calm

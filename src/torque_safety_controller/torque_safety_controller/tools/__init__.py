@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Command line tools that read parameters as the nodes do."""
