@@ -13,7 +13,6 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import pinocchio as pin
-import yaml
 from chain import ROOT
 
 from sim_bridge.bullet.limit_monitor import LimitMonitor
@@ -27,6 +26,7 @@ from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, mak
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.robot_configuration import load_model
 from viability_bounds_pkg.state import State
+from viability_bounds_pkg.user_input.yaml_file import read_yaml
 
 Configuration = TypeVar("Configuration")
 
@@ -57,7 +57,7 @@ class DirectLoop:
     """
 
     def __init__(self, robot: str, changed: Mapping[str, Any] | None = None) -> None:
-        self._file = yaml.safe_load((ROOT / "config" / f"{robot}.yaml").read_text())
+        self._file = read_yaml(ROOT / "config" / f"{robot}.yaml")
         self._changed = dict(changed or {})
         config = self._configuration("bullet_node", BulletConfiguration)
         self.robot = make_robot(config)

@@ -86,17 +86,31 @@ def figure_3() -> Figure:
     return figure
 
 
-def push(changed: dict[str, Any], force: tuple[float, ...], seconds: float = 5.0) -> dict:
-    """Push the hand and let it go; return the loop, the samples, and what they amount to."""
+def push(
+    changed: dict[str, Any],
+    force: tuple[float, ...],
+    seconds: float = 5.0,
+    before: float = 3.0,
+    after: float = 4.0,
+) -> dict:
+    """Push the hand and let it go; return the loop, the samples, and what they amount to.
+
+    Args:
+        changed: parameters that differ from the file.
+        force: N.
+        seconds: that it is pushed for.
+        before: how long it moves to its goal first, s.
+        after: how long it is watched when it is released, s.
+    """
     loop = DirectLoop(ROBOT, changed)
     start = loop.pose()
     goal(loop, start, (0.05, 0.05, 0.1))
-    loop.run(3.0)
+    loop.run(before)
     target = loop.controller.goals.pose_des.translation
     loop.robot.apply_wrench(HAND, force, (0.0, 0.0, 0.0))
     pushed = loop.run(seconds)
     loop.robot.clear_wrenches()
-    released = loop.run(4.0)
+    released = loop.run(after)
     places = hand_places(loop, released) - target
     direction = places[0] / np.linalg.norm(places[0])
     far = np.flatnonzero(np.linalg.norm(places, axis=1) > AWAY)

@@ -17,10 +17,26 @@ README = (ROOT / "README.md").read_text()
 SHORTER = {
     "bash scripts/bench.sh chain": "bash scripts/bench.sh chain --cycles 200",
     "bash scripts/bench.sh step": "bash scripts/bench.sh step --rounds 2",
-    "bash scripts/bench.sh compliance": "bash scripts/bench.sh compliance --steps 200",
+    "bash scripts/bench.sh compliance": "bash scripts/bench.sh compliance --steps 20",
 }
+DEMO = "bash scripts/demo.sh"
+"""The command that is played in full."""
+INTERRUPTED = "bash scripts/demo.sh talos_left_arm"
+"""Run by `test_demo.py` until the arm moves, and played there in full without processes."""
 NOT_HERE = {"bash scripts/test.sh"}
 """What runs this test."""
+KEYS = {
+    "robot",
+    "rate_hz",
+    "steps",
+    "max_position_violation_rad",
+    "max_velocity_violation_rad_s",
+    "max_torque_ratio",
+    "final_position_error_m",
+    "deadline_misses",
+    "latency_p50_us",
+    "latency_p99_us",
+}
 
 
 def commands():
@@ -48,16 +64,21 @@ def hurry(entry, factor):
             hurry(value, factor)
 
 
-@pytest.fixture(scope="module")
-def hurried(tmp_path_factory):
-    """A tree like this one, with scenarios of half a second; `test_demo.py` plays them in full."""
-    tree = tmp_path_factory.mktemp("tree")
+def make_tree(tree):
+    """Make a tree like this one, with results of its own, that lacks a `config`."""
     (tree / "install").symlink_to(ROOT / "install")
     (tree / "scripts").mkdir()
     for script in (ROOT / "scripts").glob("*.sh"):
         (tree / "scripts" / script.name).symlink_to(script)
     (tree / "scripts" / "setup.sh").unlink()
     (tree / "scripts" / "setup.sh").write_text(f"source '{ROOT}/scripts/setup.sh'\n")
+    return tree
+
+
+@pytest.fixture(scope="module")
+def hurried(tmp_path_factory):
+    """A tree like this one, with scenarios of half a second; see also `DEMO`."""
+    tree = make_tree(tmp_path_factory.mktemp("tree"))
     shutil.copytree(ROOT / "config", tree / "config")
     for path in (tree / "config" / "scenarios").iterdir():
         scenario = yaml.safe_load(path.read_text())
@@ -69,11 +90,42 @@ def hurried(tmp_path_factory):
 
 
 def test_there_are_commands():
-    assert "bash scripts/demo.sh" in commands()
+    assert {DEMO, INTERRUPTED} <= {*commands()}
     assert any("reproduce" in command for command in commands())
 
 
-@pytest.mark.parametrize("command", commands())
+def test_the_demo_goes_to_a_limit_and_breaks_none(tmp_path):
+    config = make_tree(tmp_path) / "config"
+    config.symlink_to(ROOT / "config")
+    result = run(DEMO, tmp_path)
+    assert result.returncode == 0, result.stdout + result.stderr
+    written = tmp_path / "results" / "demo"
+    metrics = json.loads((written / "metrics.json").read_text())
+    assert set(metrics) >= KEYS
+    assert metrics["robot"] == "baxter_left_arm"
+    assert metrics["max_position_violation_rad"] <= 1e-9
+    assert metrics["max_velocity_violation_rad_s"] <= 1e-9
+    assert metrics["max_torque_ratio"] <= 1.0 + 1e-9
+    assert metrics["final_position_error_m"] < 1e-3
+    assert metrics["final_orientation_error_rad"] < 1e-3
+    # The run is worth something only if it goes to the limit.
+    closest = min(
+        min(row["lower_clearance_rad"], row["upper_clearance_rad"])
+        for row in metrics["joints"].values()
+    )
+    assert closest < 5e-3
+    assert metrics["clock"] == "lockstep"
+    assert metrics["deadline_misses"] == metrics["braked_periods"] == 0
+    assert (written / "figure.png").stat().st_size > 50_000
+    assert (written / "data.npz").exists()
+    assert "no limit was broken" in result.stdout
+    # In a file the progress is a few lines.
+    assert result.stdout.count("TRACKING") <= 5
+    assert "nan" not in result.stdout
+    assert all(name in result.stdout for name in metrics["joints"])
+
+
+@pytest.mark.parametrize("command", sorted({*commands()} - {DEMO, INTERRUPTED}))
 def test_command_runs(hurried, command):
     if "scripts/demo.sh" not in command or "--help" in command:
         result = run(command)

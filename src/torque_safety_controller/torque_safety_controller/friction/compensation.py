@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torque_safety_controller.friction.settings import GAIN, FrictionSettings
+from torque_safety_controller.linalg.cholesky import factorise, solve
 from viability_bounds_pkg.compiled import bound, compiled
 
 Array = NDArray[np.float64]
@@ -130,11 +131,7 @@ class FrictionCompensation:
         settings = self._settings
         gamma = GAIN / period if settings.gain is None else float(settings.gain)
         blend = -math.expm1(-elapsed / _FADING_TIME)
-        try:
-            self._faded = self._compensate(blend, elapsed, float(settings.leak_rate), gamma)
-        except np.linalg.LinAlgError:  # no mass matrix
-            self.reference_velocity.fill(0.0)
-            self.last.fill(0.0)
+        self._faded = self._compensate(blend, elapsed, float(settings.leak_rate), gamma)
         return self.last
 
 
@@ -157,16 +154,21 @@ def _compensate(
     The reference velocity is that of constant acceleration and velocity within the step.
     """
     coulomb, excess, viscous, stribeck_velocity, budget = present
-    coulomb += blend * (wanted.coulomb - coulomb)
-    excess += blend * (wanted.excess - excess)
-    viscous += blend * (wanted.viscous - viscous)
-    stribeck_velocity += blend * (wanted.stribeck_velocity - stribeck_velocity)
-    budget += blend * (wanted.budget - budget)
     decay = math.exp(-leak_rate * dt)
     held = -math.expm1(-leak_rate * dt) / (leak_rate * dt) if leak_rate * dt > 0.0 else 1.0
-    gain = gamma / np.diag(np.linalg.inv(M))  # of the inertia felt while others give way
+    L, M_inv = M.copy(), np.eye(len(v))
+    if not factorise(L):  # no mass matrix
+        w[:], tau[:] = 0.0, 0.0
+        return False
+    solve(L, M_inv)
+    gain = gamma / np.diag(M_inv)  # of the inertia felt while others give way
     largest = 0.0
     for i in range(len(v)):
+        coulomb[i] += blend * (wanted.coulomb[i] - coulomb[i])
+        excess[i] += blend * (wanted.excess[i] - excess[i])
+        viscous[i] += blend * (wanted.viscous[i] - viscous[i])
+        stribeck_velocity[i] += blend * (wanted.stribeck_velocity[i] - stribeck_velocity[i])
+        budget[i] += blend * (wanted.budget[i] - budget[i])
         speed = abs(v[i])
         stiction = excess[i] * math.exp(-((speed / stribeck_velocity[i]) ** 2))
         friction = coulomb[i] + stiction + viscous[i] * speed

@@ -19,6 +19,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from torque_safety_controller.linalg.cholesky import factorise, solve
 from torque_safety_controller.linalg.singularity_damping import (
     damping,
     is_clear_of_singularities,
@@ -59,10 +60,13 @@ def dynamically_consistent_inverse(
             of different units can be scaled to like size before; that changes the damping only.
 
     Raises:
-        LinAlgError: M is singular, or there are numbers that are not finite.
+        LinAlgError: M is not positive definite, or there are numbers that are not finite.
     """
-    M_inv = np.linalg.inv(M)
-    X = M_inv @ J.T
+    L = M.copy()
+    if not factorise(L):
+        raise np.linalg.LinAlgError("M is not positive definite")
+    X = J.T.copy()
+    solve(L, X)
     M_dot_X, J_dot_X = M_dot @ X, J_dot @ X
     Y, Y_dot = J @ X, J_dot_X + J_dot_X.T - X.T @ M_dot_X
     G = J @ J.T
@@ -74,6 +78,13 @@ def dynamically_consistent_inverse(
         scale = len(M) / trace
         Y += scale * D
         Y_dot += scale * (D_dot - np.trace(M_dot) / trace * D)
-    Y_inv = np.linalg.inv(Y)
-    J_plus = X @ Y_inv
-    return J_plus, (M_inv @ (J_dot.T - M_dot_X) - J_plus @ Y_dot) @ Y_inv, damped
+    if not factorise(Y):
+        raise np.linalg.LinAlgError("J M^-1 J^T is not positive definite")
+    # Y and Y_dot are symmetric, so J^+ = X Y^-1 is the transpose of Y^-1 X^T.
+    J_plus = X.T.copy()
+    solve(Y, J_plus)
+    X_dot = J_dot.T - M_dot_X
+    solve(L, X_dot)
+    J_plus_dot = (X_dot - J_plus.T @ Y_dot).T.copy()
+    solve(Y, J_plus_dot)
+    return J_plus.T.copy(), J_plus_dot.T.copy(), damped

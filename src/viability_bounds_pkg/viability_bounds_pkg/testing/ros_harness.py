@@ -9,19 +9,20 @@ nothing sleeps.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import os
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 import rclpy
-import yaml
 from ament_index_python.packages import get_package_share_directory
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import SetParameters
@@ -34,6 +35,7 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, make_executor, set_stamp, stamp_to_ns
+from viability_bounds_pkg.user_input.yaml_file import read_yaml
 
 
 def config_folder() -> Path:
@@ -87,9 +89,12 @@ def _in_use(domain: int) -> bool:
     return False
 
 
+_read_once = functools.cache(read_yaml)
+
+
 def read_config(robot: str, *nodes: str) -> dict[str, Any]:
     """Return the parameters that ``config/<robot>.yaml`` has for nodes."""
-    document = yaml.safe_load((config_folder() / f"{robot}.yaml").read_text(encoding="utf-8"))
+    document = deepcopy(_read_once(config_folder() / f"{robot}.yaml"))
     sections = [document.get(key, {}) for key in ("/**", *(f"/**/{node}" for node in nodes))]
     return {k: v for section in sections for k, v in section.get("ros__parameters", {}).items()}
 
