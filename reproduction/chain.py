@@ -112,8 +112,12 @@ def run_chain(
             nodes[name] = kind(parameter_overrides=overrides)
         try:
             player = nodes["scenario_node"]
-            play(player, others=[each for each in nodes.values() if each is not player], quiet=True)
-            return ChainResult(player.recorded_run(), player.robot, nodes["bullet_node"].true_positions)
+            play(
+                player, others=[each for each in nodes.values() if each is not player], quiet=True
+            )
+            return ChainResult(
+                player.recorded_run(), player.robot, nodes["bullet_node"].true_positions
+            )
         finally:
             for node in nodes.values():
                 node.destroy_node()

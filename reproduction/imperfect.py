@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Limits of three imperfect robots: late, coarse and noisy, with and without what is done about it.
+"""Limits of three imperfect robots, late, coarse and noisy, with and without remedies.
 
 bash scripts/reproduce.sh imperfect                 the tables, and docs/reproduction_imperfect.md
 bash scripts/reproduce.sh imperfect panda           those of one robot
 bash scripts/reproduce.sh imperfect --minutes 1     quicker: 1 minute each in place of 10
 
 The real nodes in one process, in lockstep, with `config/imperfect/<robot>.yaml`. Each minute has
-its own seed: goals anew each second, half of the joints at their limits, pushes, and rests in which
-joints lie on their limits. Every second minute has a posture task so stiff that the limits decide.
-Limits are checked at each physics step, against the true state.
+its own seed: goals anew each second, half of the joints at their limits, pushes, and rests in
+which joints lie on their limits. Every second minute has a posture task so stiff that the limits
+decide. Limits are checked at each physics step, against the true state.
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from chain import ROOT, load_node_values, run_chain
-from figure import RESULTS, table
+from chain import load_node_values, run_chain
 
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 
@@ -93,12 +92,18 @@ CASES = {
     "ideal": Case("nothing spoilt, nothing done", 0, ()),
     "ideal_remedies": Case("nothing spoilt, all done", 0),
     "nothing": Case("spoilt, nothing done", 1, ()),
-    "no_margins": Case("spoilt, all but margins and horizon", 1, changed={"bounds_node": NOTHING_DECLARED}),
+    "no_margins": Case(
+        "spoilt, all but margins and horizon", 1, changed={"bounds_node": NOTHING_DECLARED}
+    ),
     "no_prediction": Case(
-        "spoilt, all but prediction", 1, changed={"estimator_node": {"delay": 0, "motor_bandwidth": []}}
+        "spoilt, all but prediction",
+        1,
+        changed={"estimator_node": {"delay": 0, "motor_bandwidth": []}},
     ),
     "no_observer": Case(
-        "spoilt, all but the observer", 1, changed={"estimator_node": {"velocity_estimation": False}}
+        "spoilt, all but the observer",
+        1,
+        changed={"estimator_node": {"velocity_estimation": False}},
     ),
     "all": Case("spoilt, all done", 1),
     "twice": Case("spoilt twice as much as declared, all done", 2),
@@ -178,7 +183,9 @@ class Course:
         self._rng = np.random.default_rng(seed)
         self._joints = list(values["joints"])
         self._low, self._high = (np.array(values[f"position_{end}"]) for end in ("min", "max"))
-        locked = dict(zip(values.get("locked_joints", []), values.get("locked_positions", []), strict=True))
+        locked = dict(
+            zip(values.get("locked_joints", []), values.get("locked_positions", []), strict=True)
+        )
         self._model = build_model(read_urdf(values["robot_description"]), self._joints, locked)
         self._data = self._model.createData()
         self._frames = values["base_frame"], values["end_effector_frame"]
@@ -346,7 +353,9 @@ def main() -> int:
                 rows.append(row(CASES[name], minutes, hands))
                 print(robot, *rows[-1], sep=" | ", flush=True)
                 if name in ("all", "outage_stop"):
-                    fine &= all(m.position <= 0 and m.speed <= 0 and m.torque <= 1 + 1e-9 for m in minutes)
+                    fine &= all(
+                        m.position <= 0 and m.speed <= 0 and m.torque <= 1 + 1e-9 for m in minutes
+                    )
             pages.append((robot, rows))
     return 0 if fine else 1
 
