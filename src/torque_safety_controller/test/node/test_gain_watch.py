@@ -89,6 +89,12 @@ def test_the_tool_prints_the_largest_gains_and_says_what_is_exceeded(declared, c
     assert not rows["pose_kp"].endswith("exceeded")
 
 
+def test_missed_deadlines_lengthen_the_horizon_of_the_bounds(declared, capsys):
+    assert main(files(FILE, declared("missed_deadlines: 4"))) == 0
+    rows = {line.split()[0]: line for line in capsys.readouterr().out.splitlines() if line}
+    assert rows["bounds_dt_factor"].split()[1] == "5"
+
+
 def test_a_step_of_all_encoders_is_exceeded_too(declared, capsys):
     assert main(files(FILE, declared(f"velocity_error: {[0.005] * 9}"))) == 1
     (line,) = (row for row in capsys.readouterr().out.splitlines() if "at rest" in row)

@@ -43,6 +43,7 @@ class LoopConfiguration(ControlRate, LimitedRobotConfiguration):
     velocity_error: Array = joint_numbers("see bounds_node", NOT_NEGATIVE, if_empty=0.0)
     delay: int = whole_number("see bounds_node", Range(0, 100), default=0)
     delay_jitter: int = whole_number("see bounds_node", Range(0, 100), default=0)
+    missed_deadlines: int = whole_number("see bounds_node", Range(0, 100), default=0)
     motor_bandwidth: Array = joint_numbers("see bounds_node", NOT_NEGATIVE, if_empty=0.0)
 
     @property
@@ -50,6 +51,11 @@ class LoopConfiguration(ControlRate, LimitedRobotConfiguration):
         """Whether any delay, lag or error is declared."""
         errors = (self.position_error, self.velocity_error, self.motor_bandwidth)
         return self.delay + self.delay_jitter > 0 or any(each.any() for each in errors)
+
+    @property
+    def horizon(self) -> float:
+        """Horizon of the bounds in control periods, which missed deadlines lengthen."""
+        return max(self.bounds_dt_factor, 1.0 + self.missed_deadlines + self.delay_jitter)
 
     def timing(self, estimated: bool) -> RobotTiming:
         """Return what the margins are computed with.
@@ -67,7 +73,7 @@ class LoopConfiguration(ControlRate, LimitedRobotConfiguration):
             velocity_error=self.velocity_error,
             acceleration_disturbance=self.acceleration_disturbance,
             braking=np.minimum(-self.acceleration_min, self.acceleration_max),
-            bounds_dt_factor=self.bounds_dt_factor,
+            bounds_dt_factor=self.horizon,
             estimated=estimated,
         )
 

@@ -83,9 +83,9 @@ def _run(options: argparse.Namespace) -> int:
     report(limits)
     print(
         f"modulus margin with the gains given: {check.stiffest_margin():.2g}, of a joint on its "
-        f"limit {check.limit_margin(loop.bounds_dt_factor):.2g}"
+        f"limit {check.limit_margin(loop.horizon):.2g}"
     )
-    calm = _report_steps(config, check, loop.bounds_dt_factor)
+    calm = _report_steps(config, check, loop.horizon)
     return 1 if any(limit.exceeded for limit in limits) or not calm else 0
 
 
