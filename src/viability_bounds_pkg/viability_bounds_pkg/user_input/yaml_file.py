@@ -37,7 +37,7 @@ class _Loader(_Strict, yaml.SafeLoader):
 
 
 class _FastLoader(_Strict, getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """Takes a quarter of the time, where PyYAML was built with LibYAML."""
+    """Several times as fast, where PyYAML was built with LibYAML."""
 
 
 for _each in (_Loader, _FastLoader):
