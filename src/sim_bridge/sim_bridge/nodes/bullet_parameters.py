@@ -49,7 +49,7 @@ Array = NDArray[np.float64]
 CLOCKS = ("real_time", "lockstep")
 
 _OBSERVER_TIME = 0.002
-"""Of the drives' own stop, s: their velocities are exact."""
+"""Of the drives' own stop, s: their velocities are exact, and the motors have no lag."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -521,6 +521,7 @@ def test_in_real_time_it_keeps_its_rate_and_brakes_without_commands(ros):
 def test_when_commands_fail_it_stops_within_its_limits_and_goes_on_when_they_return(ros):
     robot = RobotProbe(ros, clock="real_time", rate_hz=100.0, command_timeout=2)
     robot.await_reported("control", "brakes")  # there was no command yet
+    assert robot.node._robot._brakes.all()
     push = np.array([8.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
     def answer():

@@ -154,6 +154,23 @@ def test_an_adversary_of_accelerations_within_the_margin_passes_no_limit(panda, 
         assert (np.abs(v) <= panda.margin / HOLD_GAIN).all()
 
 
+def test_motors_with_a_lag_pass_a_limit_by_little(arm):
+    rng = np.random.default_rng(0)
+    share = -np.expm1(-2.0 * np.pi * 50.0 * H)  # of the way to a new torque in a step, 50 Hz
+    stop = arm.stop()
+    for _ in range(3):
+        q, v = arm.edge(rng)
+        tau = pin.rnea(arm.model, arm.data, q, v, np.zeros(arm.n)).copy()
+        stop.begin(q, v)
+        for _ in range(round((stop.time_to_rest(v) + 0.2) / H)):
+            tau += share * (stop.torque(q, v) - tau)
+            q, v = arm.move(q, v, tau, 1)
+            assert arm.beyond(q).max() < 1e-4
+            assert (np.abs(v) <= arm.limits.v_max).all()
+        assert stop.at_rest
+        assert np.abs(v).max() < 5e-3
+
+
 def test_the_observer_balances_what_the_model_does_not_know(arm):
     rng = np.random.default_rng(2)
     q, v = arm.inside(rng)

@@ -77,7 +77,8 @@ class CoordinatedStop:
         margin: how far accelerations may be off within a step, rad/s^2; 5 % of the smaller
             acceleration limit where not given.
         observer_time: time constant of the observer of disturbances, s; inf for none. It needs
-            velocities whose noise is far below the acceleration limits times this time.
+            velocities whose noise is far below the acceleration limits times this time, and
+            motors without lag: it oscillates where their bandwidth is below 200 Hz.
         rest_speed: the arm is at rest when no joint is faster, rad/s; above the noise of the
             velocities.
 
