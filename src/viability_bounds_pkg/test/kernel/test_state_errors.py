@@ -14,6 +14,10 @@ from viability_bounds_pkg.viability import (
 )
 
 
+ROOMY = [name for name in HOLDING if name != "condition (11) just holds"]
+"""Joints for which condition (11) holds with small errors, too."""
+
+
 def step_speed(case):
     """Return a speed that a step can make or stop, and that does not cross the range, rad/s."""
     q_min, q_max, v_max, a_min, a_max, dt = case
@@ -55,15 +59,14 @@ def test_no_errors_are_the_bounds_without_them_bit_for_bit(name, margin, period)
             assert found.tobytes() == expected.tobytes()
 
 
-@pytest.mark.parametrize("name", HOLDING)
+@pytest.mark.parametrize("name", ROOMY)
 @pytest.mark.parametrize("margin", [0.0, 0.02])
 def test_the_bounds_are_those_of_the_worst_states_within_the_errors(name, margin):
     case = HOLDING[name]
     limits, dt = one_joint(*case[:5]), case[5]
     errors = errors_of(case)
     w = margin_of(case, margin)
-    if not discrete_time_condition(limits, dt, w, **errors).all():
-        pytest.skip("the kernel is a smaller one")
+    assert discrete_time_condition(limits, dt, w, **errors).all()
     known, unsure = BoundsSolver(limits, dt, w), robust(case, 0.03, margin)
     q, v = (column(x) for x in states_of(case, 5000, seed=2))
     off, error = errors["position_error"], errors["velocity_error"]
@@ -75,12 +78,11 @@ def test_the_bounds_are_those_of_the_worst_states_within_the_errors(name, margin
     np.testing.assert_allclose(bounds.lower[both], below.lower[both], rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", HOLDING)
+@pytest.mark.parametrize("name", ROOMY)
 def test_joints_count_as_outside_only_where_no_state_within_the_errors_is_viable(name):
     case = HOLDING[name]
     known, unsure = BoundsSolver(one_joint(*case[:5]), case[5]), robust(case)
-    if not unsure.exact.all():
-        pytest.skip("the kernel is a smaller one")
+    assert unsure.exact.all()
     errors = errors_of(case)
     off, error = map(np.array, errors.values())
     q, v = (column(x) for x in states_of(case, 2000, seed=3))
