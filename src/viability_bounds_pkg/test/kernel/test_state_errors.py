@@ -13,7 +13,6 @@ from viability_bounds_pkg.viability import (
     discrete_time_condition,
 )
 
-
 ROOMY = [name for name in HOLDING if name != "condition (11) just holds"]
 """Joints for which condition (11) holds with small errors, too."""
 

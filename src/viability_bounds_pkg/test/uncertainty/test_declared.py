@@ -185,6 +185,14 @@ def test_the_tool_prints_what_each_joint_and_each_declaration_costs(tmp_path, ca
     assert f"most: {shares_of(config.loop, config.declared)[0].name}\n" in shown
 
 
+def test_the_tool_takes_files_without_parameters_of_the_bounds(tmp_path, capsys):
+    files = overlay(tmp_path, ["delay: 1"])
+    path = tmp_path / "robot.yaml"
+    path.write_text("/**/bullet_node:\n  ros__parameters:\n    clock: lockstep\n")
+    assert main([*files, "--params-file", str(path)]) == 0
+    assert "most: delay" in capsys.readouterr().out
+
+
 def test_the_tool_without_declarations(capsys):
     assert main(["--params-file", str(config_folder() / "panda.yaml")]) == 0
     assert "nothing is declared" in capsys.readouterr().out
