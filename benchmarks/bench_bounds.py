@@ -74,11 +74,17 @@ def main() -> None:
         calls = [1e6 * t for t in time_calls(solver.bounds, q, v)]
         function = partial(acceleration_bounds, limits=limits, dt=dt)
         lookups = [1e6 * t for t in time_calls(function, q, v)]
+        # Small enough for (11) to hold, or not, as without.
+        off, error = np.full(JOINTS, 1e-3), np.full(JOINTS, 1e-3)
+        unsure = BoundsSolver(limits, dt, position_error=off, velocity_error=error)
+        with_errors = [1e6 * t for t in time_calls(unsure.bounds, q, v)]
         rates = [r / 1e6 for r in time_batches(solver, q, v)]
         print(
             f"dt {dt:g} s, {what}: {statistics.median(calls):.1f} us per call of {JOINTS} joints "
             f"(best block {min(calls):.1f}), {statistics.median(lookups):.1f} us as the function "
             f"acceleration_bounds, which looks the solver up; "
+            f"{statistics.median(with_errors) / statistics.median(calls):.2f} times as long for "
+            f"states with errors; "
             f"{statistics.median(rates):.1f} M joint-states/s in a batch "
             f"(best {max(rates):.1f}); construction {1e3 * construction:.1f} ms"
         )

@@ -99,6 +99,16 @@ def test_a_node_has_the_topics_and_services_of_the_tables_and_no_others(ros, nam
     assert offered == {s.name for s in make_reference.SERVICES if s.server == name}
 
 
+@pytest.mark.parametrize("name", ["bounds_node", "controller_node"])
+def test_estimated_states_take_the_place_of_those_reported(ros, name):
+    table = {row.name for row in make_reference.TABLES[name]}
+    given = {k: v for k, v in read_config("panda", name).items() if k in table}
+    node = ros.start(NODES[name], given | {"use_estimated_states": True})
+    subscribed = dict(node.get_subscriber_names_and_types_by_node(name, "/"))
+    assert "/estimated_joint_states" in subscribed
+    assert "/joint_states" not in subscribed
+
+
 @pytest.mark.parametrize("name", ["bounds_node", "controller_node", "bullet_node"])
 def test_topics_have_the_quality_of_service_of_the_tables(ros, name):
     node = start(ros, name)

@@ -174,15 +174,15 @@ def acceleration_bounds(
     Raises:
         JointLimitsError: an argument is unusable, or the shapes of `q` and `v`.
     """
-    margin = None if margin is None else tuple(checked_margin(margin, limits).tolist())
-    off, error = (
-        None if errors is None else tuple(checked_errors(field, errors, limits).tolist())
-        for field, errors in (
-            ("position_error", position_error),
-            ("velocity_error", velocity_error),
-        )
-    )
-    return _solver(limits, dt, margin, period, off, error).bounds(q, v)
+    if margin is not None:
+        margin = tuple(checked_margin(margin, limits).tolist())
+    if position_error is not None:
+        errors = checked_errors("position_error", position_error, limits)
+        position_error = tuple(errors.tolist())
+    if velocity_error is not None:
+        errors = checked_errors("velocity_error", velocity_error, limits)
+        velocity_error = tuple(errors.tolist())
+    return _solver(limits, dt, margin, period, position_error, velocity_error).bounds(q, v)
 
 
 _Numbers = tuple[float, ...] | None

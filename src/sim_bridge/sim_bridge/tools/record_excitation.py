@@ -75,7 +75,7 @@ def _run(options: argparse.Namespace) -> int:
     check_writable(options.output)
     if options.output.resolve() == options.parameters.resolve():
         raise ParameterFileError(f"{options.output} is read, and cannot be written too")
-    given = node_parameters(options.parameters, "/**/bullet_node")
+    given = node_parameters(options.parameters, node="/**/bullet_node")
     config = read(BulletConfiguration, given)
     motion = excitation(
         config, config.start_positions, config.dt, options.amplitude, options.speed

@@ -218,7 +218,7 @@ def random_plan(rng, joints, shortest=1e-3, shares=(1.0, 1.0), predicted=True, *
     if not good:
         return random_plan(rng, joints, shortest, shares, predicted, **kinds)
     chosen = {
-        name: value[good] if isinstance(value, np.ndarray) else value
+        name: value[good] if np.size(value) == joints else value
         for name, value in vars(declared).items()
     }
     names = tuple(names[j] for j in good)

@@ -151,8 +151,16 @@ def test_two_declarations_that_are_both_too_large():
         make_bounds(configured(position_error=[3.0] * 7, velocity_error=[3.0] * 7), None)
 
 
-def test_state_dependent_limits_do_not_know_errors():
-    config = configured(position_error=[1e-4] * 7, acceleration_limits="state_dependent")
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"position_error": [1e-4] * 7},
+        {"missed_deadlines": 1},
+        {"acceleration_disturbance": [0.1] * 7, **ESTIMATED},
+    ],
+)
+def test_state_dependent_limits_do_not_know_errors(changed):
+    config = configured(acceleration_limits="state_dependent", **changed)
     with pytest.raises(SettingError, match="worst_case, where errors of the states"):
         make_bounds(config, None)
 
@@ -175,6 +183,14 @@ def test_the_tool_prints_what_each_joint_and_each_declaration_costs(tmp_path, ca
     assert f"{reach.speed[6]:.3f}" in shown
     assert f"look {1e3 * config.horizon:.3g} ms ahead, 4 ms without" in shown
     assert f"most: {shares_of(config.loop, config.declared)[0].name}\n" in shown
+
+
+def test_the_tool_takes_files_without_parameters_of_the_bounds(tmp_path, capsys):
+    files = overlay(tmp_path, ["delay: 1"])
+    path = tmp_path / "robot.yaml"
+    path.write_text("/**/bullet_node:\n  ros__parameters:\n    clock: lockstep\n")
+    assert main([*files, "--params-file", str(path)]) == 0
+    assert "most: delay" in capsys.readouterr().out
 
 
 def test_the_tool_without_declarations(capsys):

@@ -124,27 +124,32 @@ def _check_limits(urdf: str, source: str) -> None:
                 raise ParameterFileError(f"{source}: joint {joint.get('name')} has no {key} limit")
 
 
-def node_parameters(path: Path, node: str = NODE) -> dict[str, Any]:
+def node_parameters(*paths: Path, node: str = NODE) -> dict[str, Any]:
     """Return the parameters of one node, those for all nodes included.
 
     Args:
-        path: the parameter file.
+        paths: parameter files; of several values of a parameter the last one counts.
         node: ``/**/name``; sections ``name`` and ``/name`` count as well.
 
     Raises:
-        YamlError: the file cannot be read, is no YAML, or has a key twice.
-        ParameterFileError: the file is no parameter file, has none for `node`, or a misspelt one.
+        YamlError: a file cannot be read, is no YAML, or has a key twice.
+        ParameterFileError: a file is no parameter file, or has a misspelt parameter; there is
+            none for `node`; the files are for several robots.
     """
-    check_parameter_files([str(path)])
+    check_parameter_files([str(path) for path in paths])
     name = node.rpartition("/")[2]
     parameters: dict[str, Any] = {}
-    for section, values in sections_of(read_yaml(path)):
-        if section in ("/**", f"/{name}", node):
-            parameters.update(values)
-    if unknown := unknown_parameters(parameters):
-        raise ParameterFileError(f"{path}: {unknown}")
+    for path in paths:
+        given: dict[str, Any] = {}
+        for section, values in sections_of(read_yaml(path)):
+            if section in ("/**", f"/{name}", node):
+                given.update(values)
+        if unknown := unknown_parameters(given):
+            raise ParameterFileError(f"{path}: {unknown}")
+        parameters |= given
     if not parameters:
-        raise ParameterFileError(f"{path}: no parameters under '/**' or '{node}'")
+        files = ", ".join(map(str, paths))
+        raise ParameterFileError(f"{files}: no parameters under '/**' or '{node}'")
     return parameters
 
 

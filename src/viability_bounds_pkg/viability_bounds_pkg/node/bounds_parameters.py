@@ -37,7 +37,7 @@ from viability_bounds_pkg.robot_configuration import (
 from viability_bounds_pkg.state_dependent.limits import StateDependentBounds
 from viability_bounds_pkg.torque_margin import TorqueMargins, tightened, torque_margins
 from viability_bounds_pkg.uncertainty.declared import DeclaredUncertainty, VelocityEstimation
-from viability_bounds_pkg.uncertainty.feasible import refusal
+from viability_bounds_pkg.uncertainty.feasible import declared_names, refusal
 from viability_bounds_pkg.uncertainty.margins import Loop, UncertaintyMargins
 
 Array = NDArray[np.float64]
@@ -231,8 +231,9 @@ def _state_dependent(
     if not config.robot_description:
         allowed = "a URDF, for state-dependent acceleration limits"
         raise SettingError("robot_description", config.robot_description, allowed)
-    if any(map(np.any, config.uncertainty[1:])):
-        allowed = "worst_case, where errors of the states or delays are declared"
+    others = set(declared_names(config.declared)) - {"acceleration_disturbance"}
+    if others or config.uncertainty.velocity_error.any():
+        allowed = "worst_case, where errors of the states, delays or missed deadlines are declared"
         raise SettingError("acceleration_limits", config.acceleration_limits, allowed)
     worst = np.maximum(-limits.a_min, limits.a_max)
     peak = config.acceleration_peak if len(config.acceleration_peak) else PEAK * worst

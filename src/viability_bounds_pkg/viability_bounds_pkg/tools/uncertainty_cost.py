@@ -11,7 +11,6 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from viability_bounds_pkg.cli.command_line import Parser, run_tool
 from viability_bounds_pkg.cli.limits_file import node_parameters
@@ -21,7 +20,6 @@ from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.uncertainty.cost import Reach, Share, reach_of, shares_of
 from viability_bounds_pkg.uncertainty.feasible import none_of, refusal
 from viability_bounds_pkg.uncertainty.margins import UncertaintyMargins
-from viability_bounds_pkg.user_input.parameter_files import check_parameter_files
 
 NAME = "uncertainty_cost"
 
@@ -42,14 +40,6 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         help="parameter file of the robot; repeatable, the last value given counts",
     )
     return parser.parse_args(arguments)
-
-
-def _configuration(paths: Sequence[Path]) -> BoundsConfiguration:
-    check_parameter_files([str(path) for path in paths])
-    given: dict[str, Any] = {}
-    for path in paths:
-        given |= node_parameters(path)
-    return read(BoundsConfiguration, given)
 
 
 def _print_joints(
@@ -99,7 +89,7 @@ def _print_shares(joints: Sequence[str], shares: Sequence[Share]) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    config = _configuration(options.params_file)
+    config = read(BoundsConfiguration, node_parameters(*options.params_file))
     loop, declared = config.loop, config.declared
     try:
         reach = reach_of(loop, declared)
