@@ -13,6 +13,7 @@ from sim_bridge.nodes.bullet_node import BulletNode
 from sim_bridge.nodes.scenario_node import ScenarioNode
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
+from viability_bounds_pkg.node.estimator_node import EstimatorNode
 from viability_bounds_pkg.parameter import REQUIRED, read
 from viability_bounds_pkg.ros.parameters import describe
 from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
@@ -26,12 +27,14 @@ _SPEC.loader.exec_module(make_reference)
 
 NODES = {
     "bounds_node": BoundsNode,
+    "estimator_node": EstimatorNode,
     "controller_node": ControllerNode,
     "bullet_node": BulletNode,
     "scenario_node": ScenarioNode,
 }
 EXTRA = {
     "bounds_node": {},
+    "estimator_node": {},
     "controller_node": {"ros2_control_topic": "ros2_control_topic"},
     "bullet_node": {"publish_clock": True, "start_paused": True, "clock": "lockstep"},
     "scenario_node": {
@@ -109,7 +112,9 @@ def test_estimated_states_take_the_place_of_those_reported(ros, name):
     assert "/joint_states" not in subscribed
 
 
-@pytest.mark.parametrize("name", ["bounds_node", "controller_node", "bullet_node"])
+@pytest.mark.parametrize(
+    "name", ["bounds_node", "estimator_node", "controller_node", "bullet_node"]
+)
 def test_topics_have_the_quality_of_service_of_the_tables(ros, name):
     node = start(ros, name)
     for topic in make_reference.TOPICS:

@@ -9,7 +9,7 @@ from true_arm import TrueArm, model
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.state_estimation.estimator import StateEstimator
 from viability_bounds_pkg.state_estimation.observer import design_observer
-from viability_bounds_pkg.state_estimation.prediction import MotorLag, TorquesUnderWay
+from viability_bounds_pkg.state_estimation.prediction import CommandsUnderWay, MotorLag
 
 PERIOD_NS = 2_000_000
 DT = 1e-9 * PERIOD_NS
@@ -37,40 +37,40 @@ def some_torques(rng, state, count):
 
 
 def test_commands_are_those_that_act_between_the_state_and_its_answer():
-    way = TorquesUnderWay(2)
+    way = CommandsUnderWay(2)
     for stamp in range(1, 8):
         way.open(stamp)
         way.answer(stamp, np.full(2, float(stamp)))
     way.open(8)
     # State 8 is of the instant 8 - sensing; command 8 acts 2 periods later: 6 and 7 until then.
-    assert [tau[0] for tau in way.torques()] == [5.0, 6.0, 7.0]
+    assert [command.tau[0] for command in way.acting()] == [5.0, 6.0, 7.0]
 
 
 def test_without_delay_only_the_command_that_acted_last():
-    way = TorquesUnderWay(0)
+    way = CommandsUnderWay(0)
     way.open(1)
     way.answer(1, np.ones(2))
     way.open(2)
-    (tau,) = way.torques()
-    assert tau[0] == 1.0
+    (command,) = way.acting()
+    assert command.tau[0] == 1.0
 
 
 def test_a_command_that_never_came_holds_the_last():
-    way = TorquesUnderWay(2)
+    way = CommandsUnderWay(2)
     for stamp in (1, 2, 3, 4, 5):
         way.open(stamp)
         if stamp in (1, 4):
             way.answer(stamp, np.full(2, float(stamp)))
-    assert [tau[0] for tau in way.torques()] == [1.0, 1.0, 4.0]
+    assert [command.tau[0] for command in way.acting()] == [1.0, 1.0, 4.0]
     for stamp in (6, 7, 8):
         assert not way.silent
         way.open(stamp)
     assert way.silent
-    assert [tau[0] for tau in way.torques()] == [4.0, 4.0, 4.0]
+    assert [command.tau[0] for command in way.acting()] == [4.0, 4.0, 4.0]
 
 
 def test_of_several_commands_for_a_state_the_first_acts_and_those_for_no_state_do_not():
-    way = TorquesUnderWay(1)
+    way = CommandsUnderWay(1)
     way.open(1)
     way.answer(1, np.ones(2))
     way.answer(1, np.full(2, 7.0))
@@ -78,29 +78,35 @@ def test_of_several_commands_for_a_state_the_first_acts_and_those_for_no_state_d
     way.open(2)
     way.answer(2, np.full(2, 2.0))
     way.open(3)
-    assert [tau[0] for tau in way.torques()] == [1.0, 2.0]
+    assert [command.tau[0] for command in way.acting()] == [1.0, 2.0]
 
 
 def test_lost_states_have_no_commands():
-    way = TorquesUnderWay(2)
+    way = CommandsUnderWay(2)
     way.open(1)
     way.answer(1, np.ones(2))
     way.open(4, periods=3)
-    assert [tau[0] for tau in way.torques()] == [1.0, 1.0, 1.0]
+    assert [command.tau[0] for command in way.acting()] == [1.0, 1.0, 1.0]
     way.answer(4, np.full(2, 4.0))
     way.open(5)
-    assert [tau[0] for tau in way.torques()] == [1.0, 1.0, 4.0]
+    assert [command.tau[0] for command in way.acting()] == [1.0, 1.0, 4.0]
 
 
 def test_position_commands_have_no_torque():
-    way = TorquesUnderWay(1)
+    way = CommandsUnderWay(1)
     for stamp, tau in ((1, np.ones(2)), (2, None)):
         way.open(stamp)
         way.answer(stamp, tau)
     way.open(3)
-    first, second = way.torques()
-    assert first[0] == 1.0
-    assert second is None
+    first, second = way.acting()
+    assert first.tau[0] == 1.0
+    assert second.tau is None
+
+
+def test_before_the_first_command_none_acts():
+    way = CommandsUnderWay(1)
+    way.open(1)
+    assert way.acting() == [None, None]
 
 
 # The motors' lag
@@ -261,6 +267,17 @@ def test_drives_that_control_positions_hold_the_torque_that_they_report():
         arm.step(tau + PUSH)
     np.testing.assert_allclose(answer, arm.state, atol=1e-4)
     assert answer.v[0] > 0.1
+
+
+def test_brakes_that_no_effort_tells_of_hold_before_the_first_command():
+    ours = estimator(delay=2, observers=OBSERVERS)
+    for k in range(1, 9):
+        answer = ours.step(k * PERIOD_NS, State(STILL, np.zeros(N)), np.zeros(N))
+    np.testing.assert_allclose(answer, State(STILL, np.zeros(N)), atol=1e-9)
+    # A command on its way: the brakes hold until it acts.
+    ours.answer(k * PERIOD_NS, gravity(State(STILL, np.zeros(N))))
+    answer = ours.step((k + 1) * PERIOD_NS, State(STILL, np.zeros(N)), np.zeros(N))
+    np.testing.assert_allclose(answer, State(STILL, np.zeros(N)), atol=1e-9)
 
 
 def test_without_torques_velocities_are_taken_to_stay():

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.state_estimation.observer import Observer, ObserverDesign
 from viability_bounds_pkg.state_estimation.prediction import (
+    Command,
+    CommandsUnderWay,
     ForwardModel,
     MotorLag,
-    TorquesUnderWay,
 )
 
 Array = NDArray[np.float64]
@@ -73,7 +74,7 @@ class StateEstimator:
         self._longest_gap = longest_gap
         self._model = ForwardModel(model, dt)
         self._lag = MotorLag(motor_lag, dt)
-        self._commands = TorquesUnderWay(delay)
+        self._commands = CommandsUnderWay(delay)
         self._observer: Observer | None = None
         self._jump = zero
         if observers is not None:
@@ -87,7 +88,7 @@ class StateEstimator:
         self.innovation = zero.copy()
 
     def answer(self, stamp: int, tau: Array | None) -> None:
-        """Take note of a command, see `TorquesUnderWay.answer`."""
+        """Take note of a command, see `CommandsUnderWay.answer`."""
         self._commands.answer(stamp, tau)
 
     def step(self, stamp: int, reported: State, effort: Array | None) -> State:
@@ -102,11 +103,12 @@ class StateEstimator:
         periods = self._periods_since_last(stamp)
         self._stamp = stamp
         if not periods:
-            return self._start(stamp, reported, effort)
+            return self._start(stamp, reported)
         self._commands.open(stamp, periods)
-        acted, *coming = self._commands.torques()
-        if effort is not None and self._commands.silent:
-            acted, coming = None, [None] * len(coming)
+        acted, *coming = self._commands.acting()
+        if effort is not None and acted is not None and self._commands.silent:
+            # What the robot does by itself then, the effort tells.
+            acted, coming = Command(None), [Command(None)] * len(coming)
         before = self._tau
         self._tau = self._torque(before, acted, reported, effort)
         state = reported
@@ -117,30 +119,36 @@ class StateEstimator:
             innovation = observer.innovation(reported.q)
             size = np.abs(innovation)
             if not (size <= self._jump).all():
-                return self._restart("the state jumped", stamp, reported, effort)
+                return self._restart("the state jumped", stamp, reported)
             np.maximum(self.innovation, size, out=self.innovation)
             observer.correct(innovation)
             state = observer.state
         answer = self._predict(state, coming)
         if not np.isfinite(answer).all():
-            return self._restart("the model diverged", stamp, reported, effort)
+            return self._restart("the model diverged", stamp, reported)
         return answer
 
     def _torque(
-        self, before: Array, command: Array | None, reported: State, effort: Array | None
+        self, before: Array, command: Command | None, reported: State, effort: Array | None
     ) -> Array:
         """Return the motors' torque now, one period after `before`, shape (n,), N m.
 
         A command is without the noise of what is reported, which only tells whether it came.
+        Before the first command the joints are taken to keep their velocity: the torque of brakes
+        is in no effort.
         """
-        kept, self._acting = self._acting, command
+        kept, self._acting = self._acting, None if command is None else command.tau
         if command is None:
+            return self._model.torque_at(reported)
+        if command.tau is None:
             return self._model.torque_at(reported) if effort is None else effort
-        expected = self._lag.end(before, command)
+        expected = self._lag.end(before, command.tau)
         if effort is None:
             return expected
+        if kept is None:  # the torque before is not that of a command
+            return effort
         off = self._distance(effort, expected)
-        if kept is not None and kept is not command:
+        if kept is not command.tau:
             unchanged = self._lag.end(before, kept)
             if (off_unchanged := self._distance(effort, unchanged)) < off:
                 expected, off, self._acting = unchanged, off_unchanged, kept
@@ -160,29 +168,30 @@ class StateEstimator:
         self.resets["stamps jumped"] += 1
         return 0
 
-    def _restart(self, why: str, stamp: int, reported: State, effort: Array | None) -> State:
+    def _restart(self, why: str, stamp: int, reported: State) -> State:
         self.resets[why] += 1
-        return self._start(stamp, reported, effort)
+        return self._start(stamp, reported)
 
-    def _start(self, stamp: int, reported: State, effort: Array | None) -> State:
+    def _start(self, stamp: int, reported: State) -> State:
         """Start anew from a reported state; nothing is known to be under way."""
         self._commands.clear()
         self._commands.open(stamp)
         self._model.a = np.zeros(len(self._tau))
         self._acting = None
-        self._tau = self._model.torque_at(reported) if effort is None else effort
+        self._tau = self._model.torque_at(reported)
         if self._observer is not None:
             self._observer.start(reported)
-        answer = self._predict(reported, self._commands.torques()[1:])
+        answer = self._predict(reported, self._commands.acting()[1:])
         return answer if np.isfinite(answer).all() else reported
 
-    def _predict(self, state: State, coming: list[Array | None]) -> State:
-        """Return a state after the commands that are under way, None for the torque as it is."""
+    def _predict(self, state: State, coming: list[Command | None]) -> State:
+        """Return a state after the commands under way, those without torques for that of now."""
         model, lag, tau = self._model, self._lag, self._tau
         learned = 0.0 if self._observer is None else self._observer.disturbance
         accelerations = [model.a]
         for command in coming:
-            after = tau if command is None else lag.end(tau, command)
+            sent = None if command is None else command.tau
+            after = tau if sent is None else lag.end(tau, sent)
             accelerations.append(model.acceleration(state, lag.mean(tau, after)))
             state = state.after(model.a + learned, self._dt)
             tau = after

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections import deque
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -90,11 +91,17 @@ class MotorLag:
         return State(state.q + self._lag * state.v, state.v + self._lag * a)
 
 
-class TorquesUnderWay:
+class Command(NamedTuple):
+    """A command: torques, shape (n,), N m; None where the drives control positions."""
+
+    tau: Array | None
+
+
+class CommandsUnderWay:
     """The commands that have been sent but do not act yet, and the one that acted last.
 
     Each joint state opens a slot for the command that answers it. A slot without an answer keeps
-    the torque of the one before, as the robot does.
+    the command of the one before, as the robot does.
 
     Args:
         delay: control periods from the instant of a state to that when its command begins to act.
@@ -103,12 +110,11 @@ class TorquesUnderWay:
     def __init__(self, delay: int) -> None:
         # That of the state that came last is not under way yet.
         self._slots: deque[_Slot] = deque(maxlen=delay + 2)
-        self._held: Array | None = None
         self.clear()
 
     def clear(self) -> None:
         """Forget all commands."""
-        self._held = None
+        self._held: Command | None = None
         self._slots.extend(_Slot(-1) for _ in range(self._slots.maxlen or 0))
 
     def open(self, stamp: int, periods: int = 1) -> None:
@@ -119,9 +125,7 @@ class TorquesUnderWay:
             periods: since the last one; those between were lost, and nothing answers them.
         """
         for each in (*[-1] * (periods - 1), stamp):
-            oldest = self._slots[0]
-            if oldest.answered:
-                self._held = oldest.tau
+            self._held = self._slots[0].command or self._held
             self._slots.append(_Slot(each))
 
     def answer(self, stamp: int, tau: Array | None) -> None:
@@ -129,35 +133,34 @@ class TorquesUnderWay:
 
         Args:
             stamp: of the state that it answers, ns; others are ignored.
-            tau: torques, shape (n,), N m; None where the drives control positions.
+            tau: as of `Command`.
         """
         for slot in self._slots:
-            if slot.stamp == stamp and not slot.answered:
-                slot.answered, slot.tau = True, tau
+            if slot.stamp == stamp and slot.command is None:
+                slot.command = Command(tau)
 
-    def torques(self) -> list[Array | None]:
+    def acting(self) -> list[Command | None]:
         """Return what acted in the period before the last state, and what acts in the next ones.
 
-        As many as the delay is long, and one; None where no torque is known.
+        As many as the delay is long, and one; None where no command came yet: brakes may hold.
         """
         held, commands = self._held, []
         for slot in self._slots:
-            if slot.answered:
-                held = slot.tau
+            held = slot.command or held
             commands.append(held)
         return commands[:-1]
 
     @property
     def silent(self) -> bool:
         """Whether none of the states whose commands act now or later was answered."""
-        return not any(slot.answered for slot in self._slots)
+        return all(slot.command is None for slot in self._slots)
 
 
 class _Slot:
     """The command that answers one joint state."""
 
-    __slots__ = ("answered", "stamp", "tau")
+    __slots__ = ("command", "stamp")
 
     def __init__(self, stamp: int) -> None:
-        self.stamp, self.answered = stamp, False
-        self.tau: Array | None = None
+        self.stamp = stamp
+        self.command: Command | None = None
