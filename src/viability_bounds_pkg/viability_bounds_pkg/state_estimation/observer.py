@@ -36,6 +36,10 @@ LEAST_ACCELERATION_ERROR = 0.1
 LEARNING = 0.2
 """Of the gain that learns lasting disturbances: the slowest of three poles is fastest with it."""
 
+SLOWER = 1.15
+"""How much larger than the least the largest velocity error may be, for a slower observer: what a
+step of the encoder makes of the velocity is then less than half."""
+
 _POLES = np.concatenate(([0.0], np.exp(-np.geomspace(7.0, 5e-3, 300))))
 """Poles to choose from: 2.5 % between two in frequency: costs less than 1e-4 of the error."""
 
@@ -69,9 +73,9 @@ class ObserverDesign:
 def design_observer(
     dt: float, position_error: ArrayLike, acceleration_error: ArrayLike
 ) -> ObserverDesign:
-    """Return the observers whose largest error of the velocity is least.
+    """Return the slowest observers whose largest error of the velocity is nearly the least.
 
-    Where positions are exact, the poles are at zero: the velocity is right after two periods.
+    It is at most `SLOWER` times as large. Where positions are exact, the poles are at zero: the velocity is right after two periods.
     Gains are chosen for an error of the acceleration of at least `LEAST_ACCELERATION_ERROR`; what
     is guaranteed is for the errors given, so that it is zero where both are.
 
@@ -86,7 +90,10 @@ def design_observer(
     from_position, from_acceleration = table.velocity
     # In units of the period: the choice depends on the ratio of the two only.
     least = np.maximum(w, LEAST_ACCELERATION_ERROR) * dt**2
-    chosen = np.argmin(np.outer(delta, from_position) + np.outer(least, from_acceleration), axis=1)
+    error = np.outer(delta, from_position) + np.outer(least, from_acceleration)
+    close = error <= SLOWER * error.min(axis=1, keepdims=True)
+    slowest = len(_POLES) - 1 - np.argmax(close[:, ::-1], axis=1)
+    chosen = np.where(delta > 0.0, slowest, 0)
 
     def worst(responses: _Norms) -> Array:
         return (
