@@ -19,6 +19,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 from multiprocessing import get_context
 from typing import Any
 
@@ -44,6 +45,7 @@ FAST = 9  # goals of a second each
 REST = 6.0  # s of a goal that is kept
 SETTLED = 5.0  # s after which the torque steps of such a goal count
 RISE = 0.2  # s
+UNUSED = ("acceleration_limits", "ft_wrench")
 LEG = 6.0  # s of a goal whose time is measured
 NEAR = 5e-3  # rad; so near a goal is reached
 STIFF = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
@@ -256,7 +258,7 @@ def play(robot: str, name: str, seed: int) -> Minute:
     course = Course(values["controller_node"], robot, seed)
     if seed % 2:
         values["controller_node"] |= STIFF
-    result = run_chain({}, course.scenario, values)
+    result = run_chain({}, course.scenario, values, UNUSED)
     run = result.run
     steps = np.abs(np.diff(run.tau, axis=0)) / values["controller_node"]["torque_max"]
     at_rest = np.zeros(len(steps), dtype=bool)
@@ -278,10 +280,13 @@ def hand_at_rest(robot: str, name: str, seed: int) -> float:
     course = Course(values["controller_node"], robot, seed)
     start = np.array(values["bullet_node"]["start_positions"])
     goal = course.pose(start + np.random.default_rng(seed).uniform(-0.2, 0.2, start.size))
-    result = run_chain({}, {"duration": 4.0, "events": list(course.pose_goal(0.0, goal))}, values)
+    result = run_chain(
+        {}, {"duration": 4.0, "events": list(course.pose_goal(0.0, goal))}, values, UNUSED
+    )
     return float(np.linalg.norm(course.pose(result.q).translation - goal.translation))
 
 
+@cache
 def encoder_step_at_hand(robot: str) -> float:
     """Return how far a step of all encoders may move the hand at the start, m."""
     values = node_values(robot, CASES["all"], 0)
@@ -310,7 +315,7 @@ def times_to_goal(robot: str, name: str) -> dict[str, Any]:
         {"time": LEG * k, "posture": dict(zip(controller["joints"], goal.tolist(), strict=True))}
         for k, goal in enumerate(goals)
     ]
-    run = run_chain({}, {"duration": LEG * len(goals), "events": events}, values).run
+    run = run_chain({}, {"duration": LEG * len(goals), "events": events}, values, UNUSED).run
     times: list[float | None] = []
     left = 0.0
     for k, goal in enumerate(goals[1:], start=1):

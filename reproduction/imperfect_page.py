@@ -56,10 +56,12 @@ The largest violation of a position and of a speed limit in each case; a circle 
 Each minute has random numbers of its own, the same in all cases. It has four rounds: nine goals of
 a second each, and one that is kept for 6 s. A goal is a posture, and the pose of the hand in it;
 each joint has it at one of its limits with a probability of one half. In every second round a
-link is pushed once per second by {pushes}, in a random direction; a push rises within 0.2 s and
-lasts for 0.2 s more. In every second minute the posture task is so stiff (kp 100 1/s², alone) that
-it drives each joint into its limits.{holdable}
+link is pushed once per second in a random direction; a push rises within 0.2 s and lasts for 0.2 s
+more. In every second minute the posture task is so stiff (kp 100 1/s², alone) that it drives each
+joint into its limits.
 
+{pushes}
+{holdable}
 Remedies: the *observer* estimates velocities from positions, and the *prediction* takes the state
 through the commands under way ([state_estimation.md](state_estimation.md)); *margins and horizon*
 of the bounds follow from what is declared ([uncertainty.md](uncertainty.md)); the *stop* is that
@@ -96,9 +98,9 @@ last column has the largest distance left at the limits.
 a state to its command, without and with the remedies.
 """
 HOLDABLE = """
-
-The limits of {robots} are narrower than in its file in all cases, so that the arm can hold and
-accelerate itself in all states: the constant `HOLDABLE` of `reproduction/imperfect.py`."""
+The limits of {robots} are narrower than in its file in all cases, so that the
+arm can hold and accelerate itself in all states: `HOLDABLE` in `reproduction/imperfect.py`.
+"""
 
 
 @dataclass(frozen=True)
@@ -319,14 +321,13 @@ def write_page(
     figure.save(draw(outcomes, titles))
     image = ROOT / "docs" / "images" / f"{NAME}.png"
     image.write_bytes((RESULTS / NAME / "figure.png").read_bytes())
-    forces = [
-        f"{force:g} N ({robot}, `{link}`)"
-        for robot in outcomes
-        for link, force in pushed[robot].items()
-    ]
+    pushes = Figure(NAME)
+    for robot in outcomes:
+        links = (f"`{link}` {force:g} N" for link, force in pushed[robot].items())
+        pushes.rows.append((robot, ", ".join(links)))
     changed = ", ".join(f"`{robot}`" for robot in limits_changed if robot in outcomes)
     page = PAGE.format(
-        pushes=", ".join(forces),
+        pushes=table([pushes], ("robot", "links that are pushed, and how hard")),
         holdable=HOLDABLE.format(robots=changed) if changed else "",
         hands=max(len(each.hands) for part in outcomes.values() for each in part.values()),
         step=STEP_AT_REST,
