@@ -64,6 +64,9 @@ HOLDABLE: dict[str, dict[str, Any]] = {
         "start_positions": [-0.036, -0.753, -0.544, 2.2, -0.091, -0.151, -0.136],
     }
 }
+OF_ROBOT = ("rotor_inertia", "acceleration_min", "acceleration_max")
+"""What the files of imperfect robots have of robot and model: the same in all cases."""
+
 PUSHED = {
     "panda": {"panda_hand": 10.0, "panda_link4": 20.0},
     "talos_left_arm": {"wrist_left_ft_tool_link": 20.0, "arm_left_4_link": 40.0},
@@ -105,7 +108,12 @@ NOTHING_DECLARED: dict[str, Any] = {
 }
 CASES = {
     "ideal": Case("nothing spoilt, nothing done", 0, ()),
-    "ideal_remedies": Case("nothing spoilt, all done", 0),
+    # A delay that is declared is predicted, so that it must exist.
+    "ideal_remedies": Case(
+        "nothing spoilt, all done; no delay to predict",
+        0,
+        changed={"estimator_node": {"delay": 0, "motor_bandwidth": []}},
+    ),
     "nothing": Case("spoilt, nothing done", 1, ()),
     "no_margins": Case(
         "spoilt, all but margins and horizon", 1, changed={"bounds_node": NOTHING_DECLARED}
@@ -175,7 +183,9 @@ def node_values(robot: str, case: Case, seed: int) -> Values:
             )
             if case.outages:
                 chosen |= {"missed_in_row": round(0.2 * chosen["rate_hz"])}
-        values[node] = chosen | HOLDABLE.get(robot, {}) | dict((case.changed or {}).get(node, {}))
+        of_robot = {name: imperfect[node][name] for name in OF_ROBOT if name in imperfect[node]}
+        changed = dict((case.changed or {}).get(node, {}))
+        values[node] = chosen | of_robot | HOLDABLE.get(robot, {}) | changed
     values["bullet_node"] |= {"imperfection_seed": seed}
     if not values["controller_node"].get("use_estimated_states"):
         del values["estimator_node"]

@@ -282,7 +282,7 @@ def _costs(robots: Sequence[str], titles: Mapping[str, str]) -> Figure:
     for robot in robots:
         for name, cost in kept(robot)["costs"].items():
             times = [f"{t:.2f}" if t is not None else "-" for t in cost["times"]]
-            title = f"{robot}, {titles[name].rpartition(', ')[2]}"
+            title = f"{robot}, {titles[name].partition(', ')[2]}"
             figure.rows.append((title, *times, f"{1e3 * cost['left']:.1f}"))
     return figure
 
