@@ -84,7 +84,10 @@ def _context():
 
 
 def run_chain(
-    values: dict[str, Any], scenario: dict[str, Any], per_node: dict[str, dict[str, Any]]
+    values: dict[str, Any],
+    scenario: dict[str, Any],
+    per_node: dict[str, dict[str, Any]],
+    not_recorded: tuple[str, ...] = (),
 ) -> ChainResult:
     """Play a scenario through bounds, controller and robot node, in lockstep.
 
@@ -93,6 +96,7 @@ def run_chain(
         scenario: content of a scenario file.
         per_node: parameters that differ for one node, by node name; with ``estimator_node`` among
             them this node runs too.
+        not_recorded: topics whose values are not needed: NaN; each costs 4% of a period to record.
     """
     lockstep = {
         "clock": "lockstep",
@@ -110,6 +114,9 @@ def run_chain(
             own = values | lockstep | {"scenario": str(path)} | per_node.get(name, {})
             overrides = [Parameter(key, value=value) for key, value in own.items() if value != []]
             nodes[name] = kind(parameter_overrides=overrides)
+        for each in list(nodes["scenario_node"].subscriptions):
+            if each.topic_name.removeprefix("/") in not_recorded:
+                nodes["scenario_node"].destroy_subscription(each)
         try:
             player = nodes["scenario_node"]
             play(

@@ -3,6 +3,7 @@
 
 bash scripts/reproduce.sh imperfect                 the tables, and docs/reproduction_imperfect.md
 bash scripts/reproduce.sh imperfect panda           those of one robot
+bash scripts/reproduce.sh imperfect page            only the page, of all rows that were played
 bash scripts/reproduce.sh imperfect --minutes 1     quicker: 1 minute each in place of 10
 
 The real nodes in one process, in lockstep, with `config/imperfect/<robot>.yaml`. Each minute has
@@ -15,15 +16,26 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 from chain import load_node_values, run_chain
+from imperfect_page import (
+    WITHIN_DECLARED,
+    Minute,
+    Outcome,
+    keep,
+    keep_outcome,
+    kept_outcomes,
+    row,
+    write_page,
+)
 
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 
@@ -33,6 +45,9 @@ FAST = 9  # goals of a second each
 REST = 6.0  # s of a goal that is kept
 SETTLED = 5.0  # s after which the torque steps of such a goal count
 RISE = 0.2  # s
+UNUSED = ("acceleration_limits", "ft_wrench")
+LEG = 6.0  # s of a goal whose time is measured
+NEAR = 5e-3  # rad; so near a goal is reached
 STIFF = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
 """A posture task that drives each joint to its limits, whatever the hand does."""
 
@@ -49,6 +64,9 @@ HOLDABLE: dict[str, dict[str, Any]] = {
         "start_positions": [-0.036, -0.753, -0.544, 2.31, -0.091, -0.151, -0.136],
     }
 }
+OF_ROBOT = ("rotor_inertia", "acceleration_min", "acceleration_max")
+"""What the files of imperfect robots have of robot and model: the same in all cases."""
+
 PUSHED = {
     "panda": {"panda_hand": 10.0, "panda_link4": 20.0},
     "talos_left_arm": {"wrist_left_ft_tool_link": 20.0, "arm_left_4_link": 40.0},
@@ -90,7 +108,12 @@ NOTHING_DECLARED: dict[str, Any] = {
 }
 CASES = {
     "ideal": Case("nothing spoilt, nothing done", 0, ()),
-    "ideal_remedies": Case("nothing spoilt, all done", 0),
+    # A delay that is declared is predicted, so that it must exist.
+    "ideal_remedies": Case(
+        "nothing spoilt, all done; no delay to predict",
+        0,
+        changed={"estimator_node": {"delay": 0, "motor_bandwidth": []}},
+    ),
     "nothing": Case("spoilt, nothing done", 1, ()),
     "no_margins": Case(
         "spoilt, all but margins and horizon", 1, changed={"bounds_node": NOTHING_DECLARED}
@@ -115,6 +138,7 @@ CASES = {
     ),
     "outage_stop": Case("spoilt, all done; commands fail for up to 0.2 s; stop", 1, outages=True),
 }
+IDEAL = ("ideal", "ideal_remedies")
 DOUBLED = (
     "encoder_resolution",
     "position_noise",
@@ -159,7 +183,9 @@ def node_values(robot: str, case: Case, seed: int) -> Values:
             )
             if case.outages:
                 chosen |= {"missed_in_row": round(0.2 * chosen["rate_hz"])}
-        values[node] = chosen | HOLDABLE.get(robot, {}) | dict((case.changed or {}).get(node, {}))
+        of_robot = {name: imperfect[node][name] for name in OF_ROBOT if name in imperfect[node]}
+        changed = dict((case.changed or {}).get(node, {}))
+        values[node] = chosen | of_robot | HOLDABLE.get(robot, {}) | changed
     values["bullet_node"] |= {"imperfection_seed": seed}
     if not values["controller_node"].get("use_estimated_states"):
         del values["estimator_node"]
@@ -236,33 +262,13 @@ class Course:
             yield {"time": time + (share - 0.05) * RISE, "push": push}
 
 
-@dataclass(frozen=True)
-class Minute:
-    """What a minute showed; the largest of all joints.
-
-    Attributes:
-        position, speed: how far beyond the limits, rad and rad/s.
-        torque: share of torque_max.
-        step: largest change of torque in a period, share of torque_max.
-        step_at_rest: the same, at rest.
-        stopped: periods in which the robot stopped by itself.
-    """
-
-    position: float
-    speed: float
-    torque: float
-    step: float
-    step_at_rest: float
-    stopped: int
-
-
 def play(robot: str, name: str, seed: int) -> Minute:
     """Play a minute of a case."""
     values = node_values(robot, CASES[name], seed)
     course = Course(values["controller_node"], robot, seed)
     if seed % 2:
         values["controller_node"] |= STIFF
-    result = run_chain({}, course.scenario, values)
+    result = run_chain({}, course.scenario, values, UNUSED)
     run = result.run
     steps = np.abs(np.diff(run.tau, axis=0)) / values["controller_node"]["torque_max"]
     at_rest = np.zeros(len(steps), dtype=bool)
@@ -284,38 +290,53 @@ def hand_at_rest(robot: str, name: str, seed: int) -> float:
     course = Course(values["controller_node"], robot, seed)
     start = np.array(values["bullet_node"]["start_positions"])
     goal = course.pose(start + np.random.default_rng(seed).uniform(-0.2, 0.2, start.size))
-    result = run_chain({}, {"duration": 8.0, "events": list(course.pose_goal(0.0, goal))}, values)
+    result = run_chain(
+        {}, {"duration": 8.0, "events": list(course.pose_goal(0.0, goal))}, values, UNUSED
+    )
     return float(np.linalg.norm(course.pose(result.q).translation - goal.translation))
 
 
-HEADS = (
-    "what is spoilt, and what is done",
-    "minutes",
-    "position, rad",
-    "speed, rad/s",
-    "torque, of tau_max",
-    "torque step, of tau_max",
-    "at rest",
-    "hand at rest, mm",
-)
+@cache
+def encoder_step_at_hand(robot: str) -> float:
+    """Return how far a step of all encoders may move the hand at the start, m."""
+    values = node_values(robot, CASES["all"], 0)
+    steps = values["bullet_node"].get("encoder_resolution") or [0.0]
+    start = np.array(values["bullet_node"]["start_positions"])
+    course = Course(values["controller_node"], robot, 0)
+    moved = [course.pose(start + dq) for dq in np.diag(np.broadcast_to(steps, start.shape))]
+    here = course.pose(start).translation
+    return float(sum(np.linalg.norm(pose.translation - here) for pose in moved))
 
 
-def row(case: Case, minutes: list[Minute], hands: list[float]) -> tuple[str, ...]:
-    """Return a row of the table: the worst of the minutes."""
+def times_to_goal(robot: str, name: str) -> dict[str, Any]:
+    """Return how long the joints take from the middle of their ranges to limits and back.
 
-    def worst(name: str) -> float:
-        return float(np.nanmax([getattr(minute, name) for minute in minutes]))
-
-    return (
-        case.title,
-        str(len(minutes)),
-        f"{worst('position'):.2g}",
-        f"{worst('speed'):.2g}",
-        f"{worst('torque'):.3f}",
-        f"{worst('step'):.2f}",
-        f"{worst('step_at_rest'):.3f}",
-        f"{1e3 * np.median(hands):.2f} to {1e3 * np.max(hands):.2f}",
-    )
+    Returns:
+        "times" to the upper limits, back, to the lower ones, and back, s, None where a joint stays
+        off; and what is "left" at the limits, rad.
+    """
+    values = node_values(robot, CASES[name], 0)
+    controller = values["controller_node"]
+    controller |= STIFF
+    low, high = (np.array(controller[f"position_{end}"]) for end in ("min", "max"))
+    middle = 0.5 * (low + high)
+    goals = [middle, high, middle, low, middle]
+    events = [
+        {"time": LEG * k, "posture": dict(zip(controller["joints"], goal.tolist(), strict=True))}
+        for k, goal in enumerate(goals)
+    ]
+    run = run_chain({}, {"duration": LEG * len(goals), "events": events}, values, UNUSED).run
+    times: list[float | None] = []
+    left = 0.0
+    for k, goal in enumerate(goals[1:], start=1):
+        during = (run.t >= LEG * k) & (run.t < LEG * (k + 1))
+        distance = np.abs(run.q[during] - goal).max(axis=1)
+        away = np.flatnonzero(distance > NEAR)
+        arrived = 0 if away.size == 0 else int(away[-1]) + 1
+        times.append(float(run.t[during][arrived] - LEG * k) if arrived < distance.size else None)
+        if k % 2:
+            left = max(left, float(distance[-1]))
+    return {"times": times, "left": left}
 
 
 def _own_domain() -> None:
@@ -323,18 +344,15 @@ def _own_domain() -> None:
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
 
 
-def main() -> int:
-    """Play all cases, print the tables, and tell whether what is declared kept all limits."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("robot", nargs="?", default="all", choices=("all", *ROBOTS))
-    parser.add_argument("--case", choices=tuple(CASES), help="only this row")
-    parser.add_argument("--minutes", type=int, default=10, help="of each robot, as declared")
-    parser.add_argument("--others", type=int, default=2, help="minutes of the other rows")
-    given = parser.parse_args()
-    robots = ROBOTS if given.robot == "all" else (given.robot,)
-    names = (given.case,) if given.case else tuple(CASES)
-    lengths = {name: given.minutes if name == "all" else given.others for name in names}
-    fine, pages = True, []
+def play_all(
+    robots: Sequence[str], names: Sequence[str], minutes_declared: int, minutes_others: int
+) -> bool:
+    """Play cases of robots, keep and print their rows; return whether limits were kept.
+
+    Only the cases in `WITHIN_DECLARED` count.
+    """
+    lengths = {name: minutes_declared if name == "all" else minutes_others for name in names}
+    fine = True
     with ProcessPoolExecutor(
         max(1, os.cpu_count() or 1), get_context("spawn"), initializer=_own_domain
     ) as pool:
@@ -342,21 +360,41 @@ def main() -> int:
             (robot, name): (
                 [pool.submit(play, robot, name, seed) for seed in range(minutes)],
                 [pool.submit(hand_at_rest, robot, name, seed) for seed in range(4)],
+                pool.submit(times_to_goal, robot, name) if name in IDEAL else None,
             )
             for robot in robots
             for name, minutes in lengths.items()
         }
-        for robot in robots:
-            rows = []
-            for name in names:
-                minutes, hands = ([each.result() for each in part] for part in runs[robot, name])
-                rows.append(row(CASES[name], minutes, hands))
-                print(robot, *rows[-1], sep=" | ", flush=True)
-                if name in ("all", "outage_stop"):
-                    fine &= all(
-                        m.position <= 0 and m.speed <= 0 and m.torque <= 1 + 1e-9 for m in minutes
-                    )
-            pages.append((robot, rows))
+        for (robot, name), (minutes, hands, times) in runs.items():
+            outcome = Outcome(
+                CASES[name].title,
+                [each.result() for each in minutes],
+                [each.result() for each in hands],
+                encoder_step_at_hand(robot),
+            )
+            keep_outcome(robot, name, outcome)
+            ideal = kept_outcomes(robot, ["ideal"]).get("ideal")
+            print(robot, *row(name, outcome, ideal), sep=" | ", flush=True)
+            if times is not None:
+                keep(robot, "costs", name, times.result())
+                print(robot, "time to goals", times.result(), sep=" | ", flush=True)
+            fine &= name not in WITHIN_DECLARED or outcome.kept
+    return fine
+
+
+def main() -> int:
+    """Play cases, print the tables, and tell whether what is declared kept all limits."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("robot", nargs="?", default="all", choices=("all", *ROBOTS, "page"))
+    parser.add_argument("--case", choices=tuple(CASES), help="only this row")
+    parser.add_argument("--minutes", type=int, default=10, help="of each robot, as declared")
+    parser.add_argument("--others", type=int, default=2, help="minutes of the other rows")
+    given = parser.parse_args()
+    robots = {"all": ROBOTS, "page": ()}.get(given.robot, (given.robot,))
+    names = (given.case,) if given.case else tuple(CASES)
+    fine = play_all(robots, names, given.minutes, given.others)
+    titles = {name: case.title for name, case in CASES.items()}
+    write_page(ROBOTS, titles, PUSHED, tuple(HOLDABLE), NEAR)
     return 0 if fine else 1
 
 

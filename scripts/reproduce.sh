@@ -32,7 +32,7 @@ if [ "$what" = all ]; then
 fi
 what="${what//-/_}"
 case "$what" in
-paper0 | paper1_integral | paper1_compliance | state_dependent | friction | stopping | exactness) ;;
+paper0 | paper1_integral | paper1_compliance | state_dependent | friction | stopping | imperfect | exactness) ;;
 *)
     echo "error: unknown '$what'; --help lists what there is" >&2
     exit 2

@@ -77,7 +77,9 @@ class Arm:
 
 
 def play(ros, *arms) -> None:
-    ros.wait_until(lambda: all(arm.player.done for arm in arms), "the scenarios", timeout=60.0)
+    ros.wait_until(
+        lambda: all(arm.player.ended.done() for arm in arms), "the scenarios", timeout=60.0
+    )
 
 
 @pytest.fixture(scope="module")

@@ -111,7 +111,7 @@ def test_a_run_that_others_mix_into_is_refused(ros):
     expected = (
         r"^2 publishers of '/joint_commands': /controller_node, /theirs/driver; allowed: one"
     )
-    ros.wait_until(lambda: player.done, "the end of the scenario")
+    ros.wait_until(lambda: player.ended.done(), "the end of the scenario")
     with pytest.raises(ScenarioRefused, match=expected):
         play(player, quiet=True)
 

@@ -17,6 +17,7 @@ import numpy as np
 import rclpy
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException
+from rclpy.task import Future
 
 from sim_bridge.nodes.progress import Progress
 from sim_bridge.nodes.run_listener import RunListener
@@ -70,7 +71,7 @@ class ScenarioNode(ArmNode):
 
     Attributes:
         awaits: what it waits for.
-        done: whether the scenario has ended.
+        ended: done when the scenario has ended.
         failure: why it ended early; None if it did not.
         listener: the recorded messages and diagnostics of the other nodes.
     """
@@ -86,7 +87,7 @@ class ScenarioNode(ArmNode):
             config = NodeParameters(self, ScenarioConfiguration).configuration
         self.config = config
         self.awaits = ""
-        self.done = False
+        self.ended: Future[None] = Future()
         self.failure: ScenarioRefused | None = None
         self.listener = RunListener(self, config.joints)
         self._publisher_watch = PublisherWatch(self, self.listener.topics)
@@ -124,7 +125,7 @@ class ScenarioNode(ArmNode):
                 self._check_refusals(self._refused)
             self.awaits = next(self._course)
         except StopIteration:
-            self.done = True
+            self.ended.set_result(None)
         except ScenarioRefused as error:
             self.failure, self._course = error, self._stop()
 
@@ -270,8 +271,10 @@ def play(
         executor.add_node(each)
     seen, moved_at, shown_at = None, time.monotonic(), -math.inf
     with nullcontext() if quiet else Progress(node.config.plan.duration) as progress:
-        while not (node.done or signals) and rclpy.ok(context=node.context):
-            executor.spin_once(timeout_sec=0.1)
+        while not (node.ended.done() or signals) and rclpy.ok(context=node.context):
+            # Many callbacks in a call: a tenth of the time of a period in lockstep would go into
+            # calls for one each.
+            executor.spin_until_future_complete(node.ended, timeout_sec=0.1)
             now = time.monotonic()
             if (node.listener.stamp, node.awaits) != seen:
                 seen, moved_at = (node.listener.stamp, node.awaits), now
@@ -279,12 +282,12 @@ def play(
                 raise TimeoutError(
                     f"nothing has moved for {node.config.ready_timeout:g} s ({node.awaits})"
                 )
-            if progress and (node.done or now - shown_at > _SHOW_PERIOD):
+            if progress and (node.ended.done() or now - shown_at > _SHOW_PERIOD):
                 shown_at = now
                 node.show(progress)
     if node.failure is not None:
         raise node.failure
-    if not node.done:
+    if not node.ended.done():
         raise ExternalShutdownException
 
 

@@ -1,0 +1,339 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What imperfect robots did, kept from run to run, and the page and picture made of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from chain import ROOT
+from figure import RESULTS, Figure, table
+
+NAME = "imperfect"
+WITHIN_DECLARED = ("all", "outage_stop")
+"""Cases in which no limit may be passed: what is spoilt is within what is declared."""
+STEP_AT_REST = 0.05  # of torque_max
+HAND_FACTOR = 3.0
+TORQUE_ROUNDING = 1e-9  # share of torque_max
+HEADS = (
+    "what is spoilt, and what is done",
+    "minutes",
+    "position, rad",
+    "speed, rad/s",
+    "torque, of tau_max",
+    "torque step, of tau_max",
+    "at rest",
+    "hand at rest, mm",
+    "",
+)
+COST_HEADS = (
+    "robot, nothing spoilt",
+    "to upper limits, s",
+    "back, s",
+    "to lower limits, s",
+    "back, s",
+    "distance left at limits, mrad",
+)
+PAGE = """\
+# Results for imperfect robots
+
+Written by `bash scripts/reproduce.sh imperfect`; do not edit. The real nodes in lockstep, on
+robots whose states are late, coarse and noisy, whose commands are late or lost, and whose motors
+are not what the model says: `config/imperfect/<robot>.yaml` has the values and their sources,
+[simulated_robot.md](simulated_robot.md) their models. Numbers are under `results/imperfect/`.
+
+![Largest violations by case](images/imperfect.png)
+
+The largest violation of a position and of a speed limit in each case; a circle is none at all.
+
+## How it is played
+
+Each minute has random numbers of its own, the same in all cases. It has four rounds: nine goals of
+a second each, and one that is kept for 6 s. A goal is a posture, and the pose of the hand in it;
+each joint has it at one of its limits with a probability of one half. In every second round a
+link is pushed once per second in a random direction; a push rises within 0.2 s and lasts for 0.2 s
+more. In every second minute the posture task is so stiff (kp 100 1/s², alone) that it drives each
+joint into its limits.
+
+{pushes}
+{holdable}
+Remedies: the *observer* estimates velocities from positions, and the *prediction* takes the state
+through the commands under way ([state_estimation.md](state_estimation.md)); *margins and horizon*
+of the bounds follow from what is declared ([uncertainty.md](uncertainty.md)); the *stop* is that
+of [stopping.md](stopping.md), the alternative are brakes. "Twice as much" has twice the delays,
+errors, noise and longest row of lost commands, and half the bandwidths.
+
+| column | |
+|---|---|
+| position, speed | farthest beyond a limit, any joint, true state, at each physics step |
+| torque | largest true torque of a motor; more than 1 would be beyond its limit |
+| torque step | largest change of a commanded torque from one control period to the next |
+| at rest | the same in the last second of the goals that are kept, joints on limits included |
+| hand at rest | distance from a goal 4 s after it was sent: median to largest of {hands} |
+
+A row of which something is promised ends with a verdict. Where what is spoilt is within what is
+declared ("all done", also while commands fail and the drives stop by themselves), position and
+speed must be 0 and torque at most 1. With "all done", the step at rest must also be at most
+{step:g}, and the median distance of the hand at most {factor:g} times that of the same robot with
+nothing spoilt and nothing done, or what a step of all encoders is at the hand. The other rows are
+for comparison.
+{parts}
+## What the remedies cost an ideal robot
+
+The rows "nothing spoilt" above have what they cost in violations and torque steps. The time that
+they cost: all joints go together from the middle of their ranges to a limit and back, with the
+stiff posture task, until all are within {near:g} mrad of the goal. Where "-" stands some joint
+stays farther off than that, because of margins or because the torque does not suffice there; the
+last column has the largest distance left at the limits.
+
+{costs}
+
+`uncertainty_cost` prints for each joint what a set of declarations costs in range, speed and time
+([ros2_tools.md](ros2_tools.md)). `bash scripts/bench.sh chain --imperfect` measures the time from
+a state to its command, without and with the remedies.
+"""
+HOLDABLE = """
+The limits of {robots} are narrower than in its file in all cases, so that the
+arm can hold and accelerate itself in all states: `HOLDABLE` in `reproduction/imperfect.py`.
+"""
+
+
+@dataclass(frozen=True)
+class Minute:
+    """What a minute showed; the largest of all joints.
+
+    Attributes:
+        position, speed: how far beyond the limits, rad and rad/s.
+        torque: share of torque_max.
+        step: largest change of torque in a period, share of torque_max.
+        step_at_rest: the same, at rest.
+        stopped: periods in which the robot stopped by itself.
+    """
+
+    position: float
+    speed: float
+    torque: float
+    step: float
+    step_at_rest: float
+    stopped: int
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the minutes of a case showed.
+
+    Attributes:
+        title: of the case.
+        minutes: one by one.
+        hands: distances of the hand at rest from goals, m.
+        near: what counts as no error of the hand, m: a step of all encoders.
+    """
+
+    title: str
+    minutes: list[Minute]
+    hands: list[float]
+    near: float
+
+    def worst(self, name: str) -> float:
+        """Return the largest value of all minutes."""
+        return float(np.nanmax([getattr(minute, name) for minute in self.minutes]))
+
+    @property
+    def kept(self) -> bool:
+        """Whether no limit was passed."""
+        within = self.worst("position") <= 0.0 and self.worst("speed") <= 0.0
+        return within and self.worst("torque") <= 1.0 + TORQUE_ROUNDING
+
+
+Outcomes = dict[str, Outcome]
+"""By name of the case."""
+
+
+def verdict(name: str, outcome: Outcome, ideal: Outcome | None) -> str:
+    """Return the last entry of a row, empty where nothing is promised.
+
+    Args:
+        name: of the case.
+        outcome: of the case.
+        ideal: that of the robot with nothing spoilt, if it is known.
+    """
+    if name not in WITHIN_DECLARED:
+        return ""
+    wrong = [] if outcome.kept else ["a limit was passed"]
+    if name == "all":
+        if outcome.worst("step_at_rest") > STEP_AT_REST:
+            wrong.append("step at rest")
+        near = max(HAND_FACTOR * np.median(ideal.hands), outcome.near) if ideal else np.inf
+        if np.median(outcome.hands) > near:
+            wrong.append("hand at rest")
+    return f"DIFFERS: {', '.join(wrong)}" if wrong else "kept"
+
+
+def row(name: str, outcome: Outcome, ideal: Outcome | None) -> tuple[str, ...]:
+    """Return a row of the table: the worst of the minutes."""
+    hands = 1e3 * np.array(outcome.hands)
+    return (
+        outcome.title,
+        str(len(outcome.minutes)),
+        f"{outcome.worst('position'):.2g}",
+        f"{outcome.worst('speed'):.2g}",
+        f"{outcome.worst('torque'):.3f}",
+        f"{outcome.worst('step'):.2f}",
+        f"{outcome.worst('step_at_rest'):.3f}",
+        f"{np.median(hands):.2f} to {hands.max():.2f}",
+        verdict(name, outcome, ideal),
+    )
+
+
+# Rows are kept in a file for each robot: robots can be played one after the other.
+
+
+def kept_path(robot: str) -> Path:
+    """Return where the rows of a robot are kept."""
+    return RESULTS / NAME / f"{robot}.json"
+
+
+def kept(robot: str) -> dict[str, Any]:
+    """Return what is kept of a robot: "cases" and "costs", by name of the case."""
+    path = kept_path(robot)
+    return json.loads(path.read_text()) if path.exists() else {"cases": {}, "costs": {}}
+
+
+def keep(robot: str, part: str, name: str, value: Any) -> None:
+    """Keep what a case showed in place of what it showed before."""
+    content = kept(robot)
+    content[part][name] = value
+    path = kept_path(robot)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content, indent=1) + "\n")
+
+
+def keep_outcome(robot: str, name: str, outcome: Outcome) -> None:
+    """Keep the outcome of a case."""
+    keep(robot, "cases", name, asdict(outcome))
+
+
+def kept_outcomes(robot: str, names: Sequence[str]) -> Outcomes:
+    """Return the outcomes of a robot's cases in this order, without those never played."""
+    cases = kept(robot)["cases"]
+    return {
+        name: Outcome(**cases[name] | {"minutes": [Minute(**m) for m in cases[name]["minutes"]]})
+        for name in names
+        if name in cases
+    }
+
+
+# Page and picture
+
+
+def draw(outcomes: Mapping[str, Outcomes], titles: Mapping[str, str]) -> plt.Figure:
+    """Return a picture of the largest violations by robot and case."""
+    names = [name for name in titles if any(name in part for part in outcomes.values())]
+    picture, axes = plt.subplots(
+        2, len(outcomes), figsize=(4 + 3.2 * len(outcomes), 7), sharey=True, sharex="row",
+        layout="constrained", squeeze=False,
+    )  # fmt: skip
+    kinds = (
+        ("position", "position beyond a limit, rad"),
+        ("speed", "speed beyond a limit, rad/s"),
+    )
+    for line, (kind, label) in zip(axes, kinds, strict=True):
+        values = {r: {n: o.worst(kind) for n, o in part.items()} for r, part in outcomes.items()}
+        some = [v for part in values.values() for v in part.values() if v > 0.0] or [1e-3, 1.0]
+        low = 10.0 ** np.floor(np.log10(min(some)) - 1.0)
+        for axis, (robot, part) in zip(line, values.items(), strict=True):
+            for name, value in part.items():
+                place = names.index(name)
+                color = _COLORS[_kind(name)]
+                if value > 0.0:
+                    axis.barh(place, value - low, left=low, color=color)
+                    axis.text(value, place, f" {value:.2g}", va="center", fontsize=8)
+                else:
+                    axis.plot(1.6 * low, place, "o", mfc="none", color=color, clip_on=False)
+            axis.set(xscale="log", xlim=(low, 30.0 * max(some)), xlabel=label)
+            axis.set_yticks(range(len(names)), [titles[name] for name in names], fontsize=8)
+            axis.grid(axis="x", alpha=0.3)
+            if kind == "position":
+                axis.set_title(robot)
+    axes[0, 0].invert_yaxis()
+    return picture
+
+
+_COLORS = {"ideal": "tab:gray", "all": "tab:green", "less": "tab:red", "beyond": "tab:orange"}
+
+
+def _kind(name: str) -> str:
+    """Return the group of a case: a colour."""
+    if name.startswith("ideal"):
+        return "ideal"
+    if name in WITHIN_DECLARED:
+        return "all"
+    return "beyond" if name == "twice" else "less"
+
+
+def _costs(robots: Sequence[str], titles: Mapping[str, str]) -> Figure:
+    """Return the rows of the table of times."""
+    figure = Figure(NAME)
+    for robot in robots:
+        for name, cost in kept(robot)["costs"].items():
+            times = [f"{t:.2f}" if t is not None else "-" for t in cost["times"]]
+            title = f"{robot}, {titles[name].partition(', ')[2]}"
+            figure.rows.append((title, *times, f"{1e3 * cost['left']:.1f}"))
+    return figure
+
+
+def write_page(
+    robots: Sequence[str],
+    titles: Mapping[str, str],
+    pushed: Mapping[str, Mapping[str, float]],
+    limits_changed: Sequence[str],
+    near: float,
+) -> None:
+    """Write page, picture, data and metrics of all rows that are kept.
+
+    Args:
+        robots: in the order of the page.
+        titles: of the cases by name, in the order of the rows.
+        pushed: by robot, the forces by link, N.
+        limits_changed: robots whose limits are not those of their file.
+        near: how near a goal counts as reached, rad.
+    """
+    outcomes = {robot: kept_outcomes(robot, list(titles)) for robot in robots}
+    outcomes = {robot: part for robot, part in outcomes.items() if part}
+    if not outcomes:
+        return
+    figure, parts = Figure(NAME), []
+    for robot, part in outcomes.items():
+        one = Figure(NAME)
+        for name, outcome in part.items():
+            one.rows.append(row(name, outcome, part.get("ideal")))
+            figure.data[f"{robot}_{name}_hand"] = np.array(outcome.hands)
+            for kind in Minute.__dataclass_fields__:
+                values = [getattr(minute, kind) for minute in outcome.minutes]
+                figure.data[f"{robot}_{name}_{kind}"] = np.array(values)
+                figure.metrics[f"{robot}_{name}_{kind}"] = outcome.worst(kind)
+        parts.append(f"\n## {robot}\n\n{table([one], HEADS)}\n")
+    figure.save(draw(outcomes, titles))
+    image = ROOT / "docs" / "images" / f"{NAME}.png"
+    image.write_bytes((RESULTS / NAME / "figure.png").read_bytes())
+    pushes = Figure(NAME)
+    for robot in outcomes:
+        links = (f"`{link}` {force:g} N" for link, force in pushed[robot].items())
+        pushes.rows.append((robot, ", ".join(links)))
+    changed = ", ".join(f"`{robot}`" for robot in limits_changed if robot in outcomes)
+    page = PAGE.format(
+        pushes=table([pushes], ("robot", "links that are pushed, and how hard")),
+        holdable=HOLDABLE.format(robots=changed) if changed else "",
+        hands=max(len(each.hands) for part in outcomes.values() for each in part.values()),
+        step=STEP_AT_REST,
+        factor=HAND_FACTOR,
+        parts="".join(parts),
+        near=1e3 * near,
+        costs=table([_costs(list(outcomes), titles)], COST_HEADS),
+    )
+    (ROOT / "docs" / f"reproduction_{NAME}.md").write_text(page)
