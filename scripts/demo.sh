@@ -16,8 +16,9 @@ usage: bash scripts/demo.sh [robot] [scenario] [--bounds METHOD] [--rate HZ] [--
   --rate       control rate in Hz (default: the robot's own)
   --real-time  by the wall clock; without, in lockstep: the simulation waits for each command, so
                that it is as fast as the machine can, repeatable, and misses no deadline
-  --imperfect  with encoders, delays, motors and lost commands like those of a real robot, from
-               config/imperfect/<robot>.yaml; see docs/simulated_robot.md
+  --imperfect  with encoders, delays, motors and lost commands like those of a real robot, and
+               with what is done about them, from config/imperfect/<robot>.yaml; estimator_node
+               runs, too; see docs/simulated_robot.md
   --params     a further parameter file, such as config/obstacles/panda_wall.yaml
   --out        where figure, data and metrics go (default: results/<robot>_<scenario>; then
                results/demo is a link to it)
@@ -127,6 +128,7 @@ trap 'exit 130' INT TERM HUP
 
 start viability_bounds_pkg bounds_node
 start torque_safety_controller controller_node
+[ -z "$imperfect" ] || start viability_bounds_pkg estimator_node
 start sim_bridge bullet_node
 "$root/install/sim_bridge/lib/sim_bridge/scenario_node" --out "$out" --ros-args \
     --log-level warn --params-file "$config" "${overrides[@]}" -p "scenario:=$scenario" &

@@ -11,15 +11,21 @@ import yaml
 
 from sim_bridge.nodes import bullet_node
 from torque_safety_controller.node import controller_node
-from viability_bounds_pkg.node import bounds_node
+from viability_bounds_pkg.node import bounds_node, estimator_node
 
 ROOT = Path(__file__).resolve().parent.parent
 DEADLINE = 30.0  # s
 
 BOUNDS = ("viability_bounds_pkg", "bounds_node")
+ESTIMATOR = ("viability_bounds_pkg", "estimator_node")
 CONTROLLER = ("torque_safety_controller", "controller_node")
 ROBOT = ("sim_bridge", "bullet_node")
-MAIN = {BOUNDS: bounds_node.main, CONTROLLER: controller_node.main, ROBOT: bullet_node.main}
+MAIN = {
+    BOUNDS: bounds_node.main,
+    ESTIMATOR: estimator_node.main,
+    CONTROLLER: controller_node.main,
+    ROBOT: bullet_node.main,
+}
 """What the executables call, for what needs no process of its own."""
 
 
@@ -73,6 +79,7 @@ def changed(name, index, value):
         (BOUNDS, {"method": "guessed"}, "method"),
         (BOUNDS, {"rate_hz": 0.0}, "rate_hz"),
         (BOUNDS, {"bounds_dt_factor": 0.5}, "bounds_dt_factor"),
+        (ESTIMATOR, changed("velocity_max", 0, -1.0), "velocity_max"),
         (CONTROLLER, {"joints": ["panda_joint1", "no_such_joint"]}, "position_min"),
         (CONTROLLER, {"joints": [*panda("joints")[:-1], "no_such_joint"]}, "joints"),
         (CONTROLLER, {"end_effector_frame": "no_such_frame"}, "end_effector_frame"),
@@ -97,7 +104,7 @@ def test_a_bad_parameter_ends_a_node_with_one_line(tmp_path, capfd, node, change
     assert "allowed" in lines[0]
 
 
-@pytest.mark.parametrize("node", [BOUNDS, CONTROLLER, ROBOT])
+@pytest.mark.parametrize("node", [BOUNDS, ESTIMATOR, CONTROLLER, ROBOT])
 def test_a_missing_parameter_is_named(node):
     result = start(node)
     assert result.returncode == 1
@@ -123,11 +130,12 @@ def test_a_file_that_is_not_parameters_is_refused_in_one_line(tmp_path, capfd, t
     ("node", "options"),
     [
         (BOUNDS, ()),
+        (ESTIMATOR, ()),
         (CONTROLLER, ()),
         (ROBOT, ("-p", "clock:=real_time")),
         (ROBOT, ("-p", "clock:=lockstep")),
     ],
-    ids=["bounds", "controller", "robot in real time", "robot in lockstep"],
+    ids=["bounds", "estimator", "controller", "robot in real time", "robot in lockstep"],
 )
 def test_nodes_end_when_told_to(ros, node, options, sent):
     process = subprocess.Popen(

@@ -6,7 +6,9 @@ from contextlib import closing
 import numpy as np
 import pytest
 from direct import DirectLoop
+from imperfect import HOLDABLE
 from sensor_msgs.msg import JointState
+from stopped_robot import Stopped
 
 from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.nodes.bullet_node import BulletNode
@@ -57,6 +59,27 @@ def test_no_limit_is_passed_when_commands_fail_at_a_random_moment(robot):
                     assert not monitor.violated
     assert fastest > 0.9, "the arm was hardly driven"
     assert thrown > 0.05, "the brakes would have done"
+
+
+@pytest.mark.parametrize("robot", ["panda", "talos_left_arm", "baxter_left_arm"])
+def test_motors_with_lag_errors_and_noise_pass_no_limit_and_hold_it_still(robot):
+    """Those of config/imperfect; the steps of the true torque at rest are its noise."""
+    rng = np.random.default_rng(0)
+    stopped = Stopped(robot, f"imperfect/{robot}", **HOLDABLE.get(robot, {}))
+    tau_max = stopped.config.torque_max
+    with closing(stopped.robot) as arm:
+        for _ in range(6):
+            q, v = stopped.edge(rng)
+            assert stopped.play(q, v, stopped.law.time_to_rest(v) + 0.5) == (0.0, 0.0)
+            assert stopped.law.at_rest
+            true, believed = [], []
+            for _ in range(100):
+                arm.stop(stopped.law, 1)
+                true.append(arm.state().motor_torque)
+                believed.append(arm.believed_torque)
+            assert not arm.monitor.violated
+            assert (np.abs(np.diff(true, axis=0)) / tau_max).max() < 0.05
+            assert (np.abs(np.diff(believed, axis=0)) / tau_max).max() < 0.02
 
 
 @pytest.mark.parametrize("robot", ["panda", "talos_left_arm"])

@@ -207,7 +207,13 @@ class BulletRobot(BulletBody):
             self._release_brakes()
             law.begin(*self.state()[:2])
             self._stopping = True
-        self._advance(substeps, lambda: law.torque(*self.state()[:2]))
+        motors = self._motors
+
+        def control() -> Array:
+            q, v, _ = self.state()
+            return law.torque(q, v, None if motors is None else motors.believed)
+
+        self._advance(substeps, control)
 
     def state(self) -> RobotState:
         """Return the joint state, in new arrays."""

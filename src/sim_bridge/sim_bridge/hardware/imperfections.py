@@ -101,6 +101,12 @@ class Imperfections:
             raise SettingError("velocity_filter_hz", self.velocity_filter_hz, allowed)
 
     @property
+    def motor_lag(self) -> Array:
+        """Time constant of the motors' torque, shape (n,), s; 0 without a lag."""
+        omega = 2.0 * np.pi * self.motor_bandwidth
+        return np.divide(1.0, omega, out=np.zeros_like(omega), where=omega > 0.0)
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters that make a difference."""
         return tuple(each.name for each in fields(self) if self._is_on(each.name))

@@ -49,7 +49,7 @@ Array = NDArray[np.float64]
 CLOCKS = ("real_time", "lockstep")
 
 _OBSERVER_TIME = 0.002
-"""Of the drives' own stop, s: their velocities are exact, and the motors have no lag."""
+"""Of the drives' own stop, s: their velocities are exact, and they know their motors' torque."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -238,7 +238,14 @@ def make_stop(config: BulletConfiguration) -> CoordinatedStop | None:
             a_min,
             a_max,
         )
-        return CoordinatedStop(model, limits, config.torque_max, dt, observer_time=_OBSERVER_TIME)
+        return CoordinatedStop(
+            model,
+            limits,
+            config.torque_max,
+            dt,
+            observer_time=_OBSERVER_TIME,
+            motor_lag=config.imperfections.motor_lag,
+        )
     except JointLimitsError as error:
         allowed = f"limits that can be kept in steps of {dt:g} s ({error})"
         raise SettingError("acceleration_max", a_max, allowed) from error

@@ -5,58 +5,14 @@ from contextlib import closing
 
 import numpy as np
 import pytest
+from stopped_robot import Stopped
 
-from sim_bridge.bullet.limit_monitor import LimitMonitor
-from sim_bridge.nodes.bullet_parameters import BulletConfiguration, make_robot, make_stop
+from sim_bridge.nodes.bullet_parameters import BulletConfiguration, make_stop
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.testing.ros_harness import read_config
-from viability_bounds_pkg.torque_margin import tightened
-from viability_bounds_pkg.viability import viable_velocity_range
 
 FEW_STEPS = 0.012  # s
-
-
-class Stopped:
-    """A robot of a parameter file, with its friction and masses, and its stop."""
-
-    def __init__(self, robot):
-        self.config = read(BulletConfiguration, read_config(robot, "bullet_node"))
-        bounds = read(BoundsConfiguration, read_config(robot, "bounds_node"))
-        self.kernel = tightened(bounds.limits, bounds.margins)
-        self.margin = bounds.margins.acceleration
-        config = self.config
-        self.robot = make_robot(config)
-        self.law = make_stop(config)
-        self.robot.monitor = LimitMonitor(
-            config.position_min, config.position_max, config.velocity_max, config.torque_max
-        )
-        self.n = len(config.joints)
-        self.dt = config.dt / config.substeps
-
-    def edge(self, rng):
-        """A state to which the bounds may have led, most joints as fast as they may be."""
-        low, high = self.kernel.q_min, self.kernel.q_max
-        near = rng.uniform(0.0, 0.1, self.n)
-        places = [rng.uniform(low, high), low + near, high - near]
-        q = np.clip(np.choose(rng.choice(3, self.n, p=[0.6, 0.2, 0.2]), places), low, high)
-        slowest, fastest = viable_velocity_range(q, self.kernel, self.margin)
-        share = np.where(rng.random(self.n) < 0.7, 1.0, rng.random(self.n))
-        return q, share * np.where(rng.random(self.n) < 0.5, slowest, fastest)
-
-    def play(self, q, v, duration, brake=False):
-        """Stop or brake from a state; return the violations of position and speed."""
-        self.robot.reset(q, v)
-        self.robot.monitor.reset()
-        steps = round(duration / self.dt)
-        if brake:
-            self.robot.brake(steps, self.config.torque_max)
-        else:
-            self.robot.stop(self.law, steps)
-        monitor = self.robot.monitor
-        assert monitor.max_torque_ratio.max() <= 1.0
-        return monitor.max_position_violation.max(), monitor.max_velocity_violation.max()
 
 
 @pytest.fixture(params=["panda", "talos_left_arm", "baxter_left_arm"])

@@ -101,7 +101,9 @@ class ControllerNode(ArmNode):
         )
         alone = [JOINT_COMMANDS.name, config.ros2_control_topic, states.name]
         alone += [ACCELERATION_LIMITS.name, FT_WRENCH.name]
-        self.publisher_watch = PublisherWatch(self, filter(None, alone))
+        self.publisher_watch = PublisherWatch(
+            self, filter(None, alone), needs_estimates=config.use_estimated_states
+        )
         self._diagnostics = Diagnostics(self, self._report, watch=self.publisher_watch)
         if config.collision.bodies and not config.collision.collision_avoidance:
             self.get_logger().warning(

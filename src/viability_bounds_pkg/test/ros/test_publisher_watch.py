@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import pytest
 from rclpy.node import Node
+from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from viability_bounds_pkg.ros import publisher_watch
@@ -97,3 +98,38 @@ def test_a_second_one_of_the_same_name_is_told_when_it_stays(ros, watched, monke
     watch.look()
     assert watch.rivals == {"/left/command": ("/left/arm", "/left/arm")}
     assert len(log.warnings) == 1
+
+
+def test_a_missing_estimator_is_told_once_it_has_been_missing_for_some_looks(ros, monkeypatch):
+    node = ros.add(Node("arm", context=ros.context, namespace="left"))
+    log = Log(node, monkeypatch)
+    watch = PublisherWatch(node, [], needs_estimates=True)
+    content = PublisherWatch(node, [])
+
+    def look():
+        for _ in range(4):
+            watch.look()
+            content.look()
+
+    look()
+    assert watch.trouble == ""  # the robot is not there either
+    robot = node.create_publisher(JointState, "joint_states", 1)
+    ros.wait_until(lambda: node.count_publishers("joint_states"), "the robot")
+    watch.look()
+    assert watch.trouble == ""  # the estimator may come a moment later
+    look()
+    missing = "'/left/joint_states' has a publisher, '/left/estimated_joint_states' has none"
+    assert watch.trouble == missing
+    assert content.trouble == ""
+    (text,) = log.warnings
+    assert text == f"{missing}: start estimator_node, or set use_estimated_states to false"
+    estimator = node.create_publisher(JointState, "estimated_joint_states", 1)
+    ros.wait_until(lambda: node.count_publishers("estimated_joint_states"), "the estimator")
+    look()
+    assert watch.trouble == ""
+    node.destroy_publisher(estimator)
+    ros.wait_until(lambda: not node.count_publishers("estimated_joint_states"), "its end")
+    look()
+    assert watch.trouble == missing
+    assert len(log.warnings) == 2
+    node.destroy_publisher(robot)

@@ -154,18 +154,23 @@ def test_an_adversary_of_accelerations_within_the_margin_passes_no_limit(panda, 
         assert (np.abs(v) <= panda.margin / HOLD_GAIN).all()
 
 
-def test_motors_with_a_lag_pass_a_limit_by_little(arm):
+@pytest.mark.parametrize("told", [True, False])
+def test_motors_with_a_lag_pass_no_limit_where_the_law_knows_it(arm, told):
     rng = np.random.default_rng(0)
-    share = -np.expm1(-2.0 * np.pi * 50.0 * H)  # of the way to a new torque in a step, 50 Hz
-    stop = arm.stop()
+    lag = np.full(arm.n, 1.0 / (2.0 * np.pi * 50.0))  # s
+    share = -np.expm1(-H / lag)  # of the way to a new torque in a step
+    stop = arm.stop(motor_lag=lag)
     for _ in range(3):
         q, v = arm.edge(rng)
         tau = pin.rnea(arm.model, arm.data, q, v, np.zeros(arm.n)).copy()
         stop.begin(q, v)
         for _ in range(round((stop.time_to_rest(v) + 0.2) / H)):
-            tau += share * (stop.torque(q, v) - tau)
-            q, v = arm.move(q, v, tau, 1)
-            assert arm.beyond(q).max() < 1e-4
+            asked = stop.torque(q, v, tau if told else None)
+            before = tau
+            tau = tau + share * (asked - tau)
+            mean = asked + (before - asked) * lag / H * share
+            q, v = arm.move(q, v, mean, 1)
+            assert arm.beyond(q).max() <= (0.0 if told else 1e-4)
             assert (np.abs(v) <= arm.limits.v_max).all()
         assert stop.at_rest
         assert np.abs(v).max() < 5e-3

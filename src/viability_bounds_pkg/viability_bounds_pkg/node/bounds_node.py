@@ -66,7 +66,11 @@ class BoundsNode(ArmNode):
         self._publisher = ACCELERATION_LIMITS.publisher(self)
         states = state_topic(config.use_estimated_states)
         states.subscription(self, self._on_state)
-        self.publisher_watch = PublisherWatch(self, [ACCELERATION_LIMITS.name, states.name])
+        self.publisher_watch = PublisherWatch(
+            self,
+            [ACCELERATION_LIMITS.name, states.name],
+            needs_estimates=config.use_estimated_states,
+        )
         self._distances = LimitDistances(self, config, self._reader)
         self._diagnostics = Diagnostics(self, self._report, watch=self.publisher_watch)
         self._warn_of_affected_joints(config)

@@ -210,7 +210,8 @@ class Diagnostics:
             status' name, so that two arms are told apart.
         report: returns level (a constant of ``DiagnosticStatus``), a message and the values.
         period: seconds between two messages.
-        watch: its topics with several publishers are reported, too, as a warning.
+        watch: its topics with several publishers, and a missing estimator, are reported, too, as a
+            warning.
     """
 
     def __init__(
@@ -233,10 +234,10 @@ class Diagnostics:
         """Send the status now."""
         level, message, values = self._report()
         if self._watch is not None:
-            values["topics_with_several_publishers"] = self._watch.trouble or "none"
-            if self._watch.rivals:
+            values["topics_with_several_publishers"] = self._watch.several or "none"
+            if trouble := self._watch.trouble:
                 level = max(level, DiagnosticStatus.WARN)
-                message += f"; {self._watch.trouble}"
+                message += f"; {trouble}"
         status = DiagnosticStatus(
             level=level,
             name=self._node.get_fully_qualified_name().removeprefix("/"),

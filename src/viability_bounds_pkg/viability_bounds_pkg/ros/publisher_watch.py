@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Notices a second publisher of a topic that may have one only, whoever it belongs to."""
+"""Notices a second publisher of a topic that may have one only, and a missing estimator."""
 
 from __future__ import annotations
 
@@ -10,9 +10,13 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from viability_bounds_pkg.ros.topics import ESTIMATED_JOINT_STATES, JOINT_STATES
+
 _PERIOD = 1.0
 _GHOST_TIME = 20.0
 """How long a node that was killed, or has just ended, may stay in the graph, s."""
+_PATIENCE = 3
+"""How many looks in a row must find no estimator: others may start first."""
 _UNKNOWN = "_UNKNOWN_"
 """Ends the names that rmw gives nodes which have not told theirs."""
 
@@ -29,13 +33,21 @@ class PublisherWatch:
     Args:
         node: logs a second publisher once when it has come, and once when it is gone.
         topics: names of the topics, before remapping.
+        needs_estimates: whether the node works on estimated joint states: then it is also logged,
+            once each time, that there are joint states, but nobody to estimate them.
 
     Attributes:
         rivals: nodes that publish the same topic, by topic; only topics with several.
     """
 
-    def __init__(self, node: Node, topics: Iterable[str]) -> None:
+    def __init__(
+        self, node: Node, topics: Iterable[str], *, needs_estimates: bool = False
+    ) -> None:
         self.rivals: dict[str, tuple[str, ...]] = {}
+        self._needs_estimates, self._without_estimates = needs_estimates, 0
+        self._reported, self._estimated = (
+            node.resolve_topic_name(topic.name) for topic in (JOINT_STATES, ESTIMATED_JOINT_STATES)
+        )
         self._node = node
         self._topics = [node.resolve_topic_name(topic) for topic in topics]
         self._nameless: set[str] = set()
@@ -45,6 +57,18 @@ class PublisherWatch:
 
     @property
     def trouble(self) -> str:
+        """Topics with several publishers in words, and a missing estimator; empty without."""
+        return "; ".join(filter(None, (self.several, self.missing)))
+
+    @property
+    def missing(self) -> str:
+        """Says that the estimator is missing, empty if it is not."""
+        if self._without_estimates < _PATIENCE:
+            return ""
+        return f"'{self._reported}' has a publisher, '{self._estimated}' has none"
+
+    @property
+    def several(self) -> str:
         """Topics with several publishers in words, empty if there is none."""
         return "; ".join(
             f"{len(names)} publishers of '{topic}': {', '.join(names)}"
@@ -53,6 +77,8 @@ class PublisherWatch:
 
     def look(self) -> None:
         """Compare the graph with what was known."""
+        if self._needs_estimates:
+            self._look_for_estimator()
         for topic in self._topics:
             if self._node.count_publishers(topic) > 1:
                 self._note(topic)
@@ -60,6 +86,17 @@ class PublisherWatch:
             self._ghosts.pop(topic, None)
             if self.rivals.pop(topic, None):
                 self._node.get_logger().info(f"'{topic}' has no second publisher any more")
+
+    def _look_for_estimator(self) -> None:
+        count = self._node.count_publishers
+        if count(self._estimated) or not count(self._reported):
+            self._without_estimates = 0
+            return
+        self._without_estimates += 1
+        if self._without_estimates == _PATIENCE:
+            self._node.get_logger().warning(
+                f"{self.missing}: start estimator_node, or set use_estimated_states to false"
+            )
 
     def _note(self, topic: str) -> None:
         names = sorted(map(_name, self._node.get_publishers_info_by_topic(topic)))

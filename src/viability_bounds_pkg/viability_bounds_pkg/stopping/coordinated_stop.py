@@ -21,6 +21,9 @@ At rest the joints hold the place where they are, by the same law with another w
 
 With an observer, what the joints accelerate more than commanded is attributed to a torque that
 acts on the joints (friction, a payload, a push), and this torque is balanced.
+
+Motors whose torque follows with a first-order lag 1 / omega make (q + v / omega, v + a / omega) a
+double integrator that the torques asked for drive at once. All of the law is for that state then.
 """
 
 from __future__ import annotations
@@ -59,6 +62,10 @@ HOLD_GAIN = 30.0
 HOLD_WINDOW = 2e-4
 """Distance from the place held within which the observer rests, rad: no stick-slip."""
 
+HOLD_CLEARANCE = 4e-4
+"""Distance of the place held from the position limits, rad, more than `HOLD_WINDOW`: at a limit,
+the bounds would turn noise of the torque into torque steps."""
+
 GIVE_WAY = 0.02
 """Distance from the place held at which the arm stops anew instead of going back, rad."""
 
@@ -77,10 +84,10 @@ class CoordinatedStop:
         margin: how far accelerations may be off within a step, rad/s^2; 5 % of the smaller
             acceleration limit where not given.
         observer_time: time constant of the observer of disturbances, s; inf for none. It needs
-            velocities whose noise is far below the acceleration limits times this time, and
-            motors without lag: it oscillates where their bandwidth is below 200 Hz.
+            velocities whose noise is far below the acceleration limits times this time.
         rest_speed: the arm is at rest when no joint is faster, rad/s; above the noise of the
             velocities.
+        motor_lag: time constants of the motors' torques, shape (n,), s; none where not given.
 
     Attributes:
         acceleration: chosen in the last step, rad/s^2.
@@ -101,6 +108,7 @@ class CoordinatedStop:
         *,
         observer_time: float = math.inf,
         rest_speed: float = 1e-3,
+        motor_lag: ArrayLike | None = None,
     ) -> None:
         names = list(model.names)[1:]
         if sorted(names) != sorted(limits.names) or model.nv != len(names):
@@ -113,6 +121,10 @@ class CoordinatedStop:
         for setting, value in (("observer_time", observer_time), ("rest_speed", rest_speed)):
             if not value > 0.0:
                 raise SettingError(setting, value, "a number > 0")
+        given = np.zeros(len(names)) if motor_lag is None else motor_lag
+        lag = joint_array("motor_lag", given, limits.names)
+        if not (np.isfinite(lag) & (lag >= 0.0)).all():
+            raise SettingError("motor_lag", lag, "finite numbers >= 0")
         if margin is None:
             margin = MARGIN * np.minimum(-limits.a_min, limits.a_max)
         self._solver = BoundsSolver(limits, HORIZON * dt, margin, period=dt)
@@ -125,6 +137,9 @@ class CoordinatedStop:
         self._share = 0.0 if math.isinf(observer_time) else -math.expm1(-dt / observer_time)
         self._rest_speed = rest_speed
         self._scale = 0.5 * (limits.a_max - limits.a_min)
+        self._lag = lag if lag.any() else None
+        clear = np.minimum(HOLD_CLEARANCE, 0.5 * (limits.q_max - limits.q_min))
+        self._lowest, self._highest = limits.q_min + clear, limits.q_max - clear
         self.begin(np.zeros(len(names)), np.zeros(len(names)))
 
     def begin(self, q: ArrayLike, v: ArrayLike) -> None:
@@ -152,17 +167,25 @@ class CoordinatedStop:
         """
         return float((np.abs(v) / self._braking(v)).max())
 
-    def torque(self, q: Array, v: Array) -> Array:
-        """Return the torques of the motors for the next step of the drive, N m.
+    def torque(self, q: Array, v: Array, motor_torque: Array | None = None) -> Array:
+        """Return the torques to ask of the motors for the next step of the drive, N m.
 
         They are finite and within the torque limits for every finite state.
 
         Args:
             q: positions, rad.
             v: velocities, rad/s.
+            motor_torque: that of the motors now, N m; used where they have a lag. None where it
+                is unknown: the lag is not accounted for then.
         """
+        lead = v
+        if self._lag is not None and motor_torque is not None:
+            lead = v + self._lag * self._forward_dynamics(q, v, motor_torque)
         if self._share:
-            self._observe(q, v)
+            self._observe(q, lead)
+        if self._lag is not None and motor_torque is not None:
+            a = self._forward_dynamics(q, v, motor_torque + self._disturbance)
+            q, v = q + self._lag * v, v + self._lag * a
         h = self._dt
         lower, upper, viable = self._solver.bounds(q, v)
         outside = not viable.all()
@@ -179,7 +202,7 @@ class CoordinatedStop:
             if not feasible:
                 tau, a = self._limited(tau, a, lower, upper, M)
         self.acceleration = a
-        self._expected = v + h * a
+        self._expected = lead + h * a
         return tau
 
     def _gentle_return(
@@ -223,7 +246,7 @@ class CoordinatedStop:
         """Return accelerations that stop the arm, or hold it, regardless of its limits."""
         if not self.at_rest and float(np.abs(v).max()) <= self._rest_speed:
             self.at_rest = True
-            self._place = np.clip(q, self._limits.q_min, self._limits.q_max)
+            self._place = np.clip(q, self._lowest, self._highest)
         if self.at_rest:
             off = self._place - q
             if float(np.abs(off).max()) <= GIVE_WAY:
@@ -260,6 +283,11 @@ class CoordinatedStop:
         order = self._order
         tau: Array = pin.rnea(self._model, self._data, q[order], v[order], a[order])
         return tau[self._back]
+
+    def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
+        order = self._order
+        a: Array = pin.aba(self._model, self._data, q[order], v[order], tau[order])
+        return a[self._back]
 
     def _mass_matrix(self, q: Array) -> Array:
         """Return the symmetric mass matrix, shape (n, n), in the caller's order."""
