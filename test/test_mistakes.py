@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import shlex
 from importlib import import_module
@@ -12,10 +13,12 @@ from typing import Any
 import pytest
 import yaml
 from geometry_msgs.msg import PoseStamped
+from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosidl_parser.definition import Array, BasicType, NamespacedType, UnboundedSequence
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
+from trajectory_msgs.msg import JointTrajectory
 
 from sim_bridge.nodes import bullet_node, scenario_node
 from sim_bridge.nodes.bullet_node import BulletNode
@@ -83,6 +86,8 @@ def test_on_a_command_line(mistake, tmp_path, monkeypatch, capfd):
     (tmp_path / "config").symlink_to(ROOT / "config")
     for name, content in mistake.get("files", {}).items():
         (tmp_path / name).write_text(content)
+    # Of the whole process, so that it may be what another test wanted.
+    set_logger_level("", LoggingSeverity.INFO)
     # A node that starts all the same ends at once.
     monkeypatch.setattr(program, "spin", lambda *_: None)
     monkeypatch.setattr(scenario_node, "play", lambda *_: None)
@@ -234,12 +239,17 @@ def same_stamp(running):
 
 def other_rate(running):
     running.start(BoundsNode)
-    stamps = iter(range(4, 100_000, 4))
+    answers = running.ros.listen(JointTrajectory, "acceleration_limits")
+    stamps = iter(range(4 * MS, 100_000 * MS, 4 * MS))
 
     def send():
-        for _ in range(5):
-            running.publish("joint_states", joint_state(JOINTS, next(stamps) * MS, REST, ZERO))
-            running.ros.spin()
+        for stamp in itertools.islice(stamps, 10):
+            state = joint_state(JOINTS, stamp, REST, ZERO)
+            # Until it is answered: a lost one would be a longer period.
+            running.ros.wait_until(
+                lambda stamp=stamp: stamp in answers.stamps[-1:],
+                each=lambda state=state: running.publish("joint_states", state),
+            )
 
     return send
 

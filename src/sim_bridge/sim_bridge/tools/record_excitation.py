@@ -27,13 +27,8 @@ from sim_bridge.nodes.bullet_parameters import (
 )
 from sim_bridge.tools.excitation import ExcitationError, excitation
 from viability_bounds_pkg.cli.command_line import Parser, positive, run_tool
-from viability_bounds_pkg.cli.limits_file import (
-    check_writable,
-    node_parameters,
-    write_whole,
-)
-from viability_bounds_pkg.parameter import read
-from viability_bounds_pkg.user_input.parameter_files import ParameterFileError
+from viability_bounds_pkg.cli.limits_file import check_writable, write_whole
+from viability_bounds_pkg.user_input.parameter_files import ParameterFileError, read_files
 
 Array = NDArray[np.float64]
 
@@ -75,8 +70,7 @@ def _run(options: argparse.Namespace) -> int:
     check_writable(options.output)
     if options.output.resolve() == options.parameters.resolve():
         raise ParameterFileError(f"{options.output} is read, and cannot be written too")
-    given = node_parameters(options.parameters, node="/**/bullet_node")
-    config = read(BulletConfiguration, given)
+    config = read_files(BulletConfiguration, [options.parameters], "/**/bullet_node")
     motion = excitation(
         config, config.start_positions, config.dt, options.amplitude, options.speed
     )

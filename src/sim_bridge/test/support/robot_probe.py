@@ -50,9 +50,12 @@ class RobotProbe:
     def step(self, tau=None, times=1):
         """Answer states, by default with gravity compensation, and await the next ones."""
         for _ in range(times):
-            stamp = self.stamp
-            self.send(stamp, self.gravity() if tau is None else tau)
-            self.ros.wait_until(lambda s=stamp: self.stamp > s, "the next state")
+            stamp, torque = self.stamp, self.gravity() if tau is None else tau
+            self._answer(stamp, lambda s=stamp, t=torque: self.send(s, t))
+
+    def _answer(self, stamp, send):
+        """Send until the next state has come: best effort may lose a command under load."""
+        self.ros.wait_until(lambda: self.stamp > stamp, "the next state", each=send, period=0.5)
 
     def send(self, stamp, tau=None, joints=JOINTS, *, q=None, v=None):
         message = joint_state(joints, stamp, tau=[] if tau is None else tau)
@@ -64,8 +67,7 @@ class RobotProbe:
         """Answer states with positions, and await the next ones."""
         for _ in range(times):
             stamp = self.stamp
-            self.send(stamp, q=q, v=v)
-            self.ros.wait_until(lambda s=stamp: self.stamp > s, "the next state")
+            self._answer(stamp, lambda s=stamp: self.send(s, q=q, v=v))
 
     def push(self, link, force, stamp=0):
         """Push along y and wait until the robot knows."""

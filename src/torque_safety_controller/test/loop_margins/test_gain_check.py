@@ -13,12 +13,13 @@ from torque_safety_controller.loop_margins.gain_check import (
     GainSettings,
     RobotTiming,
 )
-from torque_safety_controller.loop_margins.joint_loop import observer_gains
+from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 from viability_bounds_pkg.parameter import read
-from viability_bounds_pkg.robot_configuration import LimitedRobotConfiguration, load_model
+from viability_bounds_pkg.robot_configuration import load_model
 from viability_bounds_pkg.testing.ros_harness import read_config
+from viability_bounds_pkg.uncertainty.feasible import none_of
 
-ARM = read(LimitedRobotConfiguration, read_config("talos_left_arm"))
+ARM = read(BoundsConfiguration, read_config("talos_left_arm", "bounds_node"))
 MODEL = load_model(ARM, ARM.read_urdf())
 N = MODEL.nv
 INERTIA = ArmInertia.of(MODEL, ARM.position_min, ARM.position_max)
@@ -27,20 +28,20 @@ GAINS = GainSettings(
 )
 TIMING = RobotTiming(
     dt=1e-3,
-    delay=0,
-    delay_jitter=0,
-    motor_bandwidth=np.full(N, np.inf),
-    position_error=np.zeros(N),
-    velocity_error=np.zeros(N),
-    acceleration_disturbance=np.full(N, 5.0),
+    declared=replace(none_of(ARM.declared), acceleration_disturbance=np.full(N, 5.0)),
     braking=np.full(N, 20.0),
-    bounds_dt_factor=2.0,
-    estimated=False,
+    horizon=2.0,
 )
+ESTIMATED = {"predicted": True, "observed": True}
+
+
+def timing(predicted=False, observed=False, **changed) -> RobotTiming:
+    own = replace(TIMING.declared, **changed)
+    return replace(TIMING, declared=own, predicted=predicted, observed=observed)
 
 
 def check(gains=GAINS, **changed) -> GainCheck:
-    return GainCheck(gains, replace(TIMING, **changed), INERTIA, ARM.torque_max)
+    return GainCheck(gains, timing(**changed), INERTIA, ARM.torque_max)
 
 
 def limits(**changed):
@@ -62,7 +63,7 @@ def test_two_periods_of_delay_halve_the_integral_gain_and_a_prediction_gives_it_
     assert late["integral_lambda"].exceeded
     assert 45.0 < late["integral_lambda"].limit < 55.0
     assert not late["pose_kp"].exceeded
-    predicted = limits(delay=2, estimated=True)
+    predicted = limits(delay=2, predicted=True)
     assert not predicted["integral_lambda"].exceeded
     assert predicted["bounds_dt_factor"].limit < late["bounds_dt_factor"].limit
 
@@ -76,9 +77,9 @@ def test_a_limit_is_where_the_margin_is():
     assert kp / 900.0 == pytest.approx((kd / 50.0) ** 2)
     assert check(delay=2).margin(0.98 * kp, 0.99 * kd, 0.0) > MARGIN
     assert check(delay=2).margin(1.02 * kp, 1.01 * kd, 0.0) < MARGIN
-    factor = limits(delay=2, estimated=True)["bounds_dt_factor"].limit
-    assert check(delay=2, estimated=True).limit_margin(1.01 * factor) > LIMIT_MARGIN
-    assert check(delay=2, estimated=True).limit_margin(0.99 * factor) < LIMIT_MARGIN
+    factor = limits(delay=2, predicted=True)["bounds_dt_factor"].limit
+    assert check(delay=2, predicted=True).limit_margin(1.01 * factor) > LIMIT_MARGIN
+    assert check(delay=2, predicted=True).limit_margin(0.99 * factor) < LIMIT_MARGIN
 
 
 @pytest.mark.parametrize(
@@ -114,9 +115,8 @@ def test_integral_action_splits_into_loops_of_single_joints():
 
 def test_the_torque_step_of_the_resolution_is_the_worst_of_all_signs():
     error = np.full(N, 5e-5)
-    found = check(position_error=error, estimated=True)
-    rates = replace(TIMING, position_error=error, estimated=True).observer_rates
-    gains = observer_gains(rates, 1e-3)
+    found = check(position_error=error, **ESTIMATED)
+    gains = timing(position_error=error).observers
     random = np.random.default_rng(0)
     worst = np.zeros(N)
     for M in INERTIA.matrices:
@@ -131,13 +131,13 @@ def test_the_torque_step_of_the_resolution_is_the_worst_of_all_signs():
 
 
 def test_resolution_limits_each_gain_to_its_share_of_the_torque():
-    changed = {"position_error": np.full(N, 1e-5), "estimated": True}
+    changed = {"position_error": np.full(N, 1e-5), **ESTIMATED}
     gain = limits(**changed)["integral_lambda"].by_resolution
     alone = GAINS._replace(tasks={"pose": (0.0, 1e-12)}, integral=gain)
     assert check(alone, **changed).step_at_rest().max() == pytest.approx(TORQUE_STEP, rel=0.01)
     time = limits(**changed)["disturbance_time"].by_resolution
     share = -np.expm1(-1e-3 / time)
-    velocity = replace(TIMING, **changed).steps.velocity
+    velocity = timing(**changed).steps.velocity
     torque = INERTIA.diagonal * share * velocity / 1e-3 / ARM.torque_max
     assert torque.max() == pytest.approx(TORQUE_STEP)
 

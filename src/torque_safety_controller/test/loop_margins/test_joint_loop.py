@@ -10,10 +10,10 @@ from torque_safety_controller.loop_margins.gain_check import limit_gains
 from torque_safety_controller.loop_margins.joint_loop import (
     Feedback,
     Link,
+    ObserverGains,
     Sensing,
     filter_share,
     motion,
-    observer_gains,
     open_loop,
 )
 from viability_bounds_pkg.joint_limits import JointLimits
@@ -21,6 +21,8 @@ from viability_bounds_pkg.viability import BoundsSolver
 
 DT = 1e-3
 LEAK = (0.1, 100.0, 0.5)
+POLE = math.exp(-150.0 * DT)
+OBSERVER = ObserverGains(1.0 - POLE**2, (1.0 - POLE) ** 2 / DT)
 
 
 def simulated(link, sensing, gains, steps=400, factor=1.0):
@@ -38,9 +40,8 @@ def simulated(link, sensing, gains, steps=400, factor=1.0):
         found.append(x[0])
         seen = np.array([x[0], x[1], estimate[2]])
         if sensing.observer is not None:
-            correction = observer_gains(np.array(sensing.observer), DT)
             error = x[0] - estimate[0]
-            seen[:2] = estimate[:2] + [correction.position * error, correction.velocity * error]
+            seen[:2] = estimate[:2] + np.multiply(sensing.observer, error)
         elif sensing.filter_rate is not None:
             rate = (x[0] - q_before) / DT
             v_filtered += filter_share(1.0 / sensing.filter_rate, DT) * (rate - v_filtered)
@@ -75,7 +76,7 @@ CASES = [
     (Link(DT, 1, 300.0), Sensing(), Feedback(400.0, 40.0, 50.0)),
     (Link(DT, 1), Sensing(filter_rate=200.0), Feedback(400.0, 40.0, 20.0)),
     (Link(DT, 2, 200.0), Sensing(predicted=2), Feedback(900.0, 60.0, 100.0)),
-    (Link(DT, 3, 200.0), Sensing(observer=150.0, predicted=2), Feedback(900.0, 60.0, 50.0)),
+    (Link(DT, 3, 200.0), Sensing(OBSERVER, predicted=2), Feedback(900.0, 60.0, 50.0)),
 ]
 
 

@@ -11,15 +11,14 @@ import pytest
 
 from sim_bridge.nodes.bullet_parameters import BulletConfiguration, make_robot
 from torque_safety_controller.loop_margins.gain_check import TORQUE_STEP
-from torque_safety_controller.loop_margins.joint_loop import observer_gains
 from torque_safety_controller.node.assembly import make_controller
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.parameters.loop_parameters import LoopConfiguration
 from torque_safety_controller.qp.constraints import AccelerationRange
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.robot_configuration import load_model
 from viability_bounds_pkg.state import State
+from viability_bounds_pkg.state_estimation.observer import Observer
 from viability_bounds_pkg.testing.ros_harness import read_config
 
 POSTURE = {"pose_weight": 0.0, "posture_kp": 100.0, "posture_kd": 20.0}
@@ -28,25 +27,19 @@ POSTURE = {"pose_weight": 0.0, "posture_kp": 100.0, "posture_kd": 20.0}
 class Encoders:
     """Positions in steps, and the state that observers make of them and of the torque."""
 
-    def __init__(self, model: pin.Model, loop: LoopConfiguration, q: np.ndarray) -> None:
-        rates = loop.timing(estimated=True).observer_rates
-        self.gains = observer_gains(rates, loop.dt)
-        self.model, self.data, self.dt = model, model.createData(), loop.dt
-        self.step = 2.0 * loop.position_error
-        self.state = State(q, np.zeros(len(q)))
+    def __init__(self, model: pin.Model, bounds: BoundsConfiguration, q: np.ndarray) -> None:
+        declared = bounds.declared
+        self.model, self.data = model, model.createData()
+        self.step = 2.0 * declared.position_error
+        self.observer = Observer(declared.observers(bounds.dt), bounds.dt, np.zeros(len(q)))
+        self.observer.start(State(q, np.zeros(len(q))))
 
     def read(self, q: np.ndarray, tau: np.ndarray | None) -> State:
-        expected = self.state
+        observer = self.observer
         if tau is not None:
-            a = pin.aba(self.model, self.data, *self.state, tau)
-            q_now, v_now = self.state
-            move = v_now + 0.5 * self.dt * a
-            expected = State(q_now + self.dt * move, v_now + self.dt * a)
-        error = np.round(q / self.step) * self.step - expected.q
-        self.state = State(
-            expected.q + self.gains.position * error, expected.v + self.gains.velocity * error
-        )
-        return self.state
+            observer.predict(pin.aba(self.model, self.data, *observer.state, tau))
+        observer.correct(observer.innovation(np.round(q / self.step) * self.step))
+        return observer.state
 
 
 def largest_step(robot, joint, seconds, delay=0, **changed) -> float:
@@ -78,7 +71,7 @@ def largest_step(robot, joint, seconds, delay=0, **changed) -> float:
     controller.set_posture_goal(goal)
     encoders = None
     if "position_error" in changed:
-        encoders = Encoders(model, configured(LoopConfiguration, "bounds_node"), q)
+        encoders = Encoders(model, bounds, q)
     under_way: deque[np.ndarray] = deque()
     torques: list[np.ndarray] = []
     for _ in range(round(seconds / bullet.dt)):
@@ -110,9 +103,14 @@ def test_late_commands_make_a_limit_cycle_of_the_file_s_gains(changed, low, high
     assert low <= largest_step("talos_left_arm", 8, 1.5, delay=2, **changed) < high
 
 
-@pytest.mark.parametrize(("factor", "calm"), [(2.0, False), (4.0, True)])
+@pytest.mark.parametrize(("factor", "calm"), [(2.0, False), (6.5, True)])
 def test_the_horizon_that_the_tool_prints_leaves_coarse_encoders_calm(factor, calm):
-    """Panda's wrist, encoders of 16 bits: at least 3.9 periods by `gain_limits`."""
-    coarse = {"position_error": [4.8e-5] * 7, "rotor_inertia": [0.1] * 7}
-    found = largest_step("panda", 6, 4.0, bounds_dt_factor=factor, **coarse)
+    """Panda's wrist, encoders of 16 bits: at least 6.2 periods by `gain_limits`."""
+    declared = {
+        "position_error": [4.8e-5] * 7,
+        "rotor_inertia": [0.1] * 7,
+        "acceleration_disturbance": [0.5] * 7,
+        "use_estimated_states": True,
+    }
+    found = largest_step("panda", 6, 2.0, bounds_dt_factor=factor, **declared)
     assert (found < TORQUE_STEP) == calm

@@ -19,9 +19,9 @@ from torque_safety_controller.loop_margins.joint_loop import (
     ObserverGains,
     Sensing,
     filter_share,
-    observer_gains,
     open_loop,
 )
+from viability_bounds_pkg.uncertainty.declared import DeclaredUncertainty
 
 Array = NDArray[np.float64]
 
@@ -36,9 +36,6 @@ bears an inertia 30% off, and that of the model is assumed to be at most 20% off
 TORQUE_STEP = 0.05
 """Share of `torque_max` by which the resolution may change a torque from period to period."""
 
-LEAST_ACCELERATION_ERROR = 0.1
-"""Error of the known acceleration that an observer is designed for at least, rad/s^2."""
-
 _SCALES = 1e-4, 1e3  # of a gain
 _LONGEST = 1e3  # horizon of the bounds, control periods
 _BISECTIONS = 14
@@ -46,56 +43,48 @@ _BISECTIONS = 14
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RobotTiming:
-    """Delay, bandwidth and resolution, as declared; arrays of shape (n,).
+    """Delay, bandwidth and resolution of a robot with n joints.
 
     Attributes:
         dt: control period, s.
-        delay: control periods from a state to the effect of its command.
-        delay_jitter: control periods by which it may be longer.
-        motor_bandwidth: rad/s, infinite for none.
-        position_error, velocity_error: largest errors of what is reported, rad and rad/s.
-        acceleration_disturbance: largest error of the acceleration, rad/s^2.
-        braking: smaller limit of the acceleration, rad/s^2.
-        bounds_dt_factor: horizon of the bounds, in control periods.
-        estimated: whether delay and lag are compensated, and velocities estimated.
+        declared: delay, lag of the motors, errors of states and accelerations.
+        braking: smaller limit of the acceleration, shape (n,), rad/s^2.
+        horizon: of the bounds, in control periods.
+        predicted: whether states are predicted through delay and lag.
+        observed: whether velocities are observed, not reported.
     """
 
     dt: float
-    delay: int
-    delay_jitter: int
-    motor_bandwidth: Array
-    position_error: Array
-    velocity_error: Array
-    acceleration_disturbance: Array
+    declared: DeclaredUncertainty
     braking: Array
-    bounds_dt_factor: float
-    estimated: bool
+    horizon: float
+    predicted: bool = False
+    observed: bool = False
 
     @cached_property
     def links(self) -> list[Link]:
         """With the shortest and with the longest delay, and the slowest motor."""
-        bandwidth = float(self.motor_bandwidth.min())
-        delays = sorted({self.delay, self.delay + self.delay_jitter})
-        return [Link(self.dt, delay, bandwidth) for delay in delays]
+        lag, delay = float(self.declared.motor_lag.max()), self.declared.delay
+        delays = sorted({delay, delay + self.declared.delay_jitter})
+        return [Link(self.dt, each, 1.0 / lag if lag > 0.0 else math.inf) for each in delays]
 
     @cached_property
-    def observer_rates(self) -> Array:
-        """Poles of the observers, shape (n,), rad/s; infinite where positions are exact.
-
-        A double pole at w makes the velocity's error at most 2 w E / e + 2 W / w: the best one.
-        """
-        error = np.maximum(self.acceleration_disturbance, LEAST_ACCELERATION_ERROR)
-        with np.errstate(divide="ignore"):
-            rates: Array = np.sqrt(math.e * error / self.position_error)
-        return rates
+    def observers(self) -> ObserverGains:
+        """Gains of the observers, shape (n,) each."""
+        design = self.declared.observers(self.dt)
+        return ObserverGains(design.position_gain, design.velocity_gain)
 
     @cached_property
     def sensing(self) -> list[Sensing]:
         """How the slowest and the fastest observer tell the state."""
-        if not self.estimated:
-            return [Sensing()]
-        rates = sorted({float(self.observer_rates.min()), float(self.observer_rates.max())})
-        return [Sensing(rate if rate < math.inf else None, predicted=self.delay) for rate in rates]
+        predicted = self.declared.delay if self.predicted else None
+        if not self.observed:
+            return [Sensing(predicted=predicted)]
+        gains = sorted(set(zip(*self.observers, strict=True)))
+        return [
+            Sensing(ObserverGains(*each), predicted=predicted)
+            for each in dict.fromkeys((gains[0], gains[-1]))
+        ]
 
     @cached_property
     def steps(self) -> ObserverGains:
@@ -103,13 +92,14 @@ class RobotTiming:
 
         Shape (n,) each. A position that is off by up to E changes by 2 E at once.
         """
-        step = 2.0 * self.position_error
-        if not self.estimated or not step.any():
-            return ObserverGains(step, 2.0 * self.velocity_error)
-        gains = observer_gains(self.observer_rates, self.dt)
-        ahead = self.delay * self.dt + 1.0 / self.motor_bandwidth
-        velocity = step * gains.velocity
-        return ObserverGains(step * gains.position + ahead * velocity, velocity)
+        position, velocity = 2.0 * self.declared.position_error, 2.0 * self.declared.velocity_error
+        if self.observed:
+            velocity = self.observers.velocity * position
+            position = self.observers.position * position
+        if self.predicted:
+            ahead = self.declared.delay * self.dt + self.declared.motor_lag
+            position = position + ahead * velocity
+        return ObserverGains(position, velocity)
 
 
 class GainSettings(NamedTuple):
@@ -249,7 +239,7 @@ class GainCheck:
                 lambda s: _calm(self._step_of_bounds(1.0 / s)),
             )
         )
-        yield GainLimit(HORIZON, self._timing.bounds_dt_factor, margin, resolution)
+        yield GainLimit(HORIZON, self._timing.horizon, margin, resolution)
 
     def margin(self, kp: float, kd: float, integral: float, observed: bool = False) -> float:
         """Return the least modulus margin, over delays, observers and postures.
@@ -329,7 +319,7 @@ class GainCheck:
     def _slopes(self, factor: float) -> LimitGains:
         timing = self._timing
         horizon = factor * timing.dt
-        return limit_gains(horizon, timing.acceleration_disturbance, timing.braking)
+        return limit_gains(horizon, timing.declared.acceleration_disturbance, timing.braking)
 
     def _step(self, kp: float, kd: float, integral: float) -> Array:
         steps = self._timing.steps

@@ -39,19 +39,26 @@ class Link(NamedTuple):
     bandwidth: float = math.inf
 
 
+class ObserverGains(NamedTuple):
+    """Shares of an error of the position that correct position and velocity, 1 and 1/s."""
+
+    position: Array
+    velocity: Array
+
+
 class Sensing(NamedTuple):
     """How the controller knows the state.
 
     Attributes:
-        observer: rate of both poles of the observer that estimates the velocity, rad/s; None for
-            one that is measured, or differenced.
+        observer: gains of the observer that estimates the velocity; None for one that is measured,
+            or differenced.
         filter_rate: low-pass of a velocity by differences of the position, rad/s, perhaps
             infinite; None for one that is measured, or observed.
         predicted: periods by which the state is predicted, and the motor lag with it; None for
             no prediction.
     """
 
-    observer: float | None = None
+    observer: ObserverGains | None = None
     filter_rate: float | None = None
     predicted: int | None = None
 
@@ -128,24 +135,6 @@ def motion(link: Link) -> Motion:
     return Motion(A, np.array([0.5 * dt**2 - way, dt - moved, 1.0 - left]))
 
 
-class ObserverGains(NamedTuple):
-    """Shares of an error of the position that correct position and velocity, 1 and 1/s."""
-
-    position: Array
-    velocity: Array
-
-
-def observer_gains(rate: Array, dt: float) -> ObserverGains:
-    """Return the gains with which both poles of an observer are at exp(-rate dt).
-
-    Args:
-        rate: of any shape, rad/s.
-        dt: control period, s.
-    """
-    pole = np.exp(-rate * dt)
-    return ObserverGains(1.0 - pole**2, (1.0 - pole) ** 2 / dt)
-
-
 def filter_share(time_constant: float, dt: float) -> float:
     """Return the share of what is new that a low-pass takes in a period."""
     return -math.expm1(-dt / time_constant) if time_constant > 0.0 else 1.0
@@ -172,10 +161,9 @@ def open_loop(link: Link, sensing: Sensing, gains: Feedback) -> OpenLoop:
     q, v, dt = x["q"], x["v"], link.dt
     seen = [q, v, x["a_seen"]]
     if sensing.observer is not None:
-        correction = observer_gains(np.array(sensing.observer), dt)
         error = q - x["q_seen"]
-        seen[0] = x["q_seen"] + correction.position * error
-        seen[1] = x["v_seen"] + correction.velocity * error
+        seen[0] = x["q_seen"] + sensing.observer.position * error
+        seen[1] = x["v_seen"] + sensing.observer.velocity * error
     elif sensing.filter_rate is not None:
         share = filter_share(1.0 / sensing.filter_rate, dt)
         seen[1] = x["v_seen"] + share * ((q - x["q_before"]) / dt - x["v_seen"])

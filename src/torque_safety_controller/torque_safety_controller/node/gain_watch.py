@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Warns of gains beyond what delay, motors and encoders permit, as far as they are declared.
 
-They are declared for other nodes, in the parameter files that all nodes of a robot get: what this
-node's command line says of them is read, without asking anybody.
+They are declared for the bounds node, in the parameter files that all nodes of a robot get: what
+this node's command line says of them is read, no other node is asked.
 """
 
 from __future__ import annotations
@@ -15,8 +15,10 @@ from rclpy.node import Node
 from torque_safety_controller.loop_margins.arm_inertia import ArmInertia
 from torque_safety_controller.loop_margins.gain_check import GainCheck
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.parameters.loop_parameters import gain_check, read_loop
-from viability_bounds_pkg.exceptions import SettingError
+from torque_safety_controller.parameters.loop_parameters import gain_check, limits_gains
+from viability_bounds_pkg.exceptions import ArmSafetyError
+from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
+from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.ros.given_parameters import arguments_of, given_parameters
 
 
@@ -38,17 +40,18 @@ class GainWatch:
         self._inertia: ArmInertia | None = None
         arguments, place = arguments_of(node.context), node.get_namespace().rstrip("/")
         try:
-            self._loop = read_loop(lambda name: given_parameters(arguments, f"{place}/{name}"))
-        except SettingError:  # the node that it is for says so
+            given = given_parameters(arguments, f"{place}/bounds_node")
+            self._robot = read(BoundsConfiguration, given)
+        except ArmSafetyError:  # the node that they are for says so
             return
-        if self._loop.imperfect:
+        if limits_gains(self._robot.declared):
             self._inertia = ArmInertia.of(model, config.position_min, config.position_max)
             self.look(config)
 
     def look(self, config: ControllerConfiguration) -> None:
         """Judge the gains, at start and when they have changed."""
         if self._inertia is not None:
-            self._check = gain_check(config, self._loop, self._inertia)
+            self._check = gain_check(config, self._robot, self._inertia)
             threading.Thread(target=self._judge, args=(self._check,), daemon=True).start()
 
     def close(self) -> None:

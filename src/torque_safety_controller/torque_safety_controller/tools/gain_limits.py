@@ -2,7 +2,7 @@
 """Command line tool that prints gains beside the largest that a robot bears.
 
 Reads a robot's parameter files: delay, bandwidth of the motors and resolution of the encoders, as
-declared for bounds_node and estimator_node, and the gains of controller_node.
+declared for bounds_node, and the gains of controller_node.
 """
 
 from __future__ import annotations
@@ -10,8 +10,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -24,20 +22,12 @@ from torque_safety_controller.loop_margins.gain_check import (
     GainLimit,
 )
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.parameters.loop_parameters import (
-    LoopConfiguration,
-    gain_check,
-    read_loop,
-)
+from torque_safety_controller.parameters.loop_parameters import gain_check
 from viability_bounds_pkg.cli.command_line import Parser, run_tool
-from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.parameter import parameter_table, read
+from viability_bounds_pkg.cli.limits_file import CONTROLLER, NODE
+from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 from viability_bounds_pkg.robot_configuration import load_model
-from viability_bounds_pkg.ros.given_parameters import given_parameters, refuse_unknown
-from viability_bounds_pkg.user_input.parameter_files import (
-    ParameterFileError,
-    check_parameter_files,
-)
+from viability_bounds_pkg.user_input.parameter_files import read_files
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -50,42 +40,23 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         f"{TORQUE_STEP:.0%} of torque_max a period. docs/gains.md derives both. Exit code 1: a "
         "gain is beyond its limit.",
     )
-    parser.add_argument(
-        "--params-file",
-        type=Path,
-        action="append",
-        required=True,
-        metavar="FILE",
-        help="parameter file of the robot (ROS 2 YAML); repeatable, later ones win",
-    )
+    parser.add_parameter_files()
     return parser.parse_args(arguments)
 
 
 def _run(options: argparse.Namespace) -> int:
-    files = [str(path) for path in options.params_file]
-    check_parameter_files(files)
-    arguments = ["--ros-args", *(word for path in files for word in ("--params-file", path))]
-
-    def sections(node: str) -> dict[str, Any]:
-        given = given_parameters(arguments, f"/{node}")
-        refuse_unknown(given, [row.name for row in parameter_table(LoopConfiguration)])
-        return given
-
-    try:
-        config = read(ControllerConfiguration, sections("controller_node"))
-        loop = read_loop(sections)
-        model = load_model(config, config.read_urdf())
-    except SettingError as error:
-        raise ParameterFileError(f"{', '.join(files)}: {error}") from error
+    config = read_files(ControllerConfiguration, options.params_file, CONTROLLER)
+    robot = read_files(BoundsConfiguration, options.params_file, NODE)
+    model = load_model(config, config.read_urdf())
     inertia = ArmInertia.of(model, config.position_min, config.position_max)
-    check = gain_check(config, loop, inertia)
-    limits = list(check.limits())
+    check = gain_check(config, robot, inertia)
+    limits, horizon = list(check.limits()), robot.horizon / robot.dt
     report(limits)
     print(
         f"modulus margin with the gains given: {check.stiffest_margin():.2g}, of a joint on its "
-        f"limit {check.limit_margin(loop.horizon):.2g}"
+        f"limit {check.limit_margin(horizon):.2g}"
     )
-    calm = _report_steps(config, check, loop.horizon)
+    calm = _report_steps(config, check, horizon)
     return 1 if any(limit.exceeded for limit in limits) or not calm else 0
 
 
@@ -102,12 +73,12 @@ def report(limits: Sequence[GainLimit]) -> None:
         print(f"{limit.name:18}{limit.value:10.4g}{margin:>14}{resolution:>16}{verdict}")
 
 
-def _report_steps(config: ControllerConfiguration, check: GainCheck, factor: float) -> bool:
+def _report_steps(config: ControllerConfiguration, check: GainCheck, horizon: float) -> bool:
     """Print the torque steps that the resolution makes; return whether they are small enough."""
     calm = True
     for where, steps in (
         ("at rest, all gains together", check.step_at_rest()),
-        ("on a joint limit, what acts there together", check.step_at_limits(factor)),
+        ("on a joint limit, what acts there together", check.step_at_limits(horizon)),
     ):
         worst = int(np.argmax(steps))
         beyond = steps[worst] > TORQUE_STEP

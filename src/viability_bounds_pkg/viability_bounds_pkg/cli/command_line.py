@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import NoReturn
 
 from viability_bounds_pkg.exceptions import ArmSafetyError, did_you_mean
@@ -19,6 +20,18 @@ ROS_FLAGS = ("-p", "--param", "-r", "--remap", "--params-file", "--log-level")
 
 class Parser(argparse.ArgumentParser):
     """Reports a usage error in one line."""
+
+    def add_parameter_files(self) -> None:
+        """Add the option by which tools get parameter files, as nodes do: `params_file`."""
+        self.add_argument(
+            "--params-file",
+            type=Path,
+            action="append",
+            required=True,
+            metavar="FILE",
+            help="parameter file of the robot (ROS 2 YAML); repeatable, the last value given "
+            "counts",
+        )
 
     def error(self, message: str) -> NoReturn:
         """Print what is wrong, and exit with 2."""

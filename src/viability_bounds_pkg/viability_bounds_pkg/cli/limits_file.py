@@ -11,24 +11,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Context
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
 
 from viability_bounds_pkg.estimation.state_space import Array
-from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.parameter import read, redeclared
+from viability_bounds_pkg.parameter import redeclared
 from viability_bounds_pkg.robot_configuration import LimitedRobotConfiguration
 from viability_bounds_pkg.robot_description import build_model, read_urdf
-from viability_bounds_pkg.user_input.known_names import unknown_parameters
-from viability_bounds_pkg.user_input.parameter_files import (
-    ParameterFileError,
-    check_parameter_files,
-    sections_of,
-)
-from viability_bounds_pkg.user_input.yaml_file import read_yaml
+from viability_bounds_pkg.user_input.parameter_files import ParameterFileError, read_files
 
 NODE = "/**/bounds_node"
 """The node whose parameters the limits are."""
@@ -84,10 +76,7 @@ def read_robot(path: Path) -> Robot:
         RobotDescriptionError: the URDF cannot be found or loaded, or lacks a joint; a rotor
             inertia is negative.
     """
-    try:
-        config = read(_EstimatedRobot, node_parameters(path))
-    except SettingError as error:
-        raise ParameterFileError(f"{path}: {error}") from error
+    config = read_files(_EstimatedRobot, [path], NODE)
     urdf = read_urdf(config.robot_description)
     _check_limits(urdf, config.robot_description)
     model = build_model(urdf, config.joints, config.locked, config.rotor_inertia)
@@ -122,35 +111,6 @@ def _check_limits(urdf: str, source: str) -> None:
         for key in ("effort", "velocity"):
             if limit is None or limit.get(key) is None:
                 raise ParameterFileError(f"{source}: joint {joint.get('name')} has no {key} limit")
-
-
-def node_parameters(*paths: Path, node: str = NODE) -> dict[str, Any]:
-    """Return the parameters of one node, those for all nodes included.
-
-    Args:
-        paths: parameter files; of several values of a parameter the last one counts.
-        node: ``/**/name``; sections ``name`` and ``/name`` count as well.
-
-    Raises:
-        YamlError: a file cannot be read, is no YAML, or has a key twice.
-        ParameterFileError: a file is no parameter file, or has a misspelt parameter; there is
-            none for `node`; the files are for several robots.
-    """
-    check_parameter_files([str(path) for path in paths])
-    name = node.rpartition("/")[2]
-    parameters: dict[str, Any] = {}
-    for path in paths:
-        given: dict[str, Any] = {}
-        for section, values in sections_of(read_yaml(path)):
-            if section in ("/**", f"/{name}", node):
-                given.update(values)
-        if unknown := unknown_parameters(given):
-            raise ParameterFileError(f"{path}: {unknown}")
-        parameters |= given
-    if not parameters:
-        files = ", ".join(map(str, paths))
-        raise ParameterFileError(f"{files}: no parameters under '/**' or '{node}'")
-    return parameters
 
 
 def overlay(parameters: Mapping[str, Array], notes: Sequence[str], node: str = NODE) -> str:

@@ -7,23 +7,18 @@ from dataclasses import dataclass
 
 import pinocchio as pin
 
-from viability_bounds_pkg.parameter import above, group, number, switch
+from viability_bounds_pkg.parameter import above, group, number
 from viability_bounds_pkg.robot_configuration import ControlRate, LimitedRobotConfiguration
 from viability_bounds_pkg.state_estimation.estimator import StateEstimator
-from viability_bounds_pkg.state_estimation.observer import ObserverDesign, design_observer
-from viability_bounds_pkg.uncertainty.declared import DeclaredUncertainty
+from viability_bounds_pkg.state_estimation.observer import ObserverDesign
+from viability_bounds_pkg.uncertainty.declared import DeclaredUncertainty, VelocityEstimation
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class EstimatorConfiguration(ControlRate, LimitedRobotConfiguration):
+class EstimatorConfiguration(VelocityEstimation, ControlRate, LimitedRobotConfiguration):
     """Parameters of the estimator node."""
 
     declared: DeclaredUncertainty = group(DeclaredUncertainty)
-    velocity_estimation: bool = switch(
-        "whether velocities are estimated from positions and torques; false takes those that the "
-        "robot reports",
-        default=True,
-    )
     state_timeout: float = number(
         "silence after which older stamps are accepted again, s", above(0.0, 3600.0), default=0.5
     )
@@ -31,10 +26,7 @@ class EstimatorConfiguration(ControlRate, LimitedRobotConfiguration):
     @property
     def observers(self) -> ObserverDesign | None:
         """Observers of the velocities; None where they are not estimated."""
-        if not self.velocity_estimation:
-            return None
-        declared = self.declared
-        return design_observer(self.dt, declared.position_error, declared.acceleration_disturbance)
+        return self.declared.observers(self.dt) if self.velocity_estimation else None
 
 
 def make_estimator(config: EstimatorConfiguration, model: pin.Model) -> StateEstimator:

@@ -10,16 +10,15 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 from viability_bounds_pkg.cli.command_line import Parser, run_tool
-from viability_bounds_pkg.cli.limits_file import node_parameters
+from viability_bounds_pkg.cli.limits_file import NODE
 from viability_bounds_pkg.joint_limits import JointLimitsError
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
-from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.uncertainty.cost import Reach, Share, reach_of, shares_of
 from viability_bounds_pkg.uncertainty.feasible import none_of, refusal
 from viability_bounds_pkg.uncertainty.margins import UncertaintyMargins
+from viability_bounds_pkg.user_input.parameter_files import read_files
 
 NAME = "uncertainty_cost"
 
@@ -31,14 +30,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         epilog="E_q and E_v are the largest errors of position and velocity for which the bounds "
         "hold, at the instant when a command begins to act; docs/uncertainty.md derives them.",
     )
-    parser.add_argument(
-        "--params-file",
-        type=Path,
-        action="append",
-        required=True,
-        metavar="FILE",
-        help="parameter file of the robot; repeatable, the last value given counts",
-    )
+    parser.add_parameter_files()
     return parser.parse_args(arguments)
 
 
@@ -89,7 +81,7 @@ def _print_shares(joints: Sequence[str], shares: Sequence[Share]) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    config = read(BoundsConfiguration, node_parameters(*options.params_file))
+    config = read_files(BoundsConfiguration, options.params_file, NODE)
     loop, declared = config.loop, config.declared
     try:
         reach = reach_of(loop, declared)

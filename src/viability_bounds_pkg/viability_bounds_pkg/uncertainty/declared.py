@@ -19,6 +19,7 @@ from viability_bounds_pkg.parameter import (
     switch,
     whole_number,
 )
+from viability_bounds_pkg.state_estimation.observer import ObserverDesign, design_observer
 
 Array = NDArray[np.float64]
 
@@ -94,3 +95,11 @@ class DeclaredUncertainty:
         """Time constant of the motors' torque, shape (n,), s; 0 without a lag."""
         bandwidth = 2.0 * np.pi * self.motor_bandwidth
         return np.divide(1.0, bandwidth, out=np.zeros_like(bandwidth), where=bandwidth > 0.0)
+
+    def observers(self, dt: float) -> ObserverDesign:
+        """Return the observers that estimate velocities.
+
+        Args:
+            dt: control period, s.
+        """
+        return design_observer(dt, self.position_error, self.acceleration_disturbance)

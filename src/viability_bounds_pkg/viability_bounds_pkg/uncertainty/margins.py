@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.state import State
-from viability_bounds_pkg.state_estimation.observer import design_observer
 from viability_bounds_pkg.torque_margin import TorqueMargins, tightened
 from viability_bounds_pkg.uncertainty.declared import DeclaredUncertainty
 from viability_bounds_pkg.viability import BoundsSolver
@@ -36,22 +35,6 @@ class UncertaintyMargins(NamedTuple):
     horizon: float
     position_error: Array
     velocity_error: Array
-
-
-def reported_errors(declared: DeclaredUncertainty) -> State:
-    """Return the largest errors of position and velocity of a reported state."""
-    return State(declared.position_error, declared.velocity_error)
-
-
-def observer_errors(declared: DeclaredUncertainty, dt: float) -> State:
-    """Return the largest errors of an observed state for its own instant.
-
-    Args:
-        declared: errors of the positions and accelerations from which it is observed.
-        dt: control period, s.
-    """
-    design = design_observer(dt, declared.position_error, declared.acceleration_disturbance)
-    return State(design.position_error, design.velocity_error)
 
 
 def uncertainty_margins(
@@ -126,7 +109,8 @@ class Loop(NamedTuple):
 
     def margins(self, declared: DeclaredUncertainty) -> UncertaintyMargins:
         """Return what the bounds must hold for; the horizon is that of the bounds."""
-        errors = observer_errors(declared, self.dt) if self.observed else reported_errors(declared)
+        source = declared.observers(self.dt) if self.observed else declared
+        errors = State(source.position_error, source.velocity_error)
         w = self.torque_margins.acceleration + declared.acceleration_disturbance
         margins = uncertainty_margins(declared, self.dt, self.limits, w, errors, self.predicted)
         return margins._replace(horizon=max(self.least_horizon, margins.horizon))

@@ -4,11 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
-from viability_bounds_pkg.exceptions import ArmSafetyError, did_you_mean
-from viability_bounds_pkg.user_input.known_names import graph_names
+from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError, did_you_mean
+from viability_bounds_pkg.parameter import read
+from viability_bounds_pkg.user_input.known_names import graph_names, unknown_parameters
 from viability_bounds_pkg.user_input.yaml_file import read_yaml
+
+Configuration = TypeVar("Configuration")
 
 _VALUES = "ros__parameters"
 
@@ -96,3 +100,54 @@ def check_list(value: Any, what: str) -> None:
         only_numbers = {type(item) for item in value} == {int, float}
         allowed = "all with a decimal point, or none" if only_numbers else "items of one type"
         raise ParameterFileError(f"{what} is {value}; allowed: {allowed}")
+
+
+def node_parameters(paths: Sequence[Path], node: str) -> dict[str, Any]:
+    """Return the parameters of one node, those for all nodes included.
+
+    Args:
+        paths: parameter files; of several values of a parameter the last one counts.
+        node: ``/**/name``; sections ``name`` and ``/name`` count as well.
+
+    Raises:
+        YamlError: a file cannot be read, is no YAML, or has a key twice.
+        ParameterFileError: a file is no parameter file, or has a misspelt parameter; there is
+            none for `node`; the files are for several robots.
+    """
+    check_parameter_files([str(path) for path in paths])
+    name = node.rpartition("/")[2]
+    parameters: dict[str, Any] = {}
+    for path in paths:
+        given: dict[str, Any] = {}
+        for section, values in sections_of(read_yaml(path)):
+            if section in ("/**", f"/{name}", node):
+                given.update(values)
+        if unknown := unknown_parameters(given):
+            raise ParameterFileError(f"{path}: {unknown}")
+        parameters |= given
+    if not parameters:
+        raise ParameterFileError(f"{_listed(paths)}: no parameters under '/**' or '{node}'")
+    return parameters
+
+
+def read_files(kind: type[Configuration], paths: Sequence[Path], node: str) -> Configuration:
+    """Return the configuration that parameter files give a node.
+
+    Args:
+        kind: dataclass of the node's parameters.
+        paths: see `node_parameters`.
+        node: see `node_parameters`.
+
+    Raises:
+        YamlError: see `node_parameters`.
+        ParameterFileError: see `node_parameters`; or a value is missing, of another type, or not
+            allowed.
+    """
+    try:
+        return read(kind, node_parameters(paths, node))
+    except SettingError as error:
+        raise ParameterFileError(f"{_listed(paths)}: {error}") from error
+
+
+def _listed(paths: Sequence[Path]) -> str:
+    return ", ".join(map(str, paths))
