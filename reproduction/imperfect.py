@@ -359,7 +359,10 @@ def play_all(
         runs = {
             (robot, name): (
                 [pool.submit(play, robot, name, seed) for seed in range(minutes)],
-                [pool.submit(hand_at_rest, robot, name, seed) for seed in range(4)],
+                [
+                    pool.submit(hand_at_rest, robot, name, k)
+                    for k in range(4 if name in HANDS else 1)
+                ],
                 pool.submit(times_to_goal, robot, name) if name in IDEAL else None,
             )
             for robot in robots
