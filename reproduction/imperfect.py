@@ -47,6 +47,8 @@ SETTLED = 5.0  # s after which the torque steps of such a goal count
 RISE = 0.2  # s
 UNUSED = ("acceleration_limits", "ft_wrench")
 LEG = 6.0  # s of a goal whose time is measured
+HANDS = ("ideal", "ideal_remedies", "all")
+"""Cases whose hand is looked at four times, not once."""
 NEAR = 5e-3  # rad; so near a goal is reached
 STIFF = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
 """A posture task that drives each joint to its limits, whatever the hand does."""

@@ -75,9 +75,10 @@ def design_observer(
 ) -> ObserverDesign:
     """Return the slowest observers whose largest error of the velocity is nearly the least.
 
-    It is at most `SLOWER` times as large. Where positions are exact, the poles are at zero: the velocity is right after two periods.
-    Gains are chosen for an error of the acceleration of at least `LEAST_ACCELERATION_ERROR`; what
-    is guaranteed is for the errors given, so that it is zero where both are.
+    It is at most `SLOWER` times as large. Where positions are exact, the poles are at zero: the
+    velocity is right after two periods. Gains are chosen for an error of the acceleration of at
+    least `LEAST_ACCELERATION_ERROR`; what is guaranteed is for the errors given, so that it is
+    zero where both are.
 
     Args:
         dt: control period, s.
