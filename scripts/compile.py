@@ -26,6 +26,7 @@ from torque_safety_controller.node.limits import LimitsReader
 from viability_bounds_pkg.cli.command_line import INTERRUPTED
 from viability_bounds_pkg.compiled import compilations, compiled_functions, is_kept
 from viability_bounds_pkg.ros.messages import JointStateReader
+from viability_bounds_pkg.stopping.coordinated_stop import CoordinatedStop
 
 CONFIG = Path(__file__).resolve().parent.parent / "config"
 TABLE = Obstacle("table", "box", (0.2, 0.6, 0.1), (0.30702, 0.0, 0.42237), (0.0, 0.0, 0.0, 1.0))
@@ -52,6 +53,7 @@ def compile_all() -> None:
             play(path.stem, {})
         play("panda", {"acceleration_limits": "state_dependent", **wall["ros__parameters"]})
         touch()
+        stop()
         LimitsReader(["joint"])
         JointStateReader(["joint"])
         project_to_limits(np.zeros(1), np.zeros(1), np.ones(1))
@@ -71,6 +73,15 @@ def touch() -> None:
     loop.robot.obstacles.add(TABLE)
     for _ in range(100):
         loop.robot.step(np.zeros(loop.model.nv), loop.config.substeps)
+
+
+def stop() -> None:
+    """Ask motors for a stop that they are too weak for."""
+    loop = DirectLoop("panda")
+    q, v, _ = loop.robot.state()
+    law = CoordinatedStop(loop.model, loop.limits, np.full(len(q), 0.1), loop.dt)
+    law.begin(q, v)
+    law.torque(q, v)
 
 
 @contextmanager

@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 from geometry_msgs.msg import InertiaStamped, WrenchStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
-from robot_probe import JOINTS, MODEL, PERIOD, VALUES, Q, RobotProbe
+from robot_probe import BRAKES, JOINTS, MODEL, PERIOD, VALUES, Q, RobotProbe
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -27,9 +27,6 @@ from viability_bounds_pkg.ros.runtime import (
     stamp_to_ns,
 )
 from viability_bounds_pkg.testing.ros_harness import joint_state, names_parameter, read_config
-
-BRAKES = {"acceleration_min": [], "acceleration_max": []}
-"""Without acceleration limits the robot brakes when commands stop."""
 
 
 def test_each_command_with_the_right_stamp_moves_time_by_one_period(ros):

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from robot_probe import JOINTS, VALUES, RobotProbe
+from robot_probe import BRAKES, JOINTS, VALUES, RobotProbe
 from std_srvs.srv import SetBool, Trigger
 
 from sim_bridge.hardware.communication import MissedDeadlines
@@ -132,7 +132,7 @@ def test_a_missed_command_is_not_applied_and_the_last_one_is_held(ros):
 
 def test_a_row_longer_than_the_time_out_leads_to_the_brakes_and_back(ros):
     changes = {"missed_probability": 0.8, "missed_in_row": 6, "imperfection_seed": 1}
-    robot = RobotProbe(ros, command_timeout=2, **changes)
+    robot = RobotProbe(ros, command_timeout=2, **BRAKES, **changes)
     commands = list(torques(60))
     deadlines, acting, row = MissedDeadlines(0.8, 6, 1), [None], 0
     for tau in commands:

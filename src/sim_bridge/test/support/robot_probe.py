@@ -16,6 +16,8 @@ JOINTS = VALUES["joints"]
 MODEL = build_model(read_urdf(VALUES["robot_description"]), JOINTS)
 Q = np.array(VALUES["start_positions"])
 PERIOD = 2_000_000  # ns, of the configured 500 Hz
+BRAKES = {"acceleration_min": [], "acceleration_max": []}
+"""Without acceleration limits the robot brakes when commands stop."""
 
 
 class RobotProbe:
