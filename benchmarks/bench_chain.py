@@ -4,7 +4,8 @@
 Both chains live in one process on one executor, and are driven in turns by the same probe, so
 that what differs is the work of the nodes. Each chain has its own simulated arm, moved outside the
 measured time: the real chain's by its commands, through the demo's goals and into the limits;
-the relays' by gravity compensation.
+the relays' by gravity compensation. With ``--imperfect`` a third chain has what
+``config/imperfect/`` declares, and the estimator node.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from sim_bridge.scenario.events import PoseGoal
 from sim_bridge.scenario.scenario import load_scenario
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
+from viability_bounds_pkg.node.estimator_node import EstimatorNode
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS, make_executor, set_stamp
 
@@ -123,6 +125,25 @@ def parameters(robot: str) -> dict:
     }
 
 
+def remedies(robot: str, node: str) -> dict:
+    """Return the parameters of a node with what is declared for the imperfect robot.
+
+    Without rotors, which the probes' robots do not have.
+    """
+    values: dict = {}
+    for name in (robot, f"imperfect/{robot}"):
+        content = yaml.safe_load((ROOT / "config" / f"{name}.yaml").read_text())
+        for section in ("/**", f"/**/{node}"):
+            values |= content.get(section, {}).get("ros__parameters", {})
+    return values | {"rotor_inertia": parameters(robot).get("rotor_inertia", [])}
+
+
+def overridden(values: dict) -> list[Parameter]:
+    """Return parameters for a node of a chain."""
+    values = values | {"bounds_timeout": 1.0, "rate_hz": 1e9 / DT_NS}
+    return [Parameter(name, value=value) for name, value in values.items() if value != []]
+
+
 def drive(executor, probe: Probe, model, cycles: int) -> list[float]:
     """Return the times of some cycles, s, moving the probe's arm in between."""
     data = model.createData()
@@ -141,14 +162,12 @@ def main() -> None:
     parser.add_argument("--robot", default="baxter_left_arm")
     parser.add_argument("--cycles", type=int, default=8000, help="of each chain")
     parser.add_argument("--block", type=int, default=100, help="cycles before the other's turn")
+    parser.add_argument("--imperfect", action="store_true", help="also with all remedies")
     options = parser.parse_args()
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     rclpy.init()
     values = parameters(options.robot)
     joints = values["joints"]
-    overrides = [Parameter(name, value=value) for name, value in values.items()]
-    overrides.append(Parameter("bounds_timeout", value=1.0))
-    overrides.append(Parameter("rate_hz", value=1e9 / DT_NS))
     urdf = read_urdf(values["robot_description"])
     model = build_model(urdf, joints)
     scenario = load_scenario(ROOT / "config" / "scenarios" / f"{options.robot}_demo.yaml")
@@ -159,7 +178,7 @@ def main() -> None:
         robot.reset(values["start_positions"], np.zeros(len(joints)))
         return robot
 
-    real = {"namespace": "real", "parameter_overrides": overrides}
+    real = {"namespace": "real", "parameter_overrides": overridden(values)}
     relay = {"namespace": "relay"}
     nodes = [
         BoundsNode(**real),
@@ -171,6 +190,11 @@ def main() -> None:
         "real": Probe(joints, make_robot(), namespace="real"),
         "relay": Probe(joints, make_robot(), namespace="relay"),
     }
+    if options.imperfect:
+        for kind in (EstimatorNode, BoundsNode, ControllerNode):
+            own = overridden(remedies(options.robot, kind.NAME))
+            nodes.append(kind(namespace="remedies", parameter_overrides=own))
+        probes["remedies"] = Probe(joints, make_robot(), namespace="remedies")
     executor = make_executor()
     for node in (*nodes, *probes.values()):
         executor.add_node(node)
@@ -182,15 +206,18 @@ def main() -> None:
     times: dict[str, list[float]] = {name: [] for name in probes}
     blocks = options.cycles // options.block
     for block in range(blocks):
-        probes["real"].set_goal(goals[block * len(goals) // blocks])
         for name, probe in probes.items():
+            if name != "relay":
+                probe.set_goal(goals[block * len(goals) // blocks])
             times[name] += drive(executor, probe, model, options.block)
     medians = {name: np.nanmedian(samples) * 1e6 for name, samples in times.items()}
     for name, samples in times.items():
         slow = np.nanpercentile(samples, 99) * 1e6
         lost = int(np.isnan(samples).sum())
-        print(f"{name:>5}: median {medians[name]:7.1f} us, 99% {slow:7.1f} us, lost {lost}")
+        print(f"{name:>8}: median {medians[name]:7.1f} us, 99% {slow:7.1f} us, lost {lost}")
     print(f"ratio real / relay: {medians['real'] / medians['relay']:.2f}")
+    if options.imperfect:
+        print(f"ratio remedies / real: {medians['remedies'] / medians['real']:.2f}")
     for node in (*nodes, *probes.values()):
         node.destroy_node()
     rclpy.try_shutdown()

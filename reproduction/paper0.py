@@ -399,7 +399,9 @@ def write_document(figures: list[Figure]) -> None:
         "Fig. 5: the paper does not give its poses. Here the arm starts with the elbow at 0.446\n"
         "rad and the goal is a pose that the elbow can hold at 0.084 rad, 0.13 rad inside its\n"
         "limit: the path, not the goal, leads beyond the limit. Acceleration limits are those\n"
-        "of `config/baxter_left_arm.yaml`; the exact bounds also keep its torque margins.\n"
+        "of `config/baxter_left_arm.yaml`; the exact bounds also keep its torque margins.\n\n"
+        "Here commands act at once on states that are exact. The same bounds on robots that are\n"
+        "late, coarse and noisy: [reproduction_imperfect.md](reproduction_imperfect.md).\n"
     )
 
 

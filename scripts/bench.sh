@@ -8,7 +8,8 @@ usage: bash scripts/bench.sh NAME [options]
 
 Ratios compare programs that run in turns in one process. NAME --help lists options.
 
-  chain       from state to command through both nodes, against empty relays
+  chain       from state to command through both nodes, against empty relays; with --imperfect
+              also with estimator, prediction and margins
   step        one controller step, part by part
   bounds      acceleration bounds: one arm, and batches; with --tsid also TSID's, which is
               installed into .venv-tsid

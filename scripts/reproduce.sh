@@ -14,9 +14,12 @@ Writes figures to results/, and prints a table with the paper's numbers and ours
   paper1-compliance  pushes, poles, yielding and pressing hand
   state_dependent    Baxter with state-dependent acceleration limits
   friction           TALOS with friction compensation
-  stopping           commands fail: the drives' own stop beside the brakes, and its cost
+  stopping           commands fail: the drives' own stop beside the brakes, and its cost (2 min)
+  imperfect          late, coarse and noisy robots, with and without each remedy, and
+                     docs/reproduction_imperfect.md (40 min on two cores)
+  imperfect panda    one of the robots; its rows replace those of before
   exactness          the bounds compared with brute force (30 min)
-  all                all of the above except exactness (default)
+  all                all of the above except imperfect and exactness (default)
 USAGE
 }
 
