@@ -132,7 +132,8 @@ def test_a_missed_command_is_not_applied_and_the_last_one_is_held(ros):
 
 def test_a_row_longer_than_the_time_out_leads_to_the_brakes_and_back(ros):
     changes = {"missed_probability": 0.8, "missed_in_row": 6, "imperfection_seed": 1}
-    robot = RobotProbe(ros, command_timeout=2, **changes)
+    brakes = {"acceleration_min": [], "acceleration_max": []}
+    robot = RobotProbe(ros, command_timeout=2, **changes, **brakes)
     commands = list(torques(60))
     deadlines, acting, row = MissedDeadlines(0.8, 6, 1), [None], 0
     for tau in commands:
@@ -212,7 +213,7 @@ def test_the_files_of_imperfect_robots_describe_one(name):
     }
     assert set(given.names) >= expected
     assert 1 <= given.state_delay + given.command_delay <= 2
-    assert given.missed_in_row <= config.command_timeout
+    assert given.missed_in_row == config.command_timeout == config.missed_deadlines
     # The arm can be held under gravity with what remains of its torque.
     motors = Motors(given, config.torque_max, config.physics_dt)
     n = len(config.joints)
