@@ -89,7 +89,7 @@ class Case:
         spoilt: how many times the imperfections of the file are simulated: 0, 1 or 2.
         overlay: nodes that get the file of the imperfect robot.
         changed: parameters that differ, by node.
-        outages: whether the commands fail now and then for longer than is declared.
+        outages: whether all commands fail for up to 0.2 s, some 1.5 times a second.
     """
 
     title: str
@@ -184,7 +184,8 @@ def node_values(robot: str, case: Case, seed: int) -> Values:
                 {k: v for k, v in imperfect[node].items() if own.get(k) != v}, case.spoilt
             )
             if case.outages:
-                chosen |= {"missed_in_row": round(0.2 * chosen["rate_hz"])}
+                rate = chosen["rate_hz"]
+                chosen |= {"outage_probability": 1.5 / rate, "outage_longest": round(0.2 * rate)}
         of_robot = {name: imperfect[node][name] for name in OF_ROBOT if name in imperfect[node]}
         changed = dict((case.changed or {}).get(node, {}))
         values[node] = chosen | of_robot | HOLDABLE.get(robot, {}) | changed

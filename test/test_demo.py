@@ -85,6 +85,19 @@ def test_an_imperfect_robot_may_have_further_parameters(tmp_path):
     assert line in result.stderr
 
 
+def test_an_imperfect_robot_is_played_with_what_is_done_about_it(tmp_path):
+    scenario = yaml.safe_load((SCENARIOS / "panda_demo.yaml").read_text())
+    path = tmp_path / "first_goal.yaml"
+    path.write_text(yaml.safe_dump({"duration": 1.0, "events": scenario["events"][:1]}))
+    result = demo("panda", path, "--imperfect", "--out", tmp_path)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "VERDICT: no limit was broken" in result.stdout
+    assert "estimated_joint_states" not in result.stderr  # nobody misses them
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["deadline_misses"] == metrics["braked_periods"] == 0
+    assert max(joint["max_speed_ratio"] for joint in metrics["joints"].values()) > 0.5
+
+
 def test_it_knows_the_bounds_there_are():
     assert f"\n{' | '.join(METHODS)}) ;;\n" in DEMO.read_text()
 

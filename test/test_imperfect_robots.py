@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Imperfect robots and the nodes that know what is wrong with them, in lockstep."""
 
+import numpy as np
 import pytest
+from chain import run_chain
+from imperfect import CASES, STIFF, Course, node_values
 from sensor_msgs.msg import JointState
 
 from torque_safety_controller.node.controller_node import ControllerNode
@@ -21,3 +24,41 @@ def test_nodes_say_that_the_estimator_is_missing(ros, kind, name):
     node._diagnostics.publish()
     missing = "'/joint_states' has a publisher, '/estimated_joint_states' has none"
     ros.wait_until(lambda: missing in ros.reported(name, "message"), "the message")
+
+
+def play(robot, case, duration, seed=1):
+    """Play the begin of a minute of reproduction/imperfect.py; return what came of it."""
+    values = node_values(robot, CASES[case], seed)
+    course = Course(values["controller_node"], robot, seed)
+    values["controller_node"] |= STIFF
+    events = [event for event in course.scenario["events"] if event["time"] < duration]
+    return run_chain({}, {"duration": duration, "events": events}, values)
+
+
+@pytest.mark.parametrize(
+    ("robot", "case", "duration"),
+    [
+        ("panda", "outage_stop", 6.0),
+        ("talos_left_arm", "outage_stop", 3.0),
+        ("baxter_left_arm", "all", 6.0),
+    ],
+)
+def test_no_limit_is_passed_by_a_robot_as_bad_as_declared(robot, case, duration):
+    result = play(robot, case, duration)
+    assert result.vector("position_violation_rad").max() == 0.0
+    assert result.vector("velocity_violation_rad_s").max() == 0.0
+    assert result.vector("torque_ratio").max() <= 1.0 + 1e-9
+    values = node_values(robot, CASES[case], 1)["controller_node"]
+    assert (np.abs(result.run.v) / values["velocity_max"]).max() > 0.8, "it was hardly driven"
+    reach = np.array(values["position_max"]) - values["position_min"]
+    nearest = [result.vector(f"{end}_clearance_rad") for end in ("lower", "upper")]
+    assert (np.minimum(*nearest) < 0.05 * reach).any(), "no joint came near a limit"
+    assert int(result.robot["missed_deadlines_injected"]) > 5
+    stopped = int(result.robot["braked_periods"])
+    assert stopped > 50 if case == "outage_stop" else stopped == 0
+
+
+def test_without_what_is_done_about_it_a_limit_is_passed():
+    result = play("baxter_left_arm", "nothing", 6.0)
+    assert result.vector("position_violation_rad").max() > 1e-3
+    assert result.vector("velocity_violation_rad_s").max() > 1e-3

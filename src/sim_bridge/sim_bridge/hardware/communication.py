@@ -35,6 +35,30 @@ class MissedDeadlines:
         return self._row > 0
 
 
+class Outages:
+    """Times in which all commands are lost, at random.
+
+    Args:
+        probability: of each command that one begins with it.
+        longest: of their lengths, which are uniform from 1 on, commands.
+        seed: of the random numbers.
+    """
+
+    def __init__(self, probability: float, longest: int, seed: int) -> None:
+        self._probability, self._longest = probability, longest
+        self._random = generator(seed, Stream.OUTAGES)
+        self._left = 0
+
+    def next(self) -> bool:
+        """Return whether the next command is lost."""
+        if self._probability == 0.0:
+            return False
+        if self._left == 0 and self._random.random() < self._probability:
+            self._left = 1 + int(self._random.integers(self._longest))
+        lost, self._left = self._left > 0, max(0, self._left - 1)
+        return lost
+
+
 class CommandPath(Generic[Command]):
     """Commands on their way to the drives, one in each control period.
 
@@ -51,6 +75,9 @@ class CommandPath(Generic[Command]):
         self._deadlines = MissedDeadlines(
             given.missed_probability, given.missed_in_row, given.imperfection_seed
         )
+        self._outages = Outages(
+            given.outage_probability, given.outage_longest, given.imperfection_seed
+        )
         self._line: DelayLine[Command | None] = DelayLine(given.command_delay, None)
 
     def arriving(self, sent: Command | None) -> Command | None:
@@ -62,7 +89,9 @@ class CommandPath(Generic[Command]):
         Returns:
             The one sent `command_delay` periods ago; None if there was none, or it was lost.
         """
-        if sent is not None and self._deadlines.next():
-            self.missed += 1
-            sent = None
+        if sent is not None:
+            missed, out = self._deadlines.next(), self._outages.next()
+            if missed or out:
+                self.missed += 1
+                sent = None
         return self._line.shift(sent)

@@ -86,6 +86,16 @@ class Imperfections:
         default=0.0,
     )
     missed_in_row: int = whole_number("longest row of such periods", Range(1, 1000), default=4)
+    outage_probability: float = number(
+        "probability of each command that an outage begins with it, in which all are lost",
+        Range(0.0, 1.0, without=1.0),
+        default=0.0,
+    )
+    outage_longest: int = whole_number(
+        "longest outage, control periods; each length up to it is as likely",
+        Range(1, 10_000),
+        default=100,
+    )
     imperfection_seed: int = whole_number(
         "seed of all these random numbers", Range(0, 2**31 - 1), default=0
     )
@@ -116,7 +126,7 @@ class Imperfections:
         return any(map(self._is_on, names))
 
     def _is_on(self, name: str) -> bool:
-        if name in ("missed_in_row", "imperfection_seed"):
+        if name in ("missed_in_row", "outage_longest", "imperfection_seed"):
             return False
         value = getattr(self, name)
         return value != "exact" if isinstance(value, str) else bool(np.any(value))

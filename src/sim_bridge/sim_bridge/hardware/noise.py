@@ -22,6 +22,7 @@ class Stream(IntEnum):
     REPORTED_CURRENT = 2
     MOTOR_CURRENT = 3
     MISSED_DEADLINES = 4
+    OUTAGES = 5
 
 
 def generator(seed: int, stream: Stream) -> np.random.Generator:

@@ -87,6 +87,12 @@ class BulletNode(ArmNode):
             warn_of_unusual(self, config, config.urdf)
             self._robot = make_robot(config)
             self._stop = make_stop(config)
+        if 0 < config.missed_deadlines < config.command_timeout:
+            self.get_logger().warning(
+                f"parameter 'command_timeout' is {config.command_timeout}, but the bounds cover "
+                f"{config.missed_deadlines} missed periods (missed_deadlines): limits may be "
+                "passed in a longer row, before the robot stops itself"
+            )
         self._config = config
         self._monitor = LimitMonitor(
             config.position_min, config.position_max, config.velocity_max, config.torque_max

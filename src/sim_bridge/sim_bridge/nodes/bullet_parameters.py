@@ -72,6 +72,12 @@ class BulletConfiguration(ControlRate, LimitedRobotConfiguration):
         Range(1, 1000),
         default=5,
     )
+    missed_deadlines: int = whole_number(
+        "longest such row that the bounds are declared to cover; where command_timeout is longer, "
+        "this is logged; 0: not declared",
+        Range(0, 100),
+        default=0,
+    )
     acceleration_min: Array = joint_numbers(
         "lower acceleration limits when the robot stops itself, rad/s^2; it brakes with all its "
         "torque if empty",

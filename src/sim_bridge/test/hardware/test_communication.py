@@ -3,7 +3,7 @@ from itertools import groupby
 
 import pytest
 
-from sim_bridge.hardware.communication import CommandPath, MissedDeadlines
+from sim_bridge.hardware.communication import CommandPath, MissedDeadlines, Outages
 from sim_bridge.hardware.imperfections import Imperfections
 
 
@@ -30,6 +30,27 @@ def test_none_is_missed_without_a_probability():
 def test_the_seed_decides_which():
     assert drawn(0.3, 4, 200) == drawn(0.3, 4, 200)
     assert drawn(0.3, 4, 200) != drawn(0.3, 4, 200, seed=1)
+
+
+def test_outages_have_all_lengths_up_to_the_longest():
+    outages = Outages(0.02, 10, seed=0)
+    lost = [outages.next() for _ in range(40_000)]
+    rows = [len(list(group)) for value, group in groupby(lost) if value]
+    single = [length for length in rows if length <= 10]  # others began as the last one ended
+    assert len(single) > 0.95 * len(rows)
+    assert set(single) == set(range(1, 11))
+    assert sum(single) / len(single) == pytest.approx(5.5, abs=0.4)
+
+
+def test_an_outage_leaves_the_missed_deadlines_as_they_were():
+    path = CommandPath(
+        Imperfections(missed_probability=0.3, outage_probability=0.1, outage_longest=9)
+    )
+    arrived = [path.arriving(k) for k in range(300)]
+    missed = {k for k, each in enumerate(drawn(0.3, 4, 300)) if each}
+    lost = {k for k, each in enumerate(arrived) if each is None}
+    assert lost > missed
+    assert path.missed == len(lost)
 
 
 @pytest.mark.parametrize("delay", [0, 1, 4])

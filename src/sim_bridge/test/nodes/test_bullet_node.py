@@ -543,6 +543,15 @@ def test_when_commands_fail_it_stops_within_its_limits_and_goes_on_when_they_ret
     np.testing.assert_allclose(robot.q, q, atol=1e-3)
 
 
+@pytest.mark.parametrize(("declared", "warns"), [(0, False), (3, True), (4, False)])
+def test_it_says_that_it_goes_on_for_longer_than_the_bounds_cover(ros, capfd, declared, warns):
+    RobotProbe(ros, command_timeout=4, missed_deadlines=declared)
+    said = (
+        "'command_timeout' is 4, but the bounds cover 3 missed periods" in capfd.readouterr().err
+    )
+    assert said == warns
+
+
 def test_the_brakes_hold_it_again_after_a_reset(ros):
     robot = RobotProbe(ros, clock="real_time", rate_hz=100.0, command_timeout=1)
     ros.wait_until(

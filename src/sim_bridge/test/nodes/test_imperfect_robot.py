@@ -212,7 +212,7 @@ def test_the_files_of_imperfect_robots_describe_one(name):
     }
     assert set(given.names) >= expected
     assert 1 <= given.state_delay + given.command_delay <= 2
-    assert given.missed_in_row <= config.command_timeout
+    assert given.missed_in_row == config.command_timeout == config.missed_deadlines
     # The arm can be held under gravity with what remains of its torque.
     motors = Motors(given, config.torque_max, config.physics_dt)
     n = len(config.joints)
