@@ -50,8 +50,8 @@ are not what the model says: `config/imperfect/<robot>.yaml` has the values and 
 ![Largest violations by case](images/imperfect.png)
 
 The largest violation of a position and of a speed limit in each case; a circle is none at all.
-Grey: nothing is spoilt. Green: within what is declared, all done. Red: a remedy is missing. Orange:
-beyond what is declared.
+Grey: nothing is spoilt. Green: within what is declared, all done. Red: a remedy is missing.
+Orange: beyond what is declared.
 
 ## How it is played
 
