@@ -30,10 +30,11 @@ for a period, or that hit something, is found by it."""
 
 DISAGREES = 0.1
 """From which difference on the torque that is reported is believed, and not a command, in torque
-limits, root sum square over the joints: brakes, or drives that stop by themselves. Less where the torque reported is quiet."""
+limits, root sum square over the joints: brakes, or drives that stop by themselves. Less where the
+torque reported has less noise."""
 
 BEYOND_NOISE = 3.0
-"""The same in root mean squares of that difference over `NOISE_PERIODS` in which commands acted."""
+"""The same in root mean squares of the difference in `NOISE_PERIODS` in which commands acted."""
 
 LEAST = 0.03
 """Below this no difference counts, in torque limits: motors are not known that well."""
