@@ -256,6 +256,17 @@ def test_the_effort_is_believed_where_no_command_explains_it():
     assert speed_after(0.0 * PUSH, 2.0 * PUSH) == speed_after(2.0 * PUSH, 2.0 * PUSH)
 
 
+@pytest.mark.parametrize(("quiet", "believed"), [(2, False), (300, True)])
+def test_the_quieter_the_effort_the_less_it_must_differ_to_be_believed(quiet, believed):
+    ours, tau, k = moving(observers=OBSERVERS)
+    still = State(STILL, np.zeros(N))
+    for stamp in range(k, k + quiet):
+        ours.step(stamp * PERIOD_NS, still, tau)
+        ours.answer(stamp * PERIOD_NS, tau)
+    answer = ours.step((k + quiet) * PERIOD_NS, still, tau + 0.5 * PUSH)  # 6 % of torque_max
+    assert (answer.v[0] > 1e-3) == believed
+
+
 def test_drives_that_control_positions_hold_the_torque_that_they_report():
     ours, tau, k = moving(delay=3)
     still = State(STILL, np.zeros(N))

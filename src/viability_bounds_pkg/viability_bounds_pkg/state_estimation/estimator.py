@@ -30,7 +30,16 @@ for a period, or that hit something, is found by it."""
 
 DISAGREES = 0.1
 """From which difference on the torque that is reported is believed, and not a command, in torque
-limits, root sum square over the joints: brakes, or drives that stop by themselves."""
+limits, root sum square over the joints: brakes, or drives that stop by themselves. Less where the
+torque reported has less noise."""
+
+BEYOND_NOISE = 3.0
+"""The same in root mean squares of the difference in `NOISE_PERIODS` in which commands acted."""
+
+LEAST = 0.03
+"""Below this no difference counts, in torque limits: motors are not known that well."""
+
+NOISE_PERIODS = 100
 
 
 class StateEstimator:
@@ -83,6 +92,7 @@ class StateEstimator:
         self._stamp = -1
         self._tau = zero  # of the motors at the instant of the last state
         self._acting: Array | None = None  # the command that acts then
+        self._noise = (DISAGREES / BEYOND_NOISE) ** 2  # mean square of `_distance`
         self._torque_share = 1.0 / torque_max
         self.resets: Counter[str] = Counter()
         self.innovation = zero.copy()
@@ -152,7 +162,11 @@ class StateEstimator:
             unchanged = self._lag.end(before, kept)
             if (off_unchanged := self._distance(effort, unchanged)) < off:
                 expected, off, self._acting = unchanged, off_unchanged, kept
-        return expected if off < DISAGREES**2 else effort
+        limit = min(DISAGREES**2, max(LEAST**2, BEYOND_NOISE**2 * self._noise))
+        if off >= limit:
+            return effort
+        self._noise += (off - self._noise) / NOISE_PERIODS
+        return expected
 
     def _distance(self, effort: Array, expected: Array) -> float:
         share = self._torque_share * (effort - expected)
