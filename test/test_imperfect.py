@@ -56,7 +56,9 @@ def test_each_case_differs_as_its_title_says(robot):
         values["no_margins"]["bounds_node"]["delay"] == 0 < values["all"]["bounds_node"]["delay"]
     )
     assert not values["no_observer"]["estimator_node"]["velocity_estimation"]
-    assert robots["outage_stop"]["missed_in_row"] > robots["all"]["missed_in_row"]
+    stopping = robots["outage_stop"]
+    assert stopping["outage_longest"] > stopping["command_timeout"]
+    assert "outage_longest" not in robots["all"]
     # One robot and one model of it in all cases.
     for node in ("bullet_node", "bounds_node", "controller_node"):
         rotors = [each[node].get("rotor_inertia") for each in values.values()]

@@ -50,7 +50,7 @@ def test_no_limit_is_passed_by_a_robot_as_bad_as_declared(robot, case, duration)
     assert result.vector("torque_ratio").max() <= 1.0 + 1e-9
     values = node_values(robot, CASES[case], 1)["controller_node"]
     # The bounds leave TALOS 80 % of its top speed, the rest is for errors and friction.
-    assert (np.abs(result.run.v) / values["velocity_max"]).max() > 0.75, "it was hardly driven"
+    assert (np.abs(result.run.v) / values["velocity_max"]).max() > 0.65, "it was hardly driven"
     reach = np.array(values["position_max"]) - values["position_min"]
     nearest = [result.vector(f"{end}_clearance_rad") for end in ("lower", "upper")]
     assert (np.minimum(*nearest) < 0.05 * reach).any(), "no joint came near a limit"
@@ -61,5 +61,5 @@ def test_no_limit_is_passed_by_a_robot_as_bad_as_declared(robot, case, duration)
 
 def test_without_what_is_done_about_it_a_limit_is_passed():
     result = play("baxter_left_arm", "nothing", 6.0)
-    assert result.vector("position_violation_rad").max() > 1e-3
+    assert result.vector("position_violation_rad").max() > 1e-4
     assert result.vector("velocity_violation_rad_s").max() > 1e-3
