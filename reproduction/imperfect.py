@@ -347,6 +347,11 @@ def _own_domain() -> None:
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
 
 
+def seeds(name: str, minutes: int) -> range:
+    """Return the seeds of a case's minutes: one minute alone is one with a stiff posture task."""
+    return range(minutes) if name == "all" else range(1, minutes + 1)
+
+
 def play_all(
     robots: Sequence[str], names: Sequence[str], minutes_declared: int, minutes_others: int
 ) -> bool:
@@ -361,7 +366,7 @@ def play_all(
     ) as pool:
         runs = {
             (robot, name): (
-                [pool.submit(play, robot, name, seed) for seed in range(minutes)],
+                [pool.submit(play, robot, name, seed) for seed in seeds(name, minutes)],
                 [
                     pool.submit(hand_at_rest, robot, name, k)
                     for k in range(4 if name in HANDS else 1)
@@ -394,7 +399,7 @@ def main() -> int:
     parser.add_argument("robot", nargs="?", default="all", choices=("all", *ROBOTS, "page"))
     parser.add_argument("--case", choices=tuple(CASES), help="only this row")
     parser.add_argument("--minutes", type=int, default=10, help="of each robot, as declared")
-    parser.add_argument("--others", type=int, default=2, help="minutes of the other rows")
+    parser.add_argument("--others", type=int, default=1, help="minutes of the other rows")
     given = parser.parse_args()
     robots = {"all": ROBOTS, "page": ()}.get(given.robot, (given.robot,))
     names = (given.case,) if given.case else tuple(CASES)

@@ -76,7 +76,7 @@ errors, noise and longest row of lost commands, and half the bandwidths.
 | torque | largest true torque of a motor; more than 1 would be beyond its limit |
 | torque step | largest change of a commanded torque from one control period to the next |
 | at rest | the same in the last second of the goals that are kept, joints on limits included |
-| hand at rest | distance from a goal 4 s after it was sent: median to largest of {hands} |
+| hand at rest | distance from a goal 8 s after it was sent: median to largest |
 
 A row of which something is promised ends with a verdict. Where what is spoilt is within what is
 declared ("all done", also while commands fail and the drives stop by themselves), position and
