@@ -331,7 +331,6 @@ def write_page(
     page = PAGE.format(
         pushes=table([pushes], ("robot", "links that are pushed, and how hard")),
         holdable=HOLDABLE.format(robots=changed) if changed else "",
-        hands=max(len(each.hands) for part in outcomes.values() for each in part.values()),
         step=STEP_AT_REST,
         factor=HAND_FACTOR,
         parts="".join(parts),
