@@ -72,7 +72,7 @@ OF_ROBOT = ("rotor_inertia", "acceleration_min", "acceleration_max")
 PUSHED = {
     "panda": {"panda_hand": 10.0, "panda_link4": 20.0},
     "talos_left_arm": {"wrist_left_ft_tool_link": 20.0, "arm_left_4_link": 40.0},
-    "baxter_left_arm": {"left_gripper": 5.0, "left_lower_elbow": 20.0},
+    "baxter_left_arm": {"left_gripper": 5.0, "left_lower_elbow": 10.0},
 }
 """Links that are pushed, and how hard, N."""
 
