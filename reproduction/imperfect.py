@@ -54,9 +54,10 @@ STIFF = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_w
 """A posture task that drives each joint to its limits, whatever the hand does."""
 
 HOLDABLE: dict[str, dict[str, Any]] = {
-    # With the elbow this much bent, left_s1 can hold and accelerate the arm in all states, so that
-    # no limit of its acceleration has to be set by hand:
+    # With the elbow this much bent, left_s1 can hold and accelerate the arm in all states
+    # searched, so that no limit of its acceleration has to be set by hand. Without rotors, from
     #   estimate_acceleration_limits --cap 5 --margin-dt 0.01
+    # The rotors of the imperfect file leave a little less acceleration than this.
     "baxter_left_arm": {
         "position_min": [-1.7016, -2.147, -3.0541, 2.0, -3.059, -1.5707, -3.059],
         "velocity_max": [1.0, 0.8, 1.0, 1.0, 2.0, 2.0, 2.0],

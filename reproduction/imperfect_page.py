@@ -84,6 +84,11 @@ speed must be 0 and torque at most 1. With "all done", the step at rest must als
 {step:g}, and the median distance of the hand at most {factor:g} times that of the same robot with
 nothing spoilt and nothing done, or what a step of all encoders is at the hand. The other rows are
 for comparison.
+
+Three things that a verdict does not say. It holds for the minutes, goals and pushes of its row, in
+lockstep. Pushes and TALOS' friction are at times more than `acceleration_disturbance` declares:
+what keeps the limits then are the disturbance observer and further margins in the files, which are
+tested, not proven. And Baxter's limits are narrower than in its file.
 {parts}
 ## What the remedies cost an ideal robot
 
