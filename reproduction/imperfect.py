@@ -55,15 +55,16 @@ STIFF = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_w
 
 HOLDABLE: dict[str, dict[str, Any]] = {
     # With the elbow this much bent, left_s1 can hold and accelerate the arm in all states
-    # searched, so that no limit of its acceleration has to be set by hand. Without rotors, from
-    #   estimate_acceleration_limits --cap 5 --margin-dt 0.01
-    # The rotors of the imperfect file leave a little less acceleration than this.
+    # searched, so that no limit of its acceleration has to be set by hand. With the rotors of
+    # the imperfect file, from
+    #   estimate_acceleration_limits --cap 5 --margin-dt 0.01 --samples 200000
+    # of a file with these position and velocity limits; drift plus 10%.
     "baxter_left_arm": {
         "position_min": [-1.7016, -2.147, -3.0541, 2.0, -3.059, -1.5707, -3.059],
         "velocity_max": [1.0, 0.8, 1.0, 1.0, 2.0, 2.0, 2.0],
-        "acceleration_min": [-5.0, -3.3, -5.0, -5.0, -5.0, -5.0, -5.0],
+        "acceleration_min": [-5.0, -3.1, -5.0, -5.0, -5.0, -5.0, -5.0],
         "acceleration_max": [5.0, 5.0, 5.0, 5.0, 5.0, 5.0, 5.0],
-        "acceleration_drift": [528.0, 147.0, 610.0, 302.0, 1903.0, 572.0, 2007.0],
+        "acceleration_drift": [247.0, 113.0, 229.0, 200.0, 195.0, 230.0, 153.0],
         "start_positions": [-0.036, -0.753, -0.544, 2.31, -0.091, -0.151, -0.136],
     }
 }
