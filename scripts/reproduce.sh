@@ -14,6 +14,7 @@ Writes figures to results/, and prints a table with the paper's numbers and ours
   paper1-compliance  pushes, poles, yielding and pressing hand
   state_dependent    Baxter with state-dependent acceleration limits
   friction           TALOS with friction compensation
+  out_of_reach       hands sent out of reach, without and with a largest speed (2 min)
   stopping           commands fail: the drives' own stop beside the brakes, and its cost (2 min)
   imperfect          late, coarse and noisy robots, with and without each remedy, and
                      docs/reproduction_imperfect.md (40 min on two cores)
@@ -28,14 +29,14 @@ what="${1:-all}"
 [ $# -eq 0 ] || shift
 case "$what" in -h | --help) usage; exit 0 ;; esac
 if [ "$what" = all ]; then
-    for part in paper0 paper1-integral paper1-compliance state_dependent friction stopping; do
+    for part in paper0 paper1-integral paper1-compliance state_dependent friction out_of_reach stopping; do
         bash "$root/scripts/reproduce.sh" "$part"
     done
     exit 0
 fi
 what="${what//-/_}"
 case "$what" in
-paper0 | paper1_integral | paper1_compliance | state_dependent | friction | stopping | imperfect | exactness) ;;
+paper0 | paper1_integral | paper1_compliance | state_dependent | friction | out_of_reach | stopping | imperfect | exactness) ;;
 *)
     echo "error: unknown '$what'; --help lists what there is" >&2
     exit 2

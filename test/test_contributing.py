@@ -24,7 +24,6 @@ GAINS = Gains(
     posture_kp=10.0,
     posture_kd=6.0,
     posture_weight=1e-3,
-    posture_in_null_space=True,
     hold_kd=20.0,
 )
 FLOOR = 0.4  # m

@@ -23,7 +23,6 @@ RACING = Gains(
     posture_kp=2000.0,
     posture_kd=90.0,
     posture_weight=1.0,
-    posture_in_null_space=False,
     hold_kd=20.0,
 )
 

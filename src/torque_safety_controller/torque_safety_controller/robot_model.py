@@ -35,6 +35,7 @@ class RobotModel:
     Attributes:
         q: position, shape (n,), rad.
         v: velocity, shape (n,), rad/s.
+        a_last: acceleration commanded last, shape (n,), rad/s^2.
         pose: placement of the end effector in the base frame.
         J: its Jacobian in its own axes, shape (6, n), linear rows first.
         drift: its acceleration at zero joint acceleration, J' v, shape (6,).
@@ -62,6 +63,7 @@ class RobotModel:
         self._zero = np.zeros(self.n)
         self.q: Array = self._zero
         self.v: Array = self._zero
+        self.a_last: Array = self._zero
         self.pose = pin.SE3.Identity()
         self.J = np.zeros((6, self.n))
         self.drift = np.zeros(6)
@@ -80,6 +82,7 @@ class RobotModel:
         """
         model, data = self.model, self.data
         q, v = self.q, self.v = state
+        self.a_last = a_last
         q_mid, v_mid = middle_of_step(q, v, a_last, self.dt)
         self.M = pin.crba(model, data, q_mid)
         self.h = pin.nonLinearEffects(model, data, q_mid, v_mid)

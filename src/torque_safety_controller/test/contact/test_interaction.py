@@ -31,7 +31,6 @@ GAINS = Gains(
     posture_kp=8.0,
     posture_kd=5.0,
     posture_weight=1e-6,  # so little that the hand does what its tasks want
-    posture_in_null_space=True,
     hold_kd=20.0,
 )
 WIDE = np.full(7, 1e3)  # rad/s^2; bounds that no one feels

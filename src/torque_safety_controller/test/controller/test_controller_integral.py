@@ -57,7 +57,6 @@ GAINS = Gains(
     posture_kp=VALUES["posture_kp"],
     posture_kd=critical_damping(VALUES["posture_kp"]),
     posture_weight=VALUES["posture_weight"],
-    posture_in_null_space=True,
     hold_kd=VALUES["hold_kd"],
 )
 DEFAULT = {"budget": 0.1 * ARM.tau_max}

@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 from torque_safety_controller.tasks.damping_task import DampingTask
-from torque_safety_controller.tasks.gains import critical_damping
+from torque_safety_controller.tasks.gains import Gains, critical_damping
 from torque_safety_controller.tasks.pose_task import PoseMotion, PoseTask, pose_error
 from torque_safety_controller.tasks.posture_task import PostureTask
 from viability_bounds_pkg.state import State
@@ -100,6 +100,47 @@ def test_a_pose_task_at_rest_pulls_with_its_stiffness(arm):
     np.testing.assert_allclose(less.b, KP * share * error, atol=1e-12)
     np.testing.assert_array_equal(A, robot.J)
     assert weight == WEIGHT
+
+
+def test_a_far_goal_counts_as_one_at_the_largest_error(arm):
+    robot = updated(arm, arm.q_start, np.zeros(arm.n))
+    largest = (0.05, 0.2)  # m, rad
+    for size in (0.5, 1.0, 2.0, 10.0):
+        error = size * np.array(
+            [0.03, 0.0, -0.04, 0.12, 0.16, 0.0]
+        )  # as long as allowed, times size
+        goal = robot.pose * pin.exp6(error)
+        b = PoseTask(goal, KP, KD, WEIGHT, error_max=largest).term(robot).b
+        np.testing.assert_allclose(b, KP * error * min(1.0, 1.0 / size), atol=1e-9)
+
+
+def test_a_far_goal_is_approached_at_the_speed_allowed(arm):
+    """At that speed stiffness and damping balance: nothing accelerates the hand any more."""
+    gains = Gains(pose_kp=90.0, posture_kp=0.0, pose_speed_max=np.array([0.3, 0.7]))
+    rng = np.random.default_rng(6)
+    for _ in range(5):
+        q, _ = arm.random_state(rng)
+        robot = updated(arm, q, np.zeros(arm.n))
+        turn, shift = rng.normal(size=(2, 3))
+        goal = robot.pose * pin.exp6(np.concatenate([2.0 * shift, turn]))
+        error = pose_error(robot.pose, goal)
+        twist = np.concatenate(
+            [
+                speed * part / np.linalg.norm(part)
+                for speed, part in zip((0.3, 0.7), (error[:3], error[3:]), strict=True)
+            ]
+        )
+        robot = updated(arm, q, np.linalg.pinv(robot.J) @ twist)
+        term = PoseTask(goal, gains.pose_kp, gains.pose_kd, 1.0, error_max=gains.pose_error_max)
+        np.testing.assert_allclose(term.term(robot).b, -robot.drift, atol=1e-9)
+
+
+def test_without_a_speed_or_a_stiffness_no_error_is_too_large():
+    assert Gains(pose_kp=90.0, posture_kp=0.0, pose_speed_max=np.empty(0)).pose_error_max is None
+    speeds = np.array([0.3, 0.7])
+    assert Gains(pose_kp=0.0, posture_kp=0.0, pose_speed_max=speeds).pose_error_max is None
+    limits = Gains(pose_kp=100.0, pose_kd=10.0, posture_kp=0.0, pose_speed_max=speeds)
+    assert limits.pose_error_max == pytest.approx((0.03, 0.07))
 
 
 def test_posture_and_damping_terms():

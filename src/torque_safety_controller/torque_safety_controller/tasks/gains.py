@@ -6,7 +6,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from viability_bounds_pkg.parameter import Range, above, number, switch
+import numpy as np
+from numpy.typing import NDArray
+
+from viability_bounds_pkg.parameter import POSITIVE, Range, above, number, numbers
+
+Array = NDArray[np.float64]
 
 CRITICAL = -1.0
 """Of ``pose_kd`` and ``posture_kd``: critical damping."""
@@ -15,7 +20,7 @@ OFF = -1.0
 """Of ``disturbance_time``: disturbances are not estimated."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Gains:
     """What may change while the controller runs.
 
@@ -32,6 +37,14 @@ class Gains:
     pose_weight: float = number(
         "weight of the pose task; 0: no pose task", Range(0.0, 1e5), default=1.0, live=True
     )
+    pose_speed_max: Array = numbers(
+        "speeds at which the pose task approaches its goal at most, m/s and rad/s; no limit if "
+        "empty",
+        POSITIVE,
+        length=2,
+        default=(),
+        live=True,
+    )
     posture_kp: float = number("stiffness of the posture task, 1/s^2", Range(0.0, 1e5), live=True)
     posture_kd: float = number(
         "damping of the posture task, 1/s; -1: critical, 2 sqrt(kp)",
@@ -41,11 +54,6 @@ class Gains:
     )
     posture_weight: float = number(
         "weight of the posture task", above(0.0, 1e5), default=1e-3, live=True
-    )
-    posture_in_null_space: bool = switch(
-        "whether the posture task leaves the pose alone; false: eq. (33) as printed",
-        default=True,
-        live=True,
     )
     hold_kd: float = number("damping in HOLD, 1/s", Range(0.0, 1e4), default=20.0, live=True)
     disturbance_time: float | None = number(
@@ -64,6 +72,17 @@ class Gains:
             object.__setattr__(self, "posture_kd", critical_damping(self.posture_kp))
         if self.disturbance_time == OFF:
             object.__setattr__(self, "disturbance_time", None)
+
+    @property
+    def pose_error_max(self) -> tuple[float, float] | None:
+        """Errors of translation, m, and rotation, rad, beyond which the pose task is no stiffer.
+
+        Damping then balances stiffness at `pose_speed_max`: kp error = kd speed. None: no limit.
+        """
+        if not len(self.pose_speed_max) or self.pose_kp == 0.0:
+            return None
+        linear, angular = (self.pose_speed_max * (self.pose_kd / self.pose_kp)).tolist()
+        return linear, angular
 
 
 def critical_damping(kp: float) -> float:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.pose_task import PoseMotion, PoseTask, pose_error
 from torque_safety_controller.tasks.posture_task import PostureTask
+from torque_safety_controller.tasks.settling_pose_task import SettlingPoseTask
 from torque_safety_controller.tasks.task import Task
 
 Array = NDArray[np.float64]
@@ -93,14 +94,17 @@ class Goals:
         """
         tasks: list[Task] = []
         if self.pose_des is not None and gains.pose_weight > 0.0:
+            # With errors of any size its curvature would slow the arm down on its way.
+            kind = PoseTask if gains.pose_error_max is None else SettlingPoseTask
             tasks.append(
-                PoseTask(
+                kind(
                     self.pose_des,
                     gains.pose_kp,
                     gains.pose_kd,
                     gains.pose_weight,
                     self._pose_motion,
                     stiffness,
+                    gains.pose_error_max,
                 )
             )
         tasks.append(
@@ -109,7 +113,7 @@ class Goals:
                 gains.posture_kp,
                 gains.posture_kd,
                 gains.posture_weight,
-                gains.posture_in_null_space and bool(tasks),
+                bool(tasks),
                 None if self._v_des is None else gains.posture_kd * self._v_des,
             )
         )

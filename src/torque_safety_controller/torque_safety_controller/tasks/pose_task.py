@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -37,6 +38,9 @@ class PoseTask:
         weight: of the squared error of acceleration.
         motion: of the goal; None for one at rest.
         stiffness: share of `kp` in each of the end effector's axes, shape (6,); None for all.
+        error_max: sizes at which the error of translation, m, and that of rotation, rad, count
+            at most, so that a far goal is approached at no more than kp / kd times them; None
+            for no limit.
     """
 
     pose_des: pin.SE3
@@ -45,10 +49,14 @@ class PoseTask:
     weight: float
     motion: PoseMotion | None = None
     stiffness: Array | None = None
+    error_max: tuple[float, float] | None = None
 
     def term(self, robot: RobotModel) -> TaskTerm:
         """Return ``J a = kp error - kd J v - J' v + feedforward`` as a term of the cost."""
         error = pose_error(robot.pose, self.pose_des)
+        if self.error_max is not None:
+            shorten(error[:3], self.error_max[0])
+            shorten(error[3:], self.error_max[1])
         if self.stiffness is not None:
             error = self.stiffness * error
         b = spring_damper(robot.J, robot.v, error, robot.drift, self.kp, self.kd)
@@ -68,6 +76,13 @@ class PoseTask:
         rate = between.act(pin.Motion(motion.twist_rate)) - pin.Motion(twist).cross(seen)
         feedforward: Array = self.kd * seen.vector + rate.vector
         return feedforward
+
+
+def shorten(vector: Array, largest: float) -> None:
+    """Shorten a vector of 3 numbers, in place, to a length of at most `largest`."""
+    length = math.hypot(*vector.tolist())
+    if length > largest:
+        vector *= largest / length
 
 
 class PoseDifference(NamedTuple):
