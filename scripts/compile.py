@@ -65,6 +65,8 @@ def play(robot: str, changes: dict[str, Any]) -> None:
     for mode in ("joints", "task", "none"):
         loop.change(integral_action=mode)
         loop.run(2.0 * loop.dt)
+    loop.change(pose_speed_max=[1.0, 1.0])
+    loop.run(2.0 * loop.dt)
 
 
 def touch() -> None:
