@@ -18,6 +18,7 @@ import argparse
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cache
 from multiprocessing import get_context
@@ -38,6 +39,7 @@ from imperfect_page import (
 )
 
 from viability_bounds_pkg.robot_description import build_model, read_urdf
+from viability_bounds_pkg.testing.ros_harness import private_domain
 
 ROBOTS = ("panda", "talos_left_arm", "baxter_left_arm")
 MINUTE = 60.0  # s
@@ -80,6 +82,8 @@ PUSHED = {
 
 Values = dict[str, dict[str, Any]]
 """Parameters by node."""
+
+_held = ExitStack()
 
 
 @dataclass(frozen=True)
@@ -345,8 +349,8 @@ def times_to_goal(robot: str, name: str) -> dict[str, Any]:
 
 
 def _own_domain() -> None:
-    """Let the nodes of this process see no others."""
-    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+    """Let the nodes of this process see no others, until it ends."""
+    os.environ["ROS_DOMAIN_ID"] = str(_held.enter_context(private_domain()))
 
 
 def seeds(name: str, minutes: int) -> range:
