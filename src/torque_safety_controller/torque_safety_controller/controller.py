@@ -22,6 +22,7 @@ from torque_safety_controller.contact.interaction import Interaction
 from torque_safety_controller.qp.constraints import (
     AccelerationRange,
     Constraint,
+    LinearConstraints,
     stack_constraints,
 )
 from torque_safety_controller.qp.inverse_dynamics_qp import ContactForces, InverseDynamicsQP
@@ -34,6 +35,7 @@ from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.goals import Goals
 from torque_safety_controller.tasks.task import Task
 from viability_bounds_pkg.state import State
+from viability_bounds_pkg.whole_arm.safety_filter import SafetyFilter
 
 __all__ = ["ControlOutput", "Controller", "Gains"]
 
@@ -74,10 +76,11 @@ class Controller:
         solver: of the QP, one of `inverse_dynamics_qp.SOLVERS`.
         constraints: on the accelerations, besides bounds and torque limits.
         interaction: forces at the hand and other contacts; None for nothing.
+        safety_filter: keeps a plan in hand that keeps all limits; None for nothing.
 
     Attributes:
         goals: of the end effector and the joints.
-        additional, constraints, interaction: as given.
+        additional, constraints, interaction, safety_filter: as given.
         iterations: of the last QP.
     """
 
@@ -91,6 +94,7 @@ class Controller:
         solver: str = "daqp",
         constraints: Sequence[Constraint] = (),
         interaction: Interaction | None = None,
+        safety_filter: SafetyFilter | None = None,
     ) -> None:
         n = robot.n
         self.robot = robot
@@ -99,11 +103,15 @@ class Controller:
         self.additional = additional
         self.constraints = constraints
         self.interaction = interaction
+        self.safety_filter = safety_filter
         self.iterations = 0
         self._limiter = TorqueLimiter(tau_max, torque_rate_max, robot.dt)
         self._qp = InverseDynamicsQP(n, solver=solver)
         self._observer = DisturbanceObserver(n, gains.disturbance_time)
         self._a_last = np.zeros(n)
+        self._no_torque = np.zeros(n)
+        free = np.full(n, np.inf)
+        self._any_acceleration = AccelerationRange(-free, free)
 
     @property
     def tau_max(self) -> Array:
@@ -128,6 +136,8 @@ class Controller:
             self.additional.reset()
         if self.interaction is not None:
             self.interaction.start()
+        if self.safety_filter is not None:
+            self.safety_filter.reset()
 
     def set_pose_goal(
         self,
@@ -165,6 +175,8 @@ class Controller:
         self.robot.rates = self.additional is not None
         self.robot.update(state, zero)
         self.reset(zero)
+        if self.safety_filter is not None:
+            self.safety_filter.outcomes.clear()
 
     def step(
         self, state: State, bounds: AccelerationRange, elapsed: float | None = None
@@ -266,12 +278,12 @@ class Controller:
         bias = robot.h if additional is None else robot.h + additional
         lower, upper = self._limiter.range()
         disturbance = self._observer.known
+        rows = self._look_ahead(bounds, additional, disturbance)
         if disturbance is not None:
             bounds = AccelerationRange(*self._observer.shift(*bounds))
-        constraints = None
-        if self.constraints:
-            parts = [each.constraint(robot, bounds, disturbance) for each in self.constraints]
-            constraints = stack_constraints(parts)
+        parts = [each.constraint(robot, bounds, disturbance) for each in self.constraints]
+        parts.append(rows)
+        constraints = stack_constraints(parts)
         terms = [task.term(robot) for task in tasks]
         try:
             solution = qp.solve(
@@ -280,20 +292,47 @@ class Controller:
         except NoSolutionFound as error:
             return self._hold(additional, str(error))
         self.iterations = solution.iterations
-        tau = robot.torque(solution.a)
+        a = solution.a
+        if self.safety_filter is not None:
+            a = _chosen(self.safety_filter, a, disturbance)
+        tau = robot.torque(a)
         if additional is not None:
             tau = tau + additional
         if contacts is not None and self.interaction is not None:
             tau = tau - contacts.B @ solution.rho
             self.interaction.note_forces(solution.rho)
-        a = self._remember(solution.a)
+        a = self._remember(a)
         tau = self._limiter.limited(tau)
-        return ControlOutput(tau, a, True, solution.relaxation, "", solution.constraint_relaxation)
+        relaxed = solution.constraint_relaxation
+        if relaxed is not None and rows is not None:
+            relaxed = relaxed[: -len(rows.G)]
+        return ControlOutput(tau, a, True, solution.relaxation, "", relaxed)
+
+    def _look_ahead(
+        self, bounds: AccelerationRange, additional: Array | None, disturbance: Array | None
+    ) -> LinearConstraints | None:
+        """Let the filter look; return its constraints on the commanded accelerations."""
+        if self.safety_filter is None:
+            return None
+        robot = self.robot
+        extra = self._no_torque if additional is None else additional
+        if disturbance is not None:
+            extra = extra - robot.M @ disturbance
+        rows = self.safety_filter.look(robot.q, robot.v, extra, *bounds)
+        if rows is None:
+            return None
+        G, upper = rows
+        if disturbance is not None:
+            upper = upper - G @ disturbance
+        return LinearConstraints(G, np.full(len(upper), -np.inf), upper)
 
     def _hold(self, additional: Array | None, failure: str) -> ControlOutput:
         robot = self.robot
         self._observer.reset()  # what is asked for here may be more than the motors can give
         a = -self.gains.hold_kd * robot.v
+        if self.safety_filter is not None:
+            self._look_ahead(self._any_acceleration, additional, None)
+            a = self.safety_filter.choose(a)
         bias = robot.h
         if additional is not None and np.isfinite(additional).all():
             bias = robot.h + additional
@@ -308,3 +347,10 @@ class Controller:
     def _remember(self, a: Array) -> Array:
         self._a_last = a if math.isfinite(a.dot(a)) else np.zeros(self.robot.n)
         return self._a_last
+
+
+def _chosen(safety_filter: SafetyFilter, a: Array, disturbance: Array | None) -> Array:
+    """Return the acceleration to command in place of `a`."""
+    if disturbance is None:
+        return safety_filter.choose(a)
+    return safety_filter.choose(a + disturbance) - disturbance

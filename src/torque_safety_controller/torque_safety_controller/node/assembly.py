@@ -24,6 +24,7 @@ from viability_bounds_pkg.exceptions import SettingError, did_you_mean
 from viability_bounds_pkg.robot_configuration import load_model
 from viability_bounds_pkg.robot_description import RobotDescriptionError, inertia_beyond
 from viability_bounds_pkg.ros.robot_urdf import robot_urdf, warn_of_unusual
+from viability_bounds_pkg.whole_arm.safety_filter import SafetyFilter
 
 if TYPE_CHECKING:
     from rclpy.node import Node
@@ -58,9 +59,30 @@ def make_controller(
         config.qp_solver,
         [] if collision is None else [collision],
         make_interaction(config, robot, urdf),
+        make_safety_filter(config, robot.model),
     )
     controller.warm_up()
     return controller, base
+
+
+def make_safety_filter(config: ControllerConfiguration, model: pin.Model) -> SafetyFilter | None:
+    """Return what keeps a plan in hand; None where that is off.
+
+    Args:
+        config: checked parameters.
+        model: of the arm.
+    """
+    if not config.safety_filter:
+        return None
+    limits = config.collision
+    return SafetyFilter(
+        model,
+        config.position_min,
+        config.position_max,
+        np.minimum(-limits.acceleration_min, limits.acceleration_max),
+        config.torque_max,
+        config.dt,
+    )
 
 
 def configure(controller: Controller, config: ControllerConfiguration) -> None:

@@ -69,10 +69,14 @@ class CollisionConfiguration:
         note="within the position limits",
     )
     acceleration_min: Array = joint_numbers(
-        "for collision_avoidance: lower acceleration limits, rad/s^2", NEGATIVE, default=()
+        "for collision_avoidance and safety_filter: lower acceleration limits, rad/s^2",
+        NEGATIVE,
+        default=(),
     )
     acceleration_max: Array = joint_numbers(
-        "for collision_avoidance: upper acceleration limits, rad/s^2", POSITIVE, default=()
+        "for collision_avoidance and safety_filter: upper acceleration limits, rad/s^2",
+        POSITIVE,
+        default=(),
     )
     obstacles: tuple[str, ...] = texts(
         "obstacles to keep away from, fixed in base_frame: position of the centre, of a "
@@ -102,8 +106,16 @@ class CollisionConfiguration:
         if len(q) and not ((low <= q) & (q <= high) & np.isfinite(q)).all():
             raise SettingError("collision_posture", q, "within the position limits")
         if self.collision_avoidance:
-            check_per_joint("acceleration_min", self.acceleration_min, robot.joints)
-            check_per_joint("acceleration_max", self.acceleration_max, robot.joints)
+            self.check_accelerations(robot)
+
+    def check_accelerations(self, robot: RobotConfiguration) -> None:
+        """Check that there are acceleration limits.
+
+        Raises:
+            SettingError: none.
+        """
+        check_per_joint("acceleration_min", self.acceleration_min, robot.joints)
+        check_per_joint("acceleration_max", self.acceleration_max, robot.joints)
 
     def posture(self, robot: RobotConfiguration) -> Array:
         """Return the posture that is free of collisions, shape (n,), rad."""

@@ -17,7 +17,15 @@ from torque_safety_controller.qp.inverse_dynamics_qp import SOLVERS
 from torque_safety_controller.safety.modes import CONTROLS
 from torque_safety_controller.tasks.gains import Gains
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.parameter import Range, above, group, joint_numbers, number, text
+from viability_bounds_pkg.parameter import (
+    Range,
+    above,
+    group,
+    joint_numbers,
+    number,
+    switch,
+    text,
+)
 from viability_bounds_pkg.robot_configuration import (
     ControlRate,
     RobotConfiguration,
@@ -43,6 +51,12 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
         "limits of the rate of torque, N m/s; none if empty", if_empty=np.inf, note="all > 0"
     )
     gains: Gains = group(Gains)
+    safety_filter: bool = switch(
+        "whether steps are changed after which no plan is known that brings the arm to rest "
+        "within all limits; acceleration_min and acceleration_max need not be available in every "
+        "state then",
+        default=False,
+    )
     qp_solver: str = text(
         "solver of the QP; proxqp takes several times as long",
         default="daqp",
@@ -87,3 +101,5 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
         )
         object.__setattr__(self, "additional", additional)
         self.collision.check(self)
+        if self.safety_filter:
+            self.collision.check_accelerations(self)

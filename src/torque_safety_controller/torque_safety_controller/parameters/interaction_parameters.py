@@ -104,13 +104,6 @@ class InteractionConfiguration:
         default=_DEFAULTS.yielding_gains.kp,
         live=True,
     )
-    yield_speed_max: Array = numbers(
-        "speeds at which it yields at most, m/s and rad/s",
-        POSITIVE,
-        length=2,
-        default=_DEFAULTS.yielding_gains.speed_max,
-        live=True,
-    )
     contacts: tuple[str, ...] = texts(
         "points at which the QP may use contact forces, in the axes of the link frame: point, m, "
         "its origin if left out; normal, direction in which the environment pushes; friction, "
@@ -158,11 +151,7 @@ class InteractionConfiguration:
             ),
             closed=tuple(map(frames.index, self.closed_contacts)),
             yield_threshold=threshold,
-            yielding_gains=replace(
-                _DEFAULTS.yielding_gains,
-                kp=tuple(self.yield_kp.tolist()),
-                speed_max=tuple(self.yield_speed_max.tolist()),
-            ),
+            yielding_gains=replace(_DEFAULTS.yielding_gains, kp=tuple(self.yield_kp.tolist())),
         )
 
 

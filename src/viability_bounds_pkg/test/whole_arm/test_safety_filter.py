@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The filter on Baxter, whose shoulder cannot hold the stretched arm, against an adversary."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from viability_bounds_pkg.cli.limits_file import read_robot
+from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
+from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
+from viability_bounds_pkg.viability import BoundsSolver
+from viability_bounds_pkg.whole_arm.safety_filter import KEPT, RESERVE, SafetyFilter
+
+ROUNDING = 1e-9
+SHOULDER = 1
+
+
+class Arm:
+    """A robot of a parameter file under exact accelerations, each kept for a control period."""
+
+    def __init__(self, robot, share=1.0):
+        values = read_config(robot, "controller_node")
+        self.model = read_robot(config_folder() / f"{robot}.yaml").model
+        self.data = self.model.createData()
+        keys = ("position_min", "position_max", "velocity_max")
+        keys = (*keys, "acceleration_min", "acceleration_max")
+        bounds = read_config(robot, "bounds_node")
+        self.limits = JointLimits(bounds["joints"], *(np.array(bounds[key]) for key in keys))
+        self.tau_max = share * np.array(values["torque_max"])
+        self.dt = 1.0 / values["rate_hz"]
+        self.n = len(self.limits)
+        braking = np.minimum(-self.limits.a_min, self.limits.a_max)
+        self.solver = BoundsSolver(self.limits, 2.0 * self.dt, 0.05 * braking, period=self.dt)
+        self.start = np.array(read_config(robot, "bullet_node")["start_positions"])
+
+    def filter(self):
+        limits = self.limits
+        braking = np.minimum(-limits.a_min, limits.a_max)
+        return SafetyFilter(self.model, limits.q_min, limits.q_max, braking, self.tau_max, self.dt)
+
+    def torque(self, q, v, a):
+        return pin.rnea(self.model, self.data, q, v, a).copy()
+
+    def mid_torque(self, q, v, a):
+        """What is held during a step for mean acceleration `a`."""
+        h = 0.5 * self.dt
+        return self.torque(q + (v + 0.5 * a * h) * h, v + a * h, a)
+
+    def possible(self, q, v, plan, a):
+        """What the torque limits allow of the way from `plan` to `a`, as the QP would."""
+        share = 1.0
+        for _ in range(4):  # the torque in the middle of the step is only nearly linear
+            low, high = (
+                self.mid_torque(q, v, plan),
+                self.mid_torque(q, v, plan + share * (a - plan)),
+            )
+            room = np.where(high > low, self.tau_max - low, -self.tau_max - low)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                more = np.where(high == low, 1.0, room / (high - low)).min()
+            share *= float(np.clip(more, 0.0, 1.0))
+        return plan + share * (a - plan)
+
+    def play(self, wanted, seconds, filtered=True):
+        """Drive the arm; return the worst of positions, speeds and torques, and the states."""
+        limits, dt = self.limits, self.dt
+        keeper = self.filter()
+        q, v = self.start.copy(), np.zeros(self.n)
+        zero = np.zeros(self.n)
+        worst, states = np.zeros(3), []
+        for k in range(round(seconds / dt)):
+            lower, upper, _ = self.solver.bounds(q, v)
+            keeper.look(q, v, zero, lower, upper)
+            a = self.possible(q, v, keeper.plan, np.clip(wanted(k * dt, q, v), lower, upper))
+            if filtered:
+                a = keeper.choose(a)
+            load = np.abs(self.mid_torque(q, v, a)) / self.tau_max
+            worst[2] = max(worst[2], load.max())
+            q, v = q + (v + 0.5 * a * dt) * dt, v + a * dt
+            beyond = np.maximum(q - limits.q_max, limits.q_min - q).max()
+            worst[:2] = np.maximum(worst[:2], [beyond, (np.abs(v) - limits.v_max).max()])
+            states.append((q, v))
+        return worst, states, keeper
+
+
+def bang_bang(arm, seed, duration=0.4):
+    """Every joint to and fro as hard as its bounds allow, for random times."""
+    rng = np.random.default_rng(seed)
+    ends = {}
+
+    def wanted(t, q, v):
+        return ends.setdefault(int(t / duration), rng.choice([-1e3, 1e3], arm.n))
+
+    return wanted
+
+
+def heavier(arm):
+    """Each joint to where gravity asks for most of its motor: the worst of all goals."""
+    step = 1e-4
+
+    def wanted(t, q, v):
+        gravity = np.abs(pin.computeGeneralizedGravity(arm.model, arm.data, q))
+        slope = np.zeros(arm.n)
+        for j in range(arm.n):
+            moved = q.copy()
+            moved[j] += step
+            there = np.abs(pin.computeGeneralizedGravity(arm.model, arm.data, moved))
+            slope[j] = ((there - gravity) / arm.tau_max).sum()
+        return 1e3 * np.sign(slope)
+
+    return wanted
+
+
+ARMS = [("baxter_left_arm", 1.0), ("panda", 0.6), ("talos_left_arm", 0.6)]
+
+
+@pytest.fixture(scope="module", params=ARMS, ids=lambda each: f"{each[0]}-{each[1]}")
+def arm(request):
+    return Arm(*request.param)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_limit_is_passed_whatever_is_wanted(arm, seed):
+    worst, _, keeper = arm.play(bang_bang(arm, seed), 6.0)
+    assert worst[0] <= ROUNDING
+    assert worst[1] <= ROUNDING
+    assert worst[2] <= 1.0 + ROUNDING
+    assert keeper.outcomes["outside"] == 0
+    assert keeper.outcomes["as wanted"] > 0
+
+
+def test_no_limit_is_passed_where_the_worst_posture_is_wanted(arm):
+    worst, states, keeper = arm.play(heavier(arm), 4.0)
+    assert worst[0] <= ROUNDING
+    assert worst[1] <= ROUNDING
+    assert worst[2] <= 1.0 + ROUNDING
+    q, v = states[-1]
+    if arm.tau_max[SHOULDER] == 50.0:  # Baxter's: pressed against what it can hold
+        load = arm.torque(q, np.zeros(arm.n), np.zeros(arm.n))[SHOULDER] / arm.tau_max[SHOULDER]
+        assert 1.0 - RESERVE - 3.0 * KEPT <= abs(load) <= 1.0 - RESERVE + ROUNDING
+
+
+def test_without_the_filter_baxter_passes_its_limits():
+    arm = Arm("baxter_left_arm")
+    worst = max(arm.play(bang_bang(arm, seed), 6.0, False)[0][2] for seed in range(3))
+    assert worst > 1.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_plan_in_hand_ends_at_rest_and_can_be_held(arm, seed):
+    """Nothing is wanted any more: the plans alone, from wherever the adversary had got to."""
+    adversary, stop = bang_bang(arm, seed), 3.0 + 0.37 * seed
+
+    def wanted(t, q, v):
+        return adversary(t, q, v) if t < stop else -v / arm.dt
+
+    worst, states, _ = arm.play(wanted, stop + 2.5)
+    assert (worst <= [ROUNDING, ROUNDING, 1.0 + ROUNDING]).all()
+    q, v = states[-1]
+    assert np.abs(v).max() < 1e-6
+    held = np.abs(arm.torque(q, np.zeros(arm.n), np.zeros(arm.n)))
+    assert (held <= arm.tau_max).all()
+
+
+def test_between_its_samples_a_plan_needs_no_more_than_the_reserve(arm):
+    """The torques of accepted plans on a fine grid: what `RESERVE` has to cover."""
+    rng = np.random.default_rng(5)
+    worst, states, _ = arm.play(bang_bang(arm, 7), 4.0)
+    keeper, plans = arm.filter(), None
+    zero = np.zeros(arm.n)
+    most = 0.0
+    for index in rng.choice(len(states), 60, replace=False):
+        q, v = states[index]
+        slack = keeper._plans.look(q, v, 0.3, zero)
+        if slack < 0.0:
+            continue
+        plans = keeper._plans
+        times, a = plans.times.copy(), -v / plans.times
+        for t in np.linspace(0.0, times.max(), 300):
+            moved = np.minimum(t, times)
+            tau = arm.torque(
+                q + (v + 0.5 * a * moved) * moved, v + a * moved, np.where(t < times, a, 0.0)
+            )
+            most = max(most, (np.abs(tau) / arm.tau_max).max())
+    assert plans is not None
+    assert most <= 1.0
+
+
+def test_constraints_leave_the_plan_as_it_is(arm):
+    """They allow its acceleration, so that a QP with them, bounds and torques has a solution."""
+    _, states, _ = arm.play(bang_bang(arm, 3), 4.0)
+    keeper, zero, seen = arm.filter(), np.zeros(arm.n), 0
+    for q, v in states[::7]:
+        lower, upper, _ = arm.solver.bounds(q, v)
+        rows = keeper.look(q, v, zero, lower, upper)
+        if rows is None or keeper.slack < KEPT:
+            continue
+        seen += 1
+        np.testing.assert_allclose(np.linalg.norm(rows.G, axis=1), 1.0)
+        assert (rows.G @ keeper.plan <= rows.upper + ROUNDING).all()
+    assert seen > 0
+
+
+def test_torque_that_is_given_besides_counts():
+    arm = Arm("baxter_left_arm")
+    keeper, zero, wide = arm.filter(), np.zeros(arm.n), np.full(arm.n, 1e3)
+    keeper.look(arm.start, zero, zero, -wide, wide)
+    free, held = keeper.slack, keeper.rest_torque
+    extra = np.zeros(arm.n)
+    extra[SHOULDER] = 0.2 * arm.tau_max[SHOULDER] * np.sign(held[SHOULDER])
+    keeper.look(arm.start, zero, extra, -wide, wide)
+    np.testing.assert_allclose(keeper.rest_torque, held + extra)
+    assert keeper.slack == pytest.approx(free - 0.2 / (1.0 - RESERVE))
+
+
+def test_a_posture_that_cannot_be_held_is_told():
+    arm = Arm("baxter_left_arm")
+    stretched = np.array([0.0, -0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
+    keeper, zero, wide = arm.filter(), np.zeros(arm.n), np.full(arm.n, 1e3)
+    keeper.look(stretched, zero, zero, -wide, wide)
+    assert keeper.slack < 0.0
+    assert abs(keeper.rest_torque[SHOULDER]) > arm.tau_max[SHOULDER]
+
+
+def test_what_is_not_finite_never_passes():
+    arm = Arm("baxter_left_arm")
+    keeper, zero, wide = arm.filter(), np.zeros(arm.n), np.full(arm.n, 1e3)
+    keeper.look(arm.start, zero, zero, -wide, wide)
+    a = keeper.choose(np.full(arm.n, np.nan))
+    np.testing.assert_array_equal(a, keeper.plan)
+
+
+@pytest.mark.parametrize(
+    ("changed", "field"),
+    [
+        ({"braking": -1.0}, "braking"),
+        ({"braking": np.inf}, "braking"),
+        ({"tau_max": 0.0}, "tau_max"),
+        ({"position_min": np.nan}, "position_min"),
+    ],
+)
+def test_wrong_limits_are_named(changed, field):
+    arm = Arm("baxter_left_arm")
+    values = {
+        "position_min": arm.limits.q_min,
+        "position_max": arm.limits.q_max,
+        "braking": arm.limits.a_max,
+        "tau_max": arm.tau_max,
+    }
+    for name, value in changed.items():
+        values[name] = np.array(values[name])
+        values[name][2] = value
+    with pytest.raises(JointLimitsError) as error:
+        SafetyFilter(arm.model, *values.values(), arm.dt)
+    assert error.value.field == field
