@@ -62,6 +62,7 @@ HOLDABLE: dict[str, dict[str, Any]] = {
     #   estimate_acceleration_limits --cap 5 --margin-dt 0.01 --samples 200000
     # of a file with these position and velocity limits; drift plus 10%.
     "baxter_left_arm": {
+        "safety_filter": False,
         "position_min": [-1.7016, -2.147, -3.0541, 2.0, -3.059, -1.5707, -3.059],
         "velocity_max": [1.0, 0.8, 1.0, 1.0, 2.0, 2.0, 2.0],
         "acceleration_min": [-5.0, -3.1, -5.0, -5.0, -5.0, -5.0, -5.0],

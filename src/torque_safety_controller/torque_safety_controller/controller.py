@@ -282,7 +282,15 @@ class Controller:
         if disturbance is not None:
             bounds = AccelerationRange(*self._observer.shift(*bounds))
         parts = [each.constraint(robot, bounds, disturbance) for each in self.constraints]
-        parts.append(rows)
+        if self.safety_filter is not None:
+            # With the plan allowed by bounds, rows and torque limits, the QP has a solution.
+            plan = self.safety_filter.plan
+            if disturbance is not None:
+                plan = plan - disturbance
+            bounds = AccelerationRange(
+                np.minimum(bounds.lower, plan), np.maximum(bounds.upper, plan)
+            )
+            parts.append(rows)
         constraints = stack_constraints(parts)
         terms = [task.term(robot) for task in tasks]
         try:

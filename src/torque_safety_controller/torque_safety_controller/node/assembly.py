@@ -79,7 +79,8 @@ def make_safety_filter(config: ControllerConfiguration, model: pin.Model) -> Saf
         model,
         config.position_min,
         config.position_max,
-        np.minimum(-limits.acceleration_min, limits.acceleration_max),
+        limits.acceleration_min,
+        limits.acceleration_max,
         config.torque_max,
         config.dt,
     )

@@ -17,7 +17,7 @@ from trajectory_msgs.msg import JointTrajectory
 from torque_safety_controller.controller import ControlOutput
 from torque_safety_controller.node.assembly import configure, make_controller
 from torque_safety_controller.node.collision_report import CollisionReport
-from torque_safety_controller.node.controller_report import LEVELS, StepRecord
+from torque_safety_controller.node.controller_report import LEVELS, StepRecord, too_weak
 from torque_safety_controller.node.gain_watch import GainWatch
 from torque_safety_controller.node.goals import GoalSubscriber
 from torque_safety_controller.node.joint_commands import JointCommands
@@ -373,7 +373,9 @@ class ControllerNode(ArmNode):
             }
         )
         level, text = LEVELS[self._modes.mode], f"{self._modes.mode.value}: {self._modes.reason}"
-        for trouble in filter(None, (self._collision.too_near, self._wrenches.trouble)):
+        weak = too_weak(self._config.joints, self._controller)
+        weak = weak and f"the arm cannot be held where it would come to rest: {weak}"
+        for trouble in filter(None, (self._collision.too_near, self._wrenches.trouble, weak)):
             level, text = max(level, DiagnosticStatus.WARN), f"{text}; {trouble}"
         return level, text, values
 

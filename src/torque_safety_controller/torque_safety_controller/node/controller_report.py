@@ -85,7 +85,25 @@ class StepRecord:
                 "joints_at_integral_budget": _named(joints, controller.additional.saturated),
                 "integral_skipped_steps": controller.additional.skipped,
             }
+        if controller.safety_filter is not None:
+            values |= {
+                "steps_by_plan": controller.safety_filter.outcomes,
+                "plan_torque_left": controller.safety_filter.slack,
+                "joints_too_weak_to_hold": too_weak(joints, controller) or "none",
+            }
         return values
+
+
+def too_weak(joints: tuple[str, ...], controller: Controller) -> str:
+    """Return which joints cannot hold the arm where it would come to rest; empty for none."""
+    if controller.safety_filter is None:
+        return ""
+    torque, most = controller.safety_filter.rest_torque, controller.tau_max
+    return ", ".join(
+        f"{name} needs {needed:.1f} of {limit:.1f} N m"
+        for name, needed, limit in zip(joints, np.abs(torque), most, strict=True)
+        if needed > limit
+    )
 
 
 def _named(joints: tuple[str, ...], flags: np.ndarray) -> str:

@@ -1,19 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Braking plans: every joint slows down at a constant rate until it stands; compiled.
 
-From a state (q, v), with one time T for the whole arm, joint j stops within
+From a state (q, v), with one time T for the whole arm, joint j stands after
 
-    T_j = min(T, 2 r_j / |v_j|),    d_j = |v_j| / T_j,
+    T_j = min( max(T, |v_j| / A_j),  2 r_j / |v_j| ),
 
-r_j the distance to its position limit in the direction of its motion: it stops at time T, or
-where it would pass the limit, just before it. So positions and speeds keep their limits all the
-way, and what is left to check are torques. What is left of a plan after some time t is the plan
-with T - t from the state then.
+r_j the distance to its position limit in the direction of its motion: it stands at time T, later
+where it would have to brake harder than A_j, sooner where it would pass the limit. Times are
+whole control periods: rounded up, but for a limit rounded down. So positions and speeds keep their
+limits all the way, and what is left to check are torques. The rest of a plan after a period are
+the same times, one period shorter, from the state then.
 """
 
 from __future__ import annotations
 
-from math import inf
+from math import ceil, floor, inf
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,11 +26,11 @@ Array = NDArray[np.float64]
 UNIFORM = 20
 """Samples at equal distances in time, the first at the beginning."""
 
-TIMED, HARDEST, AT_LIMIT = 0.0, 1.0, 2.0
-"""What decides how long a joint takes."""
-
 EDGE = 1e-9
-"""How near a joint's stop the samples before and after it are, as a share of T."""
+"""How near a joint's stop the samples before and after it are, as a share of the longest time."""
+
+ROUNDING = 1e-9
+"""Of numbers of periods."""
 
 
 def samples(n: int) -> int:
@@ -47,39 +48,56 @@ def stop_times(
     T: float,
     q_min: Array,
     q_max: Array,
+    tolerance: Array,
     braking: Array,
     dt: float,
-    tolerance: Array,
     times: Array,
-    kind: Array,
-) -> float:
-    """Fill in when each joint stands; return by how far a position limit is passed at worst, rad.
+) -> None:
+    """Fill in when each joint stands in the plan of time `T`.
 
     Args:
         q: positions, shape (n,), rad.
         v: velocities, shape (n,), rad/s.
-        T: time of the plan, s, at least `dt`.
-        q_min: shape (n,), rad.
-        q_max: shape (n,), rad.
-        dt: control period, s: no joint stops sooner.
-        tolerance: by how far a joint may pass a limit, shape (n,), rad.
-        times: T_j, shape (n,), s.
-        kind: what decides T_j, shape (n,): `TIMED`, `HARDEST` or `AT_LIMIT`.
+        T: s.
+        q_min: lowest positions at which joints are to stand, shape (n,), rad.
+        q_max: highest, shape (n,), rad.
+        tolerance: by how far they may stand beyond where only braking harder than A would help,
+            shape (n,), rad.
+        braking: A, shape (n,), rad/s^2.
+        dt: control period, s.
+        times: T_j, shape (n,), s; at least one period.
+    """
+    for j in range(q.size):
+        speed = abs(v[j])
+        room = q_max[j] - q[j] if v[j] > 0.0 else q[j] - q_min[j]
+        periods = max(ceil(max(T, speed / braking[j]) / dt - ROUNDING), 1)
+        if speed > 0.0 and 0.5 * speed * periods * dt > room:
+            most = floor(2.0 * max(room, 0.0) / (speed * dt) + ROUNDING)
+            beyond = floor(2.0 * max(room + tolerance[j], 0.0) / (speed * dt) + ROUNDING)
+            hardest = ceil(speed / (braking[j] * dt) - ROUNDING)
+            periods = max(most, min(hardest, beyond), 1)
+        times[j] = periods * dt
+
+
+@compiled
+def passed(
+    q: Array, v: Array, times: Array, q_min: Array, q_max: Array, tolerance: Array
+) -> float:
+    """Return by how far a plan, or the present state, passes a position limit at worst, rad.
+
+    Args:
+        q: positions, shape (n,), rad.
+        v: velocities, shape (n,), rad/s.
+        times: of the plan, shape (n,), s.
+        q_min: lowest positions at which joints are to stand, shape (n,), rad.
+        q_max: highest, shape (n,), rad.
+        tolerance: by how far they may stand beyond, shape (n,), rad.
     """
     worst = 0.0
     for j in range(q.size):
-        speed = abs(v[j])
-        room = (q_max[j] - q[j] if v[j] > 0.0 else q[j] - q_min[j]) + tolerance[j]
-        worst = max(worst, max(q[j] - q_max[j], q_min[j] - q[j]) - tolerance[j])
-        times[j], kind[j] = T, TIMED
-        if speed > T * braking[j]:
-            times[j], kind[j] = speed / braking[j], HARDEST
-        if 0.5 * speed * times[j] > room:
-            if 0.5 * speed * dt < room:
-                times[j], kind[j] = 2.0 * room / speed, AT_LIMIT
-            else:
-                times[j], kind[j] = dt, TIMED
-                worst = max(worst, 0.5 * speed * dt - room)
+        end = q[j] + 0.5 * v[j] * times[j]
+        high, low = max(q[j], end), min(q[j], end)
+        worst = max(worst, max(high - q_max[j], q_min[j] - low) - tolerance[j])
     return worst
 
 
@@ -129,7 +147,6 @@ def fill_plan(
 def sensitivity(
     dt: float,
     times: Array,
-    kind: Array,
     clock: float,
     by_q: Array,
     by_v: Array,
@@ -139,13 +156,12 @@ def sensitivity(
     """Fill in how the torques of a sample change with the acceleration of one control step.
 
     With the acceleration of the plan, the rest of the plan stays what it is. With another one the
-    arm is elsewhere after the step, and the plan of the time that is left, T - dt, differs: its
-    torques at the time of the sample change by ``gradient (a - plan)``, to first order.
+    arm is elsewhere after the step, and brakes from there in the times that are left: the torques
+    at the time of the sample change by ``gradient (a - plan)``, to first order.
 
     Args:
         dt: control period, s.
-        times: from `stop_times`, for the state in which the step begins.
-        kind: from `stop_times`.
+        times: of the plan from the state in which the step begins, shape (n,), s.
         clock: time of the sample from then on, s.
         by_q: derivative of the torque by positions at the sample, shape (n, n).
         by_v: by velocities, shape (n, n).
@@ -156,28 +172,12 @@ def sensitivity(
     t = max(clock - dt, 0.0)
     for j in range(n):
         T = max(times[j] - dt, dt)
-        # Of acceleration, velocity and position at the sample, by position and velocity then.
-        if kind[j] == AT_LIMIT:
-            # T = 2 r / v, acceleration -v^2 / (2 r).
-            a_q, a_v = -2.0 / (T * T), -2.0 / T
-            if t < T:
-                q_q, q_v = 1.0 + 0.5 * a_q * t * t, t + 0.5 * a_v * t * t
-                v_q, v_v = a_q * t, 1.0 + a_v * t
-            else:
-                q_q = q_v = v_q = v_v = a_q = a_v = 0.0
-        elif kind[j] == HARDEST:
-            a_q = a_v = v_q = 0.0
-            q_q = 1.0
-            q_v, v_v = (t, 1.0) if t < T else (T, 0.0)
+        # Of position, velocity and acceleration at the sample, by the velocity after the step.
+        if t < T:
+            q_v, v_v, a_v = t - 0.5 * t * t / T, 1.0 - t / T, -1.0 / T
         else:
-            a_q, a_v = 0.0, -1.0 / T
-            q_q, v_q = 1.0, 0.0
-            if t < T:
-                q_v, v_v = t - 0.5 * t * t / T, 1.0 - t / T
-            else:
-                q_v, v_v, a_v = 0.5 * T, 0.0, 0.0
+            q_v, v_v, a_v = 0.5 * T, 0.0, 0.0
+        q_a, v_a, a_a = dt * (0.5 * dt + q_v), dt * v_v, dt * a_v
         for i in range(n):
             inertia = M[i, j] if i <= j else M[j, i]
-            of_q = by_q[i, j] * q_q + by_v[i, j] * v_q + inertia * a_q
-            of_v = by_q[i, j] * q_v + by_v[i, j] * v_v + inertia * a_v
-            gradient[i, j] = of_q * 0.5 * dt * dt + of_v * dt
+            gradient[i, j] = by_q[i, j] * q_a + by_v[i, j] * v_a + inertia * a_a

@@ -8,7 +8,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from viability_bounds_pkg.compiled import compiled
-from viability_bounds_pkg.whole_arm.braking_plan import fill_plan, samples, stop_times
+from viability_bounds_pkg.whole_arm.braking_plan import fill_plan, passed, samples, stop_times
 
 Array = NDArray[np.float64]
 
@@ -29,7 +29,6 @@ class PlanTorques:
 
     Attributes:
         times: when each joint stands, shape (n,), s.
-        kind: what decides that; see `braking_plan.stop_times`.
         clock: times of the samples, s; inf at rest.
         positions: rad.
         velocities: rad/s.
@@ -55,7 +54,7 @@ class PlanTorques:
         self._q_min, self._q_max, self._braking = q_min, q_max, braking
         self._tau_max, self._dt, self._tolerance = tau_max, dt, tolerance
         self._pool = pin.ModelPool(model, 1)
-        self.times, self.kind, self.clock = np.zeros(n), np.zeros(n), np.zeros(count)
+        self.times, self.clock = np.full(n, dt), np.zeros(count)
         self.positions, self.velocities, self.accelerations, self.tau = (
             np.zeros((count, n)) for _ in range(4)
         )
@@ -66,10 +65,8 @@ class PlanTorques:
         self.loads, self.busiest = np.zeros(n), np.zeros(n, dtype=np.int64)
         self.beyond = 0.0
 
-    def look(self, q: Array, v: Array, T: float, extra: Array) -> float:
-        """Compute the plan of time `T`; return the least share of a torque limit that it leaves.
-
-        Negative where a torque or position limit is passed.
+    def plan(self, q: Array, v: Array, T: float, extra: Array) -> float:
+        """Make the plan of time `T`; return what `follow` does.
 
         Args:
             q: positions at its beginning, shape (n,), rad.
@@ -77,22 +74,36 @@ class PlanTorques:
             T: time of the plan, s.
             extra: torque that the motors give besides, shape (n,), N m.
         """
-        self.beyond = stop_times(
+        stop_times(
             q,
             v,
             T,
             self._q_min,
             self._q_max,
+            self._tolerance,
             self._braking,
             self._dt,
-            self._tolerance,
             self.times,
-            self.kind,
         )
+        return self.follow(q, v, self.times, extra)
+
+    def follow(self, q: Array, v: Array, times: Array, extra: Array) -> float:
+        """Compute the plan of given times; return the least share that it leaves of a limit.
+
+        Negative where a torque limit is passed.
+
+        Args:
+            q: positions at its beginning, shape (n,), rad.
+            v: velocities, shape (n,), rad/s.
+            times: when each joint stands, shape (n,), s.
+            extra: torque that the motors give besides, shape (n,), N m.
+        """
+        self.times[:] = times
+        self.beyond = passed(q, v, times, self._q_min, self._q_max, self._tolerance)
         fill_plan(
             q,
             v,
-            self.times,
+            times,
             self.positions,
             self.velocities,
             self.accelerations,

@@ -6,9 +6,9 @@ with gravity and the coupling of the joints, is a promise of the parameter file,
 motor is weak it cannot be made. Here it is not needed. One plan is always in hand that brings the
 arm to rest and holds it there, with positions, speeds and torques within their limits all the
 way (`braking_plan`). A step is taken as it is wanted if such a plan is known from where it leads;
-otherwise it is taken on the way between what is wanted and the plan, as near to what is wanted as
-a few trials find; in the worst case it is the plan's own, after which the rest of the plan is still
-in hand. `docs/whole_arm.md` has the proof and its assumptions.
+otherwise it is taken between what is wanted and the plan, as near to what is wanted as a few
+trials find; in the worst case it is the plan's own, after which the rest of the plan is still in
+hand. `docs/whole_arm.md` has the proof and its assumptions.
 """
 
 from __future__ import annotations
@@ -33,6 +33,10 @@ constant acceleration under held torque, and for errors of the model."""
 KEPT = 0.01
 """Further share that the constraints on a step leave, so that its trial seldom fails."""
 
+LOST = 0.1
+"""Share of a torque limit by which a plan may pass it, after a disturbance, and still be followed
+as far as the motors can; beyond, the bounds alone count."""
+
 NEAR = 0.6
 """Share of a torque limit above which a plan's torque constrains the step."""
 
@@ -51,12 +55,15 @@ FACTORS = (1.15, 1.0 / 1.15, 1.6, 1.0 / 1.6, 4.0, 0.25)
 PULL = 1e-4
 """Weight of the squared logarithm of T over `USUAL` in the choice of T."""
 
+RELUCTANCE = 0.02
+"""Share by which another time must need less, so that it does not change to and fro."""
+
 HALVINGS = 3
 """How often the way between what is wanted and the plan is halved."""
 
-CLEARANCE = 0.3
-"""Distance of a plan's end from a position limit, in accelerations times period squared: a joint
-that brakes a little less than planned in the last steps does not pass the limit."""
+CLEARANCE = 3.0
+"""Distance of a plan's end from a position limit, in accelerations times period squared: farther
+than the margins of the bounds, which would change a plan that ends nearer."""
 
 
 class Rows(NamedTuple):
@@ -72,14 +79,15 @@ class SafetyFilter:
     """Keeps a braking plan of one arm in hand, and changes steps that would lose it.
 
     Call `look` at the beginning of each control step, then `choose` with the accelerations that
-    are wanted. Accelerations are those that the arm is to have: what disturbances add is in `extra`.
+    are wanted: those that the arm is to have, disturbances included.
 
     Args:
         model: the arm, n joints with one coordinate each.
         position_min: lower position limits, shape (n,), rad; -inf for none.
         position_max: upper position limits, shape (n,), rad; inf for none.
-        braking: acceleration with which plans brake where no position limit asks for more, shape
-            (n,), rad/s^2; it need not be available in every state.
+        acceleration_min: lower acceleration limits of the bounds, shape (n,), rad/s^2. Plans brake
+            with no more where no position limit asks for it; it need not always be available.
+        acceleration_max: upper ones, shape (n,), rad/s^2.
         tau_max: torque limits, shape (n,), N m.
         dt: control period, s.
 
@@ -92,8 +100,8 @@ class SafetyFilter:
             "outside", without a plan within the limits.
 
     Raises:
-        JointLimitsError: not one value for each joint, or braking or torques that are not finite
-            and positive.
+        JointLimitsError: not one value for each joint, or one that is not finite or of the wrong
+            sign.
     """
 
     def __init__(
@@ -101,24 +109,33 @@ class SafetyFilter:
         model: pin.Model,
         position_min: ArrayLike,
         position_max: ArrayLike,
-        braking: ArrayLike,
+        acceleration_min: ArrayLike,
+        acceleration_max: ArrayLike,
         tau_max: ArrayLike,
         dt: float,
     ) -> None:
         n, names = model.nv, tuple(model.names)[1:]
-        q_min, q_max, rates, torques = (
+        q_min, q_max, a_min, a_max, torques = (
             joint_array(field, values, names)
             for field, values in (
                 ("position_min", position_min),
                 ("position_max", position_max),
-                ("braking", braking),
+                ("acceleration_min", acceleration_min),
+                ("acceleration_max", acceleration_max),
                 ("tau_max", tau_max),
             )
         )
-        for field, values in (("braking", rates), ("tau_max", torques)):
+        for field, values, sign in (
+            ("acceleration_min", a_min, -1.0),
+            ("acceleration_max", a_max, 1.0),
+            ("tau_max", torques, 1.0),
+        ):
             for name, value in zip(names, values.tolist(), strict=True):
-                if not (np.isfinite(value) and value > 0.0):
-                    raise JointLimitsError(field, name, value, "must be finite and positive")
+                if not (np.isfinite(value) and sign * value > 0.0):
+                    allowed = f"must be finite and {'positive' if sign > 0.0 else 'negative'}"
+                    raise JointLimitsError(field, name, value, allowed)
+        rates = np.minimum(-a_min, a_max)
+        self._a_min, self._a_max = a_min, a_max
         self._usable = (1.0 - RESERVE) * torques
         clearance = CLEARANCE * dt * dt * rates
         self._plans = PlanTorques(
@@ -126,7 +143,9 @@ class SafetyFilter:
         )
         self._dt = dt
         self._model, self._data = model, model.createData()
-        self._time = USUAL
+        self._time = USUAL  # T of the plan in hand
+        self._times: Array = np.full(n, dt)  # when each joint stands in it, from now on
+        self._begun = False
         self._turn = 0
         self._q = self._v = self._extra = np.zeros(n)
         self._gradient = np.zeros((n, n))
@@ -139,7 +158,7 @@ class SafetyFilter:
 
     def reset(self) -> None:
         """Forget the plan in hand."""
-        self._time = USUAL
+        self._time, self._begun = USUAL, False
 
     def _warm_up(self) -> None:
         """Compile everything now and not in a control loop."""
@@ -153,8 +172,8 @@ class SafetyFilter:
     def look(self, q: Array, v: Array, extra: Array, lower: Array, upper: Array) -> Rows | None:
         """Look at the state in which a step begins; return what its accelerations must keep to.
 
-        To first order, and approaching limits with `APPROACH`; None where all are far. The plan's
-        acceleration keeps to it.
+        To first order, and approaching limits with `APPROACH`; None where all are far, or no
+        plan is near. The plan's acceleration keeps to it.
 
         Args:
             q: positions, shape (n,), rad.
@@ -165,12 +184,21 @@ class SafetyFilter:
         """
         self._q, self._v, self._extra = q, v, extra
         plans = self._plans
-        self.slack = plans.look(q, v, self._time, extra)
+        if self._begun:
+            self.slack = plans.follow(q, v, self._times, extra)
+        else:
+            self.slack = plans.plan(q, v, self._time, extra)
+            self._times, self._begun = plans.times.copy(), True
         self._beyond = plans.beyond
-        # The bounds have margins for errors within a step, which the plan has not.
-        self.plan = np.minimum(np.maximum(-v / plans.times, lower), upper)
+        # The bounds have margins for errors within a step, which the plan has not. Acceleration
+        # limits are none to the plan: its torques are known.
+        low = np.where(lower <= self._a_min, -np.inf, lower)
+        high = np.where(upper >= self._a_max, np.inf, upper)
+        self.plan = np.minimum(np.maximum(-v / plans.times, low), high)
         rest = len(plans.clock) - 1
         self.rest_torque = plans.tau[rest].copy()
+        if self.slack < -RESERVE:
+            return None  # nothing to keep: the bounds alone count
         at_rest = np.abs(self.rest_torque) > NEAR * self._usable
         wanted: dict[int, list[int]] = {}
         for j in np.flatnonzero(plans.loads > NEAR).tolist():
@@ -192,7 +220,7 @@ class SafetyFilter:
                 plans.velocities[k],
                 plans.accelerations[k],
             )
-            sensitivity(self._dt, plans.times, plans.kind, plans.clock[k], by_q, by_v, M, gradient)
+            sensitivity(self._dt, plans.times, plans.clock[k], by_q, by_v, M, gradient)
             for j in joints:
                 tau = plans.tau[k, j]
                 row = gradient[j] if tau > 0.0 else -gradient[j]
@@ -209,43 +237,68 @@ class SafetyFilter:
             a: acceleration wanted, shape (n,), rad/s^2.
         """
         self._turn = (self._turn + 1) % len(FACTORS)
-        left = max(self._time - self._dt, self._dt)
         other = self._time * FACTORS[self._turn]
-        if self._take(a, self._time, other, left):
+        rest = np.maximum(self._times - self._dt, self._dt)
+        if self._take(a, rest, other):
             self.outcomes["as wanted"] += 1
             return a
-        if self.slack < -RESERVE and np.isfinite(a).all():  # the motors cannot give the plan's
+        if self.slack < -LOST and np.isfinite(a).all():
             self.outcomes["outside"] += 1
+            self._begun = False
             return a
         low, high = 0.0, 1.0
         for _ in range(HALVINGS):
             share = 0.5 * (low + high)
-            if self._safe(self.plan + share * (a - self.plan), left):
+            if self._safe(self.plan + share * (a - self.plan), rest):
                 low = share
             else:
                 high = share
         self.outcomes["changed" if low > 0.0 else "planned"] += 1
         chosen = self.plan + low * (a - self.plan) if low > 0.0 else self.plan
-        # What is left of the plan is safe; at rest it would end in plans too short to begin from.
-        if not self._take(chosen, left, max(left, other)):
-            self._time = left
+        # The rest of the plan is safe. At rest it would end in plans too short to begin from.
+        time = max(self._time - self._dt, self._dt)
+        if not self._take(chosen, rest, max(time, other)):
+            self._time, self._times = time, rest
         return chosen
 
-    def _take(self, a: Array, *times: float) -> bool:
-        """Take the plan after `a` that needs least, of those that are safe; False without one."""
-        best = np.inf
-        for T in times:
-            if self._dt <= T <= LONGEST and self._safe(a, T):
-                cost = self._plans.cost + PULL * np.log(T / USUAL) ** 2
-                if cost < best:
-                    best, self._time = cost, T
-        return best < np.inf
+    def _take(self, a: Array, rest: Array, other: float) -> bool:
+        """Take the plan after `a` that needs least, of those that are safe; False without one.
 
-    def _safe(self, a: Array, T: float) -> bool:
-        """Return whether the plan of time `T` after a step is within the limits.
+        Args:
+            a: acceleration of the step, shape (n,), rad/s^2.
+            rest: what is left of the times of the plan in hand, shape (n,), s.
+            other: time of a plan to try besides that of the plan in hand, s.
+        """
+        best, time, times = np.inf, self._time, None
+        for T, given in (
+            (self._time, None),
+            (other, None),
+            (max(self._time - self._dt, self._dt), rest),
+        ):
+            if self._dt <= T <= LONGEST and self._safe(a, T if given is None else given):
+                cost = self._plans.cost + PULL * np.log(T / USUAL) ** 2
+                if self._time != T:
+                    cost *= 1.0 + RELUCTANCE
+                if cost < best:
+                    best, time, times = cost, T, self._plans.times.copy()
+        if times is None:
+            return False
+        self._time, self._times = time, times
+        return True
+
+    def _safe(self, a: Array, plan: float | Array) -> bool:
+        """Return whether a plan after a step is within the limits.
 
         Where the plan in hand is not, because of a disturbance, it must not be worse.
+
+        Args:
+            a: acceleration of the step, shape (n,), rad/s^2.
+            plan: its time T, or when each joint stands, shape (n,), s.
         """
-        dt, v = self._dt, self._v
-        slack = self._plans.look(self._q + dt * v + 0.5 * dt * dt * a, v + dt * a, T, self._extra)
-        return slack >= min(0.0, self.slack) and self._plans.beyond <= self._beyond
+        dt, v, plans = self._dt, self._v, self._plans
+        after = self._q + dt * v + 0.5 * dt * dt * a, v + dt * a
+        if isinstance(plan, float):
+            slack = plans.plan(*after, plan, self._extra)
+        else:
+            slack = plans.follow(*after, plan, self._extra)
+        return slack >= min(0.0, self.slack) and plans.beyond <= self._beyond

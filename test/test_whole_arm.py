@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Arms with motors that are too weak for their own weight or haste, with the safety filter."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from direct import DirectLoop, column
+
+STIFF = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
+"""A posture task that drives each joint to its limits, whatever the hand does."""
+SHOULDER = 1
+STRETCHED = np.array([0.0, -0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
+"""Where Baxter's shoulder needs more than it has."""
+
+
+def load_at(loop, q):
+    """What holds the arm, as a share of the torque limits."""
+    data = loop.model.createData()
+    return np.abs(pin.computeGeneralizedGravity(loop.model, data, q)) / loop.config.torque_max
+
+
+def race(robot, seconds, seed, **changed):
+    """Go to random postures, half of the joints at their limits, each for 3 s."""
+    loop = DirectLoop(robot, STIFF | changed)
+    rng = np.random.default_rng(seed)
+    low, high = loop.limits.q_min, loop.limits.q_max
+    n = low.size
+    for _ in range(round(seconds / 3.0)):
+        ends = np.where(rng.random(n) < 0.5, low, high)
+        goal = np.where(rng.random(n) < 0.5, ends, rng.uniform(low, high))
+        loop.controller.set_posture_goal(goal)
+        loop.run(3.0)
+    return loop
+
+
+def beyond(loop):
+    """The largest violations of position and speed limits, and the largest share of torque."""
+    monitor = loop.robot.monitor
+    return (
+        monitor.max_position_violation.max(),
+        monitor.max_velocity_violation.max(),
+        monitor.max_torque_ratio.max(),
+    )
+
+
+def test_baxters_shoulder_keeps_its_limits_only_with_the_filter():
+    without = beyond(race("baxter_left_arm", 30.0, 4, safety_filter=False))
+    assert without[0] > 0.1
+    assert without[1] > 0.1
+    loop = race("baxter_left_arm", 30.0, 4, safety_filter=True)
+    position, speed, torque = beyond(loop)
+    assert position == 0.0
+    assert speed == 0.0
+    assert torque <= 1.0 + 1e-9
+    outcomes = loop.controller.safety_filter.outcomes
+    assert outcomes["changed"] + outcomes["planned"] > 0
+    assert outcomes["as wanted"] > 0.9 * outcomes.total()
+
+
+@pytest.mark.parametrize(("robot", "seconds"), [("panda", 9.0), ("talos_left_arm", 6.0)])
+def test_arms_with_weaker_motors_keep_their_limits(robot, seconds):
+    """With limits of acceleration that were found for torque limits of 100%."""
+    tau_max = DirectLoop(robot).config.torque_max
+    loop = race(robot, seconds, 0, safety_filter=True, torque_max=(0.6 * tau_max).tolist())
+    position, speed, torque = beyond(loop)
+    assert position == 0.0
+    assert speed == 0.0
+    assert torque <= 1.0 + 1e-9
+
+
+@pytest.mark.parametrize("gains", [STIFF, {"pose_weight": 0.0, "posture_weight": 1.0}])
+def test_a_posture_that_cannot_be_held_is_approached_as_far_as_one_that_can(gains):
+    loop = DirectLoop("baxter_left_arm", gains | {"safety_filter": True})
+    assert load_at(loop, STRETCHED)[SHOULDER] > 1.0
+    start = loop.robot.state().q
+    loop.controller.set_posture_goal(STRETCHED)
+    last = loop.run(10.0)[-100:]
+    q = column(last, "q")
+    assert np.ptp(q, axis=0).max() < 0.02, "it does not stay"
+    assert 0.9 < load_at(loop, q[-1])[SHOULDER] <= 0.98
+    assert np.abs(q[-1] - STRETCHED).max() < 0.8 * np.abs(start - STRETCHED).max()
+    assert beyond(loop)[:2] == (0.0, 0.0)
+    assert loop.controller.safety_filter.outcomes["outside"] == 0
+
+
+def test_an_arm_that_starts_where_it_cannot_be_held_comes_down_slowly():
+    loop = DirectLoop("baxter_left_arm", STIFF | {"safety_filter": True})
+    loop.robot.reset(STRETCHED, np.zeros(7))
+    loop.begin()
+    samples = loop.run(8.0)
+    assert loop.controller.safety_filter.slack >= -1e-3
+    assert np.abs(column(samples, "v")[-1]).max() < 0.1
+    assert load_at(loop, samples[-1].q)[SHOULDER] < 0.98
+    assert beyond(loop)[:2] == (0.0, 0.0)
