@@ -33,7 +33,7 @@ class Figure:
     name: str
     data: dict[str, np.ndarray] = field(default_factory=dict)
     metrics: dict[str, float] = field(default_factory=dict)
-    rows: list[tuple[str, str, str, str]] = field(default_factory=list)
+    rows: list[tuple[str, ...]] = field(default_factory=list)
 
     def save(self, picture: plt.Figure | None) -> None:
         """Write picture, data and metrics."""

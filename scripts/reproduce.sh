@@ -16,6 +16,7 @@ Writes figures to results/, and prints a table with the paper's numbers and ours
   friction           TALOS with friction compensation
   out_of_reach       hands sent out of reach, without and with a largest speed (2 min)
   stopping           commands fail: the drives' own stop beside the brakes, and its cost (2 min)
+  whole_arm          weak motors, with and without the safety filter (10 min)
   imperfect          late, coarse and noisy robots, with and without each remedy, and
                      docs/reproduction_imperfect.md (40 min on two cores)
   imperfect panda    one of the robots; its rows replace those of before
@@ -29,14 +30,14 @@ what="${1:-all}"
 [ $# -eq 0 ] || shift
 case "$what" in -h | --help) usage; exit 0 ;; esac
 if [ "$what" = all ]; then
-    for part in paper0 paper1-integral paper1-compliance state_dependent friction out_of_reach stopping; do
+    for part in paper0 paper1-integral paper1-compliance state_dependent friction out_of_reach stopping whole_arm; do
         bash "$root/scripts/reproduce.sh" "$part"
     done
     exit 0
 fi
 what="${what//-/_}"
 case "$what" in
-paper0 | paper1_integral | paper1_compliance | state_dependent | friction | out_of_reach | stopping | imperfect | exactness) ;;
+paper0 | paper1_integral | paper1_compliance | state_dependent | friction | out_of_reach | stopping | whole_arm | imperfect | exactness) ;;
 *)
     echo "error: unknown '$what'; --help lists what there is" >&2
     exit 2

@@ -266,3 +266,16 @@ def test_joints_at_a_limit_are_named(ros):
     lower[3] = upper[3] = 0.7
     chain.answer(10, v=REST, lower=lower, upper=upper)
     ros.wait_until(lambda: chain.reported("joints_at_acceleration_limit") == JOINTS[3])
+
+
+def test_joints_that_cannot_hold_the_arm_are_named(ros):
+    chain = NodeChain(ros, safety_filter=True)
+    chain.answer(10, v=REST)
+    ros.wait_until(lambda: chain.reported("joints_too_weak_to_hold") == "none")
+    assert "as wanted" in chain.reported("steps_by_plan")
+    stretched = np.array([0.0, -0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
+    chain.answer(20, q=stretched, v=REST)
+    said = "left_s1 needs 5"
+    ros.wait_until(lambda: said in chain.reported("joints_too_weak_to_hold"))
+    assert f"cannot be held where it would come to rest: {said}" in chain.reported("message")
+    assert float(chain.reported("plan_torque_left")) < 0.0

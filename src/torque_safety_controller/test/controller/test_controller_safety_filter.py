@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The safety filter in the controller: what the QP is given, and what is sent in the end."""
+
+import numpy as np
+import pytest
+from arms import load_arm
+
+from torque_safety_controller.controller import Controller, Gains
+from torque_safety_controller.qp.constraints import AccelerationRange, LinearConstraints
+from viability_bounds_pkg.state import State
+from viability_bounds_pkg.testing.ros_harness import read_config
+from viability_bounds_pkg.whole_arm.safety_filter import SafetyFilter
+
+ARM = load_arm("baxter_left_arm")
+VALUES = read_config("baxter_left_arm", "controller_node")
+A_MAX = np.array(VALUES["acceleration_max"])
+ZERO = np.zeros(ARM.n)
+SHOULDER = 1
+STRETCHED = np.array([0.0, -0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
+EDGE = np.array([0.0, -0.64, 0.0, -0.0, 0.0, 0.0, 0.0])
+"""Where the shoulder needs 96% of its torque."""
+FOLDED = np.array([0.0, -0.8, 0.0, 2.2, 0.0, 0.5, 0.0])
+GAINS = Gains(
+    pose_kp=10.0,
+    pose_kd=6.0,
+    pose_weight=0.0,
+    posture_kp=100.0,
+    posture_kd=20.0,
+    posture_weight=1.0,
+    hold_kd=20.0,
+)
+
+
+def make(filtered=True, **arguments):
+    keeper = SafetyFilter(ARM.model, ARM.q_min, ARM.q_max, -A_MAX, A_MAX, ARM.tau_max, ARM.dt)
+    return Controller(
+        ARM.robot(),
+        ARM.tau_max,
+        GAINS,
+        safety_filter=keeper if filtered else None,
+        **arguments,
+    )
+
+
+def towards_stretched(controller, q=EDGE, v=ZERO, bounds=A_MAX):
+    controller.reset(q)
+    controller.set_posture_goal(STRETCHED)
+    return controller.step(State(q, v), AccelerationRange(-bounds, bounds))
+
+
+def test_a_step_to_where_the_arm_cannot_be_held_is_changed():
+    free, held = towards_stretched(make(False)), towards_stretched(make())
+    assert free.a[SHOULDER] > 1.0
+    assert held.a[SHOULDER] < 0.5 * free.a[SHOULDER]
+    assert held.relaxation is None
+
+
+def test_elsewhere_nothing_is_changed():
+    q = FOLDED
+    outputs = []
+    for filtered in (False, True):
+        controller = make(filtered)
+        controller.reset(q)
+        controller.set_posture_goal(q + 0.1)
+        outputs.append(controller.step(State(q, ZERO), AccelerationRange(-A_MAX, A_MAX)))
+    np.testing.assert_allclose(outputs[0].tau, outputs[1].tau, atol=1e-6)
+
+
+def test_its_torque_is_that_of_the_acceleration_chosen():
+    controller = make()
+    output = towards_stretched(controller)
+    q_mid = EDGE + 0.125 * ARM.dt**2 * output.a
+    robot = ARM.robot(0.0)
+    robot.update(State(q_mid, 0.5 * ARM.dt * output.a), ZERO)
+    np.testing.assert_allclose(output.tau, robot.M @ output.a + robot.h, atol=1e-6)
+
+
+def test_bounds_that_do_not_allow_the_plan_are_widened_for_it():
+    """The plan brakes harder than the acceleration limits where it must."""
+    controller = make()
+    q = ARM.q_start.copy()
+    v = np.zeros(ARM.n)
+    v[6] = 4.0
+    q[6] = ARM.q_max[6] - 0.25  # 32 rad/s^2 are needed
+    tight = AccelerationRange(np.full(ARM.n, -15.0), np.full(ARM.n, 15.0))
+    controller.reset(q)
+    controller.set_posture_goal(q)
+    for _ in range(2):
+        output = controller.step(State(q, v), tight)
+    assert controller.safety_filter.plan[6] < -20.0
+    assert output.a[6] < -20.0
+    assert output.relaxation is None
+
+
+def test_rows_of_the_filter_are_not_told_as_distances():
+    class Impossible:
+        def constraint(self, robot, bounds, disturbance=None):
+            return LinearConstraints(np.eye(robot.n)[:1], np.full(1, 1e3), np.full(1, 1e3))
+
+    output = towards_stretched(make(constraints=[Impossible()]))
+    assert output.constraint_relaxation.shape == (1,)
+    assert output.constraint_relaxation[0] > 100.0
+
+
+def test_without_a_qp_the_arm_brakes_as_the_filter_allows():
+    controller = make()
+    v = np.array([0.1, 0.4, 0.0, 0.0, 0.0, 0.0, 0.0])
+    controller.reset(FOLDED)
+    output = controller.hold(State(FOLDED, v))
+    assert controller.safety_filter.outcomes == {"as wanted": 1}
+    np.testing.assert_allclose(output.a, -GAINS.hold_kd * v)
+    output = controller.hold(State(EDGE, v))
+    assert controller.safety_filter.outcomes.total() == 2
+    assert (np.abs(output.tau) <= ARM.tau_max).all()
+
+
+def test_a_disturbance_that_is_known_counts():
+    """Seen after a few steps in which the arm fell more than it was told to."""
+    loads = []
+    for fall in (0.0, -2.0):
+        controller = make()
+        controller.gains = GAINS.__class__(**{**vars(GAINS), "disturbance_time": 0.0})
+        v = np.zeros(ARM.n)
+        for _ in range(3):
+            output = towards_stretched(controller, ARM.q_start, v)
+            v = v + ARM.dt * output.a
+            v[SHOULDER] += ARM.dt * fall
+            controller.goals.posture = ARM.q_start
+            controller.step(State(ARM.q_start, v), AccelerationRange(-A_MAX, A_MAX))
+        loads.append(controller.safety_filter.rest_torque[SHOULDER])
+    assert abs(loads[1] - loads[0]) > 0.5
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_with_the_plan_the_qp_never_has_to_give_way(seed):
+    rng = np.random.default_rng(seed)
+    controller = make()
+    q, v = ARM.q_start.copy(), ZERO.copy()
+    controller.reset(q)
+    for k in range(300):
+        if k % 60 == 0:
+            controller.set_posture_goal(rng.uniform(ARM.q_min, ARM.q_max))
+        output = controller.step(State(q, v), AccelerationRange(-A_MAX, A_MAX))
+        if controller.safety_filter.slack >= 0.0:
+            assert output.relaxation is None or output.relaxation.max() < 1e-3
+        q, v = q + v * ARM.dt + 0.5 * output.a * ARM.dt**2, v + output.a * ARM.dt
+        v = np.clip(v, -ARM.v_max, ARM.v_max)
+    assert controller.safety_filter.outcomes["as wanted"] > 200
