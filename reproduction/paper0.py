@@ -130,7 +130,7 @@ def figure_3() -> Figure:
 
 def joint_space_run(method: str, factor: float) -> ChainResult:
     """Play Fig. 4: Baxter's first joint, driven 0.1 rad beyond its upper limit."""
-    values = load_values("baxter_left_arm")
+    values = load_values("baxter_left_arm") | {"safety_filter": False}
     n = len(values["joints"])
     first = [2.0] + values["position_max"][1:]
     values |= {
@@ -263,7 +263,7 @@ def figure_5() -> Figure:
         "naive, 20 dt": ("naive", 20.0),
         "b: exact, 2 dt": ("exact", 2.0),
     }
-    values = load_values("baxter_left_arm")
+    values = load_values("baxter_left_arm") | {"safety_filter": False}
     elbow = values["joints"].index("left_e1")
     low, dt = values["position_min"][elbow], 1.0 / values["rate_hz"]
     path = ROOT / "config" / "scenarios" / "baxter_left_arm_demo.yaml"

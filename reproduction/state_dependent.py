@@ -23,7 +23,12 @@ ACROSS = [-1.65, -0.1, -1.0, 2.2, 1.5, 1.0, -1.5]
 FOLDED = [1.65, -1.2, 1.0, 2.55, -1.5, -1.5, 1.5]
 PAUSE = 4.0  # s between goals
 NEAR = 0.01  # rad
-STIFF = {"posture_kp": 400.0, "posture_weight": 1.0, "pose_weight": 0.0}
+STIFF = {
+    "posture_kp": 400.0,
+    "posture_weight": 1.0,
+    "pose_weight": 0.0,
+    "safety_filter": False,  # the limits alone
+}
 
 
 def play(values: dict, goals: list[list[float]], limits: str) -> ChainResult:

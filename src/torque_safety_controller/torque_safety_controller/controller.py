@@ -313,7 +313,7 @@ class Controller:
         tau = self._limiter.limited(tau)
         relaxed = solution.constraint_relaxation
         if relaxed is not None and rows is not None:
-            relaxed = relaxed[: -len(rows.G)]
+            relaxed = relaxed[: -len(rows.G)] if len(relaxed) > len(rows.G) else None
         return ControlOutput(tau, a, True, solution.relaxation, "", relaxed)
 
     def _look_ahead(

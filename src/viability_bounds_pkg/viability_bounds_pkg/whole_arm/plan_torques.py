@@ -35,7 +35,7 @@ class PlanTorques:
         accelerations: rad/s^2.
         tau: torques that are needed, N m.
         loads: largest torque of each joint along the plan, as a share of its limit, shape (n,).
-        busiest: samples at which they are needed, shape (n,).
+        busiest: samples after the first at which most of each is needed, shape (n,).
         beyond: by how far a position limit is passed, less the tolerance, rad; 0 where none is.
     """
 
@@ -131,20 +131,22 @@ def measure(
         extra: shape (n,), N m.
         tau_max: shape (n,), N m.
         loads: largest share of each joint's limit, shape (n,).
-        busiest: its sample, shape (n,).
+        busiest: the sample after the first with the largest torque of each joint, shape (n,).
     """
     count, n = tau.shape
     most = 0.0
     for j in range(n):
         loads[j] = -1.0
-    for k in range(count):
+        busiest[j] = count - 1
+    for k in range(count - 1, -1, -1):
         for j in range(n):
             tau[k, j] += extra[j]
             load = abs(tau[k, j]) / tau_max[j]
             # Written so that a NaN counts as too much.
             if not load <= loads[j]:
                 loads[j] = load
-                busiest[j] = k
+                if k > 0:
+                    busiest[j] = k
     for j in range(n):
         if not loads[j] <= most:
             most = loads[j]

@@ -199,12 +199,12 @@ class SafetyFilter:
         self.rest_torque = plans.tau[rest].copy()
         if self.slack < -RESERVE:
             return None  # nothing to keep: the bounds alone count
-        at_rest = np.abs(self.rest_torque) > NEAR * self._usable
         wanted: dict[int, list[int]] = {}
+        # With fewer samples the largest torque would move to and fro between them.
         for j in np.flatnonzero(plans.loads > NEAR).tolist():
-            wanted.setdefault(int(plans.busiest[j]), []).append(j)
-            if at_rest[j] and plans.busiest[j] != rest:
-                wanted.setdefault(rest, []).append(j)
+            for k in {0, int(plans.busiest[j]), rest}:
+                if abs(plans.tau[k, j]) > NEAR * self._usable[j]:
+                    wanted.setdefault(k, []).append(j)
         return self._rows(wanted) if wanted else None
 
     def _rows(self, wanted: dict[int, list[int]]) -> Rows:
