@@ -12,7 +12,7 @@ usage: bash scripts/demo.sh [robot] [scenario] [--bounds METHOD] [--rate HZ] [--
   scenario     the name in config/scenarios/<robot>_<scenario>.yaml, or the path of a file,
                see docs/scenarios.md (default: demo)
   --bounds     how acceleration limits are computed: exact (default), or naive, which violates the
-               limits, decre, rubrecht, damper
+               limits, decre, rubrecht, damper; these without the safety filter
   --rate       control rate in Hz (default: the robot's own)
   --real-time  by the wall clock; without, in lockstep: the simulation waits for each command, so
                that it is as fast as the machine can, repeatable, and misses no deadline
@@ -104,6 +104,8 @@ overrides=()
 [ -z "$imperfect" ] || overrides+=(--params-file "$imperfect")
 [ -z "$params" ] || overrides+=(--params-file "$params")
 overrides+=(-p "clock:=$clock" -p "bounds_node:method:=$bounds" -p start_paused:=true)
+# What other bounds do is to be seen, not what the filter makes of it.
+[ "$bounds" = exact ] || overrides+=(-p "controller_node:safety_filter:=false")
 [ "$rate" = default ] || overrides+=(-p "rate_hz:=$rate")
 if [ "$clock" = lockstep ]; then
     # The robot waits for the nodes, so long time-outs are safe and a busy machine causes none.
