@@ -92,3 +92,17 @@ def test_an_arm_that_starts_where_it_cannot_be_held_comes_down_slowly():
     assert np.abs(column(samples, "v")[-1]).max() < 0.1
     assert load_at(loop, samples[-1].q)[SHOULDER] < 0.98
     assert beyond(loop)[:2] == (0.0, 0.0)
+
+
+def test_a_goal_behind_what_cannot_be_held_is_reached_by_a_detour():
+    """From one side of the horizontal to the other, the elbow straight at both ends."""
+    loop = DirectLoop("baxter_left_arm", STIFF | {"safety_filter": True})
+    above = np.array([0.0, -1.3, 0.0, 0.0, 0.0, 0.0, 0.0])
+    below = np.array([0.0, 0.9, 0.0, 0.0, 0.0, 0.0, 0.0])
+    loop.robot.reset(above, np.zeros(7))
+    loop.begin()
+    loop.controller.set_posture_goal(below)
+    samples = loop.run(14.0)
+    assert np.abs(samples[-1].q - below).max() < 0.01
+    assert column(samples, "q")[:, 3].max() > 0.3, "the elbow did not bend"
+    assert beyond(loop)[:2] == (0.0, 0.0)

@@ -31,8 +31,10 @@ from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.safety.disturbance_observer import DisturbanceObserver
 from torque_safety_controller.safety.torque_limiter import TorqueLimiter
 from torque_safety_controller.tasks.damping_task import DampingTask
+from torque_safety_controller.tasks.detour import Detour
 from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.goals import Goals
+from torque_safety_controller.tasks.posture_task import PostureTask
 from torque_safety_controller.tasks.task import Task
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.whole_arm.safety_filter import SafetyFilter
@@ -109,6 +111,7 @@ class Controller:
         self._qp = InverseDynamicsQP(n, solver=solver)
         self._observer = DisturbanceObserver(n, gains.disturbance_time)
         self._a_last = np.zeros(n)
+        self._detour = Detour(robot.dt)
         self._no_torque = np.zeros(n)
         free = np.full(n, np.inf)
         self._any_acceleration = AccelerationRange(-free, free)
@@ -138,6 +141,7 @@ class Controller:
             self.interaction.start()
         if self.safety_filter is not None:
             self.safety_filter.reset()
+        self._detour.reset()
 
     def set_pose_goal(
         self,
@@ -263,9 +267,18 @@ class Controller:
         """Return the tasks of a step, and the forces that contacts may exert."""
         gains, interaction = self.gains, self.interaction
         if interaction is None:
-            return self.goals.tasks(gains), None
-        tasks = self.goals.tasks(gains, interaction.stiffness)
+            return self._by_detours(self.goals.tasks(gains)), None
+        tasks = self._by_detours(self.goals.tasks(gains, interaction.stiffness))
         return tasks + interaction.tasks(gains), interaction.forces(self.robot)
+
+    def _by_detours(self, tasks: list[Task]) -> list[Task]:
+        """Return tasks in which one joint goes first where a posture task alone is stuck."""
+        task, keeper = tasks[-1], self.safety_filter
+        if keeper is None or not isinstance(task, PostureTask) or len(tasks) > 1:
+            return tasks
+        robot, load = self.robot, np.abs(keeper.rest_torque) / self.tau_max
+        shares = self._detour.shares(task.q_des, robot.q, robot.v, load, keeper.can_hold)
+        return [replace(task, shares=shares)]
 
     def _solve(
         self,

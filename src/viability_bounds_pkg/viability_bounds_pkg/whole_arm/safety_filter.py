@@ -160,6 +160,15 @@ class SafetyFilter:
         """Forget the plan in hand."""
         self._time, self._begun = USUAL, False
 
+    def can_hold(self, q: Array) -> bool:
+        """Return whether plans may end in a posture: whether it leaves what plans leave.
+
+        Args:
+            q: positions, shape (n,), rad.
+        """
+        needed = np.abs(pin.computeGeneralizedGravity(self._model, self._data, q))
+        return bool((needed <= (1.0 - KEPT) * self._usable).all())
+
     def _warm_up(self) -> None:
         """Compile everything now and not in a control loop."""
         zero = np.zeros_like(self._usable)
