@@ -26,7 +26,11 @@ CONFIG = ROOT / "config"
 NODES = {node.NAME: node for node in (BoundsNode, ControllerNode, BulletNode, ScenarioNode)}
 EXTRA = {
     "bounds_node": {"method": "damper", "bounds_dt_factor": 3},
-    "controller_node": {"pose_kd": 1e-7, "torque_rate_max": [1e3, 1e9, 1e-9, 1.0, 2.0, 3.0, 4.0]},
+    "controller_node": {
+        "pose_kd": 1e-7,
+        "safety_filter": True,
+        "torque_rate_max": [1e3, 1e9, 1e-9, 1.0, 2.0, 3.0, 4.0],
+    },
     "bullet_node": {"start_paused": True},
     "scenario_node": {"ready_timeout": 1e3},
 }

@@ -25,7 +25,11 @@ from torque_safety_controller.qp.constraints import (
     LinearConstraints,
     stack_constraints,
 )
-from torque_safety_controller.qp.inverse_dynamics_qp import ContactForces, InverseDynamicsQP
+from torque_safety_controller.qp.inverse_dynamics_qp import (
+    ContactForces,
+    InverseDynamicsQP,
+    Solution,
+)
 from torque_safety_controller.qp.quadratic_program import NoSolutionFound
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.safety.disturbance_observer import DisturbanceObserver
@@ -292,24 +296,36 @@ class Controller:
         lower, upper = self._limiter.range()
         disturbance = self._observer.known
         rows = self._look_ahead(bounds, additional, disturbance)
+        if self.safety_filter is not None:
+            bounds = AccelerationRange(self.safety_filter.lower, self.safety_filter.upper)
         if disturbance is not None:
             bounds = AccelerationRange(*self._observer.shift(*bounds))
         parts = [each.constraint(robot, bounds, disturbance) for each in self.constraints]
-        if self.safety_filter is not None:
-            # With the plan allowed by bounds, rows and torque limits, the QP has a solution.
-            plan = self.safety_filter.plan
-            if disturbance is not None:
-                plan = plan - disturbance
-            bounds = AccelerationRange(
-                np.minimum(bounds.lower, plan), np.maximum(bounds.upper, plan)
-            )
-            parts.append(rows)
-        constraints = stack_constraints(parts)
         terms = [task.term(robot) for task in tasks]
-        try:
-            solution = qp.solve(
+
+        def solve(bounds: AccelerationRange, rows: LinearConstraints | None) -> Solution:
+            constraints = stack_constraints([*parts, rows])
+            return qp.solve(
                 qp.build(terms, bounds, robot.M, lower - bias, upper - bias, constraints, contacts)
             )
+
+        try:
+            if self.safety_filter is None:
+                solution = solve(bounds, None)
+            else:
+                # With the plan allowed by bounds, rows and torque limits, there is a solution.
+                # Where changes are limited, the bounds may ask for more than the plan does.
+                plan = self.safety_filter.plan
+                if disturbance is not None:
+                    plan = plan - disturbance
+                wider = AccelerationRange(
+                    np.minimum(bounds.lower, plan), np.maximum(bounds.upper, plan)
+                )
+                solution = solve(bounds if self.safety_filter.smooth else wider, rows)
+                if solution.relaxation is not None and self.safety_filter.smooth:
+                    if rows is not None:
+                        rows = rows._replace(upper=np.maximum(rows.upper, rows.G @ plan))
+                    solution = solve(wider, rows)
         except NoSolutionFound as error:
             return self._hold(additional, str(error))
         self.iterations = solution.iterations
@@ -335,11 +351,12 @@ class Controller:
         """Let the filter look; return its constraints on the commanded accelerations."""
         if self.safety_filter is None:
             return None
-        robot = self.robot
+        robot, last = self.robot, self._a_last
         extra = self._no_torque if additional is None else additional
         if disturbance is not None:
             extra = extra - robot.M @ disturbance
-        rows = self.safety_filter.look(robot.q, robot.v, extra, *bounds)
+            last = last + disturbance
+        rows = self.safety_filter.look(robot.q, robot.v, extra, *bounds, last)
         if rows is None:
             return None
         G, upper = rows

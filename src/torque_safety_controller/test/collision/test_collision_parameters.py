@@ -105,8 +105,6 @@ def test_what_an_arm_is_mounted_on_is_left_out_and_said_to_be():
         ({"collision_margin": -0.1}, "collision_margin"),
         ({"collision_margin": 0.6}, "collision_margin"),
         ({"collision_margin": float("nan")}, "collision_margin"),
-        ({"collision_speed_max": 0.0}, "collision_speed_max"),
-        ({"collision_speed_max": float("inf")}, "collision_speed_max"),
         ({"collision_pairs": ["panda_hand"]}, "collision_pairs"),
         ({"collision_posture": [0.0] * 6}, "collision_posture"),
         ({"collision_posture": [9.0] * 7}, "collision_posture"),

@@ -221,7 +221,6 @@ def contact(**changed):
         ({"admittance_kp": []}, "admittance_kp"),
         ({"admittance_speed_max": [0.1]}, "admittance_speed_max"),
         ({"yield_threshold": [0.0, 1.0]}, "yield_threshold"),
-        ({"yield_kp": [-0.1, 1.0]}, "yield_kp"),
         ({"contacts": [contact(frame="moon")]}, "contacts[0].frame"),
         ({"contacts": [contact(), contact(frame="panda_link8")]}, "contacts"),
         ({"contacts": [contact(frame="")]}, "contacts[0].frame"),
@@ -247,15 +246,13 @@ def test_each_parameter_reaches_the_settings():
         admittance_kp=[0.2, 0.03],
         admittance_speed_max=[0.1, 0.4],
         yield_threshold=[3.0, 4.0],
-        yield_kp=[5.0, 6.0],
         force_stiffness=[0.0, 0.1, 0.2, 0.3, 0.4, 1.0],
         ft_filter_hz=9.0,
         ft_timeout=0.5,
     ).interaction
     settings = interaction.settings
-    gains, led = settings.gains, settings.yielding_gains
+    gains = settings.gains
     assert (gains.kp, gains.speed_max) == ((0.2, 0.03), (0.1, 0.4))
-    assert led.kp == (5.0, 6.0)
     assert settings.yield_threshold == (3.0, 4.0)
     np.testing.assert_array_equal(settings.directions, [0, 0, 1, 0, 0, 0])
     np.testing.assert_array_equal(settings.stiffness, [0.0, 0.1, 0.2, 0.3, 0.4, 1.0])

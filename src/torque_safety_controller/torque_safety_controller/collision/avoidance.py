@@ -25,7 +25,7 @@ from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.compiled import bound
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.kernel.one_sided_limit import make_table
-from viability_bounds_pkg.parameter import Range, above, check, number
+from viability_bounds_pkg.parameter import Range, check, number
 
 Array = NDArray[np.float64]
 
@@ -39,6 +39,9 @@ INFLUENCE = 0.08
 ROWS_MAX = 40
 """Rows that a step returns at most; of more, those of the least distances. Only arms deep in
 obstacles have more, and a QP needs an end."""
+
+SPEED_MAX = 1.0
+"""Largest speed of approach, m/s."""
 
 # Of a virtual joint whose braking is 1: more than anything has.
 _FAST, _HARD = 1e6, 1e12
@@ -55,7 +58,6 @@ class CollisionSettings:
     margin: float = number(
         "distance kept between links and to obstacles, m", Range(0.0, 0.5), default=0.02
     )
-    speed_max: float = number("largest speed of approach, m/s", above(0.0, 10.0), default=1.0)
 
     def __post_init__(self) -> None:
         check(self, "collision_")
@@ -120,7 +122,7 @@ class CollisionAvoidance:
                 pairs,
                 self._kinematics.motion,
                 kept=settings.kept,
-                speed_max=float(settings.speed_max),
+                speed_max=SPEED_MAX,
                 influence=settings.margin + INFLUENCE,
                 dt=float(dt),
                 table=table,

@@ -83,6 +83,9 @@ def make_safety_filter(config: ControllerConfiguration, model: pin.Model) -> Saf
         limits.acceleration_max,
         config.torque_max,
         config.dt,
+        config.velocity_max,
+        config.jerk_max,
+        config.torque_rate_max,
     )
 
 

@@ -18,6 +18,7 @@ from torque_safety_controller.safety.modes import CONTROLS
 from torque_safety_controller.tasks.gains import Gains
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import (
+    POSITIVE,
     Range,
     above,
     group,
@@ -47,8 +48,21 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
         additional: settings of the integral action and of the friction compensation.
     """
 
+    velocity_max: Array = joint_numbers(
+        "speed limits, rad/s, for jerk_max and torque_rate_max; none if empty",
+        POSITIVE,
+        if_empty=np.inf,
+    )
     torque_rate_max: Array = joint_numbers(
-        "limits of the rate of torque, N m/s; none if empty", if_empty=np.inf, note="all > 0"
+        "limits of the rate of torque, N m/s; none if empty; with safety_filter",
+        if_empty=np.inf,
+        note="all > 0",
+    )
+    jerk_max: Array = joint_numbers(
+        "limits of the rate of the commanded accelerations, rad/s^3; none if empty; with "
+        "safety_filter",
+        if_empty=np.inf,
+        note="all > 0",
     )
     gains: Gains = group(Gains)
     safety_filter: bool = switch(
@@ -91,8 +105,16 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
     def __post_init__(self) -> None:
         """Check all that does not depend on the URDF, and make the settings."""
         super().__post_init__()
-        if not (self.torque_rate_max > 0).all():
-            raise SettingError("torque_rate_max", self.torque_rate_max, "numbers > 0")
+        for name in ("torque_rate_max", "jerk_max"):
+            rates = getattr(self, name)
+            if not (rates > 0).all():
+                raise SettingError(name, rates, "numbers > 0")
+            if np.isfinite(rates).any() and not self.safety_filter:
+                # The bounds know nothing of rates: near a limit a joint could not stop any more.
+                raise SettingError(name, rates, "empty without safety_filter: true")
+            if np.isfinite(rates).any() and not np.isfinite(self.velocity_max).all():
+                allowed = f"a number for each of 'joints', for {name}"
+                raise SettingError("velocity_max", self.velocity_max, allowed)
         additional = AdditionalSettings(
             self.integral.integral_action,
             self.integral.settings(self.torque_max),

@@ -97,13 +97,6 @@ class InteractionConfiguration:
         default=(),
         live=True,
     )
-    yield_kp: Array = numbers(
-        "acceleration by which the hand yields, m/s^2 per N and rad/s^2 per N m",
-        NOT_NEGATIVE,
-        length=2,
-        default=_DEFAULTS.yielding_gains.kp,
-        live=True,
-    )
     contacts: tuple[str, ...] = texts(
         "points at which the QP may use contact forces, in the axes of the link frame: point, m, "
         "its origin if left out; normal, direction in which the environment pushes; friction, "
@@ -151,7 +144,6 @@ class InteractionConfiguration:
             ),
             closed=tuple(map(frames.index, self.closed_contacts)),
             yield_threshold=threshold,
-            yielding_gains=replace(_DEFAULTS.yielding_gains, kp=tuple(self.yield_kp.tolist())),
         )
 
 

@@ -19,6 +19,7 @@ class Arm:
     """A robot of a parameter file under exact accelerations, each kept for a control period."""
 
     def __init__(self, robot, share=1.0):
+        self.name = robot
         values = read_config(robot, "controller_node")
         self.model = read_robot(config_folder() / f"{robot}.yaml").model
         self.data = self.model.createData()
@@ -33,7 +34,7 @@ class Arm:
         self.solver = BoundsSolver(self.limits, 2.0 * self.dt, 0.05 * braking, period=self.dt)
         self.start = np.array(read_config(robot, "bullet_node")["start_positions"])
 
-    def filter(self):
+    def filter(self, **rates):
         limits = self.limits
         return SafetyFilter(
             self.model,
@@ -43,6 +44,8 @@ class Arm:
             limits.a_max,
             self.tau_max,
             self.dt,
+            limits.v_max,
+            **rates,
         )
 
     def torque(self, q, v, a):
@@ -53,35 +56,49 @@ class Arm:
         h = 0.5 * self.dt
         return self.torque(q + (v + 0.5 * a * h) * h, v + a * h, a)
 
-    def possible(self, q, v, plan, a):
+    def possible(self, q, v, plan, a, tau_last=None, change=np.inf):
         """What the torque limits allow of the way from `plan` to `a`, as the QP would."""
+        least, most = -self.tau_max, self.tau_max
+        if tau_last is not None:
+            least = np.maximum(least, tau_last - change)
+            most = np.minimum(most, tau_last + change)
         share = 1.0
         for _ in range(4):  # the torque in the middle of the step is only nearly linear
             low, high = (
                 self.mid_torque(q, v, plan),
                 self.mid_torque(q, v, plan + share * (a - plan)),
             )
-            room = np.where(high > low, self.tau_max - low, -self.tau_max - low)
+            room = np.where(high > low, most - low, least - low)
             with np.errstate(divide="ignore", invalid="ignore"):
                 more = np.where(high == low, 1.0, room / (high - low)).min()
             share *= float(np.clip(more, 0.0, 1.0))
         return plan + share * (a - plan)
 
-    def play(self, wanted, seconds, filtered=True):
-        """Drive the arm; return the worst of positions, speeds and torques, and the states."""
+    def play(self, wanted, seconds, filtered=True, jerk_max=np.inf, torque_rate_max=np.inf):
+        """Drive the arm; return the worst of positions, speeds and torques, and the states.
+
+        Also the worst of jerks and rates of torques, as shares of their limits.
+        """
         limits, dt = self.limits, self.dt
-        keeper = self.filter()
+        jerk, rate = (np.broadcast_to(each, self.n) for each in (jerk_max, torque_rate_max))
+        keeper = self.filter(jerk_max=jerk, torque_rate_max=rate)
         q, v = self.start.copy(), np.zeros(self.n)
         zero = np.zeros(self.n)
-        worst, states = np.zeros(3), []
+        worst, states = np.zeros(5), []
+        last, tau_last = zero, None
         for k in range(round(seconds / dt)):
             lower, upper, _ = self.solver.bounds(q, v)
-            keeper.look(q, v, zero, lower, upper)
-            a = self.possible(q, v, keeper.plan, np.clip(wanted(k * dt, q, v), lower, upper))
+            keeper.look(q, v, zero, lower, upper, last)
+            a = np.clip(wanted(k * dt, q, v), keeper.lower, keeper.upper)
+            a = self.possible(q, v, keeper.plan, a, tau_last, dt * rate)
             if filtered:
                 a = keeper.choose(a)
-            load = np.abs(self.mid_torque(q, v, a)) / self.tau_max
-            worst[2] = max(worst[2], load.max())
+            tau = self.mid_torque(q, v, a)
+            worst[2] = max(worst[2], (np.abs(tau) / self.tau_max).max())
+            worst[3] = max(worst[3], (np.abs(a - last) / (dt * jerk)).max())
+            if tau_last is not None:
+                worst[4] = max(worst[4], (np.abs(tau - tau_last) / (dt * rate)).max())
+            last, tau_last = a, tau
             q, v = q + (v + 0.5 * a * dt) * dt, v + a * dt
             beyond = np.maximum(q - limits.q_max, limits.q_min - q).max()
             worst[:2] = np.maximum(worst[:2], [beyond, (np.abs(v) - limits.v_max).max()])
@@ -135,6 +152,26 @@ def test_no_limit_is_passed_whatever_is_wanted(arm, seed):
     assert keeper.outcomes["as wanted"] > 0
 
 
+RATES = {
+    "baxter_left_arm": [(100.0, np.inf), (1000.0, 500.0)],
+    "panda": [(500.0, np.inf), (2000.0, 300.0)],
+    "talos_left_arm": [(500.0, np.inf), (2000.0, 1000.0)],
+}
+
+
+@pytest.mark.parametrize("kind", [0, 1], ids=["jerk", "both"])
+@pytest.mark.parametrize("seed", range(2))
+def test_nor_where_rates_are_limited_and_those_are_kept(arm, seed, kind):
+    jerk, rate = RATES[arm.name][kind]
+    worst, states, keeper = arm.play(
+        bang_bang(arm, seed, 0.6), 3.0, jerk_max=jerk, torque_rate_max=rate
+    )
+    assert (worst <= [ROUNDING, ROUNDING, 1.0 + ROUNDING, 1.0 + 1e-6, 1.0 + 1e-6]).all()
+    assert keeper.outcomes["outside"] == 0
+    fast = max(np.abs(v / arm.limits.v_max).max() for _, v in states)
+    assert fast > 0.4  # and it is not kept by standing still
+
+
 def test_no_limit_is_passed_where_the_worst_posture_is_wanted(arm):
     worst, states, keeper = arm.play(heavier(arm), 2.5)
     assert worst[0] <= ROUNDING
@@ -161,7 +198,7 @@ def test_the_plan_in_hand_ends_at_rest_and_can_be_held(arm, seed):
         return adversary(t, q, v) if t < stop else -v / arm.dt
 
     worst, states, _ = arm.play(wanted, stop + 2.0)
-    assert (worst <= [ROUNDING, ROUNDING, 1.0 + ROUNDING]).all()
+    assert (worst[:3] <= [ROUNDING, ROUNDING, 1.0 + ROUNDING]).all()
     q, v = states[-1]
     assert np.abs(v).max() < 1e-6
     held = np.abs(arm.torque(q, np.zeros(arm.n), np.zeros(arm.n)))
@@ -177,11 +214,12 @@ def test_between_its_samples_a_plan_needs_no_more_than_the_reserve(arm):
     most = 0.0
     for index in rng.choice(len(states), 60, replace=False):
         q, v = states[index]
-        slack = keeper._plans.plan(q, v, 0.3, zero)
-        if slack < 0.0:
+        keeper._plans.plan(q, v, zero, 0.3, np.full(arm.n, np.inf), zero)
+        if keeper._plans.slack < 0.0:
             continue
         plans = keeper._plans
-        times, a = plans.times.copy(), -v / plans.times
+        times = arm.dt * plans.course.moving
+        a = -v / times
         for t in np.linspace(0.0, times.max(), 300):
             moved = np.minimum(t, times)
             tau = arm.torque(

@@ -8,9 +8,24 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from viability_bounds_pkg.compiled import compiled
-from viability_bounds_pkg.whole_arm.braking_plan import fill_plan, passed, samples, stop_times
+from viability_bounds_pkg.state import State
+from viability_bounds_pkg.whole_arm.braking_plan import (
+    FIRST,
+    STEP,
+    Counts,
+    Course,
+    JointLimitsOfPlans,
+    copy_course,
+    fill_plan,
+    make_course,
+    new_course,
+    samples,
+)
 
 Array = NDArray[np.float64]
+
+RATE_RESERVE = 0.1
+"""Share of the limits of the torques' rates that plans leave, for what lies between samples."""
 
 
 class PlanTorques:
@@ -20,41 +35,44 @@ class PlanTorques:
 
     Args:
         model: the arm, n joints with one coordinate each.
-        q_min: lowest positions at which plans end, shape (n,), rad.
-        q_max: highest, shape (n,), rad.
-        braking: hardest braking where no position limit asks for more, shape (n,), rad/s^2.
+        limits: what plans keep to.
         tau_max: torque that the plans may use, shape (n,), N m.
+        tau_change: change of torque in a period that they may use, shape (n,), N m; inf for none.
         dt: control period, s.
-        tolerance: by how far a joint may come to stand beyond a position limit, shape (n,), rad.
 
     Attributes:
-        times: when each joint stands, shape (n,), s.
-        clock: times of the samples, s; inf at rest.
+        course: when each joint does what.
+        clock: periods of the samples; -1 for the step that leads to the plan.
         positions: rad.
         velocities: rad/s.
         accelerations: rad/s^2.
         tau: torques that are needed, N m.
         loads: largest torque of each joint along the plan, as a share of its limit, shape (n,).
+        changes: largest change of torque likewise.
         busiest: samples after the first at which most of each is needed, shape (n,).
+        slack: least share that the plan leaves of a torque limit; negative beyond it.
         beyond: by how far a position limit is passed, less the tolerance, rad; 0 where none is.
+        excess: by which share a limit of speed or of the change of acceleration is passed; 0 where
+            none is.
+        hurry: by which share the torques change too fast; 0 where they do not.
     """
 
     def __init__(
         self,
         model: pin.Model,
-        q_min: Array,
-        q_max: Array,
-        braking: Array,
+        limits: JointLimitsOfPlans,
         tau_max: Array,
+        tau_change: Array,
         dt: float,
-        tolerance: Array,
     ) -> None:
         n = model.nv
-        count = samples(n)
-        self._q_min, self._q_max, self._braking = q_min, q_max, braking
-        self._tau_max, self._dt, self._tolerance = tau_max, dt, tolerance
+        rates = bool(np.isfinite(tau_change).any())
+        count = samples(n, rates or bool(np.isfinite(limits.change_max).any()))
+        self._limits, self._tau_max, self._tau_change, self._dt = limits, tau_max, tau_change, dt
         self._pool = pin.ModelPool(model, 1)
-        self.times, self.clock = np.full(n, dt), np.zeros(count)
+        self.course = new_course(n)
+        self.clock = np.zeros(count, dtype=np.int64)
+        self._order = np.zeros(count if rates else 0, dtype=np.int64)
         self.positions, self.velocities, self.accelerations, self.tau = (
             np.zeros((count, n)) for _ in range(4)
         )
@@ -62,92 +80,150 @@ class PlanTorques:
         self._columns = tuple(
             each.T for each in (self.positions, self.velocities, self.accelerations, self.tau)
         )
-        self.loads, self.busiest = np.zeros(n), np.zeros(n, dtype=np.int64)
-        self.beyond = 0.0
+        self.loads, self.changes = np.zeros(n), np.zeros(n)
+        self.busiest = np.zeros(n, dtype=np.int64)
+        self.slack = self.beyond = self.excess = self.hurry = 0.0
 
-    def plan(self, q: Array, v: Array, T: float, extra: Array) -> float:
-        """Make the plan of time `T`; return what `follow` does.
+    def plan(
+        self,
+        q: Array,
+        v: Array,
+        a: Array,
+        T: float,
+        gentle: Array,
+        extra: Array,
+        step: State | None = None,
+    ) -> None:
+        """Make the plan of time `T`, and `follow` it.
 
         Args:
             q: positions at its beginning, shape (n,), rad.
             v: velocities, shape (n,), rad/s.
+            a: accelerations of the period before, shape (n,), rad/s^2.
             T: time of the plan, s.
+            gentle: change of accelerations from period to period, shape (n,), rad/s^2.
             extra: torque that the motors give besides, shape (n,), N m.
+            step: see `follow`.
         """
-        stop_times(
-            q,
-            v,
-            T,
-            self._q_min,
-            self._q_max,
-            self._tolerance,
-            self._braking,
-            self._dt,
-            self.times,
-        )
-        return self.follow(q, v, self.times, extra)
+        make_course(q, v, a, T, gentle, self._limits, self._dt, self.course)
+        self.follow(q, v, a, self.course, extra, step)
 
-    def follow(self, q: Array, v: Array, times: Array, extra: Array) -> float:
-        """Compute the plan of given times; return the least share that it leaves of a limit.
-
-        Negative where a torque limit is passed.
+    def follow(
+        self,
+        q: Array,
+        v: Array,
+        a: Array,
+        course: Course,
+        extra: Array,
+        step: State | None = None,
+    ) -> None:
+        """Compute the plan of a given course, and what it leaves of the limits.
 
         Args:
             q: positions at its beginning, shape (n,), rad.
             v: velocities, shape (n,), rad/s.
-            times: when each joint stands, shape (n,), s.
+            a: accelerations of the period before, shape (n,), rad/s^2.
+            course: when each joint does what.
             extra: torque that the motors give besides, shape (n,), N m.
+            step: state in which that period began; None if the plan begins now.
         """
-        self.times[:] = times
-        self.beyond = passed(q, v, times, self._q_min, self._q_max, self._tolerance)
-        fill_plan(
+        if course is not self.course:
+            copy_course(course, self.course)
+        self.beyond, self.excess = fill_plan(
             q,
             v,
-            times,
+            a,
+            course,
+            self._limits,
+            self._dt,
+            self.clock,
+            self._order,
             self.positions,
             self.velocities,
             self.accelerations,
-            self.clock,
         )
+        if step is not None:
+            self.positions[STEP], self.velocities[STEP] = step
+            self.accelerations[STEP] = a
+        else:
+            for rows in (self.positions, self.velocities, self.accelerations):
+                rows[STEP] = rows[FIRST]
         pin.rneaInParallel(1, self._pool, *self._columns)
-        slack: float = measure(self.tau, extra, self._tau_max, self.loads, self.busiest)
-        return slack
+        self.slack, self.hurry = measure(
+            self.tau,
+            extra,
+            self._tau_max,
+            self._tau_change,
+            self.clock,
+            self._order,
+            self.loads,
+            self.changes,
+            self.busiest,
+        )
 
     @property
     def cost(self) -> float:
-        """How much of the torque limits the plan needs, of all joints together."""
-        squares = self.loads * self.loads
-        return float(squares @ squares)
+        """How much of the limits the plan needs, of all joints together."""
+        loads, changes = self.loads * self.loads, self.changes * self.changes
+        return float(loads @ loads + changes @ changes)
 
 
 @compiled
 def measure(
-    tau: Array, extra: Array, tau_max: Array, loads: Array, busiest: NDArray[np.int64]
-) -> float:
-    """Add `extra` to torques in place, fill in the largest shares; return 1 less the largest.
+    tau: Array,
+    extra: Array,
+    tau_max: Array,
+    tau_change: Array,
+    clock: Counts,
+    order: Counts,
+    loads: Array,
+    changes: Array,
+    busiest: Counts,
+) -> tuple[float, float]:
+    """Add `extra` to torques in place, and compare them with their limits.
 
     Args:
         tau: torques at the samples, shape (k, n), N m.
         extra: shape (n,), N m.
         tau_max: shape (n,), N m.
-        loads: largest share of each joint's limit, shape (n,).
-        busiest: the sample after the first with the largest torque of each joint, shape (n,).
+        tau_change: largest change in a period, shape (n,), N m.
+        clock: periods of the samples, shape (k,).
+        order: of the samples in time, shape (k,).
+        loads: largest share of each joint's limit, shape (n,), filled in.
+        changes: largest share of what may change, shape (n,), filled in.
+        busiest: the sample after the first with the largest torque of each joint, filled in.
+
+    Returns:
+        1 less the largest share of a torque limit; and by which share a change is too large, or 0.
     """
     count, n = tau.shape
-    most = 0.0
+    most = hurry = 0.0
     for j in range(n):
         loads[j] = -1.0
         busiest[j] = count - 1
-    for k in range(count - 1, -1, -1):
+        changes[j] = 0.0
+        tau[STEP, j] += extra[j]
+    for k in range(count - 1, FIRST - 1, -1):
         for j in range(n):
             tau[k, j] += extra[j]
             load = abs(tau[k, j]) / tau_max[j]
             # Written so that a NaN counts as too much.
             if not load <= loads[j]:
                 loads[j] = load
-                if k > 0:
+                if k > FIRST:
                     busiest[j] = k
     for j in range(n):
         if not loads[j] <= most:
             most = loads[j]
-    return 1.0 - most
+        if tau_change[j] == np.inf:
+            continue
+        for i in range(1, count - 1):  # but for the last, the arm at rest
+            before, now = order[i - 1], order[i]
+            if clock[now] > clock[before]:
+                change = abs(tau[now, j] - tau[before, j])
+                change /= tau_change[j] * (clock[now] - clock[before])
+                if not change <= changes[j]:
+                    changes[j] = change
+        if not changes[j] <= hurry:
+            hurry = changes[j]
+    return 1.0 - most, max(hurry - 1.0, 0.0)

@@ -5,7 +5,8 @@ The acceleration limits of the bounds are each joint's own: that all motors toge
 with gravity and the coupling of the joints, is a promise of the parameter file, and where a
 motor is weak it cannot be made. Here it is not needed. One plan is always in hand that brings the
 arm to rest and holds it there, with positions, speeds and torques within their limits all the
-way (`braking_plan`). A step is taken as it is wanted if such a plan is known from where it leads;
+way (`braking_plan`), and the limits of their changes from step to step where
+there are such. A step is taken as it is wanted if such a plan is known from where it leads;
 otherwise it is taken between what is wanted and the plan, as near to what is wanted as a few
 trials find; in the worst case it is the plan's own, after which the rest of the plan is still in
 hand. `docs/whole_arm.md` has the proof and its assumptions.
@@ -14,6 +15,7 @@ hand. `docs/whole_arm.md` has the proof and its assumptions.
 from __future__ import annotations
 
 from collections import Counter
+from math import log
 from typing import NamedTuple
 
 import numpy as np
@@ -21,8 +23,18 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from viability_bounds_pkg.joint_limits import JointLimitsError, joint_array
-from viability_bounds_pkg.whole_arm.braking_plan import sensitivity
-from viability_bounds_pkg.whole_arm.plan_torques import PlanTorques
+from viability_bounds_pkg.state import State
+from viability_bounds_pkg.whole_arm.braking_plan import (
+    FIRST,
+    Course,
+    JointLimitsOfPlans,
+    copy_course,
+    new_course,
+    rest_of,
+    sensitivity,
+    viable_range,
+)
+from viability_bounds_pkg.whole_arm.plan_torques import RATE_RESERVE, PlanTorques
 
 Array = NDArray[np.float64]
 
@@ -65,6 +77,14 @@ CLEARANCE = 3.0
 """Distance of a plan's end from a position limit, in accelerations times period squared: farther
 than the margins of the bounds, which would change a plan that ends nearer."""
 
+GENTLE = 0.5
+"""Share of the limits of the torques' rates that the joints' accelerations use in plans."""
+
+SPARE = 0.005
+"""Share of the limits of speeds and of the accelerations' rates that plans leave where changes are
+limited, because states drift a little while a plan is carried on; what is asked for leaves twice
+as much."""
+
 
 class Rows(NamedTuple):
     """Linear constraints ``G a <= upper`` on the accelerations of a step, |G_i| = 1."""
@@ -75,11 +95,41 @@ class Rows(NamedTuple):
     """Shape (k,), rad/s^2."""
 
 
+class Needs(NamedTuple):
+    """What a plan needs at worst: see `PlanTorques`."""
+
+    slack: float
+    """At most 0."""
+    beyond: float
+    """rad."""
+    excess: float
+    """Share."""
+    hurry: float
+    """Share."""
+
+    @classmethod
+    def of(cls, plan: PlanTorques) -> Needs:
+        """Return what the plan that was looked at last needs."""
+        # Samples move while a plan is carried on; what is between them has the reserve.
+        hurry = min(plan.hurry, 0.5 * RATE_RESERVE)
+        return cls(min(plan.slack, 0.0), plan.beyond, plan.excess, hurry)
+
+    def cover(self, plan: PlanTorques) -> bool:
+        """Return whether a plan needs no more."""
+        return (
+            plan.slack >= self.slack
+            and plan.beyond <= self.beyond
+            and plan.excess <= self.excess
+            and plan.hurry <= self.hurry
+        )
+
+
 class SafetyFilter:
     """Keeps a braking plan of one arm in hand, and changes steps that would lose it.
 
     Call `look` at the beginning of each control step, then `choose` with the accelerations that
-    are wanted: those that the arm is to have, disturbances included.
+    are wanted: those that the arm is to have, disturbances included. Their torques must be within
+    the limits of torques and their rates, as those of the plan are.
 
     Args:
         model: the arm, n joints with one coordinate each.
@@ -90,12 +140,20 @@ class SafetyFilter:
         acceleration_max: upper ones, shape (n,), rad/s^2.
         tau_max: torque limits, shape (n,), N m.
         dt: control period, s.
+        velocity_max: speed limits, shape (n,), rad/s; needed where changes are limited.
+        jerk_max: limits of the accelerations' rates, shape (n,), rad/s^3; inf or None for none.
+        torque_rate_max: limits of the torques' rates, shape (n,), N m/s; inf or None for none.
 
     Attributes:
-        plan: acceleration with which the plan in hand goes on, shape (n,), rad/s^2.
+        plan: acceleration with which the plan in hand goes on, shape (n,), rad/s^2, within the
+            bounds where that is safe.
+        lower: bounds of what may be wanted, shape (n,), rad/s^2: those given to `look`, or
+            narrower where changes are limited.
+        upper: shape (n,), rad/s^2.
         slack: least share of a torque limit that this plan leaves of what it may use; negative
             where it passes a limit.
         rest_torque: what holds the arm where this plan ends, shape (n,), N m.
+        smooth: whether changes are limited.
         outcomes: how many steps were "as wanted", "changed", "planned", the plan's own; and
             "outside", without a plan within the limits.
 
@@ -113,16 +171,23 @@ class SafetyFilter:
         acceleration_max: ArrayLike,
         tau_max: ArrayLike,
         dt: float,
+        velocity_max: ArrayLike | None = None,
+        jerk_max: ArrayLike | None = None,
+        torque_rate_max: ArrayLike | None = None,
     ) -> None:
         n, names = model.nv, tuple(model.names)[1:]
-        q_min, q_max, a_min, a_max, torques = (
-            joint_array(field, values, names)
+        none = np.full(n, np.inf)
+        q_min, q_max, a_min, a_max, torques, v_max, jerks, rates = (
+            joint_array(field, none if values is None else values, names)
             for field, values in (
                 ("position_min", position_min),
                 ("position_max", position_max),
                 ("acceleration_min", acceleration_min),
                 ("acceleration_max", acceleration_max),
                 ("tau_max", tau_max),
+                ("velocity_max", velocity_max),
+                ("jerk_max", jerk_max),
+                ("torque_rate_max", torque_rate_max),
             )
         )
         for field, values, sign in (
@@ -134,23 +199,47 @@ class SafetyFilter:
                 if not (np.isfinite(value) and sign * value > 0.0):
                     allowed = f"must be finite and {'positive' if sign > 0.0 else 'negative'}"
                     raise JointLimitsError(field, name, value, allowed)
-        rates = np.minimum(-a_min, a_max)
+        for field, values in (
+            ("velocity_max", v_max),
+            ("jerk_max", jerks),
+            ("torque_rate_max", rates),
+        ):
+            for name, value in zip(names, values.tolist(), strict=True):
+                if not value > 0.0:
+                    raise JointLimitsError(field, name, value, "must be positive")
+        braking = np.minimum(-a_min, a_max)
         self._a_min, self._a_max = a_min, a_max
         self._usable = (1.0 - RESERVE) * torques
-        clearance = CLEARANCE * dt * dt * rates
-        self._plans = PlanTorques(
-            model, q_min + clearance, q_max - clearance, rates, self._usable, dt, clearance
+        clearance = CLEARANCE * dt * dt * braking
+        self._limits = JointLimitsOfPlans(
+            q_min + clearance,
+            q_max - clearance,
+            clearance,
+            (1.0 - SPARE) * v_max,
+            braking,
+            dt * jerks,
         )
+        self._narrower = self._limits._replace(v_max=(1.0 - SPARE) * v_max)
+        allowed_change = (1.0 - RATE_RESERVE) * dt * rates
+        self._plans = PlanTorques(model, self._limits, self._usable, allowed_change, dt)
+        self.smooth = bool(np.isfinite(jerks).any() or np.isfinite(rates).any())
         self._dt = dt
         self._model, self._data = model, model.createData()
         self._time = USUAL  # T of the plan in hand
-        self._times: Array = np.full(n, dt)  # when each joint stands in it, from now on
+        self._tau_change = dt * rates
+        self._gentle: Array = none
+        self._course, self._rest = new_course(n), new_course(n)
         self._begun = False
         self._turn = 0
-        self._q = self._v = self._extra = np.zeros(n)
+        self._state = State(np.zeros(n), np.zeros(n))
+        self._extra = np.zeros(n)
+        self._last: Array = np.zeros(n)
         self._gradient = np.zeros((n, n))
-        self._beyond = 0.0
+        self._own: Array = np.zeros(n)  # the acceleration of the plan in hand, whatever the bounds
+        self._now = Needs(0.0, 0.0, 0.0, 0.0)
         self.plan: Array = np.zeros(n)
+        self.lower: Array = np.zeros(n)
+        self.upper: Array = np.zeros(n)
         self.rest_torque: Array = np.zeros(n)
         self.slack = 0.0
         self.outcomes: Counter[str] = Counter()
@@ -173,12 +262,21 @@ class SafetyFilter:
         """Compile everything now and not in a control loop."""
         zero = np.zeros_like(self._usable)
         self.look(zero, zero, zero, zero - 1.0, zero + 1.0)
-        self._rows({0: [0]})
+        self._narrow(zero - 1.0, zero + 1.0)
+        self._rows({FIRST: [0]})
         self.choose(zero)
         self.reset()
         self.outcomes.clear()
 
-    def look(self, q: Array, v: Array, extra: Array, lower: Array, upper: Array) -> Rows | None:
+    def look(
+        self,
+        q: Array,
+        v: Array,
+        extra: Array,
+        lower: Array,
+        upper: Array,
+        last: Array | None = None,
+    ) -> Rows | None:
         """Look at the state in which a step begins; return what its accelerations must keep to.
 
         To first order, and approaching limits with `APPROACH`; None where all are far, or no
@@ -190,31 +288,72 @@ class SafetyFilter:
             extra: torque that the motors give besides that of the model, shape (n,), N m.
             lower: bounds of the joints' accelerations, which keep their own limits, rad/s^2.
             upper: shape (n,), rad/s^2.
+            last: acceleration of the step before, shape (n,), rad/s^2; None after a rest.
         """
-        self._q, self._v, self._extra = q, v, extra
+        self._state, self._extra = State(q, v), extra
+        self._last = np.zeros_like(q) if last is None else last
         plans = self._plans
+        if self.smooth:
+            self._gentle = self._gentle_changes(q)
         if self._begun:
-            self.slack = plans.follow(q, v, self._times, extra)
+            plans.follow(q, v, self._last, self._course, extra)
         else:
-            self.slack = plans.plan(q, v, self._time, extra)
-            self._times, self._begun = plans.times.copy(), True
-        self._beyond = plans.beyond
-        # The bounds have margins for errors within a step, which the plan has not. Acceleration
-        # limits are none to the plan: its torques are known.
-        low = np.where(lower <= self._a_min, -np.inf, lower)
-        high = np.where(upper >= self._a_max, np.inf, upper)
-        self.plan = np.minimum(np.maximum(-v / plans.times, low), high)
-        rest = len(plans.clock) - 1
-        self.rest_torque = plans.tau[rest].copy()
+            plans.plan(q, v, self._last, self._time, self._gentle, extra)
+            self._keep(self._time)
+            self._begun = True
+        rest_of(self._course, self._rest)
+        self.slack = plans.slack
+        self._now = Needs.of(plans)
+        self.plan = self._own = plans.accelerations[FIRST].copy()
+        self.rest_torque = plans.tau[-1].copy()
+        self.lower, self.upper = lower, upper
+        if self.smooth:
+            self._narrow(lower, upper)
+        else:
+            # The bounds have margins for errors within a step, which the plan has not.
+            # Acceleration limits are none to the plan: its torques are known.
+            low = np.where(lower <= self._a_min, -np.inf, lower)
+            high = np.where(upper >= self._a_max, np.inf, upper)
+            self.plan = np.minimum(np.maximum(self._own, low), high)
         if self.slack < -RESERVE:
             return None  # nothing to keep: the bounds alone count
         wanted: dict[int, list[int]] = {}
         # With fewer samples the largest torque would move to and fro between them.
         for j in np.flatnonzero(plans.loads > NEAR).tolist():
-            for k in {0, int(plans.busiest[j]), rest}:
+            for k in {FIRST, int(plans.busiest[j]), len(plans.clock) - 1}:
                 if abs(plans.tau[k, j]) > NEAR * self._usable[j]:
                     wanted.setdefault(k, []).append(j)
         return self._rows(wanted) if wanted else None
+
+    def _narrow(self, lower: Array, upper: Array) -> None:
+        """Narrow the bounds to what each joint by itself can stop from again."""
+        self.lower, self.upper = lower.copy(), upper.copy()
+        viable_range(
+            *self._state,
+            self.plan,
+            self._last,
+            self._time,
+            self._gentle,
+            self._narrower,
+            self._dt,
+            self.lower,
+            self.upper,
+        )
+
+    def _gentle_changes(self, q: Array) -> Array:
+        """Return changes of acceleration that the limits of torques' rates allow, rad/s^2.
+
+        In proportion to how hard the joints brake, and small enough that all joints may change
+        at once, whatever their signs. What else changes torques has the rest of the limits.
+
+        Args:
+            q: positions, shape (n,), rad.
+        """
+        M = pin.crba(self._model, self._data, q)
+        inertia = np.abs(np.triu(M) + np.triu(M, 1).T)
+        braking = self._limits.braking
+        share = GENTLE * float((self._tau_change / (inertia @ braking)).min())
+        return np.minimum((1.0 - SPARE) * self._limits.change_max, share * braking)
 
     def _rows(self, wanted: dict[int, list[int]]) -> Rows:
         """Return the rows of joints at samples."""
@@ -229,7 +368,7 @@ class SafetyFilter:
                 plans.velocities[k],
                 plans.accelerations[k],
             )
-            sensitivity(self._dt, plans.times, plans.clock[k], by_q, by_v, M, gradient)
+            sensitivity(self._dt, plans.course, plans.clock[k], by_q, by_v, M, gradient)
             for j in joints:
                 tau = plans.tau[k, j]
                 row = gradient[j] if tau > 0.0 else -gradient[j]
@@ -247,67 +386,70 @@ class SafetyFilter:
         """
         self._turn = (self._turn + 1) % len(FACTORS)
         other = self._time * FACTORS[self._turn]
-        rest = np.maximum(self._times - self._dt, self._dt)
-        if self._take(a, rest, other):
+        if self._take(a, other):
             self.outcomes["as wanted"] += 1
             return a
         if self.slack < -LOST and np.isfinite(a).all():
             self.outcomes["outside"] += 1
             self._begun = False
             return a
+        plan = self.plan if self._safe(self.plan, self._rest) else self._own
         low, high = 0.0, 1.0
         for _ in range(HALVINGS):
             share = 0.5 * (low + high)
-            if self._safe(self.plan + share * (a - self.plan), rest):
+            if self._safe(plan + share * (a - plan), self._rest):
                 low = share
             else:
                 high = share
         self.outcomes["changed" if low > 0.0 else "planned"] += 1
-        chosen = self.plan + low * (a - self.plan) if low > 0.0 else self.plan
+        chosen = plan + low * (a - plan) if low > 0.0 else plan
         # The rest of the plan is safe. At rest it would end in plans too short to begin from.
         time = max(self._time - self._dt, self._dt)
-        if not self._take(chosen, rest, max(time, other)):
-            self._time, self._times = time, rest
+        if not self._take(chosen, max(time, other)):
+            self._time = time
+            copy_course(self._rest, self._course)
         return chosen
 
-    def _take(self, a: Array, rest: Array, other: float) -> bool:
+    def _keep(self, T: float) -> None:
+        """Keep the plan that was looked at last."""
+        self._time = T
+        copy_course(self._plans.course, self._course)
+
+    def _take(self, a: Array, other: float) -> bool:
         """Take the plan after `a` that needs least, of those that are safe; False without one.
 
         Args:
             a: acceleration of the step, shape (n,), rad/s^2.
-            rest: what is left of the times of the plan in hand, shape (n,), s.
-            other: time of a plan to try besides that of the plan in hand, s.
+            other: time of a plan to try besides that of the plan in hand and its rest, s.
         """
-        best, time, times = np.inf, self._time, None
-        for T, given in (
-            (self._time, None),
+        best, now, taken = np.inf, self._time, False
+        for T, course in (
+            (now, None),
             (other, None),
-            (max(self._time - self._dt, self._dt), rest),
+            (max(now - self._dt, self._dt), self._rest),
         ):
-            if self._dt <= T <= LONGEST and self._safe(a, T if given is None else given):
-                cost = self._plans.cost + PULL * np.log(T / USUAL) ** 2
-                if self._time != T:
+            if self._dt <= T <= LONGEST and self._safe(a, course or T):
+                cost = self._plans.cost + PULL * log(T / USUAL) ** 2
+                if now != T:
                     cost *= 1.0 + RELUCTANCE
                 if cost < best:
-                    best, time, times = cost, T, self._plans.times.copy()
-        if times is None:
-            return False
-        self._time, self._times = time, times
-        return True
+                    best, taken = cost, True
+                    self._keep(T)
+        return taken
 
-    def _safe(self, a: Array, plan: float | Array) -> bool:
+    def _safe(self, a: Array, plan: float | Course) -> bool:
         """Return whether a plan after a step is within the limits.
 
         Where the plan in hand is not, because of a disturbance, it must not be worse.
 
         Args:
             a: acceleration of the step, shape (n,), rad/s^2.
-            plan: its time T, or when each joint stands, shape (n,), s.
+            plan: its time, s, or its course.
         """
-        dt, v, plans = self._dt, self._v, self._plans
-        after = self._q + dt * v + 0.5 * dt * dt * a, v + dt * a
+        plans, begin = self._plans, self._state
+        q, v = begin.after(a, self._dt)
         if isinstance(plan, float):
-            slack = plans.plan(*after, plan, self._extra)
+            plans.plan(q, v, a, plan, self._gentle, self._extra, begin)
         else:
-            slack = plans.follow(*after, plan, self._extra)
-        return slack >= min(0.0, self.slack) and plans.beyond <= self._beyond
+            plans.follow(q, v, a, plan, self._extra, begin)
+        return self._now.cover(plans)
