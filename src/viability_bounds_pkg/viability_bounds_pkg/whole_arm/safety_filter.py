@@ -430,8 +430,8 @@ class SafetyFilter:
         ):
             if self._dt <= T <= LONGEST and self._safe(a, course or T):
                 cost = self._plans.cost + PULL * log(T / USUAL) ** 2
-                if now != T:
-                    cost *= 1.0 + RELUCTANCE
+                if now != T and abs(log(T / USUAL)) >= abs(log(now / USUAL)):
+                    cost *= 1.0 + RELUCTANCE  # not back to usual: at rest nothing else leads there
                 if cost < best:
                     best, taken = cost, True
                     self._keep(T)
