@@ -11,6 +11,8 @@ STIFF = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_w
 SHOULDER = 1
 STRETCHED = np.array([0.0, -0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
 """Where Baxter's shoulder needs more than it has."""
+AT_LIMITS = np.array([1.7, -2.146, -3.051, 2.613, -2.671, -0.831, 3.054])
+"""Baxter with five joints at their limits."""
 
 
 def load_at(loop, q):
@@ -106,3 +108,39 @@ def test_a_goal_behind_what_cannot_be_held_is_reached_by_a_detour():
     assert np.abs(samples[-1].q - below).max() < 0.01
     assert column(samples, "q")[:, 3].max() > 0.3, "the elbow did not bend"
     assert beyond(loop)[:2] == (0.0, 0.0)
+
+
+def test_a_pose_behind_limits_of_joints_is_reached_by_a_detour():
+    """Where five joints of the goal's posture are at limits, limits are in the way."""
+    errors = []
+    for led in (False, True):
+        loop = DirectLoop(
+            "baxter_left_arm", {"pose_kp": 100.0, "pose_kd": 20.0, "safety_filter": True}
+        )
+        if not led:
+            loop.controller.detour = None
+        data = loop.model.createData()
+        pin.framesForwardKinematics(loop.model, data, AT_LIMITS)
+        frame = loop.model.getFrameId(loop.controller.robot.frame)
+        loop.controller.set_pose_goal(data.oMf[frame].copy())
+        errors.append(np.linalg.norm(loop.run(10.0)[-1].error))
+        assert beyond(loop)[:2] == (0.0, 0.0)
+    assert errors[0] > 0.05
+    assert errors[1] < 1e-3
+
+
+def test_motions_that_need_no_detour_are_bit_for_bit_what_they_are_without():
+    samples = []
+    for led in (False, True):
+        loop = DirectLoop("baxter_left_arm", STIFF | {"safety_filter": True})
+        if not led:
+            loop.controller.detour = None
+        loop.controller.set_posture_goal(loop.robot.state().q + 0.4)
+        samples.append(loop.run(3.0))
+    for name in ("q", "v", "tau"):
+        np.testing.assert_array_equal(column(samples[0], name), column(samples[1], name))
+
+
+def test_without_the_filter_there_are_no_detours():
+    loop = DirectLoop("baxter_left_arm", {"safety_filter": False})
+    assert loop.controller.detour is None

@@ -38,7 +38,6 @@ from torque_safety_controller.tasks.damping_task import DampingTask
 from torque_safety_controller.tasks.detour import Detour
 from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.goals import Goals
-from torque_safety_controller.tasks.posture_task import PostureTask
 from torque_safety_controller.tasks.task import Task
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.whole_arm.safety_filter import SafetyFilter
@@ -83,10 +82,11 @@ class Controller:
         constraints: on the accelerations, besides bounds and torque limits.
         interaction: forces at the hand and other contacts; None for nothing.
         safety_filter: keeps a plan in hand that keeps all limits; None for nothing.
+        detour: leads the arm where it would stand short of its goal; None for nothing.
 
     Attributes:
         goals: of the end effector and the joints.
-        additional, constraints, interaction, safety_filter: as given.
+        additional, constraints, interaction, safety_filter, detour: as given.
         iterations: of the last QP.
     """
 
@@ -101,6 +101,7 @@ class Controller:
         constraints: Sequence[Constraint] = (),
         interaction: Interaction | None = None,
         safety_filter: SafetyFilter | None = None,
+        detour: Detour | None = None,
     ) -> None:
         n = robot.n
         self.robot = robot
@@ -110,12 +111,12 @@ class Controller:
         self.constraints = constraints
         self.interaction = interaction
         self.safety_filter = safety_filter
+        self.detour = detour
         self.iterations = 0
         self._limiter = TorqueLimiter(tau_max, torque_rate_max, robot.dt)
         self._qp = InverseDynamicsQP(n, solver=solver)
         self._observer = DisturbanceObserver(n, gains.disturbance_time)
         self._a_last = np.zeros(n)
-        self._detour = Detour(robot.dt)
         self._no_torque = np.zeros(n)
         free = np.full(n, np.inf)
         self._any_acceleration = AccelerationRange(-free, free)
@@ -145,7 +146,8 @@ class Controller:
             self.interaction.start()
         if self.safety_filter is not None:
             self.safety_filter.reset()
-        self._detour.reset()
+        if self.detour is not None:
+            self.detour.reset()
 
     def set_pose_goal(
         self,
@@ -271,18 +273,18 @@ class Controller:
         """Return the tasks of a step, and the forces that contacts may exert."""
         gains, interaction = self.gains, self.interaction
         if interaction is None:
-            return self._by_detours(self.goals.tasks(gains)), None
-        tasks = self._by_detours(self.goals.tasks(gains, interaction.stiffness))
-        return tasks + interaction.tasks(gains), interaction.forces(self.robot)
+            return self._by_detour(self.goals.tasks(gains)), None
+        tasks, forced = self.goals.tasks(gains, interaction.stiffness), interaction.tasks(gains)
+        forces = interaction.forces(self.robot)
+        if forced or forces is not None:
+            if self.detour is not None:
+                self.detour.reset()
+            return tasks + forced, forces
+        return self._by_detour(tasks), None
 
-    def _by_detours(self, tasks: list[Task]) -> list[Task]:
-        """Return tasks in which one joint goes first where a posture task alone is stuck."""
-        task, keeper = tasks[-1], self.safety_filter
-        if keeper is None or not isinstance(task, PostureTask) or len(tasks) > 1:
-            return tasks
-        robot, load = self.robot, np.abs(keeper.rest_torque) / self.tau_max
-        shares = self._detour.shares(task.q_des, robot.q, robot.v, load, keeper.can_hold)
-        return [replace(task, shares=shares)]
+    def _by_detour(self, tasks: list[Task]) -> list[Task]:
+        """Return the tasks that lead the arm where those of its goals would leave it standing."""
+        return tasks if self.detour is None else self.detour.tasks(tasks, self.robot)
 
     def _solve(
         self,

@@ -1,80 +1,180 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When a detour begins and ends, and which joint goes first."""
+"""When an arm is led, where to, and when that ends."""
 
 import numpy as np
+import pinocchio as pin
 import pytest
+from arms import load_arm
 
-from torque_safety_controller.tasks.detour import LONGEST, OTHERS, PATIENCE, Detour
+from torque_safety_controller.tasks.detour import (
+    ATTEMPTS,
+    FARTHEST,
+    PATIENCE,
+    WORK,
+    Detour,
+    Progress,
+)
+from torque_safety_controller.tasks.detour_search import DetourSearch
+from torque_safety_controller.tasks.pose_task import PoseTask
+from torque_safety_controller.tasks.posture_search import COST
 from torque_safety_controller.tasks.posture_task import PostureTask
+from viability_bounds_pkg.state import State
+from viability_bounds_pkg.testing.ros_harness import read_config
+from viability_bounds_pkg.whole_arm.safety_filter import SafetyFilter
 
-DT = 0.01
-GOAL = np.array([1.0, 1.0, 1.0])
-HERE = np.array([0.0, 0.5, 1.0])
-REST = np.zeros(3)
-LOAD = np.array([0.2, 0.95, 0.3])
-PATIENT = round(PATIENCE / DT)
-
-
-def stand(detour, steps, q=HERE, v=REST, load=LOAD, goal=GOAL, held=True):
-    for _ in range(steps):
-        shares = detour.shares(goal, q, v, load, lambda q: held)
-    return shares
-
-
-def test_the_joint_that_holds_most_goes_first_after_a_while():
-    detour = Detour(DT)
-    assert stand(detour, PATIENT) is None
-    np.testing.assert_array_equal(stand(detour, 2), [OTHERS, 1.0, OTHERS])
-    assert detour.joint == 1
+ARM = load_arm("baxter_left_arm")
+A_MAX = np.array(read_config("baxter_left_arm", "controller_node")["acceleration_max"])
+REST = np.zeros(ARM.n)
+KP, KD = 100.0, 20.0
+EDGE = np.array([0.0, -0.64, 0.0, 0.0, 0.0, 0.0, 0.0])
+"""Where Baxter's shoulder, the elbow straight, needs 96% of its torque."""
+BELOW = np.array([0.0, 0.9, 0.0, 0.0, 0.0, 0.0, 0.0])
+"""On the other side of what it cannot hold."""
+STRETCHED = np.array([0.0, -0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
+PATIENT = round(PATIENCE / ARM.dt)
 
 
-def test_the_joint_that_is_farthest_off_where_that_one_has_arrived():
-    detour = Detour(DT)
-    stand(detour, PATIENT + 2, q=np.array([0.0, 1.0, 0.9]))
-    assert detour.joint == 0
+class Arm:
+    """An arm that is where it is put, and its detour."""
+
+    def __init__(self, goal=BELOW, pose=None):
+        self.keeper = SafetyFilter(
+            ARM.model, ARM.q_min, ARM.q_max, -A_MAX, A_MAX, ARM.tau_max, ARM.dt
+        )
+        self.asked = 0
+        self.robot = ARM.robot()
+        search = DetourSearch(self.robot, ARM.q_min, ARM.q_max, ARM.tau_max, self.can_hold)
+        self.detour = Detour(search, ARM.dt)
+        self.given = [PostureTask(goal, KP, KD, 1.0)]
+        if pose is not None:
+            self.given = [PoseTask(pose, KP, KD, 1.0), PostureTask(goal, 10.0, 6.0, 1e-3, True)]
+
+    def can_hold(self, q):
+        self.asked += 1
+        return self.keeper.can_hold(q)
+
+    def step(self, q=EDGE, v=REST, a_last=REST):
+        self.robot.update(State(q, v), a_last)
+        return self.detour.tasks(self.given, self.robot)
+
+    def stand(self, steps, **state):
+        for _ in range(steps):
+            tasks = self.step(**state)
+        return tasks
+
+    def wait_for(self, progress, q=EDGE):
+        for _ in range(3000):
+            tasks = self.step(q)
+            if self.detour.progress is progress:
+                return tasks
+        raise AssertionError(f"{self.detour.progress}, not {progress}")
+
+    def follow(self, q=EDGE):
+        """Be where the arm is led, until it is there; return the postures."""
+        passed = []
+        for _ in range(3000):
+            tasks = self.step(q)
+            if self.detour.progress is not Progress.LED:
+                return passed, tasks
+            assert len(tasks) == 1
+            step = np.clip(tasks[0].q_des - q, -0.02, 0.02)
+            q = q + step
+            passed.append(q)
+        raise AssertionError("the way has no end")
+
+
+def test_an_arm_that_stands_is_led_where_it_can_be_held():
+    arm = Arm()
+    assert arm.stand(PATIENT) is arm.given
+    assert arm.detour.progress is Progress.NONE
+    arm.wait_for(Progress.LED)
+    passed, tasks = arm.follow()
+    assert tasks is arm.given
+    np.testing.assert_allclose(passed[-1], BELOW, atol=0.03)
+    assert np.max(passed, axis=0)[3] > 0.3, "the elbow did not bend"
+    assert all(arm.keeper.can_hold(q) for q in passed[15:])
+
+
+def test_for_a_pose_it_is_led_to_a_posture_that_is_then_kept():
+    data = ARM.model.createData()
+    pin.framesForwardKinematics(ARM.model, data, BELOW)
+    pose = data.oMf[ARM.model.getFrameId(ARM.frame)].copy()
+    arm = Arm(ARM.q_start, pose)
+    arm.wait_for(Progress.LED)
+    passed, tasks = arm.follow()
+    assert tasks[0] is arm.given[0]
+    q = tasks[1].q_des
+    pin.framesForwardKinematics(ARM.model, data, q)
+    error = pin.log6(data.oMf[ARM.model.getFrameId(ARM.frame)].actInv(pose)).vector
+    assert np.abs(error).max() < 1e-4  # m, rad
+    np.testing.assert_allclose(passed[-1], q, atol=0.03)
+    assert tasks[1].in_null_space
+    assert arm.keeper.can_hold(q)
 
 
 @pytest.mark.parametrize(
-    "other",
+    "state",
     [
-        {"v": np.array([0.0, 0.0, 0.1])},
-        {"q": GOAL - 0.01},
-        {"load": 0.5 * LOAD},
-        {"held": False},
+        {"v": np.full(ARM.n, 0.1)},
+        {"q": BELOW + 0.01},
+        {"a_last": 0.5 * KP * (BELOW - EDGE)},  # somebody holds it: the QP would let it go on
     ],
 )
-def test_there_is_none_while_the_arm_moves_or_has_arrived_or_may_go_on(other):
-    detour = Detour(DT)
-    assert stand(detour, 10 * PATIENT, **other) is None
+def test_it_is_not_led_while_it_moves_or_is_there_or_is_held(state):
+    arm = Arm()
+    assert arm.stand(20 * PATIENT, **state) is arm.given
+    assert arm.detour.progress is Progress.NONE
 
 
-def test_it_has_to_stand_without_a_break():
-    detour = Detour(DT)
-    stand(detour, PATIENT)
-    stand(detour, 1, v=np.array([0.0, 0.0, 0.1]))
-    assert stand(detour, PATIENT) is None
+def test_without_stiffness_it_is_not_led():
+    arm = Arm()
+    arm.given[0].kp = 0.0
+    assert arm.stand(20 * PATIENT) is arm.given
 
 
-def test_it_ends_when_the_joint_arrives_or_takes_too_long_or_the_goal_changes():
-    for steps, other in (
-        (1, {"q": np.array([0.0, 0.99, 1.0])}),
-        (round(LONGEST / DT) + 2, {}),
-        (1, {"goal": GOAL.copy()}),
-    ):
-        detour = Detour(DT)
-        stand(detour, PATIENT + 2)
-        assert detour.joint == 1
-        assert stand(detour, steps, **other) is None
-        assert detour.joint is None
+def test_a_goal_that_cannot_be_held_is_told_and_not_searched_for():
+    arm = Arm(STRETCHED)
+    assert arm.stand(2 * PATIENT) is arm.given
+    assert arm.detour.progress is Progress.NOT_HELD
+    assert arm.detour.load.argmax() == 1
+    assert arm.detour.load[1] * ARM.tau_max[1] > 50.0  # N m
+    asked = arm.asked
+    arm.stand(10)
+    assert arm.asked == asked
 
 
-def test_shares_weigh_the_errors_of_a_posture_task():
-    class Robot:
-        q, v = HERE, REST
+def test_a_step_does_no_more_work_than_it_may():
+    arm = Arm()
+    arm.stand(PATIENT + 1)
+    most = []
+    while arm.detour.progress is not Progress.LED:
+        before = arm.asked
+        arm.step()
+        most.append(arm.asked - before)
+    assert len(most) > 3
+    assert max(most) <= WORK * ARM.dt + COST
 
-    shares = np.array([0.5, 1.0, 0.1])
-    A, b, weight = PostureTask(GOAL, 10.0, 2.0, 3.0, shares=shares).term(Robot)
-    a = np.array([1.0, -2.0, 3.0])
-    expected = shares * (a - 10.0 * (GOAL - HERE))
-    np.testing.assert_allclose(A @ a - b, expected)
-    assert weight == 3.0
+
+def test_another_goal_is_begun_with_and_the_same_one_is_not():
+    arm = Arm()
+    arm.wait_for(Progress.LED)
+    arm.given = [PostureTask(BELOW.copy(), KP, KD, 1.0)]
+    assert arm.step() is not arm.given
+    arm.given = [PostureTask(BELOW + 0.01, KP, KD, 1.0)]
+    assert arm.step() is arm.given
+    assert arm.detour.progress is Progress.NONE
+
+
+def test_other_ways_are_tried_where_the_arm_does_not_follow_and_then_no_more():
+    arm = Arm()
+    arm.wait_for(Progress.LED)
+    led, before = 1, Progress.LED
+    for _ in range(3000):
+        arm.step()
+        led += arm.detour.progress is Progress.LED is not before
+        before = arm.detour.progress
+        if before is Progress.NO_WAY:
+            break
+        assert np.abs(arm.detour.lead - EDGE).max() <= FARTHEST
+    assert led == ATTEMPTS
+    assert arm.stand(100) is arm.given

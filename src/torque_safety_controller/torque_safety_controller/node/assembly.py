@@ -20,11 +20,13 @@ from torque_safety_controller.controller import Controller
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parameters.interaction_parameters import ContactPoint
 from torque_safety_controller.robot_model import RobotModel
+from torque_safety_controller.tasks.detour import Detour
+from torque_safety_controller.tasks.detour_search import DetourSearch
 from viability_bounds_pkg.exceptions import SettingError, did_you_mean
 from viability_bounds_pkg.robot_configuration import load_model
 from viability_bounds_pkg.robot_description import RobotDescriptionError, inertia_beyond
 from viability_bounds_pkg.ros.robot_urdf import robot_urdf, warn_of_unusual
-from viability_bounds_pkg.whole_arm.safety_filter import SafetyFilter
+from viability_bounds_pkg.whole_arm.safety_filter import CLEARANCE, SafetyFilter
 
 if TYPE_CHECKING:
     from rclpy.node import Node
@@ -50,6 +52,7 @@ def make_controller(
     """
     robot, base, urdf = load_robot(config, node)
     collision = load_collision(config, urdf, robot.model)
+    safety_filter = make_safety_filter(config, robot.model)
     controller = Controller(
         robot,
         config.torque_max,
@@ -59,7 +62,8 @@ def make_controller(
         config.qp_solver,
         [] if collision is None else [collision],
         make_interaction(config, robot, urdf),
-        make_safety_filter(config, robot.model),
+        safety_filter,
+        None if safety_filter is None else make_detour(config, robot, safety_filter),
     )
     controller.warm_up()
     return controller, base
@@ -87,6 +91,29 @@ def make_safety_filter(config: ControllerConfiguration, model: pin.Model) -> Saf
         config.jerk_max,
         config.torque_rate_max,
     )
+
+
+def make_detour(
+    config: ControllerConfiguration, robot: RobotModel, safety_filter: SafetyFilter
+) -> Detour:
+    """Return what leads the arm where it would stand short of its goal.
+
+    Args:
+        config: checked parameters.
+        robot: model of the arm.
+        safety_filter: knows what can be held.
+    """
+    limits = config.collision
+    rates = np.minimum(-limits.acceleration_min, limits.acceleration_max)
+    clearance = CLEARANCE * config.dt**2 * rates
+    search = DetourSearch(
+        robot,
+        config.position_min + clearance,
+        config.position_max - clearance,
+        config.torque_max,
+        safety_filter.can_hold,
+    )
+    return Detour(search, config.dt)
 
 
 def configure(controller: Controller, config: ControllerConfiguration) -> None:

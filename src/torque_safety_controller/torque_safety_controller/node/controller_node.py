@@ -17,7 +17,12 @@ from trajectory_msgs.msg import JointTrajectory
 from torque_safety_controller.controller import ControlOutput
 from torque_safety_controller.node.assembly import configure, make_controller
 from torque_safety_controller.node.collision_report import CollisionReport
-from torque_safety_controller.node.controller_report import LEVELS, StepRecord, too_weak
+from torque_safety_controller.node.controller_report import (
+    LEVELS,
+    StepRecord,
+    about_detour,
+    too_weak,
+)
 from torque_safety_controller.node.gain_watch import GainWatch
 from torque_safety_controller.node.goals import GoalSubscriber
 from torque_safety_controller.node.joint_commands import JointCommands
@@ -377,6 +382,9 @@ class ControllerNode(ArmNode):
         weak = weak and f"the arm cannot be held where it would come to rest: {weak}"
         for trouble in filter(None, (self._collision.too_near, self._wrenches.trouble, weak)):
             level, text = max(level, DiagnosticStatus.WARN), f"{text}; {trouble}"
+        detour = about_detour(self._config.joints, self._controller)
+        if detour.text:
+            level, text = max(level, detour.level), f"{text}; {detour.text}"
         return level, text, values
 
 

@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from torque_safety_controller.controller import Controller, ControlOutput
 from torque_safety_controller.safety.modes import Mode
+from torque_safety_controller.tasks.detour import Progress
 
 LEVELS = {
     Mode.TRACKING: DiagnosticStatus.OK,
@@ -85,6 +86,8 @@ class StepRecord:
                 "joints_at_integral_budget": _named(joints, controller.additional.saturated),
                 "integral_skipped_steps": controller.additional.skipped,
             }
+        if controller.detour is not None:
+            values["detour"] = controller.detour.progress.value
         if controller.safety_filter is not None:
             values |= {
                 "steps_by_plan": controller.safety_filter.outcomes,
@@ -104,6 +107,28 @@ def too_weak(joints: tuple[str, ...], controller: Controller) -> str:
         for name, needed, limit in zip(joints, np.abs(torque), most, strict=True)
         if needed > limit
     )
+
+
+class About(NamedTuple):
+    """What to report, and at which level."""
+
+    level: bytes
+    text: str
+
+
+def about_detour(joints: tuple[str, ...], controller: Controller) -> About:
+    """Return what is done about an arm that stands short of its goal; no text for nothing."""
+    detour = controller.detour
+    if detour is None or detour.progress is Progress.NONE:
+        return About(DiagnosticStatus.OK, "")
+    text = detour.progress.value
+    if detour.progress in (Progress.SEARCHING, Progress.LED):
+        return About(DiagnosticStatus.OK, text)
+    if detour.progress is Progress.NOT_HELD:
+        joint = int(detour.load.argmax())
+        limit = float(controller.tau_max[joint])
+        text += f": {joints[joint]} needs {detour.load[joint] * limit:.1f} of {limit:.1f} N m"
+    return About(DiagnosticStatus.WARN, text)
 
 
 def _named(joints: tuple[str, ...], flags: np.ndarray) -> str:

@@ -33,7 +33,6 @@ class PostureTask:
         weight: of the squared error of acceleration.
         in_null_space: whether the stiffness leaves the end effector alone.
         feedforward: ``kd v_des + a_des``, shape (n,), rad/s^2; None for a goal at rest.
-        shares: of each joint's error that count, shape (n,); None for all of them.
     """
 
     q_des: Array
@@ -42,7 +41,6 @@ class PostureTask:
     weight: float
     in_null_space: bool = False
     feedforward: Array | None = None
-    shares: Array | None = None
 
     def term(self, robot: RobotModel) -> TaskTerm:
         """Return ``a = kp (q_des - q) - kd v + feedforward`` as a term of the cost."""
@@ -55,6 +53,4 @@ class PostureTask:
             b = self.kp * (self.q_des - robot.q) - self.kd * robot.v
         if self.feedforward is not None:
             b = b + self.feedforward
-        if self.shares is not None:
-            return TaskTerm(np.diag(self.shares), self.shares * b, self.weight)
         return TaskTerm(None, b, self.weight)

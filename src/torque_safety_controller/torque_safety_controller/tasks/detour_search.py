@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Searches for ways to a posture or a pose that keep away from what cannot be held."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from torque_safety_controller.robot_model import RobotModel
+from torque_safety_controller.tasks.posture_search import PostureSearch
+from torque_safety_controller.tasks.way_search import CanPass, Search, Way, find_way
+
+Array = NDArray[np.float64]
+
+COMFORT = 0.12
+"""Share of the torque limits that the middle of a way leaves: no arm follows a way exactly."""
+
+ENDS = 1.0
+"""Distance from the ends of a way, which may be what can just be held, to where all of `COMFORT`
+is left, rad."""
+
+LOOSE = 0.2
+"""How near its beginning a way may lead through what the model says cannot be held, where the arm
+stands in spite of the model, rad."""
+
+SEEDS, LOCAL = 150, 10
+"""Postures from which inverse kinematics begin; the first of them nearer to the arm."""
+
+
+class Goal(NamedTuple):
+    """What an arm is brought to."""
+
+    pose: pin.SE3 | None
+    """Of the end effector, in the URDF's root frame; None for the joints alone."""
+    q: Array
+    """Of the joints, shape (n,), rad."""
+
+    def same_as(self, other: Goal) -> bool:
+        """Return whether all numbers are the same."""
+        if self.pose is None or other.pose is None:
+            same = self.pose is other.pose
+        else:
+            same = self.pose is other.pose or bool(self.pose == other.pose)
+        return same and (self.q is other.q or np.array_equal(self.q, other.q))
+
+
+class DetourSearch:
+    """Finds ways for one arm.
+
+    Args:
+        robot: model of the arm.
+        low: lowest positions of ways, shape (n,), rad; -inf for none.
+        high: highest, shape (n,), rad; inf for none.
+        tau_max: torque limits, shape (n,), N m.
+        can_hold: whether a posture can be held.
+    """
+
+    def __init__(
+        self,
+        robot: RobotModel,
+        low: Array,
+        high: Array,
+        tau_max: Array,
+        can_hold: Callable[[Array], bool],
+    ) -> None:
+        self.can_hold = can_hold
+        self._low, self._high, self._tau_max = low, high, tau_max
+        self._model, self._data = robot.model, robot.model.createData()
+        self._kinematics = PostureSearch(robot.model, robot.frame, low, high)
+
+    def load(self, q: Array) -> Array:
+        """Return what holds a posture, as a share of the torque limits, shape (n,)."""
+        needed: Array = pin.computeGeneralizedGravity(self._model, self._data, q) / self._tau_max
+        return needed
+
+    def ways(self, q: Array, goal: Goal, rng: np.random.Generator) -> Search[Way | None]:
+        """Search for a way from a posture to a goal; see `find_way`.
+
+        For a pose, to the first posture that inverse kinematics and `find_way` find.
+
+        Args:
+            q: where the arm stands, shape (n,), rad.
+            goal: for the joints, it can be held.
+            rng: chooses the postures to try.
+        """
+        low = np.where(np.isfinite(self._low), self._low, q - np.pi)
+        high = np.where(np.isfinite(self._high), self._high, q + np.pi)
+        for comfort in (COMFORT, 0.0):
+            if goal.pose is None:
+                can_pass = self._can_pass(q, goal.q, comfort)
+                way = yield from find_way(q, goal.q, low, high, can_pass, rng)
+                if way is not None:
+                    return way
+                continue
+            for k in range(SEEDS):
+                seed = q + min(k / LOCAL, 1.0) * (rng.uniform(low, high) - q)
+                end = yield from self._kinematics.find(goal.pose, seed)
+                if end is not None and self.can_hold(end):
+                    can_pass = self._can_pass(q, end, comfort)
+                    way = yield from find_way(q, end, low, high, can_pass, rng)
+                    if way is not None:
+                        return way
+        return None
+
+    def _can_pass(self, start: Array, end: Array, comfort: float) -> CanPass:
+        """Return what tells where a way may lead."""
+        loose = 0.0 if self.can_hold(start) else LOOSE
+
+        def can_pass(q: Array) -> bool:
+            from_start = float(np.abs(q - start).max())
+            if from_start < loose:
+                return True
+            apart = min(from_start, float(np.abs(q - end).max()), ENDS)
+            most = 1.0 - comfort * apart / ENDS
+            return bool(np.abs(self.load(q)).max() <= most) and self.can_hold(q)
+
+        return can_pass
