@@ -193,8 +193,9 @@ class Arena:
 
     def play(self, genes: np.ndarray) -> dict[str, float]:
         """Play an episode; return what was left of each limit at least, and other findings."""
-        loop, n = self.loop, self.n
+        n = self.n
         self.start(genes[:n])
+        loop = self.loop
         parts = genes[n:].reshape(GOALS, -1)
         shares = 0.1 + parts[:, n]
         begins = EPISODE * np.concatenate([[0.0], np.cumsum(shares) / shares.sum()])
