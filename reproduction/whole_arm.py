@@ -5,7 +5,6 @@ bash scripts/reproduce.sh whole_arm
 bash scripts/reproduce.sh whole_arm --minutes 30     longer; 2 minutes of each row otherwise
 bash scripts/reproduce.sh whole_arm --row Panda      rows whose names contain it
 bash scripts/reproduce.sh whole_arm --limit 6        s that an arm has for a goal, 15 otherwise
-bash scripts/reproduce.sh whole_arm --faster         time to goals with larger accelerations
 
 In turns, random postures that can be held, half of the joints next to their limits, and poses of
 the hand in random postures, not all of which can be reached from where the arm is without
@@ -320,7 +319,6 @@ def main() -> int:
     parser.add_argument("--minutes", type=int, default=2, help="of each row")
     parser.add_argument("--limit", type=float, default=15.0, help="time for a goal, s")
     parser.add_argument("--row", default="", help="rows whose names contain this alone")
-    parser.add_argument("--faster", action="store_true", help="time to goals instead")
     given = parser.parse_args()
     figure = Figure("whole_arm")
     kept = compare(figure, given.minutes, given.limit, given.row)
