@@ -38,8 +38,9 @@ if [ "$what" = all ]; then
     exit 0
 fi
 what="${what//-/_}"
+[ "$what" != adversary ] || what=search_adversary
 case "$what" in
-paper0 | paper1_integral | paper1_compliance | state_dependent | friction | out_of_reach | stopping | whole_arm | time_to_goal | adversary | imperfect | exactness) ;;
+paper0 | paper1_integral | paper1_compliance | state_dependent | friction | out_of_reach | stopping | whole_arm | time_to_goal | search_adversary | imperfect | exactness) ;;
 *)
     echo "error: unknown '$what'; --help lists what there is" >&2
     exit 2
