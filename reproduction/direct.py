@@ -52,6 +52,7 @@ class DirectLoop:
     Attributes:
         robot: in PyBullet.
         controller: with its goals at the start pose.
+        bounds: of the accelerations in a state (q, v).
         samples: one a control step.
         sensing: whether the force/torque sensor says anything.
     """
@@ -68,7 +69,7 @@ class DirectLoop:
         self.model = load_model(config, config.urdf)
         bounds = self._configuration("bounds_node", BoundsConfiguration)
         self.limits = bounds.limits
-        self._bounds = make_bounds(bounds, lambda _: self.model).solve
+        self.bounds = make_bounds(bounds, lambda _: self.model).solve
         self.controller, _ = assembly.make_controller(self._controller_configuration())
         self.sensing = True
         self._sensor = None
@@ -142,7 +143,7 @@ class DirectLoop:
         q, v, _ = self.robot.state()
         if self._sensor is not None and self.sensing:
             self.controller.interaction.sensor.receive(self._sensor.read())
-        bounds = self._bounds(q, v)
+        bounds = self.bounds(q, v)
         step = self.controller.step(State(q, v), AccelerationRange(bounds.lower, bounds.upper))
         self._record(q, v, step.tau)
         self.robot.step(step.tau, self.config.substeps)
@@ -160,7 +161,7 @@ class DirectLoop:
     def bumpless_transfer(self, q_des: np.ndarray) -> None:
         """Prepare torque control in a step that is still the drives'."""
         q, v, tau = self.robot.state()
-        bounds = self._bounds(q, v)
+        bounds = self.bounds(q, v)
         self.controller.bumpless_transfer(
             State(q, v), AccelerationRange(bounds.lower, bounds.upper), tau
         )

@@ -3,20 +3,22 @@
 
 bash scripts/reproduce.sh whole_arm
 bash scripts/reproduce.sh whole_arm --minutes 30     longer; 2 minutes of each row otherwise
+bash scripts/reproduce.sh whole_arm --row Panda      rows whose names contain it
+bash scripts/reproduce.sh whole_arm --limit 6        s that an arm has for a goal, 15 otherwise
 
-Random postures that can be held, half of the joints at their limits; a new one every 6 s.
-The posture task is stiff, so that the limits decide. Robot, bounds and controller are those of the
-files, in one loop in lockstep, with exact states. The page is `docs/whole_arm.md`.
+In turns, random postures that can be held, half of the joints next to their limits, and poses of
+the hand in random postures, not all of which can be reached from where the arm is without
+planning. The next goal comes when the arm has been at rest at one, or after the time limit.
+The tasks are stiff, so that the limits decide. Robot, bounds and controller are those of the
+files, in one loop in lockstep, with exact states. The page is `docs/whole_arm.md`. What is done is
+kept in results/whole_arm/ until a source file changes.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
 import time
 from collections import Counter
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
@@ -25,137 +27,221 @@ import pinocchio as pin
 from chain import ROOT
 from direct import DirectLoop, column
 from figure import Figure, table, verdict
+from pieces import in_pieces
 
 from viability_bounds_pkg.whole_arm.plan_torques import PlanTorques
 from viability_bounds_pkg.whole_arm.safety_filter import RESERVE
 
-STIFF = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
+POSTURE = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
+"""Gains on the way to postures."""
+POSE = {"pose_kp": 100.0, "pose_kd": 20.0, "posture_kp": 10.0, "posture_kd": -1.0}
+POSE |= {"pose_weight": 1.0, "posture_weight": 1e-5}
+"""Gains on the way to poses; damping of the posture is critical."""
+AGAINST_FRICTION = {"posture_kp": 900.0, "posture_kd": 50.0}, {"pose_kp": 900.0, "pose_kd": 50.0}
+"""TALOS', whose joints stick 2 mrad off with less."""
 DATA_SHEET = [15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0]
 """Panda's largest accelerations by its maker, rad/s^2."""
-FASTER = {"acceleration_min": [-a for a in DATA_SHEET], "acceleration_max": DATA_SHEET}
-CASES: dict[str, tuple[str, float, dict[str, Any]]] = {
-    "Baxter, without": ("baxter_left_arm", 1.0, {"safety_filter": False}),
-    "Baxter": ("baxter_left_arm", 1.0, {}),
-    "Panda, without": ("panda", 1.0, {"safety_filter": False}),
-    "Panda": ("panda", 1.0, {}),
-    "Panda, accelerations of the data sheet": ("panda", 1.0, FASTER),
-    "Panda, 60% of its torque, without": ("panda", 0.6, {"safety_filter": False}),
-    "Panda, 60% of its torque": ("panda", 0.6, {}),
-    "TALOS": ("talos_left_arm", 1.0, {}),
-    "TALOS, 60% of its torque, without": ("talos_left_arm", 0.6, {"safety_filter": False}),
-    "TALOS, 60% of its torque": ("talos_left_arm", 0.6, {}),
-}
-"""Robot, share of its torque limits, and what differs from its file."""
-EACH = 6.0  # s for a goal
-NEAR = 0.01  # rad; the bounds' margins keep Baxter 4 mrad off its limits
-KEPT_FREE = 0.05  # share of the torque limits that holding a goal leaves
+SHORT = 4
+"""Minutes of rows without the filter, at most."""
+CLEAR = 0.005
+"""Distance of goals from position limits, rad: the bounds' margins keep Baxter 4 mrad off them."""
+KEPT_FREE = 0.05
+"""Share of the torque limits that holding a goal leaves."""
+NEAR = {"posture": (0.01,), "pose": (0.01, 0.05)}
+"""Tolerances of goals: rad of each joint; m and rad of the hand. `AT` is the closer one."""
+AT = {"posture": (0.001,), "pose": (0.001, 0.005)}
+STILL, REST = 0.01, 0.3
+"""Speed below which an arm is at rest, rad/s, and how long it is to be before the next goal, s."""
 SHOULDER, ELBOW = 1, 3
 
 
-class Minute(NamedTuple):
-    """What came of a minute of goals.
+class Case(NamedTuple):
+    """A row of the table.
 
     Attributes:
-        position, speed, torque: largest violations, rad and rad/s, and share of a torque limit.
-        times: to each goal, s; NaN where it was not reached.
-        outcomes: of the filter, by kind.
+        robot: its file.
+        share: of its torque limits.
+        changed: what differs from its file.
     """
 
-    position: float
-    speed: float
-    torque: float
-    times: list[float]
-    outcomes: Counter[str]
+    robot: str
+    share: float = 1.0
+    changed: dict[str, Any] = {}
+
+    @property
+    def filtered(self) -> bool:
+        """Whether the safety filter is on."""
+        return bool(self.changed.get("safety_filter", True))
 
 
-def make_loop(case: str) -> DirectLoop:
+WITHOUT = {"safety_filter": False}
+ARMS = {
+    "Baxter": ("baxter_left_arm", 1.0),
+    "Panda": ("panda", 1.0),
+    "TALOS": ("talos_left_arm", 1.0),
+    "Panda, 60% of its torque": ("panda", 0.6),
+    "TALOS, 60% of its torque": ("talos_left_arm", 0.6),
+}
+CASES: dict[str, Case] = {}
+for _arm, (_robot, _share) in ARMS.items():
+    CASES[_arm] = Case(_robot, _share)
+    CASES[f"{_arm}, without"] = Case(_robot, _share, WITHOUT)
+
+
+def make_loop(case: Case) -> DirectLoop:
     """Return the arm of a case."""
-    robot, share, changed = CASES[case]
-    tau_max = DirectLoop(robot).config.torque_max
-    return DirectLoop(
-        robot,
-        STIFF | {"safety_filter": True, "torque_max": (share * tau_max).tolist()} | changed,
-    )
+    tau_max = DirectLoop(case.robot).config.torque_max
+    own = {"safety_filter": True, "torque_max": (case.share * tau_max).tolist()}
+    return DirectLoop(case.robot, POSTURE | own | case.changed)
 
 
-def goals(loop: DirectLoop, seed: int) -> list[np.ndarray]:
-    """Return the goals of a minute."""
-    rng, data = np.random.default_rng(seed), loop.model.createData()
-    low, high = loop.limits.q_min, loop.limits.q_max
-    found: list[np.ndarray] = []
-    while len(found) < round(60.0 / EACH):
+def random_goal(loop: DirectLoop, rng: np.random.Generator, at_limits: float = 0.5) -> np.ndarray:
+    """Return a posture that can be held, with a share of its joints next to their limits."""
+    data = loop.model.createData()
+    low, high = loop.limits.q_min + CLEAR, loop.limits.q_max - CLEAR
+    while True:
         ends = np.where(rng.random(low.size) < 0.5, low, high)
-        goal = np.where(rng.random(low.size) < 0.5, ends, rng.uniform(low, high))
+        goal = np.where(rng.random(low.size) < at_limits, ends, rng.uniform(low, high))
         held = np.abs(pin.computeGeneralizedGravity(loop.model, data, goal))
         if (held <= (1.0 - KEPT_FREE) * loop.config.torque_max).all():
-            found.append(goal)
-    return found
+            return goal
 
 
-def play(case: str, seed: int) -> Minute:
-    """Play a minute."""
-    loop = make_loop(case)
-    times: list[float] = []
-    for goal in goals(loop, seed):
-        loop.controller.set_posture_goal(goal)
-        off = np.abs(column(loop.run(EACH), "q") - goal).max(axis=1)
-        away = np.flatnonzero(off > NEAR)
-        arrived = 0 if away.size == 0 else int(away[-1]) + 1
-        times.append(arrived * loop.dt if arrived < off.size else float("nan"))
+class Errors:
+    """How far an arm is off its goal.
+
+    Args:
+        loop: of the arm.
+        goals: "posture" or "pose".
+        goal: a posture; for poses, one of those with the hand where it is to go.
+    """
+
+    def __init__(self, loop: DirectLoop, goals: str, goal: np.ndarray) -> None:
+        self._loop, self._goal = loop, goal if goals == "posture" else None
+        if goals == "posture":
+            loop.controller.set_posture_goal(goal)
+        else:
+            data = loop.model.createData()
+            pin.framesForwardKinematics(loop.model, data, goal)
+            frame = loop.model.getFrameId(loop.controller.robot.frame)
+            loop.controller.set_pose_goal(data.oMf[frame].copy())
+
+    def now(self) -> np.ndarray:
+        """Return the largest of a joint, rad; or those of the hand, m and rad."""
+        loop = self._loop
+        sample = loop.samples[-1]
+        if self._goal is not None:
+            return np.abs(sample.q - self._goal).max(keepdims=True)
+        return np.linalg.norm(sample.error.reshape(2, 3), axis=1)
+
+
+def arrive(loop: DirectLoop, goals: str, goal: np.ndarray, limit: float) -> tuple[float, float]:
+    """Go to a goal; return when the arm was near and at it for good, s, NaN where it was not."""
+    errors, steps = Errors(loop, goals, goal), round(limit / loop.dt)
+    last = {"near": 0, "at": 0}  # steps in which it was not there
+    resting = 0
+    for k in range(steps):
+        loop.step()
+        off = errors.now()
+        for name, tolerance in (("near", NEAR[goals]), ("at", AT[goals])):
+            if not (off <= tolerance).all():
+                last[name] = k + 1
+        still = last["at"] <= k and float(np.abs(loop.samples[-1].v).max()) < STILL
+        resting = resting + 1 if still else 0
+        if resting * loop.dt >= REST:
+            steps = k + 1
+            break
+    loop.samples.clear()
+    near, at = (t * loop.dt if t < steps else float("nan") for t in last.values())
+    return near, at
+
+
+def play(name: str, seed: int, limit: float, duration: float = 60.0) -> dict[str, Any]:
+    """Play random goals for a minute; return violations, times and what the filter did."""
+    case = CASES[name]
+    loop, rng = make_loop(case), np.random.default_rng(seed)
+    gains = {"posture": POSTURE, "pose": POSE}
+    if case.robot == "talos_left_arm":
+        gains = {"posture": POSTURE | AGAINST_FRICTION[0], "pose": POSE | AGAINST_FRICTION[1]}
+    times: dict[str, list[tuple[float, float]]] = {goals: [] for goals in gains}
+    while loop.t < duration:
+        for goals, own in gains.items():
+            loop.change(**own)
+            goal = random_goal(loop, rng, 0.5 if goals == "posture" else 0.0)
+            times[goals].append(arrive(loop, goals, goal, limit))
     monitor, keeper = loop.robot.monitor, loop.controller.safety_filter
-    return Minute(
-        float(monitor.max_position_violation.max()),
-        float(monitor.max_velocity_violation.max()),
-        float(monitor.max_torque_ratio.max()),
-        times,
-        Counter() if keeper is None else keeper.outcomes,
-    )
+    return {
+        "position": float(monitor.max_position_violation.max()),
+        "speed": float(monitor.max_velocity_violation.max()),
+        "torque": float(monitor.max_torque_ratio.max()),
+        "seconds": loop.t,
+        "times": times,
+        "outcomes": {} if keeper is None else dict(keeper.outcomes),
+    }
 
 
-def compare(figure: Figure, minutes: int) -> bool:
+def compare(figure: Figure, minutes: int, limit: float, word: str) -> bool:
     """Play all cases, fill in their rows; return whether the filter kept all limits."""
     kept = True
-    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
-        runs = {case: [pool.submit(play, case, s) for s in range(minutes)] for case in CASES}
-        for case, futures in runs.items():
-            played = [future.result() for future in futures]
-            position, speed, torque = (
-                max(getattr(minute, name) for minute in played)
-                for name in ("position", "speed", "torque")
-            )
-            times = np.array([time for minute in played for time in minute.times])
-            outcomes: Counter[str] = sum((minute.outcomes for minute in played), Counter())
-            fine = position == 0.0 and speed == 0.0 and torque <= 1.0 + 1e-9
-            filtered = bool(outcomes)
-            kept &= fine or not filtered
-            share = 1.0 - outcomes["as wanted"] / max(outcomes.total(), 1)
-            figure.metrics |= {
-                f"{case}: position": position,
-                f"{case}: speed": speed,
-                f"{case}: reached": float(np.isfinite(times).mean()),
-                f"{case}: time": float(np.nanmedian(times)),
-            }
-            figure.rows.append(
-                (
-                    case,
-                    f"{minutes} min",
-                    f"{position:.2g}",
-                    f"{speed:.2g}",
-                    f"{torque:.3f}",
-                    f"{np.isfinite(times).sum()} of {times.size}",
-                    f"{np.nanmedian(times):.2f} s",
-                    f"{share:.2%}" if filtered else "-",
-                    verdict(fine, "kept") if filtered else "",
-                )
-            )
+    names = [name for name in CASES if word in name]
+    seeds = {
+        name: range(minutes if CASES[name].filtered else min(minutes, SHORT)) for name in names
+    }
+    pieces = [(name, seed, limit) for name in names for seed in seeds[name]]
+    played: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
+    for (name, *_), minute in in_pieces("whole_arm", play, pieces):
+        played[name].append(minute)
+        if len(played[name]) == len(seeds[name]):
+            kept &= add_row(figure, name, played[name])
             print(*figure.rows[-1], sep=" | ", flush=True)
     return kept
+
+
+def add_row(figure: Figure, name: str, minutes: list[dict[str, Any]]) -> bool:
+    """Add the row of a case; return whether the filter, if it is on, kept all limits."""
+    position, speed, torque = (
+        max(minute[key] for minute in minutes) for key in ("position", "speed", "torque")
+    )
+    times = {
+        goals: np.array([each for minute in minutes for each in minute["times"][goals]])
+        for goals in NEAR
+    }
+    postures, poses = np.isfinite(times["posture"]), np.isfinite(times["pose"])
+    median = float(np.nanmedian(times["posture"][:, 0]))
+    outcomes: Counter[str] = sum((Counter(minute["outcomes"]) for minute in minutes), Counter())
+    fine = position == 0.0 and speed == 0.0 and torque <= 1.0 + 1e-9
+    filtered = CASES[name].filtered
+    share = 1.0 - outcomes["as wanted"] / max(outcomes.total(), 1)
+    figure.metrics |= {
+        f"{name}: position": position,
+        f"{name}: speed": speed,
+        f"{name}: postures": len(postures),
+        f"{name}: near": float(postures[:, 0].mean()),
+        f"{name}: at": float(postures[:, 1].mean()),
+        f"{name}: poses near": float(poses[:, 0].mean()),
+        f"{name}: poses at": float(poses[:, 1].mean()),
+        f"{name}: time": median,
+    }
+    figure.rows.append(
+        (
+            name,
+            f"{sum(minute['seconds'] for minute in minutes) / 60.0:.0f} min",
+            f"{position:.2g}",
+            f"{speed:.2g}",
+            f"{torque:.3f}",
+            *(f"{near.sum()}, {at.sum()} of {near.size}" for near, at in (postures.T, poses.T)),
+            f"{median:.2f} s",
+            f"{share:.2%}" if filtered else "-",
+            verdict(fine, "kept") if filtered else "",
+        )
+    )
+    return fine or not filtered
 
 
 def shoulder(axis: plt.Axes, seed: int = 4) -> None:
     """Draw Baxter's shoulder on its way to random goals, 3 s each, with and without."""
     for label, colour, filtered in (("without", "tab:red", False), ("with", "tab:green", True)):
-        loop = DirectLoop("baxter_left_arm", STIFF | {"safety_filter": filtered})
+        loop = DirectLoop("baxter_left_arm", POSTURE | {"safety_filter": filtered})
         rng = np.random.default_rng(seed)
         low, high = loop.limits.q_min, loop.limits.q_max
         for _ in range(10):
@@ -231,17 +317,22 @@ def main() -> int:
     """Play, draw, print the table; return whether the filter kept all limits."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--minutes", type=int, default=2, help="of each row")
+    parser.add_argument("--limit", type=float, default=15.0, help="time for a goal, s")
+    parser.add_argument("--row", default="", help="rows whose names contain this alone")
     given = parser.parse_args()
     figure = Figure("whole_arm")
-    kept = compare(figure, given.minutes)
+    kept = compare(figure, given.minutes, given.limit, given.row)
+    heads = ("arm", "played", "position, rad", "speed, rad/s", "torque")
+    heads = (*heads, "postures: near, at", "poses: near, at", "median time", "steps changed", "")
+    print("\n" + table([figure], heads))
+    if given.row:
+        return 0 if kept else 1
     picture, axes = plt.subplots(1, 3, figsize=(16, 4.6), layout="constrained")
     shoulder(axes[0])
     safe_set(axes[1], 0.0)
     safe_set(axes[2], 1.5)
     picture.savefig(ROOT / "docs" / "images" / "whole_arm.png", dpi=90)
     figure.save(picture)
-    heads = ("arm", "played", "position, rad", "speed, rad/s", "torque", "goals reached")
-    print("\n" + table([figure], (*heads, "median time", "steps changed", "")))
     for robot in ("panda", "baxter_left_arm", "talos_left_arm"):
         median, slow = cost(robot)
         print(f"{robot}: the filter takes {median:.0f} us of a step in the median, 99% {slow:.0f}")

@@ -17,6 +17,7 @@ Ratios compare programs that run in turns in one process. NAME --help lists opti
   collision   pairs of shapes, and controller steps with and without them
   antiwindup  limits on the integral torque, in closed form and by a solver
   compliance  controller steps with integral action, sensor and contacts
+  filter      the safety filter in a step, against the number of joints
   nullspace   a step of null-space compliance; with --motion also how far the hand gives way
 USAGE
 }

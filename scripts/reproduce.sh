@@ -17,11 +17,13 @@ Writes figures to results/, and prints a table with the paper's numbers and ours
   out_of_reach       hands sent out of reach, without and with a largest speed (2 min)
   stopping           commands fail: the drives' own stop beside the brakes, and its cost (2 min)
   whole_arm          weak motors, with and without the safety filter (10 min)
+  time_to_goal       Panda with larger accelerations and the safety filter (10 min)
+  adversary          goals and pushes that are searched for to pass limits (30 min)
   imperfect          late, coarse and noisy robots, with and without each remedy, and
                      docs/reproduction_imperfect.md (40 min on two cores)
   imperfect panda    one of the robots; its rows replace those of before
   exactness          the bounds compared with brute force (30 min)
-  all                all of the above except imperfect and exactness (default)
+  all                all of the above except time_to_goal, adversary, imperfect and exactness (default)
 USAGE
 }
 
@@ -36,8 +38,9 @@ if [ "$what" = all ]; then
     exit 0
 fi
 what="${what//-/_}"
+[ "$what" != adversary ] || what=search_adversary
 case "$what" in
-paper0 | paper1_integral | paper1_compliance | state_dependent | friction | out_of_reach | stopping | whole_arm | imperfect | exactness) ;;
+paper0 | paper1_integral | paper1_compliance | state_dependent | friction | out_of_reach | stopping | whole_arm | time_to_goal | search_adversary | imperfect | exactness) ;;
 *)
     echo "error: unknown '$what'; --help lists what there is" >&2
     exit 2

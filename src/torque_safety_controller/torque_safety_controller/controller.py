@@ -300,6 +300,8 @@ class Controller:
         rows = self._look_ahead(bounds, additional, disturbance)
         if self.safety_filter is not None:
             bounds = AccelerationRange(self.safety_filter.lower, self.safety_filter.upper)
+            if self.safety_filter.lost:
+                tasks = [DampingTask(self.gains.hold_kd)]
         if disturbance is not None:
             bounds = AccelerationRange(*self._observer.shift(*bounds))
         parts = [each.constraint(robot, bounds, disturbance) for each in self.constraints]
@@ -315,19 +317,17 @@ class Controller:
             if self.safety_filter is None:
                 solution = solve(bounds, None)
             else:
-                # With the plan allowed by bounds, rows and torque limits, there is a solution.
-                # Where changes are limited, the bounds may ask for more than the plan does.
-                plan = self.safety_filter.plan
-                if disturbance is not None:
-                    plan = plan - disturbance
-                wider = AccelerationRange(
-                    np.minimum(bounds.lower, plan), np.maximum(bounds.upper, plan)
-                )
-                solution = solve(bounds if self.safety_filter.smooth else wider, rows)
-                if solution.relaxation is not None and self.safety_filter.smooth:
+                solution = solve(bounds, rows)
+                if solution.relaxation is not None and not self.safety_filter.lost:
+                    # The bounds have margins that the plan does not keep, and rows lead back
+                    # from where it leaves too little. With the plan allowed there is a solution.
+                    plan = self.safety_filter.plan
+                    if disturbance is not None:
+                        plan = plan - disturbance
+                    low, high = np.minimum(bounds.lower, plan), np.maximum(bounds.upper, plan)
                     if rows is not None:
                         rows = rows._replace(upper=np.maximum(rows.upper, rows.G @ plan))
-                    solution = solve(wider, rows)
+                    solution = solve(AccelerationRange(low, high), rows)
         except NoSolutionFound as error:
             return self._hold(additional, str(error))
         self.iterations = solution.iterations

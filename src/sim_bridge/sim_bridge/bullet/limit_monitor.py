@@ -88,9 +88,15 @@ class LimitMonitor:
         return np.maximum(-np.minimum(self.closest_to_q_min, self.closest_to_q_max), 0.0)
 
     @property
+    def max_speed(self) -> Array:
+        """Greatest speed, shape (n,), rad/s."""
+        speed: Array = self._peak[:, 1].max(axis=0)
+        return speed
+
+    @property
     def max_velocity_violation(self) -> Array:
         """Greatest excess of speed, shape (n,), rad/s; 0 where never violated."""
-        excess: Array = np.maximum(self._peak[:, 1].max(axis=0) - self._v_max, 0.0)
+        excess: Array = np.maximum(self.max_speed - self._v_max, 0.0)
         return excess
 
     @property

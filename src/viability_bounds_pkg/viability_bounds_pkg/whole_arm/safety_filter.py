@@ -58,6 +58,9 @@ APPROACH = 0.04
 USUAL = 0.3
 """Time of plans without a reason for another, s."""
 
+BEGINNINGS = (USUAL, 0.15, 0.6, 1.2)
+"""Times of plans to begin with: the first that is safe, or the best."""
+
 LONGEST = 1.5
 """Longest time of a plan, s."""
 
@@ -145,13 +148,13 @@ class SafetyFilter:
         torque_rate_max: limits of the torques' rates, shape (n,), N m/s; inf or None for none.
 
     Attributes:
-        plan: acceleration with which the plan in hand goes on, shape (n,), rad/s^2, within the
-            bounds where that is safe.
+        plan: acceleration with which the plan in hand goes on, shape (n,), rad/s^2.
         lower: bounds of what may be wanted, shape (n,), rad/s^2: those given to `look`, or
             narrower where changes are limited.
         upper: shape (n,), rad/s^2.
         slack: least share of a torque limit that this plan leaves of what it may use; negative
             where it passes a limit.
+        lost: whether no plan is near, so that the arm is to brake as it can.
         rest_torque: what holds the arm where this plan ends, shape (n,), N m.
         smooth: whether changes are limited.
         outcomes: how many steps were "as wanted", "changed", "planned", the plan's own; and
@@ -214,7 +217,7 @@ class SafetyFilter:
         self._limits = JointLimitsOfPlans(
             q_min + clearance,
             q_max - clearance,
-            clearance,
+            0.5 * clearance,
             (1.0 - SPARE) * v_max,
             braking,
             dt * jerks,
@@ -235,13 +238,13 @@ class SafetyFilter:
         self._extra = np.zeros(n)
         self._last: Array = np.zeros(n)
         self._gradient = np.zeros((n, n))
-        self._own: Array = np.zeros(n)  # the acceleration of the plan in hand, whatever the bounds
         self._now = Needs(0.0, 0.0, 0.0, 0.0)
         self.plan: Array = np.zeros(n)
         self.lower: Array = np.zeros(n)
         self.upper: Array = np.zeros(n)
         self.rest_torque: Array = np.zeros(n)
         self.slack = 0.0
+        self.lost = False
         self.outcomes: Counter[str] = Counter()
         self._warm_up()
 
@@ -298,23 +301,16 @@ class SafetyFilter:
         if self._begun:
             plans.follow(q, v, self._last, self._course, extra)
         else:
-            plans.plan(q, v, self._last, self._time, self._gentle, extra)
-            self._keep(self._time)
-            self._begun = True
+            self._begin()
         rest_of(self._course, self._rest)
         self.slack = plans.slack
         self._now = Needs.of(plans)
-        self.plan = self._own = plans.accelerations[FIRST].copy()
+        self.plan = plans.accelerations[FIRST].copy()
         self.rest_torque = plans.tau[-1].copy()
         self.lower, self.upper = lower, upper
         if self.smooth:
             self._narrow(lower, upper)
-        else:
-            # The bounds have margins for errors within a step, which the plan has not.
-            # Acceleration limits are none to the plan: its torques are known.
-            low = np.where(lower <= self._a_min, -np.inf, lower)
-            high = np.where(upper >= self._a_max, np.inf, upper)
-            self.plan = np.minimum(np.maximum(self._own, low), high)
+        self.lost = self.slack < -LOST
         if self.slack < -RESERVE:
             return None  # nothing to keep: the bounds alone count
         wanted: dict[int, list[int]] = {}
@@ -324,6 +320,20 @@ class SafetyFilter:
                 if abs(plans.tau[k, j]) > NEAR * self._usable[j]:
                     wanted.setdefault(k, []).append(j)
         return self._rows(wanted) if wanted else None
+
+    def _begin(self) -> None:
+        """Take the best plan of some times, the usual one if it is safe."""
+        best = -np.inf
+        for T in BEGINNINGS:
+            plans = self._plans
+            plans.plan(*self._state, self._last, T, self._gentle, self._extra)
+            if plans.slack > best:
+                best = plans.slack
+                self._keep(T)
+            if best >= 0.0:
+                break
+        plans.follow(*self._state, self._last, self._course, self._extra)
+        self._begun = True
 
     def _narrow(self, lower: Array, upper: Array) -> None:
         """Narrow the bounds to what each joint by itself can stop from again."""
@@ -389,12 +399,11 @@ class SafetyFilter:
         if self._take(a, other):
             self.outcomes["as wanted"] += 1
             return a
-        if self.slack < -LOST and np.isfinite(a).all():
+        if self.lost and np.isfinite(a).all():
             self.outcomes["outside"] += 1
-            self._begun = False
+            self.reset()
             return a
-        plan = self.plan if self._safe(self.plan, self._rest) else self._own
-        low, high = 0.0, 1.0
+        plan, low, high = self.plan, 0.0, 1.0
         for _ in range(HALVINGS):
             share = 0.5 * (low + high)
             if self._safe(plan + share * (a - plan), self._rest):
