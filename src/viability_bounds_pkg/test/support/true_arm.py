@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cache
 
 import numpy as np
@@ -25,8 +26,9 @@ def model(robot: str = "panda") -> pin.Model:
     )
 
 
-SUBSTEPS = 4
-"""A period. Half as many change states by less than 1e-10 rad and rad/s, without switches."""
+SUBSTEP = 2.5e-4
+"""Of the integration, s: off by less than 1e-6 rad and rad/s, also for a step of 20 N m through a
+lag of 1.6 ms."""
 
 
 class TrueArm:
@@ -67,8 +69,9 @@ class TrueArm:
 
         # By Runge and Kutta. Where a disturbance switches within a step the arm feels a mean of
         # it, which is no larger.
-        (q, v), h = self.state, self.dt / SUBSTEPS
-        for t in (h * np.arange(SUBSTEPS)).tolist():
+        (q, v), count = self.state, math.ceil(self.dt / SUBSTEP - 1e-9)
+        h = self.dt / count
+        for t in (h * np.arange(count)).tolist():
             k1 = acceleration(t, q, v)
             v2 = v + 0.5 * h * k1
             k2 = acceleration(t + 0.5 * h, q + 0.5 * h * v, v2)
