@@ -3,6 +3,6 @@
 
 from arms import arm
 
-from viability_bounds_pkg.testing.fixtures import graph_of_its_own, ros
+from viability_bounds_pkg.testing.fixtures import graph_of_its_own, ros, shared_ros
 
-__all__ = ["arm", "graph_of_its_own", "ros"]
+__all__ = ["arm", "graph_of_its_own", "ros", "shared_ros"]

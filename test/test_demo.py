@@ -17,6 +17,7 @@ from direct import DirectLoop, column, hand_errors
 from sim_bridge.scenario.events import ParameterChange, PoseGoal, Push
 from sim_bridge.scenario.scenario import load_scenario
 from viability_bounds_pkg.node.bounds_parameters import METHODS
+from viability_bounds_pkg.testing.executables import interruptible
 
 ROOT = Path(__file__).resolve().parent.parent
 DEMO = ROOT / "scripts" / "demo.sh"
@@ -113,8 +114,7 @@ def test_a_signal_takes_down_all_of_it(tmp_path, when, sent):
         stderr=subprocess.PIPE,
         text=True,
         env=environment,
-        # Started from a job in the background, SIGINT is ignored by inheritance.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        preexec_fn=interruptible,
     )
 
     def nodes():

@@ -38,9 +38,9 @@ def play(robot, case, duration, seed=1):
 @pytest.mark.parametrize(
     ("robot", "case", "duration"),
     [
-        ("panda", "outage_stop", 6.0),
+        ("panda", "outage_stop", 4.0),
         ("talos_left_arm", "outage_stop", 3.0),
-        ("baxter_left_arm", "all", 6.0),
+        ("baxter_left_arm", "all", 4.0),
     ],
 )
 def test_no_limit_is_passed_by_a_robot_as_bad_as_declared(robot, case, duration):

@@ -39,7 +39,7 @@ def test_steady_error_is_ten_times_smaller():
 @pytest.mark.parametrize("force", PUSHES)
 def test_push_and_release(force):
     without, limited = (
-        push(changed, force, seconds=3.0, before=1.5, after=2.0) for changed in (UNLIMITED, PAPER)
+        push(changed, force, seconds=3.0, before=1.0, after=1.5) for changed in (UNLIMITED, PAPER)
     )
     assert limited["share"] <= 1.0 + 1e-9 < 2.0 < without["share"]
     assert limited["overshoot"] <= without["overshoot"] / 3.0

@@ -257,23 +257,19 @@ def unavailable_share(
     model: pin.Model,
     space: StateSpace,
     limits: AccelerationLimits,
-    samples: int = 20_000,
-    seed: int = 0,
 ) -> Array:
-    """Return the share of random states in which torque does not allow a joint's limits.
+    """Return the share of 20,000 random states in which torque does not allow a joint's limits.
 
     Args:
         model: the robot.
         space: the box of states, with the torque available.
         limits: what is asked for.
-        samples: uniformly random states.
-        seed: of the random generator.
 
     Returns:
         Shares in [0, 1], shape (n,): zero in all but rare states for limits that were found,
         large for an override that gravity alone forbids.
     """
-    q, v = space.states(np.random.default_rng(seed).random((samples, 2 * space.n)))
+    q, v = space.states(np.random.default_rng(0).random((20_000, 2 * space.n)))
     room = acceleration_room(model, model.createData(), space, q, v)
     wanted = np.stack([limits.a_max, -limits.a_min])
     share: Array = np.mean(np.any(room < wanted, axis=1), axis=0)

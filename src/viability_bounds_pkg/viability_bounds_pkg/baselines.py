@@ -44,13 +44,13 @@ def naive_bounds(q: ArrayLike, v: ArrayLike, limits: JointLimits, dt: float) -> 
 
 
 def damper_velocity_range(
-    q: ArrayLike, limits: JointLimits, influence: float, security: float, gain: float
+    q: ArrayLike, limits: JointLimits, influence: float, gain: float
 ) -> tuple[Array, Array]:
     """Return the speeds that a linear velocity damper allows; arguments as `damper_bounds`."""
     q = np.asarray(q, dtype=np.float64)
 
     def towards(room: Array) -> Array:
-        slowed = gain * (room - security) / (influence - security)
+        slowed = gain * room / influence
         return np.minimum(np.where(room < influence, slowed, np.inf), limits.v_max)
 
     return -towards(q - limits.q_min), towards(limits.q_max - q)
@@ -62,7 +62,6 @@ def damper_bounds(
     limits: JointLimits,
     dt: float,
     influence: float = 0.2,
-    security: float = 0.0,
     gain: float = 1.0,
 ) -> AccelerationBounds:
     """Return the accelerations that obey a linear velocity damper at the end of the step.
@@ -73,10 +72,9 @@ def damper_bounds(
         limits: of n joints.
         dt: step, s.
         influence: distance to a limit from which on the damper acts, rad.
-        security: distance at which it allows no more approach, rad.
         gain: speed it allows at `influence`, rad/s.
     """
-    return _to_reach(v, damper_velocity_range(q, limits, influence, security, gain), limits, dt)
+    return _to_reach(v, damper_velocity_range(q, limits, influence, gain), limits, dt)
 
 
 def decre_velocity_range(q: ArrayLike, limits: JointLimits, dt: float) -> tuple[Array, Array]:

@@ -26,7 +26,10 @@ T = TypeVar("T")
 
 _functions: list[Any] = []
 
-_NOT_CALLED = {"node", "nodes", "ros", "parameters", "cli", "tools", "user_input", "__pycache__"}
+_NOT_CALLED = {
+    *("node", "nodes", "ros", "parameters", "cli", "tools", "testing", "user_input"),
+    "__pycache__",
+}
 """Folders that compiled functions never call: the maths does not import them."""
 
 

@@ -3,27 +3,19 @@
 
 from __future__ import annotations
 
-import os
 import re
 import signal
-import subprocess
-import sys
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 import pytest
 
-import sim_bridge
-import viability_bounds_pkg
 from sim_bridge.tools.excitation import PARTS, ROOM, ExcitationError, excitation
 from sim_bridge.tools.record_excitation import main
 from viability_bounds_pkg.robot_configuration import LimitedRobotConfiguration
+from viability_bounds_pkg.testing.executables import called, started
 from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
 
-PACKAGES = [
-    str(Path(package.__file__).resolve().parents[1])
-    for package in (sim_bridge, viability_bounds_pkg)
-]
 FILE = config_folder() / "panda.yaml"
 PANDA = read_config("panda", "bullet_node")
 JOINTS = tuple(PANDA["joints"])
@@ -99,11 +91,6 @@ def test_joints_without_limits_and_joints_without_room():
 # The executable
 
 
-def environment():
-    paths = [*PACKAGES, os.environ.get("PYTHONPATH", "")]
-    return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
-
-
 @pytest.fixture
 def short(monkeypatch):
     """Makes the motion short: what is to be seen does not take its time."""
@@ -111,24 +98,16 @@ def short(monkeypatch):
 
 
 @pytest.fixture
-def call(capsys):
-    """Runs the tool in this process; returns exit code, output and errors."""
-
-    def run_here(*arguments):
-        try:
-            code = main([str(argument) for argument in arguments])
-        except SystemExit as ended:
-            code = ended.code
-        return code, *capsys.readouterr()
-
-    return run_here
+def call(capfd):
+    """Runs the tool in this process, which saves the start of an interpreter."""
+    return partial(called, capfd, main)
 
 
 def test_a_recording_is_what_the_robot_reported(short, call, tmp_path):
     output = tmp_path / "run.npz"
-    code, out, errors = call(FILE, "-o", output, "--speed", "0.3")
-    assert (code, errors) == (0, "")
-    assert re.search(rf"1 s of motion written to {output}; torque at most 0\.\d\d", out)
+    ended = call(FILE, "-o", output, "--speed", "0.3")
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert re.search(rf"1 s of motion written to {output}; torque at most 0\.\d\d", ended.stdout)
     with np.load(output) as recording:
         assert tuple(recording["joints"]) == JOINTS
         t, tau = recording["t"], recording["tau"]
@@ -169,8 +148,9 @@ def test_what_cannot_be_done_is_told_in_one_line(call, tmp_path, arguments, code
         "bad": tmp_path / "bad.yaml",
         "stuck": tmp_path / "stuck.yaml",
     }
-    ended, _, errors = call(*(argument.format(**names) for argument in arguments))
-    assert ended == code
+    ended = call(*(argument.format(**names) for argument in arguments))
+    errors = ended.stderr
+    assert ended.returncode == code
     assert errors.startswith("record_excitation: ") and errors.count("\n") == 1
     assert message in errors
     assert not (tmp_path / "run.npz").exists()
@@ -191,13 +171,7 @@ sys.exit(tool.main())
 
 
 def test_an_interrupt_leaves_nothing_behind(tmp_path):
-    ended = subprocess.run(
-        [sys.executable, "-c", INTERRUPTIBLE, FILE, "-o", tmp_path / "run.npz"],
-        capture_output=True,
-        text=True,
-        env=environment(),
-        timeout=60.0,
-    )
+    ended = started("-c", INTERRUPTIBLE, FILE, "-o", tmp_path / "run.npz")
     assert ended.returncode == 128 + signal.SIGINT, ended.stderr
     assert ended.stderr.strip() == "record_excitation: interrupted, nothing written"
     assert not list(tmp_path.iterdir())

@@ -1,481 +1,70 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Handover between position and torque control over real DDS, and with the real robot node."""
-
-from __future__ import annotations
+"""The controller goes on from the torque of others."""
 
 import math
 
 import numpy as np
 import pytest
-from controller_chain import NODE, ControllerChain
-from geometry_msgs.msg import PoseStamped, WrenchStamped
-from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
-from std_srvs.srv import SetBool
+from controllers import EXACT, KHZ, assert_may_be_sent, gravity, pose_at, wide, with_integral
 
-from sim_bridge.nodes.bullet_node import BulletNode
-from torque_safety_controller.node.controller_node import ControllerNode
-from torque_safety_controller.safety import handover
-from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.node.bounds_node import BoundsNode
-from viability_bounds_pkg.ros.runtime import GOAL_QOS
-from viability_bounds_pkg.testing.ros_harness import read_config
-
-SERVICE = f"{NODE}/enable_torque"
-
-# Watchdogs that do not bark while a busy machine runs the other tests.
-VALUES = read_config("panda", NODE) | {
-    "start_control": "position",
-    "bounds_timeout": 20.0,
-    "state_timeout": 40.0,
-}
-JOINTS = VALUES["joints"]
-N = len(JOINTS)
-TAU_MAX = np.array(VALUES["torque_max"])
-Q = np.array(read_config("panda", "bullet_node")["start_positions"])
-TAU = 0.1 * TAU_MAX  # of the motors, by which the arm is held
-SMALL = 0.01 * TAU_MAX
-WIDE = np.full(N, 5.0)
-
-
-class HandoverChain(ControllerChain):
-    """The other side of the controller: robot, bounds node and user."""
-
-    def __init__(self, ros, **changed) -> None:
-        super().__init__(ros, VALUES | changed)
-        self.stamp = 0
-
-    def state(self, stamp, q=Q, tau=TAU) -> None:
-        self.send_state(stamp, q, np.zeros(N), tau)
-
-    def bound(self, stamp) -> None:
-        self.send_limits(stamp, -WIDE, WIDE)
-
-    def answer(self, q=Q, tau=TAU, bounds=True) -> JointState:
-        """Send the next state, and limits, until the command comes; return that."""
-        self.stamp += 1
-        stamp = self.stamp
-
-        def send():
-            if bounds:
-                self.bound(stamp)
-            self.state(stamp, q, tau)
-
-        return self.await_command(stamp, send)
-
-    def call(self, torque: bool) -> SetBool.Response:
-        return self.ros.call(SetBool, SERVICE, SetBool.Request(data=torque))
-
-    def enable(self, torque: bool) -> None:
-        response = self.call(torque)
-        assert response.success, response.message
-
-    def refuses(self, torque: bool) -> str:
-        response = self.call(torque)
-        assert not response.success
-        return response.message
-
-    def await_report(self, each=None, **values) -> None:
-        self.ros.wait_until(
-            lambda: all(v in self.ros.reported(NODE, k) for k, v in values.items()),
-            f"{values}, not {self.ros.diagnostics.get(NODE)}",
-            each=each,
-        )
-
-
-def assert_position(command: JointState, q=Q) -> None:
-    assert command.name == JOINTS
-    assert not len(command.effort)
-    np.testing.assert_array_equal(command.position, q)
-    np.testing.assert_array_equal(command.velocity, np.zeros(N))
-
-
-def assert_torque(command: JointState) -> np.ndarray:
-    assert not len(command.position)
-    assert (np.abs(command.effort) <= TAU_MAX).all()
-    return np.array(command.effort)
-
-
-# From position to torque and back
-
-
-def test_it_goes_over_to_the_torque_of_the_motors_and_back(ros):
-    chain = HandoverChain(ros)
-    assert_position(chain.answer(bounds=False))
-    chain.await_report(mode="POSITION", reason="as at start", control="position")
-    # The goal of the drives does not follow the arm.
-    assert_position(chain.answer(Q + 1e-3))
-    chain.enable(True)
-    assert_position(chain.answer(Q + 1e-3))
-    first = assert_torque(chain.answer(Q + 1e-3))
-    assert (np.abs(first - TAU) < SMALL).all()
-    chain.await_report(mode="TRACKING", control="torque")
-    for _ in range(3):
-        assert_torque(chain.answer(Q + 1e-3))
-    chain.enable(False)
-    assert_position(chain.answer(Q + 2e-3), Q + 1e-3)
-    chain.await_report(mode="POSITION", reason="enable_torque", control="position")
-    # And again, from another torque.
-    chain.answer(Q, -TAU)
-    chain.enable(True)
-    chain.answer(Q, -TAU)
-    assert (np.abs(assert_torque(chain.answer(Q, -TAU)) + TAU) < SMALL).all()
-
-
-def test_a_state_asked_for_again_gets_what_it_got(ros):
-    chain = HandoverChain(ros)
-    chain.answer()
-    chain.enable(True)
-    handover = chain.answer()
-    chain.commands.clear()
-    stamp = chain.stamp
-    ros.wait_until(lambda: len(chain.commands) > 2, each=lambda: chain.state(stamp))
-    assert all(command == handover for command in chain.commands)
-    torque = chain.answer()
-    chain.enable(False)
-    chain.commands.clear()
-    stamp = chain.stamp
-    ros.wait_until(lambda: len(chain.commands) > 2, each=lambda: chain.state(stamp))
-    assert all(command == torque for command in chain.commands)
-
-
-def test_a_call_between_a_state_and_its_limits_is_obeyed(ros):
-    chain = HandoverChain(ros, start_control="torque")
-    assert_torque(chain.answer())
-    ros.run_for(0.05, each=lambda: chain.state(10))
-    chain.enable(False)
-    assert_position(chain.await_command(10, lambda: chain.bound(10)))
-    chain.stamp = 10
-    for _ in range(3):
-        assert_position(chain.answer())
-    assert ros.reported(NODE, "control") == "position"
-
-
-def test_a_handover_that_was_asked_for_can_be_called_off(ros):
-    chain = HandoverChain(ros)
-    chain.answer()
-    chain.enable(True)
-    chain.enable(False)
-    for _ in range(3):
-        assert_position(chain.answer(Q + 0.01))
-
-
-def test_an_arm_in_hold_is_given_to_its_drives(ros):
-    chain = HandoverChain(ros, start_control="torque")
-    assert_torque(chain.answer())
-    chain.await_report(mode="HOLD")
-    chain.enable(False)
-    assert_position(chain.answer())
-
-
-def test_goals_from_before_the_handover_are_dropped(ros):
-    chain = HandoverChain(ros)
-    chain.answer()
-    poses = ros.talk(PoseStamped, "target_pose", GOAL_QOS)
-    far = PoseStamped()
-    far.pose.position.x, far.pose.orientation.w = 0.3, 1.0
-    poses.publish(far)
-    chain.await_report(goals_pending="1")
-    chain.enable(True)
-    chain.answer()
-    first = assert_torque(chain.answer())
-    assert (np.abs(first - TAU) < SMALL).all()
-    chain.await_report(goals_pending="0", mode="TRACKING")
-    ros.diagnostics.clear()
-    ros.wait_until(lambda: ros.reported(NODE, "position_error_m"))
-    assert float(ros.reported(NODE, "position_error_m")) < 1e-9
-
-
-def test_efforts_for_ros2_control_are_silent_under_position_control(ros):
-    topic = "/effort_controller/commands"
-    chain = HandoverChain(ros, ros2_control_topic=topic)
-    efforts = ros.listen(Float64MultiArray, topic)
-    ros.hears(topic)
-    chain.answer()
-    chain.enable(True)
-    chain.answer()
-    ros.run_for(0.05)
-    assert not efforts
-    torque = chain.answer()
-    ros.wait_until(lambda: efforts, "efforts", each=lambda: chain.state(chain.stamp))
-    np.testing.assert_array_equal(efforts[0].data, torque.effort)
-
-
-def test_noise_of_the_currents_is_no_step_of_the_torque(ros):
-    """Seeded from one sample, 1% of noise made a first step of 2.3% of the limits."""
-    chain, random = HandoverChain(ros), np.random.default_rng(3)
-    command = chain.answer(Q, TAU + 0.01 * TAU_MAX)
-    chain.enable(True)
-    while not len(command.effort):
-        assert_position(command)
-        command = chain.answer(Q, TAU + 0.01 * TAU_MAX * random.standard_normal(N))
-    assert chain.stamp > 20
-    assert (np.abs(assert_torque(command) - TAU) < 0.005 * TAU_MAX).all()
-
-
-def test_a_torque_that_stays_unknown_is_not_gone_on_from(ros, monkeypatch):
-    monkeypatch.setattr(handover, "PATIENCE", 0.05)
-    chain = HandoverChain(ros)
-    chain.answer()
-    chain.enable(True)
-    for sign in (-1.0, 1.0) * 15:
-        assert_position(chain.answer(Q, sign * TAU))
-    chain.await_report(mode="POSITION", reason="handover failed: after 0.05 s the torque of")
-
-
-# Refused
-
-
-def test_torque_is_refused_before_the_first_state(ros):
-    chain = HandoverChain(ros)
-    assert "no joint state" in chain.refuses(True)
-    assert "position control is on already" in chain.refuses(False)
-    assert_position(chain.answer())
-
-
-def test_torque_is_refused_while_states_are_old(ros):
-    chain = HandoverChain(ros, bounds_timeout=0.1)
-    chain.answer()
-    ros.run_for(0.15)
-    assert "no joint state, or only old ones" in chain.refuses(True)
-    chain.answer()
-    chain.enable(True)
-
-
-@pytest.mark.parametrize("stamp", [1, 1_000_000])
-def test_torque_is_refused_while_limits_are_old_or_of_another_run(ros, stamp):
-    chain = HandoverChain(ros, bounds_timeout=5.0)
-    chain.stamp = 10_000  # ms
-    chain.answer(bounds=False)
-    assert "no acceleration limits" in chain.refuses(True)
-    ros.run_for(0.05, each=lambda: chain.bound(stamp))
-    assert "no acceleration limits" in chain.refuses(True)
-    assert_position(chain.answer())
-    chain.enable(True)
-
-
-@pytest.mark.parametrize(
-    ("q", "tau", "reason"),
-    [
-        (Q + 10.0 * np.eye(N)[2], TAU, f"outside the position limits: {JOINTS[2]}"),
-        (Q, (), "no motor torque"),
-        (Q, [*TAU[:6], math.nan], "no motor torque"),
-        (Q, [*TAU[:6], 1.1 * TAU_MAX[6]], f"motor torque beyond torque_max: {JOINTS[6]}"),
-    ],
+from torque_safety_controller.additional_torque import (
+    MODES,
 )
-def test_torque_is_refused_where_it_cannot_begin(ros, q, tau, reason):
-    chain = HandoverChain(ros)
-    chain.answer(q, tau)
-    assert reason in chain.refuses(True)
-    assert_position(chain.answer(q, tau), q)
-    chain.await_report(control="position")
+from torque_safety_controller.qp.constraints import AccelerationRange
+from viability_bounds_pkg.state import State
 
 
-def test_what_is_on_already_is_refused(ros):
-    chain = HandoverChain(ros, start_control="torque")
-    before = assert_torque(chain.answer())
-    assert "torque control is on already" in chain.refuses(True)
-    np.testing.assert_allclose(assert_torque(chain.answer()), before, atol=1e-6)
-    chain.enable(False)
-    chain.answer()
-    assert "position control is on already" in chain.refuses(False)
+@pytest.mark.parametrize("mode", MODES)
+def test_it_takes_over_the_torque_of_others(arm, mode):
+    rng = np.random.default_rng(6)
+    for _ in range(5):
+        controller = with_integral(arm, mode)
+        tau = gravity(arm, arm.q_start) + rng.uniform(-0.15, 0.15, arm.n) * arm.tau_max
+        tau = np.clip(tau, -arm.tau_max, arm.tau_max)
+        state = State(arm.q_start, np.zeros(arm.n))
+        controller.set_pose_goal(pose_at(arm, arm.q_start + 0.5))  # forgotten
+        step = controller.bumpless_transfer(state, wide(arm), tau)
+        assert not step.failure
+        # The next step is at the same place, where friction holds the arm.
+        after = controller.step(state, wide(arm))
+        assert (np.abs(after.tau - tau) < 0.01 * arm.tau_max).all()
+        np.testing.assert_allclose(after.a, 0.0, atol=5e-3)
+        assert controller.goals.pose_des.isApprox(pose_at(arm, arm.q_start))
+        np.testing.assert_array_equal(controller.goals.q_des, arm.q_start)
 
 
-def test_it_starts_with_torque_or_position_only(ros):
-    with pytest.raises(SettingError, match="'start_control' is 'velocity'; allowed: one of"):
-        ros.start(ControllerNode, VALUES | {"start_control": "velocity"})
-    HandoverChain(ros)
-    assert "read-only" in ros.refuses(NODE, start_control="torque")
+def test_torque_beyond_the_limits_is_taken_over_up_to_them(arm):
+    controller = with_integral(arm)
+    state = State(arm.q_start, np.zeros(arm.n))
+    controller.bumpless_transfer(state, wide(arm), 1.5 * arm.tau_max)
+    step = controller.step(state, wide(arm))
+    assert_may_be_sent(step, arm)
+    assert (step.tau > 0.97 * arm.tau_max).all()
 
 
-# What goes wrong on the way
+def test_the_rate_of_torque_counts_from_what_was_measured(arm):
+    rate = np.full(arm.n, 1.0)
+    controller = with_integral(arm, "none", rate=rate)
+    state = State(arm.q_start, np.zeros(arm.n))
+    tau = gravity(arm, arm.q_start) + 0.2 * arm.tau_max
+    controller.bumpless_transfer(state, wide(arm), tau)
+    assert (np.abs(controller.step(state, wide(arm)).tau - tau) <= rate * KHZ + EXACT).all()
 
 
-def test_a_handover_ends_where_limits_stop_coming(ros):
-    chain = HandoverChain(ros, bounds_timeout=0.2)
-    chain.answer()
-    chain.enable(True)
-    # Repeated, as by a robot in lockstep, and not answered until then.
-    command = chain.answer(Q + 1e-3, bounds=False)
-    assert_position(command)
-    chain.await_report(
-        mode="POSITION",
-        reason="handover failed: acceleration limits are stale",
-        control="position",
-    )
-    for _ in range(3):
-        assert_position(chain.answer(bounds=False))
-    assert "no acceleration limits" not in chain.call(True).message  # 4 ms old by their stamps
-
-
-@pytest.mark.parametrize(
-    ("q", "tau", "reason"),
-    [
-        (Q, (), "joint_states carry no motor torque"),
-        (Q + 10.0, TAU, "outside the position limits"),
-    ],
-)
-def test_a_handover_ends_where_torque_cannot_begin_after_all(ros, q, tau, reason):
-    chain = HandoverChain(ros)
-    chain.answer()
-    chain.enable(True)
-    assert_position(chain.answer(q, tau))
-    chain.await_report(mode="POSITION", reason=f"handover failed: {reason}")
-    assert_position(chain.answer())
-
-
-@pytest.mark.parametrize("start", ["torque", "position"])
-def test_a_robot_that_was_silent_is_commanded_as_at_start(ros, start):
-    chain = HandoverChain(ros, start_control=start, state_timeout=0.3, bounds_timeout=0.3)
-    chain.answer()
-    if start == "position":
-        chain.enable(True)
-        chain.answer()
-    assert_torque(chain.answer())
-    chain.await_report(mode="STOPPED")
-    assert "no joint state" in chain.refuses(False)
-    again = chain.answer()
-    if start == "torque":
-        assert_torque(again)
-    else:
-        assert_position(again)
-        chain.await_report(reason="the robot was silent or started over")
-
-
-def test_nothing_is_sent_once_it_is_stopped(ros):
-    chain = HandoverChain(ros, state_timeout=0.3, bounds_timeout=0.1)
-    chain.answer()
-    # States that cannot be used: the drives hold on.
-    bad = np.full(N, math.nan)
-    chain.commands.clear()
-    assert_position(chain.await_command(50, lambda: chain.state(50, bad)))
-    chain.await_report(each=lambda: chain.state(50, bad), mode="STOPPED", reason="refused")
-    chain.commands.clear()
-    ros.run_for(0.1, each=lambda: chain.state(50, bad))
-    assert not chain.commands
-
-
-# With the robot
-
-
-class HandoverArm:
-    """A robot in lockstep with bounds and controller, all of them real; recorded."""
-
-    def __init__(self, ros, robot, **changed) -> None:
-        values = read_config(robot, "bounds_node", NODE, "bullet_node") | {
-            "clock": "lockstep",
-            "bounds_timeout": 20.0,
-            "state_timeout": 40.0,
-            "start_control": "position",
-        }
-        values = {key: value for key, value in (values | changed).items() if value != []}
-        self.ros = ros
-        self.tau_max = np.array(values["torque_max"])
-        self.states = ros.listen(JointState, "joint_states")
-        self.commands = ros.listen(JointState, "joint_commands")
-        ros.start(ControllerNode, values)
-        ros.start(BoundsNode, values)
-        self.wrenches = ros.probe.create_publisher(WrenchStamped, "external_wrench", GOAL_QOS)
-        ros.hears("joint_commands")
-        ros.start(BulletNode, values)
-
-    def run(self, periods: int) -> None:
-        """Let the robot move on by at least as many control periods."""
-        goal = len(self.states) + periods
-        self.ros.wait_until(lambda: len(self.states) >= goal, f"{periods} periods", timeout=30.0)
-
-    def enable(self, torque: bool) -> None:
-        response = self.ros.call(SetBool, SERVICE, SetBool.Request(data=torque))
-        assert response.success, response.message
-
-    def push(self, link, force) -> None:
-        message = WrenchStamped()
-        message.header.frame_id = link
-        message.wrench.force.x, message.wrench.force.y, message.wrench.force.z = force
-        self.wrenches.publish(message)
-
-    def recorded(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return positions, torques of the motors, and which periods torque commands began."""
-        states = dict(zip(self.states.stamps, self.states, strict=True))
-        commands = dict(zip(self.commands.stamps, self.commands, strict=True))
-        stamps = sorted(states)[:-1]
-        n = len(self.tau_max)  # locked joints follow
-        q = np.array([states[s].position[:n] for s in stamps])
-        tau = np.array([states[s].effort[:n] for s in stamps])
-        return q, tau, np.array([len(commands[s].effort) > 0 for s in stamps])
-
-
-PUSHED = {"talos_left_arm": "arm_left_5_link", "panda": "panda_link5"}
-FORCE = {"talos_left_arm": (30.0, -40.0, 50.0), "panda": (20.0, -30.0, 40.0)}  # N
-# Panda's gears are good; here they are not.
-POOR_GEARS = {
-    "integral_action": "task",
-    "rotor_inertia": [0.3, 0.3, 0.3, 0.3, 0.1, 0.1, 0.1],
-    "friction_coulomb": (0.08 * TAU_MAX).tolist(),
-    "friction_static": (0.1 * TAU_MAX).tolist(),
-}
-
-
-@pytest.mark.parametrize(
-    ("robot", "changed", "load"),
-    [
-        ("talos_left_arm", {}, ""),
-        ("talos_left_arm", {}, "friction"),
-        ("talos_left_arm", {"integral_action": "none"}, "friction"),
-        ("talos_left_arm", {}, "push"),
-        ("panda", {}, ""),
-        ("panda", {}, "push"),
-        ("panda", POOR_GEARS, "friction"),
-    ],
-    ids=["talos", "talos-friction", "talos-none", "talos-push", "panda", "panda-push", "poor"],
-)
-def test_the_handover_is_not_felt(ros, robot, changed, load):
-    arm = HandoverArm(ros, robot, **changed)
-    arm.run(100)
-    if load:
-        arm.push(PUSHED[robot], FORCE[robot])  # for half a second
-        arm.run(750 if load == "friction" else 200)
-    arm.enable(True)
-    arm.run(200)
-    arm.enable(False)
-    arm.run(300)
-    q, tau, by_torque = arm.recorded()
-    first, last = np.flatnonzero(by_torque)[[0, -1]]
-    assert by_torque[first:last].all()
-    assert last - first > 150
-    # In the state after the one first answered with torque, the effort is that torque.
-    steps = np.abs(np.diff(tau, axis=0)) / arm.tau_max
-    if load:
-        assert np.ptp(tau[50:first] / arm.tau_max, axis=0).max() > 0.05, "hardly a load"
-    ordinary = steps[first - 50 : first].max(axis=0)
-    assert (steps[first] < ordinary + 0.01).all()
-    assert (steps[first + 1 : first + 50] < 0.01).all()
-    if load != "push":
-        # Nothing is to be seen of it either, nor of the way back.
-        assert np.abs(q[first:last] - q[first]).max() < 1e-3
-        assert np.abs(q[last:] - q[last]).max() < 1e-3
-        assert (steps[last : last + 2] < 0.01).all()
-
-
-def test_an_arm_in_motion_is_brought_to_rest_before_its_drives_take_it(ros):
-    arm = HandoverArm(ros, "talos_left_arm")
-    arm.run(50)
-    arm.enable(True)
-    arm.run(50)
-    joints = list(arm.states[0].name)
-    goal = np.array(arm.states[0].position) + 0.25
-    goals = ros.talk(JointState, "target_posture", GOAL_QOS)
-    arm.ros.set_parameters(NODE, posture_kp=20.0, pose_weight=0.0)
-    goals.publish(JointState(name=joints, position=goal.tolist()))
-    arm.ros.wait_until(lambda: np.abs(arm.states[-1].velocity).max() > 0.3, "motion")
-    arm.enable(False)
-    arm.ros.wait_until(
-        lambda: arm.ros.reported(NODE, "control") == "position", "the drives", timeout=30.0
-    )
-    arm.run(300)
-    q, tau, by_torque = arm.recorded()
-    last = np.flatnonzero(by_torque)[-1]
-    steps = np.abs(np.diff(tau, axis=0)) / arm.tau_max
-    # Taken in motion, drives brake it with the whole of their torque in one step.
-    assert steps[last : last + 50].max() < 0.1
-    assert np.abs(q[last:] - q[last]).max() < 2e-3
+@pytest.mark.parametrize("bad", ["bounds", "torque", "position"])
+def test_a_handover_that_fails_leaves_everything_as_it_was(arm, bad):
+    controller = with_integral(arm)
+    goal = pose_at(arm, arm.q_start + 0.1)
+    controller.set_pose_goal(goal)
+    nan = np.full(arm.n, math.nan)
+    q = nan if bad == "position" else arm.q_start
+    bounds = (nan, nan) if bad == "bounds" else wide(arm)
+    tau = nan if bad == "torque" else 0.5 * arm.tau_max
+    step = controller.bumpless_transfer(State(q, np.zeros(arm.n)), AccelerationRange(*bounds), tau)
+    assert step.failure
+    assert not controller.additional.last.any()
+    assert controller.goals.pose_des is goal
+    assert controller.goals.q_des is None
+    step = controller.hold(State(arm.q_start, np.zeros(arm.n)))
+    np.testing.assert_allclose(step.tau, gravity(arm, arm.q_start), atol=EXACT)
+    assert not controller.step(State(arm.q_start, np.zeros(arm.n)), wide(arm)).failure

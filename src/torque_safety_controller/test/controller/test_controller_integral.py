@@ -1,302 +1,141 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller node with integral action: its parameters, at start and live."""
-
-from __future__ import annotations
+"""The controller with integral action."""
 
 import math
-import re
+from dataclasses import replace
 
 import numpy as np
-import pytest
 from arms import load_arm
-from sensor_msgs.msg import JointState
-from trajectory_msgs.msg import JointTrajectory
+from controllers import (
+    GAINS,
+    KHZ,
+    NUMBERS,
+    VECTORS,
+    assert_may_be_sent,
+    integral,
+    pose_at,
+    wide,
+    with_integral,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from torque_safety_controller.additional_torque import (
-    AdditionalSettings,
-    AdditionalTorque,
+    MODES,
 )
-from torque_safety_controller.controller import Controller, Gains
-from torque_safety_controller.integral_feedback import IntegralSettings
-from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.qp.constraints import AccelerationRange
-from torque_safety_controller.tasks.gains import critical_damping
-from viability_bounds_pkg.exceptions import SettingError
+from torque_safety_controller.tasks.pose_task import pose_error
 from viability_bounds_pkg.state import State
-from viability_bounds_pkg.testing.ros_harness import (
-    acceleration_limits,
-    joint_state,
-    names_parameter,
-    read_config,
+
+DEEDS = st.lists(
+    st.tuples(
+        st.sampled_from(["step", "brake", "hold", "bumpless_transfer", "reset"]),
+        st.sampled_from([None, *MODES]),
+        st.one_of(st.none(), NUMBERS),
+        st.one_of(st.just(np.zeros(7)), VECTORS),
+        st.one_of(st.just(np.zeros(7)), VECTORS),
+        VECTORS,
+    ),
+    min_size=1,
+    max_size=10,
 )
 
-NODE = "controller_node"
-MS = 1_000_000
-ARM = load_arm("panda")
-PERIOD = round(1e3 * ARM.dt)  # ms
-VALUES = read_config("panda", NODE) | {
-    "bounds_timeout": 20.0,
-    "state_timeout": 40.0,
-    "disturbance_time": -1.0,
-    "integral_action": "joints",
-}
-JOINTS = VALUES["joints"]
-N = ARM.n
-Q = ARM.q_start
-WIDE = np.full(N, 50.0)
-# Of states at one place: what the arm does not do as it is told, the integral sees.
-SPEEDS = (
-    0.02 * ARM.v_max * np.array([[1], [-1], [0.5], [-2], [1]]) * np.sign(0.5 - np.arange(N) % 2)
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(
+    mode=st.sampled_from(MODES),
+    share=st.sampled_from([0.0, 0.1, 1.0]),
+    rate=st.sampled_from([math.inf, 1000.0]),
+    deeds=DEEDS,
 )
-SAME_TORQUE = 1e-6  # N m
-
-GAINS = Gains(
-    pose_kp=VALUES["pose_kp"],
-    pose_kd=critical_damping(VALUES["pose_kp"]),
-    pose_weight=VALUES["pose_weight"],
-    posture_kp=VALUES["posture_kp"],
-    posture_kd=critical_damping(VALUES["posture_kp"]),
-    posture_weight=VALUES["posture_weight"],
-    hold_kd=VALUES["hold_kd"],
-)
-DEFAULT = {"budget": 0.1 * ARM.tau_max}
-"""Of the settings, where it is not that of the classes."""
-
-
-def core(mode="joints", rows=slice(0, 6), **changed) -> Controller:
-    """The node's core, set up by hand; also says what its defaults are."""
-    additional = AdditionalTorque(make_settings(mode, **changed), rows)
-    controller = Controller(ARM.robot(), ARM.tau_max, GAINS, additional=additional)
-    controller.reset(Q)
-    return controller
-
-
-def make_settings(mode="joints", **changed) -> AdditionalSettings:
-    return AdditionalSettings(mode, IntegralSettings(**DEFAULT | changed), 2.0 * ARM.tau_max)
-
-
-class IntegralChain:
-    """A controller that is asked for torques, one period after the other."""
-
-    def __init__(self, ros, **changed) -> None:
-        self.ros, self.stamp = ros, 10 * PERIOD
-        self.node = ros.start(ControllerNode, VALUES | changed)
-        self.commands = ros.listen(JointState, "joint_commands")
-        self.states = ros.talk(JointState, "joint_states")
-        self.limits = ros.talk(JointTrajectory, "acceleration_limits")
-        ros.hears("joint_commands")
-
-    def answer(self, v, period=PERIOD) -> np.ndarray:
-        """Return the torques for the next state."""
-        self.stamp += period
-        stamp = self.stamp * MS
-
-        def send():
-            self.limits.publish(acceleration_limits(JOINTS, stamp, -WIDE, WIDE))
-            self.states.publish(joint_state(JOINTS, stamp, Q, v))
-
-        self.ros.wait_until(lambda: stamp in self.commands.stamps, "a command", each=send)
-        return np.array(self.commands[self.commands.stamps.index(stamp)].effort)
+def test_torque_limits_hold_whatever_the_integral_does(mode, share, rate, deeds):
+    arm = load_arm("panda")
+    budget = share * arm.tau_max
+    controller = with_integral(arm, mode, rate=np.full(arm.n, rate), budget=budget)
+    controller.set_posture_goal(arm.q_start + 0.3)
+    with np.errstate(all="ignore"):
+        for deed, other, elapsed, dq, v, x in deeds:
+            if other is not None:
+                controller.additional.settings = integral(arm, other, budget=budget)
+            q = arm.q_start + dq
+            bounds = AccelerationRange(-np.abs(x), np.abs(x))
+            if deed == "reset":
+                controller.reset(q)
+                continue
+            act = getattr(controller, deed)
+            last = {"hold": (elapsed,), "bumpless_transfer": (bounds, x)}
+            step = act(State(q, v), *last.get(deed, (bounds, elapsed)))
+            assert_may_be_sent(step, arm)
+            assert np.isfinite(controller.additional.last).all()
+        # Once the world makes sense again, so does the controller.
+        controller.goals.pose_des = None
+        controller.set_posture_goal(arm.q_start)
+        rest = State(arm.q_start, np.zeros(arm.n)), wide(arm)
+        for _ in range(3):
+            assert_may_be_sent(controller.step(*rest), arm)
+        assert not controller.step(*rest).failure
 
 
-def answers(controller, speeds=SPEEDS) -> np.ndarray:
-    return np.array(
-        [controller.step(State(Q, v), AccelerationRange(-WIDE, WIDE)).tau for v in speeds]
-    )
+STIFF = replace(GAINS, pose_kp=400.0, pose_kd=40.0, posture_kp=100.0, posture_kd=20.0)
 
 
-SMALL = (0.001 * ARM.tau_max).tolist()
+def pushed(arm, q, v, tau, push):
+    """Play a period with a torque on the joints that no one knows of."""
+    return arm.move(q, v, tau + push, KHZ, steps=1)
 
 
-SMALL_BUDGET = {"budget": np.array(SMALL)}
-TASK = {"mode": "task"}
+def test_the_integral_carries_what_the_model_does_not_know():
+    arm = load_arm("panda")
+    push = 0.1 * arm.tau_max * np.array([1, -1, 1, 1, -1, 1, -1])
+    errors = {}
+    for mode in ("none", "joints", "task"):
+        controller = with_integral(arm, mode, STIFF)
+        goal = pose_at(arm, arm.q_start)
+        controller.reset(arm.q_start)
+        controller.set_pose_goal(goal)
+        q, v = arm.q_start, np.zeros(arm.n)
+        for _ in range(round(0.6 / KHZ)):
+            q, v = pushed(arm, q, v, controller.step(State(q, v), wide(arm)).tau, push)
+        errors[mode] = np.linalg.norm(pose_error(pose_at(arm, q), goal)[:3])
+    assert errors["joints"] < 0.1 * errors["none"]
+    assert errors["task"] < 0.1 * errors["none"]
 
 
-@pytest.mark.parametrize(
-    ("changed", "by_hand", "without"),
-    [
-        ({}, {}, {"mode": "none"}),
-        ({"integral_action": "none"}, {"mode": "none"}, {}),
-        ({"integral_action": "task"}, TASK, {}),
-        (
-            {"integral_action": "task", "integral_task": "position"},
-            TASK | {"rows": slice(0, 3)},
-            TASK,
-        ),
-        ({"integral_budget": SMALL}, SMALL_BUDGET, {}),
-        ({"integral_lambda": 8.0}, {"gain": 8.0}, {}),
-        ({"integral_leak": [20.0, 100.0, 0.5]}, {"slow_leak_rate": 20.0}, {}),
-        ({"integral_leak": [0.1, 10.0, 0.5]}, {"fast_leak_rate": 10.0}, {}),
-        ({"integral_leak": [0.1, 100.0, 0.1]}, {"mu": 0.1}, {}),
-        (
-            {"integral_anti_windup": "scaling", "integral_budget": SMALL},
-            SMALL_BUDGET | {"anti_windup": "scaling"},
-            SMALL_BUDGET,
-        ),
-        ({"integral_anti_windup": "paper"}, {"anti_windup": "paper"}, {}),
-        (
-            {"integral_anti_windup": "none", "integral_budget": SMALL},
-            SMALL_BUDGET | {"anti_windup": "none"},
-            SMALL_BUDGET,
-        ),
-    ],
-    ids=lambda value: " ".join(value),
-)
-def test_each_parameter_reaches_the_torque(ros, changed, by_hand, without):
-    chain = IntegralChain(ros, **changed)
-    torques = np.array([chain.answer(v) for v in SPEEDS])
-    np.testing.assert_allclose(torques, answers(core(**by_hand)), atol=SAME_TORQUE)
-    assert np.abs(torques - answers(core(**without))).max() > 20.0 * SAME_TORQUE
+def test_the_limits_on_torque_leave_the_integral_its_share(arm):
+    """The QP keeps the sum within its limits: the accelerations it returns are those it gives."""
+    state = State(arm.q_start, np.zeros(arm.n))
+    saturated = 0
+    for sign in (1.0, -1.0):
+        controller = with_integral(arm, gains=replace(GAINS, posture_kp=1e4))
+        controller.bumpless_transfer(state, wide(arm), sign * 0.5 * arm.tau_max)
+        controller.goals.pose_des = None
+        controller.set_posture_goal(arm.q_max)
+        for _ in range(5):
+            step = controller.step(state, wide(arm))
+            assert_may_be_sent(step, arm)
+            assert not step.failure
+            added = controller.additional.last
+            assert (np.abs(added) > 0.01 * arm.tau_max).any()
+            # The limits are those in the middle of a step with the acceleration of the last one.
+            model = controller.robot.torque(step.a)
+            np.testing.assert_allclose(step.tau, model + added, atol=0.01 * arm.tau_max.max())
+            saturated += (np.abs(step.tau) > 0.99 * arm.tau_max).any()
+    assert saturated == 10
 
 
-def test_parameters_change_while_it_runs_and_the_torque_goes_on(ros):
-    chain, controller = IntegralChain(ros), core()
-    np.testing.assert_allclose(
-        [chain.answer(v) for v in SPEEDS], answers(controller), atol=SAME_TORQUE
-    )
-    common = {}
-    for changed, by_hand in (
-        ({"integral_lambda": 8.0}, {"gain": 8.0}),
-        ({"integral_budget": SMALL}, {"budget": np.array(SMALL)}),
-        ({"integral_leak": [1.0, 40.0, 0.5]},
-         {"slow_leak_rate": 1.0, "fast_leak_rate": 40.0}),
-        ({"integral_leak": [1.0, 40.0, 0.2]}, {"mu": 0.2}),
-        ({"integral_action": "task"}, {"mode": "task"}),
-        ({"integral_action": "none"}, {"mode": "none"}),
-        ({"integral_action": "joints", "integral_anti_windup": "paper"},
-         {"mode": "joints", "anti_windup": "paper"}),
-    ):  # fmt: skip
-        ros.accepts(NODE, **changed)
-        common |= by_hand
-        controller.additional.settings = make_settings(**common)
-        before = controller.additional.last
-        for k, v in enumerate(SPEEDS):
-            expected = controller.step(State(Q, v), AccelerationRange(-WIDE, WIDE)).tau
-            np.testing.assert_allclose(
-                chain.answer(v), expected, atol=SAME_TORQUE, err_msg=f"{changed}, step {k}"
-            )
-            if k == 0:
-                # The same state as the last one, but for v.
-                change = controller.additional.last - before
-                assert (np.abs(change) < 0.01 * ARM.tau_max).all(), changed
-    ros.wait_until(lambda: ros.reported(NODE, "integral_action") == "joints")
-
-
-BAD = [
-    ("integral_action", "plain", "one of none, joints, task"),
-    ("integral_action", "", "one of none, joints, task"),
-    ("integral_budget", [1.0], "7 numbers"),
-    ("integral_budget", [-1.0, *ARM.tau_max[1:]], ">= 0"),
-    ("integral_budget", [math.nan, *ARM.tau_max[1:]], "finite"),
-    ("integral_budget", [math.inf, *ARM.tau_max[1:]], "at most torque_max"),
-    ("integral_budget", [87.1, *ARM.tau_max[1:]], "at most torque_max"),
-    ("integral_lambda", 0.0, "> 0"),
-    ("integral_lambda", -2.0, "> 0"),
-    ("integral_lambda", math.inf, "<= 1000"),
-    ("integral_lambda", "much", "a number"),
-    ("integral_leak", [-0.1, 100.0, 0.5], ">= 0"),
-    ("integral_leak", [math.nan, 100.0, 0.5], ">= 0"),
-    ("integral_leak", [0.1, -1.0, 0.5], ">= 0"),
-    ("integral_leak", [0.1, math.inf, 0.5], "finite"),
-    ("integral_leak", [0.1, 0.05, 0.5], "theta_f >= theta_s"),
-    ("integral_leak", [0.1, 100.0, -0.01], ">= 0"),
-    ("integral_leak", [0.1, 100.0, 1.01], "mu <= 1"),
-    ("integral_leak", [0.1, 100.0, math.nan], ">= 0"),
-    ("integral_leak", [0.1, 100.0], "3 finite numbers"),
-    ("integral_anti_windup", "qp2", "one of none, scaling, paper, qp"),
-]
-
-
-@pytest.mark.parametrize(("name", "value", "allowed"), BAD)
-def test_it_does_not_start_with_bad_parameters(ros, name, value, allowed):
-    with pytest.raises(SettingError) as refusal:
-        ros.start(ControllerNode, VALUES | {name: value})
-    text = str(refusal.value)
-    assert refusal.value.name == name
-    assert re.fullmatch(rf"parameter '{name}' is (.+); allowed: (.+)", text), text
-    assert allowed in text
-
-
-def test_bad_parameters_are_refused_live_and_the_old_ones_stay(ros):
-    chain, controller = IntegralChain(ros), core()
-    np.testing.assert_allclose(
-        [chain.answer(v) for v in SPEEDS], answers(controller), atol=SAME_TORQUE
-    )
-    before = {name: chain.node.get_parameter(name).value for name, _, _ in BAD}
-    for name, value, allowed in BAD:
-        reason = ros.refuses(NODE, **{name: value})
-        assert names_parameter(reason, name)
-        assert allowed in reason or "out of range" in reason
-    assert {name: chain.node.get_parameter(name).value for name, _, _ in BAD} == before
-    # Nothing of it is in the torque.
-    np.testing.assert_allclose(
-        [chain.answer(v) for v in SPEEDS], answers(controller), atol=SAME_TORQUE
-    )
-
-
-def test_the_task_is_read_only_and_known(ros):
-    with pytest.raises(SettingError, match="'integral_task' is 'elbow'; allowed: one of pose"):
-        ros.start(ControllerNode, VALUES | {"integral_task": "elbow"})
-    IntegralChain(ros)
-    assert "read-only" in ros.refuses(NODE, integral_task="position")
-
-
-def six_joints() -> dict:
-    cut = {k: v[:6] for k, v in VALUES.items() if isinstance(v, list) and len(v) == N}
-    return VALUES | cut | {"end_effector_frame": "panda_link6"}
-
-
-def test_six_joints_have_no_null_space_of_a_pose(ros):
-    values = six_joints()
-    with pytest.raises(SettingError) as refusal:
-        ros.start(ControllerNode, values | {"integral_action": "task"})
-    assert str(refusal.value) == (
-        "parameter 'integral_action' is 'task'; allowed: 'none' or 'joints': "
-        "6 joints have no null space left of the task"
-    )
-    ros.start(ControllerNode, values)
-    assert "no null space left" in ros.refuses(NODE, integral_action="task")
-    ros.accepts(NODE, integral_action="none", integral_leak=[0.1, 100.0, 0.2])
-
-
-def test_six_joints_have_a_null_space_of_a_position(ros):
-    values = six_joints() | {"integral_action": "task", "integral_task": "position"}
-    ros.start(ControllerNode, values)
-    ros.accepts(NODE, integral_action="joints")
-
-
-# Time
-
-
-@pytest.mark.parametrize("gap", [3 * PERIOD, 300, 100_000])
-def test_a_robot_that_pauses_or_whose_clock_jumps_gets_no_kick(ros, gap):
-    chain = IntegralChain(ros, integral_lambda=30.0)
-    for _ in range(20):
-        before = chain.answer(SPEEDS[3])
-    added = reported(ros, "additional_torque_nm")
-    assert np.abs(added / ARM.tau_max).max() > 0.01
-    after = chain.answer(SPEEDS[3], gap)
-    assert (np.abs(after - before) < 1e-3 * ARM.tau_max).all()
-    assert (np.abs(chain.answer(SPEEDS[3]) - after) < 5e-3 * ARM.tau_max).all()
-    ros.wait_until(lambda: ros.reported(NODE, "integral_skipped_steps") == "1")
-
-
-def reported(ros, key) -> np.ndarray:
-    """Return what is reported from now on."""
-    ros.diagnostics.clear()
-    ros.wait_until(lambda: ros.reported(NODE, key), key)
-    return np.array(ros.reported(NODE, key).split(), float)
-
-
-def test_states_that_cannot_be_used_do_not_move_the_integral(ros):
-    """While they come, the arm is held with the velocity taken for zero."""
-    chain = IntegralChain(ros, bounds_timeout=0.1)
-    for v in SPEEDS:
-        chain.answer(v)
-    before = reported(ros, "additional_torque_nm")
-    bad = joint_state(JOINTS, (chain.stamp + 1) * MS, np.full(N, math.nan), np.zeros(N))
-    chain.commands.clear()
-    ros.wait_until(
-        lambda: len(chain.commands) >= 3, "torques", each=lambda: chain.states.publish(bad)
-    )
-    np.testing.assert_array_equal(reported(ros, "additional_torque_nm"), before)
+def test_in_hold_nothing_grows_on_what_the_motors_cannot_give(arm):
+    controller = with_integral(arm, gains=replace(GAINS, hold_kd=100.0))
+    robot = controller.robot
+    q, v = arm.q_start, np.zeros(arm.n)
+    robot.update(State(q, v), v)
+    # So fast that to brake as it should takes 1.8 times what the first motor has.
+    v[0] = 1.8 * arm.tau_max[0] / (100.0 * robot.M[0, 0])
+    saturated = 0
+    for _ in range(8):
+        step = controller.hold(State(q, v), KHZ)
+        saturated += abs(step.tau[0]) == arm.tau_max[0]
+        q, v = arm.move(q, v, step.tau, KHZ, steps=2)
+    assert saturated > 4
+    assert controller.additional.skipped == 0
+    # With the accelerations that were wished for, half of the budget would be used up by now.
+    assert (np.abs(controller.additional.last) < 0.02 * arm.tau_max).all()

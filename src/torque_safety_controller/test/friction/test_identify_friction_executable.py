@@ -3,29 +3,22 @@
 
 from __future__ import annotations
 
-import os
 import signal
-import subprocess
-import sys
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
 import pytest
 import yaml
 
-import torque_safety_controller
-import viability_bounds_pkg
 from torque_safety_controller.cli.identify_friction import main
 from torque_safety_controller.friction.settings import FrictionModel
 from viability_bounds_pkg.cli.limits_file import read_robot
+from viability_bounds_pkg.testing.executables import called, started
 
-PACKAGES = [
-    str(Path(package.__file__).resolve().parents[1])
-    for package in (torque_safety_controller, viability_bounds_pkg)
-]
-COMMAND = [sys.executable, "-m", "torque_safety_controller.cli.identify_friction"]
-TIME_LIMIT = 60.0
+MODULE = "torque_safety_controller.cli.identify_friction"
+
+LIMIT = 60.0
 
 LIMIT = '<limit lower="-2" upper="2" effort="30" velocity="4"/>'
 URDF = f"""
@@ -86,33 +79,10 @@ def recording(robot, tmp_path):
     return path
 
 
-def environment():
-    paths = [*PACKAGES, os.environ.get("PYTHONPATH", "")]
-    return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
-
-
-def run(*arguments):
-    return subprocess.run(
-        [*COMMAND, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        env=environment(),
-        timeout=TIME_LIMIT,
-    )
-
-
 @pytest.fixture
-def call(capsys):
-    """Runs the tool in this process; returns exit code, output and errors."""
-
-    def run_here(*arguments):
-        try:
-            code = main([str(argument) for argument in arguments])
-        except SystemExit as ended:
-            code = ended.code
-        return code, *capsys.readouterr()
-
-    return run_here
+def call(capfd):
+    """Runs the tool in this process, which saves the start of an interpreter."""
+    return partial(called, capfd, main)
 
 
 def parameters_in(text):
@@ -123,7 +93,7 @@ def parameters_in(text):
 
 def test_friction_is_written_as_an_overlay(robot, recording, tmp_path):
     output = tmp_path / "friction.yaml"
-    ended = run(robot, recording, "-o", output)
+    ended = started("-m", MODULE, robot, recording, "-o", output)
     assert (ended.returncode, ended.stderr) == (0, "")
     written = parameters_in(output.read_text())
     names = ("coulomb", "static", "viscous", "stribeck_velocity")
@@ -138,9 +108,9 @@ def test_friction_is_written_as_an_overlay(robot, recording, tmp_path):
 
 
 def test_without_a_file_it_is_printed(robot, recording, call):
-    code, out, errors = call(robot, recording)
-    assert (code, errors) == (0, "")
-    parameters_in(out[out.index("# Friction found") :])
+    ended = call(robot, recording)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    parameters_in(ended.stdout[ended.stdout.index("# Friction found") :])
 
 
 def test_what_is_not_told_is_said_in_the_file(robot, recording, call, tmp_path):
@@ -149,7 +119,7 @@ def test_what_is_not_told_is_said_in_the_file(robot, recording, call, tmp_path):
     arrays["v"][:, 0] = 0.0  # the wrist stands
     np.savez(recording, **arrays)
     output = tmp_path / "friction.yaml"
-    assert call(robot, recording, "-o", output)[0] == 0
+    assert call(robot, recording, "-o", output).returncode == 0
     text = output.read_text()
     assert "# wrist: nothing found: it did not move both ways" in text
     assert parameters_in(text)["friction_model_coulomb"][1] == 0.0
@@ -160,10 +130,10 @@ def test_nothing_at_all_is_an_error_and_no_file(robot, recording, call, tmp_path
         arrays = {key: file[key][:4000] if key != "joints" else file[key] for key in file}
     np.savez(recording, **arrays)
     output = tmp_path / "friction.yaml"
-    code, out, errors = call(robot, recording, "-o", output)
-    assert code == 1
-    assert errors.strip().endswith("tells nothing about friction: see above")
-    assert "did not move both ways" in out
+    ended = call(robot, recording, "-o", output)
+    assert ended.returncode == 1
+    assert ended.stderr.strip().endswith("tells nothing about friction: see above")
+    assert "did not move both ways" in ended.stdout
     assert not output.exists()
 
 
@@ -185,8 +155,9 @@ def test_what_cannot_be_done_is_told_in_one_line(
 ):
     before = robot.read_bytes(), recording.read_bytes()
     names = {"robot": robot, "run": recording, "tmp": tmp_path}
-    ended, _, errors = call(*(argument.format(**names) for argument in arguments))
-    assert ended == code
+    ended = call(*(argument.format(**names) for argument in arguments))
+    errors = ended.stderr
+    assert ended.returncode == code
     assert errors.startswith("identify_friction: ") and errors.count("\n") == 1
     assert message in errors
     assert (robot.read_bytes(), recording.read_bytes()) == before
@@ -208,13 +179,7 @@ sys.exit(tool.main())
 def test_an_interrupt_leaves_nothing_behind(robot, recording, tmp_path):
     output = tmp_path / "friction.yaml"
     output.write_text("old")
-    ended = subprocess.run(
-        [sys.executable, "-c", INTERRUPTIBLE, robot, recording, "-o", output],
-        capture_output=True,
-        text=True,
-        env=environment(),
-        timeout=TIME_LIMIT,
-    )
+    ended = started("-c", INTERRUPTIBLE, robot, recording, "-o", output)
     assert ended.returncode == 128 + signal.SIGINT
     assert ended.stderr.strip() == "identify_friction: interrupted, nothing written"
     assert output.read_text() == "old"

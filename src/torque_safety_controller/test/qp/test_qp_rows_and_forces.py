@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The QP with contact forces and further rows, against solvers of other kinds."""
 
-from typing import NamedTuple
-
 import numpy as np
 import pytest
 import scipy.sparse as sparse
 from proxsuite import proxqp
+from qp_problems import Problem, solution_of
 from scipy.optimize import lsq_linear, nnls
 
-from torque_safety_controller.qp.constraints import AccelerationRange, LinearConstraints
+from torque_safety_controller.qp.constraints import LinearConstraints
 from torque_safety_controller.qp.inverse_dynamics_qp import ContactForces, InverseDynamicsQP
 from torque_safety_controller.qp.quadratic_program import NoSolutionFound
 from torque_safety_controller.qp.terms import TaskTerm, WrenchTerm
@@ -19,23 +18,7 @@ GAMMA = 1e-4
 KEPT = 1e-6  # rad/s^2, N m and N
 
 
-class ForceProblem(NamedTuple):
-    tasks: list[TaskTerm]
-    a_lower: np.ndarray
-    a_upper: np.ndarray
-    M: np.ndarray
-    tau_lower: np.ndarray
-    tau_upper: np.ndarray
-    rows: LinearConstraints
-    contacts: ContactForces
-
-
-def solution_of(qp, problem: ForceProblem):
-    tasks, a_lower, a_upper, *rest = problem
-    return qp.solve(qp.build(tasks, AccelerationRange(a_lower, a_upper), *rest))
-
-
-def random_problem(rng, k=10, r=8, room=1.0) -> ForceProblem:
+def random_problem(rng, k=10, r=8, room=1.0) -> Problem:
     """With little room, torques and bounds, or rows and bounds, contradict each other."""
     L = 0.5 * rng.normal(size=(N, N))
     G = rng.normal(size=(k, N))
@@ -53,7 +36,7 @@ def random_problem(rng, k=10, r=8, room=1.0) -> ForceProblem:
         WrenchTerm(rng.normal(size=(6, half_r)), 10.0 * rng.normal(size=6), 0.5, 0),
         WrenchTerm(rng.normal(size=(3, r - half_r)), 10.0 * rng.normal(size=3), 2.0, half_r),
     ]
-    return ForceProblem(
+    return Problem(
         [
             TaskTerm(rng.normal(size=(6, N)), 10.0 * rng.normal(size=6), 3.0),
             TaskTerm(None, rng.normal(size=N), 3e-2),
@@ -68,7 +51,7 @@ def random_problem(rng, k=10, r=8, room=1.0) -> ForceProblem:
     )
 
 
-def cost_of(problem: ForceProblem):
+def cost_of(problem: Problem):
     """H and g of the cost in (a, rho), the largest weight made 1."""
     r = len(problem.contacts.rho_max)
     scale = max(t.weight for t in [*problem.tasks, *problem.contacts.tasks])
@@ -84,7 +67,7 @@ def cost_of(problem: ForceProblem):
     return H, g
 
 
-def by_proxqp(problem: ForceProblem):
+def by_proxqp(problem: Problem):
     """a and rho with the torque as a variable of its own, and by an augmented Lagrangian.
 
     Variables (a, rho, tau) with the dynamics as an equation. None without a solution.
@@ -119,7 +102,7 @@ def by_proxqp(problem: ForceProblem):
     return x[: N + r]
 
 
-def least_relaxation(problem: ForceProblem) -> np.ndarray:
+def least_relaxation(problem: Problem) -> np.ndarray:
     """How far bounds and rows have to give way, shape (n + k,), as least squares in boxes.
 
     In the torques, the forces, and the nearest values within the limits.
@@ -135,14 +118,14 @@ def least_relaxation(problem: ForceProblem) -> np.ndarray:
     return A @ found.x
 
 
-def excess(problem: ForceProblem, a: np.ndarray) -> np.ndarray:
+def excess(problem: Problem, a: np.ndarray) -> np.ndarray:
     value = np.r_[a, problem.rows.G @ a]
     lower = np.r_[problem.a_lower, problem.rows.lower]
     upper = np.r_[problem.a_upper, problem.rows.upper]
     return np.maximum(np.maximum(lower - value, value - upper), 0.0)
 
 
-def assert_tasks_served_best(problem: ForceProblem, solution) -> None:
+def assert_tasks_served_best(problem: Problem, solution) -> None:
     """Karush-Kuhn-Tucker, with limits where they have been moved to."""
     x = np.r_[solution.a, solution.rho]
     H, g = cost_of(problem)
@@ -163,7 +146,7 @@ def assert_tasks_served_best(problem: ForceProblem, solution) -> None:
     assert left < 1e-5 * (1.0 + np.linalg.norm(g))
 
 
-def assert_hard_limits_kept(problem: ForceProblem, solution) -> None:
+def assert_hard_limits_kept(problem: Problem, solution) -> None:
     rho = solution.rho
     assert (rho >= 0.0).all()
     assert (rho <= problem.contacts.rho_max).all()

@@ -10,10 +10,24 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
 from torque_safety_controller.node.controller_node import ControllerNode
+from torque_safety_controller.tasks.gains import Gains, critical_damping
 from viability_bounds_pkg.testing.ros_harness import RosHarness, acceleration_limits, joint_state
 
 MS = 1_000_000
 NODE = "controller_node"
+
+
+def gains_of(values: Mapping[str, Any]) -> Gains:
+    """Return the gains that the node makes of its parameters."""
+    return Gains(
+        pose_kp=values["pose_kp"],
+        pose_kd=critical_damping(values["pose_kp"]),
+        pose_weight=values["pose_weight"],
+        posture_kp=values["posture_kp"],
+        posture_kd=critical_damping(values["posture_kp"]),
+        posture_weight=values["posture_weight"],
+        hold_kd=values["hold_kd"],
+    )
 
 
 class ControllerChain:

@@ -6,12 +6,11 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 from arms import load_arm
-from controller_chain import NODE, ControllerChain
+from controller_chain import NODE, ControllerChain, gains_of
 from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import JointState
 
-from torque_safety_controller.controller import Controller, Gains
-from torque_safety_controller.tasks.gains import critical_damping
+from torque_safety_controller.controller import Controller
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import read_config
@@ -26,15 +25,7 @@ VALUES = read_config("baxter_left_arm", NODE) | {
     "safety_filter": False,  # which has tests of its own
 }
 JOINTS = VALUES["joints"]
-GAINS = Gains(
-    pose_kp=VALUES["pose_kp"],
-    pose_kd=critical_damping(VALUES["pose_kp"]),
-    pose_weight=VALUES["pose_weight"],
-    posture_kp=VALUES["posture_kp"],
-    posture_kd=critical_damping(VALUES["posture_kp"]),
-    posture_weight=VALUES["posture_weight"],
-    hold_kd=VALUES["hold_kd"],
-)
+GAINS = gains_of(VALUES)
 Q = ARM.q_start
 REST = np.zeros(ARM.n)
 V = 0.02 * ARM.v_max

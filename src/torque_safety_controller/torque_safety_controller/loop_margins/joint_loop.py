@@ -111,18 +111,14 @@ class OpenLoop(NamedTuple):
         closed = self.A + factor * np.outer(self.b, self.c)
         return float(np.abs(np.linalg.eigvals(closed)).max())
 
-    def modulus_margin(self, factor: float = 1.0) -> float:
-        """Return the least distance of the Nyquist curve from -1; 0 for an unstable loop.
-
-        Args:
-            factor: see `spectral_radius`.
-        """
-        if self.spectral_radius(factor) > 1.0 + _ROUNDING:
+    def modulus_margin(self) -> float:
+        """Return the least distance of the Nyquist curve from -1; 0 for an unstable loop."""
+        if self.spectral_radius() > 1.0 + _ROUNDING:
             return 0.0
         angles = math.pi * np.geomspace(_SLOWEST, 1.0, _FREQUENCIES)
         z = np.exp(1j * angles)[:, None, None] * np.eye(len(self.b))
         states = np.linalg.solve(z - self.A, np.broadcast_to(self.b[:, None], (*z.shape[:2], 1)))
-        return float(np.abs(1.0 - factor * (self.c @ states[..., 0].T)).min())
+        return float(np.abs(1.0 - self.c @ states[..., 0].T).min())
 
 
 def motion(link: Link) -> Motion:

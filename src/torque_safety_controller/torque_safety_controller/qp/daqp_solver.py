@@ -66,7 +66,7 @@ def _solve(
     program: QuadraticProgram, active: NDArray[np.int32], settings: dict[str, float]
 ) -> SolverResult:
     """Solve from a guess of the active limits, which receives those of the solution."""
-    H, g, C, lower, upper, _ = program
+    H, g, C, lower, upper = program
     x, _, flag, info = daqp.solve(H, g, C, upper, lower, active, **settings)
     if flag < 0:
         valid = flag in _INFEASIBLE and _is_valid(program)
@@ -86,13 +86,13 @@ def _scale(program: QuadraticProgram) -> float:
 
 def _divided(program: QuadraticProgram, scale: float) -> QuadraticProgram:
     """Return the program for ``x / scale``."""
-    H, g, C, lower, upper, names = program
-    return QuadraticProgram(H, g / scale, C, lower / scale, upper / scale, names)
+    H, g, C, lower, upper = program
+    return QuadraticProgram(H, g / scale, C, lower / scale, upper / scale)
 
 
 def _is_valid(program: QuadraticProgram) -> bool:
     """Return whether all is finite that must be, and limits are not crossed."""
-    H, g, C, lower, upper, _ = program
+    H, g, C, lower, upper = program
     return bool(
         all(np.isfinite(each).all() for each in (H, g, C))
         and (lower <= upper).all()

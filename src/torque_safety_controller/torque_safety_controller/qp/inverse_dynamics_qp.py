@@ -14,7 +14,6 @@ bounds and constraints are relaxed as little as possible, in the sense of least 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -154,7 +153,7 @@ class InverseDynamicsQP:
         if contacts is not None:
             for W, F_des, weight, first in contacts.tasks:
                 add_least_squares(H, g, W, F_des, weight * scale, n + first)
-        return QuadraticProgram(H, g, C, lower, upper, _names(n, r, k))
+        return QuadraticProgram(H, g, C, lower, upper)
 
     def solve(self, program: QuadraticProgram) -> Solution:
         """Return the accelerations and forces that serve the tasks best within the limits.
@@ -292,12 +291,3 @@ def _greatest_weight(tasks: Sequence[TaskTerm], wrench_tasks: Sequence[WrenchTer
     if not greatest > 0.0:
         raise NoSolutionFound("no task with a weight above 0")
     return greatest
-
-
-@lru_cache(maxsize=256)
-def _names(n: int, r: int, k: int) -> tuple[str, ...]:
-    return tuple(
-        f"{what} {i}"
-        for what, count in (("acceleration", n), ("force", r), ("torque", n), ("constraint", k))
-        for i in range(count)
-    )

@@ -30,7 +30,7 @@ class ProxqpSolver:
         ProxQP cannot tell for certain that there is no solution: where it found none within its
         iterations, the status is that of an infeasible program.
         """
-        H, g, C, lower, upper, _ = program
+        H, g, C, lower, upper = program
         n, m = len(g), len(C)
         finite = all(np.isfinite(each).all() for each in (H, g, C))
         if not finite or not (lower <= upper).all():

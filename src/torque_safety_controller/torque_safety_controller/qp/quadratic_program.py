@@ -30,8 +30,6 @@ class QuadraticProgram(NamedTuple):
     """Limits of x, then of C x, shape (p + m,); -inf for none."""
     upper: Array
     """Shape (p + m,), not below `lower`; inf for none."""
-    names: tuple[str, ...] = ()
-    """What each of the p + m limits is of."""
 
     def cost(self, x: Array) -> float:
         """Return the cost at x, shape (p,)."""
@@ -42,16 +40,6 @@ class QuadraticProgram(NamedTuple):
         value = np.concatenate([x, self.C @ x])
         violations: Array = np.maximum(np.maximum(self.lower - value, value - self.upper), 0.0)
         return violations
-
-    def active(self, x: Array, tolerance: float = 1e-6) -> list[str]:
-        """Return the names of the limits that x, shape (p,), is at or beyond."""
-        value = np.concatenate([x, self.C @ x])
-        return [
-            f"{name} {side}"
-            for name, v, low, high in zip(self.names, value, self.lower, self.upper, strict=True)
-            for side, at in (("min", v <= low + tolerance), ("max", v >= high - tolerance))
-            if at
-        ]
 
 
 class Status(Enum):

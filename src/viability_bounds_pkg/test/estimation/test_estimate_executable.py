@@ -3,14 +3,12 @@
 
 from __future__ import annotations
 
-import os
 import re
 import signal
 import subprocess
 import sys
 import threading
-from decimal import ROUND_DOWN, ROUND_UP
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 import pytest
@@ -18,11 +16,15 @@ import yaml
 
 from viability_bounds_pkg.cli import limits_file
 from viability_bounds_pkg.cli.estimate_acceleration_limits import main
+from viability_bounds_pkg.testing.executables import (
+    TIME_LIMIT,
+    called,
+    environment,
+    interruptible,
+    started,
+)
 
-PACKAGE_ROOT = Path(limits_file.__file__).resolve().parents[2]
-COMMAND = [sys.executable, "-m", "viability_bounds_pkg.cli.estimate_acceleration_limits"]
-TIME_LIMIT = 60.0
-
+MODULE = "viability_bounds_pkg.cli.estimate_acceleration_limits"
 LIMITS = 'lower="-1" upper="2" effort="30" velocity="4"'
 LIMIT = f"<limit {LIMITS}/>"
 URDF = """
@@ -72,21 +74,6 @@ def robot(tmp_path):
     return write
 
 
-def environment():
-    paths = [str(PACKAGE_ROOT), os.environ.get("PYTHONPATH", "")]
-    return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
-
-
-def run(*arguments):
-    return subprocess.run(
-        [*COMMAND, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        env=environment(),
-        timeout=TIME_LIMIT,
-    )
-
-
 def parameters_in(text):
     return yaml.safe_load(text)["/**/bounds_node"]["ros__parameters"]
 
@@ -100,7 +87,9 @@ def printed(ended):
 def test_limits_are_written_as_an_overlay(robot, tmp_path, method):
     path, output = robot(), tmp_path / "limits.yaml"
     before = path.read_bytes()
-    ended = run(path, "-o", output, "--samples", 3000, "--method", method, "--seed", 2)
+    ended = started(
+        "-m", MODULE, path, "-o", output, "--samples", 3000, "--method", method, "--seed", 2
+    )
     assert (ended.returncode, ended.stderr) == (0, "")
     assert path.read_bytes() == before
     written = parameters_in(output.read_text())
@@ -199,16 +188,8 @@ def one_line(ended, code=1):
 
 @pytest.fixture
 def call(capfd):
-    """Runs the tool in this process, which saves the start of an interpreter for each case."""
-
-    def called(*arguments):
-        try:
-            code = main([str(argument) for argument in arguments])
-        except SystemExit as error:
-            code = error.code
-        return subprocess.CompletedProcess(arguments, code, *capfd.readouterr())
-
-    return called
+    """Runs the tool in this process, which saves the start of an interpreter."""
+    return partial(called, capfd, main)
 
 
 def test_gravity_beyond_the_torque(robot, call, tmp_path):
@@ -347,7 +328,7 @@ def test_options_that_do_not_fit_the_robot(robot, call, tmp_path, arguments, mes
 
 def test_missing_parameter_file(tmp_path):
     """In a process of its own, as proof that the exit code gets out."""
-    assert "none.yaml" in one_line(run(tmp_path / "none.yaml"))
+    assert "none.yaml" in one_line(started("-m", MODULE, tmp_path / "none.yaml"))
 
 
 def interrupt_when(process, ready):
@@ -372,6 +353,7 @@ def start(code, *arguments):
         stderr=subprocess.PIPE,
         text=True,
         env=environment(),
+        preexec_fn=interruptible,
     )
 
 
@@ -436,52 +418,6 @@ def test_interrupt_before_anything_was_found(robot, tmp_path):
     assert output.read_text() == "old"
 
 
-def test_existing_file_is_replaced_whole(tmp_path):
-    path = tmp_path / "limits.yaml"
-    path.write_text("old")
-    path.chmod(0o640)
-    before = path.stat().st_ino
-    limits_file.write_whole(path, "new")
-    assert path.read_text() == "new"
-    assert path.stat().st_ino != before  # another file took its place
-    assert path.stat().st_mode & 0o777 == 0o640
-    assert os.listdir(tmp_path) == ["limits.yaml"]
-
-
-@pytest.mark.parametrize("broken", ["fsync", "replace"])
-@pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()])
-def test_a_write_that_fails_leaves_the_old_file(tmp_path, monkeypatch, broken, error):
-    path = tmp_path / "limits.yaml"
-    path.write_text("old")
-
-    def fail(*arguments):
-        raise error
-
-    monkeypatch.setattr(limits_file.os, broken, fail)
-    with pytest.raises(type(error)):
-        limits_file.write_whole(path, "new")
-    assert path.read_text() == "old"
-    assert os.listdir(tmp_path) == ["limits.yaml"]
-
-
-def test_a_write_protected_file_is_left_alone(tmp_path, monkeypatch):
-    path = tmp_path / "limits.yaml"
-    path.write_text("old")
-    access = os.access
-    # The permissions themselves do not stop root, who may be running this.
-    monkeypatch.setattr(
-        limits_file.os, "access", lambda p, mode: mode != os.W_OK and access(p, mode)
-    )
-    with pytest.raises(PermissionError, match="write-protected"):
-        limits_file.check_writable(path)
-    assert os.listdir(tmp_path) == ["limits.yaml"]
-
-
-def test_checking_leaves_nothing_behind(tmp_path):
-    limits_file.check_writable(tmp_path / "limits.yaml")
-    assert os.listdir(tmp_path) == []
-
-
 def test_what_was_found_is_printed_when_it_cannot_be_written(robot, call, tmp_path, monkeypatch):
     output = tmp_path / "limits.yaml"
     output.write_text("old")
@@ -494,23 +430,3 @@ def test_what_was_found_is_printed_when_it_cannot_be_written(robot, call, tmp_pa
     assert "no space left" in one_line(ended)
     assert set(printed(ended)) == {"acceleration_min", "acceleration_max"}
     assert output.read_text() == "old"
-
-
-def test_a_link_keeps_pointing_to_the_file_written(tmp_path):
-    target, link = tmp_path / "limits.yaml", tmp_path / "link.yaml"
-    link.symlink_to(target)
-    limits_file.write_whole(link, "new")
-    assert link.is_symlink() and target.read_text() == "new"
-
-
-def test_written_numbers_err_to_the_safe_side():
-    values = np.array([3.0, -3.0, 5.08769, -5.08769, 0.00123456, 1741.837, 15.0, 0.3, 0.0])
-    down = limits_file.rounded(values, ROUND_DOWN)
-    up = limits_file.rounded(values, ROUND_UP)
-    np.testing.assert_array_equal(
-        down, [3.0, -3.0, 5.087, -5.087, 0.001234, 1741.0, 15.0, 0.3, 0.0]
-    )
-    np.testing.assert_array_equal(up, [3.0, -3.0, 5.088, -5.088, 0.001235, 1742.0, 15.0, 0.3, 0.0])
-    text = limits_file.overlay({"acceleration_min": down}, ["note"])
-    assert text.startswith("# note\n")
-    np.testing.assert_array_equal(parameters_in(text)["acceleration_min"], down)

@@ -72,10 +72,9 @@ def test_naive_bounds_are_equation_2():
 
 
 def test_damper_is_linear_within_its_influence():
-    lower, upper = damper_velocity_range(
-        column([0.0, 0.8, 0.9, 0.95]), FIGURE_1, influence=0.2, security=0.05, gain=3.0
-    )
-    assert upper[:, 0] == pytest.approx([5.0, 3.0, 1.0, 0.0])
+    q = column([0.0, 0.8, 0.95, 1.0])
+    lower, upper = damper_velocity_range(q, FIGURE_1, influence=0.2, gain=3.0)
+    assert upper[:, 0] == pytest.approx([5.0, 3.0, 0.75, 0.0])
     assert lower[:, 0] == pytest.approx([-5.0] * 4)
 
 

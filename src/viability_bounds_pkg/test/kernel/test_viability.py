@@ -92,8 +92,11 @@ def assert_exact(outcome):
 
 @pytest.mark.parametrize("name", CASES)
 def test_agrees_with_brute_force(name):
-    """`bash scripts/reproduce.sh exactness` compares far more states."""
-    count = 120 if name in HOLDING else 30
+    """`bash scripts/reproduce.sh exactness` compares far more states.
+
+    Where (11) holds, the paper's algorithm is compared in 20,000 states more, above.
+    """
+    count = 60 if name in HOLDING else 30
     outcome = compare(CASES[name], *states_of(CASES[name], count, seed=2))
     assert_exact(outcome)
     assert outcome.compared > 0.2 * count

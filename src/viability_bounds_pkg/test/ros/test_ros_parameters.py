@@ -216,9 +216,9 @@ def test_parameters_of_others_are_left_alone(ros):
         ({"gain": 0.5}, "parameter 'offset' is 1; allowed: less than gain"),
     ],
 )
-def test_a_node_does_not_start_with_bad_values(ros, changed, expected):
+def test_a_node_does_not_start_with_bad_values(shared_ros, changed, expected):
     with pytest.raises(SettingError) as refusal:
-        start(ros, **changed)
+        start(shared_ros, **changed)
     assert str(refusal.value).startswith(expected)
     assert "\n" not in str(refusal.value)
     assert refusal.value.name in expected

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import viability_bounds_pkg
+from viability_bounds_pkg.testing.executables import interruptible
 
 PACKAGES = str(Path(viability_bounds_pkg.__file__).resolve().parents[1])
 INTERRUPT = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n"
@@ -25,8 +26,7 @@ def call(directory, program, function, arguments):
         text=True,
         timeout=30,
         check=False,
-        # Started from a job in the background, SIGINT is ignored by inheritance.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        preexec_fn=interruptible,
     )
 
 

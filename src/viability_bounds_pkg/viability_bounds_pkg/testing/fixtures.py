@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 
 # Matrices here are small: a thread for each core only keeps other tests from running.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -28,12 +29,25 @@ def graph_of_its_own() -> Iterator[None]:
         yield
 
 
-@pytest.fixture
-def ros() -> Iterator[RosHarness]:
-    """A harness without nodes other than the probe."""
+@contextmanager
+def _harness() -> Iterator[RosHarness]:
     with private_domain() as domain:
         harness = RosHarness(domain)
         try:
             yield harness
         finally:
             harness.close()
+
+
+@pytest.fixture
+def ros() -> Iterator[RosHarness]:
+    """A harness without nodes other than the probe."""
+    with _harness() as harness:
+        yield harness
+
+
+@pytest.fixture(scope="module")
+def shared_ros() -> Iterator[RosHarness]:
+    """A harness for tests that leave no node in it, such as those of refusals at start."""
+    with _harness() as harness:
+        yield harness

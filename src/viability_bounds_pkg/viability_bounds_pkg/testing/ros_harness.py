@@ -12,6 +12,7 @@ from __future__ import annotations
 import functools
 import itertools
 import os
+import re
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -34,6 +35,7 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, make_executor, set_stamp, stamp_to_ns
 from viability_bounds_pkg.user_input.yaml_file import read_yaml
 
@@ -153,6 +155,29 @@ class RosHarness:
     def start(self, make: Callable[..., Node], values: Mapping[str, Any]) -> Node:
         """Make a node with these parameters and run it."""
         return self.add(make(context=self.context, parameter_overrides=overrides(values)))
+
+    def refuses_to_start(
+        self, make: Callable[..., Node], values: Mapping[str, Any], name: str, shown: str = ""
+    ) -> None:
+        """Expect that a node does not start, and says why in the one line that users get.
+
+        Args:
+            make: the node.
+            values: its parameters.
+            name: of the parameter that is named.
+            shown: part of the line.
+        """
+        try:
+            self.start(make, values)
+        except SettingError as refusal:
+            text = str(refusal)
+            assert refusal.name == name, text
+            assert re.fullmatch(rf"parameter '{re.escape(name)}' is (.+); allowed: (.+)", text), (
+                text
+            )
+            assert shown in text
+        else:
+            raise AssertionError(f"it started with another {name}")
 
     def stop(self, node: Node) -> None:
         """Take a node down before the test ends."""

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the controller sends: finite and within the limits, whatever comes."""
+
+import math
+
+import numpy as np
+from arms import load_arm
+from controllers import EXACT, VECTORS, assert_may_be_sent, gravity, make, pose_at, wide
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torque_safety_controller.qp.constraints import AccelerationRange
+from viability_bounds_pkg.state import State
+
+
+class Fixed:
+    """An additional torque that is always the same."""
+
+    idle = False
+
+    def __init__(self, torque) -> None:
+        self._torque = torque
+
+    def reset(self) -> None:
+        """Nothing to forget."""
+
+    def torque(self, robot, v, a_last, elapsed):
+        return self._torque
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(
+    q=VECTORS,
+    v=VECTORS,
+    a=VECTORS,
+    width=VECTORS,
+    additional=st.one_of(st.none(), VECTORS),
+    goals=st.sampled_from(["none", "pose", "posture", "both"]),
+    after=st.sampled_from(["step", "brake", "hold"]),
+)
+def test_torques_are_finite_and_within_their_limits_whatever_comes(
+    q, v, a, width, additional, goals, after
+):
+    arm = load_arm("baxter_left_arm")
+    torque = None if additional is None else Fixed(additional)
+    controller = make(arm, additional=torque)
+    if goals in ("pose", "both"):
+        controller.set_pose_goal(pose_at(arm, arm.q_start + 0.2))
+    if goals in ("posture", "both"):
+        controller.set_posture_goal(arm.q_start - 0.2)
+    controller.reset(arm.q_start)
+    with np.errstate(all="ignore"):
+        upper = a + np.abs(width)
+        assert_may_be_sent(controller.step(State(q, v), AccelerationRange(a, upper)), arm)
+        # The same afterwards, when the state is sane and only the past is not.
+        bounds = wide(arm)
+        state = State(arm.q_start, np.zeros(arm.n))
+        step = {
+            "step": lambda: controller.step(state, bounds),
+            "brake": lambda: controller.brake(state, bounds),
+            "hold": lambda: controller.hold(state),
+        }[after]()
+        assert_may_be_sent(step, arm)
+        if additional is None:
+            # The acceleration of the last step may still be beyond sense, but not for long.
+            assert not controller.step(state, bounds).failure
+
+
+def test_random_states_outside_all_limits(arm):
+    rng = np.random.default_rng(1)
+    controller = make(arm)
+    controller.set_pose_goal(pose_at(arm, arm.q_start))
+    saturated = relaxed = 0
+    for _ in range(300):
+        q = rng.uniform(1.5 * arm.q_min, 1.5 * arm.q_max)
+        v = rng.uniform(-4.0, 4.0, arm.n) * arm.v_max
+        lower = rng.uniform(-30.0, 30.0, arm.n)
+        step = controller.step(
+            State(q, v), AccelerationRange(lower, lower + rng.uniform(0.0, 10.0, arm.n))
+        )
+        assert_may_be_sent(step, arm)
+        assert not step.failure
+        saturated += (np.abs(step.tau) > 0.999 * arm.tau_max).any()
+        relaxed += step.relaxation is not None
+    assert saturated > 20
+    assert relaxed > 20
+
+
+def test_a_state_that_is_not_finite_is_survived(arm):
+    controller = make(arm)
+    controller.set_pose_goal(pose_at(arm, arm.q_start))
+    rest = State(arm.q_start, np.zeros(arm.n)), wide(arm)
+    before = controller.step(*rest)
+    for bad in (math.nan, math.inf, 1e200):
+        q, v = arm.q_start.copy(), np.zeros(arm.n)
+        v[2] = bad
+        with np.errstate(all="ignore"):
+            step = controller.step(State(q, v), wide(arm))
+        assert_may_be_sent(step, arm)
+        assert not step.tracking
+        assert step.failure
+        # What cannot be computed is held.
+        np.testing.assert_array_equal(step.tau, before.tau)
+        assert not controller.step(*rest).failure
+
+
+def test_an_additional_torque_that_is_not_finite_leaves_the_arm_held(arm):
+    controller = make(arm, additional=Fixed(np.full(arm.n, math.nan)))
+    controller.set_pose_goal(pose_at(arm, arm.q_start))
+    q, v = arm.q_start, np.zeros(arm.n)
+    for step in (controller.step(State(q, v), wide(arm)), controller.hold(State(q, v))):
+        assert not step.tracking
+        np.testing.assert_allclose(step.tau, gravity(arm, q), atol=EXACT)
+    assert controller.step(State(q, v), wide(arm)).failure
+
+
+def test_the_torque_limits_hold_with_the_additional_torque_in_them(arm):
+    push = 0.8 * arm.tau_max
+    rng = np.random.default_rng(2)
+    controller = make(arm, additional=Fixed(push))
+    controller.set_posture_goal(arm.q_max)
+    exact = limited = 0
+    for _ in range(60):
+        q, v = arm.random_state(rng)
+        controller.reset(q)
+        step = controller.step(State(q, 0.1 * v), wide(arm))
+        assert_may_be_sent(step, arm)
+        # It is in there once: what is left is the torque of the model.
+        rest = step.tau - push - controller.robot.torque(step.a)
+        exact += np.abs(rest).max() < EXACT
+        limited += (step.tau > 0.999 * arm.tau_max).any()
+    assert exact > 10
+    assert limited > 10
+
+
+def test_the_rate_of_torque_is_limited_whatever_comes(arm):
+    rng = np.random.default_rng(3)
+    rate = rng.uniform(50.0, 500.0, arm.n)
+    rate[2] = np.inf
+    controller = make(arm, torque_rate_max=rate)
+    controller.set_pose_goal(pose_at(arm, arm.q_start))
+    last, reached = None, np.zeros(arm.n, dtype=bool)
+    for k in range(300):
+        q, v = arm.random_state(rng)
+        if k % 7 == 3:
+            v[1] = math.nan
+        lower = rng.uniform(-30.0, 20.0, arm.n)
+        with np.errstate(all="ignore"):
+            step = (
+                controller.hold(State(q, v))
+                if k % 5 == 0
+                else controller.step(
+                    State(q, v), AccelerationRange(lower, lower + rng.uniform(0.0, 10.0, arm.n))
+                )
+            )
+        assert_may_be_sent(step, arm)
+        if last is not None:
+            change = np.abs(step.tau - last)
+            assert (change <= rate * arm.dt + EXACT).all()
+            reached |= change > 0.99 * rate * arm.dt
+        last = step.tau
+    assert reached[np.isfinite(rate)].all(), "the limit is not felt"
+    # A robot that was away begins anew.
+    controller.reset(arm.q_start)
+    q, v = arm.random_state(rng)
+    free = make(arm).hold(State(q, v)).tau
+    np.testing.assert_allclose(controller.hold(State(q, v)).tau, free, atol=EXACT)

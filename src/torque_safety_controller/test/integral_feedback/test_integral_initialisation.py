@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Initialised, also after a change of settings, the integral torque does not jump."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from integral_terms import (
+    DT,
+    ROUGH,
+    SHARP,
+    N,
+    arm_terms,
+    at_state,
+    begun,
+    moving,
+    random_dynamics,
+    torque_now,
+)
+
+from torque_safety_controller.integral_feedback import (
+    METHODS,
+    InitialisationError,
+    IntegralFeedback,
+    IntegralSettings,
+)
+from torque_safety_controller.integral_feedback.settings import WIDENING_TIME
+
+CHANGES = [
+    {"gain": 0.5},
+    {"gain": 9.0},
+    {"mu": 0.0},
+    {"mu": 1.0},
+    {"slow_leak_rate": 5.0},
+    {"fast_leak_rate": 1.0},
+    {"budget": np.full(N, 1e-3)},
+    {"budget": np.zeros(N)},
+    {"budget": np.full(N, np.inf)},
+    *({"anti_windup": method} for method in METHODS),
+    {"gain": 0.7, "mu": 0.9, "budget": np.full(N, 0.01), "anti_windup": "paper"},
+]
+
+
+@pytest.mark.parametrize("change", CHANGES, ids=str)
+@pytest.mark.parametrize("method", ["qp", "paper"])
+def test_initialised_after_a_change_the_torque_does_not_jump(change, method):
+    rng = np.random.default_rng(9)
+    feedback = IntegralFeedback(IntegralSettings(np.full(N, 0.05), anti_windup=method))
+    arm, torques = moving(feedback, rng)
+    ordinary = np.abs(np.diff(torques, axis=0)).max()
+    assert feedback.saturated.any()
+    last, steps = torques[-1], []
+    feedback.settings = replace(feedback.settings, **change)
+    np.testing.assert_allclose(feedback.initialise(last, arm), last, rtol=1e-10, atol=1e-12)
+    for _ in range(4):
+        torque = feedback.torque(arm, np.zeros(N), DT)
+        steps.append(np.abs(torque - last).max())
+        last = torque
+    # The leak of the new rates, and of a budget that narrows, is no jump.
+    assert max(steps) < 1.5 * ordinary + 0.1 * np.abs(torques[-1]).max()
+
+
+def test_gain_torque_is_kept_when_the_gain_changes():
+    feedback = at_state(IntegralSettings(np.full(N, np.inf)), np.ones(N), np.arange(N))
+    M, C = np.eye(N), np.zeros((N, N))
+    before = torque_now(feedback, M, C)
+    feedback.settings = replace(feedback.settings, gain=50.0)
+    np.testing.assert_allclose(torque_now(feedback, M, C), before, rtol=SHARP)
+
+
+def test_after_a_change_the_new_settings_count():
+    rng = np.random.default_rng(10)
+    feedback = IntegralFeedback(IntegralSettings(np.full(N, 0.5)))
+    arm, torques = moving(feedback, rng, steps=300)
+    last = torques[-1]
+    assert np.abs(last).max() > 0.15
+    feedback.settings = replace(feedback.settings, budget=np.full(N, 0.1))
+    feedback.initialise(last, arm)
+    widening = feedback.memory.widening.copy()
+    assert widening.max() == pytest.approx(np.abs(last).max() - 0.1)
+    for k in range(1, 500):
+        torque = feedback.torque(arm, np.zeros(N), 0.02)
+        excess = widening * math.exp(-k * 0.02 / WIDENING_TIME)
+        assert (np.abs(torque) <= 0.1 + excess + SHARP).all()
+    assert np.abs(torque).max() <= 0.1 + 1e-4
+
+
+@pytest.mark.parametrize("mu", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("method", ["qp", "paper"])
+def test_initialising_gives_the_torque_asked_for(mu, method):
+    rng = np.random.default_rng(11)
+    budget = np.array([0.0, 0.5, 2.0, 10.0, np.inf])
+    for _ in range(20):
+        M, C = random_dynamics(rng, speed=0.1)
+        wanted = 3.0 * rng.normal(size=N)
+        arm = arm_terms(M, C, rng.normal(size=N))
+        feedback = begun(IntegralSettings(budget, mu=mu, anti_windup=method), arm.v)
+        np.testing.assert_allclose(feedback.initialise(wanted, arm), wanted, rtol=1e-9, atol=1e-9)
+        limited = wanted if method == "qp" else 2.0 * np.diag(M) * feedback.s
+        expected = np.maximum(np.abs(limited) - budget, 0.0)
+        np.testing.assert_allclose(feedback.memory.widening, expected, rtol=1e-9, atol=1e-9)
+        # It goes on from there, and is forgotten slowly.
+        after = feedback.torque(arm, np.zeros(N), 0.01)
+        free = expected == 0.0
+        if method == "paper" and mu < 1.0:
+            decay = (after - C @ feedback.s) / limited
+            np.testing.assert_allclose(decay[free], np.exp(-0.01 * 0.1), rtol=1e-8)
+            assert (decay >= np.exp(-0.01 / WIDENING_TIME) * (1.0 - ROUGH)).all()
+        assert np.abs(after - wanted).max() < (0.1 if mu < 1.0 else 0.7) * np.abs(wanted).max()
+
+
+def test_initial_torque_fades_as_the_widened_budget_does():
+    arm = arm_terms(np.eye(N), np.zeros((N, N)))
+    feedback = begun(IntegralSettings(np.full(N, 1.0), slow_leak_rate=0.0))
+    feedback.initialise(np.full(N, 3.0), arm)
+    for k in range(1, 400):
+        torque = feedback.torque(arm, arm.v, 0.01)
+        np.testing.assert_allclose(
+            torque, 1.0 + 2.0 * math.exp(-k * 0.01 / WIDENING_TIME), rtol=ROUGH
+        )
+    # The state came along: it leaves the limit at once.
+    after = feedback.torque(arm, np.full(N, -1.0), 0.01)
+    assert (after < 1.0 + 2.0 * math.exp(-4.0)).all()
+
+
+def test_initialising_is_refused_with_a_reason():
+    feedback = begun(IntegralSettings(np.ones(N)))
+    M = np.eye(N)
+    with pytest.raises(InitialisationError):
+        feedback.initialise(np.full(N, np.nan), arm_terms(M, 0.0 * M))
+    for C in (-2.0 * M, -1.999999 * M, np.full((N, N), np.nan)):
+        with pytest.raises(InitialisationError, match="too fast"):
+            feedback.initialise(np.ones(N), arm_terms(M, C))
+    np.testing.assert_array_equal(feedback.s, 0.0)
+
+
+def test_settings_are_compared_by_value():
+    law = IntegralSettings(np.ones(N))
+    assert law.same_as(IntegralSettings([1.0] * N))
+    for change in CHANGES:
+        changed = replace(law, **change)
+        assert changed.same_as(law) == (change == {"anti_windup": "qp"})

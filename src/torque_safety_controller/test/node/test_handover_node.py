@@ -1,0 +1,353 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Handover between position and torque control over real DDS."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from controller_chain import NODE, ControllerChain
+from geometry_msgs.msg import PoseStamped
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import SetBool
+
+from torque_safety_controller.node.controller_node import ControllerNode
+from torque_safety_controller.safety import handover
+from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.ros.runtime import GOAL_QOS
+from viability_bounds_pkg.testing.ros_harness import read_config
+
+SERVICE = f"{NODE}/enable_torque"
+
+# Watchdogs that do not bark while a busy machine runs the other tests.
+VALUES = read_config("panda", NODE) | {
+    "start_control": "position",
+    "bounds_timeout": 20.0,
+    "state_timeout": 40.0,
+}
+JOINTS = VALUES["joints"]
+N = len(JOINTS)
+TAU_MAX = np.array(VALUES["torque_max"])
+Q = np.array(read_config("panda", "bullet_node")["start_positions"])
+TAU = 0.1 * TAU_MAX  # of the motors, by which the arm is held
+SMALL = 0.01 * TAU_MAX
+WIDE = np.full(N, 5.0)
+
+
+class HandoverChain(ControllerChain):
+    """The other side of the controller: robot, bounds node and user."""
+
+    def __init__(self, ros, **changed) -> None:
+        super().__init__(ros, VALUES | changed)
+        self.stamp = 0
+
+    def state(self, stamp, q=Q, tau=TAU) -> None:
+        self.send_state(stamp, q, np.zeros(N), tau)
+
+    def bound(self, stamp) -> None:
+        self.send_limits(stamp, -WIDE, WIDE)
+
+    def answer(self, q=Q, tau=TAU, bounds=True) -> JointState:
+        """Send the next state, and limits, until the command comes; return that."""
+        self.stamp += 1
+        stamp = self.stamp
+
+        def send():
+            if bounds:
+                self.bound(stamp)
+            self.state(stamp, q, tau)
+
+        return self.await_command(stamp, send)
+
+    def call(self, torque: bool) -> SetBool.Response:
+        return self.ros.call(SetBool, SERVICE, SetBool.Request(data=torque))
+
+    def enable(self, torque: bool) -> None:
+        response = self.call(torque)
+        assert response.success, response.message
+
+    def refuses(self, torque: bool) -> str:
+        response = self.call(torque)
+        assert not response.success
+        return response.message
+
+    def await_report(self, each=None, **values) -> None:
+        self.ros.wait_until(
+            lambda: all(v in self.ros.reported(NODE, k) for k, v in values.items()),
+            f"{values}, not {self.ros.diagnostics.get(NODE)}",
+            each=each,
+        )
+
+
+def assert_position(command: JointState, q=Q) -> None:
+    assert command.name == JOINTS
+    assert not len(command.effort)
+    np.testing.assert_array_equal(command.position, q)
+    np.testing.assert_array_equal(command.velocity, np.zeros(N))
+
+
+def assert_torque(command: JointState) -> np.ndarray:
+    assert not len(command.position)
+    assert (np.abs(command.effort) <= TAU_MAX).all()
+    return np.array(command.effort)
+
+
+# From position to torque and back
+
+
+def test_it_goes_over_to_the_torque_of_the_motors_and_back(ros):
+    chain = HandoverChain(ros)
+    assert_position(chain.answer(bounds=False))
+    chain.await_report(mode="POSITION", reason="as at start", control="position")
+    # The goal of the drives does not follow the arm.
+    assert_position(chain.answer(Q + 1e-3))
+    chain.enable(True)
+    assert_position(chain.answer(Q + 1e-3))
+    first = assert_torque(chain.answer(Q + 1e-3))
+    assert (np.abs(first - TAU) < SMALL).all()
+    chain.await_report(mode="TRACKING", control="torque")
+    for _ in range(3):
+        assert_torque(chain.answer(Q + 1e-3))
+    chain.enable(False)
+    assert_position(chain.answer(Q + 2e-3), Q + 1e-3)
+    chain.await_report(mode="POSITION", reason="enable_torque", control="position")
+    # And again, from another torque.
+    chain.answer(Q, -TAU)
+    chain.enable(True)
+    chain.answer(Q, -TAU)
+    assert (np.abs(assert_torque(chain.answer(Q, -TAU)) + TAU) < SMALL).all()
+
+
+def test_a_state_asked_for_again_gets_what_it_got(ros):
+    chain = HandoverChain(ros)
+    chain.answer()
+    chain.enable(True)
+    handover = chain.answer()
+    chain.commands.clear()
+    stamp = chain.stamp
+    ros.wait_until(lambda: len(chain.commands) > 2, each=lambda: chain.state(stamp))
+    assert all(command == handover for command in chain.commands)
+    torque = chain.answer()
+    chain.enable(False)
+    chain.commands.clear()
+    stamp = chain.stamp
+    ros.wait_until(lambda: len(chain.commands) > 2, each=lambda: chain.state(stamp))
+    assert all(command == torque for command in chain.commands)
+
+
+def test_a_call_between_a_state_and_its_limits_is_obeyed(ros):
+    chain = HandoverChain(ros, start_control="torque")
+    assert_torque(chain.answer())
+    ros.run_for(0.05, each=lambda: chain.state(10))
+    chain.enable(False)
+    assert_position(chain.await_command(10, lambda: chain.bound(10)))
+    chain.stamp = 10
+    for _ in range(3):
+        assert_position(chain.answer())
+    assert ros.reported(NODE, "control") == "position"
+
+
+def test_a_handover_that_was_asked_for_can_be_called_off(ros):
+    chain = HandoverChain(ros)
+    chain.answer()
+    chain.enable(True)
+    chain.enable(False)
+    for _ in range(3):
+        assert_position(chain.answer(Q + 0.01))
+
+
+def test_an_arm_in_hold_is_given_to_its_drives(ros):
+    chain = HandoverChain(ros, start_control="torque")
+    assert_torque(chain.answer())
+    chain.await_report(mode="HOLD")
+    chain.enable(False)
+    assert_position(chain.answer())
+
+
+def test_goals_from_before_the_handover_are_dropped(ros):
+    chain = HandoverChain(ros)
+    chain.answer()
+    poses = ros.talk(PoseStamped, "target_pose", GOAL_QOS)
+    far = PoseStamped()
+    far.pose.position.x, far.pose.orientation.w = 0.3, 1.0
+    poses.publish(far)
+    chain.await_report(goals_pending="1")
+    chain.enable(True)
+    chain.answer()
+    first = assert_torque(chain.answer())
+    assert (np.abs(first - TAU) < SMALL).all()
+    chain.await_report(goals_pending="0", mode="TRACKING")
+    ros.diagnostics.clear()
+    ros.wait_until(lambda: ros.reported(NODE, "position_error_m"))
+    assert float(ros.reported(NODE, "position_error_m")) < 1e-9
+
+
+def test_efforts_for_ros2_control_are_silent_under_position_control(ros):
+    topic = "/effort_controller/commands"
+    chain = HandoverChain(ros, ros2_control_topic=topic)
+    efforts = ros.listen(Float64MultiArray, topic)
+    ros.hears(topic)
+    chain.answer()
+    chain.enable(True)
+    chain.answer()
+    ros.run_for(0.05)
+    assert not efforts
+    torque = chain.answer()
+    ros.wait_until(lambda: efforts, "efforts", each=lambda: chain.state(chain.stamp))
+    np.testing.assert_array_equal(efforts[0].data, torque.effort)
+
+
+def test_noise_of_the_currents_is_no_step_of_the_torque(ros):
+    """Seeded from one sample, 1% of noise made a first step of 2.3% of the limits."""
+    chain, random = HandoverChain(ros), np.random.default_rng(3)
+    command = chain.answer(Q, TAU + 0.01 * TAU_MAX)
+    chain.enable(True)
+    while not len(command.effort):
+        assert_position(command)
+        command = chain.answer(Q, TAU + 0.01 * TAU_MAX * random.standard_normal(N))
+    assert chain.stamp > 20
+    assert (np.abs(assert_torque(command) - TAU) < 0.005 * TAU_MAX).all()
+
+
+def test_a_torque_that_stays_unknown_is_not_gone_on_from(ros, monkeypatch):
+    monkeypatch.setattr(handover, "PATIENCE", 0.05)
+    chain = HandoverChain(ros)
+    chain.answer()
+    chain.enable(True)
+    for sign in (-1.0, 1.0) * 15:
+        assert_position(chain.answer(Q, sign * TAU))
+    chain.await_report(mode="POSITION", reason="handover failed: after 0.05 s the torque of")
+
+
+# Refused
+
+
+def test_torque_is_refused_before_the_first_state(ros):
+    chain = HandoverChain(ros)
+    assert "no joint state" in chain.refuses(True)
+    assert "position control is on already" in chain.refuses(False)
+    assert_position(chain.answer())
+
+
+def test_torque_is_refused_while_states_are_old(ros):
+    chain = HandoverChain(ros, bounds_timeout=0.1)
+    chain.answer()
+    ros.run_for(0.15)
+    assert "no joint state, or only old ones" in chain.refuses(True)
+    chain.answer()
+    chain.enable(True)
+
+
+@pytest.mark.parametrize("stamp", [1, 1_000_000])
+def test_torque_is_refused_while_limits_are_old_or_of_another_run(ros, stamp):
+    chain = HandoverChain(ros, bounds_timeout=5.0)
+    chain.stamp = 10_000  # ms
+    chain.answer(bounds=False)
+    assert "no acceleration limits" in chain.refuses(True)
+    ros.run_for(0.05, each=lambda: chain.bound(stamp))
+    assert "no acceleration limits" in chain.refuses(True)
+    assert_position(chain.answer())
+    chain.enable(True)
+
+
+@pytest.mark.parametrize(
+    ("q", "tau", "reason"),
+    [
+        (Q + 10.0 * np.eye(N)[2], TAU, f"outside the position limits: {JOINTS[2]}"),
+        (Q, (), "no motor torque"),
+        (Q, [*TAU[:6], math.nan], "no motor torque"),
+        (Q, [*TAU[:6], 1.1 * TAU_MAX[6]], f"motor torque beyond torque_max: {JOINTS[6]}"),
+    ],
+)
+def test_torque_is_refused_where_it_cannot_begin(ros, q, tau, reason):
+    chain = HandoverChain(ros)
+    chain.answer(q, tau)
+    assert reason in chain.refuses(True)
+    assert_position(chain.answer(q, tau), q)
+    chain.await_report(control="position")
+
+
+def test_what_is_on_already_is_refused(ros):
+    chain = HandoverChain(ros, start_control="torque")
+    before = assert_torque(chain.answer())
+    assert "torque control is on already" in chain.refuses(True)
+    np.testing.assert_allclose(assert_torque(chain.answer()), before, atol=1e-6)
+    chain.enable(False)
+    chain.answer()
+    assert "position control is on already" in chain.refuses(False)
+
+
+def test_it_starts_with_torque_or_position_only(ros):
+    with pytest.raises(SettingError, match="'start_control' is 'velocity'; allowed: one of"):
+        ros.start(ControllerNode, VALUES | {"start_control": "velocity"})
+    HandoverChain(ros)
+    assert "read-only" in ros.refuses(NODE, start_control="torque")
+
+
+# What goes wrong on the way
+
+
+def test_a_handover_ends_where_limits_stop_coming(ros):
+    chain = HandoverChain(ros, bounds_timeout=0.2)
+    chain.answer()
+    chain.enable(True)
+    # Repeated, as by a robot in lockstep, and not answered until then.
+    command = chain.answer(Q + 1e-3, bounds=False)
+    assert_position(command)
+    chain.await_report(
+        mode="POSITION",
+        reason="handover failed: acceleration limits are stale",
+        control="position",
+    )
+    for _ in range(3):
+        assert_position(chain.answer(bounds=False))
+    assert "no acceleration limits" not in chain.call(True).message  # 4 ms old by their stamps
+
+
+@pytest.mark.parametrize(
+    ("q", "tau", "reason"),
+    [
+        (Q, (), "joint_states carry no motor torque"),
+        (Q + 10.0, TAU, "outside the position limits"),
+    ],
+)
+def test_a_handover_ends_where_torque_cannot_begin_after_all(ros, q, tau, reason):
+    chain = HandoverChain(ros)
+    chain.answer()
+    chain.enable(True)
+    assert_position(chain.answer(q, tau))
+    chain.await_report(mode="POSITION", reason=f"handover failed: {reason}")
+    assert_position(chain.answer())
+
+
+@pytest.mark.parametrize("start", ["torque", "position"])
+def test_a_robot_that_was_silent_is_commanded_as_at_start(ros, start):
+    chain = HandoverChain(ros, start_control=start, state_timeout=0.3, bounds_timeout=0.3)
+    chain.answer()
+    if start == "position":
+        chain.enable(True)
+        chain.answer()
+    assert_torque(chain.answer())
+    chain.await_report(mode="STOPPED")
+    assert "no joint state" in chain.refuses(False)
+    again = chain.answer()
+    if start == "torque":
+        assert_torque(again)
+    else:
+        assert_position(again)
+        chain.await_report(reason="the robot was silent or started over")
+
+
+def test_nothing_is_sent_once_it_is_stopped(ros):
+    chain = HandoverChain(ros, state_timeout=0.3, bounds_timeout=0.1)
+    chain.answer()
+    # States that cannot be used: the drives hold on.
+    bad = np.full(N, math.nan)
+    chain.commands.clear()
+    assert_position(chain.await_command(50, lambda: chain.state(50, bad)))
+    chain.await_report(each=lambda: chain.state(50, bad), mode="STOPPED", reason="refused")
+    chain.commands.clear()
+    ros.run_for(0.1, each=lambda: chain.state(50, bad))
+    assert not chain.commands

@@ -1,0 +1,286 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The controller node with integral action: its parameters, at start and live."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from arms import load_arm
+from controller_chain import MS, NODE, gains_of
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory
+
+from torque_safety_controller.additional_torque import (
+    AdditionalSettings,
+    AdditionalTorque,
+)
+from torque_safety_controller.controller import Controller
+from torque_safety_controller.integral_feedback import IntegralSettings
+from torque_safety_controller.node.controller_node import ControllerNode
+from torque_safety_controller.qp.constraints import AccelerationRange
+from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.state import State
+from viability_bounds_pkg.testing.ros_harness import (
+    acceleration_limits,
+    joint_state,
+    names_parameter,
+    read_config,
+)
+
+ARM = load_arm("panda")
+PERIOD = round(1e3 * ARM.dt)  # ms
+VALUES = read_config("panda", NODE) | {
+    "bounds_timeout": 20.0,
+    "state_timeout": 40.0,
+    "disturbance_time": -1.0,
+    "integral_action": "joints",
+}
+JOINTS = VALUES["joints"]
+N = ARM.n
+Q = ARM.q_start
+WIDE = np.full(N, 50.0)
+# Of states at one place: what the arm does not do as it is told, the integral sees.
+SPEEDS = (
+    0.02 * ARM.v_max * np.array([[1], [-1], [0.5], [-2], [1]]) * np.sign(0.5 - np.arange(N) % 2)
+)
+SAME_TORQUE = 1e-6  # N m
+
+GAINS = gains_of(VALUES)
+DEFAULT = {"budget": 0.1 * ARM.tau_max}
+"""Of the settings, where it is not that of the classes."""
+
+
+def core(mode="joints", rows=slice(0, 6), **changed) -> Controller:
+    """The node's core, set up by hand; also says what its defaults are."""
+    additional = AdditionalTorque(make_settings(mode, **changed), rows)
+    controller = Controller(ARM.robot(), ARM.tau_max, GAINS, additional=additional)
+    controller.reset(Q)
+    return controller
+
+
+def make_settings(mode="joints", **changed) -> AdditionalSettings:
+    return AdditionalSettings(mode, IntegralSettings(**DEFAULT | changed), 2.0 * ARM.tau_max)
+
+
+class IntegralChain:
+    """A controller that is asked for torques, one period after the other."""
+
+    def __init__(self, ros, **changed) -> None:
+        self.ros, self.stamp = ros, 10 * PERIOD
+        self.node = ros.start(ControllerNode, VALUES | changed)
+        self.commands = ros.listen(JointState, "joint_commands")
+        self.states = ros.talk(JointState, "joint_states")
+        self.limits = ros.talk(JointTrajectory, "acceleration_limits")
+        ros.hears("joint_commands")
+
+    def answer(self, v, period=PERIOD) -> np.ndarray:
+        """Return the torques for the next state."""
+        self.stamp += period
+        stamp = self.stamp * MS
+
+        def send():
+            self.limits.publish(acceleration_limits(JOINTS, stamp, -WIDE, WIDE))
+            self.states.publish(joint_state(JOINTS, stamp, Q, v))
+
+        self.ros.wait_until(lambda: stamp in self.commands.stamps, "a command", each=send)
+        return np.array(self.commands[self.commands.stamps.index(stamp)].effort)
+
+
+def answers(controller, speeds=SPEEDS) -> np.ndarray:
+    return np.array(
+        [controller.step(State(Q, v), AccelerationRange(-WIDE, WIDE)).tau for v in speeds]
+    )
+
+
+SMALL = (0.001 * ARM.tau_max).tolist()
+
+
+SMALL_BUDGET = {"budget": np.array(SMALL)}
+TASK = {"mode": "task"}
+
+
+@pytest.mark.parametrize(
+    ("changed", "by_hand", "without"),
+    [
+        ({}, {}, {"mode": "none"}),
+        ({"integral_action": "none"}, {"mode": "none"}, {}),
+        ({"integral_action": "task"}, TASK, {}),
+        (
+            {"integral_action": "task", "integral_task": "position"},
+            TASK | {"rows": slice(0, 3)},
+            TASK,
+        ),
+        ({"integral_budget": SMALL}, SMALL_BUDGET, {}),
+        ({"integral_lambda": 8.0}, {"gain": 8.0}, {}),
+        ({"integral_leak": [20.0, 100.0, 0.5]}, {"slow_leak_rate": 20.0}, {}),
+        ({"integral_leak": [0.1, 10.0, 0.5]}, {"fast_leak_rate": 10.0}, {}),
+        ({"integral_leak": [0.1, 100.0, 0.1]}, {"mu": 0.1}, {}),
+        (
+            {"integral_anti_windup": "scaling", "integral_budget": SMALL},
+            SMALL_BUDGET | {"anti_windup": "scaling"},
+            SMALL_BUDGET,
+        ),
+        ({"integral_anti_windup": "paper"}, {"anti_windup": "paper"}, {}),
+        (
+            {"integral_anti_windup": "none", "integral_budget": SMALL},
+            SMALL_BUDGET | {"anti_windup": "none"},
+            SMALL_BUDGET,
+        ),
+    ],
+    ids=lambda value: " ".join(value),
+)
+def test_each_parameter_reaches_the_torque(ros, changed, by_hand, without):
+    chain = IntegralChain(ros, **changed)
+    torques = np.array([chain.answer(v) for v in SPEEDS])
+    np.testing.assert_allclose(torques, answers(core(**by_hand)), atol=SAME_TORQUE)
+    assert np.abs(torques - answers(core(**without))).max() > 20.0 * SAME_TORQUE
+
+
+def test_parameters_change_while_it_runs_and_the_torque_goes_on(ros):
+    chain, controller = IntegralChain(ros), core()
+    np.testing.assert_allclose(
+        [chain.answer(v) for v in SPEEDS], answers(controller), atol=SAME_TORQUE
+    )
+    common = {}
+    for changed, by_hand in (
+        ({"integral_lambda": 8.0}, {"gain": 8.0}),
+        ({"integral_budget": SMALL}, {"budget": np.array(SMALL)}),
+        ({"integral_leak": [1.0, 40.0, 0.5]},
+         {"slow_leak_rate": 1.0, "fast_leak_rate": 40.0}),
+        ({"integral_leak": [1.0, 40.0, 0.2]}, {"mu": 0.2}),
+        ({"integral_action": "task"}, {"mode": "task"}),
+        ({"integral_action": "none"}, {"mode": "none"}),
+        ({"integral_action": "joints", "integral_anti_windup": "paper"},
+         {"mode": "joints", "anti_windup": "paper"}),
+    ):  # fmt: skip
+        ros.accepts(NODE, **changed)
+        common |= by_hand
+        controller.additional.settings = make_settings(**common)
+        before = controller.additional.last
+        for k, v in enumerate(SPEEDS):
+            expected = controller.step(State(Q, v), AccelerationRange(-WIDE, WIDE)).tau
+            np.testing.assert_allclose(
+                chain.answer(v), expected, atol=SAME_TORQUE, err_msg=f"{changed}, step {k}"
+            )
+            if k == 0:
+                # The same state as the last one, but for v.
+                change = controller.additional.last - before
+                assert (np.abs(change) < 0.01 * ARM.tau_max).all(), changed
+    ros.wait_until(lambda: ros.reported(NODE, "integral_action") == "joints")
+
+
+BAD = [
+    ("integral_action", "plain", "one of none, joints, task"),
+    ("integral_action", "", "one of none, joints, task"),
+    ("integral_budget", [1.0], "7 numbers"),
+    ("integral_budget", [-1.0, *ARM.tau_max[1:]], ">= 0"),
+    ("integral_budget", [math.nan, *ARM.tau_max[1:]], "finite"),
+    ("integral_budget", [math.inf, *ARM.tau_max[1:]], "at most torque_max"),
+    ("integral_budget", [87.1, *ARM.tau_max[1:]], "at most torque_max"),
+    ("integral_lambda", 0.0, "> 0"),
+    ("integral_lambda", -2.0, "> 0"),
+    ("integral_lambda", math.inf, "<= 1000"),
+    ("integral_lambda", "much", "a number"),
+    ("integral_leak", [-0.1, 100.0, 0.5], ">= 0"),
+    ("integral_leak", [math.nan, 100.0, 0.5], ">= 0"),
+    ("integral_leak", [0.1, -1.0, 0.5], ">= 0"),
+    ("integral_leak", [0.1, math.inf, 0.5], "finite"),
+    ("integral_leak", [0.1, 0.05, 0.5], "theta_f >= theta_s"),
+    ("integral_leak", [0.1, 100.0, -0.01], ">= 0"),
+    ("integral_leak", [0.1, 100.0, 1.01], "mu <= 1"),
+    ("integral_leak", [0.1, 100.0, math.nan], ">= 0"),
+    ("integral_leak", [0.1, 100.0], "3 finite numbers"),
+    ("integral_anti_windup", "qp2", "one of none, scaling, paper, qp"),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "allowed"), BAD)
+def test_it_does_not_start_with_bad_parameters(shared_ros, name, value, allowed):
+    shared_ros.refuses_to_start(ControllerNode, VALUES | {name: value}, name, allowed)
+
+
+def test_bad_parameters_are_refused_live_and_the_old_ones_stay(ros):
+    chain, controller = IntegralChain(ros), core()
+    np.testing.assert_allclose(
+        [chain.answer(v) for v in SPEEDS], answers(controller), atol=SAME_TORQUE
+    )
+    before = {name: chain.node.get_parameter(name).value for name, _, _ in BAD}
+    for name, value, allowed in BAD:
+        reason = ros.refuses(NODE, **{name: value})
+        assert names_parameter(reason, name)
+        assert allowed in reason or "out of range" in reason
+    assert {name: chain.node.get_parameter(name).value for name, _, _ in BAD} == before
+    # Nothing of it is in the torque.
+    np.testing.assert_allclose(
+        [chain.answer(v) for v in SPEEDS], answers(controller), atol=SAME_TORQUE
+    )
+
+
+def test_the_task_is_read_only_and_known(ros):
+    with pytest.raises(SettingError, match="'integral_task' is 'elbow'; allowed: one of pose"):
+        ros.start(ControllerNode, VALUES | {"integral_task": "elbow"})
+    IntegralChain(ros)
+    assert "read-only" in ros.refuses(NODE, integral_task="position")
+
+
+def six_joints() -> dict:
+    cut = {k: v[:6] for k, v in VALUES.items() if isinstance(v, list) and len(v) == N}
+    return VALUES | cut | {"end_effector_frame": "panda_link6"}
+
+
+def test_six_joints_have_no_null_space_of_a_pose(ros):
+    values = six_joints()
+    with pytest.raises(SettingError) as refusal:
+        ros.start(ControllerNode, values | {"integral_action": "task"})
+    assert str(refusal.value) == (
+        "parameter 'integral_action' is 'task'; allowed: 'none' or 'joints': "
+        "6 joints have no null space left of the task"
+    )
+    ros.start(ControllerNode, values)
+    assert "no null space left" in ros.refuses(NODE, integral_action="task")
+    ros.accepts(NODE, integral_action="none", integral_leak=[0.1, 100.0, 0.2])
+
+
+def test_six_joints_have_a_null_space_of_a_position(ros):
+    values = six_joints() | {"integral_action": "task", "integral_task": "position"}
+    ros.start(ControllerNode, values)
+    ros.accepts(NODE, integral_action="joints")
+
+
+# Time
+
+
+@pytest.mark.parametrize("gap", [3 * PERIOD, 300, 100_000])
+def test_a_robot_that_pauses_or_whose_clock_jumps_gets_no_kick(ros, gap):
+    chain = IntegralChain(ros, integral_lambda=30.0)
+    for _ in range(20):
+        before = chain.answer(SPEEDS[3])
+    added = reported(ros, "additional_torque_nm")
+    assert np.abs(added / ARM.tau_max).max() > 0.01
+    after = chain.answer(SPEEDS[3], gap)
+    assert (np.abs(after - before) < 1e-3 * ARM.tau_max).all()
+    assert (np.abs(chain.answer(SPEEDS[3]) - after) < 5e-3 * ARM.tau_max).all()
+    ros.wait_until(lambda: ros.reported(NODE, "integral_skipped_steps") == "1")
+
+
+def reported(ros, key) -> np.ndarray:
+    """Return what is reported from now on."""
+    ros.diagnostics.clear()
+    ros.wait_until(lambda: ros.reported(NODE, key), key)
+    return np.array(ros.reported(NODE, key).split(), float)
+
+
+def test_states_that_cannot_be_used_do_not_move_the_integral(ros):
+    """While they come, the arm is held with the velocity taken for zero."""
+    chain = IntegralChain(ros, bounds_timeout=0.1)
+    for v in SPEEDS:
+        chain.answer(v)
+    before = reported(ros, "additional_torque_nm")
+    bad = joint_state(JOINTS, (chain.stamp + 1) * MS, np.full(N, math.nan), np.zeros(N))
+    chain.commands.clear()
+    ros.wait_until(
+        lambda: len(chain.commands) >= 3, "torques", each=lambda: chain.states.publish(bad)
+    )
+    np.testing.assert_array_equal(reported(ros, "additional_torque_nm"), before)

@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Executables for tests: as users start them, and in this process, which is faster."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+TIME_LIMIT = 60.0
+"""For a process, s."""
+
+
+def environment() -> dict[str, str]:
+    """Return the environment of a process that imports what this one imports."""
+    return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+
+
+def interruptible() -> None:
+    """Let SIGINT end the process to be started: in the background it is ignored by inheritance."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def started(*arguments: Any) -> subprocess.CompletedProcess[str]:
+    """Return how Python ended that was started with arguments such as ``-m module``."""
+    return subprocess.run(
+        [sys.executable, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        env=environment(),
+        timeout=TIME_LIMIT,
+        check=False,
+        preexec_fn=interruptible,
+    )
+
+
+def called(
+    capfd: pytest.CaptureFixture[str], main: Callable[..., int], *arguments: Any
+) -> subprocess.CompletedProcess[str]:
+    """Return how an executable's `main` ended in this process."""
+    try:
+        code: Any = main([str(argument) for argument in arguments])
+    except SystemExit as ended:
+        code = ended.code
+    return subprocess.CompletedProcess(arguments, code, *capfd.readouterr())
