@@ -83,6 +83,9 @@ than the margins of the bounds, which would change a plan that ends nearer."""
 GENTLE = 0.5
 """Share of the limits of the torques' rates that the joints' accelerations use in plans."""
 
+TOLERANCE = 0.8
+"""Share of that distance by which plans in hand may end nearer, as states drift a little."""
+
 SPARE = 0.005
 """Share of the limits of speeds and of the accelerations' rates that plans leave where changes are
 limited, because states drift a little while a plan is carried on; what is asked for leaves twice
@@ -149,14 +152,13 @@ class SafetyFilter:
 
     Attributes:
         plan: acceleration with which the plan in hand goes on, shape (n,), rad/s^2.
-        lower: bounds of what may be wanted, shape (n,), rad/s^2: those given to `look`, or
-            narrower where changes are limited.
+        lower: bounds of what may be wanted, shape (n,), rad/s^2: those given to `look`, narrowed
+            to that from which each joint by itself has a plan.
         upper: shape (n,), rad/s^2.
         slack: least share of a torque limit that this plan leaves of what it may use; negative
             where it passes a limit.
         lost: whether no plan is near, so that the arm is to brake as it can.
         rest_torque: what holds the arm where this plan ends, shape (n,), N m.
-        smooth: whether changes are limited.
         outcomes: how many steps were "as wanted", "changed", "planned", the plan's own; and
             "outside", without a plan within the limits.
 
@@ -213,11 +215,14 @@ class SafetyFilter:
         braking = np.minimum(-a_min, a_max)
         self._a_min, self._a_max = a_min, a_max
         self._usable = (1.0 - RESERVE) * torques
+        self._smooth = bool(np.isfinite(jerks).any() or np.isfinite(rates).any())
+        if not self._smooth:
+            v_max = none  # speeds only fall along plans
         clearance = CLEARANCE * dt * dt * braking
         self._limits = JointLimitsOfPlans(
             q_min + clearance,
             q_max - clearance,
-            0.5 * clearance,
+            TOLERANCE * clearance,
             (1.0 - SPARE) * v_max,
             braking,
             dt * jerks,
@@ -225,7 +230,6 @@ class SafetyFilter:
         self._narrower = self._limits._replace(v_max=(1.0 - SPARE) * v_max)
         allowed_change = (1.0 - RATE_RESERVE) * dt * rates
         self._plans = PlanTorques(model, self._limits, self._usable, allowed_change, dt)
-        self.smooth = bool(np.isfinite(jerks).any() or np.isfinite(rates).any())
         self._dt = dt
         self._model, self._data = model, model.createData()
         self._time = USUAL  # T of the plan in hand
@@ -265,7 +269,6 @@ class SafetyFilter:
         """Compile everything now and not in a control loop."""
         zero = np.zeros_like(self._usable)
         self.look(zero, zero, zero, zero - 1.0, zero + 1.0)
-        self._narrow(zero - 1.0, zero + 1.0)
         self._rows({FIRST: [0]})
         self.choose(zero)
         self.reset()
@@ -296,7 +299,7 @@ class SafetyFilter:
         self._state, self._extra = State(q, v), extra
         self._last = np.zeros_like(q) if last is None else last
         plans = self._plans
-        if self.smooth:
+        if self._smooth:
             self._gentle = self._gentle_changes(q)
         if self._begun:
             plans.follow(q, v, self._last, self._course, extra)
@@ -307,9 +310,7 @@ class SafetyFilter:
         self._now = Needs.of(plans)
         self.plan = plans.accelerations[FIRST].copy()
         self.rest_torque = plans.tau[-1].copy()
-        self.lower, self.upper = lower, upper
-        if self.smooth:
-            self._narrow(lower, upper)
+        self._narrow(lower, upper)
         self.lost = self.slack < -LOST
         if self.slack < -RESERVE:
             return None  # nothing to keep: the bounds alone count
