@@ -120,7 +120,7 @@ class BulletNode(ArmNode):
         self._locked_at = array("d", locked.values())
         self._at_rest = array("d", [0.0] * len(locked))
         self._joints = list(config.joints)
-        self._state = JointState(name=[*self._joints, *locked])
+        self._names = [*self._joints, *locked]
         self._state_publisher = JOINT_STATES.publisher(self)
         self._clock_publisher = CLOCK.publisher(self) if config.publish_clock else None
         description = ROBOT_DESCRIPTION.publisher(self)
@@ -178,10 +178,13 @@ class BulletNode(ArmNode):
         self._stamp += self._dt_ns
         self._advanced = False
         q, v, tau = self._reading or self._robot.state()
-        state = self._state
-        state.position = array("d", q.tobytes()) + self._locked_at
-        state.velocity = array("d", v.tobytes()) + self._at_rest
-        state.effort = array("d", tau.tobytes()) + self._at_rest
+        # A new message: nodes of this process may keep the last one.
+        state = self._state = JointState(
+            name=self._names,
+            position=array("d", q.tobytes()) + self._locked_at,
+            velocity=array("d", v.tobytes()) + self._at_rest,
+            effort=array("d", tau.tobytes()) + self._at_rest,
+        )
         set_stamp(state.header.stamp, self._stamp)
         if self._clock_publisher is not None:
             self._clock_publisher.publish(ClockMessage(clock=state.header.stamp))
