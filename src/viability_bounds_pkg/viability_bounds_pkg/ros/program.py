@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import rclpy
 from numba.core.event import TimingListener, install_listener
-from rclpy.context import Context
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -38,19 +38,31 @@ _LEAVE_TIMEOUT = 5
 """How long a node may take to leave the graph, s."""
 
 
-def spin(executor: Executor, context: Context | None = None) -> None:
+def spin(executor: Executor, node: Node) -> None:
     """Run callbacks until the context is shut down or SIGINT or SIGTERM comes.
 
-    ``EventsExecutor.spin()`` of rclpy 7.1 runs no callback, and a wait without time-out does
-    not see signals, so this waits in turns on a future that is never set. A signal lets the
-    callback that it interrupts end: it may be about to publish. Call it from the main thread.
+    ``EventsExecutor.spin()`` of rclpy 7.1 runs no callback; a wait without time-out does not see
+    signals, and one with a time-out goes on while there is something to do, in lockstep for ever.
+    So a timer looks for signals, and ends a wait for a future. A signal lets the callback that it
+    interrupts end: it may be about to publish. Call it from the main thread.
+
+    Args:
+        executor: runs the callbacks.
+        node: one of its nodes.
     """
     signals: list[int] = []
     for each in (signal.SIGINT, signal.SIGTERM):
         signal.signal(each, lambda number, _: signals.append(number))
-    never: Future = Future()
-    while rclpy.ok(context=context) and not signals:
-        executor.spin_until_future_complete(never, timeout_sec=_SIGNAL_CHECK_PERIOD)
+    told: Future = Future()
+
+    def look() -> None:
+        if signals:
+            told.set_result(None)
+
+    steady = Clock(clock_type=ClockType.STEADY_TIME)
+    node.create_timer(_SIGNAL_CHECK_PERIOD, look, clock=steady)
+    while rclpy.ok(context=node.context) and not told.done():
+        executor.spin_until_future_complete(told, timeout_sec=_SIGNAL_CHECK_PERIOD)
 
 
 def own_arguments(args: Sequence[str] | None) -> list[str]:
@@ -159,7 +171,7 @@ def run_together(
         # loop.
         gc.collect()
         gc.freeze()
-        spin(executor)
+        spin(executor, nodes[0])
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except ArmSafetyError as error:
