@@ -17,7 +17,7 @@ from viability_bounds_pkg.ros.topics import ESTIMATED_JOINT_STATES
 KINDS = (BoundsNode, ControllerNode, EstimatorNode)
 
 
-def make_nodes(direct_delivery: DirectDelivery) -> Iterator[ArmNode]:
+def make_nodes(direct_delivery: DirectDelivery | None) -> Iterator[ArmNode]:
     """Make the nodes between joint states and commands; the estimator if another one needs it."""
     bounds = BoundsNode(direct_delivery=direct_delivery)
     yield bounds

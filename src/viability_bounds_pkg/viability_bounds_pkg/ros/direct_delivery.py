@@ -18,10 +18,11 @@ Receive = Callable[[Any], None]
 class DirectDelivery:
     """Gives messages of the control streams to the other nodes of a process, as the same objects.
 
-    Each message is published as ever. Where the process has the only publisher of a topic, its own
-    subscriptions get the message from the executor's next turn, and leave unread what comes by the
-    middleware. While a topic has a publisher elsewhere, all of its messages come by the
-    middleware; then one subscription reads them for all nodes of the process.
+    Each message is published as ever, where anybody outside of the process subscribes. Where the
+    process has the only publisher of a topic, its own subscriptions get the message from the
+    executor's next turn, and leave unread what comes by the middleware. While a topic has a
+    publisher elsewhere, all of its messages come by the middleware; then one subscription reads
+    them for all nodes of the process.
 
     One turn delivers what was sent meanwhile, too, in the order in which it was sent: from the
     state over the limits to the command. It ends where a topic comes a second time, so that in
@@ -40,7 +41,8 @@ class DirectDelivery:
         """Return a publisher whose messages the nodes of this process get directly."""
         publisher = node.create_publisher(message, name, qos, publisher_class=_DirectPublisher)
         stream = self._stream(node, name)
-        cast(_DirectPublisher, publisher).sent = lambda sent: self._send(node, stream, sent)
+        direct = cast(_DirectPublisher, publisher)
+        direct.stream, direct.deliver = stream, lambda sent: self._send(node, stream, sent)
         stream.publishers += 1
         stream.settle()
         return publisher
@@ -69,7 +71,7 @@ class DirectDelivery:
         return self._streams.setdefault(node.resolve_topic_name(name), _Stream())
 
     def _send(self, node: Node, stream: _Stream, message: Any) -> None:
-        if not (stream.direct and stream.subscriptions) or node.executor is None:
+        if not stream.subscriptions or node.executor is None:
             return  # nobody is there yet
         self._sent.pop(stream, None)
         self._sent[stream] = message
@@ -88,14 +90,25 @@ class DirectDelivery:
 
 
 class _DirectPublisher(Publisher):
-    """A publisher that tells what it has sent."""
+    """A publisher to nodes of the same process and to others.
 
-    sent: Receive
+    Attributes:
+        stream: its topic.
+        deliver: gives a message to the nodes of the process.
+    """
+
+    stream: _Stream
+    deliver: Receive
 
     def publish(self, msg: Any) -> None:
         """Send a message."""
-        super().publish(msg)
-        self.sent(msg)
+        if not self.stream.direct:
+            super().publish(msg)
+            return
+        # To make a message for the middleware that nobody reads takes longer than to deliver it.
+        if self.get_subscription_count() > len(self.stream.subscriptions):
+            super().publish(msg)
+        self.deliver(msg)
 
 
 class _Stream:
