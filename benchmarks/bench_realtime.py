@@ -2,10 +2,10 @@
 """Robot, bounds and controller by the wall clock: one process, separate ones, a bare loop.
 
 Each robot plays its demo's goals by turns in the ways to run it; diagnostics of the robot tell
-what was missed. A miss is a period without its command in time; of the bare loop, which sleeps
-until the next period and does nothing else, a turn that begins a period late. It is what the
-machine itself can do: nothing that runs on it does better. With --stages, where the time of a
-period goes, in lockstep.
+what was missed: periods without their command in time, and those that passed while the simulated
+robot was late itself, whose motion would have gone on. "both" is what a real robot would miss. A
+bare loop, which sleeps until the next period and does nothing else, shows what the machine itself
+can do. With --stages, where the time of a period goes, in lockstep.
 """
 
 from __future__ import annotations
@@ -186,18 +186,18 @@ def measure(robot: str, rate: float, way: str, seconds: float, imperfect: bool) 
             megabytes = memory(processes)
         finally:
             user.ros.close()
-    periods, missed, stopped = (
+    periods, missed, stopped, late = (
         int(after[key]) - int(before[key])
-        for key in ("periods", "deadline_misses", "braked_periods")
+        for key in ("periods", "deadline_misses", "braked_periods", "late_periods")
     )
     latency = [float(after[f"latency_{part}_us"]) for part in ("p50", "p99")]
     errors = [float(after[f"period_error_{part}_us"]) for part in ("p50", "p99", "max")]
-    return row(way, periods, missed, stopped, errors, latency, cpu, megabytes)
+    return row(way, periods, missed, late, stopped, errors, latency, cpu, megabytes)
 
 
 def bare_loop(rate: float, seconds: float) -> str:
     """Sleep until each period begins and do nothing else; return the row of what came of it."""
-    dt, errors, missed, periods = 1.0 / rate, RecentValues(), 0, 0
+    dt, errors, lost, periods = 1.0 / rate, RecentValues(), 0, 0
     begin = last = time.monotonic()
     used = time.process_time()
     due = begin + dt
@@ -206,19 +206,19 @@ def bare_loop(rate: float, seconds: float) -> str:
         now = time.monotonic()
         errors.note(abs(now - last - dt))
         late = max(0, math.floor((now - due) / dt))
-        missed += late
-        periods += 1 + late
+        lost += late
+        periods += 1
         due += dt * (1 + late)
         last = now
     cpu = (time.process_time() - used) / (last - begin)
     found = [1e6 * errors.percentile(50), 1e6 * errors.percentile(99), 1e6 * errors.largest]
-    return row("bare loop", periods, missed, 0, found, [], cpu, math.nan)
+    return row("bare loop", periods, 0, lost, 0, found, [], cpu, math.nan)
 
 
 HEAD = (
-    f"{'':12} {'periods':>8} {'missed':>7} {'share':>7} {'stopped':>8} "
+    f"{'':12} {'periods':>8} {'missed':>7} {'late':>6} {'both':>7} {'stopped':>8} "
     f"{'period error, us':^25} {'latency, us':^17} {'CPU':>6} {'memory':>7}\n"
-    f"{'':45} {'p50':>7} {'p99':>8} {'max':>9} {'p50':>7} {'p99':>9} {'':>6} {'MB':>7}"
+    f"{'':52} {'p50':>7} {'p99':>8} {'max':>9} {'p50':>7} {'p99':>9} {'':>6} {'MB':>7}"
 )
 
 
@@ -226,6 +226,7 @@ def row(
     name: str,
     periods: int,
     missed: int,
+    late: int,
     stopped: int,
     errors: list[float],
     latency: list[float],
@@ -235,7 +236,8 @@ def row(
     """Return a line of the table."""
     p50, p99 = latency or (math.nan, math.nan)
     text = (
-        f"{name:12} {periods:8} {missed:7} {missed / max(periods, 1):7.2%} {stopped:8} "
+        f"{name:12} {periods:8} {missed:7} {late:6} {(missed + late) / (periods + late):7.2%} "
+        f"{stopped:8} "
         f"{errors[0]:7.0f} {errors[1]:8.0f} {errors[2]:9.0f} {p50:7.0f} {p99:9.0f} "
         f"{cpu:6.0%} {megabytes:7.0f}"
     )

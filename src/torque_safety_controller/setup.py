@@ -41,7 +41,7 @@ setup(
             "identify_friction = torque_safety_controller.cli.ros_program:identify_friction",
             "safety_stack = torque_safety_controller.cli.ros_program:safety_stack",
         ],
-        "viability_bounds_pkg.stacks": [
+        "arm_safety.stacks": [
             "safety_stack = torque_safety_controller.node.safety_stack",
         ],
     },

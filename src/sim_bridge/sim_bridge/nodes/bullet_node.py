@@ -159,7 +159,7 @@ class BulletNode(ArmNode):
         self._torque_ratio = 0.0
         self._refused.clear()
         self._latencies, self._period_errors = RecentValues(), RecentValues()
-        self._ticked_at = math.nan
+        self._ticked_at, self._late = math.nan, 0
         self._started_at, self._played = time.monotonic(), 0
 
     def _plan_pause(self) -> None:
@@ -250,7 +250,10 @@ class BulletNode(ArmNode):
         if self._paused:
             return
         if math.isfinite(last):
-            self._period_errors.note(abs(self._ticked_at - last - self._config.dt))
+            dt, took = self._config.dt, self._ticked_at - last
+            self._period_errors.note(abs(took - dt))
+            # A real robot would have gone on.
+            self._late += max(0, round(took / dt) - 1)
         if not self._advanced:
             if self._command is not None:
                 self._missed += 1
@@ -360,6 +363,7 @@ class BulletNode(ArmNode):
             "rate_hz": (self._periods - self._played) / elapsed,
             "physics_steps_per_period": self._config.substeps,
             "deadline_misses": self._missed,
+            "late_periods": self._late,
             "missed_deadlines_injected": self._path.missed,
             "imperfections": ", ".join(self._config.imperfections.names) or "none",
             "braked_periods": self._braked,

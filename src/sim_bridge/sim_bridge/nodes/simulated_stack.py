@@ -14,7 +14,7 @@ from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.direct_delivery import DirectDelivery
 from viability_bounds_pkg.ros.program import report_refusal, run_together, stack_parser
 
-STACKS = "viability_bounds_pkg.stacks"
+STACKS = "arm_safety.stacks"
 """Group of entry points: modules with KINDS of nodes and a function make_nodes."""
 
 
