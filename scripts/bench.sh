@@ -10,6 +10,8 @@ Ratios compare programs that run in turns in one process. NAME --help lists opti
 
   chain       from state to command through both nodes, against empty relays; with --imperfect
               also with estimator, prediction and margins
+  realtime    all nodes by the wall clock: one process, separate ones, and what the machine itself
+              can do; with --stages, where the time of a period goes
   step        one controller step, part by part
   bounds      acceleration bounds: one arm, and batches; with --tsid also TSID's, which is
               installed into .venv-tsid

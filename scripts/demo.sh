@@ -5,7 +5,7 @@ set -eu
 usage() {
     cat <<'USAGE'
 usage: bash scripts/demo.sh [robot] [scenario] [--bounds METHOD] [--rate HZ] [--real-time]
-                            [--imperfect] [--params FILE] [--out DIRECTORY]
+                            [--imperfect] [--params FILE] [--out DIRECTORY] [--processes]
 
   robot        a parameter file in config/ that has a scenario: baxter_left_arm (default), panda,
                talos_left_arm
@@ -20,6 +20,8 @@ usage: bash scripts/demo.sh [robot] [scenario] [--bounds METHOD] [--rate HZ] [--
                with what is done about them, from config/imperfect/<robot>.yaml; estimator_node
                runs, too; see docs/simulated_robot.md
   --params     a further parameter file, such as config/obstacles/panda_wall.yaml
+  --processes  each node in a process of its own; without, robot, estimator, bounds and controller
+               are one process (docs/performance.md)
   --out        where figure, data and metrics go (default: results/<robot>_<scenario>; then
                results/demo is a link to it)
 
@@ -37,7 +39,7 @@ value() {
 }
 
 root="$(cd "$(dirname "$0")/.." && pwd)"
-robot='' scenario='' bounds=exact rate=default params='' imperfect='' clock=lockstep out=''
+robot='' scenario='' bounds=exact rate=default params='' imperfect='' clock=lockstep out='' processes=''
 while [ $# -gt 0 ]; do
     case "$1" in
     --bounds) bounds="$(value "$@")"; shift ;;
@@ -45,6 +47,7 @@ while [ $# -gt 0 ]; do
     --params) params="$(value "$@")"; shift ;;
     --out) out="$(value "$@")"; shift ;;
     --imperfect) imperfect=yes ;;
+    --processes) processes=yes ;;
     --lockstep) clock=lockstep ;;
     --real-time) clock=real_time ;;
     -h | --help) usage; exit 0 ;;
@@ -128,10 +131,14 @@ stop() {
 trap stop EXIT
 trap 'exit 130' INT TERM HUP
 
-start viability_bounds_pkg bounds_node
-start torque_safety_controller controller_node
-[ -z "$imperfect" ] || start viability_bounds_pkg estimator_node
-start sim_bridge bullet_node
+if [ -n "$processes" ]; then
+    start viability_bounds_pkg bounds_node
+    start torque_safety_controller controller_node
+    [ -z "$imperfect" ] || start viability_bounds_pkg estimator_node
+    start sim_bridge bullet_node
+else
+    start sim_bridge simulated_stack
+fi
 "$root/install/sim_bridge/lib/sim_bridge/scenario_node" --out "$out" --ros-args \
     --log-level warn --params-file "$config" "${overrides[@]}" -p "scenario:=$scenario" &
 play=$!

@@ -86,11 +86,12 @@ def test_an_imperfect_robot_may_have_further_parameters(tmp_path):
     assert line in result.stderr
 
 
-def test_an_imperfect_robot_is_played_with_what_is_done_about_it(tmp_path):
+@pytest.mark.parametrize("apart", [[], ["--processes"]], ids=["one process", "processes"])
+def test_an_imperfect_robot_is_played_with_what_is_done_about_it(tmp_path, apart):
     scenario = yaml.safe_load((SCENARIOS / "panda_demo.yaml").read_text())
     path = tmp_path / "first_goal.yaml"
     path.write_text(yaml.safe_dump({"duration": 1.0, "events": scenario["events"][:1]}))
-    result = demo("panda", path, "--imperfect", "--out", tmp_path)
+    result = demo("panda", path, "--imperfect", "--out", tmp_path, *apart)
     assert result.returncode == 0, result.stdout + result.stderr
     assert "VERDICT: no limit was broken" in result.stdout
     assert "estimated_joint_states" not in result.stderr  # nobody misses them
@@ -104,12 +105,18 @@ def test_it_knows_the_bounds_there_are():
 
 
 @pytest.mark.parametrize(
-    ("when", "sent"), [("nodes start", signal.SIGINT), ("it runs", signal.SIGTERM)]
+    ("when", "sent", "apart"),
+    [
+        ("nodes start", signal.SIGINT, ["--processes"]),
+        ("it runs", signal.SIGTERM, ["--processes"]),
+        ("nodes start", signal.SIGTERM, []),
+        ("it runs", signal.SIGINT, []),
+    ],
 )
-def test_a_signal_takes_down_all_of_it(tmp_path, when, sent):
+def test_a_signal_takes_down_all_of_it(tmp_path, when, sent, apart):
     environment = os.environ | {"DEMO_UNDER_TEST": str(tmp_path)}
     process = subprocess.Popen(
-        ["bash", DEMO, "talos_left_arm", "--out", tmp_path],
+        ["bash", DEMO, "talos_left_arm", "--out", tmp_path, *apart],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -123,7 +130,7 @@ def test_a_signal_takes_down_all_of_it(tmp_path, when, sent):
     try:
         if when == "nodes start":
             deadline = time.monotonic() + 60.0
-            while len(nodes()) < 4 and process.poll() is None:
+            while len(nodes()) < (4 if apart else 2) and process.poll() is None:
                 assert time.monotonic() < deadline, "the nodes did not start"
         else:
             assert any("TRACKING" in line for line in process.stdout)

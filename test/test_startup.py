@@ -21,6 +21,8 @@ BOUNDS = ("viability_bounds_pkg", "bounds_node")
 ESTIMATOR = ("viability_bounds_pkg", "estimator_node")
 CONTROLLER = ("torque_safety_controller", "controller_node")
 ROBOT = ("sim_bridge", "bullet_node")
+SAFETY = ("torque_safety_controller", "safety_stack")
+SIMULATED = ("sim_bridge", "simulated_stack")
 MAIN = {
     BOUNDS: bounds_node.main,
     ESTIMATOR: estimator_node.main,
@@ -113,8 +115,20 @@ def test_a_file_that_is_not_parameters_is_refused_in_one_line(tmp_path, capfd, t
         (CONTROLLER, (), signal.SIGINT),
         (ROBOT, ("-p", "clock:=real_time"), signal.SIGINT),
         (ROBOT, ("-p", "clock:=lockstep"), signal.SIGTERM),
+        (SAFETY, (), signal.SIGINT),
+        (SIMULATED, ("-p", "clock:=real_time"), signal.SIGTERM),
+        (SIMULATED, ("-p", "clock:=lockstep"), signal.SIGINT),
     ],
-    ids=["bounds", "estimator", "controller", "robot in real time", "robot in lockstep"],
+    ids=[
+        "bounds",
+        "estimator",
+        "controller",
+        "robot in real time",
+        "robot in lockstep",
+        "one process",
+        "all in real time",
+        "all in lockstep",
+    ],
 )
 def test_nodes_end_when_told_to(ros, node, options, sent):
     process = subprocess.Popen(
@@ -128,7 +142,10 @@ def test_nodes_end_when_told_to(ros, node, options, sent):
     try:
         # It spins when its first timer has run.
         ros.wait_until(
-            lambda: node[1] in ros.diagnostics or process.poll() is not None, timeout=DEADLINE
+            lambda: (
+                {node[1], "controller_node"} & set(ros.diagnostics) or process.poll() is not None
+            ),
+            timeout=DEADLINE,
         )
         process.send_signal(sent)
         _, errors = process.communicate(timeout=DEADLINE)

@@ -33,6 +33,7 @@ setup(
         "console_scripts": [
             "bullet_node = sim_bridge.cli.ros_program:bullet_node",
             "record_excitation = sim_bridge.cli.ros_program:record_excitation",
+            "simulated_stack = sim_bridge.cli.ros_program:simulated_stack",
             "scenario_node = sim_bridge.cli.ros_program:scenario_node",
         ],
     },

@@ -39,6 +39,10 @@ setup(
             "controller_node = torque_safety_controller.cli.ros_program:controller_node",
             "gain_limits = torque_safety_controller.cli.ros_program:gain_limits",
             "identify_friction = torque_safety_controller.cli.ros_program:identify_friction",
+            "safety_stack = torque_safety_controller.cli.ros_program:safety_stack",
+        ],
+        "arm_safety.stacks": [
+            "safety_stack = torque_safety_controller.node.safety_stack",
         ],
     },
 )

@@ -19,3 +19,8 @@ def record_excitation() -> int:
 def scenario_node() -> int:
     """Run the scenario node."""
     return run_with_ros("scenario_node", "sim_bridge.nodes.scenario_node")
+
+
+def simulated_stack() -> int:
+    """Run the simulated robot and the nodes that control it in one process."""
+    return run_with_ros("simulated_stack", "sim_bridge.nodes.simulated_stack")

@@ -7,7 +7,7 @@ import math
 import sys
 import time
 from array import array
-from collections import Counter, deque
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,7 @@ from sim_bridge.nodes.command_outage import CommandOutage
 from sim_bridge.nodes.ft_sensor import ForceTorqueReading
 from sim_bridge.nodes.topics import CLOCK, PAUSE, RESET
 from sim_bridge.nodes.world_subscriber import WorldSubscriber
+from viability_bounds_pkg.recent_values import RecentValues
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.joint_command import (
     CommandError,
@@ -53,7 +54,6 @@ Array = NDArray[np.float64]
 
 _RETRY_PERIOD = 0.2
 _STRAYS = 50
-_LATENCIES_KEPT = 100_000
 _CONTROL = {TorqueCommand: "torque", PositionCommand: "position"}
 
 
@@ -120,7 +120,7 @@ class BulletNode(ArmNode):
         self._locked_at = array("d", locked.values())
         self._at_rest = array("d", [0.0] * len(locked))
         self._joints = list(config.joints)
-        self._state = JointState(name=[*self._joints, *locked])
+        self._names = [*self._joints, *locked]
         self._state_publisher = JOINT_STATES.publisher(self)
         self._clock_publisher = CLOCK.publisher(self) if config.publish_clock else None
         description = ROBOT_DESCRIPTION.publisher(self)
@@ -158,7 +158,8 @@ class BulletNode(ArmNode):
         self._plan_pause()
         self._torque_ratio = 0.0
         self._refused.clear()
-        self._latencies: deque[float] = deque(maxlen=_LATENCIES_KEPT)
+        self._latencies, self._period_errors = RecentValues(), RecentValues()
+        self._ticked_at, self._late = math.nan, 0
         self._started_at, self._played = time.monotonic(), 0
 
     def _plan_pause(self) -> None:
@@ -178,10 +179,13 @@ class BulletNode(ArmNode):
         self._stamp += self._dt_ns
         self._advanced = False
         q, v, tau = self._reading or self._robot.state()
-        state = self._state
-        state.position = array("d", q.tobytes()) + self._locked_at
-        state.velocity = array("d", v.tobytes()) + self._at_rest
-        state.effort = array("d", tau.tobytes()) + self._at_rest
+        # A new message: nodes of this process may keep the last one.
+        state = self._state = JointState(
+            name=self._names,
+            position=array("d", q.tobytes()) + self._locked_at,
+            velocity=array("d", v.tobytes()) + self._at_rest,
+            effort=array("d", tau.tobytes()) + self._at_rest,
+        )
         set_stamp(state.header.stamp, self._stamp)
         if self._clock_publisher is not None:
             self._clock_publisher.publish(ClockMessage(clock=state.header.stamp))
@@ -242,8 +246,14 @@ class BulletNode(ArmNode):
 
     def _tick(self) -> None:
         """End a period in real time and begin the next."""
+        last, self._ticked_at = self._ticked_at, math.nan if self._paused else time.monotonic()
         if self._paused:
             return
+        if math.isfinite(last):
+            dt, took = self._config.dt, self._ticked_at - last
+            self._period_errors.note(abs(took - dt))
+            # A real robot would have gone on.
+            self._late += max(0, round(took / dt) - 1)
         if not self._advanced:
             if self._command is not None:
                 self._missed += 1
@@ -280,7 +290,7 @@ class BulletNode(ArmNode):
                 self.get_logger().warning(f"joint_commands refused: {error}")
             return
         self._strays = 0
-        self._latencies.append(time.monotonic() - self._published_at)
+        self._latencies.note(time.monotonic() - self._published_at)
         if isinstance(command, TorqueCommand):
             tau, tau_max = command.tau, self._config.torque_max
             self._torque_ratio = max(self._torque_ratio, float(np.max(np.abs(tau) / tau_max)))
@@ -340,8 +350,7 @@ class BulletNode(ArmNode):
 
     def _report(self) -> tuple[bytes, str, dict[str, Any]]:
         monitor = self._monitor
-        latencies = np.array(self._latencies) if self._latencies else np.full(1, np.nan)
-        median, slow = np.percentile(latencies, (50, 99)) * 1e6
+        latencies, errors = self._latencies, self._period_errors
         elapsed = time.monotonic() - self._started_at
         obstacles, control = self._robot.obstacles, self._control()
         values = {
@@ -354,6 +363,7 @@ class BulletNode(ArmNode):
             "rate_hz": (self._periods - self._played) / elapsed,
             "physics_steps_per_period": self._config.substeps,
             "deadline_misses": self._missed,
+            "late_periods": self._late,
             "missed_deadlines_injected": self._path.missed,
             "imperfections": ", ".join(self._config.imperfections.names) or "none",
             "braked_periods": self._braked,
@@ -361,8 +371,11 @@ class BulletNode(ArmNode):
             "world_changes_pending": len(self._world),
             "contact_force_n": obstacles.force,
             "contact_force_max_n": obstacles.force_max,
-            "latency_p50_us": float(median),
-            "latency_p99_us": float(slow),
+            "latency_p50_us": 1e6 * latencies.percentile(50),
+            "latency_p99_us": 1e6 * latencies.percentile(99),
+            "period_error_p50_us": 1e6 * errors.percentile(50),
+            "period_error_p99_us": 1e6 * errors.percentile(99),
+            "period_error_max_us": 1e6 * errors.largest,
             "commanded_torque_ratio_max": self._torque_ratio,
             "position_violation_rad": monitor.max_position_violation,
             "velocity_violation_rad_s": monitor.max_velocity_violation,

@@ -328,7 +328,7 @@ def main(args: list[str] | None = None) -> int:
     except (KeyboardInterrupt, ExternalShutdownException):
         return INTERRUPTED
     finally:
-        leave(node)
+        leave(*filter(None, [node]))
 
 
 if __name__ == "__main__":

@@ -171,6 +171,7 @@ def _metrics(
         "max_trajectory_error_m": _or_none(_trajectory_error(config, run, errors)),
         "max_contact_force_n": _or_none(float(robot.get("contact_force_max_n", "nan"))),
         "deadline_misses": int(robot["deadline_misses"]),
+        "late_periods": int(robot["late_periods"]),
         "braked_periods": int(robot["braked_periods"]),
         "latency_p50_us": _or_none(float(robot["latency_p50_us"])),
         "latency_p99_us": _or_none(float(robot["latency_p99_us"])),
@@ -246,6 +247,8 @@ def verdict(metrics: Metrics) -> str:
     )
     if metrics["clock"] == "real_time" or missed:
         said += f"; {missed} of {steps} deadlines were missed"
+    if late := metrics["late_periods"]:
+        said += f"; the simulation itself was late by {late} periods"
     if braked:
         said += f"; the robot braked without commands for {braked} of {steps} periods"
     exact = metrics["bounds_method"] == "exact"  # the others promise nothing

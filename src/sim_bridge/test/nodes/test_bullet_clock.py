@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The robot node in time: lockstep, real time, and commands that fail."""
 
+import time
+
 import numpy as np
 import pytest
 from robot_probe import BRAKES, PERIOD, Q, RobotProbe
@@ -45,6 +47,17 @@ def test_in_real_time_it_keeps_its_rate_and_brakes_without_commands(ros):
     ros.wait_until(lambda: int(robot.reported("braked_periods")) > braked)
     ros.wait_until(lambda: int(robot.reported("deadline_misses")) >= 3)
     assert "braking" in robot.reported("message")
+
+
+def test_periods_in_which_it_was_late_itself_are_counted(ros):
+    robot = RobotProbe(ros, clock="real_time", rate_hz=100.0)
+    ros.wait_until(lambda: robot.reported("late_periods"))
+    before = int(robot.reported("late_periods"))
+    end = time.monotonic() + 0.1
+    while time.monotonic() < end:
+        pass  # as another callback of its process would
+    ros.wait_until(lambda: int(robot.reported("late_periods")) >= before + 8)
+    assert float(robot.reported("period_error_max_us")) > 0.08e6
 
 
 def test_when_commands_fail_it_stops_within_its_limits_and_goes_on_when_they_return(ros):

@@ -9,6 +9,7 @@ KEPT = {
     "bounds_method": "exact",
     "steps": 6145,
     "deadline_misses": 0,
+    "late_periods": 0,
     "braked_periods": 0,
     "max_position_violation_rad": 0.0,
     "max_velocity_violation_rad_s": 0.0,
@@ -34,6 +35,7 @@ REASON = "the promise needs a command in every period"
             "6145 periods.",
             REASON,
         ),
+        ({"late_periods": 4}, "; the simulation itself was late by 4 periods.", REASON),
         (BROKEN, "limits were BROKEN: position by 0.02 rad (left_e1).", REASON),
         (
             BROKEN | {"clock": "real_time", "deadline_misses": 1372},

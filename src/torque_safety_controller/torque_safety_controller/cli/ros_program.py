@@ -19,3 +19,8 @@ def identify_friction() -> int:
 def gain_limits() -> int:
     """Run the check of a robot's gains."""
     return run_program("torque_safety_controller.tools.gain_limits")
+
+
+def safety_stack() -> int:
+    """Run bounds, controller and estimator in one process."""
+    return run_with_ros("safety_stack", "torque_safety_controller.node.safety_stack")

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +11,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from torque_safety_controller.controller import Controller, ControlOutput
 from torque_safety_controller.safety.modes import Mode
 from torque_safety_controller.tasks.detour import Progress
+from viability_bounds_pkg.recent_values import RecentValues
 
 LEVELS = {
     Mode.TRACKING: DiagnosticStatus.OK,
@@ -20,7 +20,6 @@ LEVELS = {
     Mode.STOPPED: DiagnosticStatus.ERROR,
 }
 
-_LATENCIES_KEPT = 4096
 _SLIGHT = 1e-3  # rad/s^2; smaller relaxations of bounds come with those of distances
 
 
@@ -33,12 +32,12 @@ class StepRecord:
 
     def __init__(self, n: int) -> None:
         self._steps = self._relaxed_steps = self._failures = 0
-        self._latencies: deque[float] = deque(maxlen=_LATENCIES_KEPT)
+        self._latencies = RecentValues()
         self._last_relaxation = np.zeros(n)
 
     def note(self, step: ControlOutput, latency: float) -> None:
         """Count a step that was answered `latency` seconds after its state came."""
-        self._latencies.append(latency)
+        self._latencies.note(latency)
         self._steps += 1
         if step.failure:
             self._failures += 1
@@ -61,8 +60,6 @@ class StepRecord:
             a_lower: acceleration limits of the last step, shape (n,), rad/s^2.
             a_upper: shape (n,), rad/s^2.
         """
-        latencies = np.array(self._latencies) if self._latencies else np.full(1, np.nan)
-        median, slow = np.percentile(latencies, (50, 99)) * 1e6
         a = controller.acceleration
         near = 1e-3 * (a_upper - a_lower) + 1e-6
         at_limit = (a <= a_lower + near) | (a >= a_upper - near)
@@ -76,8 +73,8 @@ class StepRecord:
             "bounds_relaxed_steps": self._relaxed_steps,
             "bounds_last_relaxation_rad_s2": self._last_relaxation,
             "joints_at_acceleration_limit": _named(joints, at_limit),
-            "latency_p50_us": float(median),
-            "latency_p99_us": float(slow),
+            "latency_p50_us": 1e6 * self._latencies.percentile(50),
+            "latency_p99_us": 1e6 * self._latencies.percentile(99),
         }
         if controller.additional is not None:
             values |= {

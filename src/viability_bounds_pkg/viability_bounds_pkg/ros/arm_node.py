@@ -13,12 +13,8 @@ from rclpy.node import Node
 
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.ros.claim import Claim
-from viability_bounds_pkg.ros.given_parameters import arguments_of
-from viability_bounds_pkg.ros.ros_arguments import (
-    RosArgumentError,
-    is_known_remapping,
-    ros_rules,
-)
+from viability_bounds_pkg.ros.direct_delivery import DirectDelivery
+from viability_bounds_pkg.ros.ros_arguments import RosArgumentError
 from viability_bounds_pkg.ros.topics import Topic
 
 CLOCK_TIMEOUT = 5.0
@@ -32,6 +28,10 @@ _TOPICS_OF_ROS = ("/rosout", "/parameter_events", "/clock")
 class ArmNode(Node):
     """A node that starts as a whole or not at all, and alone publishes what an arm obeys.
 
+    Args:
+        direct_delivery: to the other nodes of the process; None sends them messages, too, by the
+            middleware alone.
+
     Attributes:
         NAME: of the node, unless it is remapped.
         PARAMETERS: the dataclass of its parameters.
@@ -40,7 +40,10 @@ class ArmNode(Node):
     NAME: ClassVar[str]
     PARAMETERS: ClassVar[type]
 
-    def __init__(self, **node_arguments: Any) -> None:
+    def __init__(
+        self, *, direct_delivery: DirectDelivery | None = None, **node_arguments: Any
+    ) -> None:
+        self.direct_delivery = direct_delivery
         self._claims: list[Claim] = []
         try:
             # With the services that `rqt_logger_level` uses.
@@ -75,27 +78,28 @@ class ArmNode(Node):
             rate: of the control loop, Hz.
             what: modes and methods, in words.
         """
-        here = self.get_name(), self.get_namespace()
-        published, heard = (
-            " ".join(sorted(name for name, _ in topics if name not in _TOPICS_OF_ROS))
-            for topics in (
-                self.get_publisher_names_and_types_by_node(*here),
-                self.get_subscriber_names_and_types_by_node(*here),
-            )
-        )
+        published, heard = map(" ".join, self.topics_used())
         # A parameter of the scenario node, which robots' files have for all nodes.
         name = self._parameter_overrides.get("robot_name")
         self.get_logger().info(
             f"{name.value if name else 'robot'}, {len(joints)} joints ({joints[0]} to "
             f"{joints[-1]}) at {rate:g} Hz, {what}; subscribes to {heard}; publishes {published}"
         )
-        for flag, rule in ros_rules(arguments_of(self.context)):
-            new = self.resolve_topic_name(rule.partition(":=")[2]) if flag == "-r" else ""
-            if new and not is_known_remapping(rule) and new not in f"{heard} {published}".split():
-                self.get_logger().warning(f"'-r {rule}' changes no topic of this node")
         if self.get_parameter("use_sim_time").value:
             self._expect_clock()
-        self._watch_types(*here)
+        self._watch_types(self.get_name(), self.get_namespace())
+
+    def topics_used(self) -> tuple[list[str], list[str]]:
+        """Return the names of the topics that the node publishes, and of those subscribed to."""
+        here = self.get_name(), self.get_namespace()
+        published, heard = (
+            sorted(name for name, _ in topics if name not in _TOPICS_OF_ROS)
+            for topics in (
+                self.get_publisher_names_and_types_by_node(*here),
+                self.get_subscriber_names_and_types_by_node(*here),
+            )
+        )
+        return published, heard
 
     def _expect_clock(self) -> None:
         """Warn once if nothing publishes ``/clock``: stamps of what is published stay zero."""
@@ -139,4 +143,6 @@ class ArmNode(Node):
         """Give up the claims, too."""
         for claim in self._claims:
             claim.close()
+        if self.direct_delivery is not None:
+            self.direct_delivery.leave(self)
         super().destroy_node()

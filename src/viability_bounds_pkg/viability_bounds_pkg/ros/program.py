@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A node as a program: its command line, its start, its end by a signal."""
+"""Nodes as a program: its command line, their start, their end by a signal."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import gc
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import rclpy
 from numba.core.event import TimingListener, install_listener
-from rclpy.context import Context
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -22,8 +22,13 @@ from viability_bounds_pkg.cli.command_line import Parser
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.parameter import parameter_table
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.given_parameters import note_arguments
-from viability_bounds_pkg.ros.ros_arguments import check_ros_arguments, ros_rules
+from viability_bounds_pkg.ros.direct_delivery import DirectDelivery
+from viability_bounds_pkg.ros.given_parameters import arguments_of, note_arguments
+from viability_bounds_pkg.ros.ros_arguments import (
+    check_ros_arguments,
+    is_known_remapping,
+    ros_rules,
+)
 from viability_bounds_pkg.ros.runtime import EventsExecutor, make_executor
 from viability_bounds_pkg.user_input.parameter_files import check_parameter_files
 
@@ -33,19 +38,31 @@ _LEAVE_TIMEOUT = 5
 """How long a node may take to leave the graph, s."""
 
 
-def spin(executor: Executor, context: Context | None = None) -> None:
+def spin(executor: Executor, node: Node) -> None:
     """Run callbacks until the context is shut down or SIGINT or SIGTERM comes.
 
-    ``EventsExecutor.spin()`` of rclpy 7.1 runs no callback, and a wait without time-out does
-    not see signals, so this waits in turns on a future that is never set. A signal lets the
-    callback that it interrupts end: it may be about to publish. Call it from the main thread.
+    ``EventsExecutor.spin()`` of rclpy 7.1 runs no callback; a wait without time-out does not see
+    signals, and one with a time-out goes on while there is something to do, in lockstep for ever.
+    So a timer looks for signals, and ends a wait for a future. A signal lets the callback that it
+    interrupts end: it may be about to publish. Call it from the main thread.
+
+    Args:
+        executor: runs the callbacks.
+        node: one of its nodes.
     """
     signals: list[int] = []
     for each in (signal.SIGINT, signal.SIGTERM):
         signal.signal(each, lambda number, _: signals.append(number))
-    never: Future = Future()
-    while rclpy.ok(context=context) and not signals:
-        executor.spin_until_future_complete(never, timeout_sec=_SIGNAL_CHECK_PERIOD)
+    told: Future = Future()
+
+    def look() -> None:
+        if signals:
+            told.set_result(None)
+
+    steady = Clock(clock_type=ClockType.STEADY_TIME)
+    node.create_timer(_SIGNAL_CHECK_PERIOD, look, clock=steady)
+    while rclpy.ok(context=node.context) and not told.done():
+        executor.spin_until_future_complete(told, timeout_sec=_SIGNAL_CHECK_PERIOD)
 
 
 def own_arguments(args: Sequence[str] | None) -> list[str]:
@@ -90,60 +107,103 @@ def initialise(args: Sequence[str] | None) -> None:
     note_arguments(rclpy.get_default_context(), arguments)
 
 
+def stack_parser(name: str, description: str, kinds: Sequence[type[ArmNode]]) -> Parser:
+    """Return the parser of a program's own arguments that runs nodes of several kinds."""
+    names = ", ".join(kind.NAME for kind in kinds)
+    return Parser(
+        prog=name,
+        description=description,
+        usage="%(prog)s [-h] [--ros-args [--params-file FILE] [-p [NODE:]NAME:=VALUE] "
+        "[-r [NODE:]FROM:=TO] [--log-level LEVEL]]",
+        epilog=f"Nodes: {names}. Each has its own name, topics and parameters, as if it ran "
+        "alone; --help of each lists them.",
+    )
+
+
 def run(make_node: type[ArmNode], args: list[str] | None = None) -> int:
-    """Start a node, run it until it is told to stop.
+    """Run one node; return the exit code, as `run_together`."""
+    return run_together(node_parser(make_node), lambda _: [make_node()], args)
+
+
+def run_together(
+    parser: Parser,
+    make_nodes: Callable[[DirectDelivery], Iterable[ArmNode]],
+    args: list[str] | None = None,
+) -> int:
+    """Start nodes in one process, run them on one executor until they are told to stop.
+
+    Args:
+        parser: of the program's own arguments.
+        make_nodes: makes the nodes, one after the other, with what delivers their messages.
+        args: the command line; None for that of the process.
 
     Returns:
-        The exit code: 0 after SIGINT, SIGTERM or shutdown; 1 when the node cannot start, after one
+        The exit code: 0 after SIGINT, SIGTERM or shutdown; 1 when a node cannot start, after one
         line on stderr that says why.
     """
     try:
-        node_parser(make_node).parse_args(own_arguments(args))
+        parser.parse_args(own_arguments(args))
         initialise(args)
     except Exception as error:  # rclpy's own classes differ between releases
         report_refusal(error)
         return 1
-    node = None
+    nodes: list[ArmNode] = []
     try:
         compiling = TimingListener()
         with install_listener("numba:compile", compiling):
-            node = make_node()
+            for node in make_nodes(DirectDelivery()):
+                nodes.append(node)
+        logger = nodes[0].get_logger()
+        _warn_of_idle_remappings(nodes)
         if compiling.done:
-            node.get_logger().warning(
+            logger.warning(
                 f"compiling took {compiling.duration:.1f} s of the start, which scripts/setup.sh "
                 "does ahead: no compiled code of these sources was kept"
             )
         executor = make_executor()
         if EventsExecutor is None:
-            node.get_logger().warning(
+            logger.warning(
                 "rclpy has no EventsExecutor; the single-threaded one adds about 2 ms a cycle"
             )
-        executor.add_node(node)
+        for node in nodes:
+            executor.add_node(node)
         # What exists by now lives until the end: the collector need not visit it in the control
         # loop.
         gc.collect()
         gc.freeze()
-        spin(executor)
+        spin(executor, nodes[0])
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except ArmSafetyError as error:
         report_refusal(error)
         return 1
     finally:
-        leave(node)
+        leave(*nodes)
         gc.unfreeze()
     return 0
 
 
-def leave(node: Node | None) -> None:
-    """Destroy a node and shut ROS down at the end of a process; call it from the main thread.
+def _warn_of_idle_remappings(nodes: Sequence[ArmNode]) -> None:
+    """Warn of rules of the command line that rename nothing."""
+    used = {name for node in nodes for names in node.topics_used() for name in names}
+    which = "this node" if len(nodes) == 1 else "these nodes"
+    for flag, rule in ros_rules(arguments_of(nodes[0].context)):
+        if flag != "-r" or is_known_remapping(rule):
+            continue
+        target = rule.partition(":=")[2]
+        if used.isdisjoint(node.resolve_topic_name(target) for node in nodes):
+            nodes[0].get_logger().warning(f"'-r {rule}' changes no topic of {which}")
+
+
+def leave(*nodes: Node) -> None:
+    """Destroy nodes and shut ROS down at the end of a process; call it from the main thread.
 
     When another process leaves at the same moment, Fast DDS 2.14 may wait for ever inside a call,
     so that no Python code runs any more. So the system ends the process if this takes too long.
     """
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.alarm(_LEAVE_TIMEOUT)
-    if node is not None:
+    for node in nodes:
         node.destroy_node()
     rclpy.try_shutdown()
     signal.alarm(0)

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages of the control streams between nodes of one process, past the middleware."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, cast
+
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
+
+Receive = Callable[[Any], None]
+
+
+class DirectDelivery:
+    """Gives messages of the control streams to the other nodes of a process, as the same objects.
+
+    Each message is published as ever, where anybody outside of the process subscribes. Where the
+    process has the only publisher of a topic, its own subscriptions get the message from the
+    executor's next turn, and leave unread what comes by the middleware. While a topic has a
+    publisher elsewhere, all of its messages come by the middleware; then one subscription reads
+    them for all nodes of the process.
+
+    One turn delivers what was sent meanwhile, too, in the order in which it was sent: from the
+    state over the limits to the command. It ends where a topic comes a second time, so that in
+    lockstep services, timers and goals are not kept waiting.
+
+    As with the middleware, a message that was not delivered yet gives way to a newer one.
+    Publishers may use a message again in the next control period, unless a subscriber keeps it.
+    """
+
+    def __init__(self) -> None:
+        self._streams: dict[str, _Stream] = {}
+        self._sent: dict[_Stream, Any] = {}  # the newest of each, in their order
+        self._turn_due = False
+
+    def publisher(self, node: Node, message: type, name: str, qos: QoSProfile) -> Publisher:
+        """Return a publisher whose messages the nodes of this process get directly."""
+        publisher = node.create_publisher(message, name, qos, publisher_class=_DirectPublisher)
+        stream = self._stream(node, name)
+        direct = cast(_DirectPublisher, publisher)
+        direct.stream, direct.deliver = stream, lambda sent: self._send(node, stream, sent)
+        stream.publishers += 1
+        stream.settle()
+        return publisher
+
+    def subscription(
+        self, node: Node, message: type, name: str, qos: QoSProfile, receive: Receive
+    ) -> Subscription:
+        """Return a subscription of a node of this process."""
+        stream = self._stream(node, name)
+        events = SubscriptionEventCallbacks()
+        if not stream.subscriptions:
+            events.matched = lambda info: stream.settle(info.current_count)
+        subscription = node.create_subscription(
+            message, name, stream.receive, qos, event_callbacks=events
+        )
+        stream.subscriptions.append((node, subscription, receive))
+        stream.settle()
+        return subscription
+
+    def leave(self, node: Node) -> None:
+        """Give a node back its subscriptions, so that they are destroyed with it."""
+        for stream in self._streams.values():
+            stream.give_back(node)
+
+    def _stream(self, node: Node, name: str) -> _Stream:
+        return self._streams.setdefault(node.resolve_topic_name(name), _Stream())
+
+    def _send(self, node: Node, stream: _Stream, message: Any) -> None:
+        if not stream.subscriptions or node.executor is None:
+            return  # nobody is there yet
+        self._sent.pop(stream, None)
+        self._sent[stream] = message
+        if not self._turn_due:
+            self._turn_due = True
+            node.executor.create_task(self._deliver, node)
+
+    def _deliver(self, node: Node) -> None:
+        delivered: set[_Stream] = set()
+        while self._sent and (stream := next(iter(self._sent))) not in delivered:
+            delivered.add(stream)
+            stream.receive(self._sent.pop(stream))
+        self._turn_due = bool(self._sent) and node.executor is not None
+        if self._turn_due:
+            node.executor.create_task(self._deliver, node)
+
+
+class _DirectPublisher(Publisher):
+    """A publisher to nodes of the same process and to others.
+
+    Attributes:
+        stream: its topic.
+        deliver: gives a message to the nodes of the process.
+    """
+
+    stream: _Stream
+    deliver: Receive
+
+    def publish(self, msg: Any) -> None:
+        """Send a message."""
+        if not self.stream.direct:
+            super().publish(msg)
+            return
+        # To make a message for the middleware that nobody reads takes longer than to deliver it.
+        if self.get_subscription_count() > len(self.stream.subscriptions):
+            super().publish(msg)
+        self.deliver(msg)
+
+
+class _Stream:
+    """A topic in a process.
+
+    Attributes:
+        publishers: how many are in the process.
+        subscriptions: of the process, with their nodes and callbacks; the first reads for all.
+        direct: whether messages go past the middleware.
+    """
+
+    def __init__(self) -> None:
+        self.publishers = 0
+        self.subscriptions: list[tuple[Node, Subscription, Receive]] = []
+        self.direct = False
+        self._matched = 0
+
+    def receive(self, message: Any) -> None:
+        """Give a message to all nodes of the process that subscribe."""
+        for _, _, receive in self.subscriptions:
+            receive(message)
+
+    def settle(self, matched: int | None = None) -> None:
+        """Choose the way of the messages.
+
+        Args:
+            matched: how many publishers there are, those of this process included; None for as
+                many as before.
+        """
+        self._matched = self._matched if matched is None else matched
+        self.direct = 0 < self.publishers >= self._matched
+        for index, (node, subscription, _) in enumerate(self.subscriptions):
+            _read(node, subscription, not self.direct and index == 0)
+
+    def give_back(self, node: Node) -> None:
+        """Let the executor see the subscriptions of a node, which get nothing any more."""
+        for each in [each for each in self.subscriptions if each[0] is node]:
+            self.subscriptions.remove(each)
+            _read(node, each[1], True)
+
+
+def _read(node: Node, subscription: Subscription, wanted: bool) -> None:
+    """Have the executor read a subscription, or leave what comes unread."""
+    read_now = node._subscriptions  # rclpy has no other way to tell executors
+    if wanted == (subscription in read_now):
+        return
+    if wanted:
+        while subscription.handle.take_message(subscription.msg_type, subscription.raw):
+            pass  # came directly, too
+        read_now.append(subscription)
+    else:
+        read_now.remove(subscription)
+    if node.executor is not None:
+        node.executor.wake()
