@@ -93,6 +93,30 @@ def test_plans_brake_harder_than_the_acceleration_limits_where_they_must():
     assert hardest < -30.0
 
 
+def test_the_plan_is_allowed_where_the_bounds_ask_for_what_cannot_be_done():
+    controller = make()
+    controller.reset(EDGE)
+    controller.set_posture_goal(STRETCHED)
+    up = np.full(ARM.n, 8.0)
+    output = controller.step(State(EDGE, ZERO), AccelerationRange(up, up))
+    assert output.relaxation is None
+    assert (output.a >= controller.safety_filter.plan - 1e-6).all()
+
+
+def test_without_a_plan_the_arm_brakes():
+    """It goes to no goal where it cannot be held: it comes down, and slows down."""
+    v = np.zeros(ARM.n)
+    v[6] = 0.5
+    moved = []
+    for q in (FOLDED, STRETCHED):
+        controller = make()
+        controller.reset(q)
+        controller.set_posture_goal(q + 0.5)
+        moved.append(controller.step(State(q, v), AccelerationRange(-A_MAX, A_MAX)).a[6])
+    assert moved[0] > 10.0
+    assert moved[1] < -5.0
+
+
 def test_rows_of_the_filter_are_not_told_as_distances():
     class Impossible:
         def constraint(self, robot, bounds, disturbance=None):
