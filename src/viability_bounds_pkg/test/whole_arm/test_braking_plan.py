@@ -100,6 +100,7 @@ def test_a_plan_is_what_its_definition_says(seed, change):
             np.testing.assert_allclose(plan.positions[k], q, atol=1e-10)
             np.testing.assert_allclose(plan.velocities[k], v, atol=1e-10)
             np.testing.assert_allclose(plan.accelerations[k], a, atol=1e-9)
+    np.testing.assert_array_equal(plan.velocities[-1], 0.0)
     _, v, a = plan.at(REST)
     np.testing.assert_allclose(v, 0.0, atol=1e-10)
     np.testing.assert_array_equal(a, 0.0)
