@@ -45,6 +45,8 @@ DATA_SHEET = [15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0]
 """Panda's largest accelerations by its maker, rad/s^2."""
 SHORT = 4
 """Minutes of rows without the filter, at most."""
+TRIED = 10
+"""Minutes of rows with limits of rates, at most."""
 CLEAR = 0.005
 """Distance of goals from position limits, rad: the bounds' margins keep Baxter 4 mrad off them."""
 KEPT_FREE = 0.05
@@ -240,7 +242,9 @@ def compare(figure: Figure, minutes: int, limit: float, word: str) -> bool:
     kept = True
     names = [name for name in CASES if word in name]
     seeds = {
-        name: range(minutes if CASES[name].filtered else min(minutes, SHORT)) for name in names
+        name: range(min(minutes, TRIED if name in RATES else minutes if case.filtered else SHORT))
+        for name, case in CASES.items()
+        if name in names
     }
     pieces = [(name, seed, limit) for name in names for seed in seeds[name]]
     played: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
