@@ -97,6 +97,8 @@ class Case:
         overlay: nodes that get the file of the imperfect robot.
         changed: parameters that differ, by node.
         outages: whether all commands fail for up to 0.2 s, some 1.5 times a second.
+        filtered: whether the safety filter is on, and the limits are those of the file.
+        torque: share of the torque limits that the motors have.
     """
 
     title: str
@@ -104,6 +106,8 @@ class Case:
     overlay: tuple[str, ...] = ("bounds_node", "controller_node", "estimator_node")
     changed: Mapping[str, Mapping[str, Any]] | None = None
     outages: bool = False
+    filtered: bool = False
+    torque: float = 1.0
 
 
 NOTHING_DECLARED: dict[str, Any] = {
@@ -146,7 +150,15 @@ CASES = {
         outages=True,
     ),
     "outage_stop": Case("spoilt, all done; commands fail for up to 0.2 s; stop", 1, outages=True),
+    "filter": Case("spoilt, all done; safety filter, limits of its file", 1, filtered=True),
+    "filter_weak": Case(
+        "spoilt, all done; safety filter, 60% of its torque", 1, filtered=True, torque=0.6
+    ),
 }
+AT_LENGTH = ("all", "filter", "filter_weak")
+"""Cases that are played for longer."""
+UNABLE = {("baxter_left_arm", "filter_weak")}
+"""Robots that cannot hold their start in a case."""
 IDEAL = ("ideal", "ideal_remedies")
 DOUBLED = (
     "encoder_resolution",
@@ -195,7 +207,10 @@ def node_values(robot: str, case: Case, seed: int) -> Values:
                 chosen |= {"outage_probability": 1.5 / rate, "outage_longest": round(0.2 * rate)}
         of_robot = {name: imperfect[node][name] for name in OF_ROBOT if name in imperfect[node]}
         changed = dict((case.changed or {}).get(node, {}))
-        values[node] = chosen | of_robot | HOLDABLE.get(robot, {}) | changed
+        own = {"safety_filter": True} if case.filtered else HOLDABLE.get(robot, {})
+        values[node] = chosen | of_robot | own | changed
+        if values[node].get("torque_max"):
+            values[node]["torque_max"] = [case.torque * tau for tau in values[node]["torque_max"]]
     values["bullet_node"] |= {"imperfection_seed": seed}
     if not values["controller_node"].get("use_estimated_states"):
         del values["estimator_node"]
@@ -356,7 +371,7 @@ def _own_domain() -> None:
 
 def seeds(name: str, minutes: int) -> range:
     """Return the seeds of a case's minutes: one minute alone is one with a stiff posture task."""
-    return range(minutes) if name == "all" else range(1, minutes + 1)
+    return range(minutes) if name in AT_LENGTH else range(1, minutes + 1)
 
 
 def play_all(
@@ -366,7 +381,7 @@ def play_all(
 
     Only the cases in `WITHIN_DECLARED` count.
     """
-    lengths = {name: minutes_declared if name == "all" else minutes_others for name in names}
+    lengths = {name: minutes_declared if name in AT_LENGTH else minutes_others for name in names}
     fine = True
     with ProcessPoolExecutor(
         max(1, os.cpu_count() or 1), get_context("spawn"), initializer=_own_domain
@@ -382,6 +397,7 @@ def play_all(
             )
             for robot in robots
             for name, minutes in lengths.items()
+            if (robot, name) not in UNABLE
         }
         for (robot, name), (minutes, hands, times) in runs.items():
             outcome = Outcome(
