@@ -63,7 +63,7 @@ def two_links(
     )
     limit = np.full(2, 20.0)
     dt = settings.pop("dt", 1e-3)
-    constants = {k: settings.pop(k) for k in ("influence",) if k in settings}
+    constants = {k: settings.pop(k) for k in ("influence", "speed_max") if k in settings}
     avoidance = CollisionAvoidance(collision, -limit, limit, dt, CollisionSettings(**settings))
     return with_constants(avoidance, **constants), model
 
