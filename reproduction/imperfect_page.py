@@ -81,14 +81,15 @@ errors, noise and longest row of lost commands, and half the bandwidths.
 A row of which something is promised ends with a verdict. Where what is spoilt is within what is
 declared ("all done", also while commands fail and the drives stop by themselves, and with the
 safety filter), position and speed must be 0 and torque at most 1. With "all done" alone, the step
-at rest must also be at most {step:g}, and the median distance of the hand at most {factor:g} times that of the same robot with
-nothing spoilt and nothing done, or what a step of all encoders is at the hand. The other rows are
-for comparison.
+at rest must also be at most {step:g}, and the median distance of the hand at most {factor:g} times
+that of the same robot with nothing spoilt and nothing done, or what a step of all encoders is at
+the hand. The other rows are for comparison.
 
 Three things that a verdict does not say. It holds for the minutes, goals and pushes of its row, in
 lockstep. Pushes and TALOS' friction are at times more than `acceleration_disturbance` declares:
 what keeps the limits then are the disturbance observer and further margins in the files, which are
-tested, not proven. And Baxter's limits are narrower than in its file.
+tested, not proven. And Baxter's limits are narrower than in its file
+without the safety filter.
 {parts}
 ## What the remedies cost an ideal robot
 
@@ -106,7 +107,8 @@ a state to its command, without and with the remedies.
 """
 HOLDABLE = """
 The limits of {robots} are narrower than in its file in all cases without the safety filter, so
-that the arm can hold and accelerate itself in all states: `HOLDABLE` in `reproduction/imperfect.py`.
+that the arm can hold and accelerate itself in all states: `HOLDABLE` in
+`reproduction/imperfect.py`.
 """
 
 
