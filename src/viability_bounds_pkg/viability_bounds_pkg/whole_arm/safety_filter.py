@@ -83,6 +83,10 @@ than the margins of the bounds, which would change a plan that ends nearer."""
 GENTLE = 0.5
 """Share of the limits of the torques' rates that the joints' accelerations use in plans."""
 
+DRIFT = 0.1
+"""Further distance where changes are limited, in speeds times period: plans are longer carried on
+then, and the bounds do not lead back from the limit at once."""
+
 TOLERANCE = 0.8
 """Share of that distance by which plans in hand may end nearer, as states drift a little."""
 
@@ -216,9 +220,11 @@ class SafetyFilter:
         self._a_min, self._a_max = a_min, a_max
         self._usable = (1.0 - RESERVE) * torques
         self._smooth = bool(np.isfinite(jerks).any() or np.isfinite(rates).any())
-        if not self._smooth:
-            v_max = none  # speeds only fall along plans
         clearance = CLEARANCE * dt * dt * braking
+        if self._smooth:
+            clearance = clearance + DRIFT * dt * np.where(np.isfinite(v_max), v_max, 0.0)
+        else:
+            v_max = none  # speeds only fall along plans
         self._limits = JointLimitsOfPlans(
             q_min + clearance,
             q_max - clearance,
