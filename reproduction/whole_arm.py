@@ -17,7 +17,6 @@ kept in results/whole_arm/ until a source file changes.
 from __future__ import annotations
 
 import argparse
-import time
 from collections import Counter
 from typing import Any, NamedTuple
 
@@ -354,23 +353,6 @@ def safe_set(axis: plt.Axes, elbow: float) -> None:
     )
 
 
-def cost(robot: str, states: int = 300) -> tuple[float, float]:
-    """Return how long the filter takes in random states, median and 99%, us."""
-    loop = DirectLoop(robot, {"safety_filter": True})
-    keeper, limits, n = loop.controller.safety_filter, loop.limits, len(loop.limits)
-    assert keeper is not None
-    rng, zero, taken = np.random.default_rng(0), np.zeros(n), []
-    for _ in range(states):
-        q = rng.uniform(limits.q_min, limits.q_max)
-        v, a = 0.3 * rng.uniform(-limits.v_max, limits.v_max), rng.uniform(-1.0, 1.0, n)
-        keeper.reset()
-        begin = time.perf_counter()
-        keeper.look(q, v, zero, limits.a_min, limits.a_max)
-        keeper.choose(a)
-        taken.append(1e6 * (time.perf_counter() - begin))
-    return float(np.median(taken)), float(np.percentile(taken, 99))
-
-
 def main() -> int:
     """Play, draw, print the table; return whether the filter kept all limits."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -391,9 +373,6 @@ def main() -> int:
     safe_set(axes[2], 1.5)
     picture.savefig(ROOT / "docs" / "images" / "whole_arm.png", dpi=90)
     figure.save(picture)
-    for robot in ("panda", "baxter_left_arm", "talos_left_arm"):
-        median, slow = cost(robot)
-        print(f"{robot}: the filter takes {median:.0f} us of a step in the median, 99% {slow:.0f}")
     return 0 if kept else 1
 
 

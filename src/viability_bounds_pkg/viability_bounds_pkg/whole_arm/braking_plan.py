@@ -49,6 +49,9 @@ ROUNDING = 1e-9
 NEGLIGIBLE = 1e-6
 """Excess of speeds and rates, as a share of their limits."""
 
+DRIFTED = 0.2
+"""Share of the tolerance by which a plan that is carried on may pass a limit unrepaired."""
+
 HALVINGS = 10
 """Of the search for the largest acceleration from which a joint can stop."""
 
@@ -359,6 +362,57 @@ def rest_of(course: Course, rest: Course) -> None:
         rest.moving[j] = max(course.moving[j] - 1, 1)
         rest.rising[j] = max(course.rising[j] - 1, 1)
         rest.falling[j] = min(course.falling[j], rest.moving[j])
+
+
+@compiled
+def repair(
+    q: Array,
+    v: Array,
+    a: Array,
+    T: float,
+    gentle: Array,
+    limits: JointLimitsOfPlans,
+    dt: float,
+    course: Course,
+    repaired: Course,
+) -> bool:
+    """Fill in a course in which joints that have drifted stand before their limits again.
+
+    Args:
+        q: positions, shape (n,), rad.
+        v: velocities, shape (n,), rad/s.
+        a: accelerations of the period before, shape (n,), rad/s^2.
+        T: time of the plan, s.
+        gentle: change of accelerations from period to period, shape (n,), rad/s^2.
+        limits: of the joints.
+        dt: control period, s.
+        course: of the plan in hand.
+        repaired: filled in: the same, but for joints that end beyond by more than `DRIFTED`.
+
+    Returns:
+        Whether there are such joints.
+    """
+    found = False
+    for j in range(q.size):
+        N, m, w = course.moving[j], course.rising[j], course.falling[j]
+        low, high = limits.q_min[j], limits.q_max[j]
+        beyond = _excess(q[j], v[j], a[j], (N, m, w), low, high, dt)
+        if beyond > DRIFTED * limits.tolerance[j]:
+            found = True
+            N, m, w = joint_course(
+                q[j],
+                v[j],
+                a[j],
+                T,
+                low,
+                high,
+                limits.tolerance[j],
+                limits.braking[j],
+                gentle[j],
+                dt,
+            )
+        repaired.moving[j], repaired.rising[j], repaired.falling[j] = N, m, w
+    return found
 
 
 @compiled

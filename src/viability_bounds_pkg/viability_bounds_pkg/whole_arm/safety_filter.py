@@ -30,6 +30,7 @@ from viability_bounds_pkg.whole_arm.braking_plan import (
     JointLimitsOfPlans,
     copy_course,
     new_course,
+    repair,
     rest_of,
     sensitivity,
     viable_range,
@@ -308,7 +309,7 @@ class SafetyFilter:
         if self._smooth:
             self._gentle = self._gentle_changes(q)
         if self._begun:
-            plans.follow(q, v, self._last, self._course, extra)
+            self._go_on()
         else:
             self._begin()
         rest_of(self._course, self._rest)
@@ -327,6 +328,29 @@ class SafetyFilter:
                 if abs(plans.tau[k, j]) > NEAR * self._usable[j]:
                     wanted.setdefault(k, []).append(j)
         return self._rows(wanted) if wanted else None
+
+    def _go_on(self) -> None:
+        """Look at the plan in hand; where joints have drifted towards a limit, repair it."""
+        plans, begin, last, extra = self._plans, self._state, self._last, self._extra
+        drifted = repair(
+            *begin,
+            last,
+            self._time,
+            self._gentle,
+            self._limits,
+            self._dt,
+            self._course,
+            self._rest,
+        )
+        plans.follow(*begin, last, self._course, extra)
+        if not drifted:
+            return
+        own = Needs.of(plans)
+        plans.follow(*begin, last, self._rest, extra)
+        if plans.beyond <= own.beyond and own._replace(beyond=plans.beyond).cover(plans):
+            copy_course(self._rest, self._course)
+        else:
+            plans.follow(*begin, last, self._course, extra)
 
     def _begin(self) -> None:
         """Take the best plan of some times, the usual one if it is safe."""
