@@ -131,6 +131,11 @@ class Controller:
         """Acceleration commanded last, shape (n,), rad/s^2."""
         return self._a_last
 
+    @property
+    def lost(self) -> bool:
+        """Whether the safety filter knows no plan near the limits, so that the arm only brakes."""
+        return self.safety_filter is not None and self.safety_filter.lost
+
     def reset(self, q: Array) -> None:
         """Forget the past; `q` becomes the posture that the null space is held at."""
         self._forget()
@@ -300,7 +305,7 @@ class Controller:
         rows = self._look_ahead(bounds, additional, disturbance)
         if self.safety_filter is not None:
             bounds = AccelerationRange(self.safety_filter.lower, self.safety_filter.upper)
-            if self.safety_filter.lost:
+            if self.lost:
                 tasks = [DampingTask(self.gains.hold_kd)]
         if disturbance is not None:
             bounds = AccelerationRange(*self._observer.shift(*bounds))
@@ -318,7 +323,7 @@ class Controller:
                 solution = solve(bounds, None)
             else:
                 solution = solve(bounds, rows)
-                if solution.relaxation is not None and not self.safety_filter.lost:
+                if solution.relaxation is not None and not self.lost:
                     # The bounds have margins that the plan does not keep, and rows lead back
                     # from where it leaves too little. With the plan allowed there is a solution.
                     plan = self.safety_filter.plan
@@ -345,7 +350,7 @@ class Controller:
         relaxed = solution.constraint_relaxation
         if relaxed is not None and rows is not None:
             relaxed = relaxed[: -len(rows.G)] if len(relaxed) > len(rows.G) else None
-        return ControlOutput(tau, a, True, solution.relaxation, "", relaxed)
+        return ControlOutput(tau, a, not self.lost, solution.relaxation, "", relaxed)
 
     def _look_ahead(
         self, bounds: AccelerationRange, additional: Array | None, disturbance: Array | None

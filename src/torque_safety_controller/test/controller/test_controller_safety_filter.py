@@ -112,7 +112,9 @@ def test_without_a_plan_the_arm_brakes():
         controller = make()
         controller.reset(q)
         controller.set_posture_goal(q + 0.5)
-        moved.append(controller.step(State(q, v), AccelerationRange(-A_MAX, A_MAX)).a[6])
+        output = controller.step(State(q, v), AccelerationRange(-A_MAX, A_MAX))
+        assert output.tracking == (q is FOLDED)
+        moved.append(output.a[6])
     assert moved[0] > 10.0
     assert moved[1] < -5.0
 

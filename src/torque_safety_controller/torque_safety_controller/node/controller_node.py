@@ -235,6 +235,8 @@ class ControllerNode(ArmNode):
             return "acceleration limits are stale"
         if self._handover.control is Control.GIVING_BACK:
             return "on the way to position control"
+        if self._controller.lost:
+            return "no plan within all limits is known"
         return "goal lost" if self._goal_lost() else "no goal"
 
     def _hold(self, stamp: Any) -> None:

@@ -10,8 +10,6 @@ from viability_bounds_pkg.whole_arm.braking_plan import (
     REST,
     JointLimitsOfPlans,
     fill_plan,
-    joint_course,
-    joint_excess,
     make_course,
     new_course,
     rest_of,
@@ -19,6 +17,7 @@ from viability_bounds_pkg.whole_arm.braking_plan import (
     sensitivity,
     viable_range,
 )
+from viability_bounds_pkg.whole_arm.joint_plan import joint_course, joint_excess
 
 DT = 0.01
 N = 7

@@ -1,14 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Braking plans: every joint slows down until it stands; compiled.
 
-A plan has, for each joint, how many control periods N it moves, in how many of them, m, its
-deceleration rises, and in how many, w, it falls again. With a the acceleration of the period
-before and d the deceleration between,
-
-    a_k = a (1 - r_k) - d p_k,   r_k = min((k+1)/m, 1),   p_k = min((k+1)/m, 1, (N-k)/w),
-
-for k = 0 .. N-1, and d such that the joint stands after them. Within a period the acceleration is
-constant. With m = w = 1 that is one constant deceleration from now until the stop.
+Each joint has a plan of its own (`joint_plan`): for how many periods N it moves, in how many of
+them, m, its deceleration rises, and in how many, w, it falls.
 
 After a period, what is left of a plan is the plan with N-1, m-1 and w, at most N-1, from the state
 then: the same accelerations. So one plan, once found, is enough for ever.
@@ -20,13 +14,18 @@ the acceleration to change gently, where its changes are limited.
 
 from __future__ import annotations
 
-from math import ceil, floor
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from viability_bounds_pkg.compiled import compiled
+from viability_bounds_pkg.whole_arm.joint_plan import (
+    joint_course,
+    joint_excess,
+    joint_state,
+    passed,
+)
 
 Array = NDArray[np.float64]
 Counts = NDArray[np.int64]
@@ -42,9 +41,6 @@ FIRST = 1
 
 REST = 10**9
 """Clock of the arm at rest, periods."""
-
-ROUNDING = 1e-9
-"""Of numbers of periods."""
 
 NEGLIGIBLE = 1e-6
 """Excess of speeds and rates, as a share of their limits."""
@@ -106,215 +102,56 @@ def samples(n: int, smooth: bool) -> int:
 
 
 @compiled
-def joint_shape(v: float, a: float, N: int, m: int, w: int, dt: float) -> tuple[float, float]:
-    """Return d of one joint, and the change of its acceleration in each period of rising.
-
-    Args:
-        v: velocity, rad/s.
-        a: acceleration of the period before, rad/s^2.
-        N: periods until it stands.
-        m: periods of rising.
-        w: periods of falling, at most N + 1 - m.
-        dt: control period, s.
-    """
-    d = (v / dt + 0.5 * a * (m - 1)) / (N - 0.5 * (m + w) + 1.0)
-    return d, -(a + d) / m
-
-
-@compiled
-def after(
-    q: float, v: float, count: float, a: float, change: float, dt: float
-) -> tuple[float, float]:
-    """Return position and velocity after periods whose acceleration changes at a constant rate.
-
-    Args:
-        q: position, rad.
-        v: velocity, rad/s.
-        count: number of periods.
-        a: acceleration in the first period, rad/s^2.
-        change: of the acceleration from period to period, rad/s^2.
-        dt: control period, s.
-    """
-    pairs = 0.5 * count * (count - 1.0)
-    moved = a * (pairs + 0.5 * count) + change * pairs * ((count - 2.0) / 3.0 + 0.5)
-    return q + dt * count * v + dt * dt * moved, v + dt * (a * count + change * pairs)
-
-
-@compiled
-def joint_state(
-    q: float, v: float, a: float, N: int, m: int, w: int, dt: float, k: int
-) -> tuple[float, float, float]:
-    """Return position, velocity and acceleration of one joint at the beginning of period k.
-
-    Linear in (q, v, a). Arguments as of `joint_shape`.
-    """
-    d, change = joint_shape(v, a, N, m, w, dt)
-    if k < m and k < N:
-        q, v = after(q, v, k, a + change, change, dt)
-        return q, v, a + (k + 1) * change
-    q, v = after(q, v, m, a + change, change, dt)
-    falls = max(m, N - w + 1)
-    if k < falls and k < N:
-        q, v = after(q, v, k - m, -d, 0.0, dt)
-        return q, v, -d
-    q, v = after(q, v, min(falls, N) - m, -d, 0.0, dt)
-    begins, change = -d * (N - falls) / w, d / w
-    if k < N:
-        q, v = after(q, v, k - falls, begins, change, dt)
-        return q, v, begins + (k - falls) * change
-    q, _ = after(q, v, max(N - falls, 0), begins, change, dt)
-    return q, 0.0, 0.0
-
-
-@compiled
-def joint_excess(
-    q: float,
-    v: float,
-    a: float,
-    N: int,
-    m: int,
-    w: int,
-    dt: float,
-    q_min: float,
-    q_max: float,
-    v_max: float,
-    change_max: float,
-) -> tuple[float, float]:
-    """Return by how far one joint's plan, or the present state, passes its limits at worst.
-
-    Args:
-        q: position, rad.
-        v: velocity, rad/s.
-        a: acceleration of the period before, rad/s^2.
-        N: periods until it stands.
-        m: periods of rising.
-        w: periods of falling.
-        dt: control period, s.
-        q_min: lowest position, rad.
-        q_max: highest, rad.
-        v_max: speed, rad/s.
-        change_max: change of the acceleration from period to period, rad/s^2.
-
-    Returns:
-        Excess of position, rad; of speed and change of acceleration, as a share of their limits.
-    """
-    end, _, _ = joint_state(q, v, a, N, m, w, dt, N)
-    high, low = max(q, end), min(q, end)
-    fast = abs(v) / v_max - 1.0
-    if m == 1 and w == 1:
-        first = abs(-v / (dt * N) - a)
-        change = max(first, abs(v) / (dt * N)) / change_max - 1.0
-        return max(high - q_max, q_min - low), max(fast, change)
-    d, rising = joint_shape(v, a, N, m, w, dt)
-    change = max(abs(rising), abs(d) / w)
-    # The acceleration changes its sign once at most, while it rises, before the period `turn`.
-    # Until then speed grows or the motion turns round; from then on it only slows down.
-    begins = a + rising
-    if begins * -d < 0.0:
-        turn = min(ceil(-begins / rising), m - 1)
-        place, speed = after(q, v, turn, begins, rising, dt)
-        high, low = max(high, place), min(low, place)
-        fast = max(fast, abs(speed) / v_max - 1.0)
-        if v * speed < 0.0:
-            near, far = 0, turn  # it stands between
-            while far - near > 1:
-                middle = (near + far) // 2
-                _, between = after(q, v, middle, begins, rising, dt)
-                if v * between < 0.0:
-                    far = middle
-                else:
-                    near = middle
-            place, speed = after(q, v, near, begins, rising, dt)
-            beyond = place + 0.5 * speed * dt  # at most: it stands within this period
-            high, low = max(high, beyond), min(low, beyond)
-    return max(high - q_max, q_min - low), max(fast, change / change_max - 1.0)
-
-
-@compiled
-def joint_course(
+def _course_of(
+    j: int,
     q: float,
     v: float,
     a: float,
     T: float,
-    q_min: float,
-    q_max: float,
-    tolerance: float,
-    braking: float,
-    gentle: float,
+    gentle: Array,
+    limits: JointLimitsOfPlans,
     dt: float,
 ) -> tuple[int, int, int]:
-    """Return N, m and w of one joint in the plan of time `T`.
-
-    Args:
-        q: position, rad.
-        v: velocity, rad/s.
-        a: acceleration of the period before, rad/s^2.
-        T: s.
-        q_min: lowest position at which it is to stand, rad.
-        q_max: highest, rad.
-        tolerance: by how far it may stand beyond where only braking harder than A would help, rad.
-        braking: A, rad/s^2.
-        gentle: change of the acceleration from period to period, rad/s^2; inf for any.
-        dt: control period, s.
-    """
-    speed = abs(v)
-    if gentle == np.inf:
-        room = q_max - q if v > 0.0 else q - q_min
-        periods = max(ceil(max(T, speed / braking) / dt - ROUNDING), 1)
-        if speed > 0.0 and 0.5 * speed * periods * dt > room:
-            most = floor(2.0 * max(room, 0.0) / (speed * dt) + ROUNDING)
-            beyond = floor(2.0 * max(room + tolerance, 0.0) / (speed * dt) + ROUNDING)
-            hardest = ceil(speed / (braking * dt) - ROUNDING)
-            periods = max(most, min(hardest, beyond), 1)
-        return periods, 1, 1
-    wanted = max(ceil(T / dt - ROUNDING), 1)
-    best = _gentle_course(v, a, wanted, braking, gentle, dt)
-    if _excess(q, v, a, best, q_min, q_max, dt) > 0.0:
-        least = 1
-        best = _gentle_course(v, a, least, braking, gentle, dt)
-        # The longest that stands before the limit; the hardest where none does.
-        while wanted - least > 1:
-            middle = (least + wanted) // 2
-            trial = _gentle_course(v, a, middle, braking, gentle, dt)
-            if _excess(q, v, a, trial, q_min, q_max, dt) > 0.0:
-                wanted = middle
-            else:
-                least, best = middle, trial
-    return best
+    """Return N, m and w of joint j; see `joint_course`."""
+    return joint_course(
+        q,
+        v,
+        a,
+        T,
+        limits.q_min[j],
+        limits.q_max[j],
+        limits.tolerance[j],
+        limits.braking[j],
+        gentle[j],
+        dt,
+    )
 
 
 @compiled
-def _excess(
+def _excess_of(
+    j: int,
     q: float,
     v: float,
     a: float,
     course: tuple[int, int, int],
-    q_min: float,
-    q_max: float,
+    limits: JointLimitsOfPlans,
     dt: float,
-) -> float:
-    """Return by how far a joint's plan passes its position limits."""
+) -> tuple[float, float]:
+    """Return by how far the plan of joint j passes its limits; see `joint_excess`."""
     N, m, w = course
-    return joint_excess(q, v, a, N, m, w, dt, q_min, q_max, np.inf, np.inf)[0]
-
-
-@compiled
-def _gentle_course(
-    v: float, a: float, wanted: int, braking: float, gentle: float, dt: float
-) -> tuple[int, int, int]:
-    """Return N, at least as wanted, m and w with which a joint brakes with A at most."""
-    N, m, w = wanted, 1, 1
-    for _ in range(20):
-        impulse = v / dt + 0.5 * a * (m - 1)
-        N = max(wanted, ceil(abs(impulse) / braking + 0.5 * (m + w) - 1.0 - ROUNDING), m + w - 1)
-        d = impulse / (N - 0.5 * (m + w) + 1.0)
-        # They only grow, so it ends; with N they grow less and less.
-        rising = max(m, ceil(abs(a + d) / gentle - ROUNDING))
-        falling = max(w, ceil(abs(d) / gentle - ROUNDING))
-        if rising == m and falling == w:
-            break
-        m, w = rising, falling
-    return N, m, w
+    return joint_excess(
+        q,
+        v,
+        a,
+        N,
+        m,
+        w,
+        dt,
+        limits.q_min[j],
+        limits.q_max[j],
+        limits.v_max[j],
+        limits.change_max[j],
+    )
 
 
 @compiled
@@ -341,17 +178,8 @@ def make_course(
         course: filled in.
     """
     for j in range(q.size):
-        course.moving[j], course.rising[j], course.falling[j] = joint_course(
-            q[j],
-            v[j],
-            a[j],
-            T,
-            limits.q_min[j],
-            limits.q_max[j],
-            limits.tolerance[j],
-            limits.braking[j],
-            gentle[j],
-            dt,
+        course.moving[j], course.rising[j], course.falling[j] = _course_of(
+            j, q[j], v[j], a[j], T, gentle, limits, dt
         )
 
 
@@ -396,21 +224,10 @@ def repair(
     for j in range(q.size):
         N, m, w = course.moving[j], course.rising[j], course.falling[j]
         low, high = limits.q_min[j], limits.q_max[j]
-        beyond = _excess(q[j], v[j], a[j], (N, m, w), low, high, dt)
+        beyond = passed(q[j], v[j], a[j], (N, m, w), low, high, dt)
         if beyond > DRIFTED * limits.tolerance[j]:
             found = True
-            N, m, w = joint_course(
-                q[j],
-                v[j],
-                a[j],
-                T,
-                low,
-                high,
-                limits.tolerance[j],
-                limits.braking[j],
-                gentle[j],
-                dt,
-            )
+            N, m, w = _course_of(j, q[j], v[j], a[j], T, gentle, limits, dt)
         repaired.moving[j], repaired.rising[j], repaired.falling[j] = N, m, w
     return found
 
@@ -460,31 +277,8 @@ def viable_range(
             for turn in range(HALVINGS + 1):
                 a = bad if turn == 0 else 0.5 * (good + bad)
                 place, speed = q[j] + dt * v[j] + 0.5 * dt * dt * a, v[j] + dt * a
-                N, m, w = joint_course(
-                    place,
-                    speed,
-                    a,
-                    T,
-                    limits.q_min[j],
-                    limits.q_max[j],
-                    limits.tolerance[j],
-                    limits.braking[j],
-                    gentle[j],
-                    dt,
-                )
-                far, fast = joint_excess(
-                    place,
-                    speed,
-                    a,
-                    N,
-                    m,
-                    w,
-                    dt,
-                    limits.q_min[j],
-                    limits.q_max[j],
-                    limits.v_max[j],
-                    change,
-                )
+                course = _course_of(j, place, speed, a, T, gentle, limits, dt)
+                far, fast = _excess_of(j, place, speed, a, course, limits, dt)
                 if far <= already and fast <= NEGLIGIBLE:
                     good = a
                     if turn == 0:
@@ -575,19 +369,7 @@ def fill_plan(
             positions[k, j], velocities[k, j], accelerations[k, j] = joint_state(
                 q[j], v[j], a[j], N, m, w, dt, min(clock[k], N)
             )
-        place, speed = joint_excess(
-            q[j],
-            v[j],
-            a[j],
-            N,
-            m,
-            w,
-            dt,
-            limits.q_min[j],
-            limits.q_max[j],
-            limits.v_max[j],
-            limits.change_max[j],
-        )
+        place, speed = _excess_of(j, q[j], v[j], a[j], (N, m, w), limits, dt)
         far = max(far, place - limits.tolerance[j])
         fast = max(fast, speed)
     return far, fast if fast > NEGLIGIBLE else 0.0

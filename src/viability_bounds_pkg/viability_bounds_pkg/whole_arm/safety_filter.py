@@ -218,7 +218,6 @@ class SafetyFilter:
                 if not value > 0.0:
                     raise JointLimitsError(field, name, value, "must be positive")
         braking = np.minimum(-a_min, a_max)
-        self._a_min, self._a_max = a_min, a_max
         self._usable = (1.0 - RESERVE) * torques
         self._smooth = bool(np.isfinite(jerks).any() or np.isfinite(rates).any())
         clearance = CLEARANCE * dt * dt * braking
@@ -234,7 +233,7 @@ class SafetyFilter:
             braking,
             dt * jerks,
         )
-        self._narrower = self._limits._replace(v_max=(1.0 - SPARE) * v_max)
+        self._narrower = self._limits._replace(v_max=(1.0 - 2.0 * SPARE) * v_max)
         allowed_change = (1.0 - RATE_RESERVE) * dt * rates
         self._plans = PlanTorques(model, self._limits, self._usable, allowed_change, dt)
         self._dt = dt
