@@ -63,7 +63,7 @@ more. In every second minute the posture task is so stiff (kp 100 1/s², alone) 
 joint into its limits.
 
 {pushes}
-{holdable}
+
 Remedies: the *observer* estimates velocities from positions, and the *prediction* takes the state
 through the commands under way ([state_estimation.md](state_estimation.md)); *margins and horizon*
 of the bounds follow from what is declared ([uncertainty.md](uncertainty.md)); the *stop* is that
@@ -85,11 +85,14 @@ at rest must also be at most {step:g}, and the median distance of the hand at mo
 that of the same robot with nothing spoilt and nothing done, or what a step of all encoders is at
 the hand. The other rows are for comparison.
 
-Three things that a verdict does not say. It holds for the minutes, goals and pushes of its row, in
+The *safety filter* ([whole_arm.md](whole_arm.md)) is on in all rows of `baxter_left_arm`, as in
+its file, and elsewhere where a row says so; Panda's torques then change by no more than its maker
+allows, 1000 N m/s. `torque_reserve` in the files is for the pushes above.
+
+Two things that a verdict does not say. It holds for the minutes, goals and pushes of its row, in
 lockstep. Pushes and TALOS' friction are at times more than `acceleration_disturbance` declares:
 what keeps the limits then are the disturbance observer and further margins in the files, which are
-tested, not proven. And Baxter's limits are narrower than in its file
-without the safety filter.
+tested, not proven.
 {parts}
 ## What the remedies cost an ideal robot
 
@@ -104,11 +107,6 @@ last column has the largest distance left at the limits.
 `uncertainty_cost` prints for each joint what a set of declarations costs in range, speed and time
 ([ros2_tools.md](ros2_tools.md)). `bash scripts/bench.sh chain --imperfect` measures the time from
 a state to its command, without and with the remedies.
-"""
-HOLDABLE = """
-The limits of {robots} are narrower than in its file in all cases without the safety filter, so
-that the arm can hold and accelerate itself in all states: `HOLDABLE` in
-`reproduction/imperfect.py`.
 """
 
 
@@ -300,7 +298,6 @@ def write_page(
     robots: Sequence[str],
     titles: Mapping[str, str],
     pushed: Mapping[str, Mapping[str, float]],
-    limits_changed: Sequence[str],
     near: float,
 ) -> None:
     """Write page, picture, data and metrics of all rows that are kept.
@@ -309,7 +306,6 @@ def write_page(
         robots: in the order of the page.
         titles: of the cases by name, in the order of the rows.
         pushed: by robot, the forces by link, N.
-        limits_changed: robots whose limits are not those of their file.
         near: how near a goal counts as reached, rad.
     """
     outcomes = {robot: kept_outcomes(robot, list(titles)) for robot in robots}
@@ -334,10 +330,8 @@ def write_page(
     for robot in outcomes:
         links = (f"`{link}` {force:g} N" for link, force in pushed[robot].items())
         pushes.rows.append((robot, ", ".join(links)))
-    changed = ", ".join(f"`{robot}`" for robot in limits_changed if robot in outcomes)
     page = PAGE.format(
         pushes=table([pushes], ("robot", "links that are pushed, and how hard")),
-        holdable=HOLDABLE.format(robots=changed) if changed else "",
         step=STEP_AT_REST,
         factor=HAND_FACTOR,
         parts="".join(parts),

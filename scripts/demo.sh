@@ -108,7 +108,11 @@ overrides=()
 [ -z "$params" ] || overrides+=(--params-file "$params")
 overrides+=(-p "clock:=$clock" -p "bounds_node:method:=$bounds" -p start_paused:=true)
 # What other bounds do is to be seen, not what the filter makes of it.
-[ "$bounds" = exact ] || overrides+=(-p "controller_node:safety_filter:=false")
+if [ "$bounds" != exact ]; then
+    unlimited="[$(sed -n 's/^ *joints: *\[\(.*\)\]/\1/p' "$config" | sed 's/[^,]*/.inf/g')]"
+    overrides+=(-p "controller_node:safety_filter:=false")
+    overrides+=(-p "controller_node:torque_rate_max:=$unlimited")
+fi
 [ "$rate" = default ] || overrides+=(-p "rate_hz:=$rate")
 if [ "$clock" = lockstep ]; then
     # The robot waits for the nodes, so long time-outs are safe and a busy machine causes none.

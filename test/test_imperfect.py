@@ -99,7 +99,7 @@ def folder(tmp_path, monkeypatch):
 
 def write(folder):
     titles = {name: case.title for name, case in CASES.items()}
-    imperfect_page.write_page(imperfect.ROBOTS, titles, imperfect.PUSHED, [ROBOT], 5e-3)
+    imperfect_page.write_page(imperfect.ROBOTS, titles, imperfect.PUSHED, 5e-3)
     return (folder / "docs" / "reproduction_imperfect.md").read_text()
 
 
@@ -124,5 +124,5 @@ def test_rows_of_earlier_runs_stay_and_are_replaced_by_new_ones(folder):
 
 def test_nothing_is_written_before_anything_was_played(folder):
     titles = {name: case.title for name, case in CASES.items()}
-    imperfect_page.write_page(imperfect.ROBOTS, titles, imperfect.PUSHED, [], 5e-3)
+    imperfect_page.write_page(imperfect.ROBOTS, titles, imperfect.PUSHED, 5e-3)
     assert not (folder / "docs" / "reproduction_imperfect.md").exists()

@@ -73,6 +73,31 @@ def test_a_constant_push_is_in_the_plans(robot, share, force):
     assert_kept(loop)
 
 
+@pytest.mark.parametrize("reserve", [None, [7.0, 7.0, 5.0, 5.0, 2.5, 2.5, 0.5]])
+def test_an_arm_that_is_stretched_out_withstands_what_is_reserved_for(reserve):
+    """As far as it can be held, 5 N more throw it down; with torque left for them, they do not."""
+    own = {"start_positions": [0.0, -1.2, 0.0, 2.0, 0.0, 0.0, 0.0]}
+    own |= {} if reserve is None else {"torque_reserve": reserve}
+    loop = DirectLoop("baxter_left_arm", STIFF | STRONG | own)
+    keeper, hand = loop.controller.safety_filter, loop.controller.robot.frame
+    loop.controller.set_posture_goal(np.zeros(7))
+    loop.run(4.0)
+    np.testing.assert_allclose(abs(keeper.rest_torque[1]), keeper.usable[1], rtol=0.02)
+    stood = loop.robot.state().q[1]
+    moved = 0.0
+    for push in [*np.linspace(0.25, 5.0, 20), *[5.0] * 60, *[0.0] * 60]:
+        loop.robot.apply_wrench(hand, [0.0, 0.0, -push], np.zeros(3))
+        loop.step()
+        moved = max(moved, abs(loop.robot.state().q[1] - stood))
+    if reserve is None:
+        assert keeper.outcomes["outside"] > 0
+        assert moved > 0.3
+    else:
+        assert keeper.outcomes["outside"] == 0
+        assert moved < 0.1
+        assert_kept(loop)
+
+
 def test_a_weak_arm_keeps_its_distances_only_with_the_filter():
     """It cannot brake in front of the wall, or itself, as its acceleration limits promise."""
     _, known = around_the_wall()

@@ -128,15 +128,14 @@ def test_a_hand_that_feels_too_little_moves_on_and_too_much_back():
     np.testing.assert_allclose(hand.hand_acceleration(enough), 0.0, atol=1e-4)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
-def test_stiffness_is_what_is_left_of_it_where_force_is_controlled(share):
-    hand = SimulatedHand(directions=Z, stiffness=np.full(6, share))
+def test_no_stiffness_is_left_where_force_is_controlled():
+    hand = SimulatedHand(directions=Z)
     goal = hand.pose.pose * pin.SE3(np.eye(3), np.array([0.01, 0.0, 0.02]))
     hand.controller.set_pose_goal(goal)
     hand.interaction.set_target(np.zeros(6))
     a = hand.hand_acceleration(hand.step(force()))
     assert a[0] == pytest.approx(GAINS.pose_kp * 0.01, rel=1e-2)
-    assert a[2] == pytest.approx(0.5 * share * GAINS.pose_kp * 0.02, rel=1e-2, abs=1e-4)
+    assert a[2] == pytest.approx(0.0, abs=1e-4)
 
 
 def test_a_target_in_the_base_frame_turns_with_the_hand():

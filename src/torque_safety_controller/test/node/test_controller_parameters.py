@@ -135,6 +135,9 @@ BROKEN_URDF = __file__
         ({"torque_rate_max": [1e3] * 7}, "torque_rate_max", "empty without safety_filter"),
         ({"jerk_max": [1e3] * 7}, "jerk_max", "empty without safety_filter"),
         ({"jerk_max": [-1e3] * 7}, "jerk_max", "> 0"),
+        ({"torque_reserve": [1.0] * 6}, "torque_reserve", "7 numbers"),
+        ({"torque_reserve": [-1.0] * 7}, "torque_reserve", ">= 0"),
+        ({"torque_reserve": [1e3] * 7}, "torque_reserve", "less than 0.97 of torque_max"),
         (
             {"jerk_max": [1e3] * 7, "safety_filter": True, "velocity_max": []},
             "velocity_max",

@@ -214,8 +214,6 @@ def contact(**changed):
         ({"ft_timeout": -1.0}, "ft_timeout"),
         ({"force_directions": [1.0] * 5}, "force_directions"),
         ({"force_directions": [0.5] * 6}, "force_directions"),
-        ({"force_stiffness": [2.0] * 6}, "force_stiffness"),
-        ({"force_stiffness": [0.5] * 3}, "force_stiffness"),
         ({"admittance_kp": [-1.0, 0.1]}, "admittance_kp"),
         ({"admittance_kp": [0.1, math.inf]}, "admittance_kp"),
         ({"admittance_kp": []}, "admittance_kp"),
@@ -246,7 +244,6 @@ def test_each_parameter_reaches_the_settings():
         admittance_kp=[0.2, 0.03],
         admittance_speed_max=[0.1, 0.4],
         yield_threshold=[3.0, 4.0],
-        force_stiffness=[0.0, 0.1, 0.2, 0.3, 0.4, 1.0],
         ft_filter_hz=9.0,
         ft_timeout=0.5,
     ).interaction
@@ -255,7 +252,6 @@ def test_each_parameter_reaches_the_settings():
     assert (gains.kp, gains.speed_max) == ((0.2, 0.03), (0.1, 0.4))
     assert settings.yield_threshold == (3.0, 4.0)
     np.testing.assert_array_equal(settings.directions, [0, 0, 1, 0, 0, 0])
-    np.testing.assert_array_equal(settings.stiffness, [0.0, 0.1, 0.2, 0.3, 0.4, 1.0])
     assert (interaction.sensor.settings.filter_hz, interaction.sensor.settings.timeout) == (
         9.0,
         0.5,

@@ -67,8 +67,6 @@ class InteractionSettings:
     Attributes:
         directions: of the end effector's axes, those in which force is controlled, shape (6,),
             bool.
-        stiffness: share of the pose task's stiffness that is left there, shape (6,), 0 to 1: 0
-            for hybrid, more for parallel control. Its damping always stays.
         gains: of the admittance task when a wrench is exerted.
         closed: indices of other contacts that there are at present.
         yield_threshold: force and moment above which the hand yields, N and N m; None never.
@@ -76,7 +74,6 @@ class InteractionSettings:
     """
 
     directions: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(6, dtype=bool))
-    stiffness: Array = field(default_factory=lambda: np.zeros(6))
     gains: AdmittanceGains = AdmittanceGains()
     closed: tuple[int, ...] = ()
     yield_threshold: tuple[float, float] | None = None
@@ -132,7 +129,7 @@ class Interaction:
         self._turned |= not np.array_equal(settings.directions, self._settings.directions)
         self._settings = settings
         self._rows = np.flatnonzero(settings.directions)
-        self._shares = np.where(settings.directions, settings.stiffness, 1.0)
+        self._shares = np.where(settings.directions, 0.0, 1.0)
 
     def start(self) -> None:
         """Forget the past and the target."""

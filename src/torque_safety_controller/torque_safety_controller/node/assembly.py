@@ -90,6 +90,7 @@ def make_safety_filter(config: ControllerConfiguration, model: pin.Model) -> Saf
         config.velocity_max,
         config.jerk_max,
         config.torque_rate_max,
+        config.torque_reserve,
     )
 
 
@@ -110,7 +111,7 @@ def make_detour(
         robot,
         config.position_min + clearance,
         config.position_max - clearance,
-        config.torque_max,
+        safety_filter.usable,
         safety_filter.can_hold,
     )
     return Detour(search, config.dt)

@@ -121,9 +121,9 @@ def about_detour(joints: tuple[str, ...], controller: Controller) -> About:
     text = detour.progress.value
     if detour.progress in (Progress.SEARCHING, Progress.LED):
         return About(DiagnosticStatus.OK, text)
-    if detour.progress is Progress.NOT_HELD:
+    if detour.progress is Progress.NOT_HELD and controller.safety_filter is not None:
         joint = int(detour.load.argmax())
-        limit = float(controller.tau_max[joint])
+        limit = float(controller.safety_filter.usable[joint])
         text += f": {joints[joint]} needs {detour.load[joint] * limit:.1f} of {limit:.1f} N m"
     return About(DiagnosticStatus.WARN, text)
 

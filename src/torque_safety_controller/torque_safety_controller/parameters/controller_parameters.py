@@ -18,6 +18,7 @@ from torque_safety_controller.safety.modes import CONTROLS
 from torque_safety_controller.tasks.gains import Gains
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import (
+    NOT_NEGATIVE,
     POSITIVE,
     Range,
     above,
@@ -33,6 +34,7 @@ from viability_bounds_pkg.robot_configuration import (
     StateSource,
     TaskFrames,
 )
+from viability_bounds_pkg.whole_arm.safety_filter import RESERVE
 
 Array = NDArray[np.float64]
 
@@ -70,6 +72,13 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
         "within all limits; acceleration_min and acceleration_max need not be available in every "
         "state then",
         default=False,
+    )
+    torque_reserve: Array = joint_numbers(
+        "torque that safety_filter leaves unplanned, for pushes, payloads and errors of the "
+        "motors, which no model knows, N m; none if empty",
+        NOT_NEGATIVE,
+        if_empty=0.0,
+        note="less than 0.97 of torque_max",
     )
     qp_solver: str = text(
         "solver of the QP; proxqp takes several times as long",
@@ -115,6 +124,9 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
             if np.isfinite(rates).any() and not np.isfinite(self.velocity_max).all():
                 allowed = f"a number for each of 'joints', for {name}"
                 raise SettingError("velocity_max", self.velocity_max, allowed)
+        if not (self.torque_reserve < (1.0 - RESERVE) * self.torque_max).all():
+            allowed = f"less than {1.0 - RESERVE:g} of torque_max"
+            raise SettingError("torque_reserve", self.torque_reserve, allowed)
         additional = AdditionalSettings(
             self.integral.integral_action,
             self.integral.settings(self.torque_max),

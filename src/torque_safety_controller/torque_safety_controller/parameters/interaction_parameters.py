@@ -17,7 +17,6 @@ from viability_bounds_pkg.parameter import (
     FINITE,
     NOT_NEGATIVE,
     POSITIVE,
-    Range,
     group,
     number,
     numbers,
@@ -67,13 +66,6 @@ class InteractionConfiguration:
         if_empty=0.0,
         live=True,
         note="zeros and ones",
-    )
-    force_stiffness: Array = numbers(
-        f"share of pose_kp that is left there: {_AXES}; none of it if empty",
-        Range(0.0, 1.0),
-        length=6,
-        if_empty=0.0,
-        live=True,
     )
     admittance_kp: Array = numbers(
         "gains Kp of (27) for forces, m/s^2 per N, and moments, rad/s^2 per N m",
@@ -136,7 +128,6 @@ class InteractionConfiguration:
         threshold = tuple(self.yield_threshold.tolist()) or None
         return InteractionSettings(
             directions=self.force_directions == 1.0,
-            stiffness=self.force_stiffness,
             gains=replace(
                 _DEFAULTS.gains,
                 kp=tuple(self.admittance_kp.tolist()),

@@ -83,7 +83,7 @@ class Detour:
     Attributes:
         progress: what is done now.
         lead: posture that leads the arm while it is led, shape (n,), rad.
-        load: what would hold the goal that cannot be held, as a share of the torque limits, shape
+        load: what would hold the goal that cannot be held, as a share of what it may need, shape
             (n,).
     """
 

@@ -16,8 +16,8 @@ from torque_safety_controller.tasks.way_search import CanPass, Search, Way, find
 
 Array = NDArray[np.float64]
 
-COMFORT = 0.12
-"""Share of the torque limits that the middle of a way leaves: no arm follows a way exactly."""
+COMFORT = 0.1
+"""Share of what postures may need that the middle of a way leaves: no arm follows it exactly."""
 
 ENDS = 1.0
 """Distance from the ends of a way, which may be what can just be held, to where all of `COMFORT`
@@ -55,7 +55,7 @@ class DetourSearch:
         robot: model of the arm.
         low: lowest positions of ways, shape (n,), rad; -inf for none.
         high: highest, shape (n,), rad; inf for none.
-        tau_max: torque limits, shape (n,), N m.
+        tau_max: torques that postures may need, shape (n,), N m.
         can_hold: whether a posture can be held.
     """
 
@@ -73,7 +73,7 @@ class DetourSearch:
         self._kinematics = PostureSearch(robot.model, robot.frame, low, high)
 
     def load(self, q: Array) -> Array:
-        """Return what holds a posture, as a share of the torque limits, shape (n,)."""
+        """Return what holds a posture, as a share of the torques above, shape (n,)."""
         needed: Array = pin.computeGeneralizedGravity(self._model, self._data, q) / self._tau_max
         return needed
 

@@ -12,7 +12,7 @@ from viability_bounds_pkg.viability import BoundsSolver
 from viability_bounds_pkg.whole_arm.safety_filter import KEPT, RESERVE, SafetyFilter
 
 ROUNDING = 1e-9
-SHOULDER = 1
+SHOULDER, ELBOW = 1, 3
 
 
 class Arm:
@@ -256,6 +256,32 @@ def test_torque_that_is_given_besides_counts():
     keeper.look(arm.start, zero, extra, -wide, wide)
     np.testing.assert_allclose(keeper.rest_torque, held + extra)
     assert keeper.slack == pytest.approx(free - 0.2 / (1.0 - RESERVE))
+
+
+def test_plans_leave_a_reserve_and_count_what_is_more_than_it():
+    """Whatever acts besides, up to the reserve, may change at any time: plans do not see it."""
+    arm = Arm("baxter_left_arm")
+    reserve = 0.1 * arm.tau_max
+    keeper = arm.filter(torque_reserve=reserve)
+    bent, zero, wide = arm.start.copy(), np.zeros(arm.n), np.full(arm.n, 1e3)
+    bent[ELBOW] = 2.3
+    np.testing.assert_allclose(keeper.usable, (1.0 - RESERVE) * arm.tau_max - reserve)
+    assert keeper.can_hold(bent)
+    assert arm.filter().can_hold(arm.start) and not keeper.can_hold(arm.start)
+    keeper.look(bent, zero, zero, -wide, wide)
+    held = keeper.rest_torque
+    for share, counted in ((-1.0, 0.0), (0.7, 0.0), (1.0, 0.0), (1.5, 0.5), (-3.0, -2.0)):
+        keeper.look(bent, zero, share * reserve, -wide, wide)
+        np.testing.assert_allclose(keeper.rest_torque, held + counted * reserve, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("value", [-1.0, np.nan, np.inf, 48.5])
+def test_a_reserve_that_leaves_nothing_is_refused(value):
+    arm = Arm("baxter_left_arm")
+    reserve = np.full(arm.n, 1.0)
+    reserve[SHOULDER] = value
+    with pytest.raises(JointLimitsError, match="torque_reserve.*left_s1"):
+        arm.filter(torque_reserve=reserve)
 
 
 def test_a_posture_that_cannot_be_held_is_told():

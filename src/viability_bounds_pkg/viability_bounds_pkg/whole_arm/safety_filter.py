@@ -41,12 +41,12 @@ Array = NDArray[np.float64]
 
 RESERVE = 0.03
 """Share of the torque limits that plans leave: for what lies between their samples, for steps of
-constant acceleration under held torque, and for errors of the model."""
+constant acceleration under held torque, and for small errors of the model."""
 
 KEPT = 0.01
 """Further share that the constraints on a step leave, so that its trial seldom fails."""
 
-LOST = 0.1
+LOST = 0.07
 """Share of a torque limit by which a plan may pass it, after a disturbance, and still be followed
 as far as the motors can; beyond, the bounds alone count."""
 
@@ -154,14 +154,16 @@ class SafetyFilter:
         velocity_max: speed limits, shape (n,), rad/s; needed where changes are limited.
         jerk_max: limits of the accelerations' rates, shape (n,), rad/s^3; inf or None for none.
         torque_rate_max: limits of the torques' rates, shape (n,), N m/s; inf or None for none.
+        torque_reserve: torque that plans leave for what the model does not know, shape (n,), N m;
+            None for none.
 
     Attributes:
         plan: acceleration with which the plan in hand goes on, shape (n,), rad/s^2.
         lower: bounds of what may be wanted, shape (n,), rad/s^2: those given to `look`, narrowed
             to that from which each joint by itself has a plan.
         upper: shape (n,), rad/s^2.
-        slack: least share of a torque limit that this plan leaves of what it may use; negative
-            where it passes a limit.
+        usable: torque that plans may use, shape (n,), N m.
+        slack: least share that this plan leaves of it; negative where it needs more.
         lost: whether no plan is near, so that the arm is to brake as it can.
         rest_torque: what holds the arm where this plan ends, shape (n,), N m.
         outcomes: how many steps were "as wanted", "changed", "planned", the plan's own; and
@@ -184,10 +186,12 @@ class SafetyFilter:
         velocity_max: ArrayLike | None = None,
         jerk_max: ArrayLike | None = None,
         torque_rate_max: ArrayLike | None = None,
+        torque_reserve: ArrayLike | None = None,
     ) -> None:
         n, names = model.nv, tuple(model.names)[1:]
         none = np.full(n, np.inf)
-        q_min, q_max, a_min, a_max, torques, v_max, jerks, rates = (
+        nothing = np.zeros(n)
+        q_min, q_max, a_min, a_max, torques, reserve, v_max, jerks, rates = (
             joint_array(field, none if values is None else values, names)
             for field, values in (
                 ("position_min", position_min),
@@ -195,6 +199,7 @@ class SafetyFilter:
                 ("acceleration_min", acceleration_min),
                 ("acceleration_max", acceleration_max),
                 ("tau_max", tau_max),
+                ("torque_reserve", nothing if torque_reserve is None else torque_reserve),
                 ("velocity_max", velocity_max),
                 ("jerk_max", jerk_max),
                 ("torque_rate_max", torque_rate_max),
@@ -217,8 +222,13 @@ class SafetyFilter:
             for name, value in zip(names, values.tolist(), strict=True):
                 if not value > 0.0:
                     raise JointLimitsError(field, name, value, "must be positive")
+        self.usable: Array = (1.0 - RESERVE) * torques - reserve
+        for name, value, left in zip(names, reserve.tolist(), self.usable.tolist(), strict=True):
+            if not (value >= 0.0 and left > 0.0):
+                allowed = f"must be >= 0 and less than {1.0 - RESERVE:g} of the torque limit"
+                raise JointLimitsError("torque_reserve", name, value, allowed)
         braking = np.minimum(-a_min, a_max)
-        self._usable = (1.0 - RESERVE) * torques
+        self._reserve, self._of_limit = reserve, self.usable / torques
         self._smooth = bool(np.isfinite(jerks).any() or np.isfinite(rates).any())
         clearance = CLEARANCE * dt * dt * braking
         if self._smooth:
@@ -235,7 +245,7 @@ class SafetyFilter:
         )
         self._narrower = self._limits._replace(v_max=(1.0 - 2.0 * SPARE) * v_max)
         allowed_change = (1.0 - RATE_RESERVE) * dt * rates
-        self._plans = PlanTorques(model, self._limits, self._usable, allowed_change, dt)
+        self._plans = PlanTorques(model, self._limits, self.usable, allowed_change, dt)
         self._dt = dt
         self._model, self._data = model, model.createData()
         self._time = USUAL  # T of the plan in hand
@@ -269,11 +279,11 @@ class SafetyFilter:
             q: positions, shape (n,), rad.
         """
         needed = np.abs(pin.computeGeneralizedGravity(self._model, self._data, q))
-        return bool((needed <= (1.0 - KEPT) * self._usable).all())
+        return bool((needed <= (1.0 - KEPT) * self.usable).all())
 
     def _warm_up(self) -> None:
         """Compile everything now and not in a control loop."""
-        zero = np.zeros_like(self._usable)
+        zero = np.zeros_like(self.usable)
         self.look(zero, zero, zero, zero - 1.0, zero + 1.0)
         self._rows({FIRST: [0]})
         self.choose(zero)
@@ -297,11 +307,14 @@ class SafetyFilter:
         Args:
             q: positions, shape (n,), rad.
             v: velocities, shape (n,), rad/s.
-            extra: torque that the motors give besides that of the model, shape (n,), N m.
+            extra: torque that the motors give besides that of the model, shape (n,), N m; plans
+                count what of it is more than the reserve.
             lower: bounds of the joints' accelerations, which keep their own limits, rad/s^2.
             upper: shape (n,), rad/s^2.
             last: acceleration of the step before, shape (n,), rad/s^2; None after a rest.
         """
+        # Up to the reserve it may change at any time, so that the plans must not count on it.
+        extra = extra - np.clip(extra, -self._reserve, self._reserve)
         self._state, self._extra = State(q, v), extra
         self._last = np.zeros_like(q) if last is None else last
         plans = self._plans
@@ -317,14 +330,15 @@ class SafetyFilter:
         self.plan = plans.accelerations[FIRST].copy()
         self.rest_torque = plans.tau[-1].copy()
         self._narrow(lower, upper)
-        self.lost = self.slack < -LOST
-        if self.slack < -RESERVE:
+        most = float((plans.loads * self._of_limit).max())
+        self.lost = not most <= 1.0 + LOST
+        if not most <= 1.0:
             return None  # nothing to keep: the bounds alone count
         wanted: dict[int, list[int]] = {}
         # With fewer samples the largest torque would move to and fro between them.
         for j in np.flatnonzero(plans.loads > NEAR).tolist():
             for k in {FIRST, int(plans.busiest[j]), len(plans.clock) - 1}:
-                if abs(plans.tau[k, j]) > NEAR * self._usable[j]:
+                if abs(plans.tau[k, j]) > NEAR * self.usable[j]:
                     wanted.setdefault(k, []).append(j)
         return self._rows(wanted) if wanted else None
 
@@ -412,7 +426,7 @@ class SafetyFilter:
             for j in joints:
                 tau = plans.tau[k, j]
                 row = gradient[j] if tau > 0.0 else -gradient[j]
-                left = (1.0 - KEPT) * self._usable[j] - abs(tau)
+                left = (1.0 - KEPT) * self.usable[j] - abs(tau)
                 size = max(float(np.sqrt(row @ row)), 1e-9)
                 rows.append(row / size)
                 upper.append((use * left + float(row @ self.plan)) / size)
