@@ -59,6 +59,9 @@ APPROACH = 0.04
 USUAL = 0.3
 """Time of plans without a reason for another, s."""
 
+UNHURRIED = 1.0
+"""Time of plans that brake gently, s."""
+
 BEGINNINGS = (USUAL, 0.15, 0.6, 1.2)
 """Times of plans to begin with: the first that is safe, or the best."""
 
@@ -163,6 +166,8 @@ class SafetyFilter:
         slack: least share of a torque limit that this plan leaves of what it may use; negative
             where it passes a limit.
         lost: whether no plan is near, so that the arm is to brake as it can.
+        usual: time of plans without a reason for another, s. `UNHURRIED` lets an arm move away
+            from the edge of what it can hold where little torque is left to brake with.
         rest_torque: what holds the arm where this plan ends, shape (n,), N m.
         outcomes: how many steps were "as wanted", "changed", "planned", the plan's own; and
             "outside", without a plan within the limits.
@@ -238,6 +243,7 @@ class SafetyFilter:
         self._plans = PlanTorques(model, self._limits, self._usable, allowed_change, dt)
         self._dt = dt
         self._model, self._data = model, model.createData()
+        self.usual = USUAL
         self._time = USUAL  # T of the plan in hand
         self._tau_change = dt * rates
         self._gentle: Array = none
@@ -468,8 +474,8 @@ class SafetyFilter:
             (max(now - self._dt, self._dt), self._rest),
         ):
             if self._dt <= T <= LONGEST and self._safe(a, course or T):
-                cost = self._plans.cost + PULL * log(T / USUAL) ** 2
-                if now != T and abs(log(T / USUAL)) >= abs(log(now / USUAL)):
+                cost = self._plans.cost + PULL * log(T / self.usual) ** 2
+                if now != T and abs(log(T / self.usual)) >= abs(log(now / self.usual)):
                     cost *= 1.0 + RELUCTANCE  # not back to usual: at rest nothing else leads there
                 if cost < best:
                     best, taken = cost, True
