@@ -1,15 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arms with motors that are too weak for their own weight or haste, with the safety filter."""
 
+import re
+
 import numpy as np
 import pinocchio as pin
 import pytest
 from direct import DirectLoop, column
 from time_to_goal import SHORT, near_goal
-from whole_arm import CLEAR, arrive, random_goal
+from whole_arm import CLEAR, POSE, RATES, arrive, random_goal
+
+from torque_safety_controller.node.controller_report import about_detour
+from torque_safety_controller.tasks.detour import Progress
 
 STIFF = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
 """A posture task that drives each joint to its limits, whatever the hand does."""
+FILTERED = {"safety_filter": True}
 SHOULDER = 1
 STRETCHED = np.array([0.0, -0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
 """Where Baxter's shoulder needs more than it has."""
@@ -129,6 +135,65 @@ def test_a_pose_behind_limits_of_joints_is_reached_by_a_detour():
         assert beyond(loop)[:2] == (0.0, 0.0)
     assert errors[0] > 0.05
     assert errors[1] < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("goals", "start", "goal"),
+    [
+        # The hand is at a limit of its joint and shakes at 2 rad/s, 0.1 m off.
+        (
+            "pose",
+            [1.697, -2.142, 1.517, 2.613, 1.379, -1.566, -3.054],
+            [0.649, 0.765, 1.969, 0.431, 1.516, -1.249, -0.453],
+        ),
+        # On the edge of what the shoulder can hold, with two joints at limits: from there a plan
+        # of 0.3 s would brake too hard in whatever direction.
+        (
+            "pose",
+            [-1.697, 1.042, 1.545, -0.045, -3.054, -0.152, -3.054],
+            [1.145, -1.964, -0.698, 1.445, 0.735, -0.652, -0.615],
+        ),
+        # The straight way to the goal can be held, but goes along that edge.
+        (
+            "posture",
+            [1.564, -1.007, 0.045, 2.215, -0.885, 1.057, 0.49],
+            [1.697, 0.925, -1.634, -0.045, 2.025, 2.089, 1.256],
+        ),
+    ],
+)
+def test_goals_where_an_arm_has_been_stuck_are_reached(goals, start, goal):
+    loop = DirectLoop("baxter_left_arm", (STIFF if goals == "posture" else POSE) | FILTERED)
+    loop.robot.reset(np.array(start), np.zeros(7))
+    loop.begin()
+    loop.controller.set_posture_goal(np.array(start))
+    _, at = arrive(loop, goals, np.array(goal), 15.0)
+    assert at < 12.0
+    assert beyond(loop)[:2] == (0.0, 0.0)
+    assert loop.controller.safety_filter.outcomes["outside"] == 0
+
+
+def test_a_goal_beyond_a_position_limit_is_told_and_not_searched_for():
+    loop = DirectLoop("baxter_left_arm", STIFF | FILTERED)
+    goal = loop.robot.state().q
+    goal[5] = loop.limits.q_max[5] + 0.01
+    loop.controller.set_posture_goal(goal)
+    loop.run(3.0)
+    assert loop.controller.detour.progress is Progress.AT_LIMIT
+    told = about_detour(loop.limits.names, loop.controller).text
+    off = 1e3 * (goal[5] - loop.robot.state().q[5])
+    assert re.search(rf"left_w1 stops {off:.1f} mrad before it", told)
+
+
+def test_with_limits_of_rates_joints_come_as_near_to_their_limits_as_without():
+    loop = DirectLoop("baxter_left_arm", STIFF | FILTERED | RATES["Baxter, with rates"])
+    start = loop.robot.state().q
+    goal = np.where([0, 0, 0, 0, 1, 0, 1], loop.limits.q_max - CLEAR, start)
+    start = np.where(goal != start, goal - 1.0, start)  # far enough for their top speeds
+    loop.robot.reset(start, np.zeros(7))
+    loop.begin()
+    _, at = arrive(loop, "posture", goal, 4.0)
+    assert at < 3.0
+    assert beyond(loop)[:2] == (0.0, 0.0)
 
 
 def test_motions_that_need_no_detour_are_bit_for_bit_what_they_are_without():

@@ -35,12 +35,12 @@ from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.safety.disturbance_observer import DisturbanceObserver
 from torque_safety_controller.safety.torque_limiter import TorqueLimiter
 from torque_safety_controller.tasks.damping_task import DampingTask
-from torque_safety_controller.tasks.detour import Detour
+from torque_safety_controller.tasks.detour import Detour, Progress
 from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.goals import Goals
 from torque_safety_controller.tasks.task import Task
 from viability_bounds_pkg.state import State
-from viability_bounds_pkg.whole_arm.safety_filter import SafetyFilter
+from viability_bounds_pkg.whole_arm.safety_filter import UNHURRIED, USUAL, SafetyFilter
 
 __all__ = ["ControlOutput", "Controller", "Gains"]
 
@@ -289,7 +289,12 @@ class Controller:
 
     def _by_detour(self, tasks: list[Task]) -> list[Task]:
         """Return the tasks that lead the arm where those of its goals would leave it standing."""
-        return tasks if self.detour is None else self.detour.tasks(tasks, self.robot)
+        detour, keeper = self.detour, self.safety_filter
+        if detour is None or keeper is None:
+            return tasks
+        tasks = detour.tasks(tasks, self.robot, AccelerationRange(keeper.lower, keeper.upper))
+        keeper.usual = UNHURRIED if detour.progress is Progress.LED else USUAL
+        return tasks
 
     def _solve(
         self,

@@ -5,19 +5,21 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from arms import load_arm
+from searches import finished
 
+from torque_safety_controller.qp.constraints import AccelerationRange
 from torque_safety_controller.tasks.detour import (
     ATTEMPTS,
     FARTHEST,
-    PATIENCE,
     WORK,
     Detour,
     Progress,
 )
-from torque_safety_controller.tasks.detour_search import DetourSearch
+from torque_safety_controller.tasks.detour_search import COMFORT, SLOPE, DetourSearch, Goal
 from torque_safety_controller.tasks.pose_task import PoseTask
 from torque_safety_controller.tasks.posture_search import COST
 from torque_safety_controller.tasks.posture_task import PostureTask
+from torque_safety_controller.tasks.standstill import LOOKED_AT, PATIENCE, SHORT
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import read_config
 from viability_bounds_pkg.whole_arm.safety_filter import SafetyFilter
@@ -53,9 +55,9 @@ class Arm:
         self.asked += 1
         return self.keeper.can_hold(q)
 
-    def step(self, q=EDGE, v=REST, a_last=REST):
+    def step(self, q=EDGE, v=REST, a_last=REST, bounds=None):
         self.robot.update(State(q, v), a_last)
-        return self.detour.tasks(self.given, self.robot)
+        return self.detour.tasks(self.given, self.robot, bounds)
 
     def stand(self, steps, **state):
         for _ in range(steps):
@@ -107,7 +109,7 @@ def test_for_a_pose_it_is_led_to_a_posture_that_is_then_kept():
     pin.framesForwardKinematics(ARM.model, data, q)
     error = pin.log6(data.oMf[ARM.model.getFrameId(ARM.frame)].actInv(pose)).vector
     assert np.abs(error).max() < 1e-4  # m, rad
-    np.testing.assert_allclose(passed[-1], q, atol=0.03)
+    np.testing.assert_allclose(passed[-1], q, atol=SHORT)
     assert tasks[1].in_null_space
     assert arm.keeper.can_hold(q)
 
@@ -115,15 +117,79 @@ def test_for_a_pose_it_is_led_to_a_posture_that_is_then_kept():
 @pytest.mark.parametrize(
     "state",
     [
-        {"v": np.full(ARM.n, 0.1)},
-        {"q": BELOW + 0.01},
+        {"q": BELOW + 0.9 * SHORT},
         {"a_last": 0.5 * KP * (BELOW - EDGE)},  # somebody holds it: the QP would let it go on
     ],
 )
-def test_it_is_not_led_while_it_moves_or_is_there_or_is_held(state):
+def test_it_is_not_led_where_it_is_there_or_is_held(state):
     arm = Arm()
     assert arm.stand(20 * PATIENT, **state) is arm.given
     assert arm.detour.progress is Progress.NONE
+
+
+def swing(arm, seconds, given=0.0):
+    """Move to and fro by 5 mrad, faster than an arm that stands; return when it is led, s."""
+    w, size = 20.0, 0.005
+    for k in range(round(seconds / ARM.dt)):
+        t = k * ARM.dt
+        q = EDGE + size * np.sin(w * t)
+        v, a = np.full(ARM.n, size * w * np.cos(w * t)), -size * w * w * np.sin(w * t)
+        held = KP * (BELOW - q) - KD * v
+        tasks = arm.step(q, v, given * held + (1.0 - given) * a)
+        if arm.detour.progress is not Progress.NONE:
+            return t, tasks
+    return None
+
+
+def test_an_arm_that_moves_to_and_fro_is_stopped_and_led():
+    arm = Arm()
+    t, tasks = swing(arm, 3.0)
+    assert LOOKED_AT - 1e-9 < t < LOOKED_AT + 0.5
+    np.testing.assert_allclose(tasks[0].q_des, EDGE, atol=0.01)  # while a way is searched for
+    arm.wait_for(Progress.LED)
+    passed, _ = arm.follow()
+    np.testing.assert_allclose(passed[-1], BELOW, atol=0.03)
+
+
+def test_an_arm_that_somebody_shakes_is_not_led():
+    assert swing(Arm(), 3.0, given=0.5) is None
+
+
+def test_an_arm_that_comes_nearer_slowly_is_not_led():
+    arm, speed = Arm(), 0.1  # rad/s
+    for k in range(round(3.0 / ARM.dt)):
+        done = speed * k * ARM.dt / np.abs(BELOW - EDGE).max()
+        arm.step(EDGE + done * (BELOW - EDGE), speed / 1.54 * (BELOW - EDGE))
+        assert arm.detour.progress is Progress.NONE
+
+
+def test_a_goal_beyond_a_position_limit_is_told():
+    goal = BELOW + 0.004 * np.eye(ARM.n)[6]
+    arm = Arm(goal)
+    stopped = AccelerationRange(-np.full(ARM.n, 5.0), np.full(ARM.n, 5.0))
+    stopped.upper[6] = 0.0
+    assert arm.stand(2 * PATIENT, q=BELOW, bounds=stopped) is arm.given
+    assert arm.detour.progress is Progress.AT_LIMIT
+    np.testing.assert_allclose(arm.detour.short, goal - BELOW, atol=1e-12)
+    stopped.upper[6] = 5.0
+    seen = set()
+    for _ in range(2 * PATIENT):
+        arm.step(BELOW, bounds=stopped)
+        seen.add(arm.detour.progress)
+    assert Progress.LED in seen
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_ways_lead_away_from_the_edge_of_what_can_be_held(seed):
+    arm = Arm()
+    search = DetourSearch(arm.robot, ARM.q_min, ARM.q_max, ARM.tau_max, arm.can_hold)
+    way, _ = finished(search.ways(EDGE, Goal(None, BELOW), np.random.default_rng(seed)))
+    load, ends = lambda q: np.abs(search.load(q)).max(), (EDGE, BELOW)
+    assert load(EDGE) > 0.95
+    for a, b in zip(way, way[1:], strict=False):
+        for q in np.linspace(a, b, 20):
+            most = max(load(end) - SLOPE * np.abs(q - end).max() for end in ends)
+            assert load(q) < max(most, 1.0 - COMFORT) + 0.01  # between what was looked at
 
 
 def test_without_stiffness_it_is_not_led():
@@ -165,7 +231,7 @@ def test_another_goal_is_begun_with_and_the_same_one_is_not():
     assert arm.detour.progress is Progress.NONE
 
 
-def test_other_ways_are_tried_where_the_arm_does_not_follow_and_then_no_more():
+def test_other_ways_are_tried_where_the_arm_does_not_follow_ever_less_often():
     arm = Arm()
     arm.wait_for(Progress.LED)
     led, before = 1, Progress.LED
@@ -177,4 +243,11 @@ def test_other_ways_are_tried_where_the_arm_does_not_follow_and_then_no_more():
             break
         assert np.abs(arm.detour.lead - EDGE).max() <= FARTHEST
     assert led == ATTEMPTS
-    assert arm.stand(100) is arm.given
+    rests = []
+    for _ in range(3):
+        rests.append(0)
+        while arm.detour.progress is Progress.NO_WAY:
+            assert arm.step() is arm.given
+            rests[-1] += 1
+        arm.wait_for(Progress.NO_WAY)
+    assert rests[0] < rests[1] < rests[2]

@@ -8,11 +8,12 @@ from searches import finished
 from torque_safety_controller.tasks.way_search import STEP, find_way
 
 LOW, HIGH = np.full(2, -2.0), np.full(2, 2.0)
+TRIES = 500
 START, GOAL = np.array([-1.0, 0.0]), np.array([1.0, 0.1])
 
 
 def search(can_pass, seed=0, goal=GOAL):
-    return finished(find_way(START, goal, LOW, HIGH, can_pass, np.random.default_rng(seed)))
+    return finished(find_way(START, goal, LOW, HIGH, can_pass, np.random.default_rng(seed), TRIES))
 
 
 def wall(q):

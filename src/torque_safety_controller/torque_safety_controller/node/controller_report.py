@@ -125,6 +125,9 @@ def about_detour(joints: tuple[str, ...], controller: Controller) -> About:
         joint = int(detour.load.argmax())
         limit = float(controller.safety_filter.usable[joint])
         text += f": {joints[joint]} needs {detour.load[joint] * limit:.1f} of {limit:.1f} N m"
+    if detour.progress is Progress.AT_LIMIT:
+        joint = int(detour.short.argmax())
+        text += f": {joints[joint]} stops {1e3 * detour.short[joint]:.1f} mrad before it"
     return About(DiagnosticStatus.WARN, text)
 
 

@@ -19,16 +19,20 @@ Array = NDArray[np.float64]
 COMFORT = 0.1
 """Share of what postures may need that the middle of a way leaves: no arm follows it exactly."""
 
-ENDS = 1.0
-"""Distance from the ends of a way, which may be what can just be held, to where all of `COMFORT`
-is left, rad."""
+SLOPE = 0.24
+"""Share of the torque limits that ways leave more with each rad from their ends, which may be what
+can just be held: an arm at the edge of that cannot move along it, only away from it."""
+
+ROUNDS = ((COMFORT, 60), (COMFORT, 300), (0.5 * COMFORT, 300), (0.0, 500))
+"""What ways leave, and how many random postures are tried for each: first what is soon done."""
 
 LOOSE = 0.2
 """How near its beginning a way may lead through what the model says cannot be held, where the arm
 stands in spite of the model, rad."""
 
-SEEDS, LOCAL = 150, 10
-"""Postures from which inverse kinematics begin; the first of them nearer to the arm."""
+SEEDS, LOCAL, POSTURES = 40, 10, 5
+"""In each round: from how many postures inverse kinematics begin, the first of them nearer to the
+arm, and to how many of those that they find ways are searched for."""
 
 
 class Goal(NamedTuple):
@@ -89,33 +93,42 @@ class DetourSearch:
         """
         low = np.where(np.isfinite(self._low), self._low, q - np.pi)
         high = np.where(np.isfinite(self._high), self._high, q + np.pi)
-        for comfort in (COMFORT, 0.0):
+
+        def find(end: Array, comfort: float, tries: int) -> Search[Way | None]:
+            return find_way(q, end, low, high, self._can_pass(q, end, comfort), rng, tries)
+
+        for comfort, tries in ROUNDS:
             if goal.pose is None:
-                can_pass = self._can_pass(q, goal.q, comfort)
-                way = yield from find_way(q, goal.q, low, high, can_pass, rng)
+                way = yield from find(goal.q, comfort, tries)
                 if way is not None:
                     return way
                 continue
+            left = POSTURES
             for k in range(SEEDS):
                 seed = q + min(k / LOCAL, 1.0) * (rng.uniform(low, high) - q)
                 end = yield from self._kinematics.find(goal.pose, seed)
-                if end is not None and self.can_hold(end):
-                    can_pass = self._can_pass(q, end, comfort)
-                    way = yield from find_way(q, end, low, high, can_pass, rng)
-                    if way is not None:
-                        return way
+                if end is None or not self.can_hold(end):
+                    continue
+                way = yield from find(end, comfort, tries)
+                if way is not None:
+                    return way
+                left -= 1
+                if left == 0:
+                    break
         return None
 
     def _can_pass(self, start: Array, end: Array, comfort: float) -> CanPass:
         """Return what tells where a way may lead."""
         loose = 0.0 if self.can_hold(start) else LOOSE
+        at_start, at_end = (float(np.abs(self.load(q)).max()) for q in (start, end))
 
         def can_pass(q: Array) -> bool:
-            from_start = float(np.abs(q - start).max())
+            from_start, from_end = (float(np.abs(q - each).max()) for each in (start, end))
             if from_start < loose:
                 return True
-            apart = min(from_start, float(np.abs(q - end).max()), ENDS)
-            most = 1.0 - comfort * apart / ENDS
+            most = 1.0 - comfort
+            if comfort > 0.0:
+                most = max(most, at_start - SLOPE * from_start, at_end - SLOPE * from_end)
             return bool(np.abs(self.load(q)).max() <= most) and self.can_hold(q)
 
         return can_pass

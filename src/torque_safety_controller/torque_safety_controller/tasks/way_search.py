@@ -26,9 +26,6 @@ CanPass = Callable[[Array], bool]
 STEP = 0.1
 """Largest motion of a joint between postures that are looked at, rad."""
 
-TRIES = 500
-"""Random postures that are tried as a way round."""
-
 FREE = 0.4
 """Share of the joints that a random posture moves off the straight way; the others stay on it."""
 
@@ -37,7 +34,13 @@ SHORTCUTS = 60
 
 
 def find_way(
-    start: Array, goal: Array, low: Array, high: Array, can_pass: CanPass, rng: np.random.Generator
+    start: Array,
+    goal: Array,
+    low: Array,
+    high: Array,
+    can_pass: CanPass,
+    rng: np.random.Generator,
+    tries: int,
 ) -> Search[Way | None]:
     """Search for a way from one posture to another: RRT-Connect, [Kuffner2000].
 
@@ -50,13 +53,14 @@ def find_way(
         high: highest, shape (n,), rad; finite.
         can_pass: asked at distances of `STEP`, but not of `start`.
         rng: chooses the postures to try.
+        tries: how many of them.
 
     Returns:
-        The way with both its ends; None if there is none after `TRIES`.
+        The way with both its ends; None if there is none after these.
     """
     trees: list[list[Way]] = [[[start]], [[goal]]]
     towards = goal
-    for k in range(TRIES):
+    for k in range(tries):
         reached = yield from _grow(trees[k % 2], towards, can_pass)
         if reached is not None:
             met = yield from _grow(trees[1 - k % 2], reached[-1], can_pass)

@@ -59,6 +59,9 @@ APPROACH = 0.04
 USUAL = 0.3
 """Time of plans without a reason for another, s."""
 
+UNHURRIED = 1.0
+"""Time of plans that brake gently, s."""
+
 BEGINNINGS = (USUAL, 0.15, 0.6, 1.2)
 """Times of plans to begin with: the first that is safe, or the best."""
 
@@ -84,9 +87,9 @@ than the margins of the bounds, which would change a plan that ends nearer."""
 GENTLE = 0.5
 """Share of the limits of the torques' rates that the joints' accelerations use in plans."""
 
-DRIFT = 0.1
-"""Further distance where changes are limited, in speeds times period: plans are longer carried on
-then, and the bounds do not lead back from the limit at once."""
+DRIFT = 0.2
+"""Further distance where changes are limited, as a share of what a joint moves in a period: plans
+are longer carried on then, and the bounds do not lead back from the limit at once."""
 
 TOLERANCE = 0.8
 """Share of that distance by which plans in hand may end nearer, as states drift a little."""
@@ -165,6 +168,8 @@ class SafetyFilter:
         usable: torque that plans may use, shape (n,), N m.
         slack: least share that this plan leaves of it; negative where it needs more.
         lost: whether no plan is near, so that the arm is to brake as it can.
+        usual: time of plans without a reason for another, s. `UNHURRIED` lets an arm move away
+            from the edge of what it can hold where little torque is left to brake with.
         rest_torque: what holds the arm where this plan ends, shape (n,), N m.
         outcomes: how many steps were "as wanted", "changed", "planned", the plan's own; and
             "outside", without a plan within the limits.
@@ -230,10 +235,9 @@ class SafetyFilter:
         braking = np.minimum(-a_min, a_max)
         self._reserve, self._of_limit = reserve, self.usable / torques
         self._smooth = bool(np.isfinite(jerks).any() or np.isfinite(rates).any())
-        clearance = CLEARANCE * dt * dt * braking
-        if self._smooth:
-            clearance = clearance + DRIFT * dt * np.where(np.isfinite(v_max), v_max, 0.0)
-        else:
+        self._positions, self._clearance = (q_min, q_max), CLEARANCE * dt * dt * braking
+        clearance = self._clearance
+        if not self._smooth:
             v_max = none  # speeds only fall along plans
         self._limits = JointLimitsOfPlans(
             q_min + clearance,
@@ -248,6 +252,7 @@ class SafetyFilter:
         self._plans = PlanTorques(model, self._limits, self.usable, allowed_change, dt)
         self._dt = dt
         self._model, self._data = model, model.createData()
+        self.usual = USUAL
         self._time = USUAL  # T of the plan in hand
         self._tau_change = dt * rates
         self._gentle: Array = none
@@ -320,6 +325,7 @@ class SafetyFilter:
         plans = self._plans
         if self._smooth:
             self._gentle = self._gentle_changes(q)
+            self._keep_clear(v)
         if self._begun:
             self._go_on()
         else:
@@ -393,6 +399,17 @@ class SafetyFilter:
             self.lower,
             self.upper,
         )
+
+    def _keep_clear(self, v: Array) -> None:
+        """Set how far from position limits plans end: the faster a joint, the more may drift.
+
+        Args:
+            v: velocities, shape (n,), rad/s.
+        """
+        limits, (q_min, q_max) = self._limits, self._positions
+        clearance = self._clearance + DRIFT * self._dt * np.abs(v)
+        limits.q_min[:], limits.q_max[:] = q_min + clearance, q_max - clearance
+        limits.tolerance[:] = TOLERANCE * clearance
 
     def _gentle_changes(self, q: Array) -> Array:
         """Return changes of acceleration that the limits of torques' rates allow, rad/s^2.
@@ -482,8 +499,8 @@ class SafetyFilter:
             (max(now - self._dt, self._dt), self._rest),
         ):
             if self._dt <= T <= LONGEST and self._safe(a, course or T):
-                cost = self._plans.cost + PULL * log(T / USUAL) ** 2
-                if now != T and abs(log(T / USUAL)) >= abs(log(now / USUAL)):
+                cost = self._plans.cost + PULL * log(T / self.usual) ** 2
+                if now != T and abs(log(T / self.usual)) >= abs(log(now / self.usual)):
                     cost *= 1.0 + RELUCTANCE  # not back to usual: at rest nothing else leads there
                 if cost < best:
                     best, taken = cost, True
