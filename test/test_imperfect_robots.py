@@ -61,5 +61,4 @@ def test_no_limit_is_passed_by_a_robot_as_bad_as_declared(robot, case, duration)
 
 def test_without_what_is_done_about_it_a_limit_is_passed():
     result = play("baxter_left_arm", "nothing", 6.0)
-    assert result.vector("position_violation_rad").max() > 1e-4
-    assert result.vector("velocity_violation_rad_s").max() > 1e-3
+    assert result.vector("velocity_violation_rad_s").max() > 0.05
