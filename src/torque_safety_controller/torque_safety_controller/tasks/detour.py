@@ -135,7 +135,7 @@ class Detour:
         goal: Goal,
         bounds: AccelerationRange | None,
     ) -> None:
-        """Begin to search where the arm is stuck, go on searching, or stop where it moves on."""
+        """Search where the arm is stuck and its goal can be reached, until it moves on."""
         if self._search is not None and self._hunted:
             self._go_on()
             return
@@ -145,6 +145,8 @@ class Detour:
         if self._search is None and self._rest == 0.0:
             if not watch.stuck:
                 self.progress = Progress.NONE
+            elif goal.pose is None and not self._ways.can_hold(goal.q):
+                self.progress, self.load = Progress.NOT_HELD, np.abs(self._ways.load(goal.q))
             elif isinstance(task, PostureTask) and self._at_limit(task, robot.q, bounds):
                 self.progress, self._rest = Progress.AT_LIMIT, PATIENCE
             else:
@@ -165,10 +167,7 @@ class Detour:
         return bool((towards < GIVEN * task.kp * self.short)[self.short > 0.0].all())
 
     def _begin(self, q: Array, goal: Goal) -> None:
-        """Begin to search; not for what cannot be held."""
-        if goal.pose is None and not self._ways.can_hold(goal.q):
-            self.progress, self.load = Progress.NOT_HELD, np.abs(self._ways.load(goal.q))
-            return
+        """Begin to search."""
         # A seed for each attempt: the same motion each time, and another way each attempt.
         rng = np.random.default_rng(self._attempts)
         self._attempts += 1
