@@ -3,11 +3,13 @@
 
 import re
 import textwrap
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from arms import load_arm
+from controllers import GAINS
 
 from torque_safety_controller.controller import Controller, Gains
 from torque_safety_controller.qp.constraints import AccelerationRange
@@ -17,15 +19,7 @@ from viability_bounds_pkg.state import State
 from viability_bounds_pkg.viability import BoundsSolver
 
 TEXT = (Path(__file__).resolve().parent.parent / "CONTRIBUTING.md").read_text()
-GAINS = Gains(
-    pose_kp=100.0,
-    pose_kd=20.0,
-    pose_weight=1.0,
-    posture_kp=10.0,
-    posture_kd=6.0,
-    posture_weight=1e-3,
-    hold_kd=20.0,
-)
+STIFF = replace(GAINS, pose_kp=100.0, pose_kd=20.0)
 FLOOR = 0.4  # m
 
 
@@ -60,7 +54,7 @@ def test_the_task_asks_for_the_acceleration_of_the_point(examples):
 def test_the_limit_is_kept_in_motion(examples, limited):
     arm = load_arm("panda")
     limits = [examples["HeightLimit"](FLOOR, 1.0, 2.0, arm.dt)] if limited else []
-    controller = Controller(arm.robot(), arm.tau_max, GAINS, constraints=limits)
+    controller = Controller(arm.robot(), arm.tau_max, STIFF, constraints=limits)
     a_max = np.full(arm.n, 15.0)
     bounds = BoundsSolver(
         JointLimits(arm.model.names[1:], arm.q_min, arm.q_max, arm.v_max, -a_max, a_max),

@@ -34,11 +34,16 @@ def demo(*arguments):
     )
 
 
-def test_naive_bounds_break_the_elbow_and_say_so(tmp_path):
-    # The first goal leads to the limit.
-    scenario = yaml.safe_load((SCENARIOS / "baxter_left_arm_demo.yaml").read_text())
-    path = tmp_path / "first_goal.yaml"
+def first_goal(directory, robot):
+    """Write the beginning of a robot's demo to a file; return its path."""
+    scenario = yaml.safe_load((SCENARIOS / f"{robot}_demo.yaml").read_text())
+    path = directory / "first_goal.yaml"
     path.write_text(yaml.safe_dump({"duration": 1.0, "events": scenario["events"][:1]}))
+    return path
+
+
+def test_naive_bounds_break_the_elbow_and_say_so(tmp_path):
+    path = first_goal(tmp_path, "baxter_left_arm")  # it leads to the limit
     options = ("--bounds", "naive", "--lockstep", "--out", tmp_path)
     result = demo("baxter_left_arm", path, *options)
     assert result.returncode == 1, result.stdout + result.stderr
@@ -88,9 +93,7 @@ def test_an_imperfect_robot_may_have_further_parameters(tmp_path):
 
 @pytest.mark.parametrize("apart", [[], ["--processes"]], ids=["one process", "processes"])
 def test_an_imperfect_robot_is_played_with_what_is_done_about_it(tmp_path, apart):
-    scenario = yaml.safe_load((SCENARIOS / "panda_demo.yaml").read_text())
-    path = tmp_path / "first_goal.yaml"
-    path.write_text(yaml.safe_dump({"duration": 1.0, "events": scenario["events"][:1]}))
+    path = first_goal(tmp_path, "panda")
     result = demo("panda", path, "--imperfect", "--out", tmp_path, *apart)
     assert result.returncode == 0, result.stdout + result.stderr
     assert "VERDICT: no limit was broken" in result.stdout

@@ -4,8 +4,9 @@
 import numpy as np
 import pytest
 from arms import load_arm
+from controllers import posture_only
 
-from torque_safety_controller.controller import Controller, Gains
+from torque_safety_controller.controller import Controller
 from torque_safety_controller.qp.constraints import AccelerationRange
 from viability_bounds_pkg.estimation.discretisation_margin import discretisation_margin
 from viability_bounds_pkg.joint_limits import JointLimits
@@ -16,15 +17,7 @@ from viability_bounds_pkg.torque_margin import tightened, torque_margins
 from viability_bounds_pkg.viability import BoundsSolver
 
 DT = 0.002
-RACING = Gains(
-    pose_kp=0.0,
-    pose_kd=0.0,
-    pose_weight=0.0,
-    posture_kp=2000.0,
-    posture_kd=90.0,
-    posture_weight=1.0,
-    hold_kd=20.0,
-)
+RACING = posture_only(2000.0, 90.0)
 
 
 class Race:

@@ -8,4 +8,6 @@ from viability_bounds_pkg.testing.fixtures import graph_of_its_own, ros, shared_
 
 sys.path.insert(0, str(Path(__file__).resolve().parent / "support"))
 
-__all__ = ["graph_of_its_own", "ros", "shared_ros"]
+from talos_joints import talos_model
+
+__all__ = ["graph_of_its_own", "ros", "shared_ros", "talos_model"]

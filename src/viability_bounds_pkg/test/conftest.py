@@ -8,4 +8,6 @@ from viability_bounds_pkg.testing.fixtures import graph_of_its_own, ros, shared_
 
 sys.path.insert(0, str(Path(__file__).resolve().parent / "support"))
 
-__all__ = ["graph_of_its_own", "ros", "shared_ros"]
+from two_joint_robot import write_robot
+
+__all__ = ["graph_of_its_own", "ros", "shared_ros", "write_robot"]

@@ -14,7 +14,7 @@ def test_diagnostics_of_arms_in_other_namespaces_are_ignored(ros, own):
     for namespace in NAMESPACES:
         robot = ros.add(Node("bullet_node", context=ros.context, namespace=namespace))
         report = DiagnosticStatus.OK, "", {"arm": namespace}
-        Diagnostics(robot, lambda report=report: report, period=0.02)
+        Diagnostics(robot, lambda report=report: report)
     node = ros.add(Node("player", context=ros.context, namespace=own))
     listener, told = RunListener(node, ["x"]), []
 

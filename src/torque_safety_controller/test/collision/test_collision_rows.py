@@ -1,11 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 from types import SimpleNamespace
 
-import coal
 import numpy as np
-import pinocchio as pin
 import pytest
-from collision_arm import panda, two_links, with_constants
+from collision_arm import (
+    BALL,
+    everything,
+    panda,
+    panda_avoidance,
+    random_states,
+    two_links,
+    wide_rows,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -14,164 +20,11 @@ from torque_safety_controller.collision.avoidance import (
     CollisionAvoidance,
     CollisionSettings,
 )
-from torque_safety_controller.collision.bodies import box, capsule, half_space, sphere
+from torque_safety_controller.collision.bodies import box, half_space
 from torque_safety_controller.qp.constraints import AccelerationRange
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.viability import BoundsSolver
-
-BALL = '<sphere radius="0.05"/>'
-ROD = '<cylinder radius="0.05" length="0.4"/>'
-WIDE = 1e6  # rad/s^2; with such bounds no row is implied by them
-
-
-def everything() -> CollisionAvoidance:
-    """Panda among all obstacles, near and far."""
-    return with_constants(panda_avoidance(1000), influence=5.0)
-
-
-def panda_avoidance(rows_max: int) -> CollisionAvoidance:
-    _, limits, collision, _ = panda()
-    avoidance = CollisionAvoidance(collision, limits.a_min, limits.a_max, 2e-3)
-    avoidance._rows_max = rows_max
-    return avoidance
-
-
-def random_states(count, speed=1.0, seed=0):
-    arm = panda()[0]
-    rng = np.random.default_rng(seed)
-    for _ in range(count):
-        yield rng.uniform(arm.q_min, arm.q_max), speed * rng.uniform(-1.0, 1.0, arm.n)
-
-
-def wide_rows(avoidance, q, v):
-    wide = np.full(len(q), WIDE)
-    return avoidance.rows(q, v, -wide, wide)
-
-
-def names_of(avoidance, rows):
-    return [avoidance.model.names[k] for k in rows.pair]
-
-
-def test_the_motion_of_the_joints_is_pinocchios():
-    """Velocity and bias of points fixed to the joints."""
-    arm = panda()[0]
-    avoidance, data = everything(), arm.model.createData()
-    motion = avoidance._work.motion
-    for q, v in random_states(20):
-        wide_rows(avoidance, q, v)
-        pin.forwardKinematics(arm.model, data, q, v, np.zeros(arm.n))
-        for i in range(1, arm.model.njoints):
-            placement = data.oMi[i]
-            np.testing.assert_allclose(motion.placements[i, :3], placement.rotation, atol=1e-13)
-            np.testing.assert_allclose(motion.placements[i, 3], placement.translation, atol=1e-13)
-            for ours, theirs in ((motion.velocity, data.v), (motion.bias, data.a)):
-                spatial = placement.act(theirs[i])
-                np.testing.assert_allclose(ours[i, 0], spatial.linear, atol=1e-12)
-                np.testing.assert_allclose(ours[i, 1], spatial.angular, atol=1e-12)
-
-
-def test_distances_are_coals():
-    """Every pair of capsules, box and half space, by another implementation."""
-    avoidance = everything()
-    bodies, pairs = avoidance.model.bodies, avoidance.model.pairs
-    compared = 0
-    for q, v in random_states(60, seed=1):
-        wide_rows(avoidance, q, v)
-        for i, j, d in zip(pairs.first, pairs.second, avoidance.distances, strict=True):
-            if d == np.inf:
-                continue
-            first, second = _coal_body(avoidance, i), _coal_body(avoidance, j)
-            request, result = coal.DistanceRequest(), coal.DistanceResult()
-            expected = coal.distance(*first, *second, request, result)
-            box_like = isinstance(second[0], coal.Box)
-            # A capsule whose axis is inside a box is measured otherwise: from its deepest point.
-            if box_like and d < -bodies.radius[i]:
-                assert expected < 0.0
-            else:
-                # coal goes by GJK for boxes, to 1e-6 m
-                assert d == pytest.approx(expected, abs=2e-6 if box_like else 1e-9)
-            compared += 1
-    assert compared > 2000
-
-
-def _coal_body(avoidance, i):
-    bodies, motion = avoidance.model.bodies, avoidance._work.motion
-    half = bodies.half[bodies.first[i]]
-    R, centre = motion.rotation[i].copy(), motion.centre[i].copy()
-    if bodies.plane[i]:
-        surface = R[:, 2] @ centre + half[2]
-        return coal.Halfspace(R[:, 2], surface), coal.Transform3s()
-    if half.all():
-        return coal.Box(2.0 * half), coal.Transform3s(R, centre)
-    return coal.Capsule(float(bodies.radius[i]), 2.0 * half[2]), coal.Transform3s(R, centre)
-
-
-def test_rate_and_acceleration_by_finite_differences():
-    """Of the closest points of each pair, along motions: curvature and sliding included."""
-    avoidance = everything()
-    h = 2e-4  # s
-    found = avoidance.distances
-    compared, off = 0, 0
-    rng = np.random.default_rng(2)
-    for q, v in random_states(60, seed=3):
-        a = rng.uniform(-3.0, 3.0, len(q))
-        nearby = []
-        for t in (-h, 0.0, h):
-            rows = wide_rows(avoidance, q + v * t + 0.5 * a * t * t, v + a * t)
-            nearby.append(found.copy())
-        rows = wide_rows(avoidance, q, v)
-        before, now, after = nearby
-        rate, acceleration = (after - before) / (2.0 * h), (after + before - 2.0 * now) / h**2
-        for k, p in enumerate(rows.pair):
-            if rows.distance[k] != pytest.approx(now[p], abs=1e-12) or now[p] <= 0.0:
-                continue  # of other features than the closest points, or overlapping
-            compared += 1
-            error = abs(rows.G[k] @ a + rows.bias[k] - acceleration[p])
-            if abs(rows.rate[k] - rate[p]) > 1e-4 or error > 1e-2 * (1.0 + abs(acceleration[p])):
-                off += 1
-    # Where the closest points come to an end or an edge in between, the difference is not d''.
-    assert compared > 2000
-    assert off <= compared // 500
-
-
-@pytest.mark.parametrize("kind, axis", [("revolute", "0 0 1"), ("prismatic", "1 0 0")])
-def test_a_ball_before_a_wall_by_hand(kind, axis):
-    """The wall is x = 1; for the planar arm, x of the hand and its derivatives are known."""
-    wall = half_space("wall", [1.0, 0.0, 0.0], [-1.0, 0.0, 0.0])
-    avoidance, _ = two_links(BALL, 0.4, [wall], kind, axis, influence=5.0)
-    q, v, a = np.array([0.3, 0.4]), np.array([0.7, -0.5]), np.array([1.1, 0.6])
-    rows = wide_rows(avoidance, q, v)
-    if kind == "revolute":
-        both, speed = q.sum(), v.sum()
-        x = 0.5 * np.cos(q[0]) + 0.4 * np.cos(both)
-        x_dot = -0.5 * np.sin(q[0]) * v[0] - 0.4 * np.sin(both) * speed
-        x_bias = -0.5 * np.cos(q[0]) * v[0] ** 2 - 0.4 * np.cos(both) * speed**2
-        J = -np.array([0.5 * np.sin(q[0]) + 0.4 * np.sin(both), 0.4 * np.sin(both)])
-    else:
-        length = 0.9 + q[1]
-        x = length * np.cos(q[0])
-        x_dot = -length * np.sin(q[0]) * v[0] + np.cos(q[0]) * v[1]
-        x_bias = -length * np.cos(q[0]) * v[0] ** 2 - 2.0 * np.sin(q[0]) * v[0] * v[1]
-        J = np.array([-length * np.sin(q[0]), np.cos(q[0])])
-    assert names_of(avoidance, rows) == ["fore - wall"]
-    assert rows.distance[0] == pytest.approx(1.0 - x - 0.05)
-    assert rows.rate[0] == pytest.approx(-x_dot)
-    assert rows.G[0] @ a + rows.bias[0] == pytest.approx(-(J @ a + x_bias))
-
-
-def test_a_ball_around_a_ball_by_hand():
-    """On a circle about the other ball nothing changes; past it, on a line, d'' = v^2 / d."""
-    about = sphere("ball", [0.0, 0.0, 0.0], 0.1)
-    avoidance, _ = two_links(BALL, 0.4, [about], influence=5.0)
-    rows = wide_rows(avoidance, np.array([0.3, 0.5]), np.array([2.0, 0.0]))
-    assert rows.rate[0] == pytest.approx(0.0, abs=1e-12)
-    assert rows.bias[0] == pytest.approx(0.0, abs=1e-12)
-    slider, _ = two_links(
-        BALL, 0.4, [sphere("ball", [0.9, 0.5, 0.0], 0.1)], "prismatic", "1 0 0", influence=5.0
-    )
-    rows = wide_rows(slider, np.zeros(2), np.array([0.0, 0.8]))
-    assert rows.bias[0] == pytest.approx(0.8**2 / 0.5)
 
 
 def test_the_bound_is_that_of_a_joint_with_a_lower_limit():
@@ -257,18 +110,6 @@ def test_no_row_asks_for_what_the_bounds_do_not_allow():
     assert broken > 50
 
 
-def test_ends_have_rows_before_the_closest_point_jumps_there():
-    """A rod parallel to a wall of a box turns in its plane: one end comes, the other goes."""
-    block = box("block", [0.7, 0.2, 0.0], [1.0, 0.1, 1.0])
-    avoidance, _ = two_links(ROD, 0.2, [block], influence=5.0)
-    for tilt in (-1e-9, 1e-9):
-        rows = wide_rows(avoidance, np.array([0.0, tilt]), np.array([0.0, 1.0]))
-        near = rows.distance < rows.distance.min() + 1e-6
-        rates = rows.rate[near]
-        assert rates.min() == pytest.approx(-0.4, abs=1e-6)
-        assert rates.max() > -1e-6
-
-
 def test_bodies_that_overlap_are_parted_slowly_and_reported():
     wall = half_space("wall", [0.85, 0.0, 0.0], [-1.0, 0.0, 0.0])
     avoidance, _ = two_links(BALL, 0.4, [wall], "prismatic", "1 0 0")
@@ -326,30 +167,6 @@ def _near():
         _, limits, collision, _ = panda()
         _cache.append(CollisionAvoidance(collision, limits.a_min, limits.a_max, 2e-3))
     return _cache[0]
-
-
-@pytest.mark.parametrize("offset", [0.0, 1e-12, 1e-7])
-@pytest.mark.parametrize(
-    "obstacle",
-    [
-        lambda o: capsule("it", [0.3, -0.2 + o, 0.0], [0.3, 0.2 + o, 0.0], 0.01),  # crossing
-        lambda o: capsule("it", [0.5, o, 0.0], [0.9, o, 0.0], 0.01),  # one in the other
-        lambda o: capsule("it", [0.5, 0.2 + o, 0.0], [0.9, 0.2 + o, 0.0], 0.01),  # parallel
-        lambda o: sphere("it", [0.7, o, 0.0], 0.01),  # on the axis
-        lambda o: box("it", [0.7, o, 0.0], [0.2, 0.2, 0.2]),  # pierced
-        lambda o: box("it", [0.7, 0.2 + o, 0.0], [0.1, 0.1, 0.1]),  # parallel to faces and edges
-        lambda o: half_space("it", [0.0, o, 0.0], [0.0, 1.0, 0.0]),  # half of it inside
-    ],
-)
-def test_degenerate_places_give_finite_rows(obstacle, offset):
-    avoidance, _ = two_links(ROD, 0.2, [obstacle(offset)])
-    limit = np.full(2, 20.0)
-    for v in (np.zeros(2), np.array([1.0, -2.0])):
-        rows = avoidance.rows(np.zeros(2), v, -limit, limit)
-        assert np.isfinite(rows.G).all()
-        assert np.isfinite(rows.lower).all()
-        assert np.isfinite(rows.bias).all()
-        assert not np.isnan(avoidance.closest()[0])
 
 
 @pytest.mark.parametrize(

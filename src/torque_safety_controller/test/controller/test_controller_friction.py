@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from arms import load_arm
+from controllers import posture_only
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
@@ -17,7 +18,7 @@ from torque_safety_controller.additional_torque import (
     AdditionalSettings,
     AdditionalTorque,
 )
-from torque_safety_controller.controller import Controller, Gains
+from torque_safety_controller.controller import Controller
 from torque_safety_controller.friction.settings import FrictionModel, FrictionSettings
 from torque_safety_controller.integral_feedback import IntegralSettings
 from torque_safety_controller.node.controller_node import ControllerNode
@@ -42,15 +43,7 @@ DT = 1e-3
 COULOMB = 0.1 * ARM.tau_max
 MODEL = FrictionModel(COULOMB, 1.3 * COULOMB, 0.2 * COULOMB, np.full(N, 0.02))
 ON = FrictionSettings(MODEL, 0.2 * ARM.tau_max, 1.0)
-GAINS = Gains(
-    pose_kp=100.0,
-    pose_kd=20.0,
-    pose_weight=0.0,
-    posture_kp=100.0,
-    posture_kd=20.0,
-    posture_weight=1.0,
-    hold_kd=20.0,
-)
+GAINS = posture_only(100.0, 20.0)
 WIDE = np.full(N, 50.0)
 V = 0.3 * np.sign(0.5 - np.arange(N) % 2)
 # Of a state that does not change: each joint is wanted to stop, and does not.

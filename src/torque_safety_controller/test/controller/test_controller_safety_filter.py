@@ -4,8 +4,9 @@
 import numpy as np
 import pytest
 from arms import load_arm
+from controllers import posture_only
 
-from torque_safety_controller.controller import Controller, Gains
+from torque_safety_controller.controller import Controller
 from torque_safety_controller.qp.constraints import AccelerationRange, LinearConstraints
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import read_config
@@ -20,15 +21,7 @@ STRETCHED = np.array([0.0, -0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
 EDGE = np.array([0.0, -0.64, 0.0, -0.0, 0.0, 0.0, 0.0])
 """Where the shoulder needs 96% of its torque."""
 FOLDED = np.array([0.0, -0.8, 0.0, 2.2, 0.0, 0.5, 0.0])
-GAINS = Gains(
-    pose_kp=10.0,
-    pose_kd=6.0,
-    pose_weight=0.0,
-    posture_kp=100.0,
-    posture_kd=20.0,
-    posture_weight=1.0,
-    hold_kd=20.0,
-)
+GAINS = posture_only(100.0, 20.0)
 
 
 def make(filtered=True, **arguments):

@@ -30,6 +30,10 @@ SURROUNDINGS = (
     capsule("pole", [0.4, -0.3, 0.0], [0.5, -0.3, 1.0], 0.04),
 )
 
+BALL = '<sphere radius="0.05"/>'
+ROD = '<cylinder radius="0.05" length="0.4"/>'
+WIDE = 1e6  # rad/s^2; with such bounds no row is implied by them
+
 _TWO_LINKS = """<robot name="two_links">
   <link name="base"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1"
     ixy="0" ixz="0" iyz="0"/></inertial></link>
@@ -91,6 +95,30 @@ def panda(obstacles: bool = True) -> tuple[Arm, JointLimits, CollisionModel, pin
     surroundings = SURROUNDINGS if obstacles else ()
     collision = build_collision_model(arm.model, geometry, arm.q_start, surroundings, samples=3000)
     return arm, limits, collision, geometry
+
+
+def everything() -> CollisionAvoidance:
+    """Panda among all obstacles, near and far."""
+    return with_constants(panda_avoidance(1000), influence=5.0)
+
+
+def panda_avoidance(rows_max: int) -> CollisionAvoidance:
+    _, limits, collision, _ = panda()
+    avoidance = CollisionAvoidance(collision, limits.a_min, limits.a_max, 2e-3)
+    avoidance._rows_max = rows_max
+    return avoidance
+
+
+def random_states(count, speed=1.0, seed=0):
+    arm = panda()[0]
+    rng = np.random.default_rng(seed)
+    for _ in range(count):
+        yield rng.uniform(arm.q_min, arm.q_max), speed * rng.uniform(-1.0, 1.0, arm.n)
+
+
+def wide_rows(avoidance, q, v):
+    wide = np.full(len(q), WIDE)
+    return avoidance.rows(q, v, -wide, wide)
 
 
 def least_relaxed(

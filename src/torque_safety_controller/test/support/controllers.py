@@ -32,6 +32,19 @@ KHZ = 1e-3  # s
 WIDE = 1e3  # rad/s^2; bounds that no one feels
 
 
+def posture_only(kp: float, kd: float) -> Gains:
+    """Gains of a controller to which poses mean nothing."""
+    return Gains(
+        pose_kp=kp,
+        pose_kd=kd,
+        pose_weight=0.0,
+        posture_kp=kp,
+        posture_kd=kd,
+        posture_weight=1.0,
+        hold_kd=20.0,
+    )
+
+
 def make(arm, **arguments) -> Controller:
     return Controller(
         arm.robot(),

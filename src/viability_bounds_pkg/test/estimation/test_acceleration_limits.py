@@ -8,6 +8,15 @@ import math
 import numpy as np
 import pinocchio as pin
 import pytest
+from estimated_models import (
+    GRAVITY,
+    PENDULUM_LENGTH,
+    PENDULUM_MASS,
+    baxter,
+    limits_of,
+    panda,
+    pendulum,
+)
 
 from viability_bounds_pkg.acceleration_limits import (
     EmptyIntervalError,
@@ -15,59 +24,9 @@ from viability_bounds_pkg.acceleration_limits import (
     limits_from_worst_cases,
     unavailable_share,
 )
-from viability_bounds_pkg.estimation.discretisation_margin import discretisation_margin
 from viability_bounds_pkg.estimation.state_space import LimitEstimateError, StateSpace
 from viability_bounds_pkg.estimation.velocity_scale import largest_velocity_scale
 from viability_bounds_pkg.estimation.worst_case_search import search_by_sampling, search_refined
-from viability_bounds_pkg.estimation.zero_order_hold import (
-    jerk_under_held_torque,
-    mid_step_torque,
-    zero_order_hold_error,
-)
-from viability_bounds_pkg.robot_description import build_model, read_urdf
-
-ROBOTS = "package://example-robot-data/robots"
-PENDULUM_MASS, PENDULUM_LENGTH, GRAVITY = 2.0, 0.5, 9.81
-
-
-def baxter():
-    joints = [f"left_{name}" for name in ("s0", "s1", "e0", "e1", "w0", "w1", "w2")]
-    return build_model(read_urdf(f"{ROBOTS}/baxter_description/urdf/baxter.urdf"), joints)
-
-
-def panda():
-    joints = [f"panda_joint{i}" for i in range(1, 8)]
-    return build_model(read_urdf(f"{ROBOTS}/panda_description/urdf/panda.urdf"), joints)
-
-
-def limits_of(model):
-    """The URDF's q_min, q_max, v_max, tau_max."""
-    return (
-        model.lowerPositionLimit,
-        model.upperPositionLimit,
-        model.velocityLimit,
-        model.effortLimit,
-    )
-
-
-def pendulum_urdf(*, joint_type="continuous", tip_mass=PENDULUM_MASS, links=1):
-    """Point masses on massless rods that swing about y; angles zero hang straight down."""
-    parts = ['<robot name="pendulum"><link name="link0"/>']
-    for i in range(1, links + 1):
-        parts.append(
-            f'<joint name="joint{i}" type="{joint_type}"><parent link="link{i - 1}"/>'
-            f'<child link="link{i}"/><origin xyz="0 0 {0 if i == 1 else -PENDULUM_LENGTH}"/>'
-            '<axis xyz="0 1 0"/><limit lower="-3" upper="3" effort="30" velocity="4"/></joint>'
-            f'<link name="link{i}"><inertial><origin xyz="0 0 {-PENDULUM_LENGTH}"/>'
-            f'<mass value="{tip_mass}"/>'
-            '<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial></link>'
-        )
-    return "".join(parts) + "</robot>"
-
-
-def pendulum(**kwargs):
-    links = kwargs.get("links", 1)
-    return build_model(pendulum_urdf(**kwargs), [f"joint{i}" for i in range(1, links + 1)])
 
 
 def algorithm_4(model, q, v, tau_max):
@@ -339,96 +298,3 @@ def test_joint_that_moves_nothing_is_named(count):
     model = pendulum(tip_mass=0.0)
     with pytest.raises(LimitEstimateError, match="joint joint1 moves no inertia"):
         estimate_acceleration_limits(model, [-1], [1], [1], [1], count, 0)
-
-
-def test_acceleration_rate_is_the_time_derivative():
-    model = panda()
-    rng = np.random.default_rng(2)
-    q, v = rng.uniform(-1, 1, (3, 7)), rng.uniform(-2, 2, (3, 7))
-    a = rng.uniform(-9, 9, (3, 7))
-    tau, rate = jerk_under_held_torque(model, q, v, a)
-    data, step = model.createData(), 1e-5
-    for i in range(3):
-        later, earlier = (
-            pin.aba(model, data, q[i] + t * v[i] + t * t / 2 * a[i], v[i] + t * a[i], tau[i])
-            for t in (step, -step)
-        )
-        np.testing.assert_allclose(rate[i], (later - earlier) / (2 * step), rtol=1e-5, atol=1e-4)
-
-
-def test_zero_order_hold_error_do_not_depend_on_the_integration_step():
-    model = panda()
-    rng = np.random.default_rng(4)
-    q, v, a = rng.uniform(-1, 1, (5, 7)), rng.uniform(-2, 2, (5, 7)), rng.uniform(-9, 9, (5, 7))
-    tau = mid_step_torque(model, q, v, a, 0.01)
-    coarse = zero_order_hold_error(model, q, v, a, tau, 0.01)
-    fine = zero_order_hold_error(model, q, v, a, tau, 0.01, substeps=16)
-    np.testing.assert_allclose(coarse, fine, rtol=2e-3, atol=1e-5)
-
-
-def test_zero_order_hold_error_of_a_pendulum_in_closed_form():
-    """Leading orders of the error: gravity's torque changes as the pendulum swings."""
-    model = pendulum()
-    q, v, a, dt = np.array([[0.4]]), np.array([[2.0]]), np.array([[3.0]]), 1e-3
-    rate = GRAVITY / PENDULUM_LENGTH * math.cos(0.4) * 2.0
-    held = zero_order_hold_error(model, q, v, a, mid_step_torque(model, q, v, a, dt), dt)[0, :, 0]
-    assert held[0] == pytest.approx(rate * dt / 2, rel=0.01)
-    assert held[1] < 1e-3 * held[0]
-    assert held[2] == pytest.approx(rate * dt**3 / 12, rel=0.01)
-    plain = zero_order_hold_error(model, q, v, a, mid_step_torque(model, q, v, a, 0.0), dt)[
-        0, :, 0
-    ]
-    assert plain[0] == pytest.approx(rate * dt, rel=0.01)
-    assert plain[1] == pytest.approx(rate * dt / 2, rel=0.01)
-    assert plain[2] == pytest.approx(rate * dt**3 / 6, rel=0.01)
-
-
-def margin_of(dt, **options):
-    model = baxter()
-    bound = np.array([5.0, 3.0, 11.0, 15.0, 15.0, 15.0, 15.0])
-    options = {"samples": 3000, "seed": 0, "starts": 4, "rounds": 4} | options
-    return discretisation_margin(
-        model, *limits_of(model)[:3], -bound, bound, model.effortLimit, dt, **options
-    )
-
-
-def test_mid_step_errors_follow_from_the_jerk():
-    margin = margin_of(0.002)
-    np.testing.assert_allclose(margin.acceleration, margin.jerk * 0.001, rtol=0.1)
-    assert np.all(margin.mean_acceleration < 0.05 * margin.acceleration)
-    np.testing.assert_allclose(margin.position, margin.jerk * 0.002**3 / 12, rtol=0.1)
-
-
-def test_error_is_of_first_order_in_the_period():
-    whole, half = margin_of(0.002), margin_of(0.001)
-    np.testing.assert_allclose(half.acceleration / whole.acceleration, 0.5, atol=0.03)
-
-
-def test_margin_is_attained_within_the_limits():
-    held, model = margin_of(0.002), baxter()
-    for j in range(7):
-        q, v, a = held.q[j : j + 1], held.v[j : j + 1], held.a[j : j + 1]
-        assert np.all((model.lowerPositionLimit <= q) & (q <= model.upperPositionLimit))
-        assert np.all(np.abs(v) <= model.velocityLimit)
-        tau = mid_step_torque(model, q, v, a, 0.002)
-        assert np.all(np.abs(tau) <= model.effortLimit)
-        errors = zero_order_hold_error(model, q, v, a, tau, 0.002)
-        assert errors[0, 0, j] == pytest.approx(held.acceleration[j], rel=1e-9)
-
-
-def test_local_search_finds_worse_than_sampling():
-    sampled, searched = margin_of(0.002, rounds=0), margin_of(0.002)
-    assert np.all(searched.acceleration >= sampled.acceleration)
-    assert np.count_nonzero(searched.acceleration > 1.2 * sampled.acceleration) >= 4
-
-
-@pytest.mark.parametrize("dt", [0.0, -1.0, math.nan])
-def test_margin_needs_a_period(dt):
-    with pytest.raises(LimitEstimateError, match="dt must be positive"):
-        margin_of(dt)
-
-
-def test_margin_without_a_state_within_torque_limits():
-    model = pendulum()
-    with pytest.raises(LimitEstimateError, match="within the torque limits"):
-        discretisation_margin(model, [-1], [1], [1], [90], [91], [1.0], 0.01, samples=50)

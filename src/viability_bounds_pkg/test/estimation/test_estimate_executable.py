@@ -4,78 +4,21 @@
 from __future__ import annotations
 
 import re
-import signal
-import subprocess
-import sys
-import threading
 from functools import partial
 
 import numpy as np
 import pytest
 import yaml
+from two_joint_robot import LIMIT, ROBOT, parameters_in
 
 from viability_bounds_pkg.cli import limits_file
 from viability_bounds_pkg.cli.estimate_acceleration_limits import main
 from viability_bounds_pkg.testing.executables import (
-    TIME_LIMIT,
     called,
-    environment,
-    interruptible,
     started,
 )
 
 MODULE = "viability_bounds_pkg.cli.estimate_acceleration_limits"
-LIMITS = 'lower="-1" upper="2" effort="30" velocity="4"'
-LIMIT = f"<limit {LIMITS}/>"
-URDF = """
-<robot name="arm"><link name="base"/>
-<joint name="shoulder" type="{type}"><parent link="base"/><child link="arm"/>
-<axis xyz="0 1 0"/>{limit}</joint>
-<link name="arm"><inertial><origin xyz="0 0 -0.5"/><mass value="{mass}"/>
-<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial></link>
-<joint name="wrist" type="revolute"><parent link="arm"/><child link="hand"/>
-<origin xyz="0 0 -0.5"/><axis xyz="0 1 0"/><limit {limits}/></joint>
-<link name="hand"><inertial><origin xyz="0 0 -0.1"/><mass value="{hand_mass}"/>
-<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>
-"""
-ROBOT = """\
-# A comment.
-/**:
-  ros__parameters:
-    robot_description: {urdf}
-    joints: [shoulder, wrist]
-{more}
-/**/bounds_node:
-  ros__parameters:
-    acceleration_min: [-1.0, -1.0]
-"""
-
-
-@pytest.fixture
-def robot(tmp_path):
-    """Writes a robot's URDF and parameter file; returns the latter's path."""
-
-    def write(
-        limit=LIMIT,
-        type="revolute",
-        mass=2.0,
-        hand_mass=0.5,
-        parameters="",
-        text=ROBOT,
-    ):
-        urdf = tmp_path / "arm.urdf"
-        urdf.write_text(
-            URDF.format(limit=limit, type=type, mass=mass, hand_mass=hand_mass, limits=LIMITS)
-        )
-        path = tmp_path / "robot.yaml"
-        path.write_text(text.format(urdf=urdf, more=parameters))
-        return path
-
-    return write
-
-
-def parameters_in(text):
-    return yaml.safe_load(text)["/**/bounds_node"]["ros__parameters"]
 
 
 def printed(ended):
@@ -84,8 +27,8 @@ def printed(ended):
 
 
 @pytest.mark.parametrize("method", ["sampling", "refined"])
-def test_limits_are_written_as_an_overlay(robot, tmp_path, method):
-    path, output = robot(), tmp_path / "limits.yaml"
+def test_limits_are_written_as_an_overlay(write_robot, tmp_path, method):
+    path, output = write_robot(), tmp_path / "limits.yaml"
     before = path.read_bytes()
     ended = started(
         "-m", MODULE, path, "-o", output, "--samples", 3000, "--method", method, "--seed", 2
@@ -104,8 +47,8 @@ def test_limits_are_written_as_an_overlay(robot, tmp_path, method):
         assert word in ended.stdout
 
 
-def test_same_seed_same_file(robot, call, tmp_path):
-    path = robot()
+def test_same_seed_same_file(write_robot, call, tmp_path):
+    path = write_robot()
     outputs = [tmp_path / name for name in ("first.yaml", "second.yaml", "third.yaml")]
     for output, seed in zip(outputs, (4, 4, 5), strict=True):
         assert call(path, "-o", output, "--samples", 200, "--seed", seed).returncode == 0
@@ -114,9 +57,9 @@ def test_same_seed_same_file(robot, call, tmp_path):
     assert parameters_in(texts[0]) != parameters_in(texts[2])
 
 
-def test_options_reach_the_limits(robot, call):
+def test_options_reach_the_limits(write_robot, call):
     common = ("--samples", 500)
-    path = robot()
+    path = write_robot()
     plain = printed(call(path, *common))
     ended = call(
         path,
@@ -142,18 +85,22 @@ def test_options_reach_the_limits(robot, call):
     assert "with the torque held for 0.01 s" in ended.stdout
 
 
-def test_reserve_takes_its_part_of_the_torque(robot, call):
-    path = robot(parameters="    torque_max: [30.0, 30.0]")
+def test_reserve_takes_its_part_of_the_torque(write_robot, call):
+    path = write_robot(parameters="    torque_max: [30.0, 30.0]")
     reserved = call(path, "--samples", 300, "--torque-reserve", 0.5)
     halved = call(
-        robot(parameters="    torque_max: [15.0, 15.0]"), "--samples", 300, "--torque-reserve", 0
+        write_robot(parameters="    torque_max: [15.0, 15.0]"),
+        "--samples",
+        300,
+        "--torque-reserve",
+        0,
     )
     first, second = (printed(ended) for ended in (reserved, halved))
     assert first == second
 
 
-def test_limits_of_the_parameter_file_beat_those_of_the_urdf(robot, call):
-    path = robot(
+def test_limits_of_the_parameter_file_beat_those_of_the_urdf(write_robot, call):
+    path = write_robot(
         limit="",
         type="continuous",
         parameters="    velocity_max: [1, 1]\n    torque_max: [50.0, 30.0]\n",
@@ -165,8 +112,8 @@ def test_limits_of_the_parameter_file_beat_those_of_the_urdf(robot, call):
     assert limits["acceleration_max"][0] == pytest.approx((50 - weight) / inertia, rel=0.05)
 
 
-def test_locked_joints(robot, call):
-    path = robot()
+def test_locked_joints(write_robot, call):
+    path = write_robot()
     lines = path.read_text().replace("joints: [shoulder, wrist]", "joints: [shoulder]")
     lines = lines.replace("acceleration_min: [-1.0, -1.0]", "acceleration_min: [-1.0]")
     found = []
@@ -192,9 +139,9 @@ def call(capfd):
     return partial(called, capfd, main)
 
 
-def test_gravity_beyond_the_torque(robot, call, tmp_path):
+def test_gravity_beyond_the_torque(write_robot, call, tmp_path):
     output = tmp_path / "limits.yaml"
-    path = robot(parameters="    torque_max: [5.0, 30.0]")
+    path = write_robot(parameters="    torque_max: [5.0, 30.0]")
     line = one_line(call(path, "--samples", 500, "-o", output))
     assert "joint shoulder" in line and "5 N m" in line
     assert "lower velocities do not help" in line
@@ -205,18 +152,18 @@ def test_gravity_beyond_the_torque(robot, call, tmp_path):
     assert parameters_in(output.read_text())["acceleration_max"][0] == 1.0
 
 
-def test_too_much_speed_for_the_torque(robot, call, tmp_path):
+def test_too_much_speed_for_the_torque(write_robot, call, tmp_path):
     """Joint, state, lower velocities and the override: all that is offered helps."""
     output = tmp_path / "limits.yaml"
     fast = "    velocity_max: [40.0, 40.0]\n    torque_max: [30.0, 10.0]"
-    line = one_line(call(robot(parameters=fast), "--samples", 3000, "-o", output))
+    line = one_line(call(write_robot(parameters=fast), "--samples", 3000, "-o", output))
     assert re.search(r"joint (shoulder|wrist): its torque of .* at q = \[.*\], v = \[.*\]", line)
     assert not output.exists()
     scale = float(re.search(r"scaled by ([\d.]+)", line)[1])
     lower = [float(x) for x in re.search(r"to \[([^]]*)\] rad/s", line)[1].split(",")]
     assert lower == pytest.approx([40.0 * scale, 40.0 * scale], rel=0.01)
     slower = fast.replace("[40.0, 40.0]", str(lower))
-    ended = call(robot(parameters=slower), "--samples", 3000, "-o", output)
+    ended = call(write_robot(parameters=slower), "--samples", 3000, "-o", output)
     assert (ended.returncode, ended.stderr) == (0, "")
     found = parameters_in(output.read_text())
     smallest = min(*found["acceleration_max"], *(-a for a in found["acceleration_min"]))
@@ -224,11 +171,11 @@ def test_too_much_speed_for_the_torque(robot, call, tmp_path):
     joint = re.search(r"--override (\w+)=MIN,MAX", line)[1]
     both = [word for name in ("shoulder", "wrist") for word in ("--override", f"{name}=-1,1")]
     assert joint in ("shoulder", "wrist")
-    assert call(robot(parameters=fast), "--samples", 100, *both).returncode == 0
+    assert call(write_robot(parameters=fast), "--samples", 100, *both).returncode == 0
 
 
-def test_continuous_joint_with_limits_of_the_urdf(robot, call):
-    path = robot(limit='<limit effort="30" velocity="4"/>', type="continuous")
+def test_continuous_joint_with_limits_of_the_urdf(write_robot, call):
+    path = write_robot(limit='<limit effort="30" velocity="4"/>', type="continuous")
     ended = call(path, "--samples", 2000)
     assert (ended.returncode, ended.stderr) == (0, "")
     inertia, weight = 2.0 * 0.25 + 0.5 * 0.36, 9.81 * (2.0 * 0.5 + 0.5 * 0.6)
@@ -238,8 +185,8 @@ def test_continuous_joint_with_limits_of_the_urdf(robot, call):
     assert limits["acceleration_min"][0] == pytest.approx(-limits["acceleration_max"][0], rel=0.05)
 
 
-def test_a_link_without_mass_that_carries_others_is_fine(robot, call):
-    ended = call(robot(mass=0.0), "--samples", 300)
+def test_a_link_without_mass_that_carries_others_is_fine(write_robot, call):
+    ended = call(write_robot(mass=0.0), "--samples", 300)
     assert (ended.returncode, ended.stderr) == (0, "")
 
 
@@ -284,8 +231,8 @@ def test_a_link_without_mass_that_carries_others_is_fine(robot, call):
         ({"text": ""}, "no parameters"),
     ],
 )
-def test_bad_robots_are_told_in_one_line(robot, call, case, message):
-    assert message in one_line(call(robot(**case), "--samples", 100))
+def test_bad_robots_are_told_in_one_line(write_robot, call, case, message):
+    assert message in one_line(call(write_robot(**case), "--samples", 100))
 
 
 @pytest.mark.parametrize(
@@ -301,8 +248,8 @@ def test_bad_robots_are_told_in_one_line(robot, call, case, message):
         (["--margin-dt", "0"], "--margin-dt: must be positive"),
     ],
 )
-def test_bad_usage_is_told_in_one_line(robot, call, arguments, message):
-    assert message in one_line(call(robot(), *arguments), code=2)
+def test_bad_usage_is_told_in_one_line(write_robot, call, arguments, message):
+    assert message in one_line(call(write_robot(), *arguments), code=2)
 
 
 @pytest.mark.parametrize(
@@ -318,8 +265,8 @@ def test_bad_usage_is_told_in_one_line(robot, call, arguments, message):
         (["-o", "/proc/limits.yaml"], "/proc cannot be written to"),
     ],
 )
-def test_options_that_do_not_fit_the_robot(robot, call, tmp_path, arguments, message):
-    path = robot()
+def test_options_that_do_not_fit_the_robot(write_robot, call, tmp_path, arguments, message):
+    path = write_robot()
     before = path.read_text()
     arguments = [argument.replace("{tmp}", str(tmp_path)) for argument in arguments]
     assert message in one_line(call(path, "--samples", 100, *arguments))
@@ -331,94 +278,9 @@ def test_missing_parameter_file(tmp_path):
     assert "none.yaml" in one_line(started("-m", MODULE, tmp_path / "none.yaml"))
 
 
-def interrupt_when(process, ready):
-    """Send SIGINT once `ready()` of a line of output says so, or the time is up."""
-    timer = threading.Timer(TIME_LIMIT, process.kill)
-    timer.start()
-    lines = []
-    for line in process.stdout:
-        lines.append(line)
-        if ready(line):
-            process.send_signal(signal.SIGINT)
-            break
-    rest, errors = process.communicate()
-    timer.cancel()
-    return "".join(lines) + rest, errors
-
-
-def start(code, *arguments):
-    return subprocess.Popen(
-        [sys.executable, "-c", code, *map(str, arguments)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=environment(),
-        preexec_fn=interruptible,
-    )
-
-
-# Says when the search has found something: a marker to wait for instead of a time.
-ANNOUNCED_SEARCH = """
-import sys
-from viability_bounds_pkg.cli import estimate_acceleration_limits as tool
-search = tool.SEARCHES["sampling"]
-def announced(*arguments):
-    for count, worst in enumerate(search(*arguments)):
-        if count == 3:
-            print("SEARCHING", flush=True)
-        yield worst
-tool.SEARCHES["sampling"] = announced
-sys.exit(tool.main())
-"""
-
-
-def test_interrupt_keeps_what_was_found(robot, tmp_path):
-    output = tmp_path / "limits.yaml"
-    samples = 10**9  # hours
-    process = start(
-        ANNOUNCED_SEARCH, robot(), "-o", output, "--method", "sampling", "--samples", samples
-    )
-    out, errors = interrupt_when(process, lambda line: "SEARCHING" in line)
-    assert process.returncode == 130, errors
-    assert f"of {samples} evaluations: the limits are those found so far" in errors
-    assert "Traceback" not in errors
-    assert "shoulder: torque leaves" in out
-    text = output.read_text()
-    assert "INTERRUPTED" in text
-    written = parameters_in(text)
-    assert max(written["acceleration_min"]) < 0.0 < min(written["acceleration_max"])
-
-
-def test_interrupt_in_the_margin_keeps_the_limits(robot, tmp_path):
-    output = tmp_path / "limits.yaml"
-    slow = ANNOUNCED_SEARCH.replace(
-        "sys.exit",
-        "import functools\ntool.discretisation_margin = functools.partial("
-        "tool.discretisation_margin, samples=10**6, starts=10**4, rounds=10**4)\nsys.exit",
-    )
-    process = start(slow, robot(), "-o", output, "--samples", 500, "--margin-dt", 0.01)
-    _, errors = interrupt_when(process, lambda line: "drift of a held torque" in line)
-    assert process.returncode == 130, errors
-    assert "acceleration_drift is left out" in errors
-    assert set(parameters_in(output.read_text())) == {"acceleration_min", "acceleration_max"}
-
-
-def test_interrupt_before_anything_was_found(robot, tmp_path):
-    output = tmp_path / "limits.yaml"
-    output.write_text("old")
-    code = (
-        "import sys\nfrom viability_bounds_pkg.cli import estimate_acceleration_limits as tool\n"
-        "def wait(path):\n    print('READING', flush=True)\n    while True:\n        pass\n"
-        "tool.read_robot = wait\nsys.exit(tool.main())\n"
-    )
-    process = start(code, robot(), "-o", output)
-    _, errors = interrupt_when(process, lambda line: "READING" in line)
-    assert process.returncode == 130
-    assert "nothing written" in errors
-    assert output.read_text() == "old"
-
-
-def test_what_was_found_is_printed_when_it_cannot_be_written(robot, call, tmp_path, monkeypatch):
+def test_what_was_found_is_printed_when_it_cannot_be_written(
+    write_robot, call, tmp_path, monkeypatch
+):
     output = tmp_path / "limits.yaml"
     output.write_text("old")
 
@@ -426,7 +288,7 @@ def test_what_was_found_is_printed_when_it_cannot_be_written(robot, call, tmp_pa
         raise OSError("no space left on device")
 
     monkeypatch.setattr(limits_file.os, "fsync", full)
-    ended = call(robot(), "--samples", 300, "-o", output)
+    ended = call(write_robot(), "--samples", 300, "-o", output)
     assert "no space left" in one_line(ended)
     assert set(printed(ended)) == {"acceleration_min", "acceleration_max"}
     assert output.read_text() == "old"

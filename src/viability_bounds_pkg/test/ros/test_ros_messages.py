@@ -183,7 +183,7 @@ def test_diagnostics_come_by_themselves_although_time_stands_still(ros):
         "none": JointStateReader(JOINTS).refused,
         "text": "fine",
     }
-    Diagnostics(node, lambda: (DiagnosticStatus.WARN, "so so", values), period=0.05)
+    Diagnostics(node, lambda: (DiagnosticStatus.WARN, "so so", values))
     ros.wait_until(lambda: ros.reported("watched", "text"), "diagnostics")
     assert ros.diagnostics["watched"] == {
         "number": "1.5",
@@ -207,7 +207,7 @@ def test_numbers_in_diagnostics_are_sent_as_numbers_too(ros):
         "number": 1.0 / 3.0,
         "refused": JointStateReader(JOINTS).refused,
     }
-    Diagnostics(node, lambda: (DiagnosticStatus.OK, "", values), period=0.05)
+    Diagnostics(node, lambda: (DiagnosticStatus.OK, "", values))
     heard = ros.listen(Float64MultiArray, "left/watched/values", STATUS_QOS)
     ros.wait_until(lambda: heard, "values")
     dimensions = heard[0].layout.dim
@@ -221,7 +221,7 @@ def test_diagnostics_of_two_arms_are_told_apart(ros):
     for namespace in ("left", "right"):
         node = ros.add(Node("arm", context=ros.context, namespace=namespace))
         report = DiagnosticStatus.OK, "", {"arm": namespace}
-        Diagnostics(node, lambda report=report: report, period=0.05)
+        Diagnostics(node, lambda report=report: report)
     for namespace in ("left", "right"):
         ros.wait_until(lambda name=f"{namespace}/arm": ros.reported(name, "arm"), namespace)
         assert ros.reported(f"{namespace}/arm", "arm") == namespace

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The filter on Baxter, whose shoulder cannot hold the stretched arm, against an adversary."""
 
+from functools import cache
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -62,12 +64,9 @@ class Arm:
         if tau_last is not None:
             least = np.maximum(least, tau_last - change)
             most = np.minimum(most, tau_last + change)
-        share = 1.0
+        share, low = 1.0, self.mid_torque(q, v, plan)
         for _ in range(4):  # the torque in the middle of the step is only nearly linear
-            low, high = (
-                self.mid_torque(q, v, plan),
-                self.mid_torque(q, v, plan + share * (a - plan)),
-            )
+            high = self.mid_torque(q, v, plan + share * (a - plan))
             room = np.where(high > low, most - low, least - low)
             with np.errstate(divide="ignore", invalid="ignore"):
                 more = np.where(high == low, 1.0, room / (high - low)).min()
@@ -134,6 +133,18 @@ def heavier(arm):
     return wanted
 
 
+@cache
+def at_random(arm, seed):
+    """What `Arm.play` returns of 4 s to and fro."""
+    return arm.play(bang_bang(arm, seed), 4.0)
+
+
+@cache
+def to_the_worst(arm):
+    """What `Arm.play` returns of 2.5 s towards the worst posture."""
+    return arm.play(heavier(arm), 2.5)
+
+
 ARMS = [("baxter_left_arm", 1.0), ("panda", 0.6), ("talos_left_arm", 0.6)]
 
 
@@ -144,7 +155,7 @@ def arm(request):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_no_limit_is_passed_whatever_is_wanted(arm, seed):
-    worst, _, keeper = arm.play(bang_bang(arm, seed), 4.0)
+    worst, _, keeper = at_random(arm, seed)
     assert worst[0] <= ROUNDING
     assert worst[1] <= ROUNDING
     assert worst[2] <= 1.0 + ROUNDING
@@ -173,7 +184,7 @@ def test_nor_where_rates_are_limited_and_those_are_kept(arm, seed, kind):
 
 
 def test_no_limit_is_passed_where_the_worst_posture_is_wanted(arm):
-    worst, states, keeper = arm.play(heavier(arm), 2.5)
+    worst, states, keeper = to_the_worst(arm)
     assert worst[0] <= ROUNDING
     assert worst[1] <= ROUNDING
     assert worst[2] <= 1.0 + ROUNDING
@@ -208,7 +219,7 @@ def test_the_plan_in_hand_ends_at_rest_and_can_be_held(arm, seed):
 def test_between_its_samples_a_plan_needs_no_more_than_the_reserve(arm):
     """The torques of accepted plans on a fine grid: what `RESERVE` has to cover."""
     rng = np.random.default_rng(5)
-    worst, states, _ = arm.play(bang_bang(arm, 7), 4.0)
+    _, states, _ = at_random(arm, 0)
     keeper, plans = arm.filter(), None
     zero = np.zeros(arm.n)
     most = 0.0
@@ -232,7 +243,7 @@ def test_between_its_samples_a_plan_needs_no_more_than_the_reserve(arm):
 
 def test_constraints_leave_the_plan_as_it_is(arm):
     """They allow its acceleration, so that a QP with them, bounds and torques has a solution."""
-    states = arm.play(bang_bang(arm, 3), 4.0)[1] + arm.play(heavier(arm), 2.0)[1]
+    states = at_random(arm, 1)[1] + to_the_worst(arm)[1]
     keeper, zero, seen = arm.filter(), np.zeros(arm.n), 0
     for q, v in states[::7]:
         lower, upper, _ = arm.solver.bounds(q, v)

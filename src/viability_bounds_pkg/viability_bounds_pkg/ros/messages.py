@@ -200,6 +200,10 @@ class PeriodCheck:
             )
 
 
+DIAGNOSTICS_PERIOD = 0.5
+"""Between two messages of a node, s; tests, which wait for them, shorten it."""
+
+
 class Diagnostics:
     """Publishes one status on ``/diagnostics``, regularly and when asked.
 
@@ -209,7 +213,6 @@ class Diagnostics:
         node: the publishing node; its name with the namespace, as in ``left/bounds_node``, is the
             status' name, so that two arms are told apart.
         report: returns level (a constant of ``DiagnosticStatus``), a message and the values.
-        period: seconds between two messages.
         watch: its topics with several publishers, and a missing estimator, are reported, too, as a
             warning.
     """
@@ -218,7 +221,6 @@ class Diagnostics:
         self,
         node: Node,
         report: Report,
-        period: float = 0.5,
         watch: PublisherWatch | None = None,
     ) -> None:
         self._watch = watch
@@ -228,7 +230,7 @@ class Diagnostics:
         self._values_publisher = VALUES.publisher(node)
         # The steady clock, so that it is sent when /clock stops, too.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = node.create_timer(period, self.publish, clock=steady)
+        self._timer = node.create_timer(DIAGNOSTICS_PERIOD, self.publish, clock=steady)
 
     def publish(self) -> None:
         """Send the status now."""
