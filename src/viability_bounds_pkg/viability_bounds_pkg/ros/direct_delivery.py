@@ -18,23 +18,27 @@ Receive = Callable[[Any], None]
 class DirectDelivery:
     """Gives messages of the control streams to the other nodes of a process, as the same objects.
 
-    Each message is published as ever, where anybody outside of the process subscribes. Where the
-    process has the only publisher of a topic, its own subscriptions get the message from the
-    executor's next turn, and leave unread what comes by the middleware. While a topic has a
+    Where the process has the only publisher of a topic, its own subscriptions get the message from
+    the executor's next turn, and leave unread what comes by the middleware. While a topic has a
     publisher elsewhere, all of its messages come by the middleware; then one subscription reads
     them for all nodes of the process.
+
+    Each message is published as ever, where anybody outside of the process subscribes, but when the
+    turn has ended, the newest first: who records or looks on does not delay the command, and to a
+    robot elsewhere the command goes before copies of what led to it.
 
     One turn delivers what was sent meanwhile, too, in the order in which it was sent: from the
     state over the limits to the command. It ends where a topic comes a second time, so that in
     lockstep services, timers and goals are not kept waiting.
 
     As with the middleware, a message that was not delivered yet gives way to a newer one.
-    Publishers may use a message again in the next control period, unless a subscriber keeps it.
+    Publishers may use a message again in the next turn, unless a subscriber keeps it.
     """
 
     def __init__(self) -> None:
         self._streams: dict[str, _Stream] = {}
-        self._sent: dict[_Stream, Any] = {}  # the newest of each, in their order
+        # The newest of each, in their order.
+        self._sent: dict[_Stream, tuple[_DirectPublisher, Any]] = {}
         self._turn_due = False
 
     def publisher(self, node: Node, message: type, name: str, qos: QoSProfile) -> Publisher:
@@ -42,7 +46,7 @@ class DirectDelivery:
         publisher = node.create_publisher(message, name, qos, publisher_class=_DirectPublisher)
         stream = self._stream(node, name)
         direct = cast(_DirectPublisher, publisher)
-        direct.stream, direct.deliver = stream, lambda sent: self._send(node, stream, sent)
+        direct.stream, direct.deliver = stream, lambda sent: self._send(node, direct, sent)
         stream.publishers += 1
         stream.settle()
         return publisher
@@ -66,24 +70,32 @@ class DirectDelivery:
         """Give a node back its subscriptions, so that they are destroyed with it."""
         for stream in self._streams.values():
             stream.give_back(node)
+        gone = set(node.publishers)
+        self._sent = {key: sent for key, sent in self._sent.items() if sent[0] not in gone}
 
     def _stream(self, node: Node, name: str) -> _Stream:
         return self._streams.setdefault(node.resolve_topic_name(name), _Stream())
 
-    def _send(self, node: Node, stream: _Stream, message: Any) -> None:
+    def _send(self, node: Node, publisher: _DirectPublisher, message: Any) -> bool:
+        """Have a message delivered in the next turn; return whether there will be one."""
+        stream = publisher.stream
         if not stream.subscriptions or node.executor is None:
-            return  # nobody is there yet
-        self._sent.pop(stream, None)
-        self._sent[stream] = message
+            return False  # nobody is there yet
+        if earlier := self._sent.pop(stream, None):
+            earlier[0].publish_to_others(earlier[1])
+        self._sent[stream] = publisher, message
         if not self._turn_due:
             self._turn_due = True
             node.executor.create_task(self._deliver, node)
+        return True
 
     def _deliver(self, node: Node) -> None:
-        delivered: set[_Stream] = set()
+        delivered: dict[_Stream, tuple[_DirectPublisher, Any]] = {}
         while self._sent and (stream := next(iter(self._sent))) not in delivered:
-            delivered.add(stream)
-            stream.receive(self._sent.pop(stream))
+            delivered[stream] = self._sent.pop(stream)
+            stream.receive(delivered[stream][1])
+        for publisher, message in reversed(delivered.values()):
+            publisher.publish_to_others(message)
         self._turn_due = bool(self._sent) and node.executor is not None
         if self._turn_due:
             node.executor.create_task(self._deliver, node)
@@ -94,21 +106,24 @@ class _DirectPublisher(Publisher):
 
     Attributes:
         stream: its topic.
-        deliver: gives a message to the nodes of the process.
+        deliver: gives a message to the nodes of the process; returns whether they will get it.
     """
 
     stream: _Stream
-    deliver: Receive
+    deliver: Callable[[Any], bool]
 
     def publish(self, msg: Any) -> None:
         """Send a message."""
         if not self.stream.direct:
             super().publish(msg)
-            return
+        elif not self.deliver(msg):
+            self.publish_to_others(msg)
+
+    def publish_to_others(self, message: Any) -> None:
+        """Publish a message that nodes of the process get directly."""
         # To make a message for the middleware that nobody reads takes longer than to deliver it.
         if self.get_subscription_count() > len(self.stream.subscriptions):
-            super().publish(msg)
-        self.deliver(msg)
+            super().publish(message)
 
 
 class _Stream:
