@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -10,9 +12,13 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from rclpy.serialization import serialize_message
 from rclpy.subscription import Subscription
 
 Receive = Callable[[Any], None]
+
+_COPIES_PERIOD = 0.005
+"""For how long copies are kept while turn follows turn, s; readers' buffers hold more."""
 
 
 class DirectDelivery:
@@ -23,9 +29,11 @@ class DirectDelivery:
     publisher elsewhere, all of its messages come by the middleware; then one subscription reads
     them for all nodes of the process.
 
-    Each message is published as ever, where anybody outside of the process subscribes, but when the
-    turn has ended, the newest first: who records or looks on does not delay the command, and to a
-    robot elsewhere the command goes before copies of what led to it.
+    Each message is published as ever, where anybody outside of the process subscribes, but when
+    the turn has ended, the newest first: who records or looks on does not delay the command, and
+    to a robot elsewhere the command goes before copies of what led to it. While turn follows turn,
+    as in lockstep, copies leave every few milliseconds: to wake another process takes far longer
+    than to copy a message.
 
     One turn delivers what was sent meanwhile, too, in the order in which it was sent: from the
     state over the limits to the command. It ends where a topic comes a second time, so that in
@@ -40,6 +48,8 @@ class DirectDelivery:
         # The newest of each, in their order.
         self._sent: dict[_Stream, tuple[_DirectPublisher, Any]] = {}
         self._turn_due = False
+        self._copies: list[tuple[_DirectPublisher, bytes]] = []
+        self._published_at = -math.inf
 
     def publisher(self, node: Node, message: type, name: str, qos: QoSProfile) -> Publisher:
         """Return a publisher whose messages the nodes of this process get directly."""
@@ -72,6 +82,7 @@ class DirectDelivery:
             stream.give_back(node)
         gone = set(node.publishers)
         self._sent = {key: sent for key, sent in self._sent.items() if sent[0] not in gone}
+        self._copies = [copy for copy in self._copies if copy[0] not in gone]
 
     def _stream(self, node: Node, name: str) -> _Stream:
         return self._streams.setdefault(node.resolve_topic_name(name), _Stream())
@@ -82,7 +93,7 @@ class DirectDelivery:
         if not stream.subscriptions or node.executor is None:
             return False  # nobody is there yet
         if earlier := self._sent.pop(stream, None):
-            earlier[0].publish_to_others(earlier[1])
+            self._copy(*earlier)
         self._sent[stream] = publisher, message
         if not self._turn_due:
             self._turn_due = True
@@ -94,11 +105,23 @@ class DirectDelivery:
         while self._sent and (stream := next(iter(self._sent))) not in delivered:
             delivered[stream] = self._sent.pop(stream)
             stream.receive(delivered[stream][1])
-        for publisher, message in reversed(delivered.values()):
-            publisher.publish_to_others(message)
+        for sent in reversed(delivered.values()):
+            self._copy(*sent)
         self._turn_due = bool(self._sent) and node.executor is not None
         if self._turn_due:
             node.executor.create_task(self._deliver, node)
+        now = time.monotonic()
+        if not self._turn_due or now - self._published_at > _COPIES_PERIOD:
+            self._published_at = now
+            for publisher, copy in self._copies:
+                Publisher.publish(publisher, copy)
+            self._copies.clear()
+
+    def _copy(self, publisher: _DirectPublisher, message: Any) -> None:
+        """Keep a copy for those outside, if there are any, as it is now."""
+        # To make a copy that nobody reads takes longer than to deliver the message.
+        if publisher.has_others:
+            self._copies.append((publisher, serialize_message(message)))
 
 
 class _DirectPublisher(Publisher):
@@ -114,16 +137,13 @@ class _DirectPublisher(Publisher):
 
     def publish(self, msg: Any) -> None:
         """Send a message."""
-        if not self.stream.direct:
+        if not (self.stream.direct and self.deliver(msg)):
             super().publish(msg)
-        elif not self.deliver(msg):
-            self.publish_to_others(msg)
 
-    def publish_to_others(self, message: Any) -> None:
-        """Publish a message that nodes of the process get directly."""
-        # To make a message for the middleware that nobody reads takes longer than to deliver it.
-        if self.get_subscription_count() > len(self.stream.subscriptions):
-            super().publish(message)
+    @property
+    def has_others(self) -> bool:
+        """Whether anybody outside of the process subscribes."""
+        return self.get_subscription_count() > len(self.stream.subscriptions)
 
 
 class _Stream:
