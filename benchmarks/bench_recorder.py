@@ -17,7 +17,7 @@ import time
 from contextlib import suppress
 
 import rclpy
-from bench_realtime import User, configuration, cpu_seconds, load, running
+from bench_realtime import START, User, configuration, cpu_seconds, load, running
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.task import Future
@@ -40,10 +40,15 @@ def record(robot: str) -> None:
     listener = RunListener(node, read_config(robot)["joints"])
     executor = make_executor()
     executor.add_node(node)
-    print("ready", flush=True)
+    ready, begin = False, time.monotonic()
     with suppress(ExternalShutdownException):
         while rclpy.ok():
             executor.spin_until_future_complete(Future(), timeout_sec=0.1)
+            if not ready and listener.stamp >= 0:
+                ready = True
+                print("ready", flush=True)
+            if not ready and time.monotonic() - begin > START:
+                raise SystemExit("error: no joint states came")
     run = listener.run(0)
     print(len(run.t) - run.lost, flush=True)
 
