@@ -34,7 +34,10 @@ LOCKSTEP = ["-p", "clock:=lockstep", "-p", "bounds_timeout:=5.0", "-p", "state_t
 
 
 def record(robot: str) -> None:
-    """Record until SIGTERM; print in how many periods state, limits and command were recorded."""
+    """Record until SIGTERM; print in how many periods state, limits and command were recorded.
+
+    Prints "ready" when the first state has come.
+    """
     rclpy.init()
     node = Node("recorder")
     listener = RunListener(node, read_config(robot)["joints"])
@@ -49,8 +52,9 @@ def record(robot: str) -> None:
                 print("ready", flush=True)
             if not ready and time.monotonic() - begin > START:
                 raise SystemExit("error: no joint states came")
-    run = listener.run(0)
-    print(len(run.t) - run.lost, flush=True)
+    if ready:
+        run = listener.run(0)
+        print(len(run.t) - run.lost, flush=True)
 
 
 class Recorder:
