@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """State -> limits -> command in one process: the real nodes against nodes that only relay.
 
-Both chains live in one process on one executor, and are driven in turns by the same probe, so
-that what differs is the work of the nodes. Each chain has its own simulated arm, moved outside the
-measured time: the real chain's by its commands, through the demo's goals and into the limits;
-the relays' by gravity compensation. With ``--imperfect`` a third chain has what
-``config/imperfect/`` declares, and the estimator node.
+All chains live in one process on one executor, and are driven in turns by the same probe, so that
+what differs is the work of the nodes, and the way of messages: from node to node as in
+`safety_stack` ("one process"), or by the middleware. Each chain has its own simulated arm, moved
+outside the measured time: the real chain's by its commands, through the demo's goals and into the
+limits; the relays' by gravity compensation. With ``--imperfect`` a further chain has what
+``config/imperfect/`` declares, and the estimator node, with messages by the middleware.
 """
 
 from __future__ import annotations
@@ -33,26 +34,29 @@ from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.node.estimator_node import EstimatorNode
 from viability_bounds_pkg.robot_description import build_model, read_urdf
-from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS, make_executor, set_stamp
+from viability_bounds_pkg.ros.direct_delivery import DirectDelivery
+from viability_bounds_pkg.ros.runtime import GOAL_QOS, make_executor, set_stamp
+from viability_bounds_pkg.ros.topics import ACCELERATION_LIMITS, JOINT_COMMANDS, JOINT_STATES
 
 ROOT = Path(__file__).resolve().parent.parent
 DT_NS = 1_000_000
+WAYS = ("middleware", "one process")
+KINDS = ("real", "relay")
 
 
 class RelayLimits(Node):
     """Answers a state with limits of the right size, and does nothing else."""
 
-    def __init__(self, joints: list[str], **arguments) -> None:
+    def __init__(self, joints: list[str], direct_delivery=None, **arguments) -> None:
         super().__init__("relay_limits", **arguments)
+        self.direct_delivery = direct_delivery
         wide = array("d", [1.0] * len(joints))
         self._answer = JointTrajectory(
             joint_names=joints,
             points=[JointTrajectoryPoint(accelerations=wide) for _ in range(2)],
         )
-        self._publisher = self.create_publisher(
-            JointTrajectory, "acceleration_limits", CONTROL_QOS
-        )
-        self.create_subscription(JointState, "joint_states", self._on_state, CONTROL_QOS)
+        self._publisher = ACCELERATION_LIMITS.publisher(self)
+        JOINT_STATES.subscription(self, self._on_state)
 
     def _on_state(self, message: JointState) -> None:
         self._answer.header.stamp = message.header.stamp
@@ -62,14 +66,13 @@ class RelayLimits(Node):
 class RelayCommand(Node):
     """Takes states and limits, answers limits with a command of the right size."""
 
-    def __init__(self, joints: list[str], **arguments) -> None:
+    def __init__(self, joints: list[str], direct_delivery=None, **arguments) -> None:
         super().__init__("relay_command", **arguments)
+        self.direct_delivery = direct_delivery
         self._command = JointState(name=joints, effort=array("d", [0.0] * len(joints)))
-        self._publisher = self.create_publisher(JointState, "joint_commands", CONTROL_QOS)
-        self.create_subscription(JointState, "joint_states", lambda _: None, CONTROL_QOS)
-        self.create_subscription(
-            JointTrajectory, "acceleration_limits", self._on_limits, CONTROL_QOS
-        )
+        self._publisher = JOINT_COMMANDS.publisher(self)
+        JOINT_STATES.subscription(self, lambda _: None)
+        ACCELERATION_LIMITS.subscription(self, self._on_limits)
 
     def _on_limits(self, message: JointTrajectory) -> None:
         self._command.header.stamp = message.header.stamp
@@ -79,15 +82,18 @@ class RelayCommand(Node):
 class Probe(Node):
     """Plays the robot: publishes states, notes when the command comes."""
 
-    def __init__(self, joints: list[str], robot: BulletRobot, **arguments) -> None:
+    def __init__(
+        self, joints: list[str], robot: BulletRobot, direct_delivery=None, **arguments
+    ) -> None:
         super().__init__("probe", **arguments)
+        self.direct_delivery = direct_delivery
         self._state = JointState(name=joints, effort=array("d", [0.0] * len(joints)))
         self.robot = robot
         self._stamp = 0
         self.command: array | None = None
-        self._publisher = self.create_publisher(JointState, "joint_states", CONTROL_QOS)
+        self._publisher = JOINT_STATES.publisher(self)
         self._goal = self.create_publisher(PoseStamped, "target_pose", GOAL_QOS)
-        self.create_subscription(JointState, "joint_commands", self._on_command, CONTROL_QOS)
+        JOINT_COMMANDS.subscription(self, self._on_command)
 
     def set_goal(self, goal: PoseGoal) -> None:
         """Give the controller something to track."""
@@ -157,7 +163,7 @@ def drive(executor, probe: Probe, model, cycles: int) -> list[float]:
 
 
 def main() -> None:
-    """Run the benchmark and print both medians and their ratio."""
+    """Run the benchmark and print medians, 99th percentiles and ratios."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--robot", default="baxter_left_arm")
     parser.add_argument("--cycles", type=int, default=8000, help="of each chain")
@@ -178,18 +184,17 @@ def main() -> None:
         robot.reset(values["start_positions"], np.zeros(len(joints)))
         return robot
 
-    real = {"namespace": "real", "parameter_overrides": overridden(values)}
-    relay = {"namespace": "relay"}
-    nodes = [
-        BoundsNode(**real),
-        ControllerNode(**real),
-        RelayLimits(joints, **relay),
-        RelayCommand(joints, **relay),
-    ]
-    probes = {
-        "real": Probe(joints, make_robot(), namespace="real"),
-        "relay": Probe(joints, make_robot(), namespace="relay"),
-    }
+    nodes: list[Node] = []
+    probes: dict[str, Probe] = {}
+    for way in WAYS:
+        real, relay = ({"namespace": f"{kind}_{way.replace(' ', '_')}"} for kind in KINDS)
+        for chain in (real, relay):
+            chain["direct_delivery"] = DirectDelivery() if way == "one process" else None
+        given = real | {"parameter_overrides": overridden(values)}
+        nodes += [BoundsNode(**given), ControllerNode(**given)]
+        nodes += [RelayLimits(joints, **relay), RelayCommand(joints, **relay)]
+        probes[f"real, {way}"] = Probe(joints, make_robot(), **real)
+        probes[f"relay, {way}"] = Probe(joints, make_robot(), **relay)
     if options.imperfect:
         for kind in (EstimatorNode, BoundsNode, ControllerNode):
             own = overridden(remedies(options.robot, kind.NAME))
@@ -207,17 +212,19 @@ def main() -> None:
     blocks = options.cycles // options.block
     for block in range(blocks):
         for name, probe in probes.items():
-            if name != "relay":
+            if not name.startswith("relay"):
                 probe.set_goal(goals[block * len(goals) // blocks])
             times[name] += drive(executor, probe, model, options.block)
-    medians = {name: np.nanmedian(samples) * 1e6 for name, samples in times.items()}
-    for name, samples in times.items():
-        slow = np.nanpercentile(samples, 99) * 1e6
-        lost = int(np.isnan(samples).sum())
-        print(f"{name:>8}: median {medians[name]:7.1f} us, 99% {slow:7.1f} us, lost {lost}")
-    print(f"ratio real / relay: {medians['real'] / medians['relay']:.2f}")
+    found = {name: 1e6 * np.nanpercentile(each, (50, 99)) for name, each in times.items()}
+    for name, (median, slow) in found.items():
+        lost = int(np.isnan(times[name]).sum())
+        print(f"{name:>18}: median {median:7.1f} us, 99% {slow:7.1f} us, lost {lost}")
+    for real, relay in (("one process", "middleware"), *zip(WAYS, WAYS, strict=True)):
+        median, slow = found[f"real, {real}"] / found[f"relay, {relay}"]
+        print(f"real, {real} / relay, {relay}: {median:.2f}, 99% {slow:.2f}")
     if options.imperfect:
-        print(f"ratio remedies / real: {medians['remedies'] / medians['real']:.2f}")
+        ratio = found["remedies"][0] / found["real, middleware"][0]
+        print(f"remedies / real, middleware: {ratio:.2f}")
     for node in (*nodes, *probes.values()):
         node.destroy_node()
     rclpy.try_shutdown()

@@ -1,31 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Our bounds beside those of TSID, the implementation of [DelPrete2018] by its author.
 
-TSID's wheels need an older Pinocchio than ours, hence an environment of their own, `.venv-tsid`,
-which is made when it is missing. Data goes there and back in npz files.
+TSID's wheels need an older Pinocchio than ours, hence an environment of their own, `.venv-tsid`.
 """
 
 from __future__ import annotations
 
-import os
 import statistics
-import subprocess
-import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
+from other_environment import TSID, worker
 
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.viability import BoundsSolver, discrete_time_condition
-
-ROOT = Path(__file__).resolve().parents[1]
-ENVIRONMENT = ROOT / ".venv-tsid"
-REQUIREMENTS = ("tsid==1.7.1", "pin==3.4.*", "cmeel-urdfdom==4.*", "cmeel-tinyxml2==10.*")
-"""What works together: the wheels do not say which URDF and XML libraries they were built for."""
 
 JOINTS = 7
 STATES = 20_000
@@ -55,7 +43,7 @@ def main() -> None:
         given[f"states:{name}"] = _states(limits, dt, count, rng)
         if name in FAILING:
             given[f"starts:{name}"] = np.linspace(*limits[:2], JOINTS)
-    with _worker(given) as (found, ask):
+    with worker(TSID, "tsid_worker.py", given) as (found, ask):
         for name, case in HOLDING.items():
             _compare_where_it_holds(name, case, given[f"states:{name}"], found[f"states:{name}"])
         for name, case in FAILING.items():
@@ -154,53 +142,3 @@ def _compare_times(states: np.ndarray, ask) -> None:
         f"ours {mine:.2f} us with arrays, {mine / bare:.1f}, {mine / result:.1f} and "
         f"{mine / read:.1f} times as long, {computing:.2f} us of it computing (as in a batch)"
     )
-
-
-Arrays = dict[str, np.ndarray]
-Ask = Callable[[], tuple[float, ...]]
-
-
-@contextmanager
-def _worker(given: Arrays) -> Iterator[tuple[Arrays, Ask]]:
-    """Run TSID on `given`; yield what it found, and a function that lets it time a block."""
-    python = _environment()
-    with tempfile.TemporaryDirectory() as directory:
-        source, target = (str(Path(directory) / name) for name in ("in.npz", "out.npz"))
-        np.savez(source, **given)
-        # Not our packages, nor a Pinocchio that ROS may have brought.
-        clean = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "LD_LIBRARY_PATH")}
-        process = subprocess.Popen(
-            [python, str(ROOT / "benchmarks" / "tsid_worker.py"), source, target],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env=clean,
-        )
-
-        def ask() -> tuple[float, ...]:
-            process.stdin.write("\n")
-            process.stdin.flush()
-            return tuple(float(word) for word in process.stdout.readline().split())
-
-        try:
-            if process.stdout.readline() != "ready\n":
-                sys.exit(f"tsid_worker.py failed; remove {ENVIRONMENT} to have it made again")
-            with np.load(target) as found:
-                yield dict(found), ask
-        finally:
-            process.stdin.close()
-            process.wait()
-
-
-def _environment() -> str:
-    """Return the interpreter that has TSID, after installing it if need be."""
-    python, stamp = ENVIRONMENT / "bin" / "python", ENVIRONMENT / ".installed"
-    wanted = "\n".join((*REQUIREMENTS, sys.version))
-    if not stamp.exists() or stamp.read_text() != wanted:
-        print(f"installing TSID into {ENVIRONMENT.name}", file=sys.stderr)
-        subprocess.run([sys.executable, "-m", "venv", "--clear", str(ENVIRONMENT)], check=True)
-        pip = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
-        if subprocess.run([*pip, *REQUIREMENTS], check=False).returncode != 0:
-            sys.exit("TSID cannot be installed here: there are wheels for x86-64 Linux only")
-        stamp.write_text(wanted)
-    return str(python)

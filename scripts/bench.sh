@@ -12,6 +12,10 @@ Ratios compare programs that run in turns in one process. NAME --help lists opti
               also with estimator, prediction and margins
   realtime    all nodes by the wall clock: one process, separate ones, and what the machine itself
               can do; with --stages, where the time of a period goes
+  scaling     how bounds, step and chain grow with joints; the QP with tasks, contacts and rows
+  peers       the step beside TSID's, the QPs by solvers of qpsolvers; both are installed into
+              .venv-tsid and .venv-qpsolvers
+  recorder    what a recorder costs the control, and one that stands still; speed in lockstep
   step        one controller step, part by part
   bounds      acceleration bounds: one arm, and batches; with --tsid also TSID's, which is
               installed into .venv-tsid

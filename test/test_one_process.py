@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Robot, estimator, bounds and controller in one process."""
 
+import json
 import os
 import signal
 import subprocess
@@ -119,6 +120,63 @@ def test_each_node_keeps_name_parameters_and_topics(ros):
             each.node_name for each in ros.probe.get_subscriptions_info_by_topic("/left/torques")
         }
         assert readers == {"bullet_node", "estimator_node", "probe"}
+
+
+def played(ros, directory, *, stopped):
+    """Play the demo in lockstep; return its metrics and its recording.
+
+    Args:
+        directory: for the results.
+        stopped: whether the recorder stands still from the first motion to the end.
+    """
+    lockstep = ["-p", "clock:=lockstep", "-p", "start_paused:=true"]
+    lockstep += ["-p", "bounds_timeout:=5.0", "-p", "state_timeout:=20.0"]
+    scenario = ROOT / "config" / "scenarios" / "panda_demo.yaml"
+    program = ROOT / "install" / "sim_bridge" / "lib" / "sim_bridge" / "scenario_node"
+    with running(ros, SIMULATED, *lockstep):
+        recorder = subprocess.Popen(
+            [program, "--out", directory, "--ros-args", "--log-level", "warn", "--params-file"]
+            + [ROOT / "config" / "panda.yaml", "-p", f"scenario:={scenario}", *lockstep],
+            env=os.environ | {"ROS_DOMAIN_ID": str(ros.domain)},
+            stdout=subprocess.DEVNULL,
+        )
+        try:
+            if stopped:
+                states = ros.listen(JointState, "joint_states", CONTROL_QOS)
+                ros.wait_until(
+                    lambda: states and np.abs(states[-1].velocity).max() > 1e-3,
+                    "motion",
+                    timeout=DEADLINE,
+                )
+                recorder.send_signal(signal.SIGSTOP)
+                periods = round(500.0 * yaml.safe_load(scenario.read_text())["duration"])
+                ros.wait_until(
+                    lambda: int(ros.reported("bullet_node", "periods") or 0) >= periods,
+                    "the end of the scenario",
+                    timeout=DEADLINE,
+                )
+                recorder.send_signal(signal.SIGCONT)
+            assert recorder.wait(timeout=DEADLINE) == 0
+        finally:
+            recorder.kill()
+    metrics = json.loads((directory / "metrics.json").read_text())
+    with np.load(directory / "data.npz") as data:
+        return metrics, dict(data)
+
+
+def test_a_recorder_that_stands_still_changes_no_number(ros, tmp_path):
+    """The robot goes on without it; what it did record is what a whole recording has."""
+    metrics, part = played(ros, tmp_path / "part", stopped=True)
+    whole, run = played(ros, tmp_path / "whole", stopped=False)
+    assert len(part["t"]) < whole["steps"], "it did miss a part"
+    for joint, extremes in whole["joints"].items():  # the robot's own, of all physics steps
+        for name in ("lower_clearance_rad", "upper_clearance_rad", "max_torque_ratio"):
+            assert metrics["joints"][joint][name] == extremes[name], (joint, name)
+    assert metrics["deadline_misses"] == metrics["braked_periods"] == 0
+    _, of_part, of_run = np.intersect1d(part["t"], run["t"], return_indices=True)
+    for name in ("q", "v"):
+        assert len(of_part) > 0
+        np.testing.assert_array_equal(part[name][of_part], run[name][of_run], name)
 
 
 def test_a_robot_elsewhere_is_answered(ros):

@@ -108,7 +108,6 @@ class BulletNode(ArmNode):
             self, self._robot, config.external_wrench_timeout, self._refused
         )
         self._ft_wrench = WrenchStamped()
-        self._ft_wrench.header.frame_id = config.sensor.ft_frame
         self._ft_publisher = FT_WRENCH.publisher(self) if self._robot.sensor else None
         imperfect = config.imperfections
         senses = imperfect.of_sensing or imperfect.of_motors
@@ -179,7 +178,7 @@ class BulletNode(ArmNode):
         self._stamp += self._dt_ns
         self._advanced = False
         q, v, tau = self._reading or self._robot.state()
-        # A new message: nodes of this process may keep the last one.
+        # New messages: nodes of this process may keep the last ones, and others get theirs later.
         state = self._state = JointState(
             name=self._names,
             position=array("d", q.tobytes()) + self._locked_at,
@@ -190,11 +189,13 @@ class BulletNode(ArmNode):
         if self._clock_publisher is not None:
             self._clock_publisher.publish(ClockMessage(clock=state.header.stamp))
         if self._ft_publisher and self._sensor:  # first: subscribers use it with the state
-            set_stamp(self._ft_wrench.header.stamp, self._stamp)
-            force, torque = self._ft_wrench.wrench.force, self._ft_wrench.wrench.torque
+            measured = self._ft_wrench = WrenchStamped()
+            measured.header.frame_id = self._config.sensor.ft_frame
+            set_stamp(measured.header.stamp, self._stamp)
+            force, torque = measured.wrench.force, measured.wrench.torque
             wrench = self._sensor.read().tolist()
             force.x, force.y, force.z, torque.x, torque.y, torque.z = wrench
-            self._ft_publisher.publish(self._ft_wrench)
+            self._ft_publisher.publish(measured)
         self._published_at = time.monotonic()
         self._state_publisher.publish(state)
 

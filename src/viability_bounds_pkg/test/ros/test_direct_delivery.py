@@ -3,6 +3,7 @@
 
 import pytest
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 
 from viability_bounds_pkg.ros.direct_delivery import DirectDelivery
@@ -58,6 +59,28 @@ def test_all_get_the_same_object_once_and_others_get_it_too(ros):
     ros.run_for(0.2)
     assert [len(heard) for heard in process.heard.values()] == [1, 1]
     assert outside.stamps == [1]
+
+
+def test_who_looks_on_gets_a_copy_when_the_command_has_come(ros, monkeypatch):
+    """However long it takes to publish it; to a robot elsewhere the command goes first."""
+    process = Process(ros)
+    course = []
+    JOINT_STATES.subscription(process.node("controller"), process.answers.publish)
+    JOINT_COMMANDS.subscription(process.node("stepping"), lambda _: course.append("command taken"))
+    outside = [ros.listen(JointState, "joint_states"), ros.listen(JointState, "joint_commands")]
+    ros.wait_until(lambda: process.states.get_subscription_count() == 4)
+    ros.wait_until(lambda: process.answers.get_subscription_count() == 3)
+    publish = Publisher.publish
+
+    def noted(publisher, message):
+        course.append(f"copy of {publisher.topic.strip('/')}")
+        publish(publisher, message)
+
+    monkeypatch.setattr(Publisher, "publish", noted)
+    process.states.publish(state(1))
+    ros.wait_until(lambda: all(outside))
+    assert course == ["command taken", "copy of joint_commands", "copy of joint_states"]
+    assert [heard.stamps for heard in outside] == [[1], [1]]
 
 
 def test_a_chain_is_done_in_one_turn_and_timers_get_theirs(ros):

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -10,39 +12,51 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from rclpy.serialization import serialize_message
 from rclpy.subscription import Subscription
 
 Receive = Callable[[Any], None]
+
+_COPIES_PERIOD = 0.005
+"""For how long copies are kept while turn follows turn, s; readers' buffers hold more."""
 
 
 class DirectDelivery:
     """Gives messages of the control streams to the other nodes of a process, as the same objects.
 
-    Each message is published as ever, where anybody outside of the process subscribes. Where the
-    process has the only publisher of a topic, its own subscriptions get the message from the
-    executor's next turn, and leave unread what comes by the middleware. While a topic has a
+    Where the process has the only publisher of a topic, its own subscriptions get the message from
+    the executor's next turn, and leave unread what comes by the middleware. While a topic has a
     publisher elsewhere, all of its messages come by the middleware; then one subscription reads
     them for all nodes of the process.
+
+    Each message is published as ever, where anybody outside of the process subscribes, but when
+    the turn has ended, the newest first: who records or looks on does not delay the command, and
+    to a robot elsewhere the command goes before copies of what led to it. While turn follows turn,
+    as in lockstep, copies leave every few milliseconds: to wake another process takes far longer
+    than to copy a message.
 
     One turn delivers what was sent meanwhile, too, in the order in which it was sent: from the
     state over the limits to the command. It ends where a topic comes a second time, so that in
     lockstep services, timers and goals are not kept waiting.
 
     As with the middleware, a message that was not delivered yet gives way to a newer one.
-    Publishers may use a message again in the next control period, unless a subscriber keeps it.
+    Publishers may use a message again in the next turn, unless a subscriber keeps it.
     """
 
     def __init__(self) -> None:
         self._streams: dict[str, _Stream] = {}
-        self._sent: dict[_Stream, Any] = {}  # the newest of each, in their order
+        # The newest of each, in their order.
+        self._sent: dict[_Stream, tuple[_DirectPublisher, Any]] = {}
         self._turn_due = False
+        self._copies: list[tuple[_DirectPublisher, bytes]] = []
+        self._published_at = -math.inf
 
     def publisher(self, node: Node, message: type, name: str, qos: QoSProfile) -> Publisher:
         """Return a publisher whose messages the nodes of this process get directly."""
         publisher = node.create_publisher(message, name, qos, publisher_class=_DirectPublisher)
         stream = self._stream(node, name)
         direct = cast(_DirectPublisher, publisher)
-        direct.stream, direct.deliver = stream, lambda sent: self._send(node, stream, sent)
+        direct.stream, direct.deliver = stream, lambda sent: self._send(node, direct, sent)
         stream.publishers += 1
         stream.settle()
         return publisher
@@ -66,27 +80,48 @@ class DirectDelivery:
         """Give a node back its subscriptions, so that they are destroyed with it."""
         for stream in self._streams.values():
             stream.give_back(node)
+        gone = set(node.publishers)
+        self._sent = {key: sent for key, sent in self._sent.items() if sent[0] not in gone}
+        self._copies = [copy for copy in self._copies if copy[0] not in gone]
 
     def _stream(self, node: Node, name: str) -> _Stream:
         return self._streams.setdefault(node.resolve_topic_name(name), _Stream())
 
-    def _send(self, node: Node, stream: _Stream, message: Any) -> None:
+    def _send(self, node: Node, publisher: _DirectPublisher, message: Any) -> bool:
+        """Have a message delivered in the next turn; return whether there will be one."""
+        stream = publisher.stream
         if not stream.subscriptions or node.executor is None:
-            return  # nobody is there yet
-        self._sent.pop(stream, None)
-        self._sent[stream] = message
+            return False  # nobody is there yet
+        if earlier := self._sent.pop(stream, None):
+            self._copy(*earlier)
+        self._sent[stream] = publisher, message
         if not self._turn_due:
             self._turn_due = True
             node.executor.create_task(self._deliver, node)
+        return True
 
     def _deliver(self, node: Node) -> None:
-        delivered: set[_Stream] = set()
+        delivered: dict[_Stream, tuple[_DirectPublisher, Any]] = {}
         while self._sent and (stream := next(iter(self._sent))) not in delivered:
-            delivered.add(stream)
-            stream.receive(self._sent.pop(stream))
+            delivered[stream] = self._sent.pop(stream)
+            stream.receive(delivered[stream][1])
+        for sent in reversed(delivered.values()):
+            self._copy(*sent)
         self._turn_due = bool(self._sent) and node.executor is not None
         if self._turn_due:
             node.executor.create_task(self._deliver, node)
+        now = time.monotonic()
+        if not self._turn_due or now - self._published_at > _COPIES_PERIOD:
+            self._published_at = now
+            for publisher, copy in self._copies:
+                Publisher.publish(publisher, copy)
+            self._copies.clear()
+
+    def _copy(self, publisher: _DirectPublisher, message: Any) -> None:
+        """Keep a copy for those outside, if there are any, as it is now."""
+        # To make a copy that nobody reads takes longer than to deliver the message.
+        if publisher.has_others:
+            self._copies.append((publisher, serialize_message(message)))
 
 
 class _DirectPublisher(Publisher):
@@ -94,21 +129,21 @@ class _DirectPublisher(Publisher):
 
     Attributes:
         stream: its topic.
-        deliver: gives a message to the nodes of the process.
+        deliver: gives a message to the nodes of the process; returns whether they will get it.
     """
 
     stream: _Stream
-    deliver: Receive
+    deliver: Callable[[Any], bool]
 
     def publish(self, msg: Any) -> None:
         """Send a message."""
-        if not self.stream.direct:
+        if not (self.stream.direct and self.deliver(msg)):
             super().publish(msg)
-            return
-        # To make a message for the middleware that nobody reads takes longer than to deliver it.
-        if self.get_subscription_count() > len(self.stream.subscriptions):
-            super().publish(msg)
-        self.deliver(msg)
+
+    @property
+    def has_others(self) -> bool:
+        """Whether anybody outside of the process subscribes."""
+        return self.get_subscription_count() > len(self.stream.subscriptions)
 
 
 class _Stream:
