@@ -120,7 +120,8 @@ class EmptyIntervalError(LimitEstimateError):
             f"joint {self.joint}: its torque of {self.torque_max:.4g} N m leaves no acceleration "
             f"interval: {side} = {getattr(self, side):.3g} rad/s^2 at "
             f"q = {_text(self.q)}, v = {_text(self.v)}; {remedy}the joint's acceleration limits "
-            f"(--override {self.joint}=MIN,MAX)"
+            f"(--override {self.joint}=MIN,MAX), or take those of most states, with the "
+            "controller's safety_filter (--share)"
         )
 
 
@@ -269,8 +270,30 @@ def unavailable_share(
         Shares in [0, 1], shape (n,): zero in all but rare states for limits that were found,
         large for an override that gravity alone forbids.
     """
-    q, v = space.states(np.random.default_rng(0).random((20_000, 2 * space.n)))
-    room = acceleration_room(model, model.createData(), space, q, v)
     wanted = np.stack([limits.a_max, -limits.a_min])
-    share: Array = np.mean(np.any(room < wanted, axis=1), axis=0)
+    share: Array = np.mean(np.any(_random_room(model, space) < wanted, axis=1), axis=0)
     return share
+
+
+def limits_in_share(model: pin.Model, space: StateSpace, share: float) -> Array:
+    """Return accelerations that torque allows, either way, in a share of random states.
+
+    For joints that have no interval in all states: the safety filter needs no more than that.
+
+    Args:
+        model: the robot.
+        space: the box of states, with the torque available.
+        share: of the states, in (0, 1).
+
+    Returns:
+        Limits of each joint, shape (n,), rad/s^2; not positive where there are none.
+    """
+    either = _random_room(model, space).min(axis=1)
+    limits: Array = np.quantile(either, 1.0 - share, axis=0, method="lower")
+    return limits
+
+
+def _random_room(model: pin.Model, space: StateSpace) -> Array:
+    """Return how far accelerations can go up and down in random states, shape (k, 2, n)."""
+    q, v = space.states(np.random.default_rng(0).random((20_000, 2 * space.n)))
+    return acceleration_room(model, model.createData(), space, q, v)

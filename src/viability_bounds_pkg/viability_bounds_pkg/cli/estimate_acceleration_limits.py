@@ -23,6 +23,7 @@ from viability_bounds_pkg.acceleration_limits import (
     available_torque,
     check_adjustments,
     limits_from_worst_cases,
+    limits_in_share,
     unavailable_share,
 )
 from viability_bounds_pkg.cli.command_line import INTERRUPTED, Parser, number, positive, run_tool
@@ -108,6 +109,14 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         help="limits of a joint to use instead of what is found, rad/s^2; repeatable",
     )
     add(
+        "--share",
+        type=_fraction,
+        default=0.0,
+        metavar="FRACTION",
+        help="for joints with no limits in all states, those that torque allows in this share of "
+        "random states; only with the controller's safety_filter",
+    )
+    add(
         "--cap",
         type=_cap,
         action="append",
@@ -158,6 +167,16 @@ def _search(
     return worst, False
 
 
+def _in_share(
+    robot: Robot, space: StateSpace, worst: WorstCases, share: float
+) -> dict[str, tuple[float, float]]:
+    """Return limits of the joints that have none in all states, by name, rad/s^2."""
+    usual = limits_in_share(robot.model, space, share).tolist()
+    found = (worst.a_min < 0.0) & (worst.a_max > 0.0)
+    joints = zip(list(robot.model.names)[1:], found.tolist(), usual, strict=True)
+    return {name: (-each, each) for name, any_state, each in joints if not any_state and each > 0}
+
+
 def _margin(
     robot: Robot, space: StateSpace, limits: AccelerationLimits, options: argparse.Namespace
 ) -> tuple[ZeroOrderHoldError | None, bool]:
@@ -199,6 +218,8 @@ def _run(options: argparse.Namespace) -> int:
     if worst is None:
         raise KeyboardInterrupt
     report_search(names, worst)
+    if options.share > 0.0:
+        overrides = _in_share(robot, space, worst, options.share) | overrides
     if interrupted:
         print(
             f"interrupted after {worst.evaluations} of {options.samples} evaluations: the limits "
