@@ -109,3 +109,62 @@ def test_the_chain_of_nodes_goes_on_when_commands_return(ros, robot):
         ros.wait_until(lambda: arm._command is not None, "commands")
     reach_for(np.array(values["start_positions"]), round(0.3 * values["rate_hz"]))
     assert not arm._monitor.violated
+
+
+def test_commands_held_in_rows_of_missed_periods_pass_no_limit(ros):
+    """Rows longer than the bounds are declared to cover."""
+    values = read_config("panda", "bullet_node")
+    rows = {"missed_probability": 0.6, "missed_in_row": 5, "command_timeout": 5}
+    arm = ros.start(BulletNode, values | rows | {"clock": "lockstep"})
+    ros.start(BoundsNode, read_config("panda", "bounds_node"))
+    ros.start(ControllerNode, read_config("panda", "controller_node") | HASTE)
+    postures = goals(values, np.random.default_rng(4))
+    user = ros.talk(JointState, "target_posture", GOAL_QOS)
+    for _ in range(6):
+        user.publish(joint_state(values["joints"], 0, next(postures)))
+        end = arm._periods + 400
+        ros.wait_until(lambda end=end: arm._periods >= end, "control periods", timeout=60.0)
+    assert arm._path.missed > 500
+    assert (arm._monitor.max_speed > 0.9 * arm._config.velocity_max).any()
+    assert not arm._monitor.violated
+
+
+@pytest.mark.parametrize("robot", ["panda", "talos_left_arm"])
+def test_commands_that_return_after_outages_make_no_jolt(ros, robot):
+    """Outages of up to 100 periods begin with 1 % of the commands; goals are at the limits."""
+    values = read_config(robot, "bullet_node")
+    outages = {"outage_probability": 0.01, "outage_longest": 100, "imperfection_seed": 3}
+    arm = ros.start(BulletNode, values | outages | {"clock": "lockstep"})
+    ros.start(BoundsNode, read_config(robot, "bounds_node"))
+    ros.start(ControllerNode, read_config(robot, "controller_node") | HASTE)
+    tau_max, stop = np.array(values["torque_max"]), arm._stop
+    sent, given, last = [], [], np.zeros(len(tau_max))
+    follow, update = stop.follow, arm._monitor.update
+    first = False
+
+    def watched_follow(q, v, command, motor_torque):
+        nonlocal first
+        first = stop._resting
+        if first:
+            sent.append(np.abs((command - last) / tau_max).max())
+        return follow(q, v, command, motor_torque)
+
+    def watched_update(q, v, tau):
+        nonlocal first
+        if first:
+            given.append(np.abs((tau - last) / tau_max).max())
+        first = False
+        last[:] = tau
+        update(q, v, tau)
+
+    stop.follow, arm._monitor.update = watched_follow, watched_update
+    postures = goals(values, np.random.default_rng(2))
+    user = ros.talk(JointState, "target_posture", GOAL_QOS)
+    for _ in range(10):
+        user.publish(joint_state(values["joints"], 0, next(postures)))
+        end = arm._periods + 300
+        ros.wait_until(lambda end=end: arm._periods >= end, "control periods", timeout=60.0)
+    assert len(given) > 10
+    assert max(sent) > 0.3, "there was no jolt to avoid"
+    assert max(given) < 0.1
+    assert not arm._monitor.violated
