@@ -16,6 +16,7 @@ from sim_bridge.nodes.bullet_parameters import make_robot, make_stop
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.ros.runtime import GOAL_QOS
+from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import joint_state, read_config
 
 HASTE = {"posture_kp": 100.0, "posture_kd": -1.0, "posture_weight": 10.0, "pose_weight": 0.0}
@@ -168,3 +169,21 @@ def test_commands_that_return_after_outages_make_no_jolt(ros, robot):
     assert max(sent) > 0.3, "there was no jolt to avoid"
     assert max(given) < 0.1
     assert not arm._monitor.violated
+
+
+@pytest.mark.parametrize("robot", ["panda", "talos_left_arm", "baxter_left_arm"])
+def test_no_limit_is_passed_in_hold_without_acceleration_limits(robot):
+    rng = np.random.default_rng(5)
+    loop = DirectLoop(robot, HASTE)
+    postures = goals(read_config(robot), rng)
+    fastest = 0.0
+    with closing(loop.robot) as arm:
+        for _ in range(8):
+            loop.controller.set_posture_goal(next(postures))
+            loop.run(rng.uniform(0.2, 0.6))
+            fastest = max(fastest, float((np.abs(arm.state().v) / loop.config.velocity_max).max()))
+            for _ in range(round(0.6 / loop.dt)):
+                q, v, _ = arm.state()
+                arm.step(loop.controller.hold(State(q, v)).tau, loop.config.substeps)
+            assert not arm.monitor.violated
+    assert fastest > 0.5, "the arm was hardly driven"
