@@ -187,3 +187,34 @@ def test_no_limit_is_passed_in_hold_without_acceleration_limits(robot):
                 arm.step(loop.controller.hold(State(q, v)).tau, loop.config.substeps)
             assert not arm.monitor.violated
     assert fastest > 0.5, "the arm was hardly driven"
+
+
+def test_the_arm_is_slowed_after_a_row_of_states_that_is_too_long_and_goes_on(ros, capfd):
+    values = read_config("panda", "bullet_node")
+    arm = ros.start(BulletNode, values | {"clock": "lockstep"})
+    ros.start(BoundsNode, read_config("panda", "bounds_node"))
+    controller = ros.start(ControllerNode, read_config("panda", "controller_node") | HASTE)
+    goal = np.array(values["start_positions"]) + 0.5
+    user = ros.talk(JointState, "target_posture", GOAL_QOS)
+    ros.wait_until(lambda: arm._command is not None, "commands")
+    user.publish(joint_state(values["joints"], 0, goal))
+
+    def play(seconds):
+        end = arm._periods + round(seconds * values["rate_hz"])
+        ros.wait_until(lambda: arm._periods >= end, "control periods", timeout=60.0)
+
+    play(0.1)
+    assert controller._rate.share == 1.0
+    for _ in range(4):  # states that the controller does not see
+        arm._advance()
+        arm._next_state()
+    ros.wait_until(lambda: controller._rate.too_long, "a row that is too long")
+    assert "the bounds cover 1: the arm is slowed" in capfd.readouterr().err
+    play(0.2)
+    assert 0.0 < controller._rate.share < 1.0
+    assert "slowed to" in controller._report()[1]
+    play(3.0)
+    assert controller._rate.share == 1.0
+    assert "the arm goes on" in capfd.readouterr().err
+    assert np.abs(arm.true_positions - goal).max() < 0.02
+    assert not arm._monitor.violated

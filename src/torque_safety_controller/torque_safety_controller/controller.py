@@ -91,6 +91,7 @@ class Controller:
         goals: of the end effector and the joints.
         additional, constraints, interaction, safety_filter, detour: as given.
         iterations: of the last QP.
+        share: of the accelerations that the tasks want; the rest brings the arm to rest.
     """
 
     def __init__(
@@ -117,6 +118,7 @@ class Controller:
         self.safety_filter = safety_filter
         self.detour = detour
         self.iterations = 0
+        self.share = 1.0
         self._own_bounds = own_bounds
         self._limiter = TorqueLimiter(tau_max, torque_rate_max, robot.dt)
         self._qp = InverseDynamicsQP(n, solver=solver)
@@ -259,7 +261,7 @@ class Controller:
     def hold(self, state: State, elapsed: float | None = None) -> ControlOutput:
         """Return a torque that needs to be given no acceleration bounds: gravity and damping.
 
-        Each joint brakes with `hold_kd`, within its own bounds, or else as hard as its motor allows.
+        Joints brake with `hold_kd`, within bounds of its own, or else as hard as motors allow.
         """
         if self._own_bounds is not None:
             lower, upper, _ = self._own_bounds.bounds(state.q, state.v)
@@ -319,6 +321,9 @@ class Controller:
             bounds = AccelerationRange(*self._observer.shift(*bounds))
         parts = [each.constraint(robot, bounds, disturbance) for each in self.constraints]
         terms = [task.term(robot) for task in tasks]
+        if self.share < 1.0:
+            rest = -self.gains.hold_kd * robot.v
+            terms = [each.mixed(rest, self.share) for each in terms]
 
         def solve(bounds: AccelerationRange, rows: LinearConstraints | None) -> Solution:
             constraints = stack_constraints([*parts, rows])
