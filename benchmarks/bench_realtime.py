@@ -21,7 +21,17 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
-from live_robot import ONE_PROCESS, PROCESSES, Programs, User, configuration, goals, load, running
+from live_robot import (
+    ONE_PROCESS,
+    PROCESSES,
+    Programs,
+    User,
+    configuration,
+    goals,
+    load,
+    running,
+    scheduling_words,
+)
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.task import Future
@@ -296,11 +306,7 @@ def main() -> None:
     parser.add_argument("--stages", action="store_true", help="where the time of a period goes")
     add_scheduling(parser)
     options = parser.parse_args()
-    scheduling = ["--lock-memory"] * options.lock_memory
-    if options.priority is not None:
-        scheduling += ["--priority", str(options.priority)]
-    if options.cpus:
-        scheduling += ["--cpus", ",".join(map(str, options.cpus))]
+    scheduling = scheduling_words(options)
     for robot, rate in CASES:
         if options.case and f"{robot}@{rate:g}" not in options.case:
             continue

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import subprocess
 from collections.abc import Iterator, Sequence
@@ -94,6 +95,16 @@ class User:
         self.ros.diagnostics.pop(node, None)
         self.ros.wait_until(lambda: node in self.ros.diagnostics, node)
         return self.ros.diagnostics[node]
+
+
+def scheduling_words(options: argparse.Namespace) -> list[str]:
+    """Return the options of `add_scheduling` as words for the programs."""
+    words = ["--lock-memory"] * options.lock_memory
+    if options.priority is not None:
+        words += ["--priority", str(options.priority)]
+    if options.cpus:
+        words += ["--cpus", ",".join(map(str, options.cpus))]
+    return words
 
 
 @contextmanager
