@@ -14,21 +14,27 @@ import argparse
 import itertools
 import math
 import os
-import subprocess
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from geometry_msgs.msg import PoseStamped
+from live_robot import (
+    ONE_PROCESS,
+    PROCESSES,
+    Programs,
+    User,
+    configuration,
+    goals,
+    load,
+    running,
+    scheduling_words,
+)
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.task import Future
-from std_srvs.srv import SetBool
 
 from sim_bridge.bullet.robot import BulletRobot
 from sim_bridge.nodes import bullet_node
@@ -39,6 +45,7 @@ from torque_safety_controller.node.limits import LimitsReader
 from torque_safety_controller.node.safety_stack import make_nodes
 from torque_safety_controller.qp.inverse_dynamics_qp import InverseDynamicsQP
 from torque_safety_controller.robot_model import RobotModel
+from viability_bounds_pkg.cli.scheduling import add_scheduling
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.node.estimator_node import EstimatorNode
 from viability_bounds_pkg.recent_values import RecentValues
@@ -48,142 +55,51 @@ from viability_bounds_pkg.ros.program import initialise, leave
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, make_executor
 from viability_bounds_pkg.state_estimation.estimator import StateEstimator
-from viability_bounds_pkg.testing.ros_harness import RosHarness
 from viability_bounds_pkg.whole_arm.safety_filter import SafetyFilter
 
-ROOT = Path(__file__).resolve().parent.parent
 CASES = (
     ("panda", 500.0),
     ("panda", 1000.0),
     ("talos_left_arm", 1000.0),
     ("baxter_left_arm", 100.0),
 )
-WAYS = {
-    "one process": (("sim_bridge", "simulated_stack"),),
-    "processes": (
-        ("viability_bounds_pkg", "bounds_node"),
-        ("torque_safety_controller", "controller_node"),
-        ("sim_bridge", "bullet_node"),
-    ),
-}
+WAYS = ONE_PROCESS, PROCESSES
 SETTLING = 1.0
 """How long a robot moves before it is measured, s."""
-START = 60.0
-"""How long programs may take to start, s."""
 
 
-def configuration(robot: str, rate: float, *, imperfect: bool) -> list[str]:
-    """Return the arguments that all programs of a robot get."""
-    files = [f"config/{robot}.yaml", *([f"config/imperfect/{robot}.yaml"] * imperfect)]
-    given = [word for each in files for word in ("--params-file", str(ROOT / each))]
-    return [*given, "-p", f"rate_hz:={rate}"]
-
-
-def goals(robot: str) -> list[PoseStamped]:
-    """Return the poses that a robot's demo goes to."""
-    scenario = yaml.safe_load((ROOT / "config" / "scenarios" / f"{robot}_demo.yaml").read_text())
-    found = []
-    for pose in (event["pose"] for event in scenario["events"] if "pose" in event):
-        message = PoseStamped()
-        p, o = message.pose.position, message.pose.orientation
-        p.x, p.y, p.z = pose["position"]
-        o.x, o.y, o.z, o.w = pose["orientation"]
-        found.append(message)
-    return found
-
-
-class User:
-    """What is outside of the programs: gives goals by turns, and reads diagnostics.
-
-    Args:
-        robot: name of the robot.
-    """
-
-    def __init__(self, robot: str) -> None:
-        self.ros = RosHarness(int(os.environ["ROS_DOMAIN_ID"]))
-        self._goals = goals(robot)
-        self._publisher = self.ros.probe.create_publisher(PoseStamped, "target_pose", GOAL_QOS)
-        self._turn = 0
-
-    def start(self, alive: Callable[[], bool]) -> None:
-        """Wait for the programs, and let robot time begin."""
-
-        def ready() -> bool:
-            if not alive():
-                raise SystemExit("error: a program could not start")
-            found = {"bullet_node", "bounds_node", "controller_node"} <= set(self.ros.diagnostics)
-            return found and self._publisher.get_subscription_count() > 0
-
-        self.ros.wait_until(ready, "the programs", timeout=START)
-        self.ros.call(SetBool, "bullet_node/pause", SetBool.Request(data=False))
-
-    def use(self, seconds: float) -> None:
-        """Give a goal each second."""
-        self.ros.run_for(seconds, self._next_goal, period=1.0)
-
-    def _next_goal(self) -> None:
-        self._publisher.publish(self._goals[self._turn % len(self._goals)])
-        self._turn += 1
-
-    def report(self) -> dict[str, Any]:
-        """Return the next diagnostics of the robot."""
-        self.ros.diagnostics.pop("bullet_node", None)
-        self.ros.wait_until(lambda: "bullet_node" in self.ros.diagnostics, "the robot")
-        return self.ros.diagnostics["bullet_node"]
-
-
-@contextmanager
-def running(
-    way: str, arguments: list[str], imperfect: bool
-) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """Run the programs of a way."""
-    programs = WAYS[way]
-    if way == "processes" and imperfect:
-        programs += (("viability_bounds_pkg", "estimator_node"),)
-    processes = [
-        subprocess.Popen(
-            [ROOT / "install" / package / "lib" / package / name, "--ros-args", *arguments]
-            + ["--log-level", "error", "-p", "start_paused:=true"]
-        )
-        for package, name in programs
-    ]
-    try:
-        yield processes
-    finally:
-        for process in processes:
-            process.terminate()
-        for process in processes:
-            process.wait()
-
-
-def cpu_seconds(processes: list[subprocess.Popen[bytes]]) -> float:
+def cpu_seconds(programs: Programs) -> float:
     """Return the time on processors of running programs, s."""
     ticks = 0
-    for process in processes:
+    for process in programs.values():
         fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
         ticks += int(fields[11]) + int(fields[12])
     return ticks / os.sysconf("SC_CLK_TCK")
 
 
-def memory(processes: list[subprocess.Popen[bytes]]) -> float:
+def memory(programs: Programs) -> float:
     """Return the memory of running programs, what they share counted once, MB."""
-    lines = (Path(f"/proc/{process.pid}/smaps_rollup").read_text() for process in processes)
+    lines = (
+        Path(f"/proc/{process.pid}/smaps_rollup").read_text() for process in programs.values()
+    )
     return sum(int(text.partition("\nPss:")[2].split()[0]) for text in lines) / 1024
 
 
-def measure(robot: str, rate: float, way: str, seconds: float, imperfect: bool) -> str:
+def measure(
+    robot: str, rate: float, way: str, seconds: float, imperfect: bool, scheduling: list[str]
+) -> str:
     """Run a robot by the wall clock for some seconds; return the row of what came of it."""
     arguments = configuration(robot, rate, imperfect=imperfect)
-    with running(way, arguments, imperfect) as processes:
-        user = User(robot)
+    with running(way, arguments, imperfect, scheduling) as programs:
+        user = User(goals(robot), "target_pose")
         try:
-            user.start(lambda: all(process.poll() is None for process in processes))
+            user.start(programs)
             user.use(SETTLING)
-            before, used, begin = user.report(), cpu_seconds(processes), time.monotonic()
+            before, used, begin = user.report(), cpu_seconds(programs), time.monotonic()
             user.use(seconds)
             after = user.report()
-            cpu = (cpu_seconds(processes) - used) / (time.monotonic() - begin)
-            megabytes = memory(processes)
+            cpu = (cpu_seconds(programs) - used) / (time.monotonic() - begin)
+            megabytes = memory(programs)
         finally:
             user.ros.close()
     periods, missed, stopped, late = (
@@ -380,11 +296,6 @@ def stages_of(
     return list(watch.periods)
 
 
-def load() -> str:
-    """Return how busy the machine is."""
-    return f"{os.cpu_count()} processors, load {' '.join(f'{x:.1f}' for x in os.getloadavg())}"
-
-
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -393,7 +304,9 @@ def main() -> None:
     parser.add_argument("--case", action="append", choices=robots, help="repeatable; default: all")
     parser.add_argument("--imperfect", action="store_true", help="robots with all remedies")
     parser.add_argument("--stages", action="store_true", help="where the time of a period goes")
+    add_scheduling(parser)
     options = parser.parse_args()
+    scheduling = scheduling_words(options)
     for robot, rate in CASES:
         if options.case and f"{robot}@{rate:g}" not in options.case:
             continue
@@ -404,7 +317,10 @@ def main() -> None:
         print(HEAD)
         print(bare_loop(rate, options.seconds))
         for way in WAYS:
-            print(measure(robot, rate, way, options.seconds, options.imperfect), flush=True)
+            print(
+                measure(robot, rate, way, options.seconds, options.imperfect, scheduling),
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

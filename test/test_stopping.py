@@ -15,6 +15,7 @@ from sim_bridge.nodes.bullet_parameters import make_robot, make_stop
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.ros.runtime import GOAL_QOS
+from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import joint_state, read_config
 
 HASTE = {"posture_kp": 100.0, "posture_kd": -1.0, "posture_weight": 10.0, "pose_weight": 0.0}
@@ -116,4 +117,112 @@ def test_the_chain_of_nodes_goes_on_when_commands_return(ros, robot):
         assert arm._stop.at_rest
         ros.wait_until(lambda: arm._command is not None, "commands")
     reach_for(np.array(values["start_positions"]), round(0.3 * values["rate_hz"]))
+    assert not arm._monitor.violated
+
+
+def test_commands_held_in_rows_of_missed_periods_pass_no_limit(ros):
+    """Rows longer than the bounds are declared to cover."""
+    values = read_config("panda", "bullet_node")
+    rows = {"missed_probability": 0.6, "missed_in_row": 5, "command_timeout": 5}
+    arm = ros.start(BulletNode, values | rows | {"clock": "lockstep"})
+    ros.start(BoundsNode, read_config("panda", "bounds_node"))
+    ros.start(ControllerNode, read_config("panda", "controller_node") | HASTE)
+    postures = goals(values, np.random.default_rng(4))
+    user = ros.talk(JointState, "target_posture", GOAL_QOS)
+    for _ in range(6):
+        user.publish(joint_state(values["joints"], 0, next(postures)))
+        end = arm._periods + 400
+        ros.wait_until(lambda end=end: arm._periods >= end, "control periods", timeout=60.0)
+    assert arm._path.missed > 500
+    assert (arm._monitor.max_speed > 0.9 * arm._config.velocity_max).any()
+    assert not arm._monitor.violated
+
+
+@pytest.mark.parametrize("robot", ["panda", "talos_left_arm"])
+def test_commands_that_return_after_outages_make_no_jolt(ros, robot):
+    """Outages of up to 100 periods begin with 1 % of the commands; goals are at the limits."""
+    values = read_config(robot, "bullet_node")
+    outages = {"outage_probability": 0.01, "outage_longest": 100, "imperfection_seed": 3}
+    arm = ros.start(BulletNode, values | outages | {"clock": "lockstep"})
+    ros.start(BoundsNode, read_config(robot, "bounds_node"))
+    ros.start(ControllerNode, read_config(robot, "controller_node") | HASTE)
+    tau_max, stop = np.array(values["torque_max"]), arm._stop
+    sent, given, last = [], [], np.zeros(len(tau_max))
+    follow, update = stop.follow, arm._monitor.update
+    first = False
+
+    def watched_follow(q, v, command, motor_torque):
+        nonlocal first
+        first = stop._resting
+        if first:
+            sent.append(np.abs((command - last) / tau_max).max())
+        return follow(q, v, command, motor_torque)
+
+    def watched_update(q, v, tau):
+        nonlocal first
+        if first:
+            given.append(np.abs((tau - last) / tau_max).max())
+        first = False
+        last[:] = tau
+        update(q, v, tau)
+
+    stop.follow, arm._monitor.update = watched_follow, watched_update
+    postures = goals(values, np.random.default_rng(2))
+    user = ros.talk(JointState, "target_posture", GOAL_QOS)
+    for _ in range(10):
+        user.publish(joint_state(values["joints"], 0, next(postures)))
+        end = arm._periods + 300
+        ros.wait_until(lambda end=end: arm._periods >= end, "control periods", timeout=60.0)
+    assert len(given) > 10
+    assert max(sent) > 0.3, "there was no jolt to avoid"
+    assert max(given) < 0.1
+    assert not arm._monitor.violated
+
+
+@pytest.mark.parametrize("robot", ["panda", "talos_left_arm", "baxter_left_arm"])
+def test_no_limit_is_passed_in_hold_without_acceleration_limits(robot):
+    rng = np.random.default_rng(5)
+    loop = DirectLoop(robot, HASTE)
+    postures = goals(read_config(robot), rng)
+    fastest = 0.0
+    with closing(loop.robot) as arm:
+        for _ in range(8):
+            loop.controller.set_posture_goal(next(postures))
+            loop.run(rng.uniform(0.2, 0.6))
+            fastest = max(fastest, float((np.abs(arm.state().v) / loop.config.velocity_max).max()))
+            for _ in range(round(0.6 / loop.dt)):
+                q, v, _ = arm.state()
+                arm.step(loop.controller.hold(State(q, v)).tau, loop.config.substeps)
+            assert not arm.monitor.violated
+    assert fastest > 0.5, "the arm was hardly driven"
+
+
+def test_the_arm_is_slowed_after_a_row_of_states_that_is_too_long_and_goes_on(ros, capfd):
+    values = read_config("panda", "bullet_node")
+    arm = ros.start(BulletNode, values | {"clock": "lockstep"})
+    ros.start(BoundsNode, read_config("panda", "bounds_node"))
+    controller = ros.start(ControllerNode, read_config("panda", "controller_node") | HASTE)
+    goal = np.array(values["start_positions"]) + 0.5
+    user = ros.talk(JointState, "target_posture", GOAL_QOS)
+    ros.wait_until(lambda: arm._command is not None, "commands")
+    user.publish(joint_state(values["joints"], 0, goal))
+
+    def play(seconds):
+        end = arm._periods + round(seconds * values["rate_hz"])
+        ros.wait_until(lambda: arm._periods >= end, "control periods", timeout=60.0)
+
+    play(0.1)
+    assert controller._rate.share == 1.0
+    for _ in range(4):  # states that the controller does not see
+        arm._advance()
+        arm._next_state()
+    ros.wait_until(lambda: controller._rate.too_long, "a row that is too long")
+    assert "the bounds cover 1: the arm is slowed" in capfd.readouterr().err
+    play(0.2)
+    assert 0.0 < controller._rate.share < 1.0
+    assert "slowed to" in controller._report()[1]
+    play(3.0)
+    assert controller._rate.share == 1.0
+    assert "the arm goes on" in capfd.readouterr().err
+    assert np.abs(arm.true_positions - goal).max() < 0.02
     assert not arm._monitor.violated

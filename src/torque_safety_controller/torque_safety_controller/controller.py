@@ -40,6 +40,7 @@ from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.goals import Goals
 from torque_safety_controller.tasks.task import Task
 from viability_bounds_pkg.state import State
+from viability_bounds_pkg.viability import BoundsSolver
 from viability_bounds_pkg.whole_arm.safety_filter import UNHURRIED, USUAL, SafetyFilter
 
 __all__ = ["ControlOutput", "Controller", "Gains"]
@@ -83,11 +84,14 @@ class Controller:
         interaction: forces at the hand and other contacts; None for nothing.
         safety_filter: keeps a plan in hand that keeps all limits; None for nothing.
         detour: leads the arm where it would stand short of its goal; None for nothing.
+        own_bounds: within which it brakes while it is given no acceleration bounds; None brakes
+            regardless of positions and speeds.
 
     Attributes:
         goals: of the end effector and the joints.
         additional, constraints, interaction, safety_filter, detour: as given.
         iterations: of the last QP.
+        share: of the accelerations that the tasks want; the rest brings the arm to rest.
     """
 
     def __init__(
@@ -102,6 +106,7 @@ class Controller:
         interaction: Interaction | None = None,
         safety_filter: SafetyFilter | None = None,
         detour: Detour | None = None,
+        own_bounds: BoundsSolver | None = None,
     ) -> None:
         n = robot.n
         self.robot = robot
@@ -113,6 +118,8 @@ class Controller:
         self.safety_filter = safety_filter
         self.detour = detour
         self.iterations = 0
+        self.share = 1.0
+        self._own_bounds = own_bounds
         self._limiter = TorqueLimiter(tau_max, torque_rate_max, robot.dt)
         self._qp = InverseDynamicsQP(n, solver=solver)
         self._observer = DisturbanceObserver(n, gains.disturbance_time)
@@ -252,10 +259,13 @@ class Controller:
         return output
 
     def hold(self, state: State, elapsed: float | None = None) -> ControlOutput:
-        """Return a torque that needs no acceleration bounds: gravity and damping.
+        """Return a torque that needs to be given no acceleration bounds: gravity and damping.
 
-        Each joint brakes with `hold_kd`, as hard as its motor allows.
+        Joints brake with `hold_kd`, within bounds of its own, or else as hard as motors allow.
         """
+        if self._own_bounds is not None:
+            lower, upper, _ = self._own_bounds.bounds(state.q, state.v)
+            return self.brake(state, AccelerationRange(lower, upper), elapsed)
         return self._hold(self._begin(state, elapsed), "")
 
     def _begin(self, state: State, elapsed: float | None) -> Array | None:
@@ -316,6 +326,9 @@ class Controller:
             bounds = AccelerationRange(*self._observer.shift(*bounds))
         parts = [each.constraint(robot, bounds, disturbance) for each in self.constraints]
         terms = [task.term(robot) for task in tasks]
+        if self.share < 1.0:
+            rest = -self.gains.hold_kd * robot.v
+            terms = [each.mixed(rest, self.share) for each in terms]
 
         def solve(bounds: AccelerationRange, rows: LinearConstraints | None) -> Solution:
             constraints = stack_constraints([*parts, rows])

@@ -105,7 +105,8 @@ class BulletRobot(BulletBody):
         self._asked = self._motor_torque if motors is None else np.zeros(n)
         self._brakes = np.zeros(n)
         self._drive: PositionDrive | None = None  # made when first needed: it builds a model
-        self._driving = self._stopping = False
+        self._driving = False
+        self._law: CoordinatedStop | None = None  # the one in charge
         self._stepped = False  # since the last reset
 
     def reset(self, q: ArrayLike, v: ArrayLike) -> None:
@@ -122,7 +123,8 @@ class BulletRobot(BulletBody):
         self._motor_torque.fill(0.0)
         if self._motors is not None:
             self._motors.reset()
-        self._driving = self._stopping = self._stepped = False
+        self._driving = self._stepped = False
+        self._law = None
 
     def step(self, tau: ArrayLike, substeps: int = 1) -> None:
         """Apply joint torques for some physics steps.
@@ -132,7 +134,7 @@ class BulletRobot(BulletBody):
             substeps: how many physics steps, at least 1.
         """
         tau = finite_vector("tau", tau, len(self.joints))
-        self._driving = self._stopping = False
+        self._driving, self._law = False, None
         self._release_brakes()
         self._asked[:] = tau
         self._advance(substeps)
@@ -160,7 +162,7 @@ class BulletRobot(BulletBody):
         q_des, v_des = finite_vector("q", q, n), finite_vector("v", v, n)
         v_max = finite_vector("speed_limits", speed_limits, n, signed=False)
         tau_max = finite_vector("torque_limits", torque_limits, n, signed=False)
-        self._stopping = False
+        self._law = None
         self._release_brakes()
         drive = self._drive = self._drive or PositionDrive(
             *self.description, self._rotor_inertia, self.physics_dt
@@ -186,7 +188,7 @@ class BulletRobot(BulletBody):
             torque_limits: greatest torque of each brake, shape (n,), N m, not negative.
         """
         limits = finite_vector("torque_limits", torque_limits, len(self.joints), signed=False)
-        self._driving = self._stopping = False
+        self._driving, self._law = False, None
         if self._motors is not None:
             self._motors.switch_off()
         self._brakes[:] = limits
@@ -198,20 +200,44 @@ class BulletRobot(BulletBody):
         """Let the drives bring the arm to rest within its limits, and hold it there.
 
         Args:
-            law: for the joints of this robot in their order, with its physics step; a stop begins
-                when the last call was of another method.
+            law: for the joints of this robot in their order, with its physics step; it begins
+                anew when the last call was neither of this method nor of `follow`.
             substeps: how many physics steps, at least 1.
         """
-        if not self._stopping:
+        self._by_law(law, law.torque, substeps)
+
+    def follow(self, law: CoordinatedStop, tau: ArrayLike, substeps: int = 1) -> None:
+        """Apply joint torques as far as the drives' own law lets them through.
+
+        Args:
+            law: as of `stop`.
+            tau: torques of the motors, shape (n,), N m.
+            substeps: how many physics steps, at least 1.
+        """
+        command = finite_vector("tau", tau, len(self.joints))
+        self._by_law(law, lambda q, v, now: law.follow(q, v, command, now), substeps)
+
+    @property
+    def returning(self) -> bool:
+        """Whether commands do not have all of their effect yet after a stop."""
+        return self._law is not None and not self._law.returned
+
+    def _by_law(
+        self,
+        law: CoordinatedStop,
+        torque: Callable[[Array, Array, Array | None], Array],
+        substeps: int,
+    ) -> None:
+        if self._law is not law:
             self._driving = False
             self._release_brakes()
             law.begin(*self.state()[:2])
-            self._stopping = True
+            self._law = law
         motors = self._motors
 
         def control() -> Array:
             q, v, _ = self.state()
-            return law.torque(q, v, None if motors is None else motors.believed)
+            return torque(q, v, None if motors is None else motors.believed)
 
         self._advance(substeps, control)
 

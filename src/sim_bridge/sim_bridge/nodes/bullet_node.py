@@ -66,8 +66,9 @@ class BulletNode(ArmNode):
 
     With ``clock: real_time`` each control period has its duration on the wall clock. A command
     that comes within the period of the state with its stamp acts during that period; without one
-    the last command is held, and after ``command_timeout`` periods the robot stops itself: within
-    its limits where acceleration limits are given, by its brakes where not. With ``clock:
+    the last command is held, and after ``command_timeout`` periods the robot stops itself. Where
+    acceleration limits are given, both keep all limits, and commands that return get their effect
+    back gradually; where not, the brakes stop it. With ``clock:
     lockstep`` a period ends when the command with its stamp has come, without a limit of time.
 
     The robot's brakes are on until the first command.
@@ -87,11 +88,11 @@ class BulletNode(ArmNode):
             warn_of_unusual(self, config, config.urdf)
             self._robot = make_robot(config)
             self._stop = make_stop(config)
-        if 0 < config.missed_deadlines < config.command_timeout:
+        if self._stop is None and 0 < config.missed_deadlines < config.command_timeout:
             self.get_logger().warning(
                 f"parameter 'command_timeout' is {config.command_timeout}, but the bounds cover "
                 f"{config.missed_deadlines} missed periods (missed_deadlines): limits may be "
-                "passed in a longer row, before the robot stops itself"
+                "passed in a longer row, as no acceleration_min is given to keep them by"
             )
         self._config = config
         self._monitor = LimitMonitor(
@@ -220,7 +221,7 @@ class BulletNode(ArmNode):
                 self._command = None
 
     def _advance(self) -> None:
-        """Simulate the current period under the command that arrived last, or the brakes."""
+        """Simulate the current period under the last command, or the robot's own law."""
         config = self._config
         self._world.apply_due(self._stamp)
         command = self._command
@@ -232,7 +233,10 @@ class BulletNode(ArmNode):
             else:
                 self._robot.brake(config.substeps, config.torque_max)
         elif isinstance(command, TorqueCommand):
-            self._robot.step(command.tau, config.substeps)
+            if self._stop is None or (self._missed_in_row == 0 and not self._robot.returning):
+                self._robot.step(command.tau, config.substeps)
+            else:
+                self._robot.follow(self._stop, command.tau, config.substeps)
         else:
             self._robot.move(*command, config.torque_max, config.velocity_max, config.substeps)
         if news := self._outage.count(command is None):

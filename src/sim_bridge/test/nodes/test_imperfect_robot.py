@@ -27,6 +27,8 @@ def per_joint(value):
     return [value] * N
 
 
+# Held commands act unchanged, whatever the limits.
+NO_LAW = {"acceleration_min": None, "acceleration_max": None}
 EVERYTHING = {
     "encoder_resolution": per_joint(1e-4),
     "position_noise": per_joint(1e-5),
@@ -115,7 +117,7 @@ def test_a_command_acts_so_many_periods_late(ros, delay):
 
 
 def test_a_missed_command_is_not_applied_and_the_last_one_is_held(ros):
-    robot = RobotProbe(ros, missed_probability=0.3, missed_in_row=3, imperfection_seed=8)
+    robot = RobotProbe(ros, missed_probability=0.3, missed_in_row=3, imperfection_seed=8, **NO_LAW)
     commands = list(torques(80))
     deadlines, acting = MissedDeadlines(0.3, 3, 8), []
     missed = [deadlines.next() for _ in commands]
@@ -148,7 +150,7 @@ def test_a_row_longer_than_the_time_out_leads_to_the_brakes_and_back(ros):
 
 def test_everything_at_once_is_what_its_parts_make_of_the_true_motion(ros):
     """Seeded; and again after a reset."""
-    robot = RobotProbe(ros, **EVERYTHING, imperfection_seed=3)
+    robot = RobotProbe(ros, **EVERYTHING, **NO_LAW, imperfection_seed=3)
     config = read(BulletConfiguration, VALUES | EVERYTHING | {"imperfection_seed": 3})
     commands = list(torques(80))
     played = play(robot, commands)

@@ -165,3 +165,18 @@ def test_the_rate_of_torque_is_limited_whatever_comes(arm):
     q, v = arm.random_state(rng)
     free = make(arm).hold(State(q, v)).tau
     np.testing.assert_allclose(controller.hold(State(q, v)).tau, free, atol=EXACT)
+
+
+def test_a_share_of_the_goals_mixes_their_accelerations_with_those_of_braking():
+    arm = load_arm("panda")
+    controller = make(arm)
+    controller.reset(arm.q_start)
+    controller.set_pose_goal(pose_at(arm, arm.q_start + 0.01))
+    state = State(arm.q_start, np.full(arm.n, 0.02))
+    found = {}
+    for controller.share in (0.0, 0.25, 1.0):
+        found[controller.share] = controller.step(state, wide(arm)).a
+    rest = -controller.gains.hold_kd * state.v
+    np.testing.assert_allclose(found[0.0], rest, atol=1e-3)
+    np.testing.assert_allclose(found[0.25], 0.25 * found[1.0] + 0.75 * rest, atol=1e-3)
+    assert np.abs(found[1.0] - rest).max() > 0.1

@@ -23,9 +23,12 @@ from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks.detour import Detour
 from torque_safety_controller.tasks.detour_search import DetourSearch
 from viability_bounds_pkg.exceptions import SettingError, did_you_mean
+from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.robot_configuration import load_model
 from viability_bounds_pkg.robot_description import RobotDescriptionError, inertia_beyond
 from viability_bounds_pkg.ros.robot_urdf import robot_urdf, warn_of_unusual
+from viability_bounds_pkg.stopping.coordinated_stop import MARGIN
+from viability_bounds_pkg.viability import BoundsSolver
 from viability_bounds_pkg.whole_arm.safety_filter import CLEARANCE, SafetyFilter
 
 if TYPE_CHECKING:
@@ -64,6 +67,7 @@ def make_controller(
         make_interaction(config, robot, urdf),
         safety_filter,
         None if safety_filter is None else make_detour(config, robot, safety_filter),
+        make_own_bounds(config),
     )
     controller.warm_up()
     return controller, base
@@ -92,6 +96,25 @@ def make_safety_filter(config: ControllerConfiguration, model: pin.Model) -> Saf
         config.torque_rate_max,
         config.torque_reserve,
     )
+
+
+def make_own_bounds(config: ControllerConfiguration) -> BoundsSolver | None:
+    """Return the bounds in HOLD while those of ``acceleration_limits`` are stale.
+
+    They know nothing of declared errors and delays, and keep a share of the acceleration instead.
+
+    Args:
+        config: checked parameters; None is returned where they lack limits.
+    """
+    low, high = config.collision.acceleration_min, config.collision.acceleration_max
+    n = len(config.joints)
+    if not (len(low) == len(high) == n and np.isfinite(config.velocity_max).all()):
+        return None
+    limits = JointLimits(
+        config.joints, config.position_min, config.position_max, config.velocity_max, low, high
+    )
+    margin = MARGIN * np.minimum(-low, high)
+    return BoundsSolver(limits, HORIZON * config.dt, margin, period=config.dt)
 
 
 def make_detour(

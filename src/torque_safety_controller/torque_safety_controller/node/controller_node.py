@@ -23,6 +23,7 @@ from torque_safety_controller.node.controller_report import (
     about_detour,
     too_weak,
 )
+from torque_safety_controller.node.declared import covered_row
 from torque_safety_controller.node.gain_watch import GainWatch
 from torque_safety_controller.node.goals import GoalSubscriber
 from torque_safety_controller.node.joint_commands import JointCommands
@@ -34,6 +35,7 @@ from torque_safety_controller.parameters.controller_parameters import Controller
 from torque_safety_controller.qp.constraints import AccelerationRange
 from torque_safety_controller.safety.handover import Control, Handover, HandoverRefused
 from torque_safety_controller.safety.modes import Mode, ModeKeeper
+from torque_safety_controller.safety.rate_watch import RateWatch
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, PeriodCheck, Verdict
 from viability_bounds_pkg.ros.parameters import NodeParameters
@@ -88,6 +90,7 @@ class ControllerNode(ArmNode):
         self._message_stamp = None
         self._answered_stamp = -1
         self._bounds_lost = False
+        self._rate = RateWatch(config.dt, covered_row(self))
         self._record = StepRecord(len(config.joints))
         self._collision = CollisionReport(self.get_logger(), self._controller.constraints)
 
@@ -192,6 +195,7 @@ class ControllerNode(ArmNode):
             return
         if self._goals.apply_due(self._states.stamp):
             self._goal_at = time.monotonic()
+        self._note_rate()
         now = State(self._states.q, self._states.v), self._bounds()
         if self._goal_lost() or self._handover.control is Control.GIVING_BACK:
             step = self._controller.brake(*now, self._elapsed())
@@ -204,6 +208,12 @@ class ControllerNode(ArmNode):
         if self._answered_stamp < 0:
             return None
         return 1e-9 * (self._states.stamp - self._answered_stamp)
+
+    def _note_rate(self) -> None:
+        """Slow the arm if too many states were not answered."""
+        if news := self._rate.note(self._elapsed()):
+            self._warn(news)
+        self._controller.share = self._rate.share
 
     def _bounds(self) -> AccelerationRange:
         return AccelerationRange(self._limits.lower, self._limits.upper)
@@ -241,6 +251,7 @@ class ControllerNode(ArmNode):
 
     def _hold(self, stamp: Any) -> None:
         """Answer the newest state without acceleration limits."""
+        self._note_rate()
         state = State(self._states.q, self._states.v)
         self._answer(self._controller.hold(state, self._elapsed()), stamp)
 
@@ -373,6 +384,9 @@ class ControllerNode(ArmNode):
                 "mode_changes": self._modes.changes,
                 "control": self._handover.control.value,
                 "integral_action": self._config.integral.integral_action,
+                "goal_share": self._rate.share,
+                "missed_rows_too_long": self._rate.too_long,
+                "missed_row_longest": self._rate.longest,
                 "goals_pending": len(self._goals),
                 "goals_refused": self._goals.refused,
                 "states_refused": self._states.refused,
@@ -382,7 +396,8 @@ class ControllerNode(ArmNode):
         level, text = LEVELS[self._modes.mode], f"{self._modes.mode.value}: {self._modes.reason}"
         weak = too_weak(self._config.joints, self._controller)
         weak = weak and f"the arm cannot be held where it would come to rest: {weak}"
-        for trouble in filter(None, (self._collision.too_near, self._wrenches.trouble, weak)):
+        troubles = self._rate.trouble, self._collision.too_near, self._wrenches.trouble, weak
+        for trouble in filter(None, troubles):
             level, text = max(level, DiagnosticStatus.WARN), f"{text}; {trouble}"
         detour = about_detour(self._config.joints, self._controller)
         if detour.text:

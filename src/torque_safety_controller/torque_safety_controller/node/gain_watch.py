@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Warns of gains beyond what delay, motors and encoders permit, as far as they are declared.
-
-They are declared for the bounds node, in the parameter files that all nodes of a robot get: what
-this node's command line says of them is read, no other node is asked.
-"""
+"""Warns of gains beyond what delay, motors and encoders permit, as far as they are declared."""
 
 from __future__ import annotations
 
@@ -14,12 +10,9 @@ from rclpy.node import Node
 
 from torque_safety_controller.loop_margins.arm_inertia import ArmInertia
 from torque_safety_controller.loop_margins.gain_check import GainCheck
+from torque_safety_controller.node.declared import declared_robot
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parameters.loop_parameters import gain_check, limits_gains
-from viability_bounds_pkg.exceptions import ArmSafetyError
-from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
-from viability_bounds_pkg.parameter import read
-from viability_bounds_pkg.ros.given_parameters import arguments_of, given_parameters
 
 
 class GainWatch:
@@ -38,12 +31,10 @@ class GainWatch:
         self._told: set[tuple[str, float]] = set()
         self._check: GainCheck | None = None
         self._inertia: ArmInertia | None = None
-        arguments, place = arguments_of(node.context), node.get_namespace().rstrip("/")
-        try:
-            given = given_parameters(arguments, f"{place}/bounds_node")
-            self._robot = read(BoundsConfiguration, given)
-        except ArmSafetyError:  # the node that they are for says so
+        robot = declared_robot(node)
+        if robot is None:
             return
+        self._robot = robot
         if limits_gains(self._robot.declared):
             self._inertia = ArmInertia.of(model, config.position_min, config.position_max)
             self.look(config)

@@ -69,12 +69,14 @@ class CollisionConfiguration:
         note="within the position limits",
     )
     acceleration_min: Array = joint_numbers(
-        "for collision_avoidance and safety_filter: lower acceleration limits, rad/s^2",
+        "for collision_avoidance, safety_filter, and HOLD without bounds: lower acceleration "
+        "limits, rad/s^2",
         NEGATIVE,
         default=(),
     )
     acceleration_max: Array = joint_numbers(
-        "for collision_avoidance and safety_filter: upper acceleration limits, rad/s^2",
+        "for collision_avoidance, safety_filter, and HOLD without bounds: upper acceleration "
+        "limits, rad/s^2",
         POSITIVE,
         default=(),
     )

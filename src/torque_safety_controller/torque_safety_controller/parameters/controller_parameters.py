@@ -51,7 +51,8 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
     """
 
     velocity_max: Array = joint_numbers(
-        "speed limits, rad/s, for jerk_max and torque_rate_max; none if empty",
+        "speed limits, rad/s, for jerk_max, torque_rate_max, and HOLD without bounds; none if "
+        "empty",
         POSITIVE,
         if_empty=np.inf,
     )

@@ -20,6 +20,16 @@ class TaskTerm(NamedTuple):
     """Shape (m,)."""
     weight: float
 
+    def mixed(self, a: Array, share: float) -> TaskTerm:
+        """Return the term that wants `share` of its own and the rest of an acceleration.
+
+        Args:
+            a: shape (n,), rad/s^2.
+            share: from 0 to 1.
+        """
+        other = a if self.A is None else self.A @ a
+        return self._replace(b=share * self.b + (1.0 - share) * other)
+
 
 class WrenchTerm(NamedTuple):
     """The term ``weight * |W rho - F_des|^2`` of the cost: [Benallegue2021], III-E (a)."""

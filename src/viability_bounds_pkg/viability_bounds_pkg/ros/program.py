@@ -19,6 +19,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from viability_bounds_pkg.cli.command_line import Parser
+from viability_bounds_pkg.cli.scheduling import add_scheduling, schedule
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.parameter import parameter_table
 from viability_bounds_pkg.ros.arm_node import ArmNode
@@ -92,7 +93,7 @@ def node_parser(kind: type[ArmNode]) -> Parser:
     return Parser(
         prog=kind.NAME,
         description=(kind.__doc__ or "").strip().split("\n")[0],
-        usage="%(prog)s [-h] [--ros-args [--params-file FILE] [-p NAME:=VALUE] [-r FROM:=TO] "
+        usage="%(prog)s [options] [--ros-args [--params-file FILE] [-p NAME:=VALUE] [-r FROM:=TO] "
         "[--log-level LEVEL]]",
         epilog=f"parameters:\n{table}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -113,7 +114,7 @@ def stack_parser(name: str, description: str, kinds: Sequence[type[ArmNode]]) ->
     return Parser(
         prog=name,
         description=description,
-        usage="%(prog)s [-h] [--ros-args [--params-file FILE] [-p [NODE:]NAME:=VALUE] "
+        usage="%(prog)s [options] [--ros-args [--params-file FILE] [-p [NODE:]NAME:=VALUE] "
         "[-r [NODE:]FROM:=TO] [--log-level LEVEL]]",
         epilog=f"Nodes: {names}. Each has its own name, topics and parameters, as if it ran "
         "alone; --help of each lists them.",
@@ -142,7 +143,8 @@ def run_together(
         line on stderr that says why.
     """
     try:
-        parser.parse_args(own_arguments(args))
+        add_scheduling(parser)
+        options = parser.parse_args(own_arguments(args))
         initialise(args)
     except Exception as error:  # rclpy's own classes differ between releases
         report_refusal(error)
@@ -171,6 +173,11 @@ def run_together(
         # loop.
         gc.collect()
         gc.freeze()
+        outcome = schedule(options)
+        if outcome.text and outcome.granted:
+            logger.info(outcome.text)
+        elif outcome.text:
+            logger.warning(f"{outcome.text}; docs/performance.md tells how to grant it")
         spin(executor, nodes[0])
     except (KeyboardInterrupt, ExternalShutdownException):
         pass

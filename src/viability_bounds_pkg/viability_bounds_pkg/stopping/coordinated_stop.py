@@ -22,6 +22,13 @@ At rest the joints hold the place where they are, by the same law with another w
 With an observer, what the joints accelerate more than commanded is attributed to a torque that
 acts on the joints (friction, a payload, a push), and this torque is balanced.
 
+Commands that are held because the next one is late, and those that return, go through the same
+bounds: the accelerations wanted are then those that the command would give. After a stop
+
+    a_wanted = a_command + (a_stop - a_command,0) (1 - t / T_return),
+
+so that the torque goes on from that of the stop without a step, and ends at that of the command.
+
 Motors whose torque follows with a first-order lag 1 / omega make (q + v / omega, v + a / omega) a
 double integrator that the torques asked for drive at once. All of the law is for that state then.
 """
@@ -69,12 +76,16 @@ the bounds would turn noise of the torque into torque steps."""
 GIVE_WAY = 0.02
 """Distance from the place held at which the arm stops anew instead of going back, rad."""
 
+RETURN_TIME = 0.1
+"""In which commands that return after a stop get back all of their effect, s."""
+
 
 class CoordinatedStop:
     """A law for the drives of an arm that brings it to rest and holds it, without commands.
 
-    Call `begin` once when commands stop, then `torque` at each step of the drive. Arrays are of
-    shape (n,), in the order of `limits.names`.
+    Call `begin` once when a command is missing, then at each step of the drive `follow` as long as
+    the last command is held, `torque` when it is not any more, and `follow` again with those that
+    return, until `returned`. Arrays are of shape (n,), in the order of `limits.names`.
 
     Args:
         model: the arm, with the joints of `limits` in any order, one degree of freedom each.
@@ -92,6 +103,7 @@ class CoordinatedStop:
     Attributes:
         acceleration: chosen in the last step, rad/s^2.
         at_rest: whether the arm came to rest and is held.
+        returned: whether commands have all of their effect, but for the limits.
 
     Raises:
         JointLimitsError: other joints in `limits` than in `model`, or numbers that cannot be.
@@ -158,6 +170,13 @@ class CoordinatedStop:
         self._disturbance = np.zeros(n)
         self._expected = v.copy()
         self._M: Array | None = None
+        self._resting = False  # the last step was one of a stop
+        self._difference, self._share_left = np.zeros(n), 0.0
+
+    @property
+    def returned(self) -> bool:
+        """Whether commands have all of their effect, but for the limits."""
+        return not (self._resting or self._share_left > 0.0)
 
     def time_to_rest(self, v: Array) -> float:
         """Return how long the arm takes from velocities `v` to rest at most, but for a few steps.
@@ -178,6 +197,26 @@ class CoordinatedStop:
             motor_torque: that of the motors now, N m; used where they have a lag. None where it
                 is unknown: the lag is not accounted for then.
         """
+        return self._torque(q, v, motor_torque, None)
+
+    def follow(
+        self, q: Array, v: Array, command: Array, motor_torque: Array | None = None
+    ) -> Array:
+        """Return the torques nearest to a command that keep the limits, N m; else as `torque`.
+
+        After steps of a stop they go on from its torque.
+
+        Args:
+            q: positions, rad.
+            v: velocities, rad/s.
+            command: torques that are commanded, N m.
+            motor_torque: as of `torque`.
+        """
+        return self._torque(q, v, motor_torque, command)
+
+    def _torque(
+        self, q: Array, v: Array, motor_torque: Array | None, command: Array | None
+    ) -> Array:
         lead = v
         if self._lag is not None and motor_torque is not None:
             lead = v + self._lag * self._forward_dynamics(q, v, motor_torque)
@@ -191,7 +230,8 @@ class CoordinatedStop:
         outside = not viable.all()
         if outside:
             lower, upper = self._gentle_return(q, v, lower, upper)
-        a = np.minimum(np.maximum(self._wanted(q, v), lower), upper)
+        wanted = self._wanted(q, v) if command is None else self._commanded(q, v, command)
+        a = np.minimum(np.maximum(wanted, lower), upper)
         if outside:
             a = np.where(viable, a, self._harder(q, v, a))
         q_mid, v_mid = q + 0.5 * h * v + 0.125 * h * h * a, v + 0.5 * h * a
@@ -244,6 +284,7 @@ class CoordinatedStop:
 
     def _wanted(self, q: Array, v: Array) -> Array:
         """Return accelerations that stop the arm, or hold it, regardless of its limits."""
+        self._resting = True
         if not self.at_rest and float(np.abs(v).max()) <= self._rest_speed:
             self.at_rest = True
             self._place = np.clip(q, self._lowest, self._highest)
@@ -253,6 +294,15 @@ class CoordinatedStop:
                 return HOLD_GAIN * (HOLD_GAIN * off - 2.0 * v)
             self.at_rest = False
         return -v / max(self.time_to_rest(v), self._dt)
+
+    def _commanded(self, q: Array, v: Array, command: Array) -> Array:
+        """Return the accelerations that a command gives; after a stop less of the difference."""
+        a = self._forward_dynamics(q, v, command + self._disturbance)
+        if self._resting:
+            self._difference, self._share_left = self.acceleration - a, 1.0
+        self._resting = self.at_rest = False
+        self._share_left = max(0.0, self._share_left - self._dt / RETURN_TIME)
+        return a + self._share_left * self._difference
 
     def _observe(self, q: Array, v: Array) -> None:
         """Attribute what the last step's velocity is off to a torque, but for a joint at rest."""

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs the nodes of a robot by the wall clock as users do, and sends them goals."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import cycle
+from pathlib import Path
+from typing import Any
+
+import yaml
+from geometry_msgs.msg import PoseStamped
+from std_srvs.srv import SetBool
+
+from viability_bounds_pkg.ros.runtime import GOAL_QOS
+from viability_bounds_pkg.testing.ros_harness import RosHarness
+
+ROOT = Path(__file__).resolve().parent.parent
+ONE_PROCESS, SEPARATE_ROBOT, PROCESSES = "one process", "stack + robot", "processes"
+WAYS = {
+    ONE_PROCESS: (("sim_bridge", "simulated_stack"),),
+    SEPARATE_ROBOT: (
+        ("sim_bridge", "bullet_node"),
+        ("torque_safety_controller", "safety_stack"),
+    ),
+    PROCESSES: (
+        ("sim_bridge", "bullet_node"),
+        ("viability_bounds_pkg", "bounds_node"),
+        ("torque_safety_controller", "controller_node"),
+    ),
+}
+"""Programs that run, each with its package."""
+
+START = 60.0
+"""How long programs may take to start, s."""
+
+Programs = dict[str, subprocess.Popen[bytes]]
+
+
+def configuration(robot: str, rate: float | None = None, *, imperfect: bool) -> list[str]:
+    """Return the arguments that all programs of a robot get; None for its own rate."""
+    files = [f"config/{robot}.yaml", *([f"config/imperfect/{robot}.yaml"] * imperfect)]
+    given = [word for each in files for word in ("--params-file", str(ROOT / each))]
+    return given if rate is None else [*given, "-p", f"rate_hz:={rate}"]
+
+
+def goals(robot: str) -> list[PoseStamped]:
+    """Return the poses that a robot's demo goes to."""
+    scenario = yaml.safe_load((ROOT / "config" / "scenarios" / f"{robot}_demo.yaml").read_text())
+    found = []
+    for pose in (event["pose"] for event in scenario["events"] if "pose" in event):
+        message = PoseStamped()
+        p, o = message.pose.position, message.pose.orientation
+        p.x, p.y, p.z = pose["position"]
+        o.x, o.y, o.z, o.w = pose["orientation"]
+        found.append(message)
+    return found
+
+
+class User:
+    """What is outside of the programs: gives goals by turns, and reads diagnostics.
+
+    Args:
+        messages: goals, sent one after the other, again and again.
+        topic: theirs.
+    """
+
+    def __init__(self, messages: list[Any], topic: str) -> None:
+        self.ros = RosHarness(int(os.environ["ROS_DOMAIN_ID"]))
+        self._goals = cycle(messages)
+        self._publisher = self.ros.probe.create_publisher(type(messages[0]), topic, GOAL_QOS)
+
+    def start(self, programs: Programs) -> None:
+        """Wait for the programs, and let robot time begin."""
+
+        def ready() -> bool:
+            if any(program.poll() is not None for program in programs.values()):
+                raise SystemExit("error: a program could not start")
+            found = {"bullet_node", "bounds_node", "controller_node"} <= set(self.ros.diagnostics)
+            return found and self._publisher.get_subscription_count() > 0
+
+        self.ros.wait_until(ready, "the programs", timeout=START)
+        self.ros.call(SetBool, "bullet_node/pause", SetBool.Request(data=False))
+
+    def use(self, seconds: float, each: float = 1.0) -> None:
+        """Give a goal every `each` s."""
+        self.ros.run_for(seconds, lambda: self._publisher.publish(next(self._goals)), period=each)
+
+    def report(self, node: str = "bullet_node") -> dict[str, Any]:
+        """Return the next diagnostics of a node."""
+        self.ros.diagnostics.pop(node, None)
+        self.ros.wait_until(lambda: node in self.ros.diagnostics, node)
+        return self.ros.diagnostics[node]
+
+
+def scheduling_words(options: argparse.Namespace) -> list[str]:
+    """Return the options of `add_scheduling` as words for the programs."""
+    words = ["--lock-memory"] * options.lock_memory
+    if options.priority is not None:
+        words += ["--priority", str(options.priority)]
+    if options.cpus:
+        words += ["--cpus", ",".join(map(str, options.cpus))]
+    return words
+
+
+@contextmanager
+def running(
+    way: str, arguments: list[str], imperfect: bool, scheduling: Sequence[str] = ()
+) -> Iterator[Programs]:
+    """Run the programs of a way; yield them by name.
+
+    Args:
+        way: one of `WAYS`.
+        arguments: for ROS.
+        imperfect: whether there is an estimator.
+        scheduling: options of the programs themselves.
+    """
+    programs = WAYS[way]
+    if way == PROCESSES and imperfect:
+        programs += (("viability_bounds_pkg", "estimator_node"),)
+    started = {
+        name: subprocess.Popen(
+            [ROOT / "install" / package / "lib" / package / name, *scheduling, "--ros-args"]
+            + [*arguments, "--log-level", "error", "-p", "start_paused:=true"]
+        )
+        for package, name in programs
+    }
+    try:
+        yield started
+    finally:
+        for program in started.values():
+            program.terminate()
+        for program in started.values():
+            program.wait()
+
+
+def load() -> str:
+    """Return how busy the machine is."""
+    return f"{os.cpu_count()} processors, load {' '.join(f'{x:.1f}' for x in os.getloadavg())}"

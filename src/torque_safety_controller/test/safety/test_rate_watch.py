@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The watch over rows of states without an answer."""
+
+import pytest
+
+from torque_safety_controller.safety.rate_watch import RETURN_TIME, RateWatch
+
+DT = 0.002  # s
+
+
+def test_rows_that_the_bounds_cover_change_nothing():
+    watch = RateWatch(DT, 2)
+    for elapsed in (None, DT, 2 * DT, 3 * DT, 3.4 * DT):
+        assert watch.note(elapsed) == ""
+        assert watch.share == 1.0
+    assert (watch.too_long, watch.longest, watch.trouble) == (0, 2, "")
+
+
+def test_a_longer_row_stops_the_arm_and_it_goes_on_by_itself():
+    watch = RateWatch(DT, 2)
+    said = watch.note(4 * DT)
+    assert said.startswith("3 states in a row")
+    assert "cover 2" in said
+    assert watch.share == 0.0
+    assert watch.trouble.startswith("slowed to 0%")
+    steps = 0
+    while watch.slowed:
+        last = watch.share
+        said = watch.note(DT)
+        assert watch.share - last == pytest.approx(min(DT / RETURN_TIME, 1.0 - last))
+        steps += 1
+    assert steps == pytest.approx(RETURN_TIME / DT, abs=1)
+    assert said == "states are answered in time again: the arm goes on"
+    assert watch.note(DT) == ""
+
+
+def test_rows_one_after_the_other_are_told_once():
+    watch = RateWatch(DT, 0)
+    said = [watch.note(2 * DT if step % 10 == 0 else DT) for step in range(100)]
+    assert sum(map(bool, said)) == 1
+    assert watch.too_long == 10
+    assert watch.share < 10 * DT / RETURN_TIME

@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is declared of the robot for the bounds node.
+
+It is in the parameter files that all nodes of a robot get: what this node's command line says of
+it is read, no other node is asked.
+"""
+
+from __future__ import annotations
+
+from rclpy.node import Node
+
+from viability_bounds_pkg.exceptions import ArmSafetyError
+from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
+from viability_bounds_pkg.parameter import read
+from viability_bounds_pkg.ros.given_parameters import arguments_of, given_parameters
+
+UNDECLARED = 1
+"""Missed periods that the bounds cover by their defaults."""
+
+
+def declared_robot(node: Node) -> BoundsConfiguration | None:
+    """Return the parameters that the bounds node beside a node gets; None if it cannot start."""
+    arguments, place = arguments_of(node.context), node.get_namespace().rstrip("/")
+    try:
+        return read(BoundsConfiguration, given_parameters(arguments, f"{place}/bounds_node"))
+    except ArmSafetyError:  # the node that they are for says so
+        return None
+
+
+def covered_row(node: Node) -> int:
+    """Return how many missed periods in a row the bounds beside a node cover."""
+    robot = declared_robot(node)
+    if robot is None:
+        return UNDECLARED
+    return robot.declared.missed_deadlines or round(robot.horizon / robot.dt) - 1

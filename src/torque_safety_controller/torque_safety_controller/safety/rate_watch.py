@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Slows the arm where more states in a row stay without an answer than the bounds cover."""
+
+from __future__ import annotations
+
+RETURN_TIME = 0.5
+"""From a row that was too long until goals have all of their effect again, s of robot time."""
+
+_ROUNDING = 0.5
+"""Of the time between two states, control periods."""
+
+
+class RateWatch:
+    """Share of the goals by which the arm may move, from the times of the states answered.
+
+    Each row of unanswered states that is longer than the bounds cover takes the share to zero;
+    then it grows to one within `RETURN_TIME`. All times are those of the states' stamps, so that
+    in lockstep nothing depends on the machine.
+
+    Args:
+        dt: control period, s.
+        covered: longest row of unanswered states that the bounds hold for.
+
+    Attributes:
+        share: from 0, the arm is brought to rest, to 1.
+        too_long: number of rows that were longer than covered.
+        longest: row of unanswered states so far.
+    """
+
+    def __init__(self, dt: float, covered: int) -> None:
+        self._dt, self._covered = dt, covered
+        self.share = 1.0
+        self.too_long = self.longest = 0
+
+    def note(self, elapsed: float | None) -> str:
+        """Take the time since the last answered state; return what to log, mostly nothing.
+
+        Args:
+            elapsed: s; None if there was no such state.
+        """
+        if elapsed is None:
+            return ""
+        was_slowed = self.slowed
+        row = int(elapsed / self._dt + _ROUNDING) - 1
+        self.longest = max(self.longest, row)
+        if row > self._covered:
+            self.share = 0.0
+            self.too_long += 1
+            return "" if was_slowed else f"{row} {self._what}: the arm is slowed"
+        self.share = min(1.0, self.share + elapsed / RETURN_TIME)
+        if was_slowed and not self.slowed:
+            return "states are answered in time again: the arm goes on"
+        return ""
+
+    @property
+    def slowed(self) -> bool:
+        """Whether the arm is slowed."""
+        return self.share < 1.0
+
+    @property
+    def trouble(self) -> str:
+        """What to report; empty if there is nothing."""
+        return f"slowed to {self.share:.0%}: too many {self._what}" if self.slowed else ""
+
+    @property
+    def _what(self) -> str:
+        return f"states in a row without an answer, the bounds cover {self._covered}"
