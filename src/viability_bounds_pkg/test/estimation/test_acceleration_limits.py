@@ -22,6 +22,7 @@ from viability_bounds_pkg.acceleration_limits import (
     EmptyIntervalError,
     estimate_acceleration_limits,
     limits_from_worst_cases,
+    limits_in_share,
     unavailable_share,
 )
 from viability_bounds_pkg.estimation.state_space import LimitEstimateError, StateSpace
@@ -200,6 +201,21 @@ def test_reserve_caps_and_overrides():
     assert capped.a_max[6] == 15.0 and capped.a_min[6] == -15.0
     assert capped.a_max[0] == plain.a_max[0] < 15.0
     assert (capped.a_min[1], capped.a_max[1]) == (-3.0, 2.0)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.8])
+def test_limits_of_a_share_are_available_in_as_many_other_states(share):
+    """By Algorithm 4's lines for single states, which are others than those used."""
+    model = baxter()
+    q_min, q_max, v_max, tau_max = limits_of(model)
+    found = limits_in_share(model, StateSpace.of(model, q_min, q_max, v_max, tau_max), share)
+    rng, count = np.random.default_rng(3), 3000
+    available = np.zeros(model.nv)
+    for _ in range(count):
+        q, v = rng.uniform(q_min, q_max), rng.uniform(-v_max, v_max)
+        lower, upper = algorithm_4(model, [q], [v], tau_max)
+        available += (lower <= -found) & (found <= upper)
+    np.testing.assert_allclose(available / count, share, atol=0.03)
 
 
 def test_gravity_beyond_the_torque_is_named():

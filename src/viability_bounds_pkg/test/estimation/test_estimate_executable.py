@@ -152,6 +152,21 @@ def test_gravity_beyond_the_torque(write_robot, call, tmp_path):
     assert parameters_in(output.read_text())["acceleration_max"][0] == 1.0
 
 
+def test_limits_of_most_states_where_there_are_none_for_all(write_robot, call):
+    path = write_robot(parameters="    torque_max: [10.0, 30.0]")
+    alone = one_line(call(path, "--samples", 500))
+    assert "safety_filter (--share)" in alone
+    ended = call(path, "--samples", 500, "--share", 0.4)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert "shoulder: a in [-" in ended.stdout
+    assert "override, NOT available in 60 % of random states" in ended.stdout
+    plenty = write_robot()
+    assert (
+        call(plenty, "--samples", 500, "--share", 0.4).stdout
+        == call(plenty, "--samples", 500).stdout
+    )
+
+
 def test_too_much_speed_for_the_torque(write_robot, call, tmp_path):
     """Joint, state, lower velocities and the override: all that is offered helps."""
     output = tmp_path / "limits.yaml"
