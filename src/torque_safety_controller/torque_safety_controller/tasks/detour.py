@@ -122,7 +122,8 @@ class Detour:
             self._follow(robot.q, first.kp / first.kd, SHORT if goal.pose is not None else NEAR)
         elif self.progress is not Progress.NOT_HELD:
             self._watch_or_search(first, robot, goal, bounds)
-        if self.progress is Progress.LED or (self._search is not None and self._hunted):
+        held = self._search is not None and self._hunted and self._ways.reached
+        if self.progress is Progress.LED or held:
             return [PostureTask(self.lead, first.kp, first.kd, first.weight)]
         if self._end is not None and posture is not first:
             return [first, replace(posture, q_des=self._end)]

@@ -61,6 +61,9 @@ class DetourSearch:
         high: highest, shape (n,), rad; inf for none.
         tau_max: torques that postures may need, shape (n,), N m.
         can_hold: whether a posture can be held.
+
+    Attributes:
+        reached: whether the search that goes on knows a posture at the goal that can be held.
     """
 
     def __init__(
@@ -72,6 +75,7 @@ class DetourSearch:
         can_hold: Callable[[Array], bool],
     ) -> None:
         self.can_hold = can_hold
+        self.reached = False
         self._low, self._high, self._tau_max = low, high, tau_max
         self._model, self._data = robot.model, robot.model.createData()
         self._kinematics = PostureSearch(robot.model, robot.frame, low, high)
@@ -91,6 +95,7 @@ class DetourSearch:
             goal: for the joints, it can be held.
             rng: chooses the postures to try.
         """
+        self.reached = goal.pose is None
         low = np.where(np.isfinite(self._low), self._low, q - np.pi)
         high = np.where(np.isfinite(self._high), self._high, q + np.pi)
 
@@ -109,12 +114,15 @@ class DetourSearch:
                 end = yield from self._kinematics.find(goal.pose, seed)
                 if end is None or not self.can_hold(end):
                     continue
+                self.reached = True
                 way = yield from find(end, comfort, tries)
                 if way is not None:
                     return way
                 left -= 1
                 if left == 0:
                     break
+            if not self.reached:
+                break
         return None
 
     def _can_pass(self, start: Array, end: Array, comfort: float) -> CanPass:
