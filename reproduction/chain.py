@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import tempfile
 from contextlib import contextmanager
@@ -21,6 +22,7 @@ from sim_bridge.scenario.recording import RecordedRun
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.node.estimator_node import EstimatorNode
+from viability_bounds_pkg.ros.direct_delivery import DirectDelivery
 
 ROOT = Path(__file__).resolve().parent.parent
 NODES = {
@@ -76,6 +78,7 @@ def load_node_values(robot: str, *overlays: str) -> dict[str, dict[str, Any]]:
 @contextmanager
 def _context():
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    gc.collect()  # a run that failed leaves its participants to the garbage collector
     rclpy.init(args=["--ros-args", "--log-level", "error"])
     try:
         yield
@@ -107,13 +110,16 @@ def run_chain(
     with tempfile.TemporaryDirectory() as directory, _context():
         path = Path(directory) / "scenario.yaml"
         path.write_text(yaml.safe_dump(scenario))
-        nodes = {}
+        nodes: dict[str, Any] = {}
+        direct = DirectDelivery()
         for name, kind in NODES.items():
             if name == "estimator_node" and name not in per_node:
                 continue
             own = values | lockstep | {"scenario": str(path)} | per_node.get(name, {})
             overrides = [Parameter(key, value=value) for key, value in own.items() if value != []]
-            nodes[name] = kind(parameter_overrides=overrides)
+            # Who plays and records is like in a process of its own.
+            past = {} if kind is ScenarioNode else {"direct_delivery": direct}
+            nodes[name] = kind(parameter_overrides=overrides, **past)
         for each in list(nodes["scenario_node"].subscriptions):
             if each.topic_name.removeprefix("/") in not_recorded:
                 nodes["scenario_node"].destroy_subscription(each)

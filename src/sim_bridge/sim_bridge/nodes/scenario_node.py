@@ -141,6 +141,7 @@ class ScenarioNode(ArmNode):
         self._period = round(1e9 * float(self.robot["period_s"]))
         self._first = self.listener.stamp + self._period
         self._refused = {}
+        self._check_refusals(self._refused)  # those before the first message do not count
         while not self._load():
             yield "loading: there is no report that the messages of the scenario were received"
         lockstep = self.robot["clock"] == "lockstep"
