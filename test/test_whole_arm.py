@@ -8,7 +8,7 @@ import pinocchio as pin
 import pytest
 from direct import DirectLoop, column
 from time_to_goal import SHORT, near_goal
-from whole_arm import CLEAR, POSE, RATES, arrive, random_goal
+from whole_arm import CLEAR, POSE, arrive, random_goal
 
 from torque_safety_controller.node.controller_report import about_detour
 from torque_safety_controller.tasks.detour import Progress
@@ -182,18 +182,6 @@ def test_a_goal_beyond_a_position_limit_is_told_and_not_searched_for():
     told = about_detour(loop.limits.names, loop.controller).text
     off = 1e3 * (goal[5] - loop.robot.state().q[5])
     assert re.search(rf"left_w1 stops {off:.1f} mrad before it", told)
-
-
-def test_with_limits_of_rates_joints_come_as_near_to_their_limits_as_without():
-    loop = DirectLoop("baxter_left_arm", STIFF | FILTERED | RATES["Baxter, with rates"])
-    start = loop.robot.state().q
-    goal = np.where([0, 0, 0, 0, 1, 0, 1], loop.limits.q_max - CLEAR, start)
-    start = np.where(goal != start, goal - 1.0, start)  # far enough for their top speeds
-    loop.robot.reset(start, np.zeros(7))
-    loop.begin()
-    _, at = arrive(loop, "posture", goal, 4.0)
-    assert at < 3.0
-    assert beyond(loop)[:2] == (0.0, 0.0)
 
 
 def test_motions_that_need_no_detour_are_bit_for_bit_what_they_are_without():

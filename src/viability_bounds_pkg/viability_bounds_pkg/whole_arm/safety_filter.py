@@ -87,9 +87,9 @@ than the margins of the bounds, which would change a plan that ends nearer."""
 GENTLE = 0.5
 """Share of the limits of the torques' rates that the joints' accelerations use in plans."""
 
-DRIFT = 0.2
-"""Further distance where changes are limited, as a share of what a joint moves in a period: plans
-are longer carried on then, and the bounds do not lead back from the limit at once."""
+DRIFT = 0.1
+"""Further distance where changes are limited, in speeds times period: plans are longer carried on
+then, and the bounds do not lead back from the limit at once."""
 
 TOLERANCE = 0.8
 """Share of that distance by which plans in hand may end nearer, as states drift a little."""
@@ -235,9 +235,10 @@ class SafetyFilter:
         braking = np.minimum(-a_min, a_max)
         self._reserve, self._of_limit = reserve, self.usable / torques
         self._smooth = bool(np.isfinite(jerks).any() or np.isfinite(rates).any())
-        self._positions, self._clearance = (q_min, q_max), CLEARANCE * dt * dt * braking
-        clearance = self._clearance
-        if not self._smooth:
+        clearance = CLEARANCE * dt * dt * braking
+        if self._smooth:
+            clearance = clearance + DRIFT * dt * np.where(np.isfinite(v_max), v_max, 0.0)
+        else:
             v_max = none  # speeds only fall along plans
         self._limits = JointLimitsOfPlans(
             q_min + clearance,
@@ -325,7 +326,6 @@ class SafetyFilter:
         plans = self._plans
         if self._smooth:
             self._gentle = self._gentle_changes(q)
-            self._keep_clear(v)
         if self._begun:
             self._go_on()
         else:
@@ -399,17 +399,6 @@ class SafetyFilter:
             self.lower,
             self.upper,
         )
-
-    def _keep_clear(self, v: Array) -> None:
-        """Set how far from position limits plans end: the faster a joint, the more may drift.
-
-        Args:
-            v: velocities, shape (n,), rad/s.
-        """
-        limits, (q_min, q_max) = self._limits, self._positions
-        clearance = self._clearance + DRIFT * self._dt * np.abs(v)
-        limits.q_min[:], limits.q_max[:] = q_min + clearance, q_max - clearance
-        limits.tolerance[:] = TOLERANCE * clearance
 
     def _gentle_changes(self, q: Array) -> Array:
         """Return changes of acceleration that the limits of torques' rates allow, rad/s^2.
