@@ -46,6 +46,7 @@ MINUTE = 60.0  # s
 FAST = 9  # goals of a second each
 REST = 6.0  # s of a goal that is kept
 SETTLED = 5.0  # s after which the torque steps of such a goal count
+ON_ITS_WAY = 0.02  # rad that a joint moves afterwards; then they do not
 RISE = 0.2  # s
 UNUSED = ("acceleration_limits", "ft_wrench")
 LEG = 6.0  # s of a goal whose time is measured
@@ -289,13 +290,15 @@ def play(robot: str, name: str, seed: int) -> Minute:
     steps = np.abs(np.diff(run.tau, axis=0)) / values["controller_node"]["torque_max"]
     at_rest = np.zeros(len(steps), dtype=bool)
     for begin, end in course.rests:
-        at_rest |= (run.t[1:] >= begin) & (run.t[1:] < end)
+        during = (run.t[1:] >= begin) & (run.t[1:] < end)
+        if np.ptp(run.q[1:][during], axis=0).max() < ON_ITS_WAY:
+            at_rest |= during
     return Minute(
         float(result.vector("position_violation_rad").max()),
         float(result.vector("velocity_violation_rad_s").max()),
         float(result.vector("torque_ratio").max()),
         float(np.nanmax(steps)),
-        float(np.nanmax(steps[at_rest])),
+        float(np.nanmax(steps[at_rest], initial=0.0)),
         int(result.robot["braked_periods"]),
     )
 
