@@ -78,8 +78,8 @@ errors, noise and longest row of lost commands, and half the bandwidths.
 | at rest | the same in the last second of the goals that are kept, joints on limits included |
 | hand at rest | distance from a goal 8 s after it was sent: median to largest |
 
-An arm that moves by more than 20 mrad in that second is still on its way, as the filter may lead it
-round what it cannot hold; then that second does not count.
+An arm that moves by more than 20 mrad in that second is still on its way, as the filter may lead
+it round what it cannot hold; then that second does not count.
 
 A row of which something is promised ends with a verdict. Where what is spoilt is within what is
 declared ("all done", also while commands fail and the drives stop by themselves, and with the
