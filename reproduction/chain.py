@@ -22,7 +22,6 @@ from sim_bridge.scenario.recording import RecordedRun
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.node.estimator_node import EstimatorNode
-from viability_bounds_pkg.ros.direct_delivery import DirectDelivery
 
 ROOT = Path(__file__).resolve().parent.parent
 NODES = {
@@ -110,16 +109,13 @@ def run_chain(
     with tempfile.TemporaryDirectory() as directory, _context():
         path = Path(directory) / "scenario.yaml"
         path.write_text(yaml.safe_dump(scenario))
-        nodes: dict[str, Any] = {}
-        direct = DirectDelivery()
+        nodes = {}
         for name, kind in NODES.items():
             if name == "estimator_node" and name not in per_node:
                 continue
             own = values | lockstep | {"scenario": str(path)} | per_node.get(name, {})
             overrides = [Parameter(key, value=value) for key, value in own.items() if value != []]
-            # Who plays and records is like in a process of its own.
-            past = {} if kind is ScenarioNode else {"direct_delivery": direct}
-            nodes[name] = kind(parameter_overrides=overrides, **past)
+            nodes[name] = kind(parameter_overrides=overrides)
         for each in list(nodes["scenario_node"].subscriptions):
             if each.topic_name.removeprefix("/") in not_recorded:
                 nodes["scenario_node"].destroy_subscription(each)

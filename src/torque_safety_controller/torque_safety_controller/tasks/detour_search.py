@@ -121,8 +121,6 @@ class DetourSearch:
                 left -= 1
                 if left == 0:
                     break
-            if not self.reached:
-                break
         return None
 
     def _can_pass(self, start: Array, end: Array, comfort: float) -> CanPass:
