@@ -79,3 +79,37 @@ def test_a_signal_lets_the_callback_end_that_it_interrupts(sent):
     done = started("-c", INTERRUPTED, int(sent))
     assert done.returncode == 0, done.stderr
     assert not {word for word in ("Traceback", "Exception", "Error") if word in done.stderr}
+
+
+INTERRUPTED_AT_START = """
+import os
+import signal
+import sys
+from dataclasses import dataclass
+from viability_bounds_pkg.ros.arm_node import ArmNode
+from viability_bounds_pkg.ros.program import run
+
+@dataclass
+class Nothing:
+    pass
+
+class Slow(ArmNode):
+    NAME = "slow"
+    PARAMETERS = Nothing
+
+    def __init__(self):
+        super().__init__()
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+            signal.pause()
+        except KeyboardInterrupt:
+            pass  # as where compiled code calls back
+
+sys.exit(run(Slow, ["slow"]))
+"""
+
+
+def test_an_interrupt_that_is_lost_during_the_start_ends_the_node_all_the_same():
+    done = started("-c", INTERRUPTED_AT_START)
+    assert done.returncode == 0, done.stderr
+    assert not {word for word in ("Traceback", "Exception", "Error") if word in done.stderr}

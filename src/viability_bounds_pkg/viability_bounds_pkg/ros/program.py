@@ -150,6 +150,14 @@ def run_together(
         report_refusal(error)
         return 1
     nodes: list[ArmNode] = []
+    told: list[int] = []
+
+    def interrupt(number: int, _: object) -> None:
+        told.append(number)
+        raise KeyboardInterrupt
+
+    # What is raised while a callback of compiled code runs is lost.
+    signal.signal(signal.SIGINT, interrupt)
     try:
         compiling = TimingListener()
         with install_listener("numba:compile", compiling):
@@ -178,7 +186,8 @@ def run_together(
             logger.info(outcome.text)
         elif outcome.text:
             logger.warning(f"{outcome.text}; docs/performance.md tells how to grant it")
-        spin(executor, nodes[0])
+        if not told:
+            spin(executor, nodes[0])
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except ArmSafetyError as error:
