@@ -56,12 +56,6 @@ NEAR = 5e-3  # rad; so near a goal is reached
 STIFF = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
 """A posture task that drives each joint to its limits, whatever the hand does."""
 
-FILTERED: dict[str, dict[str, Any]] = {
-    # The rates are those of Franka's control interface.
-    "panda": {"safety_filter": True, "torque_rate_max": [1000.0] * 7},
-    "talos_left_arm": {"safety_filter": True},
-}
-"""What the controllers of robots have whose files do without the safety filter."""
 OF_ROBOT = ("rotor_inertia", "acceleration_min", "acceleration_max")
 """What the files of imperfect robots have of robot and model: the same in all cases."""
 
@@ -142,14 +136,27 @@ CASES = {
     ),
     "outage_stop": Case("spoilt, all done; commands fail for up to 0.2 s; stop", 1, outages=True),
     "filter": Case("spoilt, all done; safety filter", 1, filtered=True),
+    "filter_rates": Case(
+        "spoilt, all done; safety filter, torque rates of its maker",
+        1,
+        # Of Franka's control interface, N m/s.
+        changed={"controller_node": {"torque_rate_max": [1000.0] * 7}},
+        filtered=True,
+    ),
     "filter_weak": Case(
         "spoilt, all done; safety filter, 60% of its torque", 1, filtered=True, torque=0.6
     ),
 }
-AT_LENGTH = ("all", "filter", "filter_weak")
+AT_LENGTH = ("all", "filter", "filter_rates", "filter_weak")
 """Cases that are played for longer."""
-UNABLE = {("baxter_left_arm", "filter"), ("baxter_left_arm", "filter_weak")}
-"""Baxter has the filter in each case, and cannot hold itself with less torque."""
+NOT_PLAYED = {
+    ("baxter_left_arm", "filter"),
+    ("baxter_left_arm", "filter_rates"),
+    ("baxter_left_arm", "filter_weak"),
+    ("talos_left_arm", "filter_rates"),
+}
+"""Baxter has filter and rates in each case, and cannot hold itself with less torque; of TALOS'
+rates nothing is published."""
 IDEAL = ("ideal", "ideal_remedies")
 DOUBLED = (
     "encoder_resolution",
@@ -200,7 +207,7 @@ def node_values(robot: str, case: Case, seed: int) -> Values:
         changed = dict((case.changed or {}).get(node, {}))
         values[node] = chosen | of_robot | changed
         if case.filtered and node == "controller_node":
-            values[node] |= FILTERED.get(robot, {})
+            values[node] |= {"safety_filter": True}
         if values[node].get("torque_max"):
             values[node]["torque_max"] = [case.torque * tau for tau in values[node]["torque_max"]]
     values["bullet_node"] |= {"imperfection_seed": seed}
@@ -391,7 +398,7 @@ def play_all(
             )
             for robot in robots
             for name, minutes in lengths.items()
-            if (robot, name) not in UNABLE
+            if (robot, name) not in NOT_PLAYED
         }
         for (robot, name), (minutes, hands, times) in runs.items():
             outcome = Outcome(

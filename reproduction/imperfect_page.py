@@ -15,7 +15,7 @@ from chain import ROOT
 from figure import RESULTS, Figure, table
 
 NAME = "imperfect"
-WITHIN_DECLARED = ("all", "outage_stop", "filter", "filter_weak")
+WITHIN_DECLARED = ("all", "outage_stop", "filter", "filter_rates", "filter_weak")
 """Cases in which no limit may be passed: what is spoilt is within what is declared."""
 STEP_AT_REST = 0.05  # of torque_max
 HAND_FACTOR = 3.0
@@ -87,10 +87,11 @@ safety filter), position and speed must be 0 and torque at most 1. With "all don
 at rest must also be at most {step:g}, and the median distance of the hand at most {factor:g} times
 that of the same robot with nothing spoilt and nothing done, or what a step of all encoders is at
 the hand. The other rows are for comparison.
+Rows are kept until they are played again: they may be of different versions of the project.
 
 The *safety filter* ([whole_arm.md](whole_arm.md)) is on in all rows of `baxter_left_arm`, as in
-its file, and elsewhere where a row says so; Panda's torques then change by no more than its maker
-allows, 1000 N m/s. `torque_reserve` in the files is for the pushes above.
+its file, and elsewhere where a row says so. `torque_reserve` in the files is for the pushes above.
+Panda's maker allows torques to change by 1000 N m/s.
 
 Two things that a verdict does not say. It holds for the minutes, goals and pushes of its row, in
 lockstep. Pushes and TALOS' friction are at times more than `acceleration_disturbance` declares:

@@ -38,6 +38,28 @@ def goals(values, rng):
         yield np.where(rng.random(len(low)) < 0.5, low, high)
 
 
+def chain(ros, robot, **of_robot):
+    """Start the nodes in lockstep; return that of the robot."""
+    arm = ros.start(
+        BulletNode, read_config(robot, "bullet_node") | of_robot | {"clock": "lockstep"}
+    )
+    ros.start(BoundsNode, read_config(robot, "bounds_node"))
+    ros.start(ControllerNode, read_config(robot, "controller_node") | HASTE)
+    return arm
+
+
+def send_to_limits(ros, arm, count, periods, seed):
+    """Send the arm to some postures at its limits, one after the other."""
+    config = arm._config
+    limits = {"position_min": config.position_min, "position_max": config.position_max}
+    postures = goals(limits, np.random.default_rng(seed))
+    user = ros.talk(JointState, "target_posture", GOAL_QOS)
+    for _ in range(count):
+        user.publish(joint_state(config.joints, 0, next(postures)))
+        end = arm._periods + periods
+        ros.wait_until(lambda end=end: arm._periods >= end, "control periods", timeout=60.0)
+
+
 @pytest.mark.parametrize("robot", ["panda", "talos_left_arm"])
 def test_no_limit_is_passed_when_commands_fail_at_a_random_moment(robot):
     rng = np.random.default_rng(0)
@@ -94,9 +116,7 @@ def test_motors_with_lag_errors_and_noise_pass_no_limit_and_hold_it_still(robot)
 @pytest.mark.parametrize("robot", ["panda", "talos_left_arm"])
 def test_the_chain_of_nodes_goes_on_when_commands_return(ros, robot):
     values = read_config(robot, "bullet_node")
-    arm = ros.start(BulletNode, values | {"clock": "lockstep"})
-    ros.start(BoundsNode, read_config(robot, "bounds_node"))
-    ros.start(ControllerNode, read_config(robot, "controller_node") | HASTE)
+    arm = chain(ros, robot)
     rng = np.random.default_rng(1)
     postures = goals(values, rng)
     user = ros.talk(JointState, "target_posture", GOAL_QOS)
@@ -122,17 +142,8 @@ def test_the_chain_of_nodes_goes_on_when_commands_return(ros, robot):
 
 def test_commands_held_in_rows_of_missed_periods_pass_no_limit(ros):
     """Rows longer than the bounds are declared to cover."""
-    values = read_config("panda", "bullet_node")
-    rows = {"missed_probability": 0.6, "missed_in_row": 5, "command_timeout": 5}
-    arm = ros.start(BulletNode, values | rows | {"clock": "lockstep"})
-    ros.start(BoundsNode, read_config("panda", "bounds_node"))
-    ros.start(ControllerNode, read_config("panda", "controller_node") | HASTE)
-    postures = goals(values, np.random.default_rng(4))
-    user = ros.talk(JointState, "target_posture", GOAL_QOS)
-    for _ in range(6):
-        user.publish(joint_state(values["joints"], 0, next(postures)))
-        end = arm._periods + 400
-        ros.wait_until(lambda end=end: arm._periods >= end, "control periods", timeout=60.0)
+    arm = chain(ros, "panda", missed_probability=0.6, missed_in_row=5, command_timeout=5)
+    send_to_limits(ros, arm, 6, 400, seed=4)
     assert arm._path.missed > 500
     assert (arm._monitor.max_speed > 0.9 * arm._config.velocity_max).any()
     assert not arm._monitor.violated
@@ -141,12 +152,8 @@ def test_commands_held_in_rows_of_missed_periods_pass_no_limit(ros):
 @pytest.mark.parametrize("robot", ["panda", "talos_left_arm"])
 def test_commands_that_return_after_outages_make_no_jolt(ros, robot):
     """Outages of up to 100 periods begin with 1 % of the commands; goals are at the limits."""
-    values = read_config(robot, "bullet_node")
-    outages = {"outage_probability": 0.01, "outage_longest": 100, "imperfection_seed": 3}
-    arm = ros.start(BulletNode, values | outages | {"clock": "lockstep"})
-    ros.start(BoundsNode, read_config(robot, "bounds_node"))
-    ros.start(ControllerNode, read_config(robot, "controller_node") | HASTE)
-    tau_max, stop = np.array(values["torque_max"]), arm._stop
+    arm = chain(ros, robot, outage_probability=0.01, outage_longest=100, imperfection_seed=3)
+    tau_max, stop = arm._config.torque_max, arm._stop
     sent, given, last = [], [], np.zeros(len(tau_max))
     follow, update = stop.follow, arm._monitor.update
     first = False
@@ -167,12 +174,7 @@ def test_commands_that_return_after_outages_make_no_jolt(ros, robot):
         update(q, v, tau)
 
     stop.follow, arm._monitor.update = watched_follow, watched_update
-    postures = goals(values, np.random.default_rng(2))
-    user = ros.talk(JointState, "target_posture", GOAL_QOS)
-    for _ in range(10):
-        user.publish(joint_state(values["joints"], 0, next(postures)))
-        end = arm._periods + 300
-        ros.wait_until(lambda end=end: arm._periods >= end, "control periods", timeout=60.0)
+    send_to_limits(ros, arm, 10, 300, seed=2)
     assert len(given) > 10
     assert max(sent) > 0.3, "there was no jolt to avoid"
     assert max(given) < 0.1

@@ -6,18 +6,20 @@ import pinocchio as pin
 import pytest
 
 from viability_bounds_pkg.whole_arm.braking_plan import (
-    FIRST,
-    REST,
     JointLimitsOfPlans,
-    fill_plan,
     make_course,
     new_course,
     rest_of,
-    samples,
-    sensitivity,
     viable_range,
 )
 from viability_bounds_pkg.whole_arm.joint_plan import joint_course, joint_excess
+from viability_bounds_pkg.whole_arm.plan_samples import (
+    FIRST,
+    REST,
+    fill_plan,
+    samples,
+    sensitivity,
+)
 
 DT = 0.01
 N = 7

@@ -10,15 +10,17 @@ from numpy.typing import NDArray
 from viability_bounds_pkg.compiled import compiled
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.whole_arm.braking_plan import (
-    FIRST,
-    STEP,
     Counts,
     Course,
     JointLimitsOfPlans,
     copy_course,
-    fill_plan,
     make_course,
     new_course,
+)
+from viability_bounds_pkg.whole_arm.plan_samples import (
+    FIRST,
+    STEP,
+    fill_plan,
     samples,
 )
 

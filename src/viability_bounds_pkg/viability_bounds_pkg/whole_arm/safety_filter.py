@@ -25,15 +25,17 @@ from numpy.typing import ArrayLike, NDArray
 from viability_bounds_pkg.joint_limits import JointLimitsError, joint_array
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.whole_arm.braking_plan import (
-    FIRST,
     Course,
     JointLimitsOfPlans,
     copy_course,
     new_course,
     repair,
     rest_of,
-    sensitivity,
     viable_range,
+)
+from viability_bounds_pkg.whole_arm.plan_samples import (
+    FIRST,
+    sensitivity,
 )
 from viability_bounds_pkg.whole_arm.plan_torques import RATE_RESERVE, PlanTorques
 
