@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The safety filter's share of a control step, against the number of joints.
 
-Filters of several arms look and choose in turns, in random states that a safe plan is known from.
-What is wanted are random corners of the bounds, so that some steps are changed. Two arms are one
-model, as if one controller had both. Times are of the processor, whatever else it does.
+Filters of several arms look and choose in turns, in random states, a safe plan being in hand as in
+each step but the first. What is wanted are random corners of the bounds, so that some steps are
+changed. Two arms are one model, as if one controller had both. Times are of the processor,
+whatever else it does.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ class Timed:
         self._rng = np.random.default_rng(0)
 
     def find_state(self) -> None:
-        """Find the next random state that a safe plan is known from."""
+        """Find the next random state that a safe plan is known from, and take that in hand."""
         rng, keeper, zero, free = self._rng, self.filter, np.zeros(self.n), np.full(self.n, np.inf)
         while True:
             q = rng.uniform(self.low, self.high)
@@ -83,7 +84,6 @@ class Timed:
         """Time a step in it."""
         q, v, a = self._state
         zero, keeper = np.zeros(self.n), self.filter
-        keeper.reset()
         begin = time.thread_time()
         keeper.look(q, v, zero, self.a_min, self.a_max)
         keeper.choose(a)

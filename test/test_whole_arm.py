@@ -8,7 +8,7 @@ import pinocchio as pin
 import pytest
 from direct import DirectLoop, column
 from time_to_goal import SHORT, near_goal
-from whole_arm import CLEAR, POSE, arrive, random_goal
+from whole_arm import CASES, CLEAR, POSE, arrive, make_loop, random_goal
 
 from torque_safety_controller.node.controller_report import about_detour
 from torque_safety_controller.tasks.detour import Progress
@@ -138,10 +138,11 @@ def test_a_pose_behind_limits_of_joints_is_reached_by_a_detour():
 
 
 @pytest.mark.parametrize(
-    ("goals", "start", "goal"),
+    ("arm", "goals", "start", "goal"),
     [
         # The hand is at a limit of its joint and shakes at 2 rad/s, 0.1 m off.
         (
+            "Baxter",
             "pose",
             [1.697, -2.142, 1.517, 2.613, 1.379, -1.566, -3.054],
             [0.649, 0.765, 1.969, 0.431, 1.516, -1.249, -0.453],
@@ -149,20 +150,30 @@ def test_a_pose_behind_limits_of_joints_is_reached_by_a_detour():
         # On the edge of what the shoulder can hold, with two joints at limits: from there a plan
         # of 0.3 s would brake too hard in whatever direction.
         (
+            "Baxter",
             "pose",
             [-1.697, 1.042, 1.545, -0.045, -3.054, -0.152, -3.054],
             [1.145, -1.964, -0.698, 1.445, 0.735, -0.652, -0.615],
         ),
         # The straight way to the goal can be held, but goes along that edge.
         (
+            "Baxter",
             "posture",
             [1.564, -1.007, 0.045, 2.215, -0.885, 1.057, 0.49],
             [1.697, 0.925, -1.634, -0.045, 2.025, 2.089, 1.256],
         ),
+        # Near the goal, on that edge: only exactly on the straight way torque becomes free.
+        (
+            "Panda, 60% of its torque",
+            "posture",
+            [1.964, -1.336, 2.716, -1.275, 1.0, 3.006, 2.694],
+            [1.957, -1.394, 2.739, -1.281, 0.998, 3.0, 2.694],
+        ),
     ],
 )
-def test_goals_where_an_arm_has_been_stuck_are_reached(goals, start, goal):
-    loop = DirectLoop("baxter_left_arm", (STIFF if goals == "posture" else POSE) | FILTERED)
+def test_goals_where_an_arm_has_been_stuck_are_reached(arm, goals, start, goal):
+    loop = make_loop(CASES[arm])
+    loop.change(**(STIFF if goals == "posture" else POSE))
     loop.robot.reset(np.array(start), np.zeros(7))
     loop.begin()
     loop.controller.set_posture_goal(np.array(start))

@@ -17,6 +17,7 @@ from torque_safety_controller.tasks.posture_task import PostureTask
 from torque_safety_controller.tasks.standstill import GIVEN, PATIENCE, SHORT, Standstill
 from torque_safety_controller.tasks.task import Task
 from torque_safety_controller.tasks.way_search import Search, Way
+from torque_safety_controller.tasks.way_task import WayTask
 
 Array = NDArray[np.float64]
 
@@ -97,6 +98,7 @@ class Detour:
         self._search: Search[Way | None] | None = None
         self._hunted = False  # whether the search began while the arm moved: it is held then
         self._left: Way = []
+        self._closely = False  # whether the arm is to keep to the way, at whatever pace
         self._end: Array | None = None
 
     def tasks(
@@ -124,7 +126,8 @@ class Detour:
             self._watch_or_search(first, robot, goal, bounds)
         held = self._search is not None and self._hunted and self._ways.reached
         if self.progress is Progress.LED or held:
-            return [PostureTask(self.lead, first.kp, first.kd, first.weight)]
+            follow = WayTask if self._closely else PostureTask
+            return [follow(self.lead, first.kp, first.kd, first.weight)]
         if self._end is not None and posture is not first:
             return [first, replace(posture, q_des=self._end)]
         return tasks
@@ -190,6 +193,8 @@ class Detour:
             else:
                 self.progress, self._time = Progress.LED, 0.0
                 self.lead, *self._left = found.value
+                # A straight way that the arm did not follow is found again.
+                self._closely = self._attempts > 1 and len(self._left) == 1
 
     def _end_attempt(self) -> None:
         """Look at the goal again; rest before another attempt if there have been many."""
