@@ -24,8 +24,8 @@ import yaml
 from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from relays import RelayCommand, RelayLimits
 from sensor_msgs.msg import JointState
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from sim_bridge.bullet.robot import BulletRobot
 from sim_bridge.scenario.events import PoseGoal
@@ -36,47 +36,12 @@ from viability_bounds_pkg.node.estimator_node import EstimatorNode
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 from viability_bounds_pkg.ros.direct_delivery import DirectDelivery
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, make_executor, set_stamp
-from viability_bounds_pkg.ros.topics import ACCELERATION_LIMITS, JOINT_COMMANDS, JOINT_STATES
+from viability_bounds_pkg.ros.topics import JOINT_COMMANDS, JOINT_STATES
 
 ROOT = Path(__file__).resolve().parent.parent
 DT_NS = 1_000_000
 WAYS = ("middleware", "one process")
 KINDS = ("real", "relay")
-
-
-class RelayLimits(Node):
-    """Answers a state with limits of the right size, and does nothing else."""
-
-    def __init__(self, joints: list[str], direct_delivery=None, **arguments) -> None:
-        super().__init__("relay_limits", **arguments)
-        self.direct_delivery = direct_delivery
-        wide = array("d", [1.0] * len(joints))
-        self._answer = JointTrajectory(
-            joint_names=joints,
-            points=[JointTrajectoryPoint(accelerations=wide) for _ in range(2)],
-        )
-        self._publisher = ACCELERATION_LIMITS.publisher(self)
-        JOINT_STATES.subscription(self, self._on_state)
-
-    def _on_state(self, message: JointState) -> None:
-        self._answer.header.stamp = message.header.stamp
-        self._publisher.publish(self._answer)
-
-
-class RelayCommand(Node):
-    """Takes states and limits, answers limits with a command of the right size."""
-
-    def __init__(self, joints: list[str], direct_delivery=None, **arguments) -> None:
-        super().__init__("relay_command", **arguments)
-        self.direct_delivery = direct_delivery
-        self._command = JointState(name=joints, effort=array("d", [0.0] * len(joints)))
-        self._publisher = JOINT_COMMANDS.publisher(self)
-        JOINT_STATES.subscription(self, lambda _: None)
-        ACCELERATION_LIMITS.subscription(self, self._on_limits)
-
-    def _on_limits(self, message: JointTrajectory) -> None:
-        self._command.header.stamp = message.header.stamp
-        self._publisher.publish(self._command)
 
 
 class Probe(Node):

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from bench_realtime import load
+from live_robot import load
 from other_environment import TSID, Arrays, worker
 
 from torque_safety_controller.controller import Controller, Gains
@@ -26,7 +26,7 @@ from torque_safety_controller.qp.constraints import AccelerationRange
 from torque_safety_controller.qp.daqp_solver import DaqpSolver
 from torque_safety_controller.qp.inverse_dynamics_qp import InverseDynamicsQP
 from torque_safety_controller.qp.proxqp_solver import ProxqpSolver
-from torque_safety_controller.qp.quadratic_program import QuadraticProgram, Status
+from torque_safety_controller.qp.quadratic_program import QuadraticProgram, Solver, Status
 from torque_safety_controller.qp.terms import TaskTerm
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks.goals import Goals
@@ -258,7 +258,8 @@ def qps_by_backends(programs: list[QuadraticProgram], rounds: int) -> None:
         for name in QuadraticProgram._fields
     }
     reference = np.array([DaqpSolver().solve(program).x for program in programs])
-    for name, solver in {"daqp": DaqpSolver(), "proxqp": ProxqpSolver()}.items():
+    solvers: dict[str, Solver] = {"daqp": DaqpSolver(), "proxqp": ProxqpSolver()}
+    for name, solver in solvers.items():
         times = []
         for _ in range(rounds):
             begin = time.thread_time()

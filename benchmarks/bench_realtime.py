@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Robot, bounds and controller by the wall clock: one process, separate ones, a bare loop.
 
-Each robot plays its demo's goals by turns in the ways to run it; diagnostics of the robot tell
-what was missed: periods without their command in time, and those that passed while the simulated
-robot was late itself, whose motion would have gone on. "both" is what a real robot would miss. A
-bare loop, which sleeps until the next period and does nothing else, shows what the machine itself
-can do. With --stages, where the time of a period goes, in lockstep.
+Each robot plays its demo's goals by turns in the ways to run it, without and with another process
+that records; diagnostics of the robot tell what was missed: periods without their command in time,
+and those that passed while the simulated robot was late itself, whose motion would have gone on.
+"both" is what a real robot would miss. A bare loop, which sleeps until the next period and does
+nothing else, shows what the machine itself can do; relays in place of bounds and controller, in
+the robot's process, what messages and simulation take. Then, in lockstep, where the time of a
+period goes.
 """
 
 from __future__ import annotations
@@ -13,20 +15,23 @@ from __future__ import annotations
 import argparse
 import itertools
 import math
-import os
 import time
 from collections import defaultdict
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from bench_recorder import Recorder
 from geometry_msgs.msg import PoseStamped
 from live_robot import (
     ONE_PROCESS,
     PROCESSES,
+    RELAYS,
     Programs,
     User,
     configuration,
+    cpu_seconds,
     goals,
     load,
     running,
@@ -63,18 +68,13 @@ CASES = (
     ("talos_left_arm", 1000.0),
     ("baxter_left_arm", 100.0),
 )
-WAYS = ONE_PROCESS, PROCESSES
+RECORDED = "recorded"
+WAYS = RELAYS, ONE_PROCESS, RECORDED, PROCESSES
+"""`RECORDED` is one process as well."""
 SETTLING = 1.0
 """How long a robot moves before it is measured, s."""
-
-
-def cpu_seconds(programs: Programs) -> float:
-    """Return the time on processors of running programs, s."""
-    ticks = 0
-    for process in programs.values():
-        fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
-        ticks += int(fields[11]) + int(fields[12])
-    return ticks / os.sysconf("SC_CLK_TCK")
+LONG_ENOUGH = 6.0
+"""For where the time of a period goes, s."""
 
 
 def memory(programs: Programs) -> float:
@@ -90,9 +90,12 @@ def measure(
 ) -> str:
     """Run a robot by the wall clock for some seconds; return the row of what came of it."""
     arguments = configuration(robot, rate, imperfect=imperfect)
-    with running(way, arguments, imperfect, scheduling) as programs:
+    run = ONE_PROCESS if way == RECORDED else way
+    with running(run, arguments, imperfect, scheduling) as programs, ExitStack() as recording:
         user = User(goals(robot), "target_pose")
         try:
+            if way == RECORDED:
+                recording.callback(Recorder(robot).end)
             user.start(programs)
             user.use(SETTLING)
             before, used, begin = user.report(), cpu_seconds(programs), time.monotonic()
@@ -303,7 +306,7 @@ def main() -> None:
     robots = [f"{robot}@{rate:g}" for robot, rate in CASES]
     parser.add_argument("--case", action="append", choices=robots, help="repeatable; default: all")
     parser.add_argument("--imperfect", action="store_true", help="robots with all remedies")
-    parser.add_argument("--stages", action="store_true", help="where the time of a period goes")
+    parser.add_argument("--only", choices=("ways", "stages"), help="a part of it (default: both)")
     add_scheduling(parser)
     options = parser.parse_args()
     scheduling = scheduling_words(options)
@@ -311,16 +314,16 @@ def main() -> None:
         if options.case and f"{robot}@{rate:g}" not in options.case:
             continue
         print(f"\n{robot} at {rate:g} Hz; {load()}")
-        if options.stages:
-            stages(robot, rate, options.seconds, options.imperfect)
-            continue
-        print(HEAD)
-        print(bare_loop(rate, options.seconds))
-        for way in WAYS:
-            print(
-                measure(robot, rate, way, options.seconds, options.imperfect, scheduling),
-                flush=True,
-            )
+        if options.only != "stages":
+            print(HEAD)
+            print(bare_loop(rate, options.seconds))
+            for way in WAYS:
+                print(
+                    measure(robot, rate, way, options.seconds, options.imperfect, scheduling),
+                    flush=True,
+                )
+        if options.only != "ways":
+            stages(robot, rate, min(options.seconds, LONG_ENOUGH), options.imperfect)
 
 
 if __name__ == "__main__":

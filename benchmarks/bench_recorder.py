@@ -17,7 +17,16 @@ import time
 from contextlib import suppress
 
 import rclpy
-from bench_realtime import START, User, configuration, cpu_seconds, load, running
+from live_robot import (
+    ONE_PROCESS,
+    START,
+    User,
+    configuration,
+    cpu_seconds,
+    goals,
+    load,
+    running,
+)
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.task import Future
@@ -85,17 +94,17 @@ class Recorder:
 def measure(robot: str, rate: float, lockstep: bool, recorder: str, seconds: float) -> str:
     """Run a robot for some seconds; return the line of what came of it."""
     arguments = configuration(robot, rate, imperfect=False) + LOCKSTEP * lockstep
-    with running("one process", arguments, imperfect=False) as processes:
-        user = User(robot)
+    with running(ONE_PROCESS, arguments, imperfect=False) as programs:
+        user = User(goals(robot), "target_pose")
         recording = None if recorder == "none" else Recorder(robot)
         try:
-            user.start(lambda: all(process.poll() is None for process in processes))
+            user.start(programs)
             user.use(SETTLING)
             if recording is not None and recorder == "stopped":
                 recording.stand_still()
-            before, used, begin = user.report(), cpu_seconds(processes), time.monotonic()
+            before, used, begin = user.report(), cpu_seconds(programs), time.monotonic()
             user.use(seconds)
-            after, cpu = user.report(), cpu_seconds(processes) - used
+            after, cpu = user.report(), cpu_seconds(programs) - used
             passed = time.monotonic() - begin
         finally:
             recorded = recording.end() if recording is not None else 0

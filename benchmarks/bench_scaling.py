@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import rclpy
-from bench_realtime import load
 from bench_step import microseconds
+from live_robot import load
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
@@ -134,7 +134,7 @@ class Arm(Node):
         delivery, namespace = DirectDelivery(), f"arm_{number}"
         super().__init__("robot", namespace=namespace)
         self.direct_delivery = delivery
-        self.nodes = [self]
+        self.nodes: list[Any] = [self]
         for kind in (BoundsNode, ControllerNode):
             self.nodes.append(
                 kind(

@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import os
 import subprocess
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import cycle
@@ -21,6 +22,8 @@ from viability_bounds_pkg.testing.ros_harness import RosHarness
 
 ROOT = Path(__file__).resolve().parent.parent
 ONE_PROCESS, SEPARATE_ROBOT, PROCESSES = "one process", "stack + robot", "processes"
+RELAYS = "relays"
+RELAY_PROGRAM = Path(__file__).parent / "relays.py"
 WAYS = {
     ONE_PROCESS: (("sim_bridge", "simulated_stack"),),
     SEPARATE_ROBOT: (
@@ -80,6 +83,8 @@ class User:
         def ready() -> bool:
             if any(program.poll() is not None for program in programs.values()):
                 raise SystemExit("error: a program could not start")
+            if RELAYS in programs:
+                return "bullet_node" in self.ros.diagnostics
             found = {"bullet_node", "bounds_node", "controller_node"} <= set(self.ros.diagnostics)
             return found and self._publisher.get_subscription_count() > 0
 
@@ -114,20 +119,26 @@ def running(
     """Run the programs of a way; yield them by name.
 
     Args:
-        way: one of `WAYS`.
+        way: one of `WAYS`, or `RELAYS`: the robot, and relays in place of bounds and controller.
         arguments: for ROS.
         imperfect: whether there is an estimator.
         scheduling: options of the programs themselves.
     """
-    programs = WAYS[way]
-    if way == PROCESSES and imperfect:
-        programs += (("viability_bounds_pkg", "estimator_node"),)
+    commands: dict[str, list[Any]] = {RELAYS: [sys.executable, RELAY_PROGRAM]}
+    if way != RELAYS:
+        programs = WAYS[way]
+        if way == PROCESSES and imperfect:
+            programs += (("viability_bounds_pkg", "estimator_node"),)
+        commands = {
+            name: [ROOT / "install" / package / "lib" / package / name]
+            for package, name in programs
+        }
     started = {
         name: subprocess.Popen(
-            [ROOT / "install" / package / "lib" / package / name, *scheduling, "--ros-args"]
+            [*command, *scheduling, "--ros-args"]
             + [*arguments, "--log-level", "error", "-p", "start_paused:=true"]
         )
-        for package, name in programs
+        for name, command in commands.items()
     }
     try:
         yield started
@@ -136,6 +147,15 @@ def running(
             program.terminate()
         for program in started.values():
             program.wait()
+
+
+def cpu_seconds(programs: Programs) -> float:
+    """Return the time on processors of running programs, s."""
+    ticks = 0
+    for process in programs.values():
+        fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
+        ticks += int(fields[11]) + int(fields[12])
+    return ticks / os.sysconf("SC_CLK_TCK")
 
 
 def load() -> str:

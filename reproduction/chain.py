@@ -109,7 +109,7 @@ def run_chain(
     with tempfile.TemporaryDirectory() as directory, _context():
         path = Path(directory) / "scenario.yaml"
         path.write_text(yaml.safe_dump(scenario))
-        nodes = {}
+        nodes: dict[str, Any] = {}
         for name, kind in NODES.items():
             if name == "estimator_node" and name not in per_node:
                 continue

@@ -186,7 +186,7 @@ def compare_all(pool, wanted: int, seed: int) -> list[tuple[Joint, Comparison]]:
     return results
 
 
-def table(title: str, columns: list[str], rows: dict[tuple[str, bool], tuple]) -> None:
+def table(title: str, columns: list[str], rows: dict[tuple[str, bool], Outside]) -> None:
     """Print rows of outcomes, and what they come to for either kind."""
     print(f"\n{title}\n{'':<28}{'(11)':<8}" + "".join(f"{c:>16}" for c in columns))
     for holds in (True, False):
@@ -202,7 +202,7 @@ def _text(x: float) -> str:
     return "-" if x == -np.inf else f"{x:.1e}"
 
 
-def as_metrics(rows: dict[tuple[str, bool], tuple]) -> dict[str, dict]:
+def as_metrics(rows: dict[tuple[str, bool], Outside]) -> dict[str, dict]:
     """Return outcomes by kind and name, infinities as null."""
     found: dict[str, dict] = {"condition_11_holds": {}, "condition_11_fails": {}}
     for (name, holds), outcome in rows.items():

@@ -253,7 +253,9 @@ class Arena:
                 least = now
             else:
                 corner[j] *= -1.0
-        loop.controller.goals.a = np.where(corner > 0.0, upper, lower)
+        goals = loop.controller.goals
+        assert isinstance(goals, CornerGoals)
+        goals.a = np.where(corner > 0.0, upper, lower)
         return corner
 
     def step(self) -> tuple[float, float]:
