@@ -16,6 +16,7 @@ from viability_bounds_pkg.whole_arm.joint_plan import joint_course, joint_excess
 from viability_bounds_pkg.whole_arm.plan_samples import (
     FIRST,
     REST,
+    UNIFORM,
     fill_plan,
     samples,
     sensitivity,
@@ -62,13 +63,14 @@ class Plan:
             course = new_course(N)
             make_course(q, v, a, T, change, limits_of(change), DT, course)
         self.course = course
-        count = samples(N, True)
-        self.clock, self.order = (np.zeros(count, dtype=np.int64) for _ in range(2))
-        self.positions, self.velocities, self.accelerations = (
-            np.zeros((count, N)) for _ in range(3)
+        most = samples(N, True)
+        rows = (np.zeros(most, dtype=np.int64), *(np.zeros((most, N)) for _ in range(3)))
+        count, self.beyond, self.excess = fill_plan(
+            q, v, a, course, limits_of(change), DT, True, *rows
         )
-        rows = (self.clock, self.order, self.positions, self.velocities, self.accelerations)
-        self.beyond, self.excess = fill_plan(q, v, a, course, limits_of(change), DT, *rows)
+        self.clock, self.positions, self.velocities, self.accelerations = (
+            each[:count] for each in rows
+        )
         self.hand = [by_hand(v[j], a[j], *(each[j] for each in course)) for j in range(N)]
         self.states = [played(q[j], v[j], self.hand[j]) for j in range(N)]
 
@@ -93,8 +95,12 @@ def random_state(rng, share=1.0):
 def test_a_plan_is_what_its_definition_says(seed, change):
     rng = np.random.default_rng(seed)
     plan = Plan(*random_state(rng), rng.uniform(DT, 1.0), change)
-    assert (np.diff(plan.clock[plan.order]) >= 0).all()
-    assert sorted(plan.order) == list(range(samples(N, True)))
+    assert (np.diff(plan.clock) > 0).all()
+    longest = plan.course.moving.max()
+    looked_at = {k * longest // UNIFORM for k in range(UNIFORM)} | {-1, REST}
+    for moving, rising, falling in zip(*plan.course, strict=True):
+        looked_at |= {moving - falling, moving, rising - 1}
+    assert looked_at == set(plan.clock.tolist())
     for k, clock in enumerate(plan.clock.tolist()):
         if k >= FIRST:
             q, v, a = plan.at(clock)

@@ -32,7 +32,7 @@ REST = 10**9
 
 
 def samples(n: int, smooth: bool) -> int:
-    """Return how many samples a plan of n joints has.
+    """Return how many samples a plan of n joints has at most.
 
     The step that leads to it; those at equal distances; where each joint begins to brake less and
     where it stands, for smooth plans also where it brakes fully; and one at rest.
@@ -41,34 +41,46 @@ def samples(n: int, smooth: bool) -> int:
 
 
 @compiled
-def fill_clock(course: Course, clock: Counts, order: Counts) -> None:
-    """Fill in the periods of a plan's samples, and the samples in their order.
+def fill_clock(course: Course, smooth: bool, clock: Counts) -> int:
+    """Fill in the periods of a plan's samples, in their order, each once; return how many.
 
     Args:
         course: of the plan.
-        clock: the step that leads to the plan has -1, the last is at rest; shape (samples(n),).
-        order: indices by rising clock, shape (samples(n),), or none to be filled in.
+        smooth: whether there are samples where joints brake fully.
+        clock: the step that leads to the plan has -1, the last is at rest; shape
+            (samples(n, smooth),).
     """
-    n = course.moving.size
-    longest = course.moving.max()
     clock[STEP] = -1
-    for k in range(UNIFORM):
-        clock[FIRST + k] = (k * longest) // UNIFORM
-    corners = FIRST + UNIFORM
-    for j in range(n):
+    clock[FIRST] = 0
+    count = FIRST + 1
+    longest = course.moving.max()
+    for k in range(1, UNIFORM):
+        period = (k * longest) // UNIFORM
+        if period > clock[count - 1]:
+            clock[count] = period
+            count += 1
+    for j in range(course.moving.size):
         moving = course.moving[j]
-        clock[corners + j] = moving - course.falling[j]
-        clock[corners + n + j] = moving
-        if clock.size > corners + 2 * n + 1:
-            clock[corners + 2 * n + j] = course.rising[j] - 1
-    clock[-1] = REST
-    # Insertion into what is sorted mostly.
-    for k in range(order.size):
-        place = k
-        while place > 0 and clock[order[place - 1]] > clock[k]:
-            order[place] = order[place - 1]
-            place -= 1
-        order[place] = k
+        count = insert(moving - course.falling[j], clock, count)
+        count = insert(moving, clock, count)
+        if smooth:
+            count = insert(course.rising[j] - 1, clock, count)
+    clock[count] = REST
+    return count + 1
+
+
+@compiled
+def insert(period: int, clock: Counts, count: int) -> int:
+    """Insert a period into the first `count`, which are sorted; return how many there are now."""
+    place = count
+    while clock[place - 1] > period:
+        place -= 1
+    if clock[place - 1] == period:
+        return count
+    for k in range(count, place, -1):
+        clock[k] = clock[k - 1]
+    clock[place] = period
+    return count + 1
 
 
 @compiled
@@ -79,12 +91,12 @@ def fill_plan(
     course: Course,
     limits: JointLimitsOfPlans,
     dt: float,
+    smooth: bool,
     clock: Counts,
-    order: Counts,
     positions: Array,
     velocities: Array,
     accelerations: Array,
-) -> tuple[float, float]:
+) -> tuple[int, float, float]:
     """Fill in the states and accelerations of a plan at its samples, but for the step before.
 
     Args:
@@ -94,29 +106,29 @@ def fill_plan(
         course: of the plan.
         limits: of the joints.
         dt: control period, s.
-        clock: filled in, see `fill_clock`.
-        order: likewise.
-        positions: of the samples, shape (samples(n), n), rad.
-        velocities: shape (samples(n), n), rad/s.
-        accelerations: shape (samples(n), n), rad/s^2.
+        smooth: see `fill_clock`.
+        clock: filled in likewise.
+        positions: of the samples, shape (samples(n, smooth), n), rad.
+        velocities: likewise, rad/s.
+        accelerations: likewise, rad/s^2.
 
     Returns:
-        By how far the plan, or the present state, passes limits of joints at worst: excess of
-        positions beyond the tolerance, rad; of speeds and changes of acceleration, as a share of
-        their limits; 0 for none.
+        How many samples there are; by how far the plan, or the present state, passes limits of
+        joints at worst: excess of positions beyond the tolerance, rad; of speeds and changes of
+        acceleration, as a share of their limits; 0 for none.
     """
-    fill_clock(course, clock, order)
+    count = fill_clock(course, smooth, clock)
     far = fast = 0.0
     for j in range(q.size):
         N, m, w = course.moving[j], course.rising[j], course.falling[j]
-        for k in range(FIRST, clock.size):
+        for k in range(FIRST, count):
             positions[k, j], velocities[k, j], accelerations[k, j] = joint_state(
                 q[j], v[j], a[j], N, m, w, dt, min(clock[k], N)
             )
         place, speed = excess_of(j, q[j], v[j], a[j], (N, m, w), limits, dt)
         far = max(far, place - limits.tolerance[j])
         fast = max(fast, speed)
-    return far, fast if fast > NEGLIGIBLE else 0.0
+    return count, far, fast if fast > NEGLIGIBLE else 0.0
 
 
 @compiled

@@ -33,7 +33,8 @@ RATE_RESERVE = 0.1
 class PlanTorques:
     """The plan that was looked at last, its torques and what they leave of the limits.
 
-    Arrays have one row for each sample, and a column for each of the n joints.
+    Arrays have one row for each sample, `count` of them filled in, the last for the arm at rest;
+    and a column for each of the n joints.
 
     Args:
         model: the arm, n joints with one coordinate each.
@@ -44,7 +45,8 @@ class PlanTorques:
 
     Attributes:
         course: when each joint does what.
-        clock: periods of the samples; -1 for the step that leads to the plan.
+        count: number of samples.
+        clock: periods of the samples, rising; -1 for the step that leads to the plan.
         positions: rad.
         velocities: rad/s.
         accelerations: rad/s^2.
@@ -69,19 +71,17 @@ class PlanTorques:
     ) -> None:
         n = model.nv
         rates = bool(np.isfinite(tau_change).any())
-        count = samples(n, rates or bool(np.isfinite(limits.change_max).any()))
+        self._smooth = rates or bool(np.isfinite(limits.change_max).any())
+        most = self.count = samples(n, self._smooth)
         self._limits, self._tau_max, self._tau_change, self._dt = limits, tau_max, tau_change, dt
         self._pool = pin.ModelPool(model, 1)
         self.course = new_course(n)
-        self.clock = np.zeros(count, dtype=np.int64)
-        self._order = np.zeros(count if rates else 0, dtype=np.int64)
-        self.positions, self.velocities, self.accelerations, self.tau = (
-            np.zeros((count, n)) for _ in range(4)
-        )
-        # Pinocchio has a column for each sample.
-        self._columns = tuple(
-            each.T for each in (self.positions, self.velocities, self.accelerations, self.tau)
-        )
+        self.clock = np.zeros(most, dtype=np.int64)
+        self.positions, self.velocities, self.accelerations, self.tau = rows = [
+            np.zeros((most, n)) for _ in range(4)
+        ]
+        # Pinocchio has a column for each sample; by their number.
+        self._columns = [tuple(each[:count].T for each in rows) for count in range(most + 1)]
         self.loads, self.changes = np.zeros(n), np.zeros(n)
         self.busiest = np.zeros(n, dtype=np.int64)
         self.slack = self.beyond = self.excess = self.hurry = 0.0
@@ -131,15 +131,15 @@ class PlanTorques:
         """
         if course is not self.course:
             copy_course(course, self.course)
-        self.beyond, self.excess = fill_plan(
+        self.count, self.beyond, self.excess = fill_plan(
             q,
             v,
             a,
             course,
             self._limits,
             self._dt,
+            self._smooth,
             self.clock,
-            self._order,
             self.positions,
             self.velocities,
             self.accelerations,
@@ -150,18 +150,23 @@ class PlanTorques:
         else:
             for rows in (self.positions, self.velocities, self.accelerations):
                 rows[STEP] = rows[FIRST]
-        pin.rneaInParallel(1, self._pool, *self._columns)
+        pin.rneaInParallel(1, self._pool, *self._columns[self.count])
         self.slack, self.hurry = measure(
             self.tau,
             extra,
             self._tau_max,
             self._tau_change,
             self.clock,
-            self._order,
+            self.count,
             self.loads,
             self.changes,
             self.busiest,
         )
+
+    @property
+    def at_rest(self) -> int:
+        """Row of the arm at rest."""
+        return self.count - 1
 
     @property
     def cost(self) -> float:
@@ -177,7 +182,7 @@ def measure(
     tau_max: Array,
     tau_change: Array,
     clock: Counts,
-    order: Counts,
+    count: int,
     loads: Array,
     changes: Array,
     busiest: Counts,
@@ -189,8 +194,8 @@ def measure(
         extra: shape (n,), N m.
         tau_max: shape (n,), N m.
         tau_change: largest change in a period, shape (n,), N m.
-        clock: periods of the samples, shape (k,).
-        order: of the samples in time, shape (k,).
+        clock: periods of the samples, rising, shape (k,).
+        count: how many of the samples there are, at most k.
         loads: largest share of each joint's limit, shape (n,), filled in.
         changes: largest share of what may change, shape (n,), filled in.
         busiest: the sample after the first with the largest torque of each joint, filled in.
@@ -198,7 +203,7 @@ def measure(
     Returns:
         1 less the largest share of a torque limit; and by which share a change is too large, or 0.
     """
-    count, n = tau.shape
+    n = tau_max.size
     most = hurry = 0.0
     for j in range(n):
         loads[j] = -1.0
@@ -219,13 +224,11 @@ def measure(
             most = loads[j]
         if tau_change[j] == np.inf:
             continue
-        for i in range(1, count - 1):  # but for the last, the arm at rest
-            before, now = order[i - 1], order[i]
-            if clock[now] > clock[before]:
-                change = abs(tau[now, j] - tau[before, j])
-                change /= tau_change[j] * (clock[now] - clock[before])
-                if not change <= changes[j]:
-                    changes[j] = change
+        for k in range(FIRST, count - 1):  # but for the last, the arm at rest
+            change = abs(tau[k, j] - tau[k - 1, j])
+            change /= tau_change[j] * (clock[k] - clock[k - 1])
+            if not change <= changes[j]:
+                changes[j] = change
         if not changes[j] <= hurry:
             hurry = changes[j]
     return 1.0 - most, max(hurry - 1.0, 0.0)

@@ -336,7 +336,7 @@ class SafetyFilter:
         self.slack = plans.slack
         self._now = Needs.of(plans)
         self.plan = plans.accelerations[FIRST].copy()
-        self.rest_torque = plans.tau[-1].copy()
+        self.rest_torque = plans.tau[plans.at_rest].copy()
         self._narrow(lower, upper)
         most = float((plans.loads * self._of_limit).max())
         self.lost = not most <= 1.0 + LOST
@@ -345,7 +345,7 @@ class SafetyFilter:
         wanted: dict[int, list[int]] = {}
         # With fewer samples the largest torque would move to and fro between them.
         for j in np.flatnonzero(plans.loads > NEAR).tolist():
-            for k in {FIRST, int(plans.busiest[j]), len(plans.clock) - 1}:
+            for k in {FIRST, int(plans.busiest[j]), plans.at_rest}:
                 if abs(plans.tau[k, j]) > NEAR * self.usable[j]:
                     wanted.setdefault(k, []).append(j)
         return self._rows(wanted) if wanted else None
