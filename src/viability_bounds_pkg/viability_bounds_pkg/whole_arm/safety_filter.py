@@ -58,6 +58,10 @@ NEAR = 0.6
 APPROACH = 0.04
 """Time constant with which a step may use up what a plan leaves of a torque limit, s."""
 
+RETURN = 0.12
+"""Time constant with which a step leads back to what a plan is to leave, s: gently, because noise
+of the states moves plans as well."""
+
 USUAL = 0.3
 """Time of plans without a reason for another, s."""
 
@@ -420,7 +424,7 @@ class SafetyFilter:
     def _rows(self, wanted: dict[int, list[int]]) -> Rows:
         """Return the rows of joints at samples."""
         plans, gradient = self._plans, self._gradient
-        use = min(self._dt / APPROACH, 1.0)
+        use, back = min(self._dt / APPROACH, 1.0), min(self._dt / RETURN, 1.0)
         rows, upper = [], []
         for k, joints in wanted.items():
             by_q, by_v, M = pin.computeRNEADerivatives(
@@ -437,7 +441,8 @@ class SafetyFilter:
                 left = (1.0 - KEPT) * self.usable[j] - abs(tau)
                 size = max(float(np.sqrt(row @ row)), 1e-9)
                 rows.append(row / size)
-                upper.append((use * left + float(row @ self.plan)) / size)
+                part = (use if left > 0.0 else back) * left
+                upper.append((part + float(row @ self.plan)) / size)
         return Rows(np.array(rows), np.array(upper))
 
     def choose(self, a: Array) -> Array:
