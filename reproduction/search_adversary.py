@@ -39,6 +39,8 @@ SPREAD = 0.05
 """Least standard deviation of the search, as a share of each range."""
 SMALL, HARD = 0.01, 0.1
 """Shares of the torque limits that pushes take: within the reserve of plans, and beyond it."""
+PUSHED = 3000
+"""Random postures in which pushes are looked at."""
 HOLDING = 0.9
 """Share of the torque limits that holding takes at most where an episode starts."""
 SEARCHES = ("slack", "position", "speed")
@@ -136,6 +138,25 @@ class Unconstrained:
         self._keeper.look(*arguments)
 
 
+def pushed(loop: DirectLoop, share: float) -> np.ndarray:
+    """Return what pushes at the hand accelerate joints by, shape (n,), rad/s^2, and a tenth more.
+
+    Of pushes that take `share` of the torque limits, in random postures: what is to be declared.
+    """
+    rng, model, data = np.random.default_rng(0), loop.model, loop.model.createData()
+    frame = model.getFrameId(loop.controller.robot.frame)
+    most = np.zeros(len(loop.limits))
+    for _ in range(PUSHED):
+        q = rng.uniform(loop.limits.q_min, loop.limits.q_max)
+        J = pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
+        torque = J[:3].T @ rng.standard_normal(3)
+        torque *= (share * loop.config.torque_max / np.maximum(np.abs(torque), 1e-9)).min()
+        M = pin.crba(model, data, q)
+        M = np.triu(M) + np.triu(M, 1).T
+        most = np.maximum(most, np.abs(np.linalg.solve(M, torque)))
+    return 1.1 * most
+
+
 class Arena:
     """An arm that episodes are played on.
 
@@ -149,6 +170,10 @@ class Arena:
         changed = {"safety_filter": row.filtered, "torque_max": (row.share * tau_max).tolist()}
         self._changed = STIFF | changed
         self.loop = loop = DirectLoop(row.robot, self._changed)
+        if row.filtered and row.push == SMALL:
+            loop.robot.close()
+            self._changed |= {"acceleration_disturbance": pushed(loop, SMALL).tolist()}
+            self.loop = loop = DirectLoop(row.robot, self._changed)
         self.n = len(loop.limits)
         self.genes = self.n + GOALS * (self.n + 1 + (5 if row.push else 0))
         self._data = loop.model.createData()
