@@ -7,6 +7,7 @@ import subprocess
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
 from chain import load_values
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -18,13 +19,14 @@ from sim_bridge.nodes.scenario_node import ScenarioNode, ScenarioRefused, play
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.ros.claim import Claim, TakenError
+from viability_bounds_pkg.ros.runtime import GOAL_QOS, stamp_to_ns
 from viability_bounds_pkg.ros.topics import (
     ACCELERATION_LIMITS,
     FT_WRENCH,
     JOINT_COMMANDS,
     JOINT_STATES,
 )
-from viability_bounds_pkg.testing.ros_harness import overrides
+from viability_bounds_pkg.testing.ros_harness import acceleration_limits, joint_state, overrides
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -71,6 +73,84 @@ def test_each_node_reports_a_second_publisher_of_what_it_publishes_and_obeys(
     assert sorted(node.publisher_watch.rivals) == sorted(topic.strip("'") for topic in topics)
     ros.stop(other)
     ros.wait_until(lambda: ros.reported(kind.NAME, key) == "none", "its end")
+
+
+class Intruder:
+    """Answers each joint state at once with what is wrong on a topic, and has the right stamp."""
+
+    def __init__(self, ros, topic, values):
+        self._topic, self._values = topic, values
+        self.node = ros.add(Node("driver", context=ros.context, namespace="theirs"))
+        self._publisher = topic.publisher(self.node, f"/{topic.name}")
+        self.node.create_subscription(
+            JOINT_STATES.message, "/joint_states", self._answer, JOINT_STATES.qos
+        )
+        self._sign, self._ended = 1.0, False
+
+    def end(self, ros):
+        """Leave."""
+        self._ended = True
+        ros.stop(self.node)
+
+    def _answer(self, state):
+        if self._ended:
+            return
+        joints, n = list(state.name), len(state.name)
+        stamp = stamp_to_ns(state.header.stamp)
+        self._sign = -self._sign
+        if self._topic is JOINT_STATES:
+            q = np.array(state.position) + 0.3 * self._sign
+            message = joint_state(joints, stamp + 1_000_000, q, [0.5 * self._sign] * n)
+        elif self._topic is JOINT_COMMANDS:
+            joints = self._values["joints"]
+            message = joint_state(joints, stamp, tau=self._values["torque_max"])
+        else:
+            message = acceleration_limits(joints, stamp, [-100.0] * n, [100.0] * n)
+        self._publisher.publish(message)
+
+
+@pytest.mark.parametrize(
+    ("topic", "node", "key", "value"),
+    [
+        (
+            JOINT_STATES,
+            "controller_node",
+            "reason",
+            "2 publishers of '/joint_states': /bullet_node, /theirs/driver",
+        ),
+        (ACCELERATION_LIMITS, "controller_node", "mode", "HOLD"),
+        (JOINT_COMMANDS, "bullet_node", "control", "stopped"),
+    ],
+    ids=["states", "limits", "commands"],
+)
+def test_what_an_intruder_publishes_is_not_obeyed_and_the_arm_stops(ros, topic, node, key, value):
+    values = load_values("baxter_left_arm") | {"start_paused": False}
+    values |= {"posture_kp": 25.0, "posture_kd": 10.0, "posture_weight": 1.0, "pose_weight": 0.0}
+    arm = ros.start(BulletNode, values)
+    for kind in (BoundsNode, ControllerNode):
+        ros.start(kind, values)
+    user = ros.talk(JOINT_STATES.message, "target_posture", GOAL_QOS)
+    goal = np.array(values["start_positions"]) + [0.4, 0.0, 0.4, 0.4, 0.4, 0.4, 0.4]
+
+    def moves():
+        return np.abs(arm._robot.state().v).max() > 0.1
+
+    ros.wait_until(
+        moves, "motion", each=lambda: user.publish(joint_state(values["joints"], 0, goal))
+    )
+    intruder = Intruder(ros, topic, values)
+    ros.wait_until(lambda: ros.reported(node, key) == value, value)
+    ros.wait_until(lambda: np.abs(arm._robot.state().v).max() < 0.01, "rest")
+    for _ in range(10):
+        ros.run_for(0.05)
+        assert np.abs(arm._robot.state().v).max() < 0.02
+    assert not arm._monitor.violated
+    told = f"2 publishers of '/{topic.name}'"
+    nodes = "bullet_node", "bounds_node", "controller_node"
+    assert any(told in ros.diagnostics[node]["message"] for node in nodes)
+    intruder.end(ros)
+    ros.wait_until(lambda: np.abs(arm._robot.state().q - goal).max() < 0.05, "the goal")
+    assert not arm._monitor.violated
 
 
 def test_a_topic_of_ros2_control_is_watched_where_there_is_one(ros):

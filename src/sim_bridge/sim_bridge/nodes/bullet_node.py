@@ -125,7 +125,7 @@ class BulletNode(ArmNode):
         self._clock_publisher = CLOCK.publisher(self) if config.publish_clock else None
         description = ROBOT_DESCRIPTION.publisher(self)
         description.publish(String(data=config.urdf))
-        JOINT_COMMANDS.subscription(self, self._on_command)
+        self._commands_topic = JOINT_COMMANDS.subscription(self, self._on_command).topic_name
         RESET.serve(self, self._on_reset)
         PAUSE.serve(self, self._on_pause)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -285,7 +285,7 @@ class BulletNode(ArmNode):
             if not self._paused:
                 self._note_stray(stamp_to_ns(message.header.stamp))
             return
-        if self._paused:
+        if self._paused or not self.publisher_watch.admits(self._commands_topic):
             return
         try:
             command = read_command(message, self._joints)

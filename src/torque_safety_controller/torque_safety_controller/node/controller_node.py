@@ -98,8 +98,9 @@ class ControllerNode(ArmNode):
         self._gains = GainWatch(self, self._controller.robot.model, config)
         self._published = StatePublisher(self, self._controller, config, base, self._states)
         states = state_topic(config.use_estimated_states)
-        states.subscription(self, self._on_state)
-        ACCELERATION_LIMITS.subscription(self, self._on_limits)
+        self._states_topic = states.subscription(self, self._on_state).topic_name
+        limits = ACCELERATION_LIMITS.subscription(self, self._on_limits)
+        self._limits_topic = limits.topic_name
         ENABLE_TORQUE.serve(self, self._on_enable_torque)
         # Use the steady clock, so that watchdogs fire when /clock stops.
         self._watchdog = self.create_timer(
@@ -144,6 +145,8 @@ class ControllerNode(ArmNode):
     # Streams
 
     def _on_state(self, message: JointState) -> None:
+        if not self.publisher_watch.admits(self._states_topic):
+            return
         now = time.monotonic()
         self._message_at, self._message_stamp = now, message.header.stamp
         last = self._states.stamp
@@ -177,7 +180,7 @@ class ControllerNode(ArmNode):
         self._handover.robot_was_away()
 
     def _on_limits(self, message: JointTrajectory) -> None:
-        if not self._limits.read(message):
+        if not (self.publisher_watch.admits(self._limits_topic) and self._limits.read(message)):
             return
         if self._limits.stamp == self._states.stamp != self._answered_stamp:
             self._track(message.header.stamp)
@@ -327,7 +330,8 @@ class ControllerNode(ArmNode):
         if now - self._state_at > config.state_timeout:
             if self._modes.mode is not Mode.STOPPED:
                 quiet = now - self._message_at > config.state_timeout
-                self._enter(Mode.STOPPED, "no joint state" if quiet else self._why_refused())
+                silent = self.publisher_watch.several or "no joint state"
+                self._enter(Mode.STOPPED, silent if quiet else self._why_refused())
             return
         waiting = self._states.stamp != self._answered_stamp
         if waiting and now - self._waiting_since > config.bounds_timeout:

@@ -68,7 +68,7 @@ def test_other_namespaces_and_topics_are_no_rivals(ros, watched):
     assert not log.warnings
 
 
-def test_a_publisher_without_a_name_is_told_one_look_later(ros, watched, monkeypatch):
+def test_a_publisher_without_a_name_is_told_a_moment_later(ros, watched, monkeypatch):
     node, _, log = watched
     rival_of(ros)
     ros.hears("/left/command", 2)
@@ -82,6 +82,8 @@ def test_a_publisher_without_a_name_is_told_one_look_later(ros, watched, monkeyp
     watch = PublisherWatch(node, ["command"])
     watch.look()
     assert not watch.rivals
+    now = publisher_watch.time.monotonic()
+    monkeypatch.setattr(publisher_watch.time, "monotonic", lambda: now + 1.5)
     watch.look()
     assert len(watch.rivals["/left/command"]) == 2
     assert len(log.warnings) == 1

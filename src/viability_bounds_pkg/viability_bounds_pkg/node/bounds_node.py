@@ -65,7 +65,8 @@ class BoundsNode(ArmNode):
         )
         self._publisher = ACCELERATION_LIMITS.publisher(self)
         states = state_topic(config.use_estimated_states)
-        states.subscription(self, self._on_state)
+        subscription = states.subscription(self, self._on_state)
+        self._states_topic = subscription.topic_name
         self.publisher_watch = PublisherWatch(
             self,
             [ACCELERATION_LIMITS.name, states.name],
@@ -114,6 +115,8 @@ class BoundsNode(ArmNode):
                 )
 
     def _on_state(self, message: JointState) -> None:
+        if not self.publisher_watch.admits(self._states_topic):
+            return
         last = self._reader.stamp
         verdict = self._reader.read(message, time.monotonic())
         if verdict is Verdict.REFUSED:

@@ -60,8 +60,8 @@ class EstimatorNode(ArmNode):
         self._answered = self._restarts = self.commands_heard = 0
         self._answer = JointState()
         self._publisher = ESTIMATED_JOINT_STATES.publisher(self)
-        JOINT_STATES.subscription(self, self._on_state)
-        JOINT_COMMANDS.subscription(self, self._on_command)
+        self._states_topic = JOINT_STATES.subscription(self, self._on_state).topic_name
+        self._commands_topic = JOINT_COMMANDS.subscription(self, self._on_command).topic_name
         self.publisher_watch = PublisherWatch(
             self, [ESTIMATED_JOINT_STATES.name, JOINT_STATES.name, JOINT_COMMANDS.name]
         )
@@ -79,6 +79,8 @@ class EstimatorNode(ArmNode):
         self.get_logger().warning(text)
 
     def _on_state(self, message: JointState) -> None:
+        if not self.publisher_watch.admits(self._states_topic):
+            return
         reader = self._reader
         verdict = reader.read(message, time.monotonic())
         if verdict is Verdict.REFUSED:
@@ -100,6 +102,8 @@ class EstimatorNode(ArmNode):
             self._warn(f"starts anew from the reported state: {reason}; later ones are counted")
 
     def _on_command(self, message: JointState) -> None:
+        if not self.publisher_watch.admits(self._commands_topic):
+            return
         self.commands_heard += 1
         try:
             command = read_command(message, self._joints)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Notices a second publisher of a topic that may have one only, and a missing estimator."""
+"""Second publishers of topics that may have one only, told and not heard; a missing estimator."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterable
 
@@ -15,6 +16,10 @@ from viability_bounds_pkg.ros.topics import ESTIMATED_JOINT_STATES, JOINT_STATES
 _PERIOD = 1.0
 _GHOST_TIME = 20.0
 """How long a node that was killed, or has just ended, may stay in the graph, s."""
+_NAMELESS_TIME = 1.0
+"""How long a node may publish a topic before its name is known, s."""
+_AGAIN = 0.02
+"""How often messages of a topic with several publishers make it look, s."""
 _PATIENCE = 3
 """How many looks in a row must find no estimator: others may start first."""
 _UNKNOWN = "_UNKNOWN_"
@@ -50,8 +55,10 @@ class PublisherWatch:
         )
         self._node = node
         self._topics = [node.resolve_topic_name(topic) for topic in topics]
-        self._nameless: set[str] = set()
-        self._ghosts: dict[str, float] = {}  # when several of one name were first seen
+        # When a publisher without a name, and several of one name, were first seen.
+        self._nameless: dict[str, float] = {}
+        self._ghosts: dict[str, float] = {}
+        self._looked = -math.inf
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         node.create_timer(_PERIOD, self.look, clock=steady)
 
@@ -75,6 +82,26 @@ class PublisherWatch:
             for topic, names in self.rivals.items()
         )
 
+    def admits(self, topic: str) -> bool:
+        """Return whether a message that came just now is to be obeyed: nobody else publishes.
+
+        Neither is one while it is not known yet who publishes besides. So messages of several
+        publishers are never mixed; a node that was killed and has been started again is heard when
+        its name is known.
+
+        Args:
+            topic: its name, resolved.
+        """
+        with self._node.handle:
+            count = self._node.handle.get_count_publishers(topic)
+        if count <= 1:
+            return True
+        now = time.monotonic()
+        if now - self._looked > _AGAIN:
+            self._looked = now
+            self._note(topic)
+        return topic not in self.rivals and topic not in self._nameless
+
     def look(self) -> None:
         """Compare the graph with what was known."""
         if self._needs_estimates:
@@ -84,6 +111,7 @@ class PublisherWatch:
                 self._note(topic)
                 continue
             self._ghosts.pop(topic, None)
+            self._nameless.pop(topic, None)
             if self.rivals.pop(topic, None):
                 self._node.get_logger().info(f"'{topic}' has no second publisher any more")
 
@@ -100,14 +128,17 @@ class PublisherWatch:
 
     def _note(self, topic: str) -> None:
         names = sorted(map(_name, self._node.get_publishers_info_by_topic(topic)))
-        known, nameless = topic in self.rivals, any(_UNKNOWN in name for name in names)
-        if len(names) < 2 or (nameless and not known and topic not in self._nameless):
-            self._nameless.add(topic)  # a node tells its name a moment after its topics
-            return
-        self._nameless.discard(topic)
+        known, now = topic in self.rivals, time.monotonic()
+        if len(names) < 2 or any(_UNKNOWN in name for name in names):
+            # A node tells its name a moment after its topics.
+            since = self._nameless.setdefault(topic, now)
+            if len(names) < 2 or (not known and now - since < _NAMELESS_TIME):
+                return
+        else:
+            self._nameless.pop(topic, None)
         if len(set(names)) == 1:
-            since = self._ghosts.setdefault(topic, time.monotonic())
-            if not known and time.monotonic() - since < _GHOST_TIME:
+            since = self._ghosts.setdefault(topic, now)
+            if not known and now - since < _GHOST_TIME:
                 return
         self.rivals[topic] = tuple(names)
         if not known:
