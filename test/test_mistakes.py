@@ -160,6 +160,16 @@ def nodes():
 
 
 @pytest.fixture(scope="module")
+def controller():
+    """A controller alone, which obeys limits of others."""
+    with private_domain() as domain:
+        running = Running(RosHarness(domain))
+        running.start(ControllerNode)
+        yield running
+        running.ros.close()
+
+
+@pytest.fixture(scope="module")
 def robot():
     """A robot in lockstep that waits for its first command."""
     with private_domain() as domain:
@@ -194,13 +204,14 @@ def filled(message: Any, content: dict[str, Any]) -> Any:
 
 
 @pytest.mark.parametrize("mistake", of_kind("send"))
-def test_in_a_message(mistake, nodes, robot, gets):
+def test_in_a_message(mistake, nodes, controller, robot, gets):
     sent = mistake["send"]
     text = sent["message"]
     for word, value in WORDS.items():
         text = text.replace(word, yaml.safe_dump(value, default_flow_style=True).strip())
     message = filled(imported(sent["type"])(), yaml.safe_load(text))
-    heard = robot if sent["topic"] in ("external_wrench", "obstacles", "payload") else nodes
+    others = dict.fromkeys(("external_wrench", "obstacles", "payload"), robot)
+    heard = (others | {"acceleration_limits": controller}).get(sent["topic"], nodes)
     gets(heard, mistake["line"], each=lambda: heard.publish(sent["topic"], message))
 
 

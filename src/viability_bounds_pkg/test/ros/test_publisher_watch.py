@@ -57,6 +57,26 @@ def test_a_second_publisher_is_told_once_and_once_when_it_is_gone(ros, watched):
     assert len(log.warnings) == 2
 
 
+def test_messages_are_obeyed_while_there_is_one_publisher(ros, watched):
+    """From the moment on at which the graph has a second one, whatever its name, until it leaves."""
+    node, watch, _ = watched
+    topic = "/left/command"
+    ros.wait_until(lambda: node.count_publishers(topic) == 1, "its own")
+    assert watch.admits(topic)
+    rival = rival_of(ros)
+    ros.wait_until(lambda: node.count_publishers(topic) == 2, "the rival")
+    assert not watch.admits(topic)
+    ros.wait_until(lambda: watch.rivals, "its name", each=lambda: watch.admits(topic))
+    assert not watch.admits(topic)
+    ros.stop(rival)
+    ros.wait_until(lambda: node.count_publishers(topic) == 1, "its end")
+    assert watch.admits(topic)
+    # One that was killed is listed for a while beside the one that has been started instead.
+    rival_of(ros, "arm")
+    ros.wait_until(lambda: node.count_publishers(topic) == 2, "the next one")
+    ros.wait_until(lambda: watch.admits(topic), "it to be heard")
+
+
 def test_other_namespaces_and_topics_are_no_rivals(ros, watched):
     _, watch, log = watched
     rival_of(ros, namespace="right")
