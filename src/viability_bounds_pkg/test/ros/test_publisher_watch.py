@@ -58,7 +58,7 @@ def test_a_second_publisher_is_told_once_and_once_when_it_is_gone(ros, watched):
 
 
 def test_messages_are_obeyed_while_there_is_one_publisher(ros, watched):
-    """From the moment on at which the graph has a second one, whatever its name, until it leaves."""
+    """Not from the moment on at which the graph has a second one, until it leaves."""
     node, watch, _ = watched
     topic = "/left/command"
     ros.wait_until(lambda: node.count_publishers(topic) == 1, "its own")

@@ -95,6 +95,8 @@ class PublisherWatch:
         with self._node.handle:
             count = self._node.handle.get_count_publishers(topic)
         if count <= 1:
+            if topic in self.rivals:
+                self.look()
             return True
         now = time.monotonic()
         if now - self._looked > _AGAIN:
