@@ -31,9 +31,9 @@ from imperfect_page import (
     WITHIN_DECLARED,
     Minute,
     Outcome,
+    ideal_hand,
     keep,
     keep_outcome,
-    kept_outcomes,
     row,
     write_page,
 )
@@ -408,8 +408,7 @@ def play_all(
                 encoder_step_at_hand(robot),
             )
             keep_outcome(robot, name, outcome)
-            ideal = kept_outcomes(robot, ["ideal"]).get("ideal")
-            print(robot, *row(name, outcome, ideal), sep=" | ", flush=True)
+            print(robot, *row(name, outcome, ideal_hand(robot)), sep=" | ", flush=True)
             if times is not None:
                 keep(robot, "costs", name, times.result())
                 print(robot, "time to goals", times.result(), sep=" | ", flush=True)

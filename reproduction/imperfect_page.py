@@ -39,6 +39,7 @@ COST_HEADS = (
     "back, s",
     "distance left at limits, mrad",
 )
+COSTS = "What the remedies cost an ideal robot"
 PAGE = """\
 # Results for imperfect robots
 
@@ -87,7 +88,7 @@ safety filter), position and speed must be 0 and torque at most 1. With "all don
 at rest must also be at most {step:g}, and the median distance of the hand at most {factor:g} times
 that of the same robot with nothing spoilt and nothing done, or what a step of all encoders is at
 the hand. The other rows are for comparison.
-Rows are kept until they are played again: they may be of different versions of the project.
+Rows stay until they are played again: they may be of different versions of the project.
 
 The *safety filter* ([whole_arm.md](whole_arm.md)) is on in all rows of `baxter_left_arm`, as in
 its file, and elsewhere where a row says so. `torque_reserve` in the files is for the pushes above.
@@ -98,7 +99,7 @@ lockstep. Pushes and TALOS' friction are at times more than `acceleration_distur
 what keeps the limits then are the disturbance observer and further margins in the files, which are
 tested, not proven.
 {parts}
-## What the remedies cost an ideal robot
+## {costs_heading}
 
 The rows "nothing spoilt" above have what they cost in violations and torque steps. The time that
 they cost: all joints go together from the middle of their ranges to a limit and back, with the
@@ -164,14 +165,17 @@ class Outcome:
 Outcomes = dict[str, Outcome]
 """By name of the case."""
 
+Row = tuple[str, ...]
+"""Cells of a table, as `HEADS` and `COST_HEADS` have them."""
 
-def verdict(name: str, outcome: Outcome, ideal: Outcome | None) -> str:
+
+def verdict(name: str, outcome: Outcome, ideal_hand: float | None) -> str:
     """Return the last entry of a row, empty where nothing is promised.
 
     Args:
         name: of the case.
         outcome: of the case.
-        ideal: that of the robot with nothing spoilt, if it is known.
+        ideal_hand: median distance of the hand with nothing spoilt, m, if it is known.
     """
     if name not in WITHIN_DECLARED:
         return ""
@@ -179,14 +183,14 @@ def verdict(name: str, outcome: Outcome, ideal: Outcome | None) -> str:
     if name == "all":
         if outcome.worst("step_at_rest") > STEP_AT_REST:
             wrong.append("step at rest")
-        near = max(HAND_FACTOR * np.median(ideal.hands), outcome.near) if ideal else np.inf
+        near = np.inf if ideal_hand is None else max(HAND_FACTOR * ideal_hand, outcome.near)
         if np.median(outcome.hands) > near:
             wrong.append("hand at rest")
     return f"DIFFERS: {', '.join(wrong)}" if wrong else "kept"
 
 
-def row(name: str, outcome: Outcome, ideal: Outcome | None) -> tuple[str, ...]:
-    """Return a row of the table: the worst of the minutes."""
+def row(name: str, outcome: Outcome, ideal_hand: float | None) -> Row:
+    """Return a row of the table: the worst of the minutes, and the `verdict`."""
     hands = 1e3 * np.array(outcome.hands)
     return (
         outcome.title,
@@ -197,7 +201,7 @@ def row(name: str, outcome: Outcome, ideal: Outcome | None) -> tuple[str, ...]:
         f"{outcome.worst('step'):.2f}",
         f"{outcome.worst('step_at_rest'):.3f}",
         f"{np.median(hands):.2f} to {hands.max():.2f}",
-        verdict(name, outcome, ideal),
+        verdict(name, outcome, ideal_hand),
     )
 
 
@@ -239,22 +243,47 @@ def kept_outcomes(robot: str, names: Sequence[str]) -> Outcomes:
     }
 
 
+def ideal_hand(robot: str) -> float | None:
+    """Return the median distance of the hand with nothing spoilt, m; None if never played."""
+    hands = kept(robot)["cases"].get("ideal", {}).get("hands")
+    return float(np.median(hands)) if hands else None
+
+
 # Page and picture
 
 
-def draw(outcomes: Mapping[str, Outcomes], titles: Mapping[str, str]) -> plt.Figure:
+def page_path() -> Path:
+    """Return where the page is."""
+    return ROOT / "docs" / f"reproduction_{NAME}.md"
+
+
+def rows_of_page() -> dict[tuple[str, str], Row]:
+    """Return the rows of all tables of the page, by the heading above them and first cell."""
+    path, heading = page_path(), ""
+    rows = {}
+    for line in path.read_text().splitlines() if path.exists() else ():
+        if line.startswith("## "):
+            heading = line.removeprefix("## ")
+        elif line.startswith("| "):
+            cells = tuple(cell.strip() for cell in line[1:-1].split("|"))
+            rows[heading, cells[0]] = cells
+    return rows
+
+
+def draw(rows: Mapping[str, Mapping[str, Row]], titles: Mapping[str, str]) -> plt.Figure:
     """Return a picture of the largest violations by robot and case."""
-    names = [name for name in titles if any(name in part for part in outcomes.values())]
+    names = [name for name in titles if any(name in part for part in rows.values())]
     picture, axes = plt.subplots(
-        2, len(outcomes), figsize=(4 + 3.2 * len(outcomes), 7), sharey=True, sharex="row",
+        2, len(rows), figsize=(4 + 3.2 * len(rows), 7), sharey=True, sharex="row",
         layout="constrained", squeeze=False,
     )  # fmt: skip
     kinds = (
-        ("position", "position beyond a limit, rad"),
-        ("speed", "speed beyond a limit, rad/s"),
+        ("position, rad", "position beyond a limit, rad"),
+        ("speed, rad/s", "speed beyond a limit, rad/s"),
     )
-    for line, (kind, label) in zip(axes, kinds, strict=True):
-        values = {r: {n: o.worst(kind) for n, o in part.items()} for r, part in outcomes.items()}
+    for line, (head, label) in zip(axes, kinds, strict=True):
+        column = HEADS.index(head)
+        values = {r: {n: float(cells[column]) for n, cells in p.items()} for r, p in rows.items()}
         some = [v for part in values.values() for v in part.values() if v > 0.0] or [1e-3, 1.0]
         low = 10.0 ** np.floor(np.log10(min(some)) - 1.0)
         for axis, (robot, part) in zip(line, values.items(), strict=True):
@@ -269,7 +298,7 @@ def draw(outcomes: Mapping[str, Outcomes], titles: Mapping[str, str]) -> plt.Fig
             axis.set(xscale="log", xlim=(low, 30.0 * max(some)), xlabel=label)
             axis.set_yticks(range(len(names)), [titles[name] for name in names], fontsize=8)
             axis.grid(axis="x", alpha=0.3)
-            if kind == "position":
+            if line is axes[0]:
                 axis.set_title(robot)
     axes[0, 0].invert_yaxis()
     return picture
@@ -287,15 +316,14 @@ def _kind(name: str) -> str:
     return "beyond" if name == "twice" else "less"
 
 
-def _costs(robots: Sequence[str], titles: Mapping[str, str]) -> Figure:
-    """Return the rows of the table of times."""
-    figure = Figure(NAME)
-    for robot in robots:
-        for name, cost in kept(robot)["costs"].items():
-            times = [f"{t:.2f}" if t is not None else "-" for t in cost["times"]]
-            title = f"{robot}, {titles[name].partition(', ')[2]}"
-            figure.rows.append((title, *times, f"{1e3 * cost['left']:.1f}"))
-    return figure
+def _cost_row(robot: str, name: str, titles: Mapping[str, str]) -> Row:
+    """Return a row of the table of times; its first cell alone if the case was not played."""
+    title = f"{robot}, {titles[name].partition(', ')[2]}"
+    cost = kept(robot)["costs"].get(name)
+    if cost is None:
+        return (title,)
+    times = (f"{t:.2f}" if t is not None else "-" for t in cost["times"])
+    return (title, *times, f"{1e3 * cost['left']:.1f}")
 
 
 def write_page(
@@ -304,7 +332,9 @@ def write_page(
     pushed: Mapping[str, Mapping[str, float]],
     near: float,
 ) -> None:
-    """Write page, picture, data and metrics of all rows that are kept.
+    """Write page and picture of all rows, data and metrics of those whose numbers are kept.
+
+    What the page has of other cases in `titles` stays as it is.
 
     Args:
         robots: in the order of the page.
@@ -313,33 +343,45 @@ def write_page(
         near: how near a goal counts as reached, rad.
     """
     outcomes = {robot: kept_outcomes(robot, list(titles)) for robot in robots}
-    outcomes = {robot: part for robot, part in outcomes.items() if part}
-    if not outcomes:
+    if not any(outcomes.values()):
         return
-    figure, parts = Figure(NAME), []
+    before = rows_of_page()
+    figure, pushes, costs = Figure(NAME), Figure(NAME), Figure(NAME)
+    rows: dict[str, dict[str, Row]] = {}
     for robot, part in outcomes.items():
-        one = Figure(NAME)
+        hand = ideal_hand(robot)
+        known = {
+            name: row(name, part[name], hand) if name in part else before.get((robot, title))
+            for name, title in titles.items()
+        }
+        rows[robot] = {name: cells for name, cells in known.items() if cells is not None}
         for name, outcome in part.items():
-            one.rows.append(row(name, outcome, part.get("ideal")))
             figure.data[f"{robot}_{name}_hand"] = np.array(outcome.hands)
             for kind in Minute.__dataclass_fields__:
                 values = [getattr(minute, kind) for minute in outcome.minutes]
                 figure.data[f"{robot}_{name}_{kind}"] = np.array(values)
                 figure.metrics[f"{robot}_{name}_{kind}"] = outcome.worst(kind)
-        parts.append(f"\n## {robot}\n\n{table([one], HEADS)}\n")
-    figure.save(draw(outcomes, titles))
+        for name in titles:
+            cells = _cost_row(robot, name, titles)
+            cells = cells if len(cells) > 1 else before.get((COSTS, cells[0]), ())
+            costs.rows += [cells] if cells else []
+    rows = {robot: part for robot, part in rows.items() if part}
+    figure.save(draw(rows, titles))
     image = ROOT / "docs" / "images" / f"{NAME}.png"
     image.write_bytes((RESULTS / NAME / "figure.png").read_bytes())
-    pushes = Figure(NAME)
-    for robot in outcomes:
+    parts = ""
+    for robot, part in rows.items():
+        one = Figure(NAME, rows=list(part.values()))
+        parts += f"\n## {robot}\n\n{table([one], HEADS)}\n"
         links = (f"`{link}` {force:g} N" for link, force in pushed[robot].items())
         pushes.rows.append((robot, ", ".join(links)))
     page = PAGE.format(
         pushes=table([pushes], ("robot", "links that are pushed, and how hard")),
         step=STEP_AT_REST,
         factor=HAND_FACTOR,
-        parts="".join(parts),
+        parts=parts,
         near=1e3 * near,
-        costs=table([_costs(list(outcomes), titles)], COST_HEADS),
+        costs_heading=COSTS,
+        costs=table([costs], COST_HEADS),
     )
-    (ROOT / "docs" / f"reproduction_{NAME}.md").write_text(page)
+    page_path().write_text(page)
