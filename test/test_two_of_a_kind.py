@@ -153,6 +153,57 @@ def test_what_an_intruder_publishes_is_not_obeyed_and_the_arm_stops(ros, topic, 
     assert not arm._monitor.violated
 
 
+def test_goals_of_several_nodes_are_not_obeyed_and_the_arm_holds(ros):
+    values = load_values("baxter_left_arm") | {"start_paused": False}
+    for kind in (BulletNode, BoundsNode):
+        ros.start(kind, values)
+    controller = ros.start(ControllerNode, values)
+    start = np.array(values["start_positions"])
+    user = ros.talk(JOINT_STATES.message, "target_posture", GOAL_QOS)
+
+    def ask(change):
+        user.publish(joint_state(values["joints"], 0, start + change))
+
+    def mode():
+        return ros.reported("controller_node", "mode")
+
+    ros.wait_until(lambda: mode() == "TRACKING", "motion", each=lambda: ask(0.1))
+    other = rival(ros)
+    theirs = other.create_publisher(JOINT_STATES.message, "/target_posture", GOAL_QOS)
+    ros.wait_until(lambda: "/target_posture" in controller.publisher_watch.rivals)
+    assert mode() == "TRACKING"  # that there is another is told; nothing was asked for
+    goal = controller._controller.goals.q_des.copy()
+
+    def both_ask():
+        ask(0.2)
+        theirs.publish(joint_state(values["joints"], 0, start - 0.1))
+
+    ros.wait_until(lambda: mode() == "HOLD", "HOLD", each=both_ask)
+    assert ros.reported("controller_node", "reason") == "several nodes publish goals"
+    assert "/theirs/driver" in ros.diagnostics["controller_node"]["message"]
+    assert np.array_equal(controller._controller.goals.q_des, goal)
+    ros.stop(other)
+    ros.wait_until(lambda: mode() == "TRACKING", "the first goal again")
+    ros.wait_until(
+        lambda: np.array_equal(controller._controller.goals.q_des, start + 0.2),
+        "a goal",
+        each=lambda: ask(0.2),
+    )
+
+
+def test_wrenches_of_several_nodes_count_as_silence(ros):
+    values = load_values("panda") | {"start_paused": False}
+    node = ros.start(ControllerNode, values)
+    FT_WRENCH.publisher(ros.add(Node("sensor", context=ros.context)))
+    other = rival(ros)
+    theirs = FT_WRENCH.publisher(other, "/ft_wrench")
+    ros.wait_until(
+        lambda: node._wrenches.refused["several nodes publish '/ft_wrench'"] > 2,
+        each=lambda: theirs.publish(FT_WRENCH.message()),
+    )
+    assert not node._controller.interaction.sensor.wrench.any()
+
+
 def test_a_topic_of_ros2_control_is_watched_where_there_is_one(ros):
     node = ros.start(ControllerNode, VALUES | {"ros2_control_topic": "/effort/commands"})
     other = ros.add(Node("forward", context=ros.context))

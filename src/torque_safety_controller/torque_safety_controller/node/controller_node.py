@@ -29,7 +29,7 @@ from torque_safety_controller.node.goals import GoalSubscriber
 from torque_safety_controller.node.joint_commands import JointCommands
 from torque_safety_controller.node.limits import LimitsReader
 from torque_safety_controller.node.state_publisher import StatePublisher
-from torque_safety_controller.node.topics import ENABLE_TORQUE
+from torque_safety_controller.node.topics import ENABLE_TORQUE, GOALS
 from torque_safety_controller.node.wrenches import WrenchSubscriber
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.qp.constraints import AccelerationRange
@@ -80,9 +80,17 @@ class ControllerNode(ArmNode):
         self._states = JointStateReader(config.joints, config.state_timeout, self._warn)
         self._period = PeriodCheck(config.dt, self._warn)
         self._limits = LimitsReader(config.joints, self._warn)
-        self._goals = GoalSubscriber(self, self._controller, config, base)
+        states = state_topic(config.use_estimated_states)
+        alone = JOINT_COMMANDS, states, ACCELERATION_LIMITS, FT_WRENCH, *GOALS
+        self.publisher_watch = PublisherWatch(
+            self,
+            filter(None, [*(topic.name for topic in alone), config.ros2_control_topic]),
+            needs_estimates=config.use_estimated_states,
+        )
+        heard = self, self.publisher_watch
+        self._goals = GoalSubscriber(*heard, self._controller, config, base)
         self._wrenches = WrenchSubscriber(
-            self, self._controller.interaction, self._goals, config, base
+            *heard, self._controller.interaction, self._goals, config, base
         )
         self._modes = ModeKeeper()
         self._goal_at = time.monotonic()
@@ -97,7 +105,6 @@ class ControllerNode(ArmNode):
         self._commands = JointCommands(self, config.joints, config.ros2_control_topic)
         self._gains = GainWatch(self, self._controller.robot.model, config)
         self._published = StatePublisher(self, self._controller, config, base, self._states)
-        states = state_topic(config.use_estimated_states)
         self._states_topic = states.subscription(self, self._on_state).topic_name
         limits = ACCELERATION_LIMITS.subscription(self, self._on_limits)
         self._limits_topic = limits.topic_name
@@ -107,11 +114,6 @@ class ControllerNode(ArmNode):
             min(config.bounds_timeout, config.state_timeout) / 4,
             self._watch,
             clock=Clock(clock_type=ClockType.STEADY_TIME),
-        )
-        alone = [JOINT_COMMANDS.name, config.ros2_control_topic, states.name]
-        alone += [ACCELERATION_LIMITS.name, FT_WRENCH.name]
-        self.publisher_watch = PublisherWatch(
-            self, filter(None, alone), needs_estimates=config.use_estimated_states
         )
         self._diagnostics = Diagnostics(self, self._report, watch=self.publisher_watch)
         if config.collision.bodies and not config.collision.collision_avoidance:
@@ -200,7 +202,8 @@ class ControllerNode(ArmNode):
             self._goal_at = time.monotonic()
         self._note_rate()
         now = State(self._states.q, self._states.v), self._bounds()
-        if self._goal_lost() or self._handover.control is Control.GIVING_BACK:
+        lost = self._goal_lost() or self._goals.contested
+        if lost or self._handover.control is Control.GIVING_BACK:
             step = self._controller.brake(*now, self._elapsed())
         else:
             step = self._controller.step(*now, self._elapsed())
@@ -250,6 +253,8 @@ class ControllerNode(ArmNode):
             return "on the way to position control"
         if self._controller.lost:
             return "no plan within all limits is known"
+        if self._goals.contested:
+            return "several nodes publish goals"
         return "goal lost" if self._goal_lost() else "no goal"
 
     def _hold(self, stamp: Any) -> None:

@@ -7,6 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -24,6 +25,7 @@ from viability_bounds_pkg.pose_trajectory import (
     TrajectoryError,
     TrajectoryPoint,
 )
+from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import Topic
 
@@ -132,10 +134,12 @@ class GoalSubscriber:
 
     Goals wait until they are due: a stamp of zero, or one that has passed, takes effect with the
     next control step; one ahead takes effect with the first state at or after it, which makes a
-    plan of goals repeatable.
+    plan of goals repeatable. Where several nodes publish one of these topics, what comes on it is
+    refused, and the arm is to hold until there is one.
 
     Args:
         node: listens and logs what is refused.
+        watch: tells whether several nodes publish a topic.
         controller: is given the goals when they are due.
         config: has the names and limits that they are checked by.
         base: placement of the base frame in the URDF's root frame.
@@ -145,24 +149,50 @@ class GoalSubscriber:
     """
 
     def __init__(
-        self, node: Node, controller: Controller, config: ControllerConfiguration, base: pin.SE3
+        self,
+        node: Node,
+        watch: PublisherWatch,
+        controller: Controller,
+        config: ControllerConfiguration,
+        base: pin.SE3,
     ) -> None:
         self.refused: Counter[str] = Counter()
         self._pending: list[tuple[int, Callable[[], None]]] = []
         self._controller, self._config, self._base = controller, config, base
-        self._logger = node.get_logger()
-        for topic, callback in (
-            (TARGET_POSE, self._on_pose),
-            (TARGET_POSTURE, self._on_posture),
-            (TARGET_TRAJECTORY, self._on_trajectory),
-        ):
-            topic.subscription(node, callback, partial(self.refuse, topic))
+        self._node, self._watch = node, watch
+        self._contested: set[str] = set()
+        self.listen(TARGET_POSE, self._on_pose)
+        self.listen(TARGET_POSTURE, self._on_posture)
+        self.listen(TARGET_TRAJECTORY, self._on_trajectory)
         self._trajectory: PoseTrajectory | None = None
         self._begin = 0
         self._taken = controller.goals.taken
 
     def __len__(self) -> int:
         return len(self._pending)
+
+    @property
+    def contested(self) -> bool:
+        """Whether a goal came on a topic of several publishers, which are there still."""
+        if self._contested:
+            self._contested = {name for name in self._contested if not self._watch.admits(name)}
+        return bool(self._contested)
+
+    def listen(self, topic: Topic, callback: Callable[[Any], None]) -> None:
+        """Subscribe to a topic of goals; `callback` gets those of a node that is alone with it."""
+        name = self._node.resolve_topic_name(topic.name)
+
+        def receive(message: Any) -> None:
+            if self._watch.admits(name):
+                callback(message)
+                return
+            if name in self._contested:  # told already; more may come at any rate
+                self.refused[topic.name] += 1
+                return
+            self._contested.add(name)
+            self.refuse(topic, f"several nodes publish '{name}'")
+
+        topic.subscription(self._node, receive, partial(self.refuse, topic))
 
     def add(
         self,
@@ -234,4 +264,4 @@ class GoalSubscriber:
     def refuse(self, topic: Topic, reason: GoalRefused | str) -> None:
         """Count and log a goal that cannot be followed, or a publisher that cannot be heard."""
         self.refused[topic.name] += 1
-        self._logger.warning(f"{topic.name} refused: {reason}")
+        self._node.get_logger().warning(f"{topic.name} refused: {reason}")

@@ -94,11 +94,11 @@ CONTROLLER_MODE = Topic(
     (USER,),
     "TRACKING, HOLD, POSITION or STOPPED, when it changes; the reasons are in `/diagnostics`",
 )
+GOALS = (TARGET_POSE, TARGET_POSTURE, TARGET_TRAJECTORY, TARGET_WRENCH)
+"""What the arm obeys from one node each."""
+
 TOPICS = (
-    TARGET_POSE,
-    TARGET_POSTURE,
-    TARGET_TRAJECTORY,
-    TARGET_WRENCH,
+    *GOALS,
     ROS2_CONTROL_EFFORTS,
     HAND_POSE,
     HAND_POSITION_ERROR,

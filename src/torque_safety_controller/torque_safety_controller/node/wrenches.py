@@ -19,6 +19,7 @@ from torque_safety_controller.contact.wrench_sensor import WrenchError, WrenchSe
 from torque_safety_controller.node.goals import GoalRefused, GoalSubscriber
 from torque_safety_controller.node.topics import TARE_FT_SENSOR, TARGET_WRENCH
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
+from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.topics import FT_WRENCH
 
 Array = NDArray[np.float64]
@@ -35,6 +36,7 @@ class WrenchSubscriber:
 
     Args:
         node: listens and logs what is refused.
+        watch: tells whether several nodes publish ``ft_wrench``: then none is obeyed.
         interaction: receives measurements and targets; None for an arm that handles no forces.
         goals: keeps targets until they are due.
         config: names the frames.
@@ -47,6 +49,7 @@ class WrenchSubscriber:
     def __init__(
         self,
         node: Node,
+        watch: PublisherWatch,
         interaction: Interaction | None,
         goals: GoalSubscriber,
         config: ControllerConfiguration,
@@ -54,19 +57,22 @@ class WrenchSubscriber:
     ) -> None:
         self._interaction, self._goals, self._config = interaction, goals, config
         self._base = base
-        self._logger = node.get_logger()
+        self._logger, self._watch = node.get_logger(), watch
         self.refused: Counter[str] = Counter()
         self._changes = 0
-        TARGET_WRENCH.subscription(node, self._on_target, partial(goals.refuse, TARGET_WRENCH))
+        goals.listen(TARGET_WRENCH, self._on_target)
         if interaction is None or interaction.sensor is None:
             return
         sensor = interaction.sensor
-        FT_WRENCH.subscription(node, partial(self._on_measured, sensor))
+        measured = FT_WRENCH.subscription(node, partial(self._on_measured, sensor))
+        self._topic = measured.topic_name
         TARE_FT_SENSOR.serve(node, partial(self._on_tare, interaction, sensor))
 
     def _on_measured(self, sensor: WrenchSensor, message: WrenchStamped) -> None:
         frame, wanted = message.header.frame_id, self._config.interaction.ft_frame
         try:
+            if not self._watch.admits(self._topic):
+                raise WrenchError(f"several nodes publish '{self._topic}'")
             if frame not in ("", wanted):
                 raise WrenchError(f"frame_id is '{frame}'; allowed: '{wanted}' or empty")
             sensor.receive(wrench_of(message))
