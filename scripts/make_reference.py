@@ -20,6 +20,7 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
 from sim_bridge.nodes import topics as bullet_topics
 from sim_bridge.nodes.bullet_parameters import BulletConfiguration
+from sim_bridge.nodes.fault_node import FaultConfiguration
 from sim_bridge.scenario.scenario import ScenarioConfiguration
 from torque_safety_controller.node import topics as controller_topics
 from torque_safety_controller.parameters import ControllerConfiguration
@@ -36,6 +37,7 @@ CONFIGURATIONS = {
     "controller_node": ControllerConfiguration,
     "bullet_node": BulletConfiguration,
     "scenario_node": ScenarioConfiguration,
+    "fault_node": FaultConfiguration,
 }
 TABLES = {node: parameter_table(kind) for node, kind in CONFIGURATIONS.items()}
 TOPICS: tuple[Topic, ...] = (*SHARED_TOPICS, *controller_topics.TOPICS, *bullet_topics.TOPICS)

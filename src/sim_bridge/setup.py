@@ -6,7 +6,7 @@ from glob import glob
 from setuptools import find_packages, setup
 
 PACKAGE = "sim_bridge"
-CONFIG = ("config", "config/imperfect", "config/obstacles", "config/scenarios")
+CONFIG = ("config", "config/faults", "config/imperfect", "config/obstacles", "config/scenarios")
 
 setup(
     name=PACKAGE,
@@ -32,6 +32,7 @@ setup(
     entry_points={
         "console_scripts": [
             "bullet_node = sim_bridge.cli.ros_program:bullet_node",
+            "fault_node = sim_bridge.cli.ros_program:fault_node",
             "record_excitation = sim_bridge.cli.ros_program:record_excitation",
             "simulated_stack = sim_bridge.cli.ros_program:simulated_stack",
             "scenario_node = sim_bridge.cli.ros_program:scenario_node",

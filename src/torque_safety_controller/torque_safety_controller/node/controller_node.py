@@ -49,6 +49,10 @@ from viability_bounds_pkg.ros.topics import (
 )
 from viability_bounds_pkg.state import State
 
+_UNSEEN = 3
+"""From which joint state in a row that cannot be used on the arm brakes: until then the robot
+holds its last command."""
+
 
 class ControllerNode(ArmNode):
     """Answers each joint state, once its acceleration limits are there, with torques.
@@ -97,6 +101,8 @@ class ControllerNode(ArmNode):
         self._message_at = self._state_at = self._waiting_since = -np.inf
         self._message_stamp = None
         self._answered_stamp = -1
+        self._refused_in_row = 0
+        self._unseen = State(np.zeros(len(config.joints)), np.zeros(len(config.joints)))
         self._bounds_lost = False
         self._rate = RateWatch(config.dt, covered_row(self))
         self._record = StepRecord(len(config.joints))
@@ -154,7 +160,9 @@ class ControllerNode(ArmNode):
         last = self._states.stamp
         verdict = self._states.read(message, now)
         if verdict is Verdict.REFUSED:
+            self._on_refused(message.header.stamp)
             return
+        self._refused_in_row = 0
         silent = now - self._state_at > self._config.state_timeout
         self._state_at = now
         if silent or (verdict is Verdict.NEW and self._states.stamp <= last):
@@ -171,6 +179,29 @@ class ControllerNode(ArmNode):
             self._track(message.header.stamp)
         elif self._bounds_lost:
             self._hold(message.header.stamp)
+
+    def _on_refused(self, stamp: Any) -> None:
+        """Brake in the state that the model expects: the motors obey, though nothing is seen.
+
+        Each message counts as a control period.
+        """
+        if self._answered_stamp < 0 or self._modes.mode is Mode.STOPPED:
+            return
+        self._refused_in_row += 1
+        if self._refused_in_row < _UNSEEN:
+            return
+        if self._handover.by_drives:
+            self._hold_position(stamp)
+            return
+        periods = 1
+        if self._refused_in_row == _UNSEEN:
+            periods, self._unseen = _UNSEEN, State(self._states.q, self._states.v)
+        a, dt = self._controller.acceleration, self._config.dt
+        for _ in range(periods):
+            self._unseen = self._unseen.after(a, dt)
+        step = self._controller.hold(self._unseen, periods * dt)
+        self._commands.torque(step.tau, stamp)
+        self._enter(Mode.HOLD, self._why_refused())
 
     def _begin(self, verdict: Verdict) -> None:
         """Start anew: the robot was silent, or restarted."""
@@ -338,7 +369,7 @@ class ControllerNode(ArmNode):
                 silent = self.publisher_watch.several or "no joint state"
                 self._enter(Mode.STOPPED, silent if quiet else self._why_refused())
             return
-        waiting = self._states.stamp != self._answered_stamp
+        waiting = self._states.stamp != self._answered_stamp and self._refused_in_row < _UNSEEN
         if waiting and now - self._waiting_since > config.bounds_timeout:
             self._bounds_lost = True
             if self._handover.control is Control.TAKING_OVER:
@@ -347,18 +378,6 @@ class ControllerNode(ArmNode):
                 self._hold_position(self._message_stamp)
             else:
                 self._hold(self._message_stamp)
-        elif (
-            now - self._state_at > config.bounds_timeout
-            and now - self._message_at < config.bounds_timeout
-        ):
-            # States come but cannot be used: compensate gravity until STOPPED.
-            if self._handover.by_drives:
-                self._hold_position(self._message_stamp)
-                return
-            state = State(self._states.q, np.zeros_like(self._states.v))
-            step = self._controller.hold(state, 0.0)
-            self._commands.torque(step.tau, self._message_stamp)
-            self._enter(Mode.HOLD, self._why_refused())
 
     def _why_refused(self) -> str:
         return "joint states are refused: " + ", ".join(self._states.refused)
