@@ -106,3 +106,11 @@ def test_the_scenarios_shown_load_and_leave_no_event_out(tmp_path):
         path.write_text(example)
         events += load_scenario(path).events
     assert {type(event) for event in events} == set(get_args(Event))
+
+
+def test_the_tests_that_claims_rest_on_exist():
+    named = re.findall(r"`(\S+\.py)::(\w+)`", (ROOT / "docs" / "safety.md").read_text())
+    assert len(named) > 10
+    for file, function in named:
+        source = (ROOT / file).read_text()
+        assert re.search(rf"^def {function}\(", source, re.MULTILINE), f"{file}::{function}"

@@ -30,7 +30,7 @@ def test_a_longer_row_stops_the_arm_and_it_goes_on_by_itself():
         assert watch.share - last == pytest.approx(min(DT / RETURN_TIME, 1.0 - last))
         steps += 1
     assert steps == pytest.approx(RETURN_TIME / DT, abs=1)
-    assert said == "states are answered in time again: the arm goes on"
+    assert said == "the arm goes on"
     assert watch.note(DT) == ""
 
 
@@ -40,3 +40,12 @@ def test_rows_one_after_the_other_are_told_once():
     assert sum(map(bool, said)) == 1
     assert watch.too_long == 10
     assert watch.share < 10 * DT / RETURN_TIME
+
+
+def test_what_had_gone_wrong_slows_the_arm_too():
+    watch = RateWatch(DT, 2)
+    watch.slow("no limits")
+    assert (watch.share, watch.too_long, watch.trouble) == (0.0, 0, "slowed to 0%: no limits")
+    said = [watch.note(DT) for _ in range(round(RETURN_TIME / DT) + 1)]
+    assert watch.share == 1.0
+    assert [each for each in said if each] == ["the arm goes on"]

@@ -49,6 +49,8 @@ from viability_bounds_pkg.ros.topics import (
 )
 from viability_bounds_pkg.state import State
 
+_STALE = "acceleration limits are stale"
+_CONTESTED = "several nodes publish goals"
 _UNSEEN = 3
 """From which joint state in a row that cannot be used on the arm brakes: until then the robot
 holds its last command."""
@@ -104,6 +106,7 @@ class ControllerNode(ArmNode):
         self._refused_in_row = 0
         self._unseen = State(np.zeros(len(config.joints)), np.zeros(len(config.joints)))
         self._bounds_lost = False
+        self._went_wrong = ""  # why the arm was braked, until it goes on
         self._rate = RateWatch(config.dt, covered_row(self))
         self._record = StepRecord(len(config.joints))
         self._collision = CollisionReport(self.get_logger(), self._controller.constraints)
@@ -165,6 +168,8 @@ class ControllerNode(ArmNode):
         self._refused_in_row = 0
         silent = now - self._state_at > self._config.state_timeout
         self._state_at = now
+        if silent and 0 <= self._answered_stamp <= last < self._states.stamp:
+            self._went_wrong = "joint states were missing"
         if silent or (verdict is Verdict.NEW and self._states.stamp <= last):
             self._begin(verdict)
         elif verdict is Verdict.REPEAT:
@@ -201,7 +206,8 @@ class ControllerNode(ArmNode):
             self._unseen = self._unseen.after(a, dt)
         step = self._controller.hold(self._unseen, periods * dt)
         self._commands.torque(step.tau, stamp)
-        self._enter(Mode.HOLD, self._why_refused())
+        self._went_wrong = self._why_refused()
+        self._enter(Mode.HOLD, self._went_wrong)
 
     def _begin(self, verdict: Verdict) -> None:
         """Start anew: the robot was silent, or restarted."""
@@ -231,9 +237,15 @@ class ControllerNode(ArmNode):
             return
         if self._goals.apply_due(self._states.stamp):
             self._goal_at = time.monotonic()
+        contested = self._goals.contested
+        if contested:
+            self._went_wrong = _CONTESTED
+        elif self._went_wrong:
+            self._rate.slow(self._went_wrong)
+            self._went_wrong = ""
         self._note_rate()
         now = State(self._states.q, self._states.v), self._bounds()
-        lost = self._goal_lost() or self._goals.contested
+        lost = contested or self._goal_lost()
         if lost or self._handover.control is Control.GIVING_BACK:
             step = self._controller.brake(*now, self._elapsed())
         else:
@@ -268,6 +280,7 @@ class ControllerNode(ArmNode):
         self._record.note(step, now - self._message_at)
         self._wrenches.note()
         self._collision.note(step)
+        self._went_wrong = self._went_wrong or step.failure
         if step.tracking:
             self._enter(Mode.TRACKING, "goal")
         else:
@@ -279,17 +292,18 @@ class ControllerNode(ArmNode):
         if step.failure:
             return f"solver failed: {step.failure}"
         if self._bounds_lost:
-            return "acceleration limits are stale"
+            return _STALE
         if self._handover.control is Control.GIVING_BACK:
             return "on the way to position control"
         if self._controller.lost:
             return "no plan within all limits is known"
         if self._goals.contested:
-            return "several nodes publish goals"
+            return _CONTESTED
         return "goal lost" if self._goal_lost() else "no goal"
 
     def _hold(self, stamp: Any) -> None:
         """Answer the newest state without acceleration limits."""
+        self._went_wrong = _STALE
         self._note_rate()
         state = State(self._states.q, self._states.v)
         self._answer(self._controller.hold(state, self._elapsed()), stamp)
@@ -373,7 +387,7 @@ class ControllerNode(ArmNode):
         if waiting and now - self._waiting_since > config.bounds_timeout:
             self._bounds_lost = True
             if self._handover.control is Control.TAKING_OVER:
-                self._fail_handover("acceleration limits are stale")
+                self._fail_handover(_STALE)
             if self._handover.by_drives:
                 self._hold_position(self._message_stamp)
             else:

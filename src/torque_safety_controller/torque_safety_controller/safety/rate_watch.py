@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Slows the arm where more states in a row stay without an answer than the bounds cover."""
+"""Slows the arm where states stay without an answer, and lets it go on gently."""
 
 from __future__ import annotations
 
 RETURN_TIME = 0.5
-"""From a row that was too long until goals have all of their effect again, s of robot time."""
+"""Until goals have all of their effect again, s of robot time."""
 
 _ROUNDING = 0.5
 """Of the time between two states, control periods."""
@@ -13,8 +13,8 @@ _ROUNDING = 0.5
 class RateWatch:
     """Share of the goals by which the arm may move, from the times of the states answered.
 
-    Each row of unanswered states that is longer than the bounds cover takes the share to zero;
-    then it grows to one within `RETURN_TIME`. All times are those of the states' stamps, so that
+    Each row of unanswered states that is longer than the bounds cover takes the share to zero, and
+    so does `slow`; then it grows to one within `RETURN_TIME`. All times are those of the states' stamps, so that
     in lockstep nothing depends on the machine.
 
     Args:
@@ -31,6 +31,11 @@ class RateWatch:
         self._dt, self._covered = dt, covered
         self.share = 1.0
         self.too_long = self.longest = 0
+        self._why = ""
+
+    def slow(self, why: str) -> None:
+        """Take the share to zero, because of what had gone wrong until now."""
+        self.share, self._why = 0.0, why
 
     def note(self, elapsed: float | None) -> str:
         """Take the time since the last answered state; return what to log, mostly nothing.
@@ -44,12 +49,13 @@ class RateWatch:
         row = int(elapsed / self._dt + _ROUNDING) - 1
         self.longest = max(self.longest, row)
         if row > self._covered:
-            self.share = 0.0
+            what = f"states in a row without an answer, the bounds cover {self._covered}"
+            self.slow(f"too many {what}")
             self.too_long += 1
-            return "" if was_slowed else f"{row} {self._what}: the arm is slowed"
+            return "" if was_slowed else f"{row} {what}: the arm is slowed"
         self.share = min(1.0, self.share + elapsed / RETURN_TIME)
         if was_slowed and not self.slowed:
-            return "states are answered in time again: the arm goes on"
+            return "the arm goes on"
         return ""
 
     @property
@@ -60,8 +66,4 @@ class RateWatch:
     @property
     def trouble(self) -> str:
         """What to report; empty if there is nothing."""
-        return f"slowed to {self.share:.0%}: too many {self._what}" if self.slowed else ""
-
-    @property
-    def _what(self) -> str:
-        return f"states in a row without an answer, the bounds cover {self._covered}"
+        return f"slowed to {self.share:.0%}: {self._why}" if self.slowed else ""

@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Each kind of fault between the nodes at random moments, in real time: limits, braking, return.
+
+bash scripts/reproduce.sh faults [--robot NAME] [--moments N]
+
+Robot, bounds and controller in one process, the fault node between them. Goals are random corners
+of the position limits, one a second, with stiff gains; from the start of a fault until the arm
+goes on the goal stays what it was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from chain import load_values
+from figure import Figure, table, verdict
+from sensor_msgs.msg import JointState
+
+from sim_bridge.nodes.bullet_node import BulletNode
+from sim_bridge.nodes.fault_node import BEFORE, FaultNode
+from torque_safety_controller.node.controller_node import ControllerNode
+from torque_safety_controller.safety.modes import Mode
+from viability_bounds_pkg.node.bounds_node import BoundsNode
+from viability_bounds_pkg.ros.runtime import GOAL_QOS, stamp_to_ns
+from viability_bounds_pkg.ros.topics import JOINT_STATES
+from viability_bounds_pkg.testing.ros_harness import (
+    RosHarness,
+    joint_state,
+    overrides,
+    private_domain,
+)
+
+ROBOTS = ("panda", "talos_left_arm")
+STIFF = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
+SENDERS = {
+    "joint_states": BulletNode,
+    "acceleration_limits": BoundsNode,
+    "joint_commands": ControllerNode,
+}
+DURATION = 0.6  # s of a fault
+EPISODE = 4.0  # s from one to the next
+RECOVERY = 1.0  # s after a fault in which torque steps count as its end
+IN_TIME = 3
+"""Control periods from a fault to braking where the robot's own stop acts."""
+HOLD_IN_TIME = 0.1  # s, otherwise
+STEP = 0.02  # of tau_max, when the arm goes on
+AGAIN = 2.0  # s
+FAULTS = {
+    "states lost": ("joint_states", "drop: "),
+    "limits lost": ("acceleration_limits", "drop: "),
+    "commands lost": ("joint_commands", "drop: "),
+    "a third of the states lost": ("joint_states", "drop: {probability: 0.33}"),
+    "commands 20 ms late": ("joint_commands", "delay: {delay: 0.02}"),
+    "a burst of commands": ("joint_commands", "burst: "),
+    "states twice": ("joint_states", "duplicate: "),
+    "states in another order": ("joint_states", "reorder: "),
+    "states not finite": ("joint_states", "corrupt: {how: nan}"),
+    "limits not finite": ("acceleration_limits", "corrupt: {how: nan}"),
+    "commands not finite": ("joint_commands", "corrupt: {how: nan}"),
+    "states of other joints": ("joint_states", "corrupt: {how: names}"),
+    "stamps of the past": ("joint_states", "stamp: {offset: -0.3}"),
+    "stamps of the future": ("joint_states", "stamp: {offset: 0.3}"),
+    "another robot": ("joint_states", "rival: {offset: 0.5}"),
+    "other limits": ("acceleration_limits", "rival: {offset: 50}"),
+    "another controller": ("joint_commands", "rival: {offset: 5}"),
+}
+
+
+@dataclass
+class Seen:
+    """What one kind of fault did at all its moments.
+
+    Attributes:
+        position, speed, torque: worst beyond limits, rad, rad/s, and share of torque_max.
+        braking: periods until the arm braked, one for each moment; NaN where it did not.
+        by_robot: whether it was the robot's own stop that braked first.
+        again: time until it went on, s.
+        steps: largest change of torque in a period as it went on, share of torque_max.
+    """
+
+    position: float = 0.0
+    speed: float = 0.0
+    torque: float = 0.0
+    braking: list[float] = field(default_factory=list)
+    by_robot: list[bool] = field(default_factory=list)
+    again: list[float] = field(default_factory=list)
+    steps: list[float] = field(default_factory=list)
+
+
+class Bench:
+    """A robot under control, its messages by way of a fault node.
+
+    Args:
+        ros: runs the nodes.
+        robot: name of its file.
+        seed: of goals and moments.
+    """
+
+    def __init__(self, ros: RosHarness, robot: str, seed: int) -> None:
+        self._ros, self._rng = ros, np.random.default_rng(seed)
+        self._values = load_values(robot) | STIFF | {"start_paused": False, "clock": "real_time"}
+        nodes = {}
+        for topic, kind in SENDERS.items():
+            arguments = ["--ros-args", "-r", f"{topic}:={BEFORE}{topic}"]
+            nodes[topic] = ros.add(
+                kind(
+                    context=ros.context,
+                    parameter_overrides=overrides(self._values),
+                    cli_args=arguments,
+                )
+            )
+        self._arm: Any = nodes["joint_states"]
+        self._controller: Any = nodes["joint_commands"]
+        self._user = ros.talk(JointState, "target_posture", GOAL_QOS)
+        self._low, self._high = (
+            np.array(self._values[f"position_{end}"]) for end in ("min", "max")
+        )
+        self._low, self._high = np.maximum(self._low, -np.pi), np.minimum(self._high, np.pi)
+        self._dt = 1.0 / self._values["rate_hz"]
+        self._trace: list[tuple[float, bool, bool, np.ndarray]] = []
+        ros.probe.create_subscription(
+            JointState, f"{BEFORE}joint_states", self._on_state, JOINT_STATES.qos
+        )
+
+    def _on_state(self, message: JointState) -> None:
+        mode = self._controller._modes.mode
+        stopped = self._arm._control() in ("stopping", "stopped")
+        braking = stopped or mode is not Mode.TRACKING
+        t = 1e-9 * stamp_to_ns(message.header.stamp)
+        self._trace.append((t, braking, stopped, np.array(message.effort)))
+
+    def _ask(self) -> None:
+        at_ends = self._rng.random(self._low.size) < 0.7
+        ends = np.where(self._rng.random(self._low.size) < 0.5, self._low, self._high)
+        goal = np.where(at_ends, ends, self._rng.uniform(self._low, self._high))
+        self._user.publish(joint_state(self._values["joints"], 0, goal))
+
+    def suffer(self, topic: str, what: str, moments: int, folder: Path) -> Seen:
+        """Let a fault happen at random moments; return what it did."""
+        ros, seen = self._ros, Seen()
+        begins = [2.0 + EPISODE * k + self._rng.uniform(0.0, 1.0) for k in range(moments)]
+        entries = "\n".join(
+            f"  - {{time: {begin:.4f}, duration: {DURATION}, topic: {topic}, {what}}}"
+            for begin in begins
+        )
+        path = folder / "faults.yaml"
+        path.write_text(f"topics: [{', '.join(SENDERS)}]\nfaults:\n{entries}\n")
+        faults: Any = ros.start(FaultNode, {"faults": str(path)})
+        self._arm._monitor.reset()
+        self._trace.clear()
+        ros.wait_until(lambda: faults._begin >= 0, "the first state")
+        start = 1e-9 * faults._begin
+        asked = -np.inf
+
+        def now() -> float:
+            return self._trace[-1][0] - start if self._trace else 0.0
+
+        def in_fault() -> bool:
+            return any(begin <= now() < begin + DURATION + RECOVERY for begin in begins)
+
+        while now() < begins[-1] + EPISODE - 1.0:
+            if now() - asked > 1.0 and not in_fault():
+                self._ask()
+                asked = now()
+            ros.spin(0.05)
+        monitor = self._arm._monitor
+        seen.position = float(monitor.max_position_violation.max())
+        seen.speed = float(monitor.max_velocity_violation.max())
+        seen.torque = float(monitor.max_torque_ratio.max())
+        for begin in begins:
+            self._judge(seen, start + begin)
+        ros.stop(faults)
+        return seen
+
+    def _judge(self, seen: Seen, begin: float) -> None:
+        """Add what the trace shows of one moment."""
+        t = np.array([each[0] for each in self._trace])
+        braking, stopped = (np.array([each[k] for each in self._trace]) for k in (1, 2))
+        tau_max = np.array(self._values["torque_max"])
+        during = (t >= begin) & (t < begin + DURATION)
+        first = np.flatnonzero(during & braking)
+        if first.size:
+            seen.braking.append(round((t[first[0]] - begin) / self._dt))
+            seen.by_robot.append(bool(stopped[first[0]]))
+        else:
+            seen.braking.append(np.nan)
+            seen.by_robot.append(False)
+        end = begin + DURATION
+        after = np.flatnonzero((t >= end) & ~braking)
+        seen.again.append(float(t[after[0]] - end) if after.size else np.inf)
+        if not after.size or not first.size:
+            return
+        part = self._trace[max(after[0] - 1, 0) :]
+        tau = np.array([each[3] for each in part if each[0] < end + RECOVERY])
+        seen.steps.append(float((np.abs(np.diff(tau, axis=0)) / tau_max).max()))
+
+
+def play(robot: str, names: list[str], moments: int) -> list[tuple[str, dict[str, Any]]]:
+    """Let a robot suffer these faults; return what each did."""
+    with private_domain() as domain, tempfile.TemporaryDirectory() as folder:
+        ros = RosHarness(domain)
+        try:
+            bench = Bench(ros, robot, 1)
+            return [
+                (name, vars(bench.suffer(*FAULTS[name], moments, Path(folder)))) for name in names
+            ]
+        finally:
+            ros.close()
+
+
+def add_row(figure: Figure, robot: str, name: str, seen: Seen, dt: float) -> bool:
+    """Add a row; return whether everything is as it should be."""
+    braked = np.array(seen.braking)
+    robots = np.array(seen.by_robot)
+    wrong = []
+    if seen.position > 0.0 or seen.speed > 0.0 or seen.torque > 1.0 + 1e-9:
+        wrong.append("a limit was passed")
+    late = braked > np.where(robots, IN_TIME, HOLD_IN_TIME / dt)
+    if late.any():
+        wrong.append("braking")
+    if max(seen.again) > AGAIN:
+        wrong.append("not in time again")
+    if seen.steps and max(seen.steps) > STEP:
+        wrong.append("torque step")
+    some = np.isfinite(braked).any()
+    figure.rows.append(
+        (
+            robot,
+            name,
+            str(len(braked)),
+            f"{seen.position:.2g}",
+            f"{seen.speed:.2g}",
+            f"{seen.torque:.3f}",
+            f"{np.nanmedian(braked):.0f} to {np.nanmax(braked):.0f}" if some else "-",
+            "robot" if robots.any() else "controller" if some else "-",
+            f"{max(seen.again):.2f}",
+            f"{max(seen.steps):.3f}" if seen.steps else "-",
+            verdict(not wrong, "kept") + (f": {', '.join(wrong)}" if wrong else ""),
+        )
+    )
+    return not wrong
+
+
+def main() -> int:
+    """Play, print the table; return whether all is as it should be."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--robot", action="append", choices=ROBOTS, help="only this one")
+    parser.add_argument("--fault", action="append", choices=tuple(FAULTS), help="only this one")
+    parser.add_argument("--moments", type=int, default=10, help="of each fault")
+    given = parser.parse_args()
+    robots, names = given.robot or ROBOTS, given.fault or list(FAULTS)
+    figure, fine = Figure("faults"), True
+    with ProcessPoolExecutor(len(robots), get_context("spawn")) as pool:
+        runs = [(robot, pool.submit(play, robot, names, given.moments)) for robot in robots]
+        for robot, run in runs:
+            dt = 1.0 / load_values(robot)["rate_hz"]
+            for name, seen in run.result():
+                fine &= add_row(figure, robot, name, Seen(**seen), dt)
+    heads = ("robot", "fault", "moments", "position, rad", "speed, rad/s", "torque")
+    heads = (*heads, "periods to braking", "by", "again, s", "torque step", "")
+    print(table([figure], heads))
+    return 0 if fine else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
