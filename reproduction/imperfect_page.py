@@ -298,7 +298,7 @@ def draw(rows: Mapping[str, Mapping[str, Row]], titles: Mapping[str, str]) -> pl
             axis.set(xscale="log", xlim=(low, 30.0 * max(some)), xlabel=label)
             axis.set_yticks(range(len(names)), [titles[name] for name in names], fontsize=8)
             axis.grid(axis="x", alpha=0.3)
-            if line is axes[0]:
+            if column == HEADS.index(kinds[0][0]):
                 axis.set_title(robot)
     axes[0, 0].invert_yaxis()
     return picture
@@ -361,7 +361,7 @@ def write_page(
                 values = [getattr(minute, kind) for minute in outcome.minutes]
                 figure.data[f"{robot}_{name}_{kind}"] = np.array(values)
                 figure.metrics[f"{robot}_{name}_{kind}"] = outcome.worst(kind)
-        for name in titles:
+        for name in filter(lambda each: _kind(each) == "ideal", titles):
             cells = _cost_row(robot, name, titles)
             cells = cells if len(cells) > 1 else before.get((COSTS, cells[0]), ())
             costs.rows += [cells] if cells else []
