@@ -46,7 +46,8 @@ SENDERS = {
 }
 DURATION = 0.6  # s of a fault
 EPISODE = 4.0  # s from one to the next
-RECOVERY = 1.0  # s after a fault in which torque steps count as its end
+RECOVERY = 1.0  # s after a fault before there is another goal
+RETURN = 0.1  # s after the arm goes on in which torque steps count: later ones are of the motion
 IN_TIME = 3
 """Control periods from a fault to braking where the robot's own stop acts."""
 HOLD_IN_TIME = 0.1  # s, otherwise
@@ -134,7 +135,9 @@ class Bench:
         stopped = self._arm._control() in ("stopping", "stopped")
         braking = stopped or mode is not Mode.TRACKING
         t = 1e-9 * stamp_to_ns(message.header.stamp)
-        self._trace.append((t, braking, stopped, np.array(message.effort)))
+        tau = dict(zip(message.name, message.effort, strict=True))
+        tau_of_joints = np.array([tau[joint] for joint in self._values["joints"]])
+        self._trace.append((t, braking, stopped, tau_of_joints))
 
     def _ask(self) -> None:
         at_ends = self._rng.random(self._low.size) < 0.7
@@ -142,41 +145,44 @@ class Bench:
         goal = np.where(at_ends, ends, self._rng.uniform(self._low, self._high))
         self._user.publish(joint_state(self._values["joints"], 0, goal))
 
-    def suffer(self, topic: str, what: str, moments: int, folder: Path) -> Seen:
-        """Let a fault happen at random moments; return what it did."""
-        ros, seen = self._ros, Seen()
-        begins = [2.0 + EPISODE * k + self._rng.uniform(0.0, 1.0) for k in range(moments)]
+    def suffer(self, names: list[str], moments: int, folder: Path) -> list[Seen]:
+        """Let faults happen at random moments, one kind after the other; return what each did."""
+        count = len(names) * moments
+        begins = 2.0 + EPISODE * np.arange(count) + self._rng.uniform(0.0, 1.0, count)
         entries = "\n".join(
             f"  - {{time: {begin:.4f}, duration: {DURATION}, topic: {topic}, {what}}}"
-            for begin in begins
+            for begin, (topic, what) in zip(
+                begins.tolist(),
+                (FAULTS[name] for name in names for _ in range(moments)),
+                strict=True,
+            )
         )
         path = folder / "faults.yaml"
         path.write_text(f"topics: [{', '.join(SENDERS)}]\nfaults:\n{entries}\n")
-        faults: Any = ros.start(FaultNode, {"faults": str(path)})
-        self._arm._monitor.reset()
-        self._trace.clear()
-        ros.wait_until(lambda: faults._begin >= 0, "the first state")
+        faults: Any = self._ros.start(FaultNode, {"faults": str(path)})
+        self._ros.wait_until(lambda: faults._begin >= 0, "the first state")
         start = 1e-9 * faults._begin
-        asked = -np.inf
+        return [self._suffer(start + some) for some in begins.reshape(-1, moments)]
 
-        def now() -> float:
-            return self._trace[-1][0] - start if self._trace else 0.0
-
-        def in_fault() -> bool:
-            return any(begin <= now() < begin + DURATION + RECOVERY for begin in begins)
-
-        while now() < begins[-1] + EPISODE - 1.0:
-            if now() - asked > 1.0 and not in_fault():
+    def _suffer(self, begins: np.ndarray) -> Seen:
+        """Go on until after the last of these moments; return what happened."""
+        monitor, trace, asked = self._arm._monitor, self._trace, -np.inf
+        monitor.reset()
+        trace.clear()
+        while not trace or trace[-1][0] < begins[-1] + EPISODE - 1.5:
+            now = trace[-1][0] if trace else -np.inf
+            calm = (now < begins) | (now > begins + DURATION + RECOVERY)
+            if trace and calm.all() and now - asked > 1.0:
                 self._ask()
-                asked = now()
-            ros.spin(0.05)
-        monitor = self._arm._monitor
-        seen.position = float(monitor.max_position_violation.max())
-        seen.speed = float(monitor.max_velocity_violation.max())
-        seen.torque = float(monitor.max_torque_ratio.max())
-        for begin in begins:
-            self._judge(seen, start + begin)
-        ros.stop(faults)
+                asked = now
+            self._ros.spin(0.05)
+        seen = Seen(
+            float(monitor.max_position_violation.max()),
+            float(monitor.max_velocity_violation.max()),
+            float(monitor.max_torque_ratio.max()),
+        )
+        for begin in begins.tolist():
+            self._judge(seen, begin)
         return seen
 
     def _judge(self, seen: Seen, begin: float) -> None:
@@ -198,7 +204,7 @@ class Bench:
         if not after.size or not first.size:
             return
         part = self._trace[max(after[0] - 1, 0) :]
-        tau = np.array([each[3] for each in part if each[0] < end + RECOVERY])
+        tau = np.array([each[3] for each in part if each[0] < part[0][0] + RETURN])
         seen.steps.append(float((np.abs(np.diff(tau, axis=0)) / tau_max).max()))
 
 
@@ -207,10 +213,8 @@ def play(robot: str, names: list[str], moments: int) -> list[tuple[str, dict[str
     with private_domain() as domain, tempfile.TemporaryDirectory() as folder:
         ros = RosHarness(domain)
         try:
-            bench = Bench(ros, robot, 1)
-            return [
-                (name, vars(bench.suffer(*FAULTS[name], moments, Path(folder)))) for name in names
-            ]
+            seen = Bench(ros, robot, 1).suffer(names, moments, Path(folder))
+            return [(name, vars(each)) for name, each in zip(names, seen, strict=True)]
         finally:
             ros.close()
 

@@ -52,8 +52,7 @@ from viability_bounds_pkg.state import State
 _STALE = "acceleration limits are stale"
 _CONTESTED = "several nodes publish goals"
 _UNSEEN = 3
-"""From which joint state in a row that cannot be used on the arm brakes: until then the robot
-holds its last command."""
+"""At which joint state in a row that cannot be used the mode is STOPPED."""
 
 
 class ControllerNode(ArmNode):
@@ -104,7 +103,6 @@ class ControllerNode(ArmNode):
         self._message_stamp = None
         self._answered_stamp = -1
         self._refused_in_row = 0
-        self._unseen = State(np.zeros(len(config.joints)), np.zeros(len(config.joints)))
         self._bounds_lost = False
         self._went_wrong = ""  # why the arm was braked, until it goes on
         self._rate = RateWatch(config.dt, covered_row(self))
@@ -186,28 +184,15 @@ class ControllerNode(ArmNode):
             self._hold(message.header.stamp)
 
     def _on_refused(self, stamp: Any) -> None:
-        """Brake in the state that the model expects: the motors obey, though nothing is seen.
-
-        Each message counts as a control period.
-        """
+        """Leave the arm to the robot's own stop, or to its drives: nothing is known of it."""
         if self._answered_stamp < 0 or self._modes.mode is Mode.STOPPED:
             return
         self._refused_in_row += 1
-        if self._refused_in_row < _UNSEEN:
-            return
         if self._handover.by_drives:
             self._hold_position(stamp)
-            return
-        periods = 1
-        if self._refused_in_row == _UNSEEN:
-            periods, self._unseen = _UNSEEN, State(self._states.q, self._states.v)
-        a, dt = self._controller.acceleration, self._config.dt
-        for _ in range(periods):
-            self._unseen = self._unseen.after(a, dt)
-        step = self._controller.hold(self._unseen, periods * dt)
-        self._commands.torque(step.tau, stamp)
-        self._went_wrong = self._why_refused()
-        self._enter(Mode.HOLD, self._went_wrong)
+        elif self._refused_in_row == _UNSEEN:
+            self._went_wrong = self._why_refused()
+            self._enter(Mode.STOPPED, self._went_wrong)
 
     def _begin(self, verdict: Verdict) -> None:
         """Start anew: the robot was silent, or restarted."""
@@ -383,7 +368,7 @@ class ControllerNode(ArmNode):
                 silent = self.publisher_watch.several or "no joint state"
                 self._enter(Mode.STOPPED, silent if quiet else self._why_refused())
             return
-        waiting = self._states.stamp != self._answered_stamp and self._refused_in_row < _UNSEEN
+        waiting = self._states.stamp != self._answered_stamp and not self._refused_in_row
         if waiting and now - self._waiting_since > config.bounds_timeout:
             self._bounds_lost = True
             if self._handover.control is Control.TAKING_OVER:
