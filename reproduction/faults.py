@@ -48,9 +48,7 @@ DURATION = 0.6  # s of a fault
 EPISODE = 4.0  # s from one to the next
 RECOVERY = 1.0  # s after a fault before there is another goal
 RETURN = 0.1  # s after the arm goes on in which torque steps count: later ones are of the motion
-IN_TIME = 3
-"""Control periods from a fault to braking where the robot's own stop acts."""
-HOLD_IN_TIME = 0.1  # s, otherwise
+HOLD_IN_TIME = 0.1  # s, where the controller brakes
 STEP = 0.02  # of tau_max, when the arm goes on
 AGAIN = 2.0  # s
 FAULTS = {
@@ -84,6 +82,7 @@ class Seen:
         by_robot: whether it was the robot's own stop that braked first.
         again: time until it went on, s.
         steps: largest change of torque in a period as it went on, share of torque_max.
+        timeout: periods for which the robot holds a command before it stops itself.
     """
 
     position: float = 0.0
@@ -93,6 +92,7 @@ class Seen:
     by_robot: list[bool] = field(default_factory=list)
     again: list[float] = field(default_factory=list)
     steps: list[float] = field(default_factory=list)
+    timeout: int = 0
 
 
 class Bench:
@@ -180,6 +180,7 @@ class Bench:
             float(monitor.max_position_violation.max()),
             float(monitor.max_velocity_violation.max()),
             float(monitor.max_torque_ratio.max()),
+            timeout=self._arm.get_parameter("command_timeout").value,
         )
         for begin in begins.tolist():
             self._judge(seen, begin)
@@ -203,8 +204,9 @@ class Bench:
         seen.again.append(float(t[after[0]] - end) if after.size else np.inf)
         if not after.size or not first.size:
             return
-        part = self._trace[max(after[0] - 1, 0) :]
-        tau = np.array([each[3] for each in part if each[0] < part[0][0] + RETURN])
+        back = after[0]
+        last = np.flatnonzero((t > t[back] + RETURN) | ((t > t[back]) & braking))
+        tau = np.array([each[3] for each in self._trace[max(back - 1, 0) : last[0]]])
         seen.steps.append(float((np.abs(np.diff(tau, axis=0)) / tau_max).max()))
 
 
@@ -226,7 +228,7 @@ def add_row(figure: Figure, robot: str, name: str, seen: Seen, dt: float) -> boo
     wrong = []
     if seen.position > 0.0 or seen.speed > 0.0 or seen.torque > 1.0 + 1e-9:
         wrong.append("a limit was passed")
-    late = braked > np.where(robots, IN_TIME, HOLD_IN_TIME / dt)
+    late = braked > np.where(robots, seen.timeout + 1, HOLD_IN_TIME / dt)
     if late.any():
         wrong.append("braking")
     if max(seen.again) > AGAIN:

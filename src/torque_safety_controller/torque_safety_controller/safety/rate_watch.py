@@ -14,8 +14,8 @@ class RateWatch:
     """Share of the goals by which the arm may move, from the times of the states answered.
 
     Each row of unanswered states that is longer than the bounds cover takes the share to zero, and
-    so does `slow`; then it grows to one within `RETURN_TIME`. All times are those of the states' stamps, so that
-    in lockstep nothing depends on the machine.
+    so does `slow`; then it grows to one within `RETURN_TIME`. All times are those of the states'
+    stamps, so that in lockstep nothing depends on the machine.
 
     Args:
         dt: control period, s.
