@@ -48,6 +48,10 @@ constant acceleration under held torque, and for small errors of the model."""
 KEPT = 0.01
 """Further share that the constraints on a step leave, so that its trial seldom fails."""
 
+TO_BEGIN = 0.002
+"""What the torque of the step itself may take of that: else an arm that stands where it leaves no
+more could not even begin to move away from there."""
+
 LOST = 0.07
 """Share of a torque limit by which a plan may pass it, after a disturbance, and still be followed
 as far as the motors can; beyond, the bounds alone count."""
@@ -438,7 +442,8 @@ class SafetyFilter:
             for j in joints:
                 tau = plans.tau[k, j]
                 row = gradient[j] if tau > 0.0 else -gradient[j]
-                left = (1.0 - KEPT) * self.usable[j] - abs(tau)
+                kept = KEPT if k != FIRST else KEPT - TO_BEGIN
+                left = (1.0 - kept) * self.usable[j] - abs(tau)
                 size = max(float(np.sqrt(row @ row)), 1e-9)
                 rows.append(row / size)
                 part = (use if left > 0.0 else back) * left
