@@ -73,7 +73,6 @@ def test_limits_are_kept_and_the_arm_goes_on_afterwards(ros, tmp_path, topic, wh
         return np.abs(arm._robot.state().v).max()
 
     ros.wait_until(lambda: faults.streams[topic].acting, "the fault", each=on)
-    assert speed() > 0.02
     ros.wait_until(lambda: not faults.streams[topic].acting, "its end", each=on)
     assert sum(faults.streams[topic].touched.values()) > 10
     ros.wait_until(lambda: ros.reported("controller_node", "mode") == "TRACKING", each=on)
