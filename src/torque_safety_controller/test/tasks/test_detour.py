@@ -11,6 +11,7 @@ from torque_safety_controller.qp.constraints import AccelerationRange
 from torque_safety_controller.tasks.detour import (
     ATTEMPTS,
     FARTHEST,
+    HELD,
     WORK,
     Detour,
     Progress,
@@ -149,6 +150,26 @@ def test_an_arm_that_moves_to_and_fro_is_stopped_and_led():
     arm.wait_for(Progress.LED)
     passed, _ = arm.follow()
     np.testing.assert_allclose(passed[-1], BELOW, atol=0.03)
+
+
+def test_an_arm_that_moved_is_not_held_for_a_long_search():
+    arm = Arm()
+
+    def endless(q, goal, rng):
+        arm.detour._ways.reached = True
+        while True:
+            yield 1
+
+    arm.detour._ways.ways = endless
+    for longest in (HELD, 2.0 * HELD):
+        _, tasks = swing(arm, 3.0)
+        assert tasks is not arm.given
+        held = 1
+        while arm.step() is not arm.given:
+            held += 1
+            assert held * ARM.dt < longest + 0.1
+        assert held * ARM.dt > longest - 0.1
+        assert arm.detour.progress is Progress.NONE
 
 
 def test_an_arm_that_somebody_shakes_is_not_led():

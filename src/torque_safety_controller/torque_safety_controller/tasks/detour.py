@@ -39,6 +39,10 @@ LOST = 3.0
 LONGEST = 1.0
 """How long the posture that leads may wait, s, besides the time in which the arm settles."""
 
+HELD = 1.0
+"""How long an arm that moved is held for a search, s; with each attempt twice as long. It may come
+to its goal by itself, later."""
+
 ATTEMPTS = 5
 """Ways to one goal that are tried without a rest; from then on each rest is twice as long."""
 
@@ -175,13 +179,18 @@ class Detour:
         # A seed for each attempt: the same motion each time, and another way each attempt.
         rng = np.random.default_rng(self._attempts)
         self._attempts += 1
-        self.progress, self._work = Progress.SEARCHING, 0.0
+        self.progress, self._time, self._work = Progress.SEARCHING, 0.0, 0.0
         self._hunted, self.lead = self._watch.hunts, q.copy()
         self._search = self._ways.ways(q.copy(), goal, rng)
 
     def _go_on(self) -> None:
         """Do a step's work of a search."""
         assert self._search is not None
+        self._time += self._dt
+        if self._hunted and self._time > HELD * 2.0 ** (self._attempts - 1):
+            self._search = None
+            self._end_attempt()
+            return
         self._work += WORK * self._dt
         try:
             while self._work > 0.0:
