@@ -57,6 +57,22 @@ FAULTS = {
     "commands that are no numbers": ("joint_commands", "corrupt: {how: nan}", "bullet_node"),
     "names of another robot": ("joint_states", "corrupt: {how: names}", "controller_node"),
     "stamps of the past": ("joint_states", "stamp: {offset: -0.3}", "controller_node"),
+    "degrees for radians": ("joint_states", "scale: {factor: 57.3}", "controller_node"),
+    "positions that froze": (
+        "joint_states",
+        "freeze: {field: position}",
+        "controller_node",
+    ),
+    "joints that are swapped": (
+        "joint_states",
+        "swap: {joints: [left_s0, left_e1]}",
+        "controller_node",
+    ),
+    "positions with a bias": (
+        "joint_states",
+        "bias: {offset: 0.3, field: position}",
+        "controller_node",
+    ),
     "another controller": ("joint_commands", "rival: {offset: 20}", "bullet_node"),
     "another robot": ("joint_states", "rival: {offset: 0.5}", "controller_node"),
 }

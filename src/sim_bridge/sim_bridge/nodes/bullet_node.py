@@ -49,6 +49,7 @@ from viability_bounds_pkg.ros.topics import (
     JOINT_STATES,
     ROBOT_DESCRIPTION,
 )
+from viability_bounds_pkg.state_estimation.state_check import GAP
 
 Array = NDArray[np.float64]
 
@@ -322,6 +323,8 @@ class BulletNode(ArmNode):
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._restart()
+        # A gap in the stamps: else the others take the leap for a state that cannot be.
+        self._stamp += round(1e9 * GAP)
         self._next_state()
         response.success = True
         response.message = "at the start configuration, at rest"

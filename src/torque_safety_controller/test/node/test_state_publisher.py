@@ -87,7 +87,7 @@ def test_nothing_is_shown_once_the_robot_is_silent(ros):
 
 def test_the_hand_is_shown_in_position_control_too(ros):
     chain = Tools(ros, start_control="position")
-    for stamp, q in ((1, Q), (2, Q + 0.1)):
+    for stamp, q in ((1, Q), (2, Q + 0.001)):
         chain.await_command(stamp, lambda stamp=stamp, q=q: chain.both(stamp, q))
         shown = pose_from_message(chain.shown(chain.hand, stamp), "base")
         assert shown.isApprox(pose_at(q), 1e-9)

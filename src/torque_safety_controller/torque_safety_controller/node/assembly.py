@@ -24,9 +24,11 @@ from torque_safety_controller.tasks.detour import Detour
 from torque_safety_controller.tasks.detour_search import DetourSearch
 from viability_bounds_pkg.exceptions import SettingError, did_you_mean
 from viability_bounds_pkg.joint_limits import JointLimits
+from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 from viability_bounds_pkg.robot_configuration import load_model
 from viability_bounds_pkg.robot_description import RobotDescriptionError, inertia_beyond
 from viability_bounds_pkg.ros.robot_urdf import robot_urdf, warn_of_unusual
+from viability_bounds_pkg.state_estimation.state_check import StateCheck
 from viability_bounds_pkg.stopping.coordinated_stop import MARGIN
 from viability_bounds_pkg.viability import BoundsSolver
 from viability_bounds_pkg.whole_arm.safety_filter import CLEARANCE, SafetyFilter
@@ -71,6 +73,29 @@ def make_controller(
     )
     controller.warm_up()
     return controller, base
+
+
+def make_state_check(
+    config: ControllerConfiguration, model: pin.Model, declared: BoundsConfiguration | None
+) -> StateCheck | None:
+    """Return what tells joint states that cannot be; None where the estimator does it.
+
+    Args:
+        config: checked parameters.
+        model: of the arm.
+        declared: of the robot, for the bounds node.
+    """
+    if config.use_estimated_states:
+        return None
+    none = np.zeros(model.nv)
+    return StateCheck(
+        model,
+        config.position_min,
+        config.position_max,
+        config.torque_max,
+        none if declared is None else declared.declared.position_error,
+        none if declared is None else declared.declared.velocity_error,
+    )
 
 
 def make_safety_filter(config: ControllerConfiguration, model: pin.Model) -> SafetyFilter | None:

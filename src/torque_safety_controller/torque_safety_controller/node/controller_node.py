@@ -15,7 +15,11 @@ from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
 from torque_safety_controller.controller import ControlOutput
-from torque_safety_controller.node.assembly import configure, make_controller
+from torque_safety_controller.node.assembly import (
+    configure,
+    make_controller,
+    make_state_check,
+)
 from torque_safety_controller.node.collision_report import CollisionReport
 from torque_safety_controller.node.controller_report import (
     LEVELS,
@@ -23,7 +27,7 @@ from torque_safety_controller.node.controller_report import (
     about_detour,
     too_weak,
 )
-from torque_safety_controller.node.declared import covered_row
+from torque_safety_controller.node.declared import covered_row, declared_robot
 from torque_safety_controller.node.gain_watch import GainWatch
 from torque_safety_controller.node.goals import GoalSubscriber
 from torque_safety_controller.node.joint_commands import JointCommands
@@ -82,7 +86,8 @@ class ControllerNode(ArmNode):
             config.torque_max,
             config.dt,
         )
-        self._states = JointStateReader(config.joints, config.state_timeout, self._warn)
+        check = make_state_check(config, self._controller.robot.model, declared_robot(self))
+        self._states = JointStateReader(config.joints, config.state_timeout, self._warn, check)
         self._period = PeriodCheck(config.dt, self._warn)
         self._limits = LimitsReader(config.joints, self._warn)
         states = state_topic(config.use_estimated_states)

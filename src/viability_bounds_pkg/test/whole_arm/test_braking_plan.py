@@ -16,7 +16,7 @@ from viability_bounds_pkg.whole_arm.joint_plan import joint_course, joint_excess
 from viability_bounds_pkg.whole_arm.plan_samples import (
     FIRST,
     REST,
-    UNIFORM,
+    UNIFORM_SMOOTH,
     fill_plan,
     samples,
     sensitivity,
@@ -97,7 +97,7 @@ def test_a_plan_is_what_its_definition_says(seed, change):
     plan = Plan(*random_state(rng), rng.uniform(DT, 1.0), change)
     assert (np.diff(plan.clock) > 0).all()
     longest = plan.course.moving.max()
-    looked_at = {k * longest // UNIFORM for k in range(UNIFORM)} | {-1, REST}
+    looked_at = {k * longest // UNIFORM_SMOOTH for k in range(UNIFORM_SMOOTH)} | {-1, REST}
     for moving, rising, falling in zip(*plan.course, strict=True):
         looked_at |= {moving - falling, moving, rising - 1}
     assert looked_at == set(plan.clock.tolist())

@@ -15,6 +15,7 @@ from sensor_msgs.msg import JointState
 from viability_bounds_pkg.node.estimator_parameters import (
     EstimatorConfiguration,
     make_estimator,
+    make_state_check,
 )
 from viability_bounds_pkg.robot_configuration import load_model
 from viability_bounds_pkg.ros.arm_node import ArmNode
@@ -50,11 +51,13 @@ class EstimatorNode(ArmNode):
             urdf = robot_urdf(config, self)
             if config.robot_description != TOPIC:
                 warn_of_unusual(self, config, urdf)
-            self._estimator = make_estimator(config, load_model(config, urdf))
+            model = load_model(config, urdf)
+            self._estimator = make_estimator(config, model)
         joints = config.joints
         self._joints = list(joints)
         self._observers = config.observers
-        self._reader = JointStateReader(joints, config.state_timeout, self._warn)
+        check = make_state_check(config, model)
+        self._reader = JointStateReader(joints, config.state_timeout, self._warn, check)
         self._period = PeriodCheck(config.dt, self._warn)
         self._refused: Counter[str] = Counter()
         self._answered = self._restarts = self.commands_heard = 0

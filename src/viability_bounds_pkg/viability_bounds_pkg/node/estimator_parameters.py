@@ -11,6 +11,7 @@ from viability_bounds_pkg.parameter import above, group, number
 from viability_bounds_pkg.robot_configuration import ControlRate, LimitedRobotConfiguration
 from viability_bounds_pkg.state_estimation.estimator import StateEstimator
 from viability_bounds_pkg.state_estimation.observer import ObserverDesign
+from viability_bounds_pkg.state_estimation.state_check import StateCheck
 from viability_bounds_pkg.uncertainty.declared import DeclaredUncertainty, VelocityEstimation
 
 
@@ -47,4 +48,22 @@ def make_estimator(config: EstimatorConfiguration, model: pin.Model) -> StateEst
         config.torque_max,
         declared.lasting_disturbance,
         1 + declared.missed_deadlines,
+    )
+
+
+def make_state_check(config: EstimatorConfiguration, model: pin.Model) -> StateCheck:
+    """Return what tells reported states that cannot be.
+
+    Args:
+        config: parameters of the node.
+        model: of the arm.
+    """
+    declared = config.declared
+    return StateCheck(
+        model,
+        config.position_min,
+        config.position_max,
+        config.torque_max,
+        declared.position_error,
+        None if config.velocity_estimation else declared.velocity_error,
     )

@@ -23,6 +23,7 @@ from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import DIAGNOSTICS, VALUES
 from viability_bounds_pkg.state import State
+from viability_bounds_pkg.state_estimation.state_check import StateCheck
 
 Report = Callable[[], tuple[bytes, str, dict[str, Any]]]
 """Returns level, message and values of a status."""
@@ -54,6 +55,7 @@ class JointStateReader:
         joints: names of the n joints.
         reset_after: time without an accepted message after which any stamp is accepted, s.
         warn: told in words when a message is dropped for a reason for the first time.
+        check: tells states that cannot be; None to believe what is finite.
 
     Attributes:
         accepted: how many new states were accepted.
@@ -68,10 +70,11 @@ class JointStateReader:
         joints: Sequence[str],
         reset_after: float = 1.0,
         warn: Callable[[str], object] | None = None,
+        check: StateCheck | None = None,
     ) -> None:
         n = len(joints)
         self.accepted = 0
-        self._warn = warn
+        self._warn, self._check = warn, check
         self.q = np.zeros(n)
         self.v = np.zeros(n)
         self.stamp = -1
@@ -117,6 +120,8 @@ class JointStateReader:
                 return Verdict.REPEAT
             if not restarted:
                 return self._refuse("other values under the same stamp")
+        if self._check is not None and (wrong := self._check.look(State(q, v), 1e-9 * stamp)):
+            return self._refuse("cannot be", wrong)
         self.q, self.v, self.stamp = q, v, stamp
         self._accepted = message, self._index
         self._accepted_at = self.heard_at = now

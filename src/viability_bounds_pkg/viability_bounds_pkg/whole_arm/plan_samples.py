@@ -21,6 +21,9 @@ Array = NDArray[np.float64]
 UNIFORM = 20
 """Samples at equal distances in time, the first at the beginning."""
 
+UNIFORM_SMOOTH = 40
+"""The same where changes are limited: torques change faster between samples than on average."""
+
 STEP = 0
 """Row of the step that leads to a plan."""
 
@@ -37,7 +40,7 @@ def samples(n: int, smooth: bool) -> int:
     The step that leads to it; those at equal distances; where each joint begins to brake less and
     where it stands, for smooth plans also where it brakes fully; and one at rest.
     """
-    return 1 + UNIFORM + (3 if smooth else 2) * n + 1
+    return 1 + (UNIFORM_SMOOTH + 3 * n if smooth else UNIFORM + 2 * n) + 1
 
 
 @compiled
@@ -54,8 +57,9 @@ def fill_clock(course: Course, smooth: bool, clock: Counts) -> int:
     clock[FIRST] = 0
     count = FIRST + 1
     longest = course.moving.max()
-    for k in range(1, UNIFORM):
-        period = (k * longest) // UNIFORM
+    uniform = UNIFORM_SMOOTH if smooth else UNIFORM
+    for k in range(1, uniform):
+        period = (k * longest) // uniform
         if period > clock[count - 1]:
             clock[count] = period
             count += 1

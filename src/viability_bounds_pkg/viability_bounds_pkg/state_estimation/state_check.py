@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tells joint states that cannot be: finite, and impossible after those before them.
+
+Between two states that are h apart a joint whose acceleration is at most A cannot leave
+
+    h min(v0, v) - A h^2 / 4 <= q - q0 <= h max(v0, v) + A h^2 / 4
+
+(it is farthest where it gathers speed for half of the time, and loses it). Impacts, at which
+speeds jump, keep to it as well. What leaves it by more than errors of the states explain is a
+*jump*: joints are swapped, units are others, it is another robot. Over longer times the
+trapezoidal rule is far closer, because its errors hardly add up. So
+
+    d(t + h) = exp(-h / WINDOW) d(t) + q - q0 - h (v0 + v) / 2
+
+stays within errors of positions and `WINDOW` times those of speeds, one impact allowed; where it
+does not, positions and velocities *contradict* each other: one of them has frozen, or has a bias.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from viability_bounds_pkg.state import State
+
+Array = NDArray[np.float64]
+
+WINDOW = 0.2
+"""Over which positions are compared with velocities, and how long both must agree again, s."""
+
+GAP = 0.1
+"""Time between states after which the later one is a beginning, s."""
+
+SPREAD = 5e-3
+"""Error of positions that is not declared and taken for possible, rad: also of stamps, 2.5 ms at
+2 rad/s."""
+
+SHARE = 0.05
+"""Error of velocities, as a share of the speed limits, taken for possible: filters."""
+
+FAST = 2.0
+"""How many times faster than its limit a joint may move, where velocities are not known."""
+
+FORGIVEN = 10.0
+"""Time without a contradiction after which the next one is taken for the first, s."""
+
+SPIKE = 0.03
+"""Wrong states that end within this time are forgotten at once, s."""
+
+IMPOSSIBLE = 10.0
+"""How many times faster than its limit no joint ever moves."""
+
+STOPS = 0.35
+"""How far an arm that is not believed may have moved on, as a multiple of its speed, s."""
+
+STAYS = 0.05
+"""And how far besides, rad."""
+
+UNSURE = 1.0
+"""Error of that speed where positions and velocities contradict each other, rad/s."""
+
+JUMP = "no motion leads there from the last"
+CONTRADICTION = "positions contradict velocities"
+OUTSIDE = "beyond a limit by more than the range of the joint"
+TOO_FAST = f"more than {IMPOSSIBLE:g} times faster than the speed limit"
+"""What is wrong with a state."""
+
+SAMPLES = 200
+"""Postures in which the largest accelerations are looked for."""
+
+
+class StateCheck:
+    """Looks at the joint states of one arm, one after the other.
+
+    After a jump states are believed again at once if they go on within `SPIKE` where the last one
+    that was believed leads to. Otherwise, and after a contradiction, they must agree with each
+    other for `WINDOW` and show the arm where it can be after a stop. What froze agrees with an arm
+    that stands: after each contradiction it takes twice as long. A gap of `GAP` in the stamps, as
+    the restart of a robot makes one, is a new beginning.
+
+    Args:
+        model: the arm, n joints with one coordinate each.
+        position_min: lower position limits, shape (n,), rad; -inf for none.
+        position_max: upper ones, shape (n,), rad; inf for none.
+        tau_max: torque limits, shape (n,), N m.
+        position_error: largest error of positions that is declared, shape (n,), rad.
+        velocity_error: of velocities, shape (n,), rad/s; None where velocities are not to be
+            looked at.
+    """
+
+    def __init__(
+        self,
+        model: pin.Model,
+        position_min: Array,
+        position_max: Array,
+        tau_max: Array,
+        position_error: Array,
+        velocity_error: Array | None,
+    ) -> None:
+        width = position_max - position_min
+        self._low, self._high = position_min - width, position_max + width
+        self._quarter_a = 0.25 * largest_accelerations(model, tau_max)
+        fastest = np.array(model.velocityLimit)
+        fastest = np.where((fastest > 0.0) & np.isfinite(fastest), fastest, 10.0)
+        self._fast, self._fastest = FAST * fastest, IMPOSSIBLE * fastest
+        self._position = SPREAD + 2.0 * position_error
+        self._with_velocities = velocity_error is not None
+        error = np.zeros_like(fastest) if velocity_error is None else velocity_error
+        self._velocity = SHARE * fastest + error
+        self._impact = fastest
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew: any state may come next."""
+        self._last: State | None = None  # that came last, if it is no nonsense
+        self._time = -np.inf  # its time, s
+        self._believed: tuple[State, float] | None = None
+        self._drift: Array = np.zeros_like(self._fast)
+        self._agreed = 0.0  # how long states have not contradicted each other, s
+        self._patience = WINDOW  # how long they must
+        self._trusted = 0.0  # how long there has been no doubt, s
+        self._doubt = ""
+        self._contradiction = False  # whether it is more than a jump
+
+    def look(self, state: State, stamp: float) -> str:
+        """Look at the next state; return what is wrong, or nothing.
+
+        Args:
+            state: finite, shapes (n,).
+            stamp: its time, s.
+        """
+        h = stamp - self._time
+        if self._doubt and -GAP <= h <= 0.0:
+            return self._doubt  # once more, or in another order
+        nonsense = self._nonsense(state)
+        if not 0.0 < h <= GAP:
+            self.reset()
+        before, self._last, self._time = self._last, None if nonsense else state, stamp
+        if nonsense:
+            self._doubt, self._agreed = nonsense, 0.0
+            return nonsense
+        if before is None:  # at the beginning, or after nonsense
+            self._agreed = 0.0
+            if not self._doubt:
+                self._believed = state, stamp
+                return ""
+            before, h = state, 0.0
+        jumps = self._jumps(before, state, h)
+        contradicts = self._contradicts(before, state, h, jumps)
+        self._agreed = 0.0 if jumps or contradicts else self._agreed + h
+        if contradicts:
+            if not self._contradiction:
+                self._patience *= 2.0
+            self._contradiction, self._doubt = True, CONTRADICTION
+        elif jumps and not self._doubt:
+            self._doubt = JUMP
+        if self._doubt and self._goes_on(state, stamp):
+            self._doubt, self._contradiction = "", False
+        self._trusted = 0.0 if self._doubt else self._trusted + h
+        if self._trusted > FORGIVEN:
+            self._patience = WINDOW
+        if not self._doubt:
+            self._believed = state, stamp
+        return self._doubt
+
+    def _nonsense(self, state: State) -> str:
+        """Return what is wrong with a state by itself, or nothing."""
+        if not ((self._low <= state.q) & (state.q <= self._high)).all():
+            return OUTSIDE
+        if self._with_velocities and (np.abs(state.v) > self._fastest).any():
+            return TOO_FAST
+        return ""
+
+    def _jumps(self, before: State, now: State, h: float) -> bool:
+        """Return whether no motion leads from one state to another."""
+        free = self._position + h * self._velocity + h * h * self._quarter_a
+        moved = now.q - before.q
+        if not self._with_velocities:
+            return bool((np.abs(moved) > free + h * self._fast).any())
+        low, high = np.minimum(before.v, now.v), np.maximum(before.v, now.v)
+        return bool(((moved < h * low - free) | (moved > h * high + free)).any())
+
+    def _contradicts(self, before: State, now: State, h: float, jumps: bool) -> bool:
+        """Return whether velocities have led elsewhere than where the joints are."""
+        if not self._with_velocities:
+            return False
+        if jumps:  # the next states are compared among themselves
+            self._drift = np.zeros_like(self._drift)
+            return False
+        self._drift = np.exp(-h / WINDOW) * self._drift
+        self._drift += now.q - before.q - 0.5 * h * (before.v + now.v)
+        allowed = (
+            self._position + WINDOW * self._velocity + h * (self._impact + h * self._quarter_a)
+        )
+        if not (np.abs(self._drift) > allowed).any():
+            return False
+        self._drift = np.zeros_like(self._drift)
+        return True
+
+    def _goes_on(self, state: State, stamp: float) -> bool:
+        """Return whether a state may follow that which was believed last."""
+        if self._believed is None:
+            return self._agreed >= self._patience
+        before, then = self._believed
+        h, moved = stamp - then, state.q - before.q
+        if not self._contradiction and h <= SPIKE:
+            free = self._position + STAYS + h * self._velocity
+            if self._with_velocities:
+                low, high = np.minimum(before.v, state.v), np.maximum(before.v, state.v)
+            else:
+                low, high = -self._fast, self._fast
+            if ((h * low - free <= moved) & (moved <= h * high + free)).all():
+                return True
+        free = self._position + STAYS
+        if self._patience > WINDOW or not self._with_velocities:
+            free = free + STOPS * UNSURE
+        on = STOPS * before.v
+        near = (np.minimum(on, 0.0) - free <= moved) & (moved <= np.maximum(on, 0.0) + free)
+        return bool(near.all()) and self._agreed >= self._patience
+
+
+def largest_accelerations(model: pin.Model, tau_max: Array) -> Array:
+    """Return what the motors can accelerate joints by at most, shape (n,), rad/s^2.
+
+    All motors together, and as much again for gravity and what is pushed, in the worst of random
+    postures: |a| <= 2 |M(q)^-1| tau_max.
+
+    Args:
+        model: the arm.
+        tau_max: torque limits, shape (n,), N m.
+    """
+    rng, data, n = np.random.default_rng(0), model.createData(), model.nv
+    most = np.zeros(n)
+    for _ in range(SAMPLES):
+        M = pin.crba(model, data, rng.uniform(-np.pi, np.pi, n))
+        most = np.maximum(most, np.abs(np.linalg.inv(M)) @ tau_max)
+    return 2.0 * most
