@@ -11,6 +11,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.tasks.gains import Gains, critical_damping
+from viability_bounds_pkg.ros.topics import state_topic
 from viability_bounds_pkg.testing.ros_harness import RosHarness, acceleration_limits, joint_state
 
 MS = 1_000_000
@@ -50,7 +51,9 @@ class ControllerChain:
         self.joints = list(values["joints"])
         self.node = ros.start(ControllerNode, values)
         self.commands = ros.listen(JointState, "joint_commands")
-        self.states = ros.talk(JointState, "joint_states")
+        self.states = ros.talk(
+            JointState, state_topic(bool(values.get("use_estimated_states"))).name
+        )
         self.limits = ros.talk(JointTrajectory, "acceleration_limits")
         ros.hears("joint_commands")
 
