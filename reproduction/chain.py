@@ -41,11 +41,13 @@ class ChainResult:
         run: states, bounds and torques by control period.
         robot: the robot's last diagnostics, by key: it saw every physics step.
         q: the true positions at the end, shape (n,), rad.
+        refused: how many joint states any node refused.
     """
 
     run: RecordedRun
     robot: dict[str, str]
     q: np.ndarray
+    refused: int
 
     def vector(self, key: str) -> np.ndarray:
         """Return a per-joint value of the robot's diagnostics."""
@@ -124,8 +126,14 @@ def run_chain(
             play(
                 player, others=[each for each in nodes.values() if each is not player], quiet=True
             )
+            readers = [nodes["controller_node"]._states]
+            if "estimator_node" in nodes:
+                readers.append(nodes["estimator_node"]._reader)
             return ChainResult(
-                player.recorded_run(), player.robot, nodes["bullet_node"].true_positions
+                player.recorded_run(),
+                player.robot,
+                nodes["bullet_node"].true_positions,
+                sum(reader.refused.total() for reader in readers),
             )
         finally:
             for node in nodes.values():

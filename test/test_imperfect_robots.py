@@ -57,8 +57,10 @@ def test_no_limit_is_passed_by_a_robot_as_bad_as_declared(robot, case, duration)
     assert int(result.robot["missed_deadlines_injected"]) > 5
     stopped = int(result.robot["braked_periods"])
     assert stopped > 50 if case == "outage_stop" else stopped == 0
+    assert result.refused == 0, "states that can be were taken for others"
 
 
 def test_without_what_is_done_about_it_a_limit_is_passed():
     result = play("baxter_left_arm", "nothing", 6.0)
     assert result.vector("velocity_violation_rad_s").max() > 0.05
+    assert result.refused == 0

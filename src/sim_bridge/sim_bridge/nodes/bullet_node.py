@@ -49,7 +49,7 @@ from viability_bounds_pkg.ros.topics import (
     JOINT_STATES,
     ROBOT_DESCRIPTION,
 )
-from viability_bounds_pkg.state_estimation.state_check import GAP
+from viability_bounds_pkg.state_estimation.state_check import RESTART
 
 Array = NDArray[np.float64]
 
@@ -322,9 +322,11 @@ class BulletNode(ArmNode):
     # Services
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        q, v, _ = self._robot.state()
+        if v.any() or not np.allclose(q, self._config.start_positions, rtol=0.0, atol=1e-6):
+            # As robots that start again: else the leap is taken for a state that cannot be.
+            self._stamp += round(1e9 * RESTART)
         self._restart()
-        # A gap in the stamps: else the others take the leap for a state that cannot be.
-        self._stamp += round(1e9 * GAP)
         self._next_state()
         response.success = True
         response.message = "at the start configuration, at rest"

@@ -52,6 +52,7 @@ from viability_bounds_pkg.ros.topics import (
     state_topic,
 )
 from viability_bounds_pkg.state import State
+from viability_bounds_pkg.state_estimation.state_check import RESTART
 
 _STALE = "acceleration limits are stale"
 _CONTESTED = "several nodes publish goals"
@@ -173,7 +174,8 @@ class ControllerNode(ArmNode):
         self._state_at = now
         if silent and 0 <= self._answered_stamp <= last < self._states.stamp:
             self._went_wrong = "joint states were missing"
-        if silent or (verdict is Verdict.NEW and self._states.stamp <= last):
+        leapt = not 0 < self._states.stamp - last <= 1e9 * RESTART
+        if silent or (verdict is Verdict.NEW and leapt):
             self._begin(verdict)
         elif verdict is Verdict.REPEAT:
             if self._answered_stamp == last:

@@ -32,6 +32,9 @@ WINDOW = 0.2
 GAP = 0.1
 """Time between states after which the later one is a beginning, s."""
 
+RESTART = 1.0
+"""Time between stamps after which a robot has started again, s."""
+
 SPREAD = 5e-3
 """Error of positions that is not declared and taken for possible, rad: also of stamps, 2.5 ms at
 2 rad/s."""
