@@ -241,7 +241,7 @@ def test_packages_declare_what_they_import(package):
 def test_parameter_files_and_scenarios_are_installed():
     share = ROOT / "install" / "sim_bridge" / "share" / "sim_bridge" / "config"
     own, installed = (
-        {path.relative_to(folder): path.read_text() for path in folder.rglob("*.yaml")}
+        {path.relative_to(folder): path.read_text() for path in folder.rglob("*.*ml")}
         for folder in (ROOT / "config", share)
     )
     assert len(own) > 5

@@ -6,7 +6,8 @@ from glob import glob
 from setuptools import find_packages, setup
 
 PACKAGE = "sim_bridge"
-CONFIG = ("config", "config/faults", "config/imperfect", "config/obstacles", "config/scenarios")
+FOLDERS = ("faults", "imperfect", "obstacles", "scenarios", "security", "two_hosts")
+CONFIG = ("config", *(f"config/{folder}" for folder in FOLDERS))
 
 setup(
     name=PACKAGE,
@@ -16,7 +17,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
-        *((f"share/{PACKAGE}/{folder}", glob(f"{folder}/*.yaml")) for folder in CONFIG),
+        *((f"share/{PACKAGE}/{folder}", glob(f"{folder}/*.*ml")) for folder in CONFIG),
     ],
     install_requires=["setuptools"],
     extras_require={"test": ["pytest", "hypothesis"]},

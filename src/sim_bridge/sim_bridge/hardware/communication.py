@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Generic, TypeVar
 
-from sim_bridge.hardware.delay_line import DelayLine
 from sim_bridge.hardware.imperfections import Imperfections
 from sim_bridge.hardware.noise import Stream, generator
 
@@ -59,14 +59,22 @@ class Outages:
         return lost
 
 
+class _Lost:
+    """Stands for a command that was lost."""
+
+
 class CommandPath(Generic[Command]):
     """Commands on their way to the drives, one in each control period.
+
+    Each acts `command_delay` periods after the state that it answers. So one that comes late, over
+    a network, acts when it would have acted anyhow, as long as that time is not over.
 
     Args:
         imperfections: which ones there are.
 
     Attributes:
-        missed: number of commands lost.
+        missed: number of commands lost on purpose.
+        absent: whether none had come for the period that `arriving` was last called for.
     """
 
     def __init__(self, imperfections: Imperfections) -> None:
@@ -78,20 +86,46 @@ class CommandPath(Generic[Command]):
         self._outages = Outages(
             given.outage_probability, given.outage_longest, given.imperfection_seed
         )
-        self._line: DelayLine[Command | None] = DelayLine(given.command_delay, None)
+        # None where no command has come yet.
+        self._line: deque[Command | _Lost | None] = deque([None] * given.command_delay)
+        self.absent = True
 
     def arriving(self, sent: Command | None) -> Command | None:
-        """Return the command that arrives in this period.
+        """Return the command that acts in this period.
 
         Args:
-            sent: the command that was sent in it; None if there is none.
+            sent: the command that has come in it; None if there is none.
 
         Returns:
-            The one sent `command_delay` periods ago; None if there was none, or it was lost.
+            The answer to the state of `command_delay` periods ago; None if there was none, or it
+            was lost.
         """
-        if sent is not None:
-            missed, out = self._deadlines.next(), self._outages.next()
-            if missed or out:
-                self.missed += 1
-                sent = None
-        return self._line.shift(sent)
+        self._line.append(None if sent is None else self._sent(sent))
+        due = self._line.popleft()
+        self.absent = due is None
+        return None if isinstance(due, _Lost) else due
+
+    def arrives_late(self, sent: Command, periods: int, *, ended: bool) -> bool:
+        """Take the answer to a state of an earlier period.
+
+        Args:
+            sent: the command.
+            periods: how many periods ago, above 0.
+            ended: whether `arriving` has been called for this period.
+
+        Returns:
+            Whether it can still act; not if it comes for the second time, either.
+        """
+        k = len(self._line) - periods - ended
+        if k < 0 or self._line[k] is not None:
+            return False
+        self._line[k] = self._sent(sent)
+        return True
+
+    def _sent(self, command: Command) -> Command | _Lost:
+        """Return a command, or what stands for it if it is lost on the way."""
+        missed, out = self._deadlines.next(), self._outages.next()
+        if missed or out:
+            self.missed += 1
+            return _Lost()
+        return command

@@ -57,7 +57,9 @@ class Imperfections:
         "control periods by which states are reported late", _DELAY, default=0
     )
     command_delay: int = whole_number(
-        "control periods by which commands act late", _DELAY, default=0
+        "control periods by which commands act late; in real time they may come so much later",
+        _DELAY,
+        default=0,
     )
     motor_bandwidth: Array = joint_numbers(
         "bandwidth of the motors' torque, a first-order lag, Hz; 0 or empty: infinite",

@@ -66,8 +66,9 @@ class BulletNode(ArmNode):
     either kind.
 
     With ``clock: real_time`` each control period has its duration on the wall clock. A command
-    that comes within the period of the state with its stamp acts during that period; without one
-    the last command is held, and after ``command_timeout`` periods the robot stops itself. Where
+    that comes within the period of the state with its stamp acts during that period, or, with
+    ``command_delay``, so many periods later, when it also may come so much later; without one the
+    last command is held, and after ``command_timeout`` periods the robot stops itself. Where
     acceleration limits are given, both keep all limits, and commands that return get their effect
     back gradually; where not, the brakes stop it. With ``clock:
     lockstep`` a period ends when the command with its stamp has come, without a limit of time.
@@ -217,6 +218,7 @@ class BulletNode(ArmNode):
             self._command = arrived
             self._missed_in_row = 0
         elif self._command is not None:
+            self._missed += self._path.absent
             self._missed_in_row += 1
             if self._missed_in_row > self._config.command_timeout:
                 self._command = None
@@ -261,8 +263,6 @@ class BulletNode(ArmNode):
             # A real robot would have gone on.
             self._late += max(0, round(took / dt) - 1)
         if not self._advanced:
-            if self._command is not None:
-                self._missed += 1
             self._receive(None)
             self._advance()
         self._next_state()
@@ -282,7 +282,9 @@ class BulletNode(ArmNode):
     # Commands
 
     def _on_command(self, message: JointState) -> None:
-        if stamp_to_ns(message.header.stamp) != self._stamp or self._advanced:
+        age, rest = divmod(self._stamp - stamp_to_ns(message.header.stamp), self._dt_ns)
+        late = 0 < age <= self._config.imperfections.command_delay and not self._config.lockstep
+        if rest or not (late or (age == 0 and not self._advanced)):
             if not self._paused:
                 self._note_stray(stamp_to_ns(message.header.stamp))
             return
@@ -295,13 +297,18 @@ class BulletNode(ArmNode):
             if self._refused[str(error)] == 1:
                 self.get_logger().warning(f"joint_commands refused: {error}")
             return
-        self._strays = 0
-        self._latencies.note(time.monotonic() - self._published_at)
         if isinstance(command, TorqueCommand):
             tau, tau_max = command.tau, self._config.torque_max
             self._torque_ratio = max(self._torque_ratio, float(np.max(np.abs(tau) / tau_max)))
             # The motors do not exceed their limits, whatever the command.
             command = TorqueCommand(np.clip(tau, -tau_max, tau_max))
+        if late and not self._path.arrives_late(command, age, ended=self._advanced):
+            self._note_stray(stamp_to_ns(message.header.stamp))
+            return
+        self._strays = 0
+        self._latencies.note(time.monotonic() - self._published_at + age * self._config.dt)
+        if late:
+            return
         self._receive(command)
         self._advance()
         # After a pause by itself the next state is not published: time stops for all nodes.
@@ -315,8 +322,8 @@ class BulletNode(ArmNode):
         if self._strays == _STRAYS:
             self.get_logger().warning(
                 f"joint_commands refused: {_STRAYS} in a row do not have the stamp of the present "
-                f"joint state; the last one has {1e-9 * stamp:.9g} s instead of "
-                f"{1e-9 * self._stamp:.9g} s"
+                f"joint state; the last one has {1e-9 * stamp:.13g} s instead of "
+                f"{1e-9 * self._stamp:.13g} s"
             )
 
     # Services

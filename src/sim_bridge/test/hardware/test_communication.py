@@ -73,3 +73,32 @@ def test_a_period_without_a_command_is_not_a_missed_one():
     path = CommandPath(Imperfections(missed_probability=0.9, missed_in_row=100))
     assert [path.arriving(None) for _ in range(50)] == [None] * 50
     assert path.missed == 0
+
+
+@pytest.mark.parametrize("ended", [False, True])
+def test_a_command_that_comes_late_acts_at_its_time_unless_that_is_over(ended):
+    """Whether the period in which it comes has ended already, or not."""
+    path = CommandPath(Imperfections(command_delay=3))
+    for k in range(5 + ended):
+        path.arriving(k if k in (0, 1) else None)
+    last = 4 - 2 + ended  # answered by what acts next
+    assert path.arrives_late("again", 5 - last, ended=ended)
+    assert not path.arrives_late("twice", 5 - last, ended=ended)
+    assert not path.arrives_late("over", 6 - last, ended=ended)
+    assert path.arrives_late("newest", 1, ended=ended)
+    acting = [path.arriving(None) for _ in range(3 - ended)]
+    assert acting == ["again", None, "newest"] if not ended else ["again", "newest"]
+    path.arriving(None)
+    assert path.absent
+
+
+def test_commands_that_come_late_are_lost_as_often():
+    path = CommandPath(Imperfections(command_delay=2, missed_probability=0.4, missed_in_row=3))
+    acted = []
+    for k in range(300):
+        path.arrives_late(k, 1, ended=False)
+        acted.append(path.arriving(None))
+        assert not path.absent or k < 1
+    missed = {k for k, each in enumerate(drawn(0.4, 3, 300)) if each}
+    assert path.missed == len(missed) > 50
+    assert acted[1:] == [None if k in missed else k for k in range(299)]

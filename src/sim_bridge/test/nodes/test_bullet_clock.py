@@ -49,6 +49,25 @@ def test_in_real_time_it_keeps_its_rate_and_brakes_without_commands(ros):
     assert "braking" in robot.reported("message")
 
 
+@pytest.mark.parametrize("delay", [1, 4])
+def test_commands_may_come_as_late_as_they_act(ros, delay):
+    """As over a network: each answers the state of two periods ago."""
+    robot = RobotProbe(ros, clock="real_time", rate_hz=25.0, command_delay=delay, **BRAKES)
+    ros.wait_until(lambda: len(robot.states) > 3, "states")
+
+    def answer():
+        robot.send(robot.states.stamps[-3], robot.gravity() + 0.3)
+
+    if delay == 1:
+        late = "not for this period"
+        ros.wait_until(lambda: late in robot.reported("commands_refused"), each=answer)
+        assert robot.reported("control") == "brakes"
+        return
+    ros.wait_until(lambda: robot.reported("control") == "torque", each=answer, period=0.01)
+    ros.wait_until(lambda: np.abs(robot.v).max() > 1e-3, "motion", each=answer, period=0.01)
+    assert float(robot.reported("latency_p50_us")) > 0.07e6
+
+
 def test_periods_in_which_it_was_late_itself_are_counted(ros):
     robot = RobotProbe(ros, clock="real_time", rate_hz=100.0)
     ros.wait_until(lambda: robot.reported("late_periods"))

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidParameterTypeException
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
 from viability_bounds_pkg.exceptions import ArmSafetyError
@@ -16,6 +17,8 @@ from viability_bounds_pkg.ros.claim import Claim
 from viability_bounds_pkg.ros.direct_delivery import DirectDelivery
 from viability_bounds_pkg.ros.ros_arguments import RosArgumentError
 from viability_bounds_pkg.ros.topics import Topic
+
+RCLError = rclpy_implementation.RCLError
 
 CLOCK_TIMEOUT = 5.0
 """How long ``/clock`` may be silent at start before a node warns, s."""
@@ -50,6 +53,8 @@ class ArmNode(Node):
             super().__init__(self.NAME, enable_logger_service=True, **node_arguments)
         except InvalidParameterTypeException as error:  # of use_sim_time: rclpy declares it
             raise RosArgumentError(str(error).rpartition(": ")[0]) from error
+        except RCLError as error:  # of the middleware, such as security that it does not have
+            raise RosArgumentError(" ".join(str(error).split(", at /")[0].split())) from error
 
     @contextmanager
     def starting(self, *topics: Topic) -> Iterator[None]:
