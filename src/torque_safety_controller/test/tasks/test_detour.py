@@ -12,6 +12,7 @@ from torque_safety_controller.tasks.detour import (
     ATTEMPTS,
     FARTHEST,
     HELD,
+    LONGEST_REST,
     WORK,
     Detour,
     Progress,
@@ -170,6 +171,16 @@ def test_an_arm_that_moved_is_not_held_for_a_long_search():
             assert held * ARM.dt < longest + 0.1
         assert held * ARM.dt > longest - 0.1
         assert arm.detour.progress is Progress.NONE
+
+
+def test_attempts_may_go_on_for_days():
+    arm = Arm()
+    arm.step()
+    arm.detour._attempts = 5000
+    assert swing(arm, 3.0) is not None  # it is held for a search
+    arm.detour._end_attempt()
+    assert arm.detour.progress is Progress.NO_WAY
+    assert arm.detour._rest == LONGEST_REST
 
 
 def test_an_arm_that_somebody_shakes_is_not_led():

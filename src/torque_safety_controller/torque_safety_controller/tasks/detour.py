@@ -49,6 +49,9 @@ ATTEMPTS = 5
 LONGEST_REST = 10.0
 """The longest rest, s."""
 
+DOUBLINGS = 10
+"""How often times are doubled at most: attempts may go on for days."""
+
 
 class Progress(Enum):
     """What is done about an arm that stands short of its goal."""
@@ -187,7 +190,7 @@ class Detour:
         """Do a step's work of a search."""
         assert self._search is not None
         self._time += self._dt
-        if self._hunted and self._time > HELD * 2.0 ** (self._attempts - 1):
+        if self._hunted and self._time > _doubled(HELD, self._attempts - 1):
             self._search = None
             self._end_attempt()
             return
@@ -211,7 +214,7 @@ class Detour:
         self.progress = Progress.NONE
         if self._attempts >= ATTEMPTS:
             self.progress = Progress.NO_WAY
-            self._rest = min(PATIENCE * 2.0 ** (self._attempts - ATTEMPTS), LONGEST_REST)
+            self._rest = min(_doubled(PATIENCE, self._attempts - ATTEMPTS), LONGEST_REST)
 
     def _follow(self, q: Array, rate: float, there: float) -> None:
         """Move the posture that leads, and see whether the arm comes with it.
@@ -239,3 +242,7 @@ class Detour:
                 self.lead = self._left.pop(0)
             else:
                 self.lead = self.lead + (ahead - apart) / length * piece
+
+
+def _doubled(time: float, times: int) -> float:
+    return time * 2.0 ** min(times, DOUBLINGS)

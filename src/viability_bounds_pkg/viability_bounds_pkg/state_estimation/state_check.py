@@ -111,7 +111,7 @@ class StateCheck:
         self._with_velocities = velocity_error is not None
         error = np.zeros_like(fastest) if velocity_error is None else velocity_error
         self._velocity = SHARE * fastest + error
-        self._impact = fastest
+        self._limit = fastest
         self.reset()
 
     def reset(self) -> None:
@@ -177,12 +177,20 @@ class StateCheck:
 
     def _jumps(self, before: State, now: State, h: float) -> bool:
         """Return whether no motion leads from one state to another."""
-        free = self._position + h * self._velocity + h * h * self._quarter_a
+        free = self._position + h * self._velocity + self._between(h)
         moved = now.q - before.q
         if not self._with_velocities:
             return bool((np.abs(moved) > free + h * self._fast).any())
         low, high = np.minimum(before.v, now.v), np.maximum(before.v, now.v)
         return bool(((moved < h * low - free) | (moved > h * high + free)).any())
+
+    def _between(self, h: float) -> Array:
+        """Return how much farther than by the speeds at both ends joints come, shape (n,), rad.
+
+        Light wrists could accelerate a thousand times as much as they do: they come no farther
+        than at twice the speed limit.
+        """
+        return np.minimum(h * h * self._quarter_a, h * self._limit)
 
     def _contradicts(self, before: State, now: State, h: float, jumps: bool) -> bool:
         """Return whether velocities have led elsewhere than where the joints are."""
@@ -193,9 +201,7 @@ class StateCheck:
             return False
         self._drift = np.exp(-h / WINDOW) * self._drift
         self._drift += now.q - before.q - 0.5 * h * (before.v + now.v)
-        allowed = (
-            self._position + WINDOW * self._velocity + h * (self._impact + h * self._quarter_a)
-        )
+        allowed = self._position + WINDOW * self._velocity + h * self._limit + self._between(h)
         if not (np.abs(self._drift) > allowed).any():
             return False
         self._drift = np.zeros_like(self._drift)
