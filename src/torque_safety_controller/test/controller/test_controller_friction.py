@@ -221,10 +221,12 @@ class FrictionChain:
 
     def __init__(self, ros, **changed) -> None:
         given = read_config("panda", NODE) | {"bounds_timeout": 20.0, "state_timeout": 40.0}
+        # Joints that stand and have a speed: the estimator would refuse them.
+        given["use_estimated_states"] = True
         self.ros, self.joints, self.stamp = ros, given["joints"], 0
         self.node = ros.start(ControllerNode, given | changed)
         self.commands = ros.listen(JointState, "joint_commands")
-        self.states = ros.talk(JointState, "joint_states")
+        self.states = ros.talk(JointState, "estimated_joint_states")
         self.limits = ros.talk(JointTrajectory, "acceleration_limits")
         ros.hears("joint_commands")
 

@@ -52,7 +52,7 @@ from viability_bounds_pkg.ros.topics import (
     state_topic,
 )
 from viability_bounds_pkg.state import State
-from viability_bounds_pkg.state_estimation.state_check import RESTART
+from viability_bounds_pkg.state_estimation.state_check import RESTART, STAYS
 
 _STALE = "acceleration limits are stale"
 _CONTESTED = "several nodes publish goals"
@@ -164,7 +164,7 @@ class ControllerNode(ArmNode):
             return
         now = time.monotonic()
         self._message_at, self._message_stamp = now, message.header.stamp
-        last = self._states.stamp
+        last, was_at = self._states.stamp, self._states.q
         verdict = self._states.read(message, now)
         if verdict is Verdict.REFUSED:
             self._on_refused(message.header.stamp)
@@ -174,8 +174,11 @@ class ControllerNode(ArmNode):
         self._state_at = now
         if silent and 0 <= self._answered_stamp <= last < self._states.stamp:
             self._went_wrong = "joint states were missing"
-        leapt = not 0 < self._states.stamp - last <= 1e9 * RESTART
-        if silent or (verdict is Verdict.NEW and leapt):
+        # Where the time alone has leapt, the arm goes on without a jolt.
+        elsewhere = self._states.stamp - last >= 1e9 * RESTART and bool(
+            (np.abs(self._states.q - was_at) > STAYS).any()
+        )
+        if silent or (verdict is Verdict.NEW and (self._states.stamp <= last or elsewhere)):
             self._begin(verdict)
         elif verdict is Verdict.REPEAT:
             if self._answered_stamp == last:
