@@ -4,7 +4,7 @@
 bash scripts/reproduce.sh whole_arm
 bash scripts/reproduce.sh whole_arm --minutes 30     longer; 2 minutes of each row otherwise
 bash scripts/reproduce.sh whole_arm --row Panda      rows whose names contain it
-bash scripts/reproduce.sh whole_arm --limit 6        s that an arm has for a goal, 15 otherwise
+bash scripts/reproduce.sh whole_arm --limit 6        s that an arm has for a goal, 30 otherwise
 
 In turns, random postures that can be held, half of the joints next to their limits, and poses of
 the hand in random postures, not all of which can be reached from where the arm is without
@@ -369,7 +369,7 @@ def main() -> int:
     """Play, draw, print the table; return whether the filter kept all limits."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--minutes", type=int, default=2, help="of each row")
-    parser.add_argument("--limit", type=float, default=15.0, help="time for a goal, s")
+    parser.add_argument("--limit", type=float, default=30.0, help="time for a goal, s")
     parser.add_argument("--row", default="", help="rows whose names contain this alone")
     given = parser.parse_args()
     figure = Figure("whole_arm")

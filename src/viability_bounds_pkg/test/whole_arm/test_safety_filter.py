@@ -183,6 +183,30 @@ def test_nor_where_rates_are_limited_and_those_are_kept(arm, seed, kind):
     assert fast > 0.4  # and it is not kept by standing still
 
 
+def test_a_plan_that_is_repaired_does_not_change_torques_faster_than_they_may():
+    arm, rate = Arm("panda"), 300.0
+    keeper = arm.filter(jerk_max=np.full(arm.n, 500.0), torque_rate_max=np.full(arm.n, rate))
+    moving, rising, falling = [1, 1, 257, 1, 262, 1, 197], [1, 1, 38, 1, 42, 1, 6], [220, 221, 192]
+    # Three joints are about to stand. What brakes the elbow, which has drifted towards its limit,
+    # also takes torque off the shoulder: a plan in which it brakes longer gives that back at once.
+    q = np.array([1.406, -1.762, 2.7, 0.0, -0.206, 3.752, -1.173])
+    v = np.array([0.0, 0.0, 1.09, 0.0, -0.359, 0.0, 0.404])
+    last = np.array([0.0, -0.364, -3.091, 0.601, 12.902, 0.601, 4.829])
+    q[ELBOW] = keeper._limits.q_max[ELBOW] + 0.5 * keeper._limits.tolerance[ELBOW]
+    v_before = v - last * arm.dt
+    q_before = q - (v_before + 0.5 * last * arm.dt) * arm.dt
+    zero = np.zeros(arm.n)
+    keeper.look(q_before, v_before, zero, arm.limits.a_min, arm.limits.a_max, last)
+    keeper._time = arm.dt
+    for counts, ours in zip((moving, rising), keeper._course, strict=False):
+        ours[:] = counts
+    keeper._course.falling[:] = 1
+    keeper._course.falling[2::2] = falling
+    keeper.look(q, v, zero, arm.limits.a_min, arm.limits.a_max, last)
+    change = arm.torque(q, v, keeper.plan) - arm.torque(q_before, v_before, last)
+    assert np.abs(change).max() <= rate * arm.dt
+
+
 def test_no_limit_is_passed_where_the_worst_posture_is_wanted(arm):
     worst, states, keeper = to_the_worst(arm)
     assert worst[0] <= ROUNDING

@@ -331,13 +331,13 @@ class SafetyFilter:
         """
         # Up to the reserve it may change at any time, so that the plans must not count on it.
         extra = extra - np.clip(extra, -self._reserve, self._reserve)
-        self._state, self._extra = State(q, v), extra
+        before, self._state, self._extra = self._state, State(q, v), extra
         self._last = np.zeros_like(q) if last is None else last
         plans = self._plans
         if self._smooth:
             self._gentle = self._gentle_changes(q)
         if self._begun:
-            self._go_on()
+            self._go_on(before)
         else:
             self._begin()
         rest_of(self._course, self._rest)
@@ -358,8 +358,13 @@ class SafetyFilter:
                     wanted.setdefault(k, []).append(j)
         return self._rows(wanted) if wanted else None
 
-    def _go_on(self) -> None:
-        """Look at the plan in hand; where joints have drifted towards a limit, repair it."""
+    def _go_on(self, before: State) -> None:
+        """Look at the plan in hand; where joints have drifted towards a limit, repair it.
+
+        Args:
+            before: state in which the step before began: from its torques, too, a repaired plan
+                must not change too fast.
+        """
         plans, begin, last, extra = self._plans, self._state, self._last, self._extra
         drifted = repair(
             *begin,
@@ -375,7 +380,7 @@ class SafetyFilter:
         if not drifted:
             return
         own = Needs.of(plans)
-        plans.follow(*begin, last, self._rest, extra)
+        plans.follow(*begin, last, self._rest, extra, before)
         if plans.beyond <= own.beyond and own._replace(beyond=plans.beyond).cover(plans):
             copy_course(self._rest, self._course)
         else:
