@@ -63,9 +63,11 @@ STILL = 0.05, 1.0  # s, shortest and longest time in which a node stands still
 APART = 1.0  # s between starts of nodes
 GOAL_PERIOD, SENT_AGAIN = 1.0, 0.2  # s
 CALM = 1.0, 2.0  # s, shortest and longest time of motion before a fault
+FILTERED_RATE = 250.0  # Hz, at least, where the imperfect robots' filter of velocities runs
 WILD = 1.0  # s, in which parameters change, or the clock jumps
-NOT_WILD = "method", "integral_anti_windup", "friction_", "closed_contacts"
-"""Live parameters that choose what keeps no limits, for comparison, or say what is so: not tried."""
+NOT_WILD = "method", "friction_", "closed_contacts", "integral_anti_windup", "integral_lambda"
+"""Live parameters that choose what keeps no limits, for comparison, or say what is so; and a gain
+that may break limits where it is higher than `gain_limits` says, tried by itself."""
 
 Course = Iterator[None]
 """What happens: goes on when asked for the next, and ends when the cause has gone."""
@@ -122,7 +124,8 @@ class Bench:
         self.ros, self.rng, self._kind = ros, rng, kind
         more = [f"imperfect/{robot}"] * kind.imperfect
         changes = STIFF | {"start_paused": False, "clock": "real_time"} | dict(kind.values)
-        changes |= {} if rate is None else {"rate_hz": rate}
+        if rate is not None:
+            changes["rate_hz"] = max(rate, FILTERED_RATE) if kind.imperfect else rate
         self._own = {name: own | changes for name, own in load_node_values(robot, *more).items()}
         values = self._own[ROBOT]
         if "robot_description" in kind.values:  # the robot itself cannot take it from the topic
@@ -152,6 +155,7 @@ class Bench:
         self._asked = self._sent = -math.inf
         self._user = ros.probe.create_publisher(JointState, "target_posture", GOAL_QOS)
         self._clock = ros.probe.create_publisher(Clock, "/clock", 1)
+        self._marked = -math.inf
         self._clients: dict[Any, dict[str, Any]] = {}
         self.clock_ahead, self._clock_at = 0.0, -math.inf
         ros.probe.create_subscription(String, "controller_mode", self._on_mode, LATCHED_QOS)
@@ -208,6 +212,15 @@ class Bench:
         node = BulletNode(context=self.ros.context, parameter_overrides=overrides(own))
         self.arm = self.ros.add(node)
 
+    def start_all(self) -> None:
+        """Start all nodes but the late one, and wait for them."""
+        names = [
+            each for each in dict.fromkeys((ROBOT, *self.programs)) if each != self._kind.late
+        ]
+        for name in names:
+            self.start(name)
+        self.ros.wait_until(lambda: all(map(self.publishers, names)), "the nodes", timeout=START)
+
     def close(self) -> None:
         """End all programs."""
         for program in self.programs.values():
@@ -225,6 +238,10 @@ class Bench:
             set_stamp(message.clock, round(1e9 * max(0.0, now + self.clock_ahead)))
             self._clock.publish(message)
         self.ros.spin(0.01)
+
+    def mark(self) -> None:
+        """Let the fault have begun now, and not when its course began."""
+        self._marked = self.now()
 
     def wait(self, duration: float) -> Course:
         """Let time pass, s."""
@@ -301,7 +318,9 @@ class Bench:
         while self.now() < end + AGAIN + 0.5 and time.monotonic() - since < 3.0 * RETURN:
             self.spin()
             since = min(since, time.monotonic()) if self.tracking else math.inf
-        seen.note_moment(self._trace, begin, end, self.dt, self._tau_max)
+        begin = max(begin, self._marked)
+        usual = self._kind.course is nothing
+        seen.note_moment(self._trace, begin, end, self.dt, self._tau_max, usual)
 
     def note_limits(self, seen: Seen) -> None:
         """Add how far limits were passed until now."""
@@ -348,7 +367,11 @@ def restarted(name: str) -> Callable[[Bench], Course]:
     """A node is told to end, and started again at once."""
 
     def course(bench: Bench) -> Course:
+        before = bench.publishers(name)
         bench.programs[name].send(signal.SIGTERM)
+        while bench.programs[name].running and bench.publishers(name) >= before:
+            yield
+        bench.mark()  # it has answered until now
         while bench.programs[name].running:
             yield
         yield from bench.until_back(name)
@@ -371,12 +394,22 @@ def stood_still(*names: str) -> Callable[[Bench], Course]:
 
 def wild_parameters(bench: Bench) -> Course:
     """Live parameters of bounds and controller change at random, then are what they were."""
+    return _wild(bench, lambda name: not name.startswith(NOT_WILD))
+
+
+def wild_integral(bench: Bench) -> Course:
+    """The integral action changes at random, then is what it was."""
+    return _wild(bench, lambda name: name in ("integral_action", "integral_lambda"))
+
+
+def _wild(bench: Bench, chosen: Callable[[str], bool]) -> Course:
+    kinds = {BOUNDS: BoundsConfiguration, CONTROLLER: ControllerConfiguration}
     rows = {
-        name: [
-            row for row in parameter_table(kind) if row.live and not row.name.startswith(NOT_WILD)
-        ]
-        for name, kind in ((BOUNDS, BoundsConfiguration), (CONTROLLER, ControllerConfiguration))
+        name: [row for row in parameter_table(kind) if row.live and chosen(row.name)]
+        for name, kind in kinds.items()
     }
+    rows = {name: found for name, found in rows.items() if found}
+    nodes = list(rows)
     before = {}
     for node in rows:
         names = [row.name for row in rows[node]]
@@ -388,7 +421,7 @@ def wild_parameters(bench: Bench) -> Course:
         }
     end = time.monotonic() + WILD
     while time.monotonic() < end:
-        node = CONTROL[bench.rng.integers(len(CONTROL))]
+        node = nodes[bench.rng.integers(len(nodes))]
         row = rows[node][bench.rng.integers(len(rows[node]))]
         value = wild_value(row, bench.limits["joints"], bench.rng)
         yield from bench.set(node, {row.name: value})
@@ -484,6 +517,7 @@ FAULTS = {
     "controller late": Kind(late(CONTROLLER), late=CONTROLLER),
     "robot late": Kind(late(ROBOT), late=ROBOT),
     "wild parameters": Kind(wild_parameters),
+    "wild integral action": Kind(wild_integral),
     "the clock jumps": Kind(clock_jumps, values={"use_sim_time": True}),
     "no room for logs": Kind(no_room),
     "another robot description": Kind(other_description, values={"robot_description": "topic"}),
@@ -507,12 +541,7 @@ def play(robot: str, name: str, moments: int, seed: int, rate: float | None) -> 
 
 def _suffer(bench: Bench, kind: Kind, seen: Seen, count: int) -> None:
     """Start the nodes and let them suffer so often."""
-    everybody = dict.fromkeys((ROBOT, *kind.programs))
-    for name in everybody:
-        if name != kind.late:
-            bench.start(name)
-    first = [name for name in everybody if name != kind.late]
-    bench.ros.wait_until(lambda: all(map(bench.publishers, first)), "the nodes", timeout=START)
+    bench.start_all()
     if kind.late:
         for _ in bench.wait(bench.rng.uniform(0.0, APART)):
             bench.spin()
@@ -523,7 +552,8 @@ def _suffer(bench: Bench, kind: Kind, seen: Seen, count: int) -> None:
     for _ in range(count):
         bench.motion(bench.rng.uniform(*CALM))
         bench.suffer(seen, kind.course(bench))
-        bench.note_limits(seen)
+    bench.motion(CALM[0])
+    bench.note_limits(seen)
 
 
 def main() -> int:

@@ -116,7 +116,7 @@ class Soak:
         """Return the arguments of a program."""
         if name == "fault_node":
             return ["--ros-args", "--log-level", "error", "-p", f"faults:={self._file}"]
-        words = ["--ros-args", "--log-level", "error", "--params-file"]
+        words: list[Any] = ["--ros-args", "--log-level", "error", "--params-file"]
         words += [ROOT / "config" / f"{self._options.robot}.yaml", "-p", "clock:=real_time"]
         if self._options.rate is not None:
             words += ["-p", f"rate_hz:={self._options.rate}"]
@@ -162,7 +162,6 @@ class Soak:
             "memory": self._look_at_memory,
             "shown": self._show,
         }
-        due["shown"] = every["shown"]
         while not told() and self.record.elapsed < 60.0 * self._options.minutes:
             self._spin(LOOK)
             self.record.elapsed = time.monotonic() - begin

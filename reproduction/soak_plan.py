@@ -24,7 +24,7 @@ BLIND = ("states frozen", "positions frozen", "velocities with a bias")
 BETWEEN = tuple(name for name in FAULTS if name not in BLIND)
 """Faults between the nodes, of `FAULTS`."""
 SHORT, LONG = 0.1, 1.0  # s, of a fault
-LEAD = 5.0  # s from the start of the fault node to the first fault
+LEAD = 3.0  # s from the start of the fault node to the first fault
 PUSH = 0.3
 """Share of the acceleration limits that a push may take, and that the bounds are told of."""
 POSTURES = 300  # of which the weakest decides how strong a push may be
