@@ -13,14 +13,14 @@ from __future__ import annotations
 import argparse
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from chain import load_values
-from figure import Figure, table, verdict
+from figure import Figure, table
+from moments import HEADS, ROBOTS, STIFF, Corners, Sample, Seen
 from sensor_msgs.msg import JointState
 
 from sim_bridge.nodes.bullet_node import BulletNode
@@ -37,8 +37,6 @@ from viability_bounds_pkg.testing.ros_harness import (
     private_domain,
 )
 
-ROBOTS = ("panda", "talos_left_arm")
-STIFF = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
 SENDERS = {
     "joint_states": BulletNode,
     "acceleration_limits": BoundsNode,
@@ -47,10 +45,6 @@ SENDERS = {
 DURATION = 0.6  # s of a fault
 EPISODE = 4.0  # s from one to the next
 RECOVERY = 1.0  # s after a fault before there is another goal
-RETURN = 0.1  # s after the arm goes on in which torque steps count: later ones are of the motion
-HOLD_IN_TIME = 0.1  # s, where the controller brakes
-STEP = 0.02  # of tau_max, when the arm goes on
-AGAIN = 2.0  # s
 FAULTS = {
     "states lost": ("joint_states", "drop: "),
     "limits lost": ("acceleration_limits", "drop: "),
@@ -75,29 +69,6 @@ FAULTS = {
     "other limits": ("acceleration_limits", "rival: {offset: 50}"),
     "another controller": ("joint_commands", "rival: {offset: 5}"),
 }
-
-
-@dataclass
-class Seen:
-    """What one kind of fault did at all its moments.
-
-    Attributes:
-        position, speed, torque: worst beyond limits, rad, rad/s, and share of torque_max.
-        braking: periods until the arm braked, one for each moment; NaN where it did not.
-        by_robot: whether it was the robot's own stop that braked first.
-        again: time until it went on, s.
-        steps: largest change of torque in a period as it went on, share of torque_max.
-        timeout: periods for which the robot holds a command before it stops itself.
-    """
-
-    position: float = 0.0
-    speed: float = 0.0
-    torque: float = 0.0
-    braking: list[float] = field(default_factory=list)
-    by_robot: list[bool] = field(default_factory=list)
-    again: list[float] = field(default_factory=list)
-    steps: list[float] = field(default_factory=list)
-    timeout: int = 0
 
 
 class Bench:
@@ -125,12 +96,9 @@ class Bench:
         self._arm: Any = nodes["joint_states"]
         self._controller: Any = nodes["joint_commands"]
         self._user = ros.talk(JointState, "target_posture", GOAL_QOS)
-        self._low, self._high = (
-            np.array(self._values[f"position_{end}"]) for end in ("min", "max")
-        )
-        self._low, self._high = np.maximum(self._low, -np.pi), np.minimum(self._high, np.pi)
+        self._corners = Corners(self._values, self._rng)
         self._dt = 1.0 / self._values["rate_hz"]
-        self._trace: list[tuple[float, bool, bool, np.ndarray]] = []
+        self._trace: list[Sample] = []
         ros.probe.create_subscription(
             JointState, f"{BEFORE}joint_states", self._on_state, JOINT_STATES.qos
         )
@@ -142,13 +110,10 @@ class Bench:
         t = 1e-9 * stamp_to_ns(message.header.stamp)
         tau = dict(zip(message.name, message.effort, strict=True))
         tau_of_joints = np.array([tau[joint] for joint in self._values["joints"]])
-        self._trace.append((t, braking, stopped, tau_of_joints))
+        self._trace.append(Sample(t, braking, stopped, tau_of_joints))
 
     def _ask(self) -> None:
-        at_ends = self._rng.random(self._low.size) < 0.7
-        ends = np.where(self._rng.random(self._low.size) < 0.5, self._low, self._high)
-        goal = np.where(at_ends, ends, self._rng.uniform(self._low, self._high))
-        self._user.publish(joint_state(self._values["joints"], 0, goal))
+        self._user.publish(joint_state(self._values["joints"], 0, self._corners.draw()))
 
     def suffer(self, names: list[str], moments: int, folder: Path) -> list[Seen]:
         """Let faults happen at random moments, one kind after the other; return what each did."""
@@ -174,45 +139,19 @@ class Bench:
         monitor, trace, asked = self._arm._monitor, self._trace, -np.inf
         monitor.reset()
         trace.clear()
-        while not trace or trace[-1][0] < begins[-1] + EPISODE - 1.5:
-            now = trace[-1][0] if trace else -np.inf
+        while not trace or trace[-1].t < begins[-1] + EPISODE - 1.5:
+            now = trace[-1].t if trace else -np.inf
             calm = (now < begins) | (now > begins + DURATION + RECOVERY)
             if trace and calm.all() and now - asked > 1.0:
                 self._ask()
                 asked = now
             self._ros.spin(0.05)
-        seen = Seen(
-            float(monitor.max_position_violation.max()),
-            float(monitor.max_velocity_violation.max()),
-            float(monitor.max_torque_ratio.max()),
-            timeout=self._arm.get_parameter("command_timeout").value,
-        )
-        for begin in begins.tolist():
-            self._judge(seen, begin)
-        return seen
-
-    def _judge(self, seen: Seen, begin: float) -> None:
-        """Add what the trace shows of one moment."""
-        t = np.array([each[0] for each in self._trace])
-        braking, stopped = (np.array([each[k] for each in self._trace]) for k in (1, 2))
+        seen = Seen(timeout=self._arm.get_parameter("command_timeout").value)
+        seen.note_limits(monitor)
         tau_max = np.array(self._values["torque_max"])
-        during = (t >= begin) & (t < begin + DURATION)
-        first = np.flatnonzero(during & braking)
-        if first.size:
-            seen.braking.append(round((t[first[0]] - begin) / self._dt))
-            seen.by_robot.append(bool(stopped[first[0]]))
-        else:
-            seen.braking.append(np.nan)
-            seen.by_robot.append(False)
-        end = begin + DURATION
-        after = np.flatnonzero((t >= end) & ~braking)
-        seen.again.append(float(t[after[0]] - end) if after.size else np.inf)
-        if not after.size or not first.size:
-            return
-        back = after[0]
-        last = np.flatnonzero((t > t[back] + RETURN) | ((t > t[back]) & braking))
-        tau = np.array([each[3] for each in self._trace[max(back - 1, 0) : last[0]]])
-        seen.steps.append(float((np.abs(np.diff(tau, axis=0)) / tau_max).max()))
+        for begin in begins.tolist():
+            seen.note_moment(trace, begin, begin + DURATION, self._dt, tau_max)
+        return seen
 
 
 def play(robot: str, names: list[str], moments: int) -> list[tuple[str, dict[str, Any]]]:
@@ -226,39 +165,6 @@ def play(robot: str, names: list[str], moments: int) -> list[tuple[str, dict[str
             ros.close()
 
 
-def add_row(figure: Figure, robot: str, name: str, seen: Seen, dt: float) -> bool:
-    """Add a row; return whether everything is as it should be."""
-    braked = np.array(seen.braking)
-    robots = np.array(seen.by_robot)
-    wrong = []
-    if seen.position > 0.0 or seen.speed > 0.0 or seen.torque > 1.0 + 1e-9:
-        wrong.append("a limit was passed")
-    late = braked > np.where(robots, seen.timeout + 1, HOLD_IN_TIME / dt)
-    if late.any():
-        wrong.append("braking")
-    if max(seen.again) > AGAIN:
-        wrong.append("not in time again")
-    if seen.steps and max(seen.steps) > STEP:
-        wrong.append("torque step")
-    some = np.isfinite(braked).any()
-    figure.rows.append(
-        (
-            robot,
-            name,
-            str(len(braked)),
-            f"{seen.position:.2g}",
-            f"{seen.speed:.2g}",
-            f"{seen.torque:.3f}",
-            f"{np.nanmedian(braked):.0f} to {np.nanmax(braked):.0f}" if some else "-",
-            "robot" if robots.any() else "controller" if some else "-",
-            f"{max(seen.again):.2f}",
-            f"{max(seen.steps):.3f}" if seen.steps else "-",
-            verdict(not wrong, "kept") + (f": {', '.join(wrong)}" if wrong else ""),
-        )
-    )
-    return not wrong
-
-
 def main() -> int:
     """Play, print the table; return whether all is as it should be."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -267,17 +173,15 @@ def main() -> int:
     parser.add_argument("--moments", type=int, default=10, help="of each fault")
     given = parser.parse_args()
     robots, names = given.robot or ROBOTS, given.fault or list(FAULTS)
-    figure, fine = Figure("faults"), True
+    figure = Figure("faults")
     with ProcessPoolExecutor(len(robots), get_context("spawn")) as pool:
         runs = [(robot, pool.submit(play, robot, names, given.moments)) for robot in robots]
         for robot, run in runs:
             dt = 1.0 / load_values(robot)["rate_hz"]
             for name, seen in run.result():
-                fine &= add_row(figure, robot, name, Seen(**seen), dt)
-    heads = ("robot", "fault", "moments", "position, rad", "speed, rad/s", "torque")
-    heads = (*heads, "periods to braking", "by", "again, s", "torque step", "")
-    print(table([figure], heads))
-    return 0 if fine else 1
+                figure.rows.append((robot, name, *Seen(**seen).cells(dt)))
+    print(table([figure], HEADS))
+    return int(any(row[-1] != "kept" for row in figure.rows))
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from sim_bridge.nodes.scenario_node import ScenarioNode, ScenarioRefused
 from sim_bridge.scenario.report import write_report
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory, circle
 from viability_bounds_pkg.robot_description import read_urdf
+from viability_bounds_pkg.testing.executables import room_on_disk
 from viability_bounds_pkg.testing.ros_harness import config_folder
 
 ROBOT = "panda"
@@ -215,7 +216,14 @@ def test_a_run_without_a_pose_has_metrics_without_a_pose_error(tmp_path, ros, ca
     path.write_text(yaml.safe_dump(scenario))
     result = run_chain(load_values(ROBOT), scenario, {})
     config = ros.start(ScenarioNode, load_values(ROBOT) | {"scenario": str(path)}).config
-    assert write_report(tmp_path / "out", config, result.run, result.robot, {"method": "exact"})
+    made = config, result.run, result.robot, {"method": "exact"}
+    assert write_report(tmp_path / "out", *made)
+    full = tmp_path / "full"
+    with (
+        room_on_disk(40_000),
+        pytest.raises(OSError, match=f"no report in {full}: File too large"),
+    ):
+        write_report(full, *made)
 
     def refuse(word):
         raise AssertionError(f"{word} is not JSON")
@@ -226,4 +234,4 @@ def test_a_run_without_a_pose_has_metrics_without_a_pose_error(tmp_path, ros, ca
     assert metrics["limits_kept"]
     printed = capfd.readouterr().out
     assert "nan" not in printed
-    assert printed.count("VERDICT: no limit was broken") == 1
+    assert printed.count("VERDICT: no limit was broken") == 2  # also without room for the files

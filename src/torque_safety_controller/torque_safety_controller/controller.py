@@ -47,6 +47,9 @@ __all__ = ["ControlOutput", "Controller", "Gains"]
 
 Array = NDArray[np.float64]
 
+_UNBOUNDED = 1e6
+"""Stands for the width of bounds that are not there, rad/s^2."""
+
 
 class ControlOutput(NamedTuple):
     """Result of one control step.
@@ -326,9 +329,11 @@ class Controller:
             bounds = AccelerationRange(*self._observer.shift(*bounds))
         parts = [each.constraint(robot, bounds, disturbance) for each in self.constraints]
         terms = [task.term(robot) for task in tasks]
+        eased = bounds
         if self.share < 1.0:
             rest = -self.gains.hold_kd * robot.v
             terms = [each.mixed(rest, self.share) for each in terms]
+            eased = _around(rest, bounds, self.share)
 
         def solve(bounds: AccelerationRange, rows: LinearConstraints | None) -> Solution:
             constraints = stack_constraints([*parts, rows])
@@ -337,20 +342,22 @@ class Controller:
             )
 
         try:
-            if self.safety_filter is None:
-                solution = solve(bounds, None)
-            else:
-                solution = solve(bounds, rows)
-                if solution.relaxation is not None and not self.lost:
-                    # The bounds have margins that the plan does not keep, and rows lead back
-                    # from where it leaves too little. With the plan allowed there is a solution.
-                    plan = self.safety_filter.plan
-                    if disturbance is not None:
-                        plan = plan - disturbance
-                    low, high = np.minimum(bounds.lower, plan), np.maximum(bounds.upper, plan)
-                    if rows is not None:
-                        rows = rows._replace(upper=np.maximum(rows.upper, rows.G @ plan))
-                    solution = solve(AccelerationRange(low, high), rows)
+            solution = solve(eased, rows)
+            if eased is not bounds and not (
+                solution.relaxation is solution.constraint_relaxation is None
+            ):
+                solution = solve(bounds, rows)  # to ease is a wish only
+            lacking = solution.relaxation is not None and not self.lost
+            if self.safety_filter is not None and lacking:
+                # The bounds have margins that the plan does not keep, and rows lead back
+                # from where it leaves too little. With the plan allowed there is a solution.
+                plan = self.safety_filter.plan
+                if disturbance is not None:
+                    plan = plan - disturbance
+                low, high = np.minimum(bounds.lower, plan), np.maximum(bounds.upper, plan)
+                if rows is not None:
+                    rows = rows._replace(upper=np.maximum(rows.upper, rows.G @ plan))
+                solution = solve(AccelerationRange(low, high), rows)
         except NoSolutionFound as error:
             return self._hold(additional, str(error))
         self.iterations = solution.iterations
@@ -410,6 +417,18 @@ class Controller:
     def _remember(self, a: Array) -> Array:
         self._a_last = a if math.isfinite(a.dot(a)) else np.zeros(self.robot.n)
         return self._a_last
+
+
+def _around(rest: Array, bounds: AccelerationRange, share: float) -> AccelerationRange:
+    """Return the share of the bounds that is nearest to `rest`, shape (n,), rad/s^2.
+
+    A goal that is far away asks for far more than the bounds allow: a small share of it, too.
+    """
+    near = np.minimum(np.maximum(rest, bounds.lower), bounds.upper)
+    reach = share * np.minimum(bounds.upper - bounds.lower, _UNBOUNDED)
+    return AccelerationRange(
+        np.maximum(bounds.lower, near - reach), np.minimum(bounds.upper, near + reach)
+    )
 
 
 def _chosen(safety_filter: SafetyFilter, a: Array, disturbance: Array | None) -> Array:

@@ -50,22 +50,28 @@ def write_report(
 
     Returns:
         Whether every limit was kept.
+
+    Raises:
+        OSError: the files cannot be written.
     """
-    directory.mkdir(parents=True, exist_ok=True)
     reference = pose_reference(config.plan.events, run.t)
     errors = _errors(config, run, reference)
     metrics = _metrics(config, run, robot, errors, bounds)
-    np.savez_compressed(
-        directory / "data.npz",
-        joints=np.array(run.joints),
-        position_error=errors[:, 0],
-        orientation_error=errors[:, 1],
-        pose_reference=reference,
-        **{name: getattr(run, name) for name in _RECORDED},
-    )
-    (directory / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
-    _draw(directory / "figure.png", config, run, errors, metrics)
     _print_table(metrics)
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(
+            directory / "data.npz",
+            joints=np.array(run.joints),
+            position_error=errors[:, 0],
+            orientation_error=errors[:, 1],
+            pose_reference=reference,
+            **{name: getattr(run, name) for name in _RECORDED},
+        )
+        (directory / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
+        _draw(directory / "figure.png", config, run, errors, metrics)
+    except OSError as error:
+        raise OSError(f"no report in {directory}: {error.strerror}") from error
     print(f"figure, data and metrics are in {directory}")
     return bool(metrics["limits_kept"])
 

@@ -5,7 +5,18 @@ import math
 
 import numpy as np
 from arms import load_arm
-from controllers import EXACT, VECTORS, assert_may_be_sent, gravity, make, pose_at, wide
+from controllers import (
+    EXACT,
+    SOLVED,
+    VECTORS,
+    assert_may_be_sent,
+    gravity,
+    make,
+    pose_at,
+    posture_only,
+    strong,
+    wide,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -180,3 +191,29 @@ def test_a_share_of_the_goals_mixes_their_accelerations_with_those_of_braking():
     np.testing.assert_allclose(found[0.0], rest, atol=1e-3)
     np.testing.assert_allclose(found[0.25], 0.25 * found[1.0] + 0.75 * rest, atol=1e-3)
     assert np.abs(found[1.0] - rest).max() > 0.1
+
+
+def test_a_far_goal_gets_its_effect_back_without_a_jolt(arm):
+    """However far away it is, and however stiff the gains: the bounds open with the share."""
+    bounds = AccelerationRange(np.full(arm.n, -15.0), np.full(arm.n, 15.0))
+    controller = strong(arm, gains=posture_only(400.0, 40.0))
+    controller.set_posture_goal(arm.q_start + 3.0)
+    state = State(arm.q_start, np.zeros(arm.n))
+    last, increment = np.zeros(arm.n), 0.01
+    for controller.share in np.arange(0.0, 1.0, increment):
+        a = controller.step(state, bounds).a
+        assert np.abs(a - last).max() <= 2.0 * increment * 30.0 + SOLVED
+        last = a
+    assert last.max() > 14.0, "the goal has no effect"
+
+
+def test_where_the_motors_cannot_let_it_rest_the_bounds_count_alone(arm):
+    state = State(arm.q_start, np.zeros(arm.n))
+    weight = np.abs(gravity(arm, arm.q_start))
+    weak = np.where(weight > 1.0, 0.9 * weight, arm.tau_max)
+    controller = make(arm, tau_max=weak, gains=posture_only(100.0, 20.0))
+    controller.set_posture_goal(arm.q_start + 1.0)
+    controller.share = 0.0
+    step = controller.step(state, wide(arm))
+    assert step.relaxation is None
+    assert np.abs(step.a).max() > 0.01, "it rests"

@@ -45,6 +45,7 @@ from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, Per
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
+from viability_bounds_pkg.ros.robot_urdf import DescriptionWatch
 from viability_bounds_pkg.ros.topics import (
     ACCELERATION_LIMITS,
     FT_WRENCH,
@@ -128,7 +129,9 @@ class ControllerNode(ArmNode):
             self._watch,
             clock=Clock(clock_type=ClockType.STEADY_TIME),
         )
-        self._diagnostics = Diagnostics(self, self._report, watch=self.publisher_watch)
+        self._diagnostics = Diagnostics(
+            self, self._report, self.publisher_watch, DescriptionWatch(self)
+        )
         if config.collision.bodies and not config.collision.collision_avoidance:
             self.get_logger().warning(
                 "parameter 'obstacles' is given, but 'collision_avoidance' is false: the arm does "

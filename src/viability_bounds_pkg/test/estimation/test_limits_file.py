@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from viability_bounds_pkg.cli import limits_file
+from viability_bounds_pkg.testing.executables import room_on_disk
 
 
 def parameters_in(text):
@@ -81,3 +82,12 @@ def test_written_numbers_err_to_the_safe_side():
     text = limits_file.overlay({"acceleration_min": down}, ["note"])
     assert text.startswith("# note\n")
     np.testing.assert_array_equal(parameters_in(text)["acceleration_min"], down)
+
+
+def test_a_disk_that_is_full_is_told_with_the_name_of_the_file(tmp_path):
+    path = tmp_path / "limits.yaml"
+    path.write_text("old")
+    with room_on_disk(1000), pytest.raises(OSError, match=f"{path} cannot be written: File too"):
+        limits_file.write_whole(path, "x" * 5000)
+    assert path.read_text() == "old"
+    assert os.listdir(tmp_path) == ["limits.yaml"]

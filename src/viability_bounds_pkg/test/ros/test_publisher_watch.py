@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+from copy import copy
+
 import pytest
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
@@ -107,6 +109,12 @@ def test_a_publisher_without_a_name_is_told_a_moment_later(ros, watched, monkeyp
     watch.look()
     assert len(watch.rivals["/left/command"]) == 2
     assert len(log.warnings) == 1
+    # It was killed and started again: its name comes late, and is that of the other one.
+    for endpoint in found:
+        endpoint.node_name, endpoint.node_namespace = "arm", "/left"
+    assert watch.admits("/left/command")
+    assert not watch.rivals
+    assert log.infos == ["'/left/command' is published by /left/arm alone"]
 
 
 def test_a_second_one_of_the_same_name_is_told_when_it_stays(ros, watched, monkeypatch):
@@ -119,6 +127,33 @@ def test_a_second_one_of_the_same_name_is_told_when_it_stays(ros, watched, monke
     monkeypatch.setattr(publisher_watch.time, "monotonic", lambda: now + 30.0)
     watch.look()
     assert watch.rivals == {"/left/command": ("/left/arm", "/left/arm")}
+    assert len(log.warnings) == 1
+
+
+def test_one_that_is_killed_and_started_again_and_again_is_heard(ros, watched, monkeypatch):
+    """The graph forgets what was killed after 20 s."""
+    node, watch, log = watched
+    ros.wait_until(lambda: node.count_publishers("/left/command") == 1, "its own")
+    (own,) = node.get_publishers_info_by_topic("/left/command")
+    now, lives = publisher_watch.time.monotonic(), 10
+    monkeypatch.setattr(publisher_watch.time, "monotonic", lambda: now)
+    monkeypatch.setattr(node, "count_publishers", lambda topic: 3)
+
+    def life(number):
+        copied = copy(own)
+        copied.endpoint_gid = [number] * 16
+        return copied
+
+    for number in range(lives):
+        listed = [life(each) for each in range(max(0, number - 2), number + 1)]
+        monkeypatch.setattr(node, "get_publishers_info_by_topic", lambda topic, now=listed: now)
+        for _ in range(8):
+            now += 1.0
+            watch.look()
+            assert not watch.rivals, f"{number}"
+    now += 20.0  # the last ones stay: they are several
+    watch.look()
+    assert len(watch.rivals["/left/command"]) == 3
     assert len(log.warnings) == 1
 
 

@@ -170,5 +170,7 @@ def write_whole(path: Path, content: str | bytes) -> None:
         if target.exists():
             shutil.copymode(target, fresh)
         fresh.replace(target)
+    except OSError as error:
+        raise OSError(f"{path} cannot be written: {error.strerror}") from error
     finally:
         fresh.unlink(missing_ok=True)

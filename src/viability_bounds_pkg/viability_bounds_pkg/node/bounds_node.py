@@ -27,7 +27,12 @@ from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, Per
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
-from viability_bounds_pkg.ros.robot_urdf import TOPIC, robot_urdf, warn_of_unusual
+from viability_bounds_pkg.ros.robot_urdf import (
+    TOPIC,
+    DescriptionWatch,
+    robot_urdf,
+    warn_of_unusual,
+)
 from viability_bounds_pkg.ros.topics import ACCELERATION_LIMITS, state_topic
 
 
@@ -73,7 +78,9 @@ class BoundsNode(ArmNode):
             needs_estimates=config.use_estimated_states,
         )
         self._distances = LimitDistances(self, config, self._reader)
-        self._diagnostics = Diagnostics(self, self._report, watch=self.publisher_watch)
+        self._diagnostics = Diagnostics(
+            self, self._report, self.publisher_watch, DescriptionWatch(self)
+        )
         self._warn_of_affected_joints(config)
         self.announce(
             joints, config.rate_hz, f"method {config.method}, limits {config.acceleration_limits}"

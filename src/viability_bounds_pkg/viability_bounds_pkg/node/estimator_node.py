@@ -24,7 +24,12 @@ from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, Per
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
-from viability_bounds_pkg.ros.robot_urdf import TOPIC, robot_urdf, warn_of_unusual
+from viability_bounds_pkg.ros.robot_urdf import (
+    TOPIC,
+    DescriptionWatch,
+    robot_urdf,
+    warn_of_unusual,
+)
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import ESTIMATED_JOINT_STATES, JOINT_COMMANDS, JOINT_STATES
 from viability_bounds_pkg.state import State
@@ -68,7 +73,9 @@ class EstimatorNode(ArmNode):
         self.publisher_watch = PublisherWatch(
             self, [ESTIMATED_JOINT_STATES.name, JOINT_STATES.name, JOINT_COMMANDS.name]
         )
-        self._diagnostics = Diagnostics(self, self._report, watch=self.publisher_watch)
+        self._diagnostics = Diagnostics(
+            self, self._report, self.publisher_watch, DescriptionWatch(self)
+        )
         source = "estimated" if config.velocity_estimation else "as reported"
         lag = 1e3 * config.declared.motor_lag
         self.announce(

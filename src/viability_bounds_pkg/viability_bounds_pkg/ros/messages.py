@@ -20,6 +20,7 @@ from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
 from viability_bounds_pkg.exceptions import did_you_mean
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
+from viability_bounds_pkg.ros.robot_urdf import DescriptionWatch
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import DIAGNOSTICS, VALUES
 from viability_bounds_pkg.state import State
@@ -220,6 +221,7 @@ class Diagnostics:
         report: returns level (a constant of ``DiagnosticStatus``), a message and the values.
         watch: its topics with several publishers, and a missing estimator, are reported, too, as a
             warning.
+        description: that the robot's has changed is, too.
     """
 
     def __init__(
@@ -227,8 +229,10 @@ class Diagnostics:
         node: Node,
         report: Report,
         watch: PublisherWatch | None = None,
+        description: DescriptionWatch | None = None,
     ) -> None:
         self._watch = watch
+        self._description = description
         self._report = report
         self._node = node
         self._publisher = DIAGNOSTICS.publisher(node)
@@ -242,9 +246,10 @@ class Diagnostics:
         level, message, values = self._report()
         if self._watch is not None:
             values["topics_with_several_publishers"] = self._watch.several or "none"
-            if trouble := self._watch.trouble:
-                level = max(level, DiagnosticStatus.WARN)
-                message += f"; {trouble}"
+        troubles = [each.trouble for each in (self._watch, self._description) if each is not None]
+        for trouble in filter(None, troubles):
+            level = max(level, DiagnosticStatus.WARN)
+            message += f"; {trouble}"
         status = DiagnosticStatus(
             level=level,
             name=self._node.get_fully_qualified_name().removeprefix("/"),

@@ -32,8 +32,8 @@ class PublisherWatch:
     `Claim` keeps two nodes of this project on one host apart. This sees the others, too:
     drivers of the user, nodes on other hosts, a ``ros2 topic pub``. It looks once a second on the
     steady clock; counting the publishers of a topic takes some microseconds. Publishers of one
-    and the same name count only after `_GHOST_TIME`: mostly one has replaced the other, and that
-    one has not left the graph yet.
+    and the same name count only when two of them have been there for `_GHOST_TIME`: mostly one has
+    replaced the other, perhaps again and again, and the others have not left the graph yet.
 
     Args:
         node: logs a second publisher once when it has come, and once when it is gone.
@@ -55,9 +55,9 @@ class PublisherWatch:
         )
         self._node = node
         self._topics = [node.resolve_topic_name(topic) for topic in topics]
-        # When a publisher without a name, and several of one name, were first seen.
+        # When a publisher without a name was first seen, and each of several, by its identity.
         self._nameless: dict[str, float] = {}
-        self._ghosts: dict[str, float] = {}
+        self._seen: dict[str, dict[tuple[int, ...], float]] = {}
         self._looked = -math.inf
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         node.create_timer(_PERIOD, self.look, clock=steady)
@@ -112,7 +112,7 @@ class PublisherWatch:
             if self._node.count_publishers(topic) > 1:
                 self._note(topic)
                 continue
-            self._ghosts.pop(topic, None)
+            self._seen.pop(topic, None)
             self._nameless.pop(topic, None)
             if self.rivals.pop(topic, None):
                 self._node.get_logger().info(f"'{topic}' has no second publisher any more")
@@ -129,8 +129,12 @@ class PublisherWatch:
             )
 
     def _note(self, topic: str) -> None:
-        names = sorted(map(_name, self._node.get_publishers_info_by_topic(topic)))
+        publishers = self._node.get_publishers_info_by_topic(topic)
+        names = sorted(map(_name, publishers))
         known, now = topic in self.rivals, time.monotonic()
+        seen = self._seen.get(topic, {})
+        identities = [tuple(each.endpoint_gid) for each in publishers]
+        seen = self._seen[topic] = {each: seen.get(each, now) for each in identities}
         if len(names) < 2 or any(_UNKNOWN in name for name in names):
             # A node tells its name a moment after its topics.
             since = self._nameless.setdefault(topic, now)
@@ -138,9 +142,10 @@ class PublisherWatch:
                 return
         else:
             self._nameless.pop(topic, None)
-        if len(set(names)) == 1:
-            since = self._ghosts.setdefault(topic, now)
-            if not known and now - since < _GHOST_TIME:
+            together = now - sorted(map(seen.__getitem__, identities))[1]
+            if len(set(names)) == 1 and together < _GHOST_TIME:
+                if self.rivals.pop(topic, None):
+                    self._node.get_logger().info(f"'{topic}' is published by {names[0]} alone")
                 return
         self.rivals[topic] = tuple(names)
         if not known:

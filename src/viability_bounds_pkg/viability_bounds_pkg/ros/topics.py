@@ -170,7 +170,8 @@ ROBOT_DESCRIPTION = Topic(
     LATCHED_QOS,
     ("bullet_node",),
     ("bounds_node", "estimator_node", "controller_node"),
-    "the URDF; read at start where the parameter `robot_description` is `topic`",
+    "the URDF; read at start where the parameter `robot_description` is `topic`; that it changes "
+    "later is reported",
 )
 DIAGNOSTICS = Topic(
     "/diagnostics",

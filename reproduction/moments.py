@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What faults at random moments do to an arm in motion, and whether it is as it should be."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from figure import verdict
+
+from sim_bridge.bullet.limit_monitor import LimitMonitor
+
+ROBOTS = ("panda", "talos_left_arm")
+STIFF = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
+"""Gains by which joint goals drive the joints at their limits."""
+RETURN = 0.1  # s after the arm goes on in which torque steps count: later ones are of the motion
+HOLD_IN_TIME = 0.1  # s, where the controller brakes
+STEP = 0.02  # of tau_max, when the arm goes on
+AGAIN = 2.0  # s
+HEADS = (
+    *("robot", "fault", "moments", "position, rad", "speed, rad/s", "torque"),
+    *("periods to braking", "by", "again, s", "torque step", ""),
+)
+"""Of a table whose rows have a robot, a fault, and `Seen.cells`."""
+
+
+class Sample(NamedTuple):
+    """What an arm does in a control period.
+
+    Attributes:
+        t: stamp of its state, s.
+        braking: whether it is brought to rest, by the controller or by itself.
+        stopped: whether it is by itself.
+        tau: torques of its motors, shape (n,), N m.
+    """
+
+    t: float
+    braking: bool
+    stopped: bool
+    tau: np.ndarray
+
+
+@dataclass
+class Seen:
+    """What one kind of fault did at all its moments.
+
+    Attributes:
+        position, speed, torque: worst beyond limits, rad, rad/s, and share of torque_max.
+        braking: periods until the arm braked, one for each moment; NaN where it did not.
+        by_robot: whether it was the robot's own stop that braked first.
+        again: time until it went on, s.
+        steps: largest change of torque in a period as it went on, share of torque_max.
+        lasted: how long the faults were there, s.
+        timeout: periods for which the robot holds a command before it stops itself.
+    """
+
+    position: float = 0.0
+    speed: float = 0.0
+    torque: float = 0.0
+    braking: list[float] = field(default_factory=list)
+    by_robot: list[bool] = field(default_factory=list)
+    again: list[float] = field(default_factory=list)
+    steps: list[float] = field(default_factory=list)
+    lasted: list[float] = field(default_factory=list)
+    timeout: int = 0
+
+    def note_limits(self, monitor: LimitMonitor) -> None:
+        """Add what a robot saw at its physics steps."""
+        self.position = max(self.position, float(monitor.max_position_violation.max()))
+        self.speed = max(self.speed, float(monitor.max_velocity_violation.max()))
+        self.torque = max(self.torque, float(monitor.max_torque_ratio.max()))
+
+    def note_moment(
+        self,
+        trace: Sequence[Sample],
+        begin: float,
+        end: float,
+        dt: float,
+        tau_max: np.ndarray,
+        usual: bool = False,
+    ) -> None:
+        """Add what the trace shows of a fault.
+
+        Args:
+            trace: from before the fault until after the arm went on.
+            begin: of the fault, s, by the stamps.
+            end: of it.
+            dt: control period, s.
+            tau_max: torque limits, shape (n,), N m.
+            usual: whether there was no fault: torque steps count though the arm did not brake.
+        """
+        t = np.array([each.t for each in trace])
+        braking, stopped = (np.array([each[k] for each in trace], dtype=bool) for k in (1, 2))
+        first = np.flatnonzero((t >= begin) & (t < end) & braking)
+        if first.size:
+            by_robot = bool(stopped[first[0]])
+            # A state shows what the robot has done in the period before it.
+            self.braking.append(max(0, round((t[first[0]] - begin) / dt) - by_robot))
+            self.by_robot.append(by_robot)
+        else:
+            self.braking.append(np.nan)
+            self.by_robot.append(False)
+        self.lasted.append(end - begin)
+        after = np.flatnonzero((t >= end) & ~braking)
+        self.again.append(float(t[after[0]] - end) if after.size else np.inf)
+        if not after.size or not (first.size or usual):
+            return
+        back = after[0]
+        last = np.flatnonzero((t > t[back] + RETURN) | ((t > t[back]) & braking))
+        stop = last[0] if last.size else len(trace)
+        tau = np.array([each.tau for each in trace[max(back - 1, 0) : stop]])
+        tau = tau[np.isfinite(tau).all(axis=1)]
+        if len(tau) > 1:
+            self.steps.append(float((np.abs(np.diff(tau, axis=0)) / tau_max).max()))
+
+    def wrong(self, dt: float) -> list[str]:
+        """Return what is not as it should be, in words.
+
+        Args:
+            dt: control period, s.
+        """
+        wrong = []
+        if self.position > 0.0 or self.speed > 0.0 or self.torque > 1.0 + 1e-9:
+            wrong.append("a limit was passed")
+        in_time = np.where(np.array(self.by_robot), self.timeout + 1, HOLD_IN_TIME / dt)
+        if (np.array(self.braking) > in_time).any():
+            wrong.append("braking")
+        if max(self.again) > AGAIN:
+            wrong.append("not in time again")
+        if self.steps and max(self.steps) > STEP:
+            wrong.append("torque step")
+        return wrong
+
+    def cells(self, dt: float) -> tuple[str, ...]:
+        """Return the cells of a row, from the number of moments on; `dt` as in `wrong`."""
+        braked, robots, wrong = np.array(self.braking), np.array(self.by_robot), self.wrong(dt)
+        some = np.isfinite(braked).any()
+        return (
+            str(len(braked)),
+            f"{self.position:.2g}",
+            f"{self.speed:.2g}",
+            f"{self.torque:.3f}",
+            f"{np.nanmedian(braked):.0f} to {np.nanmax(braked):.0f}" if some else "-",
+            "robot" if robots.any() else "controller" if some else "-",
+            f"{max(self.again):.2f}",
+            f"{max(self.steps):.3f}" if self.steps else "-",
+            verdict(not wrong, "kept") + (f": {', '.join(wrong)}" if wrong else ""),
+        )
+
+
+class Corners:
+    """Goals at random: most joints at an end of their range.
+
+    Args:
+        values: parameters of a robot.
+        rng: random numbers.
+    """
+
+    def __init__(self, values: Mapping[str, Any], rng: np.random.Generator) -> None:
+        self._rng = rng
+        self._low = np.maximum(values["position_min"], -np.pi)
+        self._high = np.minimum(values["position_max"], np.pi)
+
+    def draw(self) -> np.ndarray:
+        """Return one, shape (n,), rad."""
+        n = self._low.size
+        at_ends = self._rng.random(n) < 0.7
+        ends = np.where(self._rng.random(n) < 0.5, self._low, self._high)
+        return np.where(at_ends, ends, self._rng.uniform(self._low, self._high))
