@@ -71,7 +71,7 @@ def write_report(
         (directory / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
         _draw(directory / "figure.png", config, run, errors, metrics)
     except OSError as error:
-        raise OSError(f"no report in {directory}: {error.strerror}") from error
+        raise OSError(f"no report in {directory}: {error.strerror or error}") from error
     print(f"figure, data and metrics are in {directory}")
     return bool(metrics["limits_kept"])
 

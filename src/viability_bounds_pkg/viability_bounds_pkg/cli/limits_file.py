@@ -171,6 +171,6 @@ def write_whole(path: Path, content: str | bytes) -> None:
             shutil.copymode(target, fresh)
         fresh.replace(target)
     except OSError as error:
-        raise OSError(f"{path} cannot be written: {error.strerror}") from error
+        raise OSError(f"{path} cannot be written: {error.strerror or error}") from error
     finally:
         fresh.unlink(missing_ok=True)
