@@ -68,9 +68,9 @@ def swapped(state, t):
 SPOILT = {
     "degrees": (lambda state, t: State(57.3 * state.q, 57.3 * state.v), 0.0),
     "bias of positions": (lambda state, t: state._replace(q=state.q + 0.4), 0.0),
-    "bias of velocities": (lambda state, t: state._replace(v=state.v + 0.6), 0.036),
-    "frozen": (lambda state, t: sine(1.0), 0.008),
-    "frozen positions": (lambda state, t: state._replace(q=sine(1.0).q), 0.008),
+    "bias of velocities": (lambda state, t: state._replace(v=state.v + 0.6), WINDOW),
+    "frozen": (lambda state, t: sine(1.0), 0.1),
+    "frozen positions": (lambda state, t: state._replace(q=sine(1.0).q), 0.1),
     "swapped": (swapped, 0.0),
     "another arm": (lambda state, t: sine(t + 1.3), 0.0),
 }

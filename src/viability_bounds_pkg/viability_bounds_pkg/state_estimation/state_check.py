@@ -10,13 +10,10 @@ speeds jump, keep to it as well. What leaves it by more than errors of the state
 *jump*: joints are swapped, units are others, it is another robot. Over longer times the
 trapezoidal rule is far closer, because its errors hardly add up. So
 
-    d(t + h) = exp(-h / T) d(t) + q - q0 - h (v0 + v) / 2
+    d(t + h) = exp(-h / WINDOW) d(t) + q - q0 - h (v0 + v) / 2
 
-stays within errors of positions and T times those of speeds, one impact allowed, for any T; where
-it does not, positions and velocities *contradict* each other: one of them has frozen, or has a
-bias. With a short T large contradictions are told soon, with a long one smaller ones as well.
-Positions that are all the same again and again, while the arm says that it moves, are told even
-sooner: no encoder does that.
+stays within errors of positions and `WINDOW` times those of speeds, one impact allowed; where it
+does not, positions and velocities *contradict* each other: one of them has frozen, or has a bias.
 """
 
 from __future__ import annotations
@@ -30,19 +27,7 @@ from viability_bounds_pkg.state import State
 Array = NDArray[np.float64]
 
 WINDOW = 0.2
-"""How long positions and velocities must agree again, s."""
-
-WINDOWS = np.array([[0.04], [WINDOW]])
-"""T, over which positions are compared with velocities, s."""
-
-REPEATED = 3
-"""How often all positions may come again while the arm moves: of slower sensors."""
-
-REPEATED_FOR = 5e-3
-"""And how long at least, s."""
-
-REPEATED_WAY = 2.5e-3
-"""How far an arm must have moved meanwhile, as its velocities say: coarse encoders, rad."""
+"""Over which positions are compared with velocities, and how long both must agree again, s."""
 
 GAP = 0.1
 """Time between states after which the later one is a beginning, s."""
@@ -127,8 +112,6 @@ class StateCheck:
         error = np.zeros_like(fastest) if velocity_error is None else velocity_error
         self._velocity = SHARE * fastest + error
         self._limit = fastest
-        self._repeatable = REPEATED_WAY + 2.0 * position_error
-        self._drift_allowed = self._position + WINDOWS * self._velocity
         self.reset()
 
     def reset(self) -> None:
@@ -136,22 +119,12 @@ class StateCheck:
         self._last: State | None = None  # that came last, if it is no nonsense
         self._time = -np.inf  # its time, s
         self._believed: tuple[State, float] | None = None
-        self._compare_anew()
+        self._drift: Array = np.zeros_like(self._fast)
         self._agreed = 0.0  # how long states have not contradicted each other, s
         self._patience = WINDOW  # how long they must
         self._trusted = 0.0  # how long there has been no doubt, s
         self._doubt = ""
         self._contradiction = False  # whether it is more than a jump
-
-    def _compare_anew(self) -> None:
-        """Forget by what positions have differed from what velocities led to."""
-        self._drift: Array = np.zeros_like(self._drift_allowed)
-        self._stays_anew()
-
-    def _stays_anew(self) -> None:
-        """Forget for how long positions have been the same."""
-        self._repeats, self._repeated_for = 0, 0.0
-        self._way: Array = np.zeros_like(self._fast)
 
     def look(self, state: State, stamp: float) -> str:
         """Look at the next state; return what is wrong, or nothing.
@@ -224,29 +197,15 @@ class StateCheck:
         if not self._with_velocities:
             return False
         if jumps:  # the next states are compared among themselves
-            self._compare_anew()
+            self._drift = np.zeros_like(self._drift)
             return False
-        self._drift *= np.exp(-h / WINDOWS)
+        self._drift = np.exp(-h / WINDOW) * self._drift
         self._drift += now.q - before.q - 0.5 * h * (before.v + now.v)
-        stays = self._stay(before, now, h)
-        allowed = self._drift_allowed + (h * self._limit + self._between(h))
-        if not (np.abs(self._drift) > allowed).any() and not stays:
+        allowed = self._position + WINDOW * self._velocity + h * self._limit + self._between(h)
+        if not (np.abs(self._drift) > allowed).any():
             return False
-        self._compare_anew()
+        self._drift = np.zeros_like(self._drift)
         return True
-
-    def _stay(self, before: State, now: State, h: float) -> bool:
-        """Return whether positions are the same for longer than their velocities admit."""
-        if not np.array_equal(now.q, before.q):
-            if self._repeats:
-                self._stays_anew()
-            return False
-        self._repeats, self._repeated_for = self._repeats + 1, self._repeated_for + h
-        self._way = self._way + 0.5 * h * (before.v + now.v)
-        if self._repeats < REPEATED or self._repeated_for < REPEATED_FOR:
-            return False
-        allowed = self._repeatable + self._repeated_for * self._velocity
-        return bool((np.abs(self._way) > allowed).any())
 
     def _goes_on(self, state: State, stamp: float) -> bool:
         """Return whether a state may follow that which was believed last."""
