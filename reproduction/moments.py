@@ -127,7 +127,7 @@ class Seen:
         in_time = np.where(np.array(self.by_robot), self.timeout + 1, HOLD_IN_TIME / dt)
         if (np.array(self.braking) > in_time).any():
             wrong.append("braking")
-        if max(self.again) > AGAIN:
+        if max(self.again, default=0.0) > AGAIN:
             wrong.append("not in time again")
         if self.steps and max(self.steps) > STEP:
             wrong.append("torque step")
@@ -144,7 +144,7 @@ class Seen:
             f"{self.torque:.3f}",
             f"{np.nanmedian(braked):.0f} to {np.nanmax(braked):.0f}" if some else "-",
             "robot" if robots.any() else "controller" if some else "-",
-            f"{max(self.again):.2f}",
+            f"{max(self.again):.2f}" if self.again else "-",
             f"{max(self.steps):.3f}" if self.steps else "-",
             verdict(not wrong, "kept") + (f": {', '.join(wrong)}" if wrong else ""),
         )
