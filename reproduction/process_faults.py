@@ -83,6 +83,7 @@ class Kind:
         late: node that does not start with the others, but by the course; each moment has nodes of
             its own then.
         values: parameters of all nodes that differ.
+        brakes: whether the arm has to be brought to rest.
     """
 
     course: Callable[[Bench], Course]
@@ -90,6 +91,7 @@ class Kind:
     imperfect: bool = False
     late: str = ""
     values: Mapping[str, Any] = field(default_factory=dict)
+    brakes: bool = True
 
 
 class Bench:
@@ -323,8 +325,8 @@ class Bench:
             self.spin()
             since = min(since, time.monotonic()) if self.tracking else math.inf
         begin = max(begin, self._marked)
-        usual = self._kind.course is nothing
-        seen.note_moment(self._trace, begin, end, self.dt, self._tau_max, usual)
+        brakes = self._kind.brakes
+        seen.note_moment(self._trace, begin, end, self.dt, self._tau_max, brakes)
 
     def note_limits(self, seen: Seen) -> None:
         """Add how far limits were passed until now."""
@@ -501,8 +503,8 @@ def late(name: str) -> Callable[[Bench], Course]:
 WITH_ROBOT = (ROBOT, *CONTROL)
 WITH_ESTIMATOR = (ESTIMATOR, *CONTROL)
 FAULTS = {
-    "nothing": Kind(nothing),
-    "nothing, imperfect robot": Kind(nothing, WITH_ESTIMATOR, imperfect=True),
+    "nothing": Kind(nothing, brakes=False),
+    "nothing, imperfect robot": Kind(nothing, WITH_ESTIMATOR, imperfect=True, brakes=False),
     "bounds killed": Kind(killed(BOUNDS)),
     "bounds restarted": Kind(restarted(BOUNDS)),
     "bounds stopped and continued": Kind(stood_still(BOUNDS)),
@@ -521,11 +523,13 @@ FAULTS = {
     "bounds late": Kind(late(BOUNDS), late=BOUNDS),
     "controller late": Kind(late(CONTROLLER), late=CONTROLLER),
     "robot late": Kind(late(ROBOT), late=ROBOT),
-    "wild parameters": Kind(wild_parameters),
-    "wild integral action": Kind(wild_integral),
-    "the clock jumps": Kind(clock_jumps, values={"use_sim_time": True}),
+    "wild parameters": Kind(wild_parameters, brakes=False),
+    "wild integral action": Kind(wild_integral, brakes=False),
+    "the clock jumps": Kind(clock_jumps, values={"use_sim_time": True}, brakes=False),
     "no room for logs": Kind(no_room),
-    "another robot description": Kind(other_description, values={"robot_description": "topic"}),
+    "another robot description": Kind(
+        other_description, values={"robot_description": "topic"}, brakes=False
+    ),
 }
 
 
