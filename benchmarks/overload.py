@@ -213,9 +213,13 @@ def main() -> int:
                 results.append(measure(robot, way, kind, options.seconds, options))
                 lines.append(row(results[-1]))
                 print(lines[-1], flush=True)
-    options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "report.md").write_text("\n".join([conditions, "", HEAD, *lines, ""]))
-    (options.out / "metrics.json").write_text(json.dumps(results, indent=2) + "\n")
+    try:
+        options.out.mkdir(parents=True, exist_ok=True)
+        (options.out / "report.md").write_text("\n".join([conditions, "", HEAD, *lines, ""]))
+        (options.out / "metrics.json").write_text(json.dumps(results, indent=2) + "\n")
+    except OSError as error:
+        print(f"error: no report in {options.out}: {error.strerror}", file=sys.stderr)
+        return 2
     return int(any(result["passed"] for result in results))
 
 

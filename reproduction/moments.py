@@ -79,7 +79,7 @@ class Seen:
         end: float,
         dt: float,
         tau_max: np.ndarray,
-        usual: bool = False,
+        brakes: bool = True,
     ) -> None:
         """Add what the trace shows of a fault.
 
@@ -89,11 +89,11 @@ class Seen:
             end: of it.
             dt: control period, s.
             tau_max: torque limits, shape (n,), N m.
-            usual: whether there was no fault: torque steps count though the arm did not brake.
+            brakes: whether the arm has to brake; where not, it does for other reasons.
         """
         t = np.array([each.t for each in trace])
         braking, stopped = (np.array([each[k] for each in trace], dtype=bool) for k in (1, 2))
-        first = np.flatnonzero((t >= begin) & (t < end) & braking)
+        first = np.flatnonzero((t >= begin) & (t < end) & braking & brakes)
         if first.size:
             by_robot = bool(stopped[first[0]])
             # A state shows what the robot has done in the period before it.
@@ -105,7 +105,7 @@ class Seen:
         self.lasted.append(end - begin)
         after = np.flatnonzero((t >= end) & ~braking)
         self.again.append(float(t[after[0]] - end) if after.size else np.inf)
-        if not after.size or not (first.size or usual):
+        if not after.size or (brakes and not first.size):
             return
         back = after[0]
         last = np.flatnonzero((t > t[back] + RETURN) | ((t > t[back]) & braking))
@@ -127,7 +127,7 @@ class Seen:
         in_time = np.where(np.array(self.by_robot), self.timeout + 1, HOLD_IN_TIME / dt)
         if (np.array(self.braking) > in_time).any():
             wrong.append("braking")
-        if max(self.again) > AGAIN:
+        if max(self.again, default=0.0) > AGAIN:
             wrong.append("not in time again")
         if self.steps and max(self.steps) > STEP:
             wrong.append("torque step")
@@ -144,7 +144,7 @@ class Seen:
             f"{self.torque:.3f}",
             f"{np.nanmedian(braked):.0f} to {np.nanmax(braked):.0f}" if some else "-",
             "robot" if robots.any() else "controller" if some else "-",
-            f"{max(self.again):.2f}",
+            f"{max(self.again):.2f}" if self.again else "-",
             f"{max(self.steps):.3f}" if self.steps else "-",
             verdict(not wrong, "kept") + (f": {', '.join(wrong)}" if wrong else ""),
         )

@@ -63,7 +63,6 @@ STILL = 0.05, 1.0  # s, shortest and longest time in which a node stands still
 APART = 1.0  # s between starts of nodes
 GOAL_PERIOD, SENT_AGAIN = 1.0, 0.2  # s
 CALM = 1.0, 2.0  # s, shortest and longest time of motion before a fault
-FILTERED_RATE = 250.0  # Hz, at least, where the imperfect robots' filter of velocities runs
 WILD = 1.0  # s, in which parameters change, or the clock jumps
 NOT_WILD = "method", "friction_", "closed_contacts", "integral_anti_windup", "integral_lambda"
 """Live parameters that choose what keeps no limits, for comparison, or say what is so; and a gain
@@ -84,6 +83,7 @@ class Kind:
         late: node that does not start with the others, but by the course; each moment has nodes of
             its own then.
         values: parameters of all nodes that differ.
+        brakes: whether the arm has to be brought to rest.
     """
 
     course: Callable[[Bench], Course]
@@ -91,6 +91,7 @@ class Kind:
     imperfect: bool = False
     late: str = ""
     values: Mapping[str, Any] = field(default_factory=dict)
+    brakes: bool = True
 
 
 class Bench:
@@ -109,7 +110,7 @@ class Bench:
         rng: as given.
         limits: parameters of the robot.
         dt: control period, s.
-        stamp: of the last joint state, s; 0 before the first.
+        heard: whether there was a joint state.
         clock_ahead: of the time that nodes with `use_sim_time` are told, s.
     """
 
@@ -124,8 +125,8 @@ class Bench:
         self.ros, self.rng, self._kind = ros, rng, kind
         more = [f"imperfect/{robot}"] * kind.imperfect
         changes = STIFF | {"start_paused": False, "clock": "real_time"} | dict(kind.values)
-        if rate is not None:
-            changes["rate_hz"] = max(rate, FILTERED_RATE) if kind.imperfect else rate
+        if rate is not None and not kind.imperfect:  # what is declared is for the robot's own
+            changes["rate_hz"] = rate
         self._own = {name: own | changes for name, own in load_node_values(robot, *more).items()}
         values = self._own[ROBOT]
         if "robot_description" in kind.values:  # the robot itself cannot take it from the topic
@@ -147,8 +148,7 @@ class Bench:
             for name in kind.programs
         }
         self.arm: Any = None
-        self.stamp = 0.0
-        self._heard_at = time.monotonic()
+        self.heard = False
         self._mode = ""
         self._trace: list[Sample] = []
         self._goal, self._corners = np.array(values["start_positions"]), Corners(values, rng)
@@ -167,8 +167,9 @@ class Bench:
 
     @property
     def timeout(self) -> int:
-        """Periods for which the robot holds a command before it stops itself."""
-        return self._own[ROBOT].get("command_timeout", 5)
+        """Periods after a command in which the robot does not stop itself."""
+        own = self._own[ROBOT]
+        return own.get("command_timeout", 5) + own.get("command_delay", 0)
 
     @property
     def tracking(self) -> bool:
@@ -185,17 +186,16 @@ class Bench:
             self._trace.append(Sample(self.now(), not self.tracking, False, nothing))
 
     def _on_state(self, message: JointState) -> None:
-        self._heard_at = time.monotonic()
-        self.stamp = 1e-9 * stamp_to_ns(message.header.stamp)
+        self.heard = True
+        # In the order of the stamps, whenever they come: the robot is in this process.
+        now = self.now() if self.arm is None else 1e-9 * stamp_to_ns(message.header.stamp)
         tau = dict(zip(message.name, message.effort, strict=True))
         torques = np.array([tau[joint] for joint in self._joints])
-        self._trace.append(Sample(self.stamp, not self.tracking, self._stopped(), torques))
+        self._trace.append(Sample(now, not self.tracking, self._stopped(), torques))
 
     def now(self) -> float:
-        """Return robot time, s; it goes on where there are no states any more."""
-        if self.arm is not None:
-            return 1e-9 * float(self.arm._stamp)
-        return self.stamp + time.monotonic() - self._heard_at
+        """Return robot time, s; that of this computer where the robot is a process."""
+        return time.monotonic() if self.arm is None else 1e-9 * float(self.arm._stamp)
 
     def publishers(self, name: str) -> int:
         """Return how many nodes publish what one node alone should."""
@@ -219,7 +219,13 @@ class Bench:
         ]
         for name in names:
             self.start(name)
-        self.ros.wait_until(lambda: all(map(self.publishers, names)), "the nodes", timeout=START)
+
+        def there() -> bool:
+            started = [each for name, each in self.programs.items() if name in names]
+            assert all(each.running for each in started), "a node could not start"
+            return all(map(self.publishers, names))
+
+        self.ros.wait_until(there, "the nodes", timeout=START)
 
     def close(self) -> None:
         """End all programs."""
@@ -304,7 +310,7 @@ class Bench:
             course: what happens.
         """
         self._trace.clear()
-        begin = self.now() if self.stamp else math.nan
+        begin = self.now() if self.heard else math.nan
         deadline = time.monotonic() + START
         for _ in course:
             assert time.monotonic() < deadline, "what happens to the nodes does not end"
@@ -319,8 +325,8 @@ class Bench:
             self.spin()
             since = min(since, time.monotonic()) if self.tracking else math.inf
         begin = max(begin, self._marked)
-        usual = self._kind.course is nothing
-        seen.note_moment(self._trace, begin, end, self.dt, self._tau_max, usual)
+        brakes = self._kind.brakes
+        seen.note_moment(self._trace, begin, end, self.dt, self._tau_max, brakes)
 
     def note_limits(self, seen: Seen) -> None:
         """Add how far limits were passed until now."""
@@ -497,7 +503,8 @@ def late(name: str) -> Callable[[Bench], Course]:
 WITH_ROBOT = (ROBOT, *CONTROL)
 WITH_ESTIMATOR = (ESTIMATOR, *CONTROL)
 FAULTS = {
-    "nothing": Kind(nothing),
+    "nothing": Kind(nothing, brakes=False),
+    "nothing, imperfect robot": Kind(nothing, WITH_ESTIMATOR, imperfect=True, brakes=False),
     "bounds killed": Kind(killed(BOUNDS)),
     "bounds restarted": Kind(restarted(BOUNDS)),
     "bounds stopped and continued": Kind(stood_still(BOUNDS)),
@@ -516,27 +523,35 @@ FAULTS = {
     "bounds late": Kind(late(BOUNDS), late=BOUNDS),
     "controller late": Kind(late(CONTROLLER), late=CONTROLLER),
     "robot late": Kind(late(ROBOT), late=ROBOT),
-    "wild parameters": Kind(wild_parameters),
-    "wild integral action": Kind(wild_integral),
-    "the clock jumps": Kind(clock_jumps, values={"use_sim_time": True}),
+    "wild parameters": Kind(wild_parameters, brakes=False),
+    "wild integral action": Kind(wild_integral, brakes=False),
+    "the clock jumps": Kind(clock_jumps, values={"use_sim_time": True}, brakes=False),
     "no room for logs": Kind(no_room),
-    "another robot description": Kind(other_description, values={"robot_description": "topic"}),
+    "another robot description": Kind(
+        other_description, values={"robot_description": "topic"}, brakes=False
+    ),
 }
 
 
-def play(robot: str, name: str, moments: int, seed: int, rate: float | None) -> tuple[Seen, float]:
-    """Let a robot suffer a fault; return what it did, and the control period, s."""
-    kind, rng, seen = FAULTS[name], np.random.default_rng(seed), Seen()
+def play(
+    robot: str, name: str, moments: int, seed: int, rate: float | None
+) -> tuple[Seen, float, str]:
+    """Let a robot suffer a fault; return what it did, the control period, s, and why it ended."""
+    kind, rng, seen, why = FAULTS[name], np.random.default_rng(seed), Seen(), ""
     for count in [1] * moments if kind.late else [moments]:
         with ExitStack() as stack:
             ros = RosHarness(stack.enter_context(private_domain()))
             stack.callback(ros.close)
             bench = Bench(ros, robot, kind, rng, rate)
             stack.callback(bench.close)
-            seen.timeout = bench.timeout
-            _suffer(bench, kind, seen, count)
-            dt = bench.dt
-    return seen, dt
+            seen.timeout, dt = bench.timeout, bench.dt
+            try:
+                _suffer(bench, kind, seen, count)
+            except AssertionError as error:
+                why = str(error)
+                if bench.heard:
+                    bench.note_limits(seen)
+    return seen, dt, why
 
 
 def _suffer(bench: Bench, kind: Kind, seen: Seen, count: int) -> None:
@@ -570,10 +585,11 @@ def main() -> int:
     print(table([figure], heads), flush=True)
     for robot in given.robot or ROBOTS:
         for name in given.fault or FAULTS:
-            seen, dt = play(robot, name, given.moments, given.seed, given.rate)
+            seen, dt, why = play(robot, name, given.moments, given.seed, given.rate)
             cells = seen.cells(dt)
-            lasted = f"{min(seen.lasted):.2f} to {max(seen.lasted):.2f}"
-            figure.rows.append((robot, name, cells[0], lasted, *cells[1:]))
+            lasted = f"{min(seen.lasted):.2f} to {max(seen.lasted):.2f}" if seen.lasted else "-"
+            said = f"FAILS: {why}" if why else cells[-1]
+            figure.rows.append((robot, name, cells[0], lasted, *cells[1:-1], said))
             print("| " + " | ".join(figure.rows[-1]) + " |", flush=True)
     return int(any(row[-1] != "kept" for row in figure.rows))
 

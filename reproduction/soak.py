@@ -415,7 +415,7 @@ def main() -> int:
         (options.out / "report.md").write_text(text)
         (options.out / "metrics.json").write_text(json.dumps(record.metrics(), indent=2) + "\n")
     except OSError as error:
-        print(f"error: the report could not be written: {error}", file=sys.stderr)
+        print(f"error: no report in {options.out}: {error.strerror}", file=sys.stderr)
         return 2
     print(f"report and metrics are in {options.out}")
     return 1 if record.wrong else 0

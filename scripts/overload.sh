@@ -19,7 +19,8 @@ usage: bash scripts/overload.sh [--seconds N] [--robot NAME] [--way WAY] [--load
   --seed       of goals and pauses (default: 0)
   --out        where report.md and metrics.json go (default: results/overload)
 
-Exits with 0 when no limit of position, speed or torque was passed, 1 when one was. Each run has a
+Exits with 0 when no limit of position, speed or torque was passed, 1 when one was, 2 when the report
+cannot be written. Each run has a
 ROS domain of its own.
 USAGE
 }
