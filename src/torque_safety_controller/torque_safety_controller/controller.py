@@ -343,10 +343,9 @@ class Controller:
 
         try:
             solution = solve(eased, rows)
-            if eased is not bounds and not (
-                solution.relaxation is solution.constraint_relaxation is None
-            ):
-                solution = solve(bounds, rows)  # to ease is a wish only
+            exact = solution.relaxation is None and solution.constraint_relaxation is None
+            if eased is not bounds and not exact:
+                solution = solve(bounds, rows)  # narrower bounds are a wish only
             lacking = solution.relaxation is not None and not self.lost
             if self.safety_filter is not None and lacking:
                 # The bounds have margins that the plan does not keep, and rows lead back

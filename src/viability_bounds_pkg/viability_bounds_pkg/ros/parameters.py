@@ -109,7 +109,7 @@ class NodeParameters(Generic[Configuration]):
             configuration = read(self._kind, self._values | self._changed(parameters))
             if self._check is not None:
                 self._check(configuration)
-        except ArmSafetyError as error:  # what several settings leave nothing for has another name
+        except ArmSafetyError as error:  # settings that contradict each other raise others
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
