@@ -42,12 +42,12 @@ from rclpy.publisher import Publisher
 from rclpy.task import Future
 
 from sim_bridge.bullet.robot import BulletRobot
-from sim_bridge.nodes import bullet_node
+from sim_bridge.nodes import command_stream
 from sim_bridge.nodes.bullet_node import BulletNode
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.node.controller_node import ControllerNode
-from torque_safety_controller.node.limits import LimitsReader
 from torque_safety_controller.node.safety_stack import make_nodes
+from torque_safety_controller.node.streams.limits import LimitsReader
 from torque_safety_controller.qp.inverse_dynamics_qp import InverseDynamicsQP
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.cli.scheduling import add_scheduling
@@ -203,7 +203,7 @@ STAGES = (
     (BulletRobot, "step", "robot: physics"),
     (BulletNode, "_next_state", "robot: state to message"),
     (BulletNode, "_on_command", "robot: rest"),
-    (bullet_node, "read_command", "robot: command from message"),
+    (command_stream, "read_command", "robot: command from message"),
     (JointStateReader, "read", "states from messages"),
     (EstimatorNode, "_on_state", "estimator: rest"),
     (EstimatorNode, "_on_command", "estimator: rest"),

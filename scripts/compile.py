@@ -22,7 +22,7 @@ from direct import DirectLoop
 
 from sim_bridge.bullet.obstacles import Obstacle
 from torque_safety_controller.anti_windup import project_to_limits
-from torque_safety_controller.node.limits import LimitsReader
+from torque_safety_controller.node.streams.limits import LimitsReader
 from viability_bounds_pkg.cli.command_line import INTERRUPTED
 from viability_bounds_pkg.compiled import compilations, compiled_functions, is_kept
 from viability_bounds_pkg.ros.messages import JointStateReader

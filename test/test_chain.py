@@ -45,7 +45,7 @@ def assert_no_limit_broken(result):
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-@pytest.mark.parametrize(("seed", "rate"), [(0, None), (1, None), (2, None), (3, 1000.0)])
+@pytest.mark.parametrize(("seed", "rate"), [(0, None), (1, None), (3, 1000.0)])
 def test_random_goals_never_break_a_limit(robot, seed, rate):
     rng = np.random.default_rng(seed)
     values = load_values(robot)

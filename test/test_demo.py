@@ -110,9 +110,7 @@ def test_it_knows_the_bounds_there_are():
 @pytest.mark.parametrize(
     ("when", "sent", "apart"),
     [
-        ("nodes start", signal.SIGINT, ["--processes"]),
-        ("it runs", signal.SIGTERM, ["--processes"]),
-        ("nodes start", signal.SIGTERM, []),
+        ("nodes start", signal.SIGTERM, ["--processes"]),
         ("it runs", signal.SIGINT, []),
     ],
 )
@@ -198,7 +196,6 @@ def play(robot, name, changed):
 @pytest.mark.parametrize(
     ("robot", "changed", "remains", "near"),
     [
-        ("baxter_left_arm", {"rate_hz": 1000.0}, 1e-3, 5e-3),
         ("panda", {}, 1e-3, 5e-3),
         # With friction, and a margin for torques that are held.
         ("talos_left_arm", {}, 5e-3, 0.02),

@@ -81,7 +81,7 @@ FAULTS = {
 @pytest.mark.parametrize(("topic", "what", "node"), FAULTS.values(), ids=FAULTS)
 def test_limits_are_kept_and_the_arm_goes_on_afterwards(ros, tmp_path, topic, what, node):
     arm, faults = start(
-        ros, tmp_path, f"  - {{time: 1.0, duration: 0.6, topic: {topic}, {what}}}\n"
+        ros, tmp_path, f"  - {{time: 0.5, duration: 0.4, topic: {topic}, {what}}}\n"
     )
     on = wander(ros, arm)
 

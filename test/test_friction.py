@@ -81,7 +81,7 @@ def reach(made) -> tuple[float, float, float]:
     worst = speed = 0.0
     for goal in (home * pin.SE3(np.eye(3), np.array([0.06, -0.08, 0.05])), home):
         made.controller.set_pose_goal(goal)
-        last = made.run(2.5)[-300:]
+        last = made.run(1.8)[-300:]
         worst = max(worst, np.linalg.norm(column(last, "error")[:, :3], axis=1).max())
         speed = max(speed, np.abs(column(last, "v")).max())
     monitor = made.robot.monitor

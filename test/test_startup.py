@@ -21,7 +21,6 @@ BOUNDS = ("viability_bounds_pkg", "bounds_node")
 ESTIMATOR = ("viability_bounds_pkg", "estimator_node")
 CONTROLLER = ("torque_safety_controller", "controller_node")
 ROBOT = ("sim_bridge", "bullet_node")
-SAFETY = ("torque_safety_controller", "safety_stack")
 SIMULATED = ("sim_bridge", "simulated_stack")
 MAIN = {
     BOUNDS: bounds_node.main,
@@ -106,7 +105,8 @@ def test_a_file_that_is_not_parameters_is_refused_in_one_line(tmp_path, capfd, t
     assert "broken.yaml" in lines[0]
 
 
-# Both signals take the same way in every program; test_ros_runtime.py sends both to one.
+# Both signals take the same way in every program; test_ros_runtime.py sends both to one, and
+# test_one_process.py ends safety_stack, and simulated_stack in lockstep.
 @pytest.mark.parametrize(
     ("node", "options", "sent"),
     [
@@ -115,9 +115,7 @@ def test_a_file_that_is_not_parameters_is_refused_in_one_line(tmp_path, capfd, t
         (CONTROLLER, (), signal.SIGINT),
         (ROBOT, ("-p", "clock:=real_time"), signal.SIGINT),
         (ROBOT, ("-p", "clock:=lockstep"), signal.SIGTERM),
-        (SAFETY, (), signal.SIGINT),
-        (SIMULATED, ("-p", "clock:=real_time"), signal.SIGTERM),
-        (SIMULATED, ("-p", "clock:=lockstep"), signal.SIGINT),
+        (SIMULATED, ("-p", "clock:=real_time"), signal.SIGINT),
     ],
     ids=[
         "bounds",
@@ -125,9 +123,7 @@ def test_a_file_that_is_not_parameters_is_refused_in_one_line(tmp_path, capfd, t
         "controller",
         "robot in real time",
         "robot in lockstep",
-        "one process",
         "all in real time",
-        "all in lockstep",
     ],
 )
 def test_nodes_end_when_told_to(ros, node, options, sent):

@@ -21,28 +21,22 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from sim_bridge.bullet.limit_monitor import LimitMonitor
-from sim_bridge.hardware.communication import CommandPath
 from sim_bridge.hardware.sensing import Sensing
 from sim_bridge.nodes.bullet_parameters import BulletConfiguration, make_robot, make_stop
 from sim_bridge.nodes.command_outage import CommandOutage
+from sim_bridge.nodes.command_stream import CommandStream
 from sim_bridge.nodes.ft_sensor import ForceTorqueReading
 from sim_bridge.nodes.topics import CLOCK, PAUSE, RESET
 from sim_bridge.nodes.world_subscriber import WorldSubscriber
 from viability_bounds_pkg.recent_values import RecentValues
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.joint_command import (
-    CommandError,
-    JointCommand,
-    PositionCommand,
-    TorqueCommand,
-    read_command,
-)
+from viability_bounds_pkg.ros.joint_command import PositionCommand, TorqueCommand
 from viability_bounds_pkg.ros.messages import Diagnostics
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.robot_urdf import warn_of_unusual
-from viability_bounds_pkg.ros.runtime import set_stamp, stamp_to_ns
+from viability_bounds_pkg.ros.runtime import set_stamp
 from viability_bounds_pkg.ros.topics import (
     FT_WRENCH,
     JOINT_COMMANDS,
@@ -54,7 +48,6 @@ from viability_bounds_pkg.state_estimation.state_check import RESTART
 Array = NDArray[np.float64]
 
 _RETRY_PERIOD = 0.2
-_STRAYS = 50
 _CONTROL = {TorqueCommand: "torque", PositionCommand: "position"}
 
 
@@ -115,14 +108,15 @@ class BulletNode(ArmNode):
         imperfect = config.imperfections
         senses = imperfect.of_sensing or imperfect.of_motors
         self._sensing = Sensing(imperfect, config.torque_max, config.dt) if senses else None
+        warn = self.get_logger().warning
+        self._commands = CommandStream(config, self._refused, self._one_controller, warn)
         self._restart()
 
         # Joints that are locked, too: robot_state_publisher places no link without its joint.
         locked = self._robot.locked
         self._locked_at = array("d", locked.values())
         self._at_rest = array("d", [0.0] * len(locked))
-        self._joints = list(config.joints)
-        self._names = [*self._joints, *locked]
+        self._names = [*config.joints, *locked]
         self._state_publisher = JOINT_STATES.publisher(self)
         self._clock_publisher = CLOCK.publisher(self) if config.publish_clock else None
         description = ROBOT_DESCRIPTION.publisher(self)
@@ -149,18 +143,16 @@ class BulletNode(ArmNode):
         self._world.clear()
         self._robot.reset(config.start_positions, np.zeros(n))
         self._reading = self._sensing.reset(*self._true_state()) if self._sensing else None
-        self._path: CommandPath[JointCommand] = CommandPath(config.imperfections)
         sensor = self._robot.sensor
         self._sensor = ForceTorqueReading(sensor, config.sensor) if sensor else None
         self._monitor.reset()
-        self._command: JointCommand | None = None
-        self._missed_in_row = self._missed = self._braked = self._strays = 0
+        self._commands.restart()
+        self._braked = 0
         self._outage = CommandOutage(config.command_timeout, math.ceil(config.rate_hz))
         self._periods = 0
         self._plan_pause()
-        self._torque_ratio = 0.0
         self._refused.clear()
-        self._latencies, self._period_errors = RecentValues(), RecentValues()
+        self._period_errors = RecentValues()
         self._ticked_at, self._late = math.nan, 0
         self._started_at, self._played = time.monotonic(), 0
 
@@ -207,27 +199,12 @@ class BulletNode(ArmNode):
         q, v, _ = self._robot.state()
         return q, v, self._robot.believed_torque
 
-    def _receive(self, sent: JointCommand | None) -> None:
-        """Take the command that arrives in the current period, or hold the last one.
-
-        Args:
-            sent: the one sent in it; None if there is none.
-        """
-        arrived = self._path.arriving(sent)
-        if arrived is not None:
-            self._command = arrived
-            self._missed_in_row = 0
-        elif self._command is not None:
-            self._missed += self._path.absent
-            self._missed_in_row += 1
-            if self._missed_in_row > self._config.command_timeout:
-                self._command = None
-
     def _advance(self) -> None:
         """Simulate the current period under the last command, or the robot's own law."""
         config = self._config
         self._world.apply_due(self._stamp)
-        command = self._command
+        commands = self._commands
+        command = commands.acting
         if command is None:
             # No command can have arrived before the first one's delay.
             self._braked += self._periods >= config.imperfections.command_delay
@@ -236,7 +213,7 @@ class BulletNode(ArmNode):
             else:
                 self._robot.brake(config.substeps, config.torque_max)
         elif isinstance(command, TorqueCommand):
-            if self._stop is None or (self._missed_in_row == 0 and not self._robot.returning):
+            if self._stop is None or (commands.missed_in_row == 0 and not self._robot.returning):
                 self._robot.step(command.tau, config.substeps)
             else:
                 self._robot.follow(self._stop, command.tau, config.substeps)
@@ -263,7 +240,7 @@ class BulletNode(ArmNode):
             # A real robot would have gone on.
             self._late += max(0, round(took / dt) - 1)
         if not self._advanced:
-            self._receive(None)
+            self._commands.receive(None)
             self._advance()
         self._next_state()
 
@@ -282,49 +259,17 @@ class BulletNode(ArmNode):
     # Commands
 
     def _on_command(self, message: JointState) -> None:
-        age, rest = divmod(self._stamp - stamp_to_ns(message.header.stamp), self._dt_ns)
-        late = 0 < age <= self._config.imperfections.command_delay and not self._config.lockstep
-        if rest or not (late or (age == 0 and not self._advanced)):
-            if not self._paused:
-                self._note_stray(stamp_to_ns(message.header.stamp))
+        if not self._commands.take(
+            message, self._stamp, self._published_at, ended=self._advanced, paused=self._paused
+        ):
             return
-        if self._paused or not self.publisher_watch.admits(self._commands_topic):
-            return
-        try:
-            command = read_command(message, self._joints)
-        except CommandError as error:
-            self._refused[str(error)] += 1
-            if self._refused[str(error)] == 1:
-                self.get_logger().warning(f"joint_commands refused: {error}")
-            return
-        if isinstance(command, TorqueCommand):
-            tau, tau_max = command.tau, self._config.torque_max
-            self._torque_ratio = max(self._torque_ratio, float(np.max(np.abs(tau) / tau_max)))
-            # The motors do not exceed their limits, whatever the command.
-            command = TorqueCommand(np.clip(tau, -tau_max, tau_max))
-        if late and not self._path.arrives_late(command, age, ended=self._advanced):
-            self._note_stray(stamp_to_ns(message.header.stamp))
-            return
-        self._strays = 0
-        self._latencies.note(time.monotonic() - self._published_at + age * self._config.dt)
-        if late:
-            return
-        self._receive(command)
         self._advance()
         # After a pause by itself the next state is not published: time stops for all nodes.
         if self._config.lockstep and not self._paused:
             self._next_state()
 
-    def _note_stray(self, stamp: int) -> None:
-        """Count a command that is not for this period; warn when no other comes."""
-        self._refused["not for this period"] += 1
-        self._strays += 1
-        if self._strays == _STRAYS:
-            self.get_logger().warning(
-                f"joint_commands refused: {_STRAYS} in a row do not have the stamp of the present "
-                f"joint state; the last one has {1e-9 * stamp:.13g} s instead of "
-                f"{1e-9 * self._stamp:.13g} s"
-            )
+    def _one_controller(self) -> bool:
+        return self.publisher_watch.admits(self._commands_topic)
 
     # Services
 
@@ -359,15 +304,15 @@ class BulletNode(ArmNode):
 
     def _control(self) -> str:
         """Return what moves or holds the robot."""
-        if self._command is not None:
-            return _CONTROL[type(self._command)]
+        if self._commands.acting is not None:
+            return _CONTROL[type(self._commands.acting)]
         if self._stop is None or not self._outage.commanded:
             return "brakes"
         return "stopped" if self._stop.at_rest else "stopping"
 
     def _report(self) -> tuple[bytes, str, dict[str, Any]]:
-        monitor = self._monitor
-        latencies, errors = self._latencies, self._period_errors
+        monitor, commands = self._monitor, self._commands
+        latencies, errors = commands.latencies, self._period_errors
         elapsed = time.monotonic() - self._started_at
         obstacles, control = self._robot.obstacles, self._control()
         values = {
@@ -379,9 +324,9 @@ class BulletNode(ArmNode):
             "periods": self._periods,
             "rate_hz": (self._periods - self._played) / elapsed,
             "physics_steps_per_period": self._config.substeps,
-            "deadline_misses": self._missed,
+            "deadline_misses": commands.missed,
             "late_periods": self._late,
-            "missed_deadlines_injected": self._path.missed,
+            "missed_deadlines_injected": commands.path.missed,
             "imperfections": ", ".join(self._config.imperfections.names) or "none",
             "braked_periods": self._braked,
             "commands_refused": self._refused,
@@ -393,7 +338,7 @@ class BulletNode(ArmNode):
             "period_error_p50_us": 1e6 * errors.percentile(50),
             "period_error_p99_us": 1e6 * errors.percentile(99),
             "period_error_max_us": 1e6 * errors.largest,
-            "commanded_torque_ratio_max": self._torque_ratio,
+            "commanded_torque_ratio_max": commands.torque_ratio,
             "position_violation_rad": monitor.max_position_violation,
             "velocity_violation_rad_s": monitor.max_velocity_violation,
             "torque_ratio": monitor.max_torque_ratio,
@@ -404,7 +349,7 @@ class BulletNode(ArmNode):
             return DiagnosticStatus.ERROR, "a limit was broken", values
         if self._paused:
             return DiagnosticStatus.OK, "paused", values
-        if self._command is None:
+        if commands.acting is None:
             doing = "braking" if control == "brakes" else control
             return DiagnosticStatus.WARN, f"{doing}: no commands", values
         return DiagnosticStatus.OK, "running", values

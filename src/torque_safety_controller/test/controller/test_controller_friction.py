@@ -10,9 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from arms import load_arm
+from controller_chain import NODE, ControllerChain
 from controllers import posture_only
-from sensor_msgs.msg import JointState
-from trajectory_msgs.msg import JointTrajectory
 
 from torque_safety_controller.additional_torque import (
     AdditionalSettings,
@@ -21,22 +20,14 @@ from torque_safety_controller.additional_torque import (
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.friction.settings import FrictionModel, FrictionSettings
 from torque_safety_controller.integral_feedback import IntegralSettings
-from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.parameters.friction_parameters import FrictionConfiguration
 from torque_safety_controller.qp.constraints import AccelerationRange
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import group, read
 from viability_bounds_pkg.robot_configuration import RobotConfiguration
 from viability_bounds_pkg.state import State
-from viability_bounds_pkg.testing.ros_harness import (
-    acceleration_limits,
-    joint_state,
-    names_parameter,
-    read_config,
-)
+from viability_bounds_pkg.testing.ros_harness import names_parameter, read_config
 
-NODE = "controller_node"
-MS = 1_000_000
 ARM = load_arm("panda")
 N = ARM.n
 DT = 1e-3
@@ -216,31 +207,25 @@ def test_there_must_be_a_model_to_compensate():
         settings(friction_compensation=0.5)
 
 
-class FrictionChain:
+class FrictionChain(ControllerChain):
     """A robot that stands at one place, and its bounds node, in front of the real node."""
 
     def __init__(self, ros, **changed) -> None:
         given = read_config("panda", NODE) | {"bounds_timeout": 20.0, "state_timeout": 40.0}
         # Joints that stand and have a speed: the estimator would refuse them.
-        given["use_estimated_states"] = True
-        self.ros, self.joints, self.stamp = ros, given["joints"], 0
-        self.node = ros.start(ControllerNode, given | changed)
-        self.commands = ros.listen(JointState, "joint_commands")
-        self.states = ros.talk(JointState, "estimated_joint_states")
-        self.limits = ros.talk(JointTrajectory, "acceleration_limits")
-        ros.hears("joint_commands")
+        super().__init__(ros, given | {"use_estimated_states": True} | changed)
+        self.stamp = 0
 
     def answer(self) -> np.ndarray:
         """Return the torques for the next period."""
         self.stamp += round(1e3 * ARM.dt)
-        stamp = self.stamp * MS
+        stamp = self.stamp
 
         def send():
-            self.limits.publish(acceleration_limits(self.joints, stamp, -WIDE, WIDE))
-            self.states.publish(joint_state(self.joints, stamp, ARM.q_start, V))
+            self.send_limits(stamp, -WIDE, WIDE)
+            self.send_state(stamp, ARM.q_start, V)
 
-        self.ros.wait_until(lambda: stamp in self.commands.stamps, "a command", each=send)
-        return np.array(self.commands[self.commands.stamps.index(stamp)].effort)
+        return np.array(self.await_command(stamp, send).effort)
 
 
 def test_it_is_switched_while_the_node_runs(ros):

@@ -8,9 +8,7 @@ import math
 import numpy as np
 import pytest
 from arms import load_arm
-from controller_chain import MS, NODE, gains_of
-from sensor_msgs.msg import JointState
-from trajectory_msgs.msg import JointTrajectory
+from controller_chain import NODE, ControllerChain, gains_of
 
 from torque_safety_controller.additional_torque import (
     AdditionalSettings,
@@ -22,12 +20,7 @@ from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.qp.constraints import AccelerationRange
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.state import State
-from viability_bounds_pkg.testing.ros_harness import (
-    acceleration_limits,
-    joint_state,
-    names_parameter,
-    read_config,
-)
+from viability_bounds_pkg.testing.ros_harness import names_parameter, read_config
 
 ARM = load_arm("panda")
 PERIOD = round(1e3 * ARM.dt)  # ms
@@ -64,28 +57,23 @@ def make_settings(mode="joints", **changed) -> AdditionalSettings:
     return AdditionalSettings(mode, IntegralSettings(**DEFAULT | changed), 2.0 * ARM.tau_max)
 
 
-class IntegralChain:
+class IntegralChain(ControllerChain):
     """A controller that is asked for torques, one period after the other."""
 
     def __init__(self, ros, **changed) -> None:
-        self.ros, self.stamp = ros, 10 * PERIOD
-        self.node = ros.start(ControllerNode, VALUES | changed)
-        self.commands = ros.listen(JointState, "joint_commands")
-        self.states = ros.talk(JointState, "joint_states")
-        self.limits = ros.talk(JointTrajectory, "acceleration_limits")
-        ros.hears("joint_commands")
+        super().__init__(ros, VALUES | changed)
+        self.stamp = 10 * PERIOD
 
     def answer(self, v, period=PERIOD) -> np.ndarray:
         """Return the torques for the next state."""
         self.stamp += period
-        stamp = self.stamp * MS
+        stamp = self.stamp
 
         def send():
-            self.limits.publish(acceleration_limits(JOINTS, stamp, -WIDE, WIDE))
-            self.states.publish(joint_state(JOINTS, stamp, Q, v))
+            self.send_limits(stamp, -WIDE, WIDE)
+            self.send_state(stamp, Q, v)
 
-        self.ros.wait_until(lambda: stamp in self.commands.stamps, "a command", each=send)
-        return np.array(self.commands[self.commands.stamps.index(stamp)].effort)
+        return np.array(self.await_command(stamp, send).effort)
 
 
 def answers(controller, speeds=SPEEDS) -> np.ndarray:
@@ -278,10 +266,10 @@ def test_states_that_cannot_be_used_do_not_move_the_integral(ros):
     for v in SPEEDS:
         chain.answer(v)
     before = reported(ros, "additional_torque_nm")
-    bad = joint_state(JOINTS, (chain.stamp + 1) * MS, np.full(N, math.nan), np.zeros(N))
     chain.commands.clear()
     ros.wait_until(
-        lambda: ros.reported(NODE, "mode") == "STOPPED", each=lambda: chain.states.publish(bad)
+        lambda: ros.reported(NODE, "mode") == "STOPPED",
+        each=lambda: chain.send_state(chain.stamp + 1, np.full(N, math.nan), np.zeros(N)),
     )
     assert not chain.commands
     np.testing.assert_array_equal(reported(ros, "additional_torque_nm"), before)

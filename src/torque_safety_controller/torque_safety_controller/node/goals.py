@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -167,6 +168,7 @@ class GoalSubscriber:
         self._trajectory: PoseTrajectory | None = None
         self._begin = 0
         self._taken = controller.goals.taken
+        self.renew()
 
     def __len__(self) -> int:
         return len(self._pending)
@@ -177,6 +179,16 @@ class GoalSubscriber:
         if self._contested:
             self._contested = {name for name in self._contested if not self._watch.admits(name)}
         return bool(self._contested)
+
+    @property
+    def lost(self) -> bool:
+        """Whether the last goal is older than ``goal_timeout``."""
+        timeout = self._config.goal_timeout
+        return timeout > 0.0 and time.monotonic() - self._renewed_at > timeout
+
+    def renew(self) -> None:
+        """Count the age of the last goal from now on."""
+        self._renewed_at = time.monotonic()
 
     def listen(self, topic: Topic, callback: Callable[[Any], None]) -> None:
         """Subscribe to a topic of goals; `callback` gets those of a node that is alone with it."""
@@ -217,6 +229,8 @@ class GoalSubscriber:
         while self._pending and self._pending[0][0] <= stamp:
             self._pending.pop(0)[1]()
             due = True
+        if due or self._trajectory is not None:
+            self.renew()
         if self._trajectory is None:
             return due
         self._begin = self._begin or stamp

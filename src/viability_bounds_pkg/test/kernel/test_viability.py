@@ -96,7 +96,7 @@ def test_agrees_with_brute_force(name):
 
     Where (11) holds, the paper's algorithm is compared in 20,000 states more, above.
     """
-    count = 60 if name in HOLDING else 30
+    count = 30
     outcome = compare(CASES[name], *states_of(CASES[name], count, seed=2))
     assert_exact(outcome)
     assert outcome.compared > 0.2 * count
@@ -105,10 +105,10 @@ def test_agrees_with_brute_force(name):
 @pytest.mark.parametrize("holds", [True, False])
 def test_agrees_with_brute_force_for_random_joints(holds):
     rng = np.random.default_rng(3)
-    cases = [random_joint(rng, holds) for _ in range(6)]
+    cases = [random_joint(rng, holds) for _ in range(4)]
     outcome = merged(compare(case, *states_of(case, 30, seed=4)) for case in cases)
     assert_exact(outcome)
-    assert outcome.compared > 60
+    assert outcome.compared > 40
 
 
 def test_brute_force_sees_bounds_that_are_a_little_too_wide(monkeypatch):

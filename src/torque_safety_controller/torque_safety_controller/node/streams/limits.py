@@ -23,6 +23,7 @@ class LimitsReader:
     Attributes:
         lower, upper: of the last accepted message, shape (n,), rad/s^2.
         stamp: of the state that they belong to, ns.
+        lost: whether states are answered without them, because they did not come in time.
         refused: how many messages were dropped, by reason.
     """
 
@@ -31,6 +32,7 @@ class LimitsReader:
         self.lower = np.zeros(len(joints))
         self.upper = np.zeros(len(joints))
         self.stamp = -1
+        self.lost = False
         self.refused: Counter[str] = Counter()
         self._joints = list(joints)
 

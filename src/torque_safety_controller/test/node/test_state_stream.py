@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Joint states as they arrive: which begin anew, which wait for an answer."""
+
+import math
+
+import numpy as np
+import pytest
+
+from torque_safety_controller.node.streams.states import Arrival, StateStream
+from viability_bounds_pkg.ros.runtime import stamp_to_ns
+from viability_bounds_pkg.testing.ros_harness import joint_state
+
+JOINTS = ("a", "b")
+MS = 1_000_000
+TIMEOUT = 0.5  # s
+Q, MOVED = [0.1, 0.2], [0.1, 0.3]
+
+
+@pytest.fixture
+def stream():
+    """A stream in which a state with the stamp 100 ms came at 10 s, and was answered."""
+    made = StateStream(JOINTS, TIMEOUT)
+    assert arrives(made, 100, 10.0) is Arrival.ANEW
+    made.begin()
+    made.answered()
+    return made
+
+
+def arrives(stream, stamp, now, q=Q):
+    return stream.take(joint_state(JOINTS, stamp * MS, q, [0.0, 0.0]), now)
+
+
+@pytest.mark.parametrize(
+    ("stamp", "q", "now", "arrival"),
+    [
+        (102, Q, 10.01, Arrival.NEXT),
+        (100, Q, 10.01, Arrival.REPEAT),
+        (100, Q, 10.6, Arrival.BACK),
+        (100, MOVED, 10.6, Arrival.ANEW),  # another robot at the same time
+        (100, MOVED, 10.01, Arrival.REFUSED),
+        (102, Q, 10.6, Arrival.ANEW),
+        (50, Q, 10.01, Arrival.REFUSED),
+        (50, Q, 10.6, Arrival.ANEW),
+        (1200, Q, 10.01, Arrival.NEXT),  # the time alone has leapt
+        (1200, MOVED, 10.01, Arrival.ANEW),
+        (102, [math.nan, 0.2], 10.01, Arrival.REFUSED),
+    ],
+)
+def test_what_a_state_is_after_one_that_was_answered(stream, stamp, q, now, arrival):
+    assert arrives(stream, stamp, now, q) is arrival
+    accepted = arrival in (Arrival.NEXT, Arrival.ANEW)
+    np.testing.assert_array_equal(stream.q, q if accepted else Q)
+    assert stream.usable_at == (10.0 if arrival is Arrival.REFUSED else now)
+    assert (stream.message_at, stamp_to_ns(stream.message_stamp)) == (now, stamp * MS)
+
+
+def test_a_state_waits_until_it_is_answered_and_none_while_they_are_refused(stream):
+    assert stream.waits(20.0) == 0.0
+    arrives(stream, 102, 10.1)
+    arrives(stream, 104, 10.3)  # it is the first of them that waits
+    assert stream.waits(10.4) == pytest.approx(0.3)
+    assert stream.elapsed() == pytest.approx(4e-3)
+    assert stream.count_refused() == 1
+    assert stream.waits(10.4) == 0.0
+    arrives(stream, 106, 10.5)
+    assert stream.refused_in_row == 0
+    assert stream.waits(10.5) == pytest.approx(0.4)
+    stream.answered()
+    assert (stream.waits(10.6), stream.elapsed()) == (0.0, 0.0)
+
+
+def test_silence_is_told_and_whether_states_were_missing_meanwhile(stream):
+    assert not stream.silent(10.0 + TIMEOUT)
+    assert stream.silent(10.01 + TIMEOUT)
+    arrives(stream, 700, 10.6)
+    assert stream.missed
+    stream.begin()
+    assert stream.elapsed() is None
+    assert stream.waits(10.7) == pytest.approx(0.1)
+    arrives(stream, 702, 10.61)
+    assert not stream.missed
+    arrives(stream, 900, 11.2)  # nothing was answered since it began
+    assert not stream.missed
+
+
+def test_before_the_first_state_there_is_silence_and_nothing_waits():
+    stream = StateStream(JOINTS, TIMEOUT)
+    assert stream.silent(0.0)
+    assert stream.waits(0.0) == 0.0
+    assert stream.elapsed() is None
