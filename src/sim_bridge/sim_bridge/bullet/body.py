@@ -271,7 +271,10 @@ class BulletBody:
         self._load(prepared)
         if self.sensor and measured is not None:  # until the next step
             self.sensor.wrench = measured
-        self._place(*np.array([state[:2] for state in states]).T)
+        # What is no number stays in PyBullet whatever state is set afterwards.
+        self._place(
+            *np.nan_to_num(np.array([state[:2] for state in states]).T, posinf=0.0, neginf=0.0)
+        )
         self.obstacles.follow(self.body_id, {index: link for link, index in self._links.items()})
 
     def apply_wrench(self, link: str, force: ArrayLike, torque: ArrayLike) -> None:

@@ -109,6 +109,11 @@ class BulletRobot(BulletBody):
         self._law: CoordinatedStop | None = None  # the one in charge
         self._stepped = False  # since the last reset
 
+    @property
+    def finite(self) -> bool:
+        """Whether the state is made of numbers; a push without measure leaves none."""
+        return bool(np.isfinite(self._q + self._v).all())
+
     def reset(self, q: ArrayLike, v: ArrayLike) -> None:
         """Set the state of the joints, motors off; wrenches and monitor are not changed.
 
@@ -118,6 +123,8 @@ class BulletRobot(BulletBody):
         """
         v = finite_vector("v", v, len(self.joints))
         raw = finite_vector("q", q, len(self.joints)) + 0.5 * self.physics_dt * v
+        if not self.finite:
+            self._reload()  # after a push without measure: PyBullet keeps what is no number
         self._set_state(raw, v)
         self._q[:], self._v[:] = raw, v
         self._motor_torque.fill(0.0)

@@ -50,7 +50,7 @@ def load_timeline(path: str | Path, known: tuple[str, ...]) -> Timeline:
 
     def topic(value: Any, where: str) -> str:
         if value not in known:
-            hint = did_you_mean(value, known)
+            hint = did_you_mean(str(value), known)
             raise refuse(where, value, f"one of {', '.join(known)}{hint}")
         return str(value)
 

@@ -205,7 +205,9 @@ class BulletNode(ArmNode):
         self._world.apply_due(self._stamp)
         commands = self._commands
         command = commands.acting
-        if command is None:
+        if not self._robot.finite:  # after a push beyond all measure: no law stops that
+            self._robot.brake(config.substeps, config.torque_max)
+        elif command is None:
             # No command can have arrived before the first one's delay.
             self._braked += self._periods >= config.imperfections.command_delay
             if self._stop is not None and self._outage.commanded:

@@ -50,7 +50,10 @@ def payload_inertia(link: str, mass: float, centre: ArrayLike, moments: ArrayLik
             f"{middle:g} and {large:g} kg m^2; allowed: none negative, none above the sum of the "
             "others"
         )
-    return pin.Inertia(mass, c, matrix)
+    try:
+        return pin.Inertia(mass, c, matrix)
+    except (RuntimeError, ValueError) as error:  # Pinocchio tolerates less
+        raise PayloadError(f"payload of link {link!r}: {error}") from error
 
 
 def payload_link(link: str) -> str:

@@ -32,6 +32,22 @@ def test_wrenches_on_two_links_add_up():
         assert np.abs(second - neither).max() > 1e-4
 
 
+def test_a_push_without_measure_is_over_after_a_reset():
+    case = CASES["panda"]
+    with closing(Pair(case).robot) as robot:
+        q, limits = np.full(7, 0.4), np.full(7, 100.0)
+        motions = []
+        for force in (0.0, 1e308):
+            robot.apply_wrench("panda_hand_tcp", [force] * 3, [force] * 3)
+            robot.brake(3, limits)
+            assert robot.finite == (force == 0.0)
+            robot.clear_wrenches()
+            robot.reset(q, np.zeros(7))
+            robot.brake(20, limits)
+            motions.append(robot.state().q - q)
+        np.testing.assert_array_equal(*motions)
+
+
 def test_wrench_is_held_in_world_axes_until_cleared():
     with single_robot() as robot:
         robot.apply_wrench("arm", [0.0, 0.0, 0.0], [0.0, 0.0, 1.0])

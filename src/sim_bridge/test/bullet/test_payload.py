@@ -218,6 +218,7 @@ def test_payloads_on_what_does_not_move_are_refused():
         (1.0, CENTRE, [0.1, 0.0, 0.0, 0.1, 0.0, -0.1], "none negative"),
         (1.0, CENTRE, [0.1, 0.0, 0.0, 0.1, 0.0, 0.3], "none above the sum of the others"),
         (1.0, CENTRE, [0.1, 0.2, 0.0, 0.1, 0.0, 0.1], "none negative"),
+        (1.0, CENTRE, [1e-3, 0.0, 0.0, 1e-3, 0.0, -5e-324], "should be positive"),
     ],
 )
 def test_payloads_that_no_body_can_be_are_refused(mass, centre, moments, shown):

@@ -210,6 +210,7 @@ def test_a_wrong_file_says_what_is_wrong(tmp_path, text, says):
     ("entry", "says"),
     [
         ("topic: joint_commands, drop: ", "faults[0].topic is 'joint_commands'; allowed: one of"),
+        ("topic: {a: 1}, drop: ", "faults[0].topic is {'a': 1}; allowed: one of"),
         ("topic: joint_states", "allowed: exactly one of drop, delay"),
         ("topic: joint_states, drop: , burst: ", "has drop and burst"),
         (

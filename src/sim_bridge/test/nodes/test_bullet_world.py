@@ -22,6 +22,28 @@ from viability_bounds_pkg.ros.runtime import (
 )
 
 
+def test_a_push_without_measure_does_not_end_the_robot(ros):
+    robot = RobotProbe(ros, clock="real_time", rate_hz=100.0)
+    world = ros.talk(WrenchStamped, "external_wrench", GOAL_QOS)
+    push = WrenchStamped()
+    push.header.frame_id = "panda_hand_tcp"
+    for part in (push.wrench.force, push.wrench.torque):
+        part.x = part.y = part.z = 1e308
+    # Commands at first, and none afterwards: it stops itself by a law that needs a state.
+    for await_it, what in (
+        (lambda: ros.reported("bullet_node", "control") == "torque", "commands that are obeyed"),
+        (lambda: not np.isfinite(robot.q).all(), "a state that is none"),
+    ):
+        ros.wait_until(
+            await_it, what, each=lambda: robot.send(robot.stamp, np.zeros(7)), period=0.002
+        )
+        world.publish(push)
+    heard = len(robot.states)
+    ros.wait_until(lambda: len(robot.states) > heard + 50, "further states")
+    assert ros.call(Trigger, "bullet_node/reset", Trigger.Request()).success
+    ros.wait_until(lambda: np.isfinite(robot.q).all(), "a state")
+
+
 def test_a_push_moves_it_until_it_times_out(ros):
     robot = RobotProbe(ros, external_wrench_timeout=0.05)
     robot.push("panda_link4", 30.0)

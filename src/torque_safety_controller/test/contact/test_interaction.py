@@ -200,6 +200,30 @@ def test_what_is_counted_on_exceeds_what_is_felt_by_a_step_at_most(monkeypatch):
     assert contacts.closed[0]
 
 
+@pytest.mark.parametrize(
+    "goal",
+    [
+        force(x=1e12, z=-1.0),
+        force(y=-1e12),
+        force(x=5.0, z=10.0),
+        np.array([0.0, 0.0, -1.0, 1e12, 0.0, 0.0]),
+    ],
+    ids=["across", "across only", "a pull", "a moment"],
+)
+def test_what_a_contact_cannot_give_is_not_counted_on(goal, monkeypatch):
+    monkeypatch.setattr(interaction, "WRENCH_TIME", 1e-6)
+    hand = SimulatedHand(contact=True, directions=Z)
+    hand.interaction.set_target(-goal)
+    (contact,) = hand.interaction.contacts.contacts
+    hand.step(force())
+    (task,) = hand.interaction.forces(hand.controller.robot).tasks
+    pressing = contact.normal @ task.F_des[:3]
+    assert 0.0 <= pressing <= interaction.FORCE_STEP + 1e-9
+    across = task.F_des[:3] - pressing * contact.normal
+    assert np.linalg.norm(across) <= contact.friction * pressing + 1e-9
+    assert np.linalg.norm(task.F_des[3:]) < 1.0
+
+
 # Dual compliance
 
 

@@ -125,7 +125,7 @@ def test_measurements_that_are_none_are_dropped_counted_and_named(ros):
     hand.until("wrenches_refused", "not six finite numbers")
     assert hand.reported("compliance") == "sensor silent"
     hand.feels = wrench(force=(0.0, 30.0, 0.0), frame="moon")
-    hand.until("wrenches_refused", "frame_id is 'moon'; allowed: 'panda_link8' or empty")
+    hand.until("wrenches_refused", "another frame_id")
     assert hand.reported("compliance") == "sensor silent"
 
 

@@ -235,14 +235,25 @@ class Interaction:
         self._count_on(measured)
 
     def _count_on(self, measured: Array) -> None:
-        """Find how much of the goal the QP may count on at the hand, given what is measured."""
+        """Find how much of the goal the QP may count on at the hand, given what is measured.
+
+        Along the normal hardly more than is felt; across it, and as a moment, what a contact that
+        presses so can give: the QP would press harder for the sake of it, on nothing perhaps.
+        """
         if self._hand is None or self.contacts is None:
             return
-        normal = self.contacts.contacts[self._hand].normal
+        contact = self.contacts.contacts[self._hand]
+        normal = contact.normal
         goal = self._to_contact @ self._goal
         wanted = normal @ goal[:3]
         most = max(normal @ (self._to_contact @ measured)[:3], 0.0) + FORCE_STEP
-        self._counted = goal * (most / wanted) if wanted > most else goal
+        counted = goal * min(1.0, most / wanted) if wanted > 0.0 else np.zeros(6)
+        pressing = normal @ counted[:3]
+        along = pressing * normal
+        across = _shortened(counted[:3] - along, contact.friction * pressing)
+        lever = np.linalg.norm(contact.points, axis=1).max()
+        moment = _shortened(counted[3:], lever * np.linalg.norm(along + across))
+        self._counted = np.concatenate([along + across, moment])
 
     @property
     def stiffness(self) -> Array | None:
@@ -319,3 +330,9 @@ class Interaction:
         if state is not self.state:
             self.state, self.reason = state, reason
             self.changes += 1
+
+
+def _shortened(vector: Array, longest: float) -> Array:
+    """Return a vector, no longer than that."""
+    length = float(np.linalg.norm(vector))
+    return vector * (longest / length) if length > longest else vector

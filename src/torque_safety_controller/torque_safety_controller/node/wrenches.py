@@ -70,17 +70,22 @@ class WrenchSubscriber:
 
     def _on_measured(self, sensor: WrenchSensor, message: WrenchStamped) -> None:
         frame, wanted = message.header.frame_id, self._config.interaction.ft_frame
-        try:
-            if not self._watch.admits(self._topic):
-                raise WrenchError(f"several nodes publish '{self._topic}'")
-            if frame not in ("", wanted):
-                raise WrenchError(f"frame_id is '{frame}'; allowed: '{wanted}' or empty")
-            sensor.receive(wrench_of(message))
-        except WrenchError as error:
-            reason = str(error)
-            self.refused[reason] += 1
-            if self.refused[reason] == 1:
-                self._logger.warning(f"ft_wrench refused: {reason}")
+        if not self._watch.admits(self._topic):
+            self._refuse(f"several nodes publish '{self._topic}'")
+        elif frame not in ("", wanted):
+            # Counted together, whatever the frame: senders do not make the report longer.
+            detail = f"frame_id is '{frame}'; allowed: '{wanted}' or empty"
+            self._refuse("another frame_id", detail)
+        else:
+            try:
+                sensor.receive(wrench_of(message))
+            except WrenchError as error:
+                self._refuse(str(error))
+
+    def _refuse(self, reason: str, detail: str = "") -> None:
+        self.refused[reason] += 1
+        if self.refused[reason] == 1:
+            self._logger.warning(f"ft_wrench refused: {detail or reason}")
 
     def _on_target(self, message: WrenchStamped) -> None:
         config, interaction = self._config, self._interaction

@@ -307,12 +307,15 @@ def test_bad_changes_are_refused_and_the_old_values_keep_working(ros):
         check(robot.ask((k + 1) * 10 * MS, q, v), exact(q, v))
 
 
-def test_a_horizon_that_leaves_no_bounds_is_refused_and_the_node_answers_on(ros):
-    robot = BoundsProbe(ros, acceleration_drift=[100.0, 100.0, 100.0])
-    before = robot.ask(10 * MS, *NEAR)
-    assert "margin of joint" in ros.refuses(NODE, bounds_dt_factor=1000.0)
-    after = robot.ask(20 * MS, *NEAR)
-    assert after.points == before.points
+def test_a_horizon_that_leaves_no_bounds_is_refused(ros):
+    values = VALUES | {"acceleration_drift": [100.0, 100.0, 100.0]}
+    node = ros.start(BoundsNode, values)
+    reason = ros.refuses(NODE, bounds_dt_factor=1000.0)
+    assert names_parameter(reason, "bounds_dt_factor")
+    assert "margin of joint" in reason
+    ros.accepts(NODE, bounds_dt_factor=3.0)  # it goes on
+    ros.stop(node)
+    ros.refuses_to_start(BoundsNode, values | {"bounds_dt_factor": 1000.0}, "bounds_dt_factor")
 
 
 def test_limits_and_rates_are_read_only(ros):

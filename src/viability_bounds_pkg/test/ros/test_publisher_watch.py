@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 from copy import copy
+from types import SimpleNamespace
 
 import pytest
 from rclpy.node import Node
@@ -77,6 +78,35 @@ def test_messages_are_obeyed_while_there_is_one_publisher(ros, watched):
     rival_of(ros, "arm")
     ros.wait_until(lambda: node.count_publishers(topic) == 2, "the next one")
     ros.wait_until(lambda: watch.admits(topic), "it to be heard")
+
+
+def test_rivals_on_two_topics_at_once_are_both_told_by_their_first_message(ros, monkeypatch):
+    node = ros.add(Node("arm", context=ros.context, namespace="left"))
+    topics = ["command", "state"]
+    for topic in topics:
+        node.create_publisher(String, topic, 1)
+    watch = PublisherWatch(node, topics)
+    monkeypatch.setattr(publisher_watch, "time", SimpleNamespace(monotonic=lambda: 1000.0))
+    for topic in topics:
+        rival_of(ros, f"rival_{topic}", topic=topic)
+    for topic in topics:
+        ros.hears(f"/left/{topic}", 2)
+    assert [watch.admits(f"/left/{topic}") for topic in topics] == [False, False]
+
+
+def test_a_rival_that_follows_another_at_once_is_told_by_its_first_message(
+    ros, watched, monkeypatch
+):
+    node, watch, _ = watched
+    topic = "/left/command"
+    monkeypatch.setattr(publisher_watch, "time", SimpleNamespace(monotonic=lambda: 1000.0))
+    for name in ("first", "second"):
+        rival = rival_of(ros, name)
+        ros.hears(topic, 2)
+        assert not watch.admits(topic)
+        ros.stop(rival)
+        ros.wait_until(lambda: node.count_publishers(topic) == 1, "its end")
+        assert watch.admits(topic)
 
 
 def test_other_namespaces_and_topics_are_no_rivals(ros, watched):

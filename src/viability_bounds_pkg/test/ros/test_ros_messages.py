@@ -60,6 +60,16 @@ def test_what_other_joints_do_does_not_matter():
     holds(reader, [1.0, 2.0, 3.0], [4.0, 5.0, 6.0], 2 * SECOND)
 
 
+@pytest.mark.parametrize("stamp", [0, -1, -5 * SECOND])
+def test_a_stamp_of_zero_or_before_is_none(stamp):
+    warnings = []
+    reader = JointStateReader(JOINTS, warn=warnings.append)
+    assert reader.read(joint_state(JOINTS, stamp, Q, V), 10.0) is Verdict.REFUSED
+    assert reader.refused == {"no stamp": 1}
+    what = "zero" if stamp == 0 else "before zero"
+    assert warnings == [f"joint_states refused: no stamp: header.stamp is {what}"]
+
+
 @given(order=st.permutations(range(6)), data=st.data())
 def test_any_order_of_any_joints(order, data):
     names = [*JOINTS, "x", "y", "z"]

@@ -6,6 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterValue
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.parameter import Parameter
+from rosgraph_msgs.msg import Clock
 
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import (
@@ -181,6 +186,48 @@ def test_what_is_not_live_is_read_only(ros, name, value):
     node = start(ros)
     assert "read-only" in ros.refuses("tunable", **{name: value})
     assert node.changes == []
+
+
+def test_a_parameter_that_is_deleted_has_its_default_and_can_be_set_again(ros):
+    node = start(ros, gain=5.0)
+    (result,) = node.set_parameters([Parameter("gain", Parameter.Type.NOT_SET)])
+    assert result.successful
+    assert node.parameters.configuration.gain == 2.0
+    ros.accepts("tunable", gain=6.0)
+    assert node.parameters.configuration.gain == 6.0
+    assert "out of range" in ros.refuses("tunable", gain=-1.0)
+
+
+def test_a_parameter_of_no_type_is_refused_and_the_node_goes_on(ros):
+    start(ros)
+    strange = ParameterMessage(name="gain", value=ParameterValue(type=99))
+    request = SetParameters.Request(parameters=[strange])
+    (result,) = ros.call(SetParameters, "tunable/set_parameters", request).results
+    together = SetParametersAtomically.Request(parameters=[strange])
+    result_of_all = ros.call(
+        SetParametersAtomically, "tunable/set_parameters_atomically", together
+    ).result
+    for each in (result, result_of_all):
+        assert not each.successful
+        assert each.reason == "parameter 'gain' has a type of number 99; allowed: 0 to 9"
+    ros.accepts("tunable", gain=5.0)
+
+
+@pytest.mark.parametrize("later", [False, True])
+def test_a_time_before_zero_does_not_end_a_node(ros, later):
+    node = start(ros, use_sim_time=not later)
+    if later:
+        ros.accepts("tunable", use_sim_time=True)
+    clock = ros.talk(Clock, "/clock")
+    for sec in (-5, 7):
+        message = Clock()
+        message.clock.sec = sec
+        ros.wait_until(
+            lambda sec=sec: sec < 0 or node.get_clock().now().nanoseconds == sec * 10**9,
+            each=lambda message=message: clock.publish(message),
+        )
+        ros.run_for(0.1, each=lambda message=message: clock.publish(message))
+    assert node.get_clock().now().nanoseconds == 7 * 10**9
 
 
 def test_parameters_of_others_are_left_alone(ros):

@@ -13,7 +13,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from viability_bounds_pkg import baselines, viability
-from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError
 from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
 from viability_bounds_pkg.parameter import (
     NEGATIVE,
@@ -218,10 +218,17 @@ def make_bounds(
         try:
             return Bounds(config.loop.bounds(config.declared).bounds)
         except JointLimitsError as error:
-            raise refusal(config.loop, config.declared, error) from error
+            found = refusal(config.loop, config.declared, error)
+            raise found if isinstance(found, SettingError) else _too_long(config, found) from error
     own = {"influence": config.damper_influence, "gain": config.damper_gain}
     settings = own if config.method == "damper" else {}
     return Bounds(partial(BASELINES[config.method], limits=limits, dt=horizon, **settings))
+
+
+def _too_long(config: BoundsConfiguration, error: ArmSafetyError) -> SettingError:
+    """Return the error for a horizon that leaves a joint no bounds, whatever is declared."""
+    value, allowed = config.bounds_dt_factor, f"what leaves each joint bounds: {error}"
+    return SettingError("bounds_dt_factor", value, allowed)
 
 
 def _state_dependent(

@@ -3,14 +3,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, ClassVar
 
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.ros.claim import Claim
@@ -48,6 +52,7 @@ class ArmNode(Node):
     ) -> None:
         self.direct_delivery = direct_delivery
         self._claims: list[Claim] = []
+        self._told_of_clock = False
         try:
             # With the services that `rqt_logger_level` uses.
             super().__init__(self.NAME, enable_logger_service=True, **node_arguments)
@@ -55,6 +60,41 @@ class ArmNode(Node):
             raise RosArgumentError(str(error).rpartition(": ")[0]) from error
         except RCLError as error:  # of the middleware, such as security that it does not have
             raise RosArgumentError(" ".join(str(error).split(", at /")[0].split())) from error
+        self._guard()
+
+    def _guard(self) -> None:
+        """Refuse what ends a node inside of rclpy: times before 0, parameters of no type."""
+        source = self._time_source  # subscribes now, or when use_sim_time becomes true
+        take = source.clock_callback
+        source.clock_callback = partial(self._on_clock, take)
+        for subscription in self.subscriptions:
+            if subscription.callback == take:
+                subscription.callback = source.clock_callback
+        for service in self.services:
+            if service.srv_type in (SetParameters, SetParametersAtomically):
+                service.callback = partial(self._on_set_parameters, service.callback)
+
+    def _on_clock(self, take: Callable[[Any], None], message: Any) -> None:
+        if message.clock.sec >= 0:
+            take(message)
+        elif not self._told_of_clock:
+            self._told_of_clock = True
+            self.get_logger().warning(f"/clock refused: {message.clock.sec} s, before 0")
+
+    def _on_set_parameters(self, take: Callable[..., Any], request: Any, response: Any) -> Any:
+        types = {kind.value for kind in Parameter.Type}
+        strange = [each for each in request.parameters if each.value.type not in types]
+        if not strange:
+            return take(request, response)
+        refused = SetParametersResult(
+            reason=f"parameter '{strange[0].name}' has a type of number {strange[0].value.type}; "
+            f"allowed: 0 to {max(types)}"
+        )
+        if isinstance(response, SetParametersAtomically.Response):
+            response.result = refused
+        else:
+            response.results = [refused] * len(request.parameters)
+        return response
 
     @contextmanager
     def starting(self, *topics: Topic) -> Iterator[None]:

@@ -91,9 +91,11 @@ class JointStateReader:
     def read(self, message: JointState, now: float) -> Verdict:
         """Take a message that arrived at `now`, in s on the steady clock."""
         stamp = stamp_to_ns(message.header.stamp)
-        if stamp == 0:
-            # Later messages would have the same, and be taken for repeats of the first.
-            return self._refuse("no stamp", "header.stamp is zero")
+        if stamp <= 0:
+            # Later messages would have the same, and be taken for repeats of the first; below
+            # zero there are no times, only stamps that stand for none.
+            what = "zero" if stamp == 0 else "before zero"
+            return self._refuse("no stamp", f"header.stamp is {what}")
         restarted = now - self._accepted_at >= self._reset_after
         if stamp < self.stamp and not restarted:
             ago = 1e-9 * (self.stamp - stamp)

@@ -118,6 +118,10 @@ class NodeParameters(Generic[Configuration]):
         if not changed:
             return
         self._values |= changed
+        for row in parameter_table(self._kind):
+            if not self._node.has_parameter(row.name):  # `ros2 param delete` undeclares it
+                self._values[row.name] = _declare(self._node, row, ignore_override=True)
+                self._node.set_descriptor(row.name, describe(row))
         self.configuration = read(self._kind, self._values)
         if self._on_change is not None:
             self._on_change(self.configuration)
@@ -137,12 +141,12 @@ def _settle(node: Node, given: Mapping[str, Any], known: Sequence[str]) -> None:
 def _differs(read: Any, given: Any) -> bool:
     """Return whether rcl read another value; arrays come as its own types."""
     if isinstance(given, list):
-        read = read or ()
+        read = read if hasattr(read, "__len__") else ()
         return len(read) != len(given) or any(map(_differs, read, given))
     return type(read) is not type(given) or (read != given and given == given)
 
 
-def _declare(node: Node, row: Parameter) -> Any:
+def _declare(node: Node, row: Parameter, *, ignore_override: bool = False) -> Any:
     """Declare a parameter; return the value that it was given or its default.
 
     Its range follows when the value has been checked: rclpy's own check does not tell the value.
@@ -153,7 +157,8 @@ def _declare(node: Node, row: Parameter) -> Any:
     elif row.kind == list[float]:
         default = list(default)
     descriptor = ParameterDescriptor(dynamic_typing=True)
-    return node.declare_parameter(row.name, default, descriptor).value
+    declared = node.declare_parameter(row.name, default, descriptor, ignore_override)
+    return declared.value
 
 
 def describe(row: Parameter) -> ParameterDescriptor:

@@ -58,7 +58,7 @@ class PublisherWatch:
         # When a publisher without a name was first seen, and each of several, by its identity.
         self._nameless: dict[str, float] = {}
         self._seen: dict[str, dict[tuple[int, ...], float]] = {}
-        self._looked = -math.inf
+        self._looked: dict[str, float] = {}
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         node.create_timer(_PERIOD, self.look, clock=steady)
 
@@ -95,12 +95,13 @@ class PublisherWatch:
         with self._node.handle:
             count = self._node.handle.get_count_publishers(topic)
         if count <= 1:
+            self._looked.pop(topic, None)
             if topic in self.rivals:
                 self.look()
             return True
         now = time.monotonic()
-        if now - self._looked > _AGAIN:
-            self._looked = now
+        if now - self._looked.get(topic, -math.inf) > _AGAIN:
+            self._looked[topic] = now
             self._note(topic)
         return topic not in self.rivals and topic not in self._nameless
 

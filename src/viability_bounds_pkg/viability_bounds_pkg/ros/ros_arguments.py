@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from viability_bounds_pkg.exceptions import ArmSafetyError, did_you_mean
 from viability_bounds_pkg.user_input.known_names import graph_names
-from viability_bounds_pkg.user_input.parameter_files import check_list
+from viability_bounds_pkg.user_input.parameter_files import check_value
 from viability_bounds_pkg.user_input.yaml_file import load_yaml
 
 _WITH_VALUE = {
@@ -84,7 +84,7 @@ def check_ros_arguments(arguments: Sequence[str], environment: Mapping[str, str]
                     f"'-p {value}' has no value; an empty string is written \"{name}:=''\", "
                     "quotes included"
                 )
-            check_list(load_yaml(text, f"'-p {value}'"), f"parameter '{name}'")
+            check_value(load_yaml(text, f"'-p {value}'"), f"parameter '{name}'")
         elif flag == "-r":
             _check_remapping(value)
         elif flag == "--log-level":

@@ -60,7 +60,7 @@ def check_parameter_files(paths: Sequence[str]) -> None:
         for section, values in sections_of(content):
             _check_section(section, path)
             for name, value in values.items():
-                check_list(value, f"{path}: parameter '{name}'")
+                check_value(value, f"{path}: parameter '{name}'")
             if "robot_name" in values:
                 robots[str(values["robot_name"])] = path
     if len(robots) > 1:
@@ -94,12 +94,28 @@ def _check_section(section: str, path: str) -> None:
         raise ParameterFileError(f"{path}: section '{section}' is for no node{hint}")
 
 
-def check_list(value: Any, what: str) -> None:
-    """Raise `ParameterFileError`, naming `what`, for a list of several types: rcl reads none."""
+def check_value(value: Any, what: str) -> None:
+    """Raise `ParameterFileError`, naming `what`, for a value that rcl reads otherwise, or not."""
+    for item in value if isinstance(value, list) else [value]:
+        if isinstance(item, int) and not -(2**63) <= item < 2**63:
+            raise ParameterFileError(f"{what} is {_short(value)}; allowed: numbers of 64 bits")
+        if item is not value and item is None or not isinstance(item, _SCALARS):
+            raise ParameterFileError(
+                f"{what} is {_short(value)}; allowed: numbers, strings in quotes, true and false, "
+                "or a list of them"
+            )
     if isinstance(value, list) and len({type(item) for item in value}) > 1:
         only_numbers = {type(item) for item in value} == {int, float}
         allowed = "all with a decimal point, or none" if only_numbers else "items of one type"
         raise ParameterFileError(f"{what} is {value}; allowed: {allowed}")
+
+
+_SCALARS = bool | int | float | str | None
+
+
+def _short(value: Any) -> str:
+    text = str(value)
+    return text if len(text) < 80 else f"{text[:76]} ..."
 
 
 def node_parameters(paths: Sequence[Path], node: str) -> dict[str, Any]:

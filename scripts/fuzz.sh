@@ -1,0 +1,28 @@
+#!/usr/bin/env bash
+# SPDX-License-Identifier: Apache-2.0
+# Sends odd messages to the real nodes, starts programs with odd files, and checks the claims.
+set -eu
+usage() {
+    cat <<'USAGE'
+usage: bash scripts/fuzz.sh [--messages N] [--files N] [--seed N] [--out DIRECTORY] | --replay FILE
+
+  --messages   odd messages to the nodes, with parameters that change, nodes that go and come, time
+               that leaps, rivals; 200000 take about 20 min
+  --files      odd parameter files, scenarios and files of faults; 2000 take about 5 min
+  --seed       of the first part (default: 1); each part has the next number
+  --out        where cases that broke go (default: results/fuzz)
+  --replay     plays a case again that broke
+
+Exits with 0 when nothing broke, 1 when something did; then it says how to play it again. See
+docs/fuzzing.md.
+USAGE
+}
+case "${1:-}" in -h | --help) usage; exit 0 ;; esac
+root="$(cd "$(dirname "$0")/.." && pwd)"
+set +u
+# shellcheck disable=SC1091
+source "$root/scripts/setup.sh"
+set -u
+export ROS_DOMAIN_ID="${ROS_DOMAIN_ID:-$((1 + $$ % 100))}"
+export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
+exec python -W ignore "$root/test/fuzz.py" "$@"
