@@ -2,7 +2,8 @@
 """The torque added to the model's: integral action in one of its modes, and friction's.
 
 Modes are ``none``; ``joints``, every joint stiff, (3)-(14) of [Benallegue2021]; and ``task``,
-stiff in the task and free in its null space, (15)-(26). The torque stays continuous when mode or
+stiff in the task and free in its null space, (15)-(26), which is as printed where the anti-windup
+is. The torque stays continuous when mode or
 settings change, and when a state is missing or unusable. Friction is compensated beside it, with
 a budget of its own.
 """
@@ -21,12 +22,16 @@ from torque_safety_controller.integral_feedback.action import ArmTerms, Integral
 from torque_safety_controller.integral_feedback.feedback import IntegralFeedback
 from torque_safety_controller.integral_feedback.settings import IntegralSettings
 from torque_safety_controller.nullspace.compliance import NullspaceCompliance
+from torque_safety_controller.nullspace.printed import PrintedCompliance
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.compiled import compiled
 
 Array = NDArray[np.float64]
 
 MODES = ("none", "joints", "task")
+
+PRINTED = "task as printed"
+"""Key of the action of mode ``task`` with any anti-windup but ``qp``."""
 
 LONGEST_GAP = 2.5
 """Periods that a step may take, a missed deadline being 2; a longer gap is not integrated over."""
@@ -66,7 +71,7 @@ class AdditionalTorque:
         last: what the last step added, shape (n,), N m.
         integral: what of it is the integral action's, shape (n,), N m.
         skipped: steps that were not integrated over: time jumped, or the state did.
-        actions: the integral actions by mode.
+        actions: the integral actions by mode, and `PRINTED`.
         friction: the friction compensation.
     """
 
@@ -75,6 +80,7 @@ class AdditionalTorque:
         self.actions: dict[str, IntegralAction] = {"joints": IntegralFeedback(settings.integral)}
         if m < n:
             self.actions["task"] = NullspaceCompliance(settings.integral, m)
+            self.actions[PRINTED] = PrintedCompliance(settings.integral, m)
         self._no_friction = FrictionSettings(no_friction(n), np.zeros(n))
         self.friction = FrictionCompensation(settings.friction or self._no_friction)
         self.skipped = 0
@@ -207,16 +213,23 @@ class AdditionalTorque:
             gap = min(elapsed, LONGEST_GAP * robot.dt) if elapsed > 0.0 else 0.0
             self._fade(self._fading * math.exp(-gap / _FADING_TIME))
             torque = torque + self._fading
-        changed = self._mode != self._settings.mode
+        changed = self._mode != self._settings.mode or action is not self._chosen()
         if changed or self._integral_settings is not self._settings.integral:
             self._select_action()
             self._take_over(robot, v, torque, reset=changed)
         return torque
 
+    def _chosen(self) -> IntegralAction | None:
+        """Return the action that the settings ask for."""
+        mode = self._settings.mode
+        if mode == "task" and self._settings.integral.anti_windup != "qp":
+            mode = PRINTED
+        return self.actions.get(mode)
+
     def _select_action(self) -> None:
         """Let the mode and the settings that are set hold from now on."""
         self._mode, self._integral_settings = self._settings.mode, self._settings.integral
-        self._action = self.actions.get(self._mode)
+        self._action = self._chosen()
         for action in self.actions.values():
             action.settings = self._integral_settings
 

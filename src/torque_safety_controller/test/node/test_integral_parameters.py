@@ -124,6 +124,16 @@ TASK = {"mode": "task"}
         ),
         ({"integral_anti_windup": "paper"}, {"anti_windup": "paper"}, {}),
         (
+            {"integral_action": "task", "integral_anti_windup": "paper"},
+            TASK | {"anti_windup": "paper"},
+            TASK,
+        ),
+        (
+            {"integral_action": "task", "integral_leak": [0.1, 100.0, 0.5, 1.0]},
+            TASK | {"null_leak_rate": 1.0},
+            TASK,
+        ),
+        (
             {"integral_anti_windup": "none", "integral_budget": SMALL},
             SMALL_BUDGET | {"anti_windup": "none"},
             SMALL_BUDGET,
@@ -151,6 +161,7 @@ def test_parameters_change_while_it_runs_and_the_torque_goes_on(ros):
          {"slow_leak_rate": 1.0, "fast_leak_rate": 40.0}),
         ({"integral_leak": [1.0, 40.0, 0.2]}, {"mu": 0.2}),
         ({"integral_action": "task"}, {"mode": "task"}),
+        ({"integral_anti_windup": "scaling"}, {"anti_windup": "scaling"}),
         ({"integral_action": "none"}, {"mode": "none"}),
         ({"integral_action": "joints", "integral_anti_windup": "paper"},
          {"mode": "joints", "anti_windup": "paper"}),
@@ -191,7 +202,9 @@ BAD = [
     ("integral_leak", [0.1, 100.0, -0.01], ">= 0"),
     ("integral_leak", [0.1, 100.0, 1.01], "mu <= 1"),
     ("integral_leak", [0.1, 100.0, math.nan], ">= 0"),
-    ("integral_leak", [0.1, 100.0], "3 finite numbers"),
+    ("integral_leak", [0.1, 100.0], "3 or 4 finite numbers"),
+    ("integral_leak", [0.1, 100.0, 0.5, 0.05], "theta_null >= theta_s"),
+    ("integral_leak", [0.1, 100.0, 0.5, 9.0, 9.0], "3 or 4 finite numbers"),
     ("integral_anti_windup", "qp2", "one of none, scaling, paper, qp"),
 ]
 

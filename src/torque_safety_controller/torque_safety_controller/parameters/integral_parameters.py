@@ -50,17 +50,19 @@ class IntegralConfiguration:
         "gain, K = lambda diag(M), 1/s", above(0.0, 1e3), default=2.0, live=True
     )
     integral_leak: Array = numbers(
-        "leak rates theta_s and theta_f of the slow and the fast integrator, 1/s, and the share "
-        "mu of the fast one",
+        "leak rates theta_s and theta_f of the slow and the fast integrator, 1/s, the share mu of "
+        "the fast one, and, for task with qp, the leak rate theta_null in the null space, 1/s, "
+        "theta_f if left out",
         NOT_NEGATIVE,
-        length=3,
         default=(0.1, 100.0, 0.5),
         live=True,
-        note="[theta_s, theta_f, mu] with theta_f >= theta_s and mu <= 1",
+        note="[theta_s, theta_f, mu] or [theta_s, theta_f, mu, theta_null] with theta_f >= "
+        "theta_s, mu <= 1 and theta_null >= theta_s",
     )
     integral_anti_windup: str = text(
-        "for joints: qp limits the whole torque and the integrators; paper and scaling limit K s "
-        "only, by eq. (11) and (10) as printed; none limits nothing",
+        "qp limits the whole torque and the integrators; paper and scaling limit the torque of "
+        "the gains only, by eq. (11) and (10) as printed, none nothing: with these three the law "
+        "is as printed, task with (16), (21) and (26)",
         default="qp",
         live=True,
         choices=METHODS,
@@ -91,9 +93,11 @@ class IntegralConfiguration:
         budget = self.integral_budget if len(self.integral_budget) else BUDGET * tau_max
         if (budget > tau_max).any():
             raise SettingError("integral_budget", budget, "at most torque_max")
-        slow, fast, mu = self.integral_leak
-        if fast < slow or mu > 1.0:
-            allowed = "theta_f >= theta_s and mu <= 1"
+        if len(self.integral_leak) not in (3, 4):
+            raise SettingError("integral_leak", self.integral_leak, "3 or 4 finite numbers")
+        slow, fast, mu, *null = self.integral_leak.tolist()
+        if fast < slow or mu > 1.0 or min(null, default=slow) < slow:
+            allowed = "theta_f >= theta_s, mu <= 1 and theta_null >= theta_s"
             raise SettingError("integral_leak", self.integral_leak, allowed)
         return IntegralSettings(
             budget,
@@ -102,4 +106,5 @@ class IntegralConfiguration:
             fast_leak_rate=fast,
             mu=mu,
             anti_windup=self.integral_anti_windup,
+            null_leak_rate=null[0] if null else None,
         )
