@@ -14,12 +14,13 @@ from viability_bounds_pkg.exceptions import SettingError
 
 Array = NDArray[np.float64]
 
-METHODS = ("none", "scaling", "paper", "qp")
+METHODS = ("none", "scaling", "paper", "qp", "paper_mass")
 """Anti-windup: none, (10) or (11) as [Benallegue2021] prints them, that is for the torque of the
 gains only, with the integrators left alone and (13); or for the whole torque, integrators
-included. With the first three mode ``task`` is (16), (21) and (26) as printed."""
+included; or (11) as printed with K = lambda M for lambda diag(M), which is more than the clip of
+each joint. With all but ``qp`` mode ``task`` is (16), (21) and (26) as printed."""
 
-NONE, SCALING, PAPER, QP = range(len(METHODS))
+NONE, SCALING, PAPER, QP, PAPER_MASS = range(len(METHODS))
 
 WIDENING_TIME = 1.0
 """Time constant with which a budget widened by a handover returns to what it should be, s."""

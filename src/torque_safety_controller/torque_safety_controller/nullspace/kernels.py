@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from torque_safety_controller.anti_windup import clip, scale_factor
 from torque_safety_controller.integral_feedback.action import ArmTerms
+from torque_safety_controller.integral_feedback.gain_matrix import gain_matrix
 from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors
 from torque_safety_controller.integral_feedback.settings import WIDENING_TIME, Law
 from torque_safety_controller.linalg.generalized_inverse import (
@@ -187,8 +188,7 @@ def initial_memory(law: Law, arm: ArmTerms, J_plus: Array, torque: Array) -> Arr
     The task feels the force F = J^+^T torque. Where J a = y the slow torque is
     J^T ((1 - mu) J^+^T K J^+ y), which is J^T F for this y.
     """
-    K = law.gain * np.diag(arm.M)
-    B = (1.0 - law.mu) * (J_plus.T * K) @ J_plus
+    B = (1.0 - law.mu) * (J_plus.T @ gain_matrix(law, arm.M)) @ J_plus
     return J_plus @ (np.linalg.pinv(B, _SINGULAR) @ (J_plus.T @ torque))
 
 

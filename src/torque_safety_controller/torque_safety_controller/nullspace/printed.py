@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from torque_safety_controller.anti_windup import clip, project, scale_factor
 from torque_safety_controller.integral_feedback.action import ArmTerms, IntegralAction
+from torque_safety_controller.integral_feedback.gain_matrix import gain_torque
 from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors
 from torque_safety_controller.integral_feedback.settings import (
     NONE,
@@ -162,25 +163,24 @@ def step(
         fast_kept, _ = leak_factors(law.fast_leak_rate, dt, True)
         slow = slow_kept * memory.slow + a - memory.a
         fast = fast_kept * memory.fast + a - memory.a
-    K = law.gain * np.diag(M)
-    gain_torque = (1.0 - law.mu) * (J.T @ (J_plus.T @ (K * (J_plus @ (J @ slow)))))
-    gain_torque += law.mu * K * fast
+    stiff = gain_torque(law, M, J_plus @ (J @ slow))
+    u_K = (1.0 - law.mu) * (J.T @ (J_plus.T @ stiff)) + law.mu * gain_torque(law, M, fast)
     if initialise > 0.0:
-        widening = np.maximum(np.abs(gain_torque) - law.budget, 0.0)
+        widening = np.maximum(np.abs(u_K) - law.budget, 0.0)
     else:
         widening = math.exp(-dt / WIDENING_TIME) * memory.widening
     limit = law.budget + widening
     if law.method == NONE:
-        limited = gain_torque
+        limited = u_K
     elif law.method == SCALING:
-        limited = clip(scale_factor(gain_torque, limit) * gain_torque, limit)
+        limited = clip(scale_factor(u_K, limit) * u_K, limit)
     else:
-        limited = project(gain_torque, a, limit)
+        limited = project(u_K, a, limit)
     result = C @ a - M @ (J_plus @ (J_dot @ s) + J_plus_dot @ integral) + limited
     if not math.isfinite(result.sum() + a.sum() + integral.sum()):
         return False
     torque[:] = result
-    saturated[:] = (np.abs(gain_torque) > limit) & (law.method != NONE)
+    saturated[:] = (np.abs(u_K) > limit) & (law.method != NONE)
     memory.s[:] = s
     memory.integral[:] = integral
     memory.a[:] = a

@@ -59,8 +59,9 @@ class IntegralConfiguration:
     )
     integral_anti_windup: str = text(
         "qp limits the whole torque and the integrators; paper and scaling limit the torque of "
-        "the gains only, by eq. (11) and (10) as printed, none nothing: with these three the law "
-        "is as printed, task and position with (16), (21) and (26)",
+        "the gains only, by eq. (11) and (10) as printed, paper_mass by (11) with K = lambda M, "
+        "none nothing: with these four the law is as printed, task and position with (16), (21) "
+        "and (26)",
         default="qp",
         live=True,
         choices=METHODS,
