@@ -102,17 +102,17 @@ At the start, and at the largest pole force in each of three turns. Red: the ref
 
 [Benallegue2021]: references.md
 """
-FOUND = """With lambda = 2 1/s and the file's rotors null-space compliance has its effect where stiction
-is less than the budget, and none where it is more; the hand's error grows with stiction and falls
-with lambda. With larger lambda and the paper's budget the effect ends at less stiction: from 7.8%
-on a joint moves as far without it.
-HRP-5P has gears of 200 to 300 (the paper), TALOS here 100 to 160 (assumed in the file): with the
-same motors its rotors would count about four times as much, which makes the hand stiffer, as every
-gain acts on M. We know of no published friction of HRP-5P. A budget that is less than the stiction
-cannot start a joint, so that the paper's own budget says that stiction is below 10% of its torque
-limits; half the friction of the file, 6.5%, is plausible. With that the statements on pushes hold.
-The 2 cm among our poles do not: there lambda = 2 1/s is too slow, with half the friction and with
-four times the rotors, too; with 10 1/s they do."""
+FOUND = """With lambda = 2 1/s and the file's rotors null-space compliance has its effect where
+stiction is less than the budget, and none where it is more; the hand's error grows with stiction
+and falls with lambda. With larger lambda and the paper's budget the effect ends at less stiction:
+from 7.8% on a joint moves as far without it. HRP-5P has gears of 200 to 300 (the paper), TALOS
+here 100 to 160 (assumed in the file): with the same motors its rotors would count about four
+times as much, which makes the hand stiffer, as every gain acts on M. We know of no published
+friction of HRP-5P. A budget that is less than the stiction cannot start a joint, so that the
+paper's own budget says that stiction is below 10% of its torque limits; half the friction of the
+file, 6.5%, is plausible. With that the statements on pushes hold. The 2 cm among our poles do
+not: there lambda = 2 1/s is too slow, with half the friction and with four times the rotors, too;
+with 10 1/s they do."""
 
 
 def write_document(figures: list[Figure]) -> None:
