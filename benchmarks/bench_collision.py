@@ -90,7 +90,7 @@ class CollisionRobot:
             config.torque_max,
             config.gains,
             config.torque_rate_max,
-            AdditionalTorque(config.additional, config.integral.task_rows),
+            AdditionalTorque(config.additional),
             config.qp_solver,
             [] if collision is None else [collision],
         )

@@ -27,7 +27,6 @@ from torque_safety_controller.qp.daqp_solver import DaqpSolver
 from torque_safety_controller.qp.inverse_dynamics_qp import InverseDynamicsQP
 from torque_safety_controller.qp.proxqp_solver import ProxqpSolver
 from torque_safety_controller.qp.quadratic_program import QuadraticProgram, Solver, Status
-from torque_safety_controller.qp.terms import TaskTerm
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks.goals import Goals
 from torque_safety_controller.tasks.pose_task import PoseTask
@@ -53,20 +52,6 @@ REGULARISATION = 1e-8
 """What TSID adds to its Hessian; ours otherwise has 1e-6, relative to the largest weight."""
 
 
-class TsidPoseTask(PoseTask):
-    """The pose task that TSID has: the rotation apart, and the classical acceleration."""
-
-    def term(self, robot: RobotModel) -> TaskTerm:
-        """Return ``J a = kp error - kd J v - drift``."""
-        axes = robot.pose.rotation.T
-        rotation = pin.log3(axes @ self.pose_des.rotation)
-        error = np.r_[axes @ (self.pose_des.translation - robot.pose.translation), rotation]
-        velocity = robot.J @ robot.v
-        drift = robot.drift.copy()
-        drift[:3] += np.cross(velocity[3:], velocity[:3])
-        return TaskTerm(robot.J, self.kp * error - self.kd * velocity - drift, self.weight)
-
-
 class TsidGoals(Goals):
     """Goals whose tasks are those that TSID has."""
 
@@ -74,7 +59,9 @@ class TsidGoals(Goals):
         """Return the pose task and the posture task."""
         posture = gains.posture_kp, gains.posture_kd, gains.posture_weight
         return [
-            TsidPoseTask(self.pose_des, gains.pose_kp, gains.pose_kd, gains.pose_weight),
+            PoseTask(
+                self.pose_des, gains.pose_kp, gains.pose_kd, gains.pose_weight, separate=True
+            ),
             PostureTask(self.q_des, *posture),
         ]
 

@@ -263,7 +263,7 @@ def _rows(found: dict[tuple[str, str], dict[str, float]]) -> list[tuple[str, str
                 "null-space compliance",
                 f"with: {_told(with_it)}, {_forces(with_it)}; without: {_told(lacking)}, "
                 f"{_forces(lacking)}",
-                "agrees" if kept and lower else "DIFFERS",
+                "so with the file's values" if kept and lower else "DIFFERS",
             )
         )
     return rows

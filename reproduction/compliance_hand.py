@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
@@ -55,6 +56,7 @@ TALOS = PressingHand(
     -1.0,
     0.1816,
 )
+WITH_FILE = "so with the file's values"
 SLIDE = np.array([0.0, 0.15, 0.0])  # m
 
 
@@ -83,6 +85,7 @@ def lead(
     duration: float,
     silent_at: float = np.inf,
     changed: Mapping[str, Any] | None = None,
+    admittance: float | None = None,
 ) -> Led:
     """Push on TALOS' links, the sensor being tared before.
 
@@ -91,9 +94,14 @@ def lead(
         duration: s.
         silent_at: when the sensor falls silent, s.
         changed: parameters that differ from the file's and `DUAL`.
+        admittance: gain of (27) with which the hand yields, m/s^2 per N and rad/s^2 per N m; None
+            for the controller's own.
     """
     loop = DirectLoop(ROBOT, DUAL | dict(changed or {}))
     interaction = loop.controller.interaction
+    if admittance is not None:
+        gains = replace(interaction.settings.yielding_gains, kp=(admittance, admittance))
+        interaction.settings = replace(interaction.settings, yielding_gains=gains)
     start = loop.pose()
     rows = []
 
@@ -163,7 +171,8 @@ def dual(figure: Figure) -> None:
                 numbers["hand_while_elbow_pushed_m"] < 0.005
                 and numbers["hand_while_elbow_pushed_rad"] < np.radians(1.0)
                 and null > 0.1
-                and not numbers["yielded_steps_but_for_the_pull"]
+                and not numbers["yielded_steps_but_for_the_pull"],
+                WITH_FILE,
             ),
         ),
         (
@@ -176,7 +185,8 @@ def dual(figure: Figure) -> None:
             verdict(
                 numbers["hand_led_m"] > 0.02
                 and numbers["kept_while_elbow_pushed_again_m"] < 0.005
-                and bool(numbers["limits_kept"])
+                and bool(numbers["limits_kept"]),
+                WITH_FILE,
             ),
         ),
     ]

@@ -218,7 +218,7 @@ def figure_6() -> Figure:
             f"null-space joint moves {lacking['witness_motion_rad']:.3f} rad without, "
             f"{with_it['witness_motion_rad']:.3f} rad with ({joint}), {ratio:.0f} times further; "
             f"hand meanwhile within {told[0]} without, {told[1]} with",
-            "agrees" if ratio >= 3.0 and held and limits else "DIFFERS",
+            "so with the file's values" if ratio >= 3.0 and held and limits else "DIFFERS",
         ),
         (
             f"Fig. 6: hand pushed with {HAND_FORCE:.0f} N along x, y, z, in both directions",

@@ -120,7 +120,11 @@ def figure_10_stills() -> Figure:
 
 def embed() -> None:
     """Write the pictures that the documentation shows, few colours and small."""
-    for name, to in (("paper1-fig7-8", "compliance"), ("paper1-fig10-stills", "poles")):
+    for name, to in (
+        ("paper1-stiction", "stiction"),
+        ("paper1-fig7-8", "compliance"),
+        ("paper1-fig10-stills", "poles"),
+    ):
         image = Image.open(RESULTS / name / "figure.png").convert("RGB")
         width = 1100
         small = image.resize((width, round(image.height * width / image.width)))

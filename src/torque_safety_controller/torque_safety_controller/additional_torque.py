@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """The torque added to the model's: integral action in one of its modes, and friction's.
 
-Modes are ``none``; ``joints``, every joint stiff, (3)-(14) of [Benallegue2021]; and ``task``,
-stiff in the task and free in its null space, (15)-(26). The torque stays continuous when mode or
-settings change, and when a state is missing or unusable. Friction is compensated beside it, with
-a budget of its own.
+Modes are ``none``; ``joints``, every joint stiff, (3)-(14) of [Benallegue2021]; and ``task`` and
+``position``, the end effector's pose or position stiff and its null space free, (15)-(26), which
+are as printed where the anti-windup is. The torque stays continuous when mode or settings change,
+and when a state is missing or unusable. Friction is compensated beside it, with a budget of its
+own.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,12 +23,19 @@ from torque_safety_controller.integral_feedback.action import ArmTerms, Integral
 from torque_safety_controller.integral_feedback.feedback import IntegralFeedback
 from torque_safety_controller.integral_feedback.settings import IntegralSettings
 from torque_safety_controller.nullspace.compliance import NullspaceCompliance
+from torque_safety_controller.nullspace.printed import PrintedCompliance
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.compiled import compiled
 
 Array = NDArray[np.float64]
 
-MODES = ("none", "joints", "task")
+TASKS = {"task": slice(0, 6), "position": slice(0, 3)}
+"""Rows of the pose's Jacobian that are stiff in each mode that has a null space."""
+
+MODES = ("none", "joints", *TASKS)
+
+PRINTED = "{} as printed"
+"""Key of the action of a mode of `TASKS` with any anti-windup but ``qp``."""
 
 LONGEST_GAP = 2.5
 """Periods that a step may take, a missed deadline being 2; a longer gap is not integrated over."""
@@ -59,26 +68,31 @@ class AdditionalTorque:
 
     Args:
         settings: may be replaced between steps: the torque does not jump.
-        rows: which rows of the pose's Jacobian are the task of mode ``task``; without a null
-            space left of them there is no such mode.
+        tasks: rows of the pose's Jacobian by mode; without a null space left of them there is no
+            such mode.
 
     Attributes:
         last: what the last step added, shape (n,), N m.
         integral: what of it is the integral action's, shape (n,), N m.
         skipped: steps that were not integrated over: time jumped, or the state did.
-        actions: the integral actions by mode.
+        actions: the integral actions by mode, and `PRINTED`.
         friction: the friction compensation.
     """
 
-    def __init__(self, settings: AdditionalSettings, rows: slice = slice(0, 6)) -> None:
-        n, m = len(settings.integral.budget), rows.stop - rows.start
+    def __init__(
+        self, settings: AdditionalSettings, tasks: Mapping[str, slice] | None = None
+    ) -> None:
+        n = len(settings.integral.budget)
+        self._tasks = TASKS if tasks is None else tasks
         self.actions: dict[str, IntegralAction] = {"joints": IntegralFeedback(settings.integral)}
-        if m < n:
-            self.actions["task"] = NullspaceCompliance(settings.integral, m)
+        for mode, rows in self._tasks.items():
+            m = rows.stop - rows.start
+            if m < n:
+                self.actions[mode] = NullspaceCompliance(settings.integral, m)
+                self.actions[PRINTED.format(mode)] = PrintedCompliance(settings.integral, m)
         self._no_friction = FrictionSettings(no_friction(n), np.zeros(n))
         self.friction = FrictionCompensation(settings.friction or self._no_friction)
         self.skipped = 0
-        self._rows = rows
         self._zero = np.zeros(n)
         self._settings = settings
         self.reset()
@@ -207,16 +221,23 @@ class AdditionalTorque:
             gap = min(elapsed, LONGEST_GAP * robot.dt) if elapsed > 0.0 else 0.0
             self._fade(self._fading * math.exp(-gap / _FADING_TIME))
             torque = torque + self._fading
-        changed = self._mode != self._settings.mode
+        changed = self._mode != self._settings.mode or action is not self._chosen()
         if changed or self._integral_settings is not self._settings.integral:
             self._select_action()
             self._take_over(robot, v, torque, reset=changed)
         return torque
 
+    def _chosen(self) -> IntegralAction | None:
+        """Return the action that the settings ask for."""
+        mode = self._settings.mode
+        if mode in self._tasks and self._settings.integral.anti_windup != "qp":
+            mode = PRINTED.format(mode)
+        return self.actions.get(mode)
+
     def _select_action(self) -> None:
         """Let the mode and the settings that are set hold from now on."""
         self._mode, self._integral_settings = self._settings.mode, self._settings.integral
-        self._action = self.actions.get(self._mode)
+        self._action = self._chosen()
         for action in self.actions.values():
             action.settings = self._integral_settings
 
@@ -242,7 +263,8 @@ class AdditionalTorque:
 
     def _arm(self, robot: RobotModel, v: Array) -> ArmTerms:
         """Return what the actions need to know of the arm."""
-        return ArmTerms(robot.M, robot.C, robot.J[self._rows], robot.J_dot[self._rows], v)
+        rows = self._tasks.get(self._mode, slice(0, 6))
+        return ArmTerms(robot.M, robot.C, robot.J[rows], robot.J_dot[rows], v)
 
     def _fade(self, torque: Array) -> None:
         self._fading = torque

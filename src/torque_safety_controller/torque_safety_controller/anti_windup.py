@@ -21,6 +21,8 @@ from viability_bounds_pkg.compiled import compiled
 
 Array = NDArray[np.float64]
 
+_TINY = 1e-300  # for 0, so that it can be divided by
+
 
 def scale_to_limits(u: ArrayLike, u_max: ArrayLike) -> Array:
     """Return ``lambda_w u``, shape (n,), N m: eq. (10), [Benallegue2021].
@@ -61,14 +63,19 @@ def project_to_limits(u: ArrayLike, s: ArrayLike, u_max: ArrayLike) -> Array:
         ValueError: wrong shapes, u or s not finite, or limits negative or NaN.
     """
     u, s, u_max = _checked(u_max, u=u, s=s)
+    return project(u, s, u_max)
+
+
+@compiled
+def project(u: Array, s: Array, u_max: Array) -> Array:
+    """Solve the QP of eq. (11); see `project_to_limits`, which checks the arguments first."""
     # Scaled to about 1, products of very large or small numbers stay numbers.
-    unit = np.abs(u).max() or 1.0
+    unit = max(np.abs(u).max(), _TINY)
     s = np.where(u_max > 0.0, s, 0.0)  # it has no say where x is 0
-    s = s / (np.abs(s).max() or 1.0)
-    with np.errstate(over="ignore"):
-        u, limits = u / unit, u_max / unit
+    s = s / max(np.abs(s).max(), _TINY)
+    u, limits = u / unit, u_max / unit
     x = nearest_dissipating(u, s, limits, scale_factor(u, limits) * float(s @ u))
-    return np.clip(unit * x, -u_max, u_max)
+    return clip(unit * x, u_max)
 
 
 @compiled

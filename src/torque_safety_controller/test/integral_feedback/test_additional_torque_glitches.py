@@ -25,6 +25,7 @@ from integral_loop import (
 
 from torque_safety_controller.additional_torque import (
     MODES,
+    TASKS,
     AdditionalTorque,
 )
 from viability_bounds_pkg.state import State
@@ -227,7 +228,7 @@ STEPS = st.lists(
 def test_it_is_finite_and_never_raises(first, steps):
     robot = ARM.robot(DT)
     robot.rates = True
-    additional = AdditionalTorque(make_settings(first), POSITION)
+    additional = AdditionalTorque(make_settings(first), TASKS | {"task": POSITION})
     with np.errstate(all="ignore"):
         for q, v, a, elapsed, mode, theta in steps:
             if mode is not None:

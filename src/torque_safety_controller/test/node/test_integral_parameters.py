@@ -45,9 +45,9 @@ DEFAULT = {"budget": 0.1 * ARM.tau_max}
 """Of the settings, where it is not that of the classes."""
 
 
-def core(mode="joints", rows=slice(0, 6), **changed) -> Controller:
+def core(mode="joints", **changed) -> Controller:
     """The node's core, set up by hand; also says what its defaults are."""
-    additional = AdditionalTorque(make_settings(mode, **changed), rows)
+    additional = AdditionalTorque(make_settings(mode, **changed))
     controller = Controller(ARM.robot(), ARM.tau_max, GAINS, additional=additional)
     controller.reset(Q)
     return controller
@@ -95,11 +95,7 @@ TASK = {"mode": "task"}
         ({}, {}, {"mode": "none"}),
         ({"integral_action": "none"}, {"mode": "none"}, {}),
         ({"integral_action": "task"}, TASK, {}),
-        (
-            {"integral_action": "task", "integral_task": "position"},
-            TASK | {"rows": slice(0, 3)},
-            TASK,
-        ),
+        ({"integral_action": "position"}, {"mode": "position"}, TASK),
         ({"integral_budget": SMALL}, SMALL_BUDGET, {}),
         ({"integral_lambda": 8.0}, {"gain": 8.0}, {}),
         ({"integral_leak": [20.0, 100.0, 0.5]}, {"slow_leak_rate": 20.0}, {}),
@@ -111,6 +107,16 @@ TASK = {"mode": "task"}
             SMALL_BUDGET,
         ),
         ({"integral_anti_windup": "paper"}, {"anti_windup": "paper"}, {}),
+        (
+            {"integral_action": "task", "integral_anti_windup": "paper"},
+            TASK | {"anti_windup": "paper"},
+            TASK,
+        ),
+        (
+            {"integral_action": "task", "integral_leak": [0.1, 100.0, 0.5, 1.0]},
+            TASK | {"null_leak_rate": 1.0},
+            TASK,
+        ),
         (
             {"integral_anti_windup": "none", "integral_budget": SMALL},
             SMALL_BUDGET | {"anti_windup": "none"},
@@ -139,6 +145,8 @@ def test_parameters_change_while_it_runs_and_the_torque_goes_on(ros):
          {"slow_leak_rate": 1.0, "fast_leak_rate": 40.0}),
         ({"integral_leak": [1.0, 40.0, 0.2]}, {"mu": 0.2}),
         ({"integral_action": "task"}, {"mode": "task"}),
+        ({"integral_anti_windup": "scaling"}, {"anti_windup": "scaling"}),
+        ({"integral_action": "position"}, {"mode": "position"}),
         ({"integral_action": "none"}, {"mode": "none"}),
         ({"integral_action": "joints", "integral_anti_windup": "paper"},
          {"mode": "joints", "anti_windup": "paper"}),
@@ -160,8 +168,8 @@ def test_parameters_change_while_it_runs_and_the_torque_goes_on(ros):
 
 
 BAD = [
-    ("integral_action", "plain", "one of none, joints, task"),
-    ("integral_action", "", "one of none, joints, task"),
+    ("integral_action", "plain", "one of none, joints, task, position"),
+    ("integral_action", "", "one of none, joints, task, position"),
     ("integral_budget", [1.0], "7 numbers"),
     ("integral_budget", [-1.0, *ARM.tau_max[1:]], ">= 0"),
     ("integral_budget", [math.nan, *ARM.tau_max[1:]], "finite"),
@@ -179,7 +187,9 @@ BAD = [
     ("integral_leak", [0.1, 100.0, -0.01], ">= 0"),
     ("integral_leak", [0.1, 100.0, 1.01], "mu <= 1"),
     ("integral_leak", [0.1, 100.0, math.nan], ">= 0"),
-    ("integral_leak", [0.1, 100.0], "3 finite numbers"),
+    ("integral_leak", [0.1, 100.0], "3 or 4 finite numbers"),
+    ("integral_leak", [0.1, 100.0, 0.5, 0.05], "theta_null >= theta_s"),
+    ("integral_leak", [0.1, 100.0, 0.5, 9.0, 9.0], "3 or 4 finite numbers"),
     ("integral_anti_windup", "qp2", "one of none, scaling, paper, qp"),
 ]
 
@@ -206,13 +216,6 @@ def test_bad_parameters_are_refused_live_and_the_old_ones_stay(ros):
     )
 
 
-def test_the_task_is_read_only_and_known(ros):
-    with pytest.raises(SettingError, match="'integral_task' is 'elbow'; allowed: one of pose"):
-        ros.start(ControllerNode, VALUES | {"integral_task": "elbow"})
-    IntegralChain(ros)
-    assert "read-only" in ros.refuses(NODE, integral_task="position")
-
-
 def six_joints() -> dict:
     cut = {k: v[:6] for k, v in VALUES.items() if isinstance(v, list) and len(v) == N}
     return VALUES | cut | {"end_effector_frame": "panda_link6"}
@@ -232,7 +235,7 @@ def test_six_joints_have_no_null_space_of_a_pose(ros):
 
 
 def test_six_joints_have_a_null_space_of_a_position(ros):
-    values = six_joints() | {"integral_action": "task", "integral_task": "position"}
+    values = six_joints() | {"integral_action": "position"}
     ros.start(ControllerNode, values)
     ros.accepts(NODE, integral_action="joints")
 

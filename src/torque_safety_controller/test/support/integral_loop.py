@@ -8,6 +8,7 @@ import numpy as np
 from arms import load_arm
 
 from torque_safety_controller.additional_torque import (
+    TASKS,
     AdditionalSettings,
     AdditionalTorque,
 )
@@ -36,7 +37,7 @@ class IntegralLoop:
     def __init__(self, mode="joints", rows=POSITION, **changed) -> None:
         self.robot = ARM.robot(DT)
         self.robot.rates = True
-        self.additional = AdditionalTorque(make_settings(mode, **changed), rows)
+        self.additional = AdditionalTorque(make_settings(mode, **changed), TASKS | {"task": rows})
         self.q, self.v, self.a = ARM.q_start.copy(), REST, REST
         self.torques = [REST]
 

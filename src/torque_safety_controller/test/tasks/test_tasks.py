@@ -90,6 +90,74 @@ def test_the_pose_task_makes_the_error_a_damped_spring(arm):
         assert weight == WEIGHT
 
 
+def goal_at(goal, motion, t):
+    """Where a goal is that moves so now, to second order."""
+    return goal * pin.exp6(t * motion.twist + 0.5 * t * t * motion.twist_rate)
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_with_errors_apart_position_and_orientation_are_springs_by_themselves(arm, moving):
+    """(7), (8) in the axes of the root; all derivatives by differences along the motion."""
+    rng = np.random.default_rng(7)
+    h = 1e-4  # s
+    for _ in range(5):
+        q, v = arm.random_state(rng)
+        robot = updated(arm, q, v)
+        goal = robot.pose * pin.exp6(0.5 * rng.normal(size=6))  # far, in every direction
+        motion = PoseMotion(*(rng.normal(size=(2, 6)) if moving else np.zeros((2, 6))))
+        given = motion if moving else None
+        term = PoseTask(goal, KP, KD, WEIGHT, given, separate=True).term(robot)
+        a = np.linalg.pinv(term.A) @ term.b
+        hand = [updated(arm, q + t * v + 0.5 * t * t * a, v).pose for t in (-h, 0.0, h)]
+        goals = [goal_at(goal, motion, t) for t in (-h, 0.0, h)]
+
+        def rates(poses):
+            p = [pose.translation for pose in poses]
+            turns = [
+                pin.log3(x.rotation @ y.rotation.T) for x, y in zip(poses[1:], poses, strict=False)
+            ]
+            return (
+                (p[2] - p[0]) / (2 * h),
+                (p[2] - 2 * p[1] + p[0]) / h**2,
+                (turns[0] + turns[1]) / (2 * h),
+                (turns[1] - turns[0]) / h**2,
+            )
+
+        velocity, acceleration, turning, turning_rate = rates(hand)
+        velocity_des, acceleration_des, turning_des, turning_rate_des = rates(goals)
+        there, here = goals[1], hand[1]
+        wanted = acceleration_des + KP * (there.translation - here.translation)
+        wanted += KD * (velocity_des - velocity)
+        np.testing.assert_allclose(acceleration, wanted, atol=2e-3 * np.abs(wanted).max())
+        wanted = turning_rate_des + KP * pin.log3(there.rotation @ here.rotation.T)
+        wanted += KD * (turning_des - turning)
+        np.testing.assert_allclose(turning_rate, wanted, atol=2e-3 * np.abs(wanted).max())
+
+
+def test_with_errors_apart_the_hand_goes_straight(arm):
+    """To a goal 0.3 m and 90 degrees away; the screw of the logarithm leaves the line."""
+    off = {}
+    for separate in (True, False):
+        q, v, dt = arm.q_start.copy(), np.zeros(arm.n), 2e-3
+        start = updated(arm, q, v).pose.copy()
+        goal = pin.SE3(
+            start.rotation @ pin.exp3(np.array([0.0, 0.0, math.pi / 2.0])),
+            start.translation + np.array([-0.05, 0.0, -0.05]),
+        )
+        line = goal.translation - start.translation
+        along = line / np.linalg.norm(line)
+        off[separate] = 0.0
+        for _ in range(500):
+            robot = updated(arm, q, v)
+            way = robot.pose.translation - start.translation
+            off[separate] = max(off[separate], np.linalg.norm(way - along * (along @ way)))
+            term = PoseTask(goal, KP, critical_damping(KP), 1.0, separate=separate).term(robot)
+            a = np.linalg.pinv(term.A) @ term.b
+            q, v = q + dt * v + 0.5 * dt * dt * a, v + dt * a
+    assert off[True] < 2e-3  # m
+    assert off[False] > 5.0 * off[True]
+
+
 def test_a_pose_task_at_rest_pulls_with_its_stiffness(arm):
     robot = updated(arm, arm.q_start, np.zeros(arm.n))
     goal = robot.pose * pin.exp6(0.1 * np.arange(6.0))

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torque_safety_controller.integral_feedback.action import ArmTerms, IntegralAction
+from torque_safety_controller.integral_feedback.gain_matrix import gain_matrix
 from torque_safety_controller.integral_feedback.kernels import Memory, evaluate, step
 from torque_safety_controller.integral_feedback.leaky_integrator import mix
 from torque_safety_controller.integral_feedback.settings import QP, IntegralSettings, Law
@@ -95,19 +96,19 @@ class IntegralFeedback(IntegralAction):
                 cannot be inverted.
         """
         mu, memory = self._law.mu, self.memory
-        K = self._law.gain * np.diagonal(arm.M)
+        K = gain_matrix(self._law, np.ascontiguousarray(arm.M))
         try:
-            s = np.linalg.solve(arm.C + np.diag(K), torque)
+            s = np.linalg.solve(arm.C + K, torque)
         except np.linalg.LinAlgError:
             s = np.full_like(torque, np.nan)
         # A NaN is not of sensible size.
-        if not np.abs(K * s).max() <= _AMPLIFIED * np.abs(torque).max():
+        if not np.abs(K @ s).max() <= _AMPLIFIED * np.abs(torque).max():
             raise InitialisationError("the arm moves too fast: C + K cannot be inverted")
         if mu < 1.0:
             memory.slow[:] = (s - mu * memory.fast) / (1.0 - mu)
         else:
             memory.fast[:] = s
-        limited = torque if self._law.method == QP else K * s
+        limited = torque if self._law.method == QP else K @ s
         memory.widening[:] = np.maximum(np.abs(limited) - self._law.budget, 0.0)
         self._take(arm.M, arm.C, arm.v, arm.v)
         self.leak = self._evaluate()

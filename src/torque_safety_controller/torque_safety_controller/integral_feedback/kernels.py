@@ -9,10 +9,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torque_safety_controller.anti_windup import clip, nearest_dissipating, scale_factor
+from torque_safety_controller.anti_windup import (
+    clip,
+    nearest_dissipating,
+    project,
+    scale_factor,
+)
+from torque_safety_controller.integral_feedback.gain_matrix import gain_torque
 from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors, mix
 from torque_safety_controller.integral_feedback.settings import (
     NONE,
+    PAPER_MASS,
     QP,
     SCALING,
     WIDENING_TIME,
@@ -103,10 +110,9 @@ def evaluate(
     Returns:
         Rate at which s must be forgotten, on top of both leak rates, to stay passive, 1/s.
     """
-    K = law.gain * np.diag(M)
     limit = law.budget + memory.widening
     s = mix(memory.fast, memory.slow, law.mu)
-    Cs, Ks = C @ s, K * s
+    Cs, Ks = C @ s, gain_torque(law, M, s)
     u = Cs + Ks
     if not (np.isfinite(Ks).all() and np.isfinite(u).all()):
         # Beyond floating-point numbers: forget it all.
@@ -122,11 +128,12 @@ def evaluate(
         torque[:] = Cs + clip(scale_factor(Ks, limit) * Ks, limit)
         return 0.0
     if law.method != QP:
-        torque[:] = Cs + clip(Ks, limit)  # K is diagonal: this is (11)
+        torque[:] = Cs + (project(Ks, s, limit) if law.method == PAPER_MASS else clip(Ks, limit))
         return 0.0
-    _shrink(memory, law.mu, s, u - clip(u, limit), K + np.maximum(np.diag(C), 0.0))
+    own = law.gain * np.diag(M) + np.maximum(np.diag(C), 0.0)
+    _shrink(memory, law.mu, s, u - clip(u, limit), own)
     s = mix(memory.fast, memory.slow, law.mu)
-    Cs, Ks = C @ s, K * s
+    Cs, Ks = C @ s, gain_torque(law, M, s)
     return nearest_with_leak(M, s, Cs + Ks, limit, Cs + clip(Ks, limit), torque)
 
 

@@ -14,11 +14,13 @@ from viability_bounds_pkg.exceptions import SettingError
 
 Array = NDArray[np.float64]
 
-METHODS = ("none", "scaling", "paper", "qp")
-"""Anti-windup of the joints: none; (10) or (11) as [Benallegue2021] prints them, that is for K s
-only, with the integrators left alone and (13); or for the whole torque, integrators included."""
+METHODS = ("none", "scaling", "paper", "qp", "paper_mass")
+"""Anti-windup: none, (10) or (11) as [Benallegue2021] prints them, that is for the torque of the
+gains only, with the integrators left alone and (13); or for the whole torque, integrators
+included; or (11) as printed with K = lambda M for lambda diag(M), which is more than the clip of
+each joint. With all but ``qp`` mode ``task`` is (16), (21) and (26) as printed."""
 
-NONE, SCALING, PAPER, QP = range(len(METHODS))
+NONE, SCALING, PAPER, QP, PAPER_MASS = range(len(METHODS))
 
 WIDENING_TIME = 1.0
 """Time constant with which a budget widened by a handover returns to what it should be, s."""
@@ -33,6 +35,7 @@ class Law(NamedTuple):
     fast_leak_rate: float
     mu: float
     method: int
+    null_leak_rate: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +49,9 @@ class IntegralSettings:
         slow_leak_rate: theta_s, 1/s, >= 0; 0 never forgets.
         fast_leak_rate: theta_f, 1/s, >= theta_s.
         mu: weight of the fast integrator, 0 to 1, eq. (14).
-        anti_windup: one of `METHODS`; `NullspaceCompliance` has its own, whatever this is.
+        anti_windup: one of `METHODS`.
+        null_leak_rate: theta_null, with which `NullspaceCompliance` forgets what is in the null
+            space, 1/s, >= theta_s; None for theta_f.
 
     Raises:
         SettingError: a value is out of range.
@@ -58,6 +63,7 @@ class IntegralSettings:
     fast_leak_rate: float = 100.0
     mu: float = 0.5
     anti_windup: str = "qp"
+    null_leak_rate: float | None = None
 
     def __post_init__(self) -> None:
         budget = np.array(self.budget, dtype=np.float64)
@@ -72,6 +78,9 @@ class IntegralSettings:
             raise SettingError("slow_leak_rate", slow, "a finite number >= 0")
         if not (math.isfinite(fast) and fast >= slow):
             raise SettingError("fast_leak_rate", fast, f"a finite number >= the slow one, {slow}")
+        null = self.null_leak_rate
+        if null is not None and not (math.isfinite(null) and null >= slow):
+            raise SettingError("null_leak_rate", null, f"a finite number >= the slow one, {slow}")
         if not 0.0 <= self.mu <= 1.0:
             raise SettingError("mu", self.mu, "a number from 0 to 1")
         if self.anti_windup not in METHODS:
@@ -87,6 +96,7 @@ class IntegralSettings:
             float(self.fast_leak_rate),
             float(self.mu),
             METHODS.index(self.anti_windup),
+            float(self.fast_leak_rate if self.null_leak_rate is None else self.null_leak_rate),
         )
 
     def same_as(self, other: IntegralSettings) -> bool:

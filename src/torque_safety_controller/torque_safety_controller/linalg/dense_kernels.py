@@ -42,6 +42,20 @@ def spring_damper(J: Array, v: Array, error: Array, drift: Array, kp: float, kd:
 
 
 @compiled
+def apart(b: Array, twist: Array) -> Array:
+    """Return `b`, accelerations less J'v, with the hand's origin accelerated for its twist's.
+
+    The linear rows of J a + J'v are the rate of the velocity in axes that turn with w; the origin
+    accelerates by w x v more. Shape (6,), linear first, both in the hand's axes.
+    """
+    result = b.copy()
+    result[0] -= twist[4] * twist[2] - twist[5] * twist[1]
+    result[1] -= twist[5] * twist[0] - twist[3] * twist[2]
+    result[2] -= twist[3] * twist[1] - twist[4] * twist[0]
+    return result
+
+
+@compiled
 def null_space_spring_damper(
     J: Array, q_des: Array, q: Array, v: Array, kp: float, kd: float, regularisation: float
 ) -> Array:

@@ -63,7 +63,7 @@ def make_controller(
         config.torque_max,
         config.gains,
         config.torque_rate_max,
-        AdditionalTorque(config.additional, config.integral.task_rows),
+        AdditionalTorque(config.additional),
         config.qp_solver,
         [] if collision is None else [collision],
         make_interaction(config, robot, urdf),

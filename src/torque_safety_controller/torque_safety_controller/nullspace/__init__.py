@@ -2,5 +2,6 @@
 """Null-space compliance: stiff in a task, free in its null space."""
 
 from torque_safety_controller.nullspace.compliance import NullspaceCompliance
+from torque_safety_controller.nullspace.printed import PrintedCompliance
 
-__all__ = ["NullspaceCompliance"]
+__all__ = ["NullspaceCompliance", "PrintedCompliance"]

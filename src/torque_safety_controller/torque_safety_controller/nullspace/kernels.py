@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from torque_safety_controller.anti_windup import clip, scale_factor
 from torque_safety_controller.integral_feedback.action import ArmTerms
+from torque_safety_controller.integral_feedback.gain_matrix import gain_matrix
 from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors
 from torque_safety_controller.integral_feedback.settings import WIDENING_TIME, Law
 from torque_safety_controller.linalg.generalized_inverse import (
@@ -88,7 +89,7 @@ def step(
     J_plus, J_plus_dot, _ = dynamically_consistent_inverse(J, J_dot, M, C + C.T, THRESHOLD)
     root_M = np.sqrt(np.diag(M))
     if initialise > 0.0:
-        a = _initial_memory(law, arm, J_plus, torque)
+        a = initial_memory(law, arm, J_plus, torque)
         x = a if law.fast_leak_rate > law.slow_leak_rate else np.zeros_like(a)
         widening = np.maximum(np.abs(torque) - law.budget, 0.0)
     else:
@@ -176,20 +177,18 @@ def _advance(
     a = s - J_plus @ integral
     # The fast memory takes fast_gain of what a gained, of which slow_gain is seen.
     x = (1.0 - ratio) * a + (ratio * slow - fast) * memory.a + fast * memory.root / root_M
-    # The null space forgets at the fast rate.
-    forgotten = -math.expm1((law.slow_leak_rate - law.fast_leak_rate) * dt)
+    forgotten = -math.expm1((law.slow_leak_rate - law.null_leak_rate) * dt)  # in the null space
     return a - forgotten * (a - J_plus @ (arm.J @ a)), x
 
 
 @compiled
-def _initial_memory(law: Law, arm: ArmTerms, J_plus: Array, torque: Array) -> Array:
+def initial_memory(law: Law, arm: ArmTerms, J_plus: Array, torque: Array) -> Array:
     """Return the a whose slow memory gives what the task feels of `torque`.
 
     The task feels the force F = J^+^T torque. Where J a = y the slow torque is
     J^T ((1 - mu) J^+^T K J^+ y), which is J^T F for this y.
     """
-    K = law.gain * np.diag(arm.M)
-    B = (1.0 - law.mu) * (J_plus.T * K) @ J_plus
+    B = (1.0 - law.mu) * (J_plus.T @ gain_matrix(law, arm.M)) @ J_plus
     return J_plus @ (np.linalg.pinv(B, _SINGULAR) @ (J_plus.T @ torque))
 
 

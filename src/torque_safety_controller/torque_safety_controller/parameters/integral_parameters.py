@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from torque_safety_controller.additional_torque import MODES
+from torque_safety_controller.additional_torque import MODES, TASKS
 from torque_safety_controller.integral_feedback.settings import METHODS, IntegralSettings
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import (
@@ -25,16 +25,14 @@ Array = NDArray[np.float64]
 BUDGET = 0.1
 """Default budget in torque limits: the paper's tau_m."""
 
-TASKS = {"pose": slice(0, 6), "position": slice(0, 3)}
-"""Rows of the pose's Jacobian that are a task of integral action ``task``."""
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class IntegralConfiguration:
     """Parameters of the integral action."""
 
     integral_action: str = text(
-        "none; joints: all joints stiff; task: the task stiff and its null space compliant",
+        "none; joints: all joints stiff; task, position: the end effector's pose, or its "
+        "position, stiff and the null space compliant",
         default="none",
         live=True,
         choices=MODES,
@@ -50,29 +48,24 @@ class IntegralConfiguration:
         "gain, K = lambda diag(M), 1/s", above(0.0, 1e3), default=2.0, live=True
     )
     integral_leak: Array = numbers(
-        "leak rates theta_s and theta_f of the slow and the fast integrator, 1/s, and the share "
-        "mu of the fast one",
+        "leak rates theta_s and theta_f of the slow and the fast integrator, 1/s, the share mu of "
+        "the fast one, and, for task or position with qp, the leak rate theta_null in the null "
+        "space, 1/s, theta_f if left out",
         NOT_NEGATIVE,
-        length=3,
         default=(0.1, 100.0, 0.5),
         live=True,
-        note="[theta_s, theta_f, mu] with theta_f >= theta_s and mu <= 1",
+        note="[theta_s, theta_f, mu] or [theta_s, theta_f, mu, theta_null] with theta_f >= "
+        "theta_s, mu <= 1 and theta_null >= theta_s",
     )
     integral_anti_windup: str = text(
-        "for joints: qp limits the whole torque and the integrators; paper and scaling limit K s "
-        "only, by eq. (11) and (10) as printed; none limits nothing",
+        "qp limits the whole torque and the integrators; paper and scaling limit the torque of "
+        "the gains only, by eq. (11) and (10) as printed, paper_mass by (11) with K = lambda M, "
+        "none nothing: with these four the law is as printed, task and position with (16), (21) "
+        "and (26)",
         default="qp",
         live=True,
         choices=METHODS,
     )
-    integral_task: str = text(
-        "for task: what of the end effector is stiff", default="pose", choices=tuple(TASKS)
-    )
-
-    @property
-    def task_rows(self) -> slice:
-        """Rows of the pose's Jacobian that are the task."""
-        return TASKS[self.integral_task]
 
     def settings(self, tau_max: Array) -> IntegralSettings:
         """Return the settings of the integral action.
@@ -83,7 +76,8 @@ class IntegralConfiguration:
         Raises:
             SettingError: values that do not fit together.
         """
-        if self.integral_action == "task" and self.task_rows.stop >= len(tau_max):
+        rows = TASKS.get(self.integral_action)
+        if rows is not None and rows.stop >= len(tau_max):
             allowed = (
                 f"'none' or 'joints': {len(tau_max)} joints have no null space left of the task"
             )
@@ -91,9 +85,11 @@ class IntegralConfiguration:
         budget = self.integral_budget if len(self.integral_budget) else BUDGET * tau_max
         if (budget > tau_max).any():
             raise SettingError("integral_budget", budget, "at most torque_max")
-        slow, fast, mu = self.integral_leak
-        if fast < slow or mu > 1.0:
-            allowed = "theta_f >= theta_s and mu <= 1"
+        if len(self.integral_leak) not in (3, 4):
+            raise SettingError("integral_leak", self.integral_leak, "3 or 4 finite numbers")
+        slow, fast, mu, *null = self.integral_leak.tolist()
+        if fast < slow or mu > 1.0 or min(null, default=slow) < slow:
+            allowed = "theta_f >= theta_s, mu <= 1 and theta_null >= theta_s"
             raise SettingError("integral_leak", self.integral_leak, allowed)
         return IntegralSettings(
             budget,
@@ -102,4 +98,5 @@ class IntegralConfiguration:
             fast_leak_rate=fast,
             mu=mu,
             anti_windup=self.integral_anti_windup,
+            null_leak_rate=null[0] if null else None,
         )

@@ -9,9 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from viability_bounds_pkg.parameter import POSITIVE, Range, above, number, numbers
+from viability_bounds_pkg.parameter import POSITIVE, Range, above, number, numbers, text
 
 Array = NDArray[np.float64]
+
+POSE_ERRORS = ("separate", "logarithm")
+"""Errors of a pose: position and orientation apart, or the logarithm of SE(3)."""
 
 CRITICAL = -1.0
 """Of ``pose_kd`` and ``posture_kd``: critical damping."""
@@ -36,6 +39,13 @@ class Gains:
     )
     pose_weight: float = number(
         "weight of the pose task; 0: no pose task", Range(0.0, 1e5), default=1.0, live=True
+    )
+    pose_error: str = text(
+        "error of the pose task: separate, of position and orientation in the axes of the root, "
+        "which leads the hand straight to its goal; or the logarithm of SE(3), along a screw",
+        default="separate",
+        live=True,
+        choices=POSE_ERRORS,
     )
     pose_speed_max: Array = numbers(
         "speeds at which the pose task approaches its goal at most, m/s and rad/s; no limit if "

@@ -105,6 +105,7 @@ class Goals:
                     self._pose_motion,
                     stiffness,
                     gains.pose_error_max,
+                    gains.pose_error == "separate",
                 )
             )
         tasks.append(

@@ -1,5 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The task that brings the end effector to a pose."""
+"""The task that brings the end effector to a pose.
+
+The error of a pose is taken as one or apart, `PoseTask.separate`. As one it is the logarithm of
+SE(3): the twist that leads to the goal in unit time, along a screw. Apart, (7) and (8) of
+[Benallegue2021],
+
+    p'' = kp (p_d - p) + kd (p_d' - p') + p_d'',   w' = kp log(R_d R') + kd (w_d - w) + w_d',
+
+in the axes of the root: the origin of the hand goes straight to its goal however the hand turns
+meanwhile. Near the goal both are the same.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +21,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from torque_safety_controller.linalg.dense_kernels import spring_damper
+from torque_safety_controller.linalg.dense_kernels import apart, spring_damper
 from torque_safety_controller.qp.terms import TaskTerm
 from torque_safety_controller.robot_model import RobotModel
 
@@ -29,7 +39,7 @@ class PoseMotion(NamedTuple):
 
 @dataclass(slots=True)
 class PoseTask:
-    """Brings the end effector to a pose: eq. (34) of [DelPrete2018], (7)-(8) of [Benallegue2021].
+    """Brings the end effector to a pose: eq. (34) of [DelPrete2018] with either error.
 
     Attributes:
         pose_des: goal in the URDF's root frame.
@@ -41,6 +51,8 @@ class PoseTask:
         error_max: sizes at which the error of translation, m, and that of rotation, rad, count
             at most, so that a far goal is approached at no more than kp / kd times them; None
             for no limit.
+        separate: whether position and orientation count apart, (7)-(8) of [Benallegue2021]; else
+            their error is the logarithm of SE(3).
     """
 
     pose_des: pin.SE3
@@ -50,19 +62,37 @@ class PoseTask:
     motion: PoseMotion | None = None
     stiffness: Array | None = None
     error_max: tuple[float, float] | None = None
+    separate: bool = False
 
     def term(self, robot: RobotModel) -> TaskTerm:
         """Return ``J a = kp error - kd J v - J' v + feedforward`` as a term of the cost."""
-        error = pose_error(robot.pose, self.pose_des)
+        if self.separate:
+            error = separate_error(robot.pose, self.pose_des)
+        else:
+            error = pose_error(robot.pose, self.pose_des)
         if self.error_max is not None:
             shorten(error[:3], self.error_max[0])
             shorten(error[3:], self.error_max[1])
         if self.stiffness is not None:
             error = self.stiffness * error
         b = spring_damper(robot.J, robot.v, error, robot.drift, self.kp, self.kd)
-        if self.motion is not None:
-            b = b + self._feedforward(robot.pose, robot.J @ robot.v, self.motion)
+        twist = robot.J @ robot.v
+        if self.separate:
+            b = apart(b, twist)
+            if self.motion is not None:
+                b += self._separate_feedforward(robot.pose, self.motion)
+        elif self.motion is not None:
+            b = b + self._feedforward(robot.pose, twist, self.motion)
         return TaskTerm(robot.J, b, self.weight)
+
+    def _separate_feedforward(self, pose: pin.SE3, motion: PoseMotion) -> Array:
+        """Return ``kd (p_d', w_d) + (p_d'', w_d')`` in the end effector's axes, shape (6,)."""
+        speed, turn = np.split(motion.twist, 2)
+        rate = motion.twist_rate.copy()
+        rate[:3] += np.cross(turn, speed)  # the goal's axes turn
+        ahead = (self.kd * motion.twist + rate).reshape(2, 3)
+        turned: Array = (ahead @ self.pose_des.rotation.T @ pose.rotation).ravel()
+        return turned
 
     def _feedforward(self, pose: pin.SE3, twist: Array, motion: PoseMotion) -> Array:
         """Return what a goal in motion adds, shape (6,), in the end effector's axes.
@@ -99,6 +129,14 @@ def pose_difference(pose: pin.SE3, pose_des: pin.SE3) -> PoseDifference:
     return PoseDifference(
         pose_des.translation - pose.translation, pin.log3(pose_des.rotation @ pose.rotation.T)
     )
+
+
+def separate_error(pose: pin.SE3, pose_des: pin.SE3) -> Array:
+    """Return ``(R'(p_d - p), log(R'R_d))``, shape (6,), m and rad, in the hand's axes."""
+    error = np.empty(6)
+    error[:3] = pose.actInv(pose_des.translation)
+    error[3:] = pin.log3(pose.rotation.T @ pose_des.rotation)
+    return error
 
 
 def pose_error(pose: pin.SE3, pose_des: pin.SE3) -> Array:
