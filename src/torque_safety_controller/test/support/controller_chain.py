@@ -21,6 +21,7 @@ NODE = "controller_node"
 def gains_of(values: Mapping[str, Any]) -> Gains:
     """Return the gains that the node makes of its parameters."""
     return Gains(
+        pose_error=values.get("pose_error", "separate"),
         pose_kp=values["pose_kp"],
         pose_kd=critical_damping(values["pose_kp"]),
         pose_weight=values["pose_weight"],
