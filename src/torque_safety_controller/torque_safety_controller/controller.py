@@ -285,7 +285,10 @@ class Controller:
             self.interaction.observe(robot, self.goals, elapsed)
         if additional is None or not robot.rates:
             return None
-        return additional.torque(robot, robot.v, self._a_last, elapsed)
+        before = additional.integral
+        torque = additional.torque(robot, robot.v, self._a_last, elapsed)
+        observer.expect(additional.integral - before, self.tau_max, robot.M)
+        return torque
 
     def _tasks(self) -> tuple[list[Task], ContactForces | None]:
         """Return the tasks of a step, and the forces that contacts may exert."""
@@ -397,7 +400,7 @@ class Controller:
 
     def _hold(self, additional: Array | None, failure: str) -> ControlOutput:
         robot = self.robot
-        self._observer.reset()  # what is asked for here may be more than the motors can give
+        self._observer.pause()  # what is asked for here may be more than the motors can give
         a = -self.gains.hold_kd * robot.v
         if self.safety_filter is not None:
             self._look_ahead(self._any_acceleration, additional, None)

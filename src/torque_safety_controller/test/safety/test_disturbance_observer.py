@@ -84,13 +84,35 @@ def test_bounds_stay_bounds(v, a):
             assert (np.abs(low - lower) <= 30.0 + 10.0).all()
 
 
-def test_it_forgets():
+def test_it_keeps_what_it_knows_over_a_time_it_does_not_know():
     observer = DisturbanceObserver(1, 0.0)
     for v in (0.0, 1.0):
         observer.observe(np.array([v]), np.zeros(1), 0.1, LARGEST, np.eye(1))
     assert observer.estimate == pytest.approx(10.0)
-    observer.observe(np.array([1.0]), np.zeros(1), 0.0, LARGEST, np.eye(1))
-    assert observer.estimate == 0.0
-    lower, upper = np.array([-1.0]), np.array([1.0])
+    for elapsed in (0.0, -1.0, math.nan):
+        observer.observe(np.array([5.0]), np.zeros(1), elapsed, LARGEST, np.eye(1))
+    assert observer.estimate == pytest.approx(10.0)
+    observer.pause()
+    observer.observe(np.array([9.0]), np.zeros(1), 0.1, LARGEST, np.eye(1))
+    assert observer.estimate == pytest.approx(10.0)
+    observer.observe(np.array([9.3]), np.zeros(1), 0.1, LARGEST, np.eye(1))
+    assert observer.estimate == pytest.approx(3.0)
     observer.reset()
+    lower, upper = np.array([-1.0]), np.array([1.0])
     assert observer.shift(lower, upper) == (lower, upper)
+
+
+def test_a_change_of_the_additional_torque_counts_before_it_is_seen():
+    """With it in time the bounds of the true acceleration are kept in the very step."""
+    M = np.array([[2.0, 0.9], [0.9, 0.5]])
+    observer = DisturbanceObserver(2, 0.003)
+    change = np.array([0.2, -0.1])
+    observer.expect(change, np.full(2, 1e3), M)
+    d = np.linalg.inv(M) @ change
+    np.testing.assert_allclose(observer.estimate, d)
+    lower, upper = np.full(2, -3.0), np.full(2, 3.0)
+    low, high = observer.shift(lower, upper)
+    assert (low + np.minimum(d, 0.0) >= lower - 1e-12).all()
+    assert (high + np.maximum(d, 0.0) <= upper + 1e-12).all()
+    observer.expect(np.full(2, 1e9), np.full(2, 1e3), M)
+    assert (np.abs(observer.estimate) <= 1e3 / np.diagonal(M)).all()

@@ -53,6 +53,10 @@ class DisturbanceObserver:
     def reset(self) -> None:
         """Forget the past."""
         self.estimate.fill(0.0)
+        self.pause()
+
+    def pause(self) -> None:
+        """Keep the estimate, and learn nothing from the time until the next step."""
         self._begun = False
 
     def observe(self, v: Array, a_last: Array, elapsed: float, tau_max: Array, M: Array) -> None:
@@ -61,25 +65,39 @@ class DisturbanceObserver:
         Args:
             v: velocity now, shape (n,), rad/s.
             a_last: acceleration commanded for the step, shape (n,), rad/s^2.
-            elapsed: duration of the step, s; 0 if it is not known, which resets.
+            elapsed: duration of the step, s; 0 if it is not known: then nothing is learnt. What
+                disturbed before is the best guess: the integral action goes on from its last
+                torque, too, which is to balance it.
             tau_max: torque limits, shape (n,), N m. The estimate is limited to what the motors
                 could compensate: more than that is an impact, which does not last.
             M: mass matrix, shape (n, n), kg m^2.
         """
         if self.time_constant is None:
             return
-        if not elapsed > 0.0:
-            self.reset()
-        elif self._begun:
+        if elapsed > 0.0 and self._begun:
             gain = -math.expm1(-elapsed / self.time_constant) if self.time_constant > 0.0 else 1.0
             _observe(self.estimate, v, self._v_last, a_last, elapsed, gain, tau_max, M)
         self._v_last[:] = v
         self._begun = True
 
+    def expect(self, torque: Array, tau_max: Array, M: Array) -> None:
+        """Count a change of the additional torque before it can be seen.
+
+        Args:
+            torque: what the integral action adds in this step more than in the last one, shape
+                (n,), N m.
+            tau_max: torque limits, shape (n,), N m.
+            M: mass matrix, shape (n, n), kg m^2.
+        """
+        if self.time_constant is None or not torque.any():
+            return
+        largest = tau_max / np.diagonal(M)
+        self.estimate[:] = np.clip(self.estimate + np.linalg.solve(M, torque), -largest, largest)
+
     @property
     def known(self) -> Array | None:
-        """The estimate; None before the first step, or when switched off."""
-        return None if self.time_constant is None or not self._begun else self.estimate
+        """The estimate; None when switched off."""
+        return None if self.time_constant is None else self.estimate
 
     def shift(self, lower: Array, upper: Array) -> tuple[Array, Array]:
         """Return the bounds of the commanded accelerations.

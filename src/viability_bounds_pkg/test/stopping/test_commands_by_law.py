@@ -6,7 +6,7 @@ import pinocchio as pin
 import pytest
 from stopping_arm import Arm, H
 
-from viability_bounds_pkg.stopping.coordinated_stop import RETURN_TIME
+from viability_bounds_pkg.stopping.coordinated_stop import PASS_TIME, RETURN_TIME
 
 
 @pytest.fixture(scope="module", params=["panda", "talos_left_arm"])
@@ -38,13 +38,25 @@ def test_a_command_within_the_limits_passes_unchanged(arm):
     q, v = arm.inside(rng)
     stop = arm.stop(observer_time=0.002)
     stop.begin(q, v)
-    for _ in range(20):
+    for k in range(60):
         a = rng.uniform(-1.0, 1.0, arm.n)
         command = pin.rnea(arm.model, arm.data, q, v, a)
         tau = stop.follow(q, v, command)
-        assert stop.returned
+        assert stop.returned == ((k + 1.5) * H > PASS_TIME)  # it may act by itself then
         assert tau == pytest.approx(command, abs=2e-3 * arm.tau_max.max())
         q, v = arm.move(q, v, tau)
+
+
+def test_commands_that_pass_a_limit_do_not_act_by_themselves(arm):
+    """However long they last: for who sends them has a wrong idea of the arm."""
+    rng = np.random.default_rng(3)
+    q, v = arm.inside(rng)
+    stop = arm.stop(observer_time=0.002)
+    stop.begin(q, v)
+    for _ in range(3 * round(PASS_TIME / H)):
+        command = pin.rnea(arm.model, arm.data, q, v, 1.2 * arm.limits.a_max)
+        q, v = arm.move(q, v, stop.follow(q, v, command))
+        assert not stop.returned
 
 
 def test_a_command_after_a_stop_takes_effect_without_a_step(arm):

@@ -76,6 +76,9 @@ the bounds would turn noise of the torque into torque steps."""
 GIVE_WAY = 0.02
 """Distance from the place held at which the arm stops anew instead of going back, rad."""
 
+PASS_TIME = 0.05
+"""How long commands must be within the limits before they act by themselves again, s."""
+
 RETURN_TIME = 0.1
 """In which commands that return after a stop get back all of their effect, s."""
 
@@ -103,7 +106,8 @@ class CoordinatedStop:
     Attributes:
         acceleration: chosen in the last step, rad/s^2.
         at_rest: whether the arm came to rest and is held.
-        returned: whether commands have all of their effect, but for the limits.
+        returned: whether commands have all of their effect, and the limits have let them through
+            for `PASS_TIME`: then they may act by themselves.
 
     Raises:
         JointLimitsError: other joints in `limits` than in `model`, or numbers that cannot be.
@@ -172,11 +176,13 @@ class CoordinatedStop:
         self._M: Array | None = None
         self._resting = False  # the last step was one of a stop
         self._difference, self._share_left = np.zeros(n), 0.0
+        self._passed_for = 0.0  # s; commands in a row that the limits let through
 
     @property
     def returned(self) -> bool:
-        """Whether commands have all of their effect, but for the limits."""
-        return not (self._resting or self._share_left > 0.0)
+        """Whether commands have all of their effect, and the limits let them through."""
+        through = self._passed_for >= PASS_TIME
+        return through and not (self._resting or self._share_left > 0.0)
 
     def time_to_rest(self, v: Array) -> float:
         """Return how long the arm takes from velocities `v` to rest at most, but for a few steps.
@@ -234,6 +240,9 @@ class CoordinatedStop:
         a = np.minimum(np.maximum(wanted, lower), upper)
         if outside:
             a = np.where(viable, a, self._harder(q, v, a))
+        # Commands that the limits change are not safe to act by themselves.
+        passed = bool((np.abs(a - wanted) <= MARGIN * self._scale).all())
+        self._passed_for = self._passed_for + h if passed and command is not None else 0.0
         q_mid, v_mid = q + 0.5 * h * v + 0.125 * h * h * a, v + 0.5 * h * a
         tau = self._inverse_dynamics(q_mid, v_mid, a) - self._disturbance
         feasible = bool((np.abs(tau) <= self._tau_max).all())

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rows of missed deadlines while the integral action adds torque that the bounds do not know."""
+
+from contextlib import closing
+
+import numpy as np
+import pytest
+from direct import DirectLoop
+
+from sim_bridge.nodes.bullet_parameters import make_stop
+from torque_safety_controller.qp.constraints import AccelerationRange
+from viability_bounds_pkg.state import State
+
+RATE = 100.0  # Hz; in a row a joint moves far
+SECONDS, LONGEST, PROBABILITY = 16.0, 5, 0.1
+HASTE = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
+
+
+def play(mode: str, seed: int) -> tuple[float, float, int]:
+    """Return how far limits were passed, rad and rad/s, and how many commands were missing.
+
+    In a row states get no answer, or one that comes too late.
+    """
+    rng = np.random.default_rng(seed)
+    loop = DirectLoop("panda", HASTE | {"rate_hz": RATE, "integral_action": mode})
+    config, robot, law = loop.config, loop.robot, make_stop(loop.config)
+    low, high = config.position_min, config.position_max
+    tau = np.zeros(low.size)
+    row = in_row = missing = unanswered = 0
+    with closing(robot):
+        for k in range(round(SECONDS * RATE)):
+            if k % RATE == 0:
+                goal, side = rng.uniform(low, high), rng.random(low.size)
+                goal = np.where(side < 0.3, low, np.where(side < 0.6, high, goal))
+                loop.controller.set_posture_goal(goal)
+            if k and row == 0 and rng.random() < PROBABILITY:
+                row = int(rng.integers(1, LONGEST + 1))
+            lost, row = row > 0, max(0, row - 1)
+            unanswered += 1
+            if not lost or rng.random() < 0.5:
+                q, v, _ = robot.state()
+                bounds = AccelerationRange(*loop.bounds(q, v)[:2])
+                step = loop.controller.step(State(q, v), bounds, unanswered * config.dt)
+                unanswered = 0
+            if not lost:
+                tau, in_row = step.tau, 0
+            else:
+                in_row, missing = in_row + 1, missing + 1
+            if in_row > config.command_timeout:
+                robot.stop(law, config.substeps)
+            elif in_row or robot.returning:
+                robot.follow(law, tau, config.substeps)
+            else:
+                robot.step(tau, config.substeps)
+        monitor = robot.monitor
+        farthest = monitor.max_position_violation.max(), monitor.max_velocity_violation.max()
+        return float(farthest[0]), float(farthest[1]), missing
+
+
+@pytest.mark.parametrize("mode", ["joints", "task"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_limits_are_kept(mode, seed):
+    position, speed, missing = play(mode, seed)
+    assert missing > 200
+    assert position == 0.0 and speed == 0.0
