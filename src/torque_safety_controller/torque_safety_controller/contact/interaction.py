@@ -248,11 +248,11 @@ class Interaction:
         wanted = normal @ goal[:3]
         most = max(normal @ (self._to_contact @ measured)[:3], 0.0) + FORCE_STEP
         counted = goal * min(1.0, most / wanted) if wanted > 0.0 else np.zeros(6)
-        pressing = normal @ counted[:3]
+        pressing = float(normal @ counted[:3])
         along = pressing * normal
         across = _shortened(counted[:3] - along, contact.friction * pressing)
-        lever = np.linalg.norm(contact.points, axis=1).max()
-        moment = _shortened(counted[3:], lever * np.linalg.norm(along + across))
+        lever = float(np.linalg.norm(contact.points, axis=1).max())
+        moment = _shortened(counted[3:], lever * float(np.linalg.norm(along + across)))
         self._counted = np.concatenate([along + across, moment])
 
     @property

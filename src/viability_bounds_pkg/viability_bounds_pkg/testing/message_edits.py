@@ -167,7 +167,8 @@ def edits(most: int = 3) -> st.SearchStrategy[tuple[Edit, ...]]:
 
 
 def _parts(message: Any) -> Iterator[_Part]:
-    for name, of, is_list, fixed, nested in _schema(type(message)):
+    kind: Any = type(message)
+    for name, of, is_list, fixed, nested in _schema(kind):
         yield _Part(message, name, of, is_list, fixed)
         if nested:
             value = getattr(message, name)
