@@ -35,7 +35,7 @@ from viability_bounds_pkg.whole_arm.safety_filter import RESERVE
 
 POSTURE = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
 """Gains on the way to postures."""
-POSE = {"pose_kp": 100.0, "pose_kd": 20.0, "posture_kp": 10.0, "posture_kd": -1.0}
+POSE: dict[str, Any] = {"pose_kp": 100.0, "pose_kd": 20.0, "posture_kp": 10.0, "posture_kd": -1.0}
 POSE |= {"pose_weight": 1.0, "posture_weight": 1e-5, "pose_error": "logarithm"}
 """Gains on the way to poses; damping of the posture is critical. The logarithm for all arms."""
 AGAINST_FRICTION = {
