@@ -4,7 +4,10 @@
 import numpy as np
 import pytest
 from fuzzing import files, programs
+from fuzzing.file_edits import FileEdit, odd_file
 from fuzzing.machine import Machine
+from fuzzing.message_edits import KINDS as EDITS
+from fuzzing.message_edits import Edit, edited
 from fuzzing.stack import GOALS, KINDS, STREAMS, TOPICS, WORLD, running
 from fuzzing.tally import TAKEN, ClaimBroken, Tally
 from hypothesis import HealthCheck, given, settings
@@ -12,9 +15,6 @@ from hypothesis.stateful import run_state_machine_as_test
 
 from torque_safety_controller.safety.torque_limiter import TorqueLimiter
 from viability_bounds_pkg.ros.messages import JointStateReader, Verdict
-from viability_bounds_pkg.testing.file_edits import FileEdit, odd_file
-from viability_bounds_pkg.testing.message_edits import KINDS as EDITS
-from viability_bounds_pkg.testing.message_edits import Edit, edited
 
 FEW = settings(
     max_examples=3, stateful_step_count=8, suppress_health_check=list(HealthCheck), database=None

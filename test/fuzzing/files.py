@@ -17,6 +17,7 @@ from typing import Any
 import hypothesis
 import yaml
 from fuzzing import programs
+from fuzzing.file_edits import FileEdit, file_edits, odd_file
 from fuzzing.messages import Failure, Keep, Show, failed
 from fuzzing.tally import TAKEN, ClaimBroken, Tally
 from hypothesis import (
@@ -33,7 +34,6 @@ from hypothesis import strategies as st
 from hypothesis.errors import DidNotReproduce
 
 from viability_bounds_pkg.testing.executables import environment, interruptible
-from viability_bounds_pkg.testing.file_edits import FileEdit, file_edits, odd_file
 from viability_bounds_pkg.testing.ros_harness import config_folder
 
 ROBOTS = ("panda", "baxter_left_arm", "talos_left_arm")

@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from functools import cache
 from typing import Any, ClassVar
 
+from fuzzing.message_edits import FACTORS, NUMBERS, edits
 from fuzzing.stack import GOALS, KINDS, STREAMS, TOPICS, VARIANTS, Stack, running
 from fuzzing.tally import Tally
 from hypothesis import strategies as st
@@ -17,7 +18,6 @@ from rcl_interfaces.msg import ParameterValue
 from rclpy.parameter import Parameter as RosParameter
 
 from viability_bounds_pkg.parameter import Parameter, parameter_table
-from viability_bounds_pkg.testing.message_edits import FACTORS, NUMBERS, edits
 
 _BATCH = {"min_size": 24, "max_size": 80}
 """Odd messages in a step."""

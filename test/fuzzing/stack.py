@@ -15,6 +15,9 @@ import numpy as np
 import pinocchio as pin
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from fuzzing.good_messages import GoodMessages
+from fuzzing.message_edits import Edit, edited
+from fuzzing.stepped_nodes import Delivery, SteppedClock, Wire, stepped_clock
 from fuzzing.tally import TAKEN, ClaimBroken, Tally
 from geometry_msgs.msg import PoseStamped, Vector3Stamped, WrenchStamped
 from rcl_interfaces.msg import Parameter as ParameterMessage
@@ -40,10 +43,7 @@ from viability_bounds_pkg.node.estimator_node import EstimatorNode
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 from viability_bounds_pkg.ros.given_parameters import given_parameters, note_arguments
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp, stamp_to_ns
-from viability_bounds_pkg.testing.good_messages import GoodMessages
-from viability_bounds_pkg.testing.message_edits import Edit, edited
 from viability_bounds_pkg.testing.ros_harness import config_folder
-from viability_bounds_pkg.testing.stepped_nodes import Delivery, SteppedClock, Wire, stepped_clock
 
 VARIANTS: dict[str, tuple[str, ...]] = {
     "panda": ("panda",),

@@ -16,13 +16,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
+from fuzzing.message_edits import to_bytes
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.subscription import Subscription
-
-from viability_bounds_pkg.testing.message_edits import to_bytes
 
 PACKAGES = ("viability_bounds_pkg", "torque_safety_controller", "sim_bridge")
 _ARRIVAL = 1.0
