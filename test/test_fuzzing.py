@@ -51,7 +51,8 @@ def test_all_topics_that_nodes_hear_are_fuzzed():
     with running("panda, imperfect", False, Tally()) as stack:
         heard = {each.topic_name for node in stack.nodes.values() for each in node.subscriptions}
     fuzzed = {topic if topic.startswith("/") else f"/{topic}" for topic in TOPICS}
-    assert heard == fuzzed
+    # Compared with the description at the start, and told where it differs; nothing obeys it.
+    assert heard == fuzzed | {"/robot_description"}
 
 
 @pytest.mark.parametrize("through", [False, True], ids=["directly", "by DDS"])

@@ -261,7 +261,7 @@ def _use_controller(node: controller_node.ControllerNode) -> int:
     for stamp, state in _states(config):
         node._on_state(state)
         node._on_limits(acceleration_limits(config.joints, stamp, -a, a))
-        if node._answered_stamp == stamp:
+        if node._states.answered_stamp == stamp:
             answered += 1
             _check_torque(np.array(node._commands._torques.effort), config.torque_max)
     node._watch()
@@ -282,18 +282,18 @@ def _use_estimator(node: estimator_node.EstimatorNode) -> int:
         node._on_state(state)
         if node._answer.position and not np.isfinite(node._answer.position).all():
             raise ClaimBroken(f"an estimated state is not finite: {node._answer}")
-        tau = np.zeros(len(node._joints))
-        node._on_command(joint_state(node._joints, stamp, tau=tau))
+        tau = np.zeros(len(node._config.joints))
+        node._on_command(joint_state(node._config.joints, stamp, tau=tau))
     node._diagnostics.publish()
     return PERIODS
 
 
 def _use_robot(node: bullet_node.BulletNode) -> int:
     """Send torques of every size."""
-    n = len(node._joints)
+    n = len(node._config.joints)
     for k in range(PERIODS):
         tau = [(-1.0) ** k * 10.0 ** (k - PERIODS // 2)] * n
-        node._on_command(joint_state(node._joints, node._stamp, tau=tau))
+        node._on_command(joint_state(node._config.joints, node._stamp, tau=tau))
         if not node._config.lockstep:
             node._tick()
         ratio = node._monitor.max_torque_ratio

@@ -393,7 +393,7 @@ class Stack:
             return node.commands_heard if name == "joint_commands" else node._reader.heard_at
         if isinstance(node, BulletNode):
             if name == "joint_commands":
-                return node._periods, node._latencies._count
+                return node._periods, node._commands.latencies._count
             return len(node._world)
         if isinstance(node, FaultNode):
             return node._passed[name]
@@ -465,7 +465,7 @@ class Stack:
             self._felt_wrong = True  # a filter keeps it, and a tare takes it for the bias
             self._lose_trust(name)
         elif name == "acceleration_limits" and isinstance(node, ControllerNode):
-            if stamp_to_ns(message.header.stamp) > node._answered_stamp:
+            if stamp_to_ns(message.header.stamp) > node._states.answered_stamp:
                 self._lose_trust(name)
         elif name.endswith("joint_states") and not isinstance(node, FaultNode | ScenarioNode):
             reader = node._states if isinstance(node, ControllerNode) else node._reader

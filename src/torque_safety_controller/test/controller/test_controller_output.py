@@ -30,7 +30,7 @@ class Fixed:
     idle = False
 
     def __init__(self, torque) -> None:
-        self._torque = torque
+        self._torque = self.integral = torque
 
     def reset(self) -> None:
         """Nothing to forget."""

@@ -14,6 +14,7 @@ from torque_safety_controller.loop_margins.gain_check import TORQUE_STEP
 from torque_safety_controller.node.assembly import make_controller
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.safety.disturbance_observer import DisturbanceObserver
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.robot_configuration import load_model
@@ -98,9 +99,17 @@ def largest_step(robot, joint, seconds, delay=0, **changed) -> float:
     ],
     ids=["100", "50", "longer horizon", "no observer"],
 )
-def test_late_commands_make_a_limit_cycle_of_the_file_s_gains(changed, low, high):
-    """TALOS' wrist, commands two periods late and not compensated: 42% of the limit."""
+def test_late_commands_make_a_limit_cycle_of_the_file_s_gains(monkeypatch, changed, low, high):
+    """TALOS' wrist, commands two periods late and not compensated: 42% of the limit.
+
+    With the loop of the linear analysis, in which changes of the integral's torque count when seen.
+    """
+    monkeypatch.setattr(DisturbanceObserver, "expect", lambda *given: None)
     assert low <= largest_step("talos_left_arm", 8, 1.5, delay=2, **changed) < high
+
+
+def test_changes_of_the_torque_that_count_at_once_end_the_limit_cycle():
+    assert largest_step("talos_left_arm", 8, 1.5, delay=2, integral_lambda=100.0) < 0.01
 
 
 @pytest.mark.parametrize(("factor", "calm"), [(1.0, False), (6.5, True)])

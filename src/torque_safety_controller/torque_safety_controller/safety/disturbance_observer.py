@@ -20,6 +20,7 @@ change of the disturbance within T: after a step by d the bound is exceeded by d
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,14 +86,16 @@ class DisturbanceObserver:
 
         Args:
             torque: what the integral action adds in this step more than in the last one, shape
-                (n,), N m.
+                (n,), N m; what is not finite does not count.
             tau_max: torque limits, shape (n,), N m.
             M: mass matrix, shape (n, n), kg m^2.
         """
         if self.time_constant is None or not torque.any():
             return
-        largest = tau_max / np.diagonal(M)
-        self.estimate[:] = np.clip(self.estimate + np.linalg.solve(M, torque), -largest, largest)
+        with suppress(np.linalg.LinAlgError):
+            changed, largest = self.estimate + np.linalg.solve(M, torque), tau_max / np.diagonal(M)
+            if np.isfinite(changed).all():
+                self.estimate[:] = np.clip(changed, -largest, largest)
 
     @property
     def known(self) -> Array | None:
