@@ -102,7 +102,7 @@ def largest_step(robot, joint, seconds, delay=0, **changed) -> float:
 def test_late_commands_make_a_limit_cycle_of_the_file_s_gains(monkeypatch, changed, low, high):
     """TALOS' wrist, commands two periods late and not compensated: 42% of the limit.
 
-    With the loop of the linear analysis, in which changes of the integral's torque count when seen.
+    In the loop of the linear analysis, changes of the integral torque count when they are seen.
     """
     monkeypatch.setattr(DisturbanceObserver, "expect", lambda *given: None)
     assert low <= largest_step("talos_left_arm", 8, 1.5, delay=2, **changed) < high
