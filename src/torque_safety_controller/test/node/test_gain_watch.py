@@ -65,6 +65,19 @@ def test_where_nothing_is_declared_nothing_is_said(ros, declared, text):
     assert not said()
 
 
+def test_an_integral_gain_too_high_for_the_rate_is_told_where_nothing_is_declared(ros):
+    """Panda at 500 Hz spins with 50 1/s, beyond all limits but those of its torques."""
+    note_arguments(ros.context, ["--ros-args", *files(config_folder() / "panda.yaml")])
+    heard = ros.listen(Log, "/rosout")
+    node = ros.start(ControllerNode, read_config("panda", NODE))
+    ros.accepts(NODE, integral_lambda=50.0)
+    ros.accepts(NODE, integral_action="joints")
+    told = "parameter 'integral_lambda' is 50"
+    ros.wait_until(
+        lambda: any(m.name == node.get_name() and m.msg.startswith(told) for m in heard), told
+    )
+
+
 def test_declarations_that_are_none_are_left_to_the_node_that_they_are_for(ros, declared):
     said = warnings(ros, declared("delay: two"))
     ros.run_for(0.1)

@@ -9,16 +9,17 @@ import pinocchio as pin
 from rclpy.node import Node
 
 from torque_safety_controller.loop_margins.arm_inertia import ArmInertia
-from torque_safety_controller.loop_margins.gain_check import GainCheck
 from torque_safety_controller.node.declared import declared_robot
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parameters.loop_parameters import gain_check, limits_gains
+from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 
 
 class GainWatch:
     """Judges gains beside the control loop, in a thread: it takes some tenths of a second.
 
-    Where nothing is declared, nothing is judged.
+    Where nothing is declared, nothing is judged as long as there is no integral action: with one
+    whose gain is too high for the rate an arm passes all limits but those of its torques.
 
     Args:
         node: that warns.
@@ -29,29 +30,29 @@ class GainWatch:
     def __init__(self, node: Node, model: pin.Model, config: ControllerConfiguration) -> None:
         self._log = node.get_logger()
         self._told: set[tuple[str, float]] = set()
-        self._check: GainCheck | None = None
+        self._robot, self._model = declared_robot(node), model
         self._inertia: ArmInertia | None = None
-        robot = declared_robot(node)
-        if robot is None:
-            return
-        self._robot = robot
-        if limits_gains(self._robot.declared):
-            self._inertia = ArmInertia.of(model, config.position_min, config.position_max)
-            self.look(config)
+        self._judged: ControllerConfiguration | None = None
+        self.look(config)
 
     def look(self, config: ControllerConfiguration) -> None:
         """Judge the gains, at start and when they have changed."""
-        if self._inertia is not None:
-            self._check = gain_check(config, self._robot, self._inertia)
-            threading.Thread(target=self._judge, args=(self._check,), daemon=True).start()
+        self._judged = None
+        if self._robot is None:
+            return
+        if limits_gains(self._robot.declared) or config.integral.integral_action != "none":
+            self._judged = config
+            threading.Thread(target=self._judge, args=(self._robot, config), daemon=True).start()
 
     def close(self) -> None:
         """Say nothing more."""
-        self._check = None
+        self._judged = None
 
-    def _judge(self, check: GainCheck) -> None:
-        for limit in check.limits():
-            if check is not self._check:
+    def _judge(self, robot: BoundsConfiguration, config: ControllerConfiguration) -> None:
+        if self._inertia is None:
+            self._inertia = ArmInertia.of(self._model, config.position_min, config.position_max)
+        for limit in gain_check(config, robot, self._inertia).limits():
+            if config is not self._judged:
                 return  # the gains have changed again, or the node is gone
             key = limit.name, limit.value
             if limit.exceeded and key not in self._told:
