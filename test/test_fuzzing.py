@@ -4,10 +4,11 @@
 import numpy as np
 import pytest
 from fuzzing import files, programs
-from fuzzing.file_edits import FileEdit, odd_file
+from fuzzing.edit import Edit
+from fuzzing.file_edits import odd_file
 from fuzzing.machine import Machine
 from fuzzing.message_edits import KINDS as EDITS
-from fuzzing.message_edits import Edit, edited
+from fuzzing.message_edits import edited
 from fuzzing.stack import GOALS, KINDS, STREAMS, TOPICS, WORLD, running
 from fuzzing.tally import TAKEN, ClaimBroken, Tally
 from hypothesis import HealthCheck, given, settings
@@ -43,7 +44,7 @@ def test_odd_files_are_refused_in_a_line_or_keep_the_claims():
 
 
 def test_an_executable_refuses_an_odd_file_in_a_line():
-    case = "robot", 0, "bounds_node", (FileEdit("value", 1, "1e-3"),)
+    case = "robot", 0, "bounds_node", (Edit("value", 1, "1e-3"),)
     files.try_file(case, Tally(), really=True)
 
 
@@ -127,16 +128,16 @@ def test_each_edit_changes_a_file():
     document = {"a": {"b": [1.0, 2.0], "c": "x"}, "d": 3}
     plain = odd_file(document, ()).data
     for edit in (
-        FileEdit("value", 1, "odd"),
-        FileEdit("number", 0, -1.0),
-        FileEdit("scale", 0, 2.0),
-        FileEdit("length", 0, 1),
-        *(FileEdit(kind, 1) for kind in ("drop", "rename", "nest", "add", "cut")),
-        FileEdit("double", 0),
-        FileEdit("swap", 0, 1),
-        FileEdit("line", 1, "twice"),
-        FileEdit("insert", 3, "{"),
-        FileEdit("byte", 3, 0),
+        Edit("value", 1, "odd"),
+        Edit("number", 0, -1.0),
+        Edit("scale", 0, 2.0),
+        Edit("length", 0, 1),
+        *(Edit(kind, 1) for kind in ("drop", "rename", "nest", "add", "cut")),
+        Edit("double", 0),
+        Edit("swap", 0, 1),
+        Edit("line", 1, "twice"),
+        Edit("insert", 3, "{"),
+        Edit("byte", 3, 0),
     ):
         assert odd_file(document, (edit,)).data != plain, edit
 

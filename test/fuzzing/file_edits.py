@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Changes that make odd YAML files of valid ones: of what they say, and of their text.
 
-A `FileEdit` says what happens to which value or line; both are counted through the whole file.
+A `Edit` says what happens to which value or line; both are counted through the whole file.
 `file_edits` is the hypothesis strategy.
 """
 
@@ -10,10 +10,10 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import yaml
+from fuzzing.edit import Edit
 from hypothesis import strategies as st
 
 VALUES: tuple[Any, ...] = (
@@ -114,21 +114,6 @@ TEXTS = (
 """Put into the text."""
 
 
-@dataclass(frozen=True)
-class FileEdit:
-    """One change of a file.
-
-    Attributes:
-        kind: what is done, a key of `KINDS` or `TEXT_KINDS`.
-        where: to which value or line, modulo their number.
-        value: with which value.
-    """
-
-    kind: str
-    where: int = 0
-    value: Any = None
-
-
 class OddFile(NamedTuple):
     """A file that was changed."""
 
@@ -137,7 +122,7 @@ class OddFile(NamedTuple):
     """Keys that were touched."""
 
 
-def odd_file(document: Any, edits: Sequence[FileEdit]) -> OddFile:
+def odd_file(document: Any, edits: Sequence[Edit]) -> OddFile:
     """Return the text of a document after changes; of the document first, then of its text."""
     document, names = copy.deepcopy(document), set()
     for edit in edits:
@@ -151,22 +136,22 @@ def odd_file(document: Any, edits: Sequence[FileEdit]) -> OddFile:
     return OddFile(data, frozenset(filter(None, names)))
 
 
-def file_edits(most: int = 2) -> st.SearchStrategy[tuple[FileEdit, ...]]:
+def file_edits(most: int = 2) -> st.SearchStrategy[tuple[Edit, ...]]:
     """Return a strategy of one to `most` changes; nine of ten are of what a file says."""
     where = st.integers(0, 255)
     of_values = st.one_of(
-        st.builds(FileEdit, st.just("value"), where, st.sampled_from(VALUES)),
-        st.builds(FileEdit, st.just("number"), where, st.sampled_from(NUMBERS)),
-        st.builds(FileEdit, st.just("scale"), where, st.sampled_from(FACTORS)),
-        st.builds(FileEdit, st.just("length"), where, st.sampled_from((0, 1, 3, 6, 8, 24))),
-        st.builds(FileEdit, st.sampled_from(("drop", "rename", "nest", "double", "add")), where),
-        st.builds(FileEdit, st.just("swap"), where, where),
+        st.builds(Edit, st.just("value"), where, st.sampled_from(VALUES)),
+        st.builds(Edit, st.just("number"), where, st.sampled_from(NUMBERS)),
+        st.builds(Edit, st.just("scale"), where, st.sampled_from(FACTORS)),
+        st.builds(Edit, st.just("length"), where, st.sampled_from((0, 1, 3, 6, 8, 24))),
+        st.builds(Edit, st.sampled_from(("drop", "rename", "nest", "double", "add")), where),
+        st.builds(Edit, st.just("swap"), where, where),
     )
     of_text = st.one_of(
-        st.builds(FileEdit, st.just("line"), where, st.sampled_from(("drop", "twice", "indent"))),
-        st.builds(FileEdit, st.just("insert"), where, st.sampled_from(TEXTS)),
-        st.builds(FileEdit, st.just("byte"), where, st.integers(0, 255)),
-        st.builds(FileEdit, st.just("cut"), where),
+        st.builds(Edit, st.just("line"), where, st.sampled_from(("drop", "twice", "indent"))),
+        st.builds(Edit, st.just("insert"), where, st.sampled_from(TEXTS)),
+        st.builds(Edit, st.just("byte"), where, st.integers(0, 255)),
+        st.builds(Edit, st.just("cut"), where),
     )
     one = st.integers(0, 9).flatmap(lambda k: of_text if k == 9 else of_values)
     return st.lists(one, min_size=1, max_size=most).map(tuple)
@@ -201,11 +186,11 @@ def _leaves(document: Any) -> list[_Place]:
     return [place for place in _places(document) if not isinstance(place.value, dict)]
 
 
-def _pick(places: Sequence[_Place], edit: FileEdit) -> _Place | None:
+def _pick(places: Sequence[_Place], edit: Edit) -> _Place | None:
     return places[edit.where % len(places)] if places else None
 
 
-def _value(document: Any, edit: FileEdit) -> str:
+def _value(document: Any, edit: Edit) -> str:
     # One in sixteen takes a whole section.
     places = _places(document) if edit.where % 16 == 0 else _leaves(document)
     if place := _pick(places, edit):
@@ -218,7 +203,7 @@ def _lists(document: Any) -> list[_Place]:
     return [place for place in _leaves(document) if isinstance(place.value, list) and place.value]
 
 
-def _number(document: Any, edit: FileEdit) -> str:
+def _number(document: Any, edit: Edit) -> str:
     if place := _pick(_lists(document), edit):
         place.value[edit.where % len(place.value)] = edit.value
         return str(place.key)
@@ -229,7 +214,7 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _scale(document: Any, edit: FileEdit) -> str:
+def _scale(document: Any, edit: Edit) -> str:
     places = [
         place
         for place in _leaves(document)
@@ -247,21 +232,21 @@ def _scale(document: Any, edit: FileEdit) -> str:
     return ""
 
 
-def _length(document: Any, edit: FileEdit) -> str:
+def _length(document: Any, edit: Edit) -> str:
     if place := _pick(_lists(document), edit):
         place.put((place.value * edit.value)[: edit.value])
         return str(place.key)
     return ""
 
 
-def _drop(document: Any, edit: FileEdit) -> str:
+def _drop(document: Any, edit: Edit) -> str:
     if place := _pick(_leaves(document), edit):
         del place.holder[place.key]
         return str(place.key)
     return ""
 
 
-def _rename(document: Any, edit: FileEdit) -> str:
+def _rename(document: Any, edit: Edit) -> str:
     if place := _pick(_places(document), edit):
         name = f"{place.key}s"
         place.holder[name] = place.holder.pop(place.key)
@@ -269,14 +254,14 @@ def _rename(document: Any, edit: FileEdit) -> str:
     return ""
 
 
-def _nest(document: Any, edit: FileEdit) -> str:
+def _nest(document: Any, edit: Edit) -> str:
     if place := _pick(_leaves(document), edit):
         place.put({str(place.key): place.value})
         return str(place.key)
     return ""
 
 
-def _double(document: Any, edit: FileEdit) -> str:
+def _double(document: Any, edit: Edit) -> str:
     """Have the first element of a list in the place of the last, too."""
     if place := _pick(_lists(document), edit):
         place.value[-1] = copy.deepcopy(place.value[0])
@@ -284,13 +269,13 @@ def _double(document: Any, edit: FileEdit) -> str:
     return ""
 
 
-def _add(document: Any, edit: FileEdit) -> str:
+def _add(document: Any, edit: Edit) -> str:
     if place := _pick(_leaves(document), edit):
         place.holder["nobody_knows"] = 1.0
     return "nobody_knows"
 
 
-def _swap(document: Any, edit: FileEdit) -> str:
+def _swap(document: Any, edit: Edit) -> str:
     places = _leaves(document)
     if len(places) < 2:
         return ""
@@ -304,7 +289,7 @@ def _swap(document: Any, edit: FileEdit) -> str:
     return str(one.key)
 
 
-def _line(data: bytes, edit: FileEdit) -> bytes:
+def _line(data: bytes, edit: Edit) -> bytes:
     lines = data.splitlines(keepends=True)
     if not lines:
         return data
@@ -313,26 +298,26 @@ def _line(data: bytes, edit: FileEdit) -> bytes:
     return b"".join([*lines[:k], *of, *lines[k + 1 :]])
 
 
-def _insert(data: bytes, edit: FileEdit) -> bytes:
+def _insert(data: bytes, edit: Edit) -> bytes:
     k = _at(data, edit)
     return data[:k] + edit.value.encode() + data[k:]
 
 
-def _byte(data: bytes, edit: FileEdit) -> bytes:
+def _byte(data: bytes, edit: Edit) -> bytes:
     k = _at(data, edit)
     return data[:k] + bytes([edit.value]) + data[k + 1 :]
 
 
-def _cut(data: bytes, edit: FileEdit) -> bytes:
+def _cut(data: bytes, edit: Edit) -> bytes:
     return data[: _at(data, edit)]
 
 
-def _at(data: bytes, edit: FileEdit) -> int:
+def _at(data: bytes, edit: Edit) -> int:
     """Return a place all over the text."""
     return edit.where * 7919 % max(1, len(data))
 
 
-KINDS: dict[str, Callable[[Any, FileEdit], str]] = {
+KINDS: dict[str, Callable[[Any, Edit], str]] = {
     "value": _value,
     "number": _number,
     "scale": _scale,
@@ -346,7 +331,7 @@ KINDS: dict[str, Callable[[Any, FileEdit], str]] = {
 }
 """Changes of a document; each returns the key that it touched."""
 
-TEXT_KINDS: dict[str, Callable[[bytes, FileEdit], bytes]] = {
+TEXT_KINDS: dict[str, Callable[[bytes, Edit], bytes]] = {
     "line": _line,
     "insert": _insert,
     "byte": _byte,

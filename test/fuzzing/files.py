@@ -17,18 +17,16 @@ from typing import Any
 import hypothesis
 import yaml
 from fuzzing import programs
-from fuzzing.file_edits import FileEdit, file_edits, odd_file
+from fuzzing.edit import Edit, exploring
+from fuzzing.file_edits import file_edits, odd_file
 from fuzzing.messages import Failure, Keep, Show, failed
 from fuzzing.tally import TAKEN, ClaimBroken, Tally
 from hypothesis import (
-    HealthCheck,
-    Phase,
     currently_in_test_context,
     given,
     note,
     reproduce_failure,
     seed,
-    settings,
 )
 from hypothesis import strategies as st
 from hypothesis.errors import DidNotReproduce
@@ -103,7 +101,7 @@ def command(kind: str, robot: str, program: str, path: Path) -> tuple[str, list[
 
 
 def try_file(
-    case: tuple[str, int, str, tuple[FileEdit, ...]], tally: Tally, *, really: bool = False
+    case: tuple[str, int, str, tuple[Edit, ...]], tally: Tally, *, really: bool = False
 ) -> None:
     """Start a program with a file that is changed; check what it does.
 
@@ -209,16 +207,7 @@ def play(
     """
 
     @seed(number)
-    @settings(
-        max_examples=examples,
-        deadline=None,
-        database=None,
-        derandomize=False,
-        print_blob=True,
-        report_multiple_bugs=False,
-        phases=[Phase.generate],
-        suppress_health_check=list(HealthCheck),
-    )
+    @exploring(examples)
     @given(CASES)
     def all_files(odd: Any) -> None:
         try_file(odd, tally, really=really)

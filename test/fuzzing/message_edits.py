@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple
 
+from fuzzing.edit import Edit
 from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
 
@@ -100,21 +100,6 @@ WHOLE = (0, 1, 2, 3, 5, -1, 255, 2**31 - 1, -(2**31), 2**32 - 1)
 
 _INTEGER = re.compile(r"(u?)int(\d+)")
 _LIST = re.compile(r"(?:sequence<(?P<of>[^,]+)(?:, \d+)?>|(?P<of_array>[^\[]+)\[\d+\])")
-
-
-@dataclass(frozen=True)
-class Edit:
-    """One change of a message.
-
-    Attributes:
-        kind: what is done, a key of `KINDS`.
-        where: to which of the parts that it fits, modulo their number.
-        value: with which value.
-    """
-
-    kind: str
-    where: int = 0
-    value: Any = None
 
 
 class _Part(NamedTuple):

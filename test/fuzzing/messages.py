@@ -11,9 +11,10 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import hypothesis
+from fuzzing.edit import exploring
 from fuzzing.machine import Machine
 from fuzzing.tally import ClaimBroken, Tally
-from hypothesis import HealthCheck, Phase, reproduce_failure, seed, settings
+from hypothesis import reproduce_failure, seed
 from hypothesis.errors import DidNotReproduce
 from hypothesis.stateful import run_state_machine_as_test
 
@@ -54,17 +55,7 @@ def play(number: int, tally: Tally, *, case: bytes | None = None) -> Failure | N
     try:
         run_state_machine_as_test(
             machine,
-            settings=settings(
-                max_examples=EXAMPLES,
-                stateful_step_count=STEPS,
-                deadline=None,
-                database=None,
-                derandomize=False,
-                print_blob=True,
-                report_multiple_bugs=False,
-                phases=[Phase.generate],
-                suppress_health_check=list(HealthCheck),
-            ),
+            settings=exploring(EXAMPLES, stateful_step_count=STEPS),
         )
     except DidNotReproduce:
         return None

@@ -15,8 +15,9 @@ import numpy as np
 import pinocchio as pin
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from fuzzing.edit import Edit
 from fuzzing.good_messages import GoodMessages
-from fuzzing.message_edits import Edit, edited
+from fuzzing.message_edits import edited
 from fuzzing.stepped_nodes import Delivery, SteppedClock, Wire, stepped_clock
 from fuzzing.tally import TAKEN, ClaimBroken, Tally
 from geometry_msgs.msg import PoseStamped, Vector3Stamped, WrenchStamped

@@ -81,10 +81,7 @@ def step(
         LinAlgError: M is singular.
     """
     M, C, J, J_dot, v = arm
-    total = M.sum() + C.sum() + J.sum() + J_dot.sum() + v.sum() + a_ref.sum()
-    if initialise > 0.0:
-        total += torque.sum()
-    if not (math.isfinite(total) and (np.diag(M) > 0.0).all()):
+    if not usable(arm, a_ref, torque, initialise):
         return False
     J_plus, J_plus_dot, _ = dynamically_consistent_inverse(J, J_dot, M, C + C.T, THRESHOLD)
     root_M = np.sqrt(np.diag(M))
@@ -179,6 +176,16 @@ def _advance(
     x = (1.0 - ratio) * a + (ratio * slow - fast) * memory.a + fast * memory.root / root_M
     forgotten = -math.expm1((law.slow_leak_rate - law.null_leak_rate) * dt)  # in the null space
     return a - forgotten * (a - J_plus @ (arm.J @ a)), x
+
+
+@compiled
+def usable(arm: ArmTerms, a_ref: Array, torque: Array, initialise: float) -> bool:
+    """Return whether the arguments of a step are numbers, and M can be a mass matrix."""
+    M, C, J, J_dot, v = arm
+    total = M.sum() + C.sum() + J.sum() + J_dot.sum() + v.sum() + a_ref.sum()
+    if initialise > 0.0:
+        total += torque.sum()
+    return math.isfinite(total) and bool((np.diag(M) > 0.0).all())
 
 
 @compiled

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torque_safety_controller.anti_windup import clip, project, scale_factor
-from torque_safety_controller.integral_feedback.action import ArmTerms, IntegralAction
+from torque_safety_controller.integral_feedback.action import ArmTerms
 from torque_safety_controller.integral_feedback.gain_matrix import gain_torque
 from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors
 from torque_safety_controller.integral_feedback.settings import (
@@ -32,11 +32,11 @@ from torque_safety_controller.integral_feedback.settings import (
 )
 from torque_safety_controller.linalg.generalized_inverse import (
     THRESHOLD,
-    check_task_shape,
     dynamically_consistent_inverse,
 )
-from torque_safety_controller.nullspace.kernels import initial_memory
-from viability_bounds_pkg.compiled import bound, compiled
+from torque_safety_controller.nullspace.kernels import initial_memory, usable
+from torque_safety_controller.nullspace.task_action import TaskAction
+from viability_bounds_pkg.compiled import compiled
 
 Array = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ class PrintedMemory(NamedTuple):
     J: Array
 
 
-class PrintedCompliance(IntegralAction):
+class PrintedCompliance(TaskAction):
     """Additional torque of (16), (21) and (26), for a task of m < n rows.
 
     Args:
@@ -78,51 +78,13 @@ class PrintedCompliance(IntegralAction):
     memory: PrintedMemory
 
     def __init__(self, settings: IntegralSettings, m: int) -> None:
-        n = len(settings.budget)
-        check_task_shape(m, n)
-        s, a, slow, fast, widening, v, velocity, a_ref = np.zeros((8, n))
-        J, J_dot, J_last = np.zeros((3, m, n))
-        memory = PrintedMemory(s, np.zeros(m), a, slow, fast, widening, v, J_last)
-        self._arm = ArmTerms(np.eye(n), np.zeros((n, n)), J, J_dot, velocity)
-        super().__init__(settings, memory, (*self._arm, a_ref))
-
-    def _use(self, law: Law) -> None:
-        self._law = law
-        results = self._torque, self.saturated
-        self._step = bound(
-            step, self.memory, law, self._arm, self._inputs[-1], *results, numbers=2
-        )
-
-    def reset(self, arm: ArmTerms) -> None:
-        """See `IntegralAction`."""
-        super().reset(arm)
-        self.memory.J[:] = arm.J
-
-    def torque(self, arm: ArmTerms, a_last: Array, dt: float) -> Array:
-        """See `IntegralAction`."""
-        return self._next(arm, a_last, dt, initialise=0.0)
-
-    def initialise(self, torque: Array, arm: ArmTerms) -> Array:
-        """See `IntegralAction`; the slow memory takes what the task feels of it."""
-        self._torque[:] = torque
-        return self._next(arm, arm.v, 0.0, initialise=1.0)
+        super().__init__(settings, m, PrintedMemory, step)
 
     def skip(self, arm: ArmTerms, dt: float) -> None:
         """See `IntegralAction`."""
         super().skip(arm, dt)
         self.memory.slow[:] *= math.exp(-self._law.slow_leak_rate * dt)
         self.memory.fast[:] *= math.exp(-self._law.fast_leak_rate * dt)
-        self.memory.J[:] = arm.J
-
-    def _next(self, arm: ArmTerms, a_last: Array, dt: float, initialise: float) -> Array:
-        self._take(*arm, a_last)
-        try:
-            usable = self._step(dt, initialise)
-        except np.linalg.LinAlgError as error:
-            raise ValueError("M must be positive definite") from error
-        if not usable:
-            raise ValueError("M must be positive definite, and all numbers finite")
-        return self._torque.copy()
 
 
 @compiled
@@ -144,10 +106,7 @@ def step(
         LinAlgError: M is singular.
     """
     M, C, J, J_dot, v = arm
-    total = M.sum() + C.sum() + J.sum() + J_dot.sum() + v.sum() + a_ref.sum()
-    if initialise > 0.0:
-        total += torque.sum()
-    if not (math.isfinite(total) and (np.diag(M) > 0.0).all()):
+    if not usable(arm, a_ref, torque, initialise):
         return False
     J_plus, J_plus_dot, _ = dynamically_consistent_inverse(J, J_dot, M, C + C.T, THRESHOLD)
     if initialise > 0.0:
