@@ -40,6 +40,7 @@ from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.goals import Goals
 from torque_safety_controller.tasks.task import Task
 from viability_bounds_pkg.state import State
+from viability_bounds_pkg.state_estimation.freeze_check import FRICTION, STICTION, Expected
 from viability_bounds_pkg.viability import BoundsSolver
 from viability_bounds_pkg.whole_arm.safety_filter import UNHURRIED, USUAL, SafetyFilter
 
@@ -140,6 +141,11 @@ class Controller:
     def acceleration(self) -> Array:
         """Acceleration commanded last, shape (n,), rad/s^2."""
         return self._a_last
+
+    def expected(self) -> Expected:
+        """Return how the arm moves after the last step."""
+        idle = self.additional is None or self.additional.idle
+        return Expected(self._a_last, FRICTION if idle else STICTION, self._observer.known)
 
     @property
     def lost(self) -> bool:

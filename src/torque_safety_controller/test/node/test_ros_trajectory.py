@@ -124,7 +124,8 @@ def test_it_is_followed_in_the_robots_time(ros):
 
         def send(stamp=stamp):
             limits.publish(acceleration_limits(joints, stamp * MS, -wide, wide))
-            states.publish(joint_state(joints, stamp * MS, q, v))
+            still = q + 1e-12 * stamp  # not frozen
+            states.publish(joint_state(joints, stamp * MS, still, v))
 
         ros.wait_until(lambda s=stamp: s * MS in commands.stamps, "an answer", each=send)
         if stamp >= 20:

@@ -253,6 +253,7 @@ class ControllerNode(ArmNode):
         elapsed = states.elapsed() or 0.0
         self._commands.torque(step.tau, stamp)
         states.answered()
+        states.expect(self._controller.expected())
         self._record.note(step, now - states.message_at)
         self._wrenches.note()
         self._collision.note(step)

@@ -97,7 +97,10 @@ class EstimatorNode(ArmNode):
             return
         if verdict is Verdict.NEW:
             reported = State(reader.q, reader.v)
-            state = self._estimator.step(reader.stamp, reported, reader.effort())
+            estimator = self._estimator
+            state = estimator.step(reader.stamp, reported, reader.effort())
+            if estimator.expected is not None:
+                reader.expect(estimator.expected)
             self._answer = reader.with_state(state)
             self._answered += 1
         self._publisher.publish(self._answer)

@@ -24,6 +24,7 @@ from viability_bounds_pkg.ros.robot_urdf import DescriptionWatch
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import DIAGNOSTICS, VALUES
 from viability_bounds_pkg.state import State
+from viability_bounds_pkg.state_estimation.freeze_check import Expected
 from viability_bounds_pkg.state_estimation.state_check import StateCheck
 
 Report = Callable[[], tuple[bytes, str, dict[str, Any]]]
@@ -130,6 +131,11 @@ class JointStateReader:
         self._accepted_at = self.heard_at = now
         self.accepted += 1
         return Verdict.NEW
+
+    def expect(self, expected: Expected) -> None:
+        """Say how the arm moves from the last state on, for what tells states that cannot be."""
+        if self._check is not None:
+            self._check.expect(expected)
 
     def effort(self) -> NDArray[np.float64] | None:
         """Return the torque of the motors in the last accepted message, shape (n,), N m.

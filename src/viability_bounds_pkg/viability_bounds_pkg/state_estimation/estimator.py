@@ -10,6 +10,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from viability_bounds_pkg.state import State
+from viability_bounds_pkg.state_estimation.freeze_check import STICTION, Expected
 from viability_bounds_pkg.state_estimation.observer import Observer, ObserverDesign
 from viability_bounds_pkg.state_estimation.prediction import (
     Command,
@@ -64,6 +65,7 @@ class StateEstimator:
     Attributes:
         resets: how often it started anew, by reason.
         innovation: largest one seen since then, shape (n,), rad; not those of jumps.
+        expected: how the arm moved in the last period; None at the beginning.
     """
 
     def __init__(
@@ -96,6 +98,7 @@ class StateEstimator:
         self._torque_share = 1.0 / torque_max
         self.resets: Counter[str] = Counter()
         self.innovation = zero.copy()
+        self.expected: Expected | None = None
 
     def answer(self, stamp: int, tau: Array | None) -> None:
         """Take note of a command, see `CommandsUnderWay.answer`."""
@@ -121,11 +124,15 @@ class StateEstimator:
             acted, coming = Command(None), [Command(None)] * len(coming)
         before = self._tau
         self._tau = self._torque(before, acted, reported, effort)
-        state = reported
-        if self._observer is not None:
-            observer, mean = self._observer, self._lag.mean(before, self._tau)
+        state, mean = reported, self._lag.mean(before, self._tau)
+        if self._observer is None:
+            self.expected = Expected(self._model.acceleration_at(reported, mean), STICTION)
+        else:
+            observer = self._observer
             for _ in range(periods):
-                observer.predict(self._model.acceleration(observer.state, mean))
+                a = self._model.acceleration(observer.state, mean)
+                observer.predict(a)
+            self.expected = Expected(a, STICTION, observer.disturbance, observer.state.v)
             innovation = observer.innovation(reported.q)
             size = np.abs(innovation)
             if not (size <= self._jump).all():
@@ -188,6 +195,7 @@ class StateEstimator:
 
     def _start(self, stamp: int, reported: State) -> State:
         """Start anew from a reported state; nothing is known to be under way."""
+        self.expected = None
         self._commands.clear()
         self._commands.open(stamp)
         self._model.a = np.zeros(len(self._tau))

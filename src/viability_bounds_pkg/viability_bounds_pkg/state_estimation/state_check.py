@@ -23,6 +23,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from viability_bounds_pkg.state import State
+from viability_bounds_pkg.state_estimation.freeze_check import FROZEN, Expected, FreezeCheck
 
 Array = NDArray[np.float64]
 
@@ -79,8 +80,9 @@ class StateCheck:
     After a jump states are believed again at once if they go on within `SPIKE` where the last one
     that was believed leads to. Otherwise, and after a contradiction, they must agree with each
     other for `WINDOW` and show the arm where it can be after a stop. What froze agrees with an arm
-    that stands: after each contradiction it takes twice as long. A gap of `GAP` in the stamps, as
-    the restart of a robot makes one, is a new beginning.
+    that stands: after each contradiction it takes twice as long, except for states that were the
+    same and change again. A gap of `GAP` in the stamps, as the restart of a robot makes one, is a
+    new beginning.
 
     Args:
         model: the arm, n joints with one coordinate each.
@@ -112,6 +114,7 @@ class StateCheck:
         error = np.zeros_like(fastest) if velocity_error is None else velocity_error
         self._velocity = SHARE * fastest + error
         self._limit = fastest
+        self._freeze = FreezeCheck(model, tau_max, self._position, self._with_velocities)
         self.reset()
 
     def reset(self) -> None:
@@ -125,6 +128,11 @@ class StateCheck:
         self._trusted = 0.0  # how long there has been no doubt, s
         self._doubt = ""
         self._contradiction = False  # whether it is more than a jump
+        self._freeze.reset()
+
+    def expect(self, expected: Expected) -> None:
+        """Say how the arm moves from the last state on."""
+        self._freeze.expected = expected
 
     def look(self, state: State, stamp: float) -> str:
         """Look at the next state; return what is wrong, or nothing.
@@ -150,16 +158,18 @@ class StateCheck:
                 return ""
             before, h = state, 0.0
         jumps = self._jumps(before, state, h)
-        contradicts = self._contradicts(before, state, h, jumps)
+        frozen = self._freeze.look(before, state, h)
+        contradicts = self._contradicts(before, state, h, jumps) or frozen
         self._agreed = 0.0 if jumps or contradicts else self._agreed + h
         if contradicts:
             if not self._contradiction:
                 self._patience *= 2.0
-            self._contradiction, self._doubt = True, CONTRADICTION
+            self._contradiction, self._doubt = True, FROZEN if frozen else CONTRADICTION
         elif jumps and not self._doubt:
             self._doubt = JUMP
         if self._doubt and self._goes_on(state, stamp):
             self._doubt, self._contradiction = "", False
+            self._freeze.believe()
         self._trusted = 0.0 if self._doubt else self._trusted + h
         if self._trusted > FORGIVEN:
             self._patience = WINDOW
@@ -196,7 +206,8 @@ class StateCheck:
         """Return whether velocities have led elsewhere than where the joints are."""
         if not self._with_velocities:
             return False
-        if jumps:  # the next states are compared among themselves
+        awakes = self._doubt == FROZEN and self._freeze.changing <= h
+        if jumps or awakes:  # the next states are compared among themselves
             self._drift = np.zeros_like(self._drift)
             return False
         self._drift = np.exp(-h / WINDOW) * self._drift
@@ -226,7 +237,8 @@ class StateCheck:
             free = free + STOPS * UNSURE
         on = STOPS * before.v
         near = (np.minimum(on, 0.0) - free <= moved) & (moved <= np.maximum(on, 0.0) + free)
-        return bool(near.all()) and self._agreed >= self._patience
+        awake = self._doubt == FROZEN and self._freeze.changing >= WINDOW
+        return bool(near.all()) and self._agreed >= (WINDOW if awake else self._patience)
 
 
 def largest_accelerations(model: pin.Model, tau_max: Array) -> Array:

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tells joint states that have frozen while their stamps go on.
+
+Velocities that stay the same to the last bit have *frozen*, or they are those of an arm that
+stands and whose sensors are too coarse to tell. Where that of a joint at rest has been seen to
+change for `ALIVE` at each state, it is the first. Otherwise it matters when the arm is to move and
+positions stay the same, too. With the speed v that they report and the acceleration a that the
+motors are to give, both fading within `FADING` for what is not known,
+
+    w' = a + e - w / FADING,  w(0) = v,    m' = w - m / FADING,  m(0) = 0
+
+is how far the arm must have come. What holds it at rest is learned within `LEARNED`: e, from what
+is known to disturb it to -a. Friction may hold it: what is left counts as far as its torque is
+beyond `FRICTION`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from viability_bounds_pkg.state import State
+
+Array = NDArray[np.float64]
+
+FRICTION = 0.05
+"""What may hold a joint back, as a share of its torque limit, where nothing compensates it."""
+
+STICTION = 0.15
+"""The same where something does."""
+
+LEARNED = 0.1
+"""Time constant with which an arm that does not move is taken to be held, s."""
+
+ALIVE, STATES = 1.0, 200
+"""How long, in s, and how often at least a joint at rest changes where its last bits are noise."""
+
+REST = 0.01
+"""Speed below which a joint is at rest here, rad/s."""
+
+ROW = 3
+"""States in a row that are the same where none ever was, and at least for"""
+
+ROW_TIME = 0.01
+"""this time, s."""
+
+FADING = 0.2
+"""Time constant with which motion that is expected is forgotten, s."""
+
+FROZEN = "frozen: they stay the same to the last bit"
+"""What is wrong with such states."""
+
+
+class Expected(NamedTuple):
+    """How an arm moves from a state on.
+
+    Attributes:
+        a: acceleration that the motors are to give, shape (n,), rad/s^2.
+        friction: that may hold joints, as a share of their torque limits.
+        disturbance: error of a that is known, shape (n,), rad/s^2; None for none.
+        v: velocity, shape (n,), rad/s; None for that of the state.
+    """
+
+    a: Array
+    friction: float
+    disturbance: Array | None = None
+    v: Array | None = None
+
+
+class FreezeCheck:
+    """Looks at the joint states of one arm, one after the other.
+
+    Args:
+        model: the arm, n joints with one coordinate each.
+        tau_max: torque limits, shape (n,), N m.
+        allowed: how far the arm may seem to lag behind, shape (n,), rad.
+        with_velocities: whether the velocities of states tell anything.
+
+    Attributes:
+        expected: how the arm moves from the last state on; None if that is not known.
+        changing: for how long no state has been as that before it, s.
+    """
+
+    def __init__(
+        self, model: pin.Model, tau_max: Array, allowed: Array, with_velocities: bool
+    ) -> None:
+        self._model, self._data = model, model.createData()
+        self._tau_max, self._allowed = tau_max, allowed
+        self._with_velocities = with_velocities
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew: any state may come next."""
+        zero = np.zeros_like(self._tau_max)
+        self.expected: Expected | None = None
+        self.changing = 0.0
+        self._changes = zero  # of each joint at rest, one after the other
+        self._alive = False  # whether there is always one
+        self._told = False
+        self._speed = self._held = zero
+        self._begin()
+
+    def _begin(self) -> None:
+        self._row = 0  # states that were the same as those before them, one after the other
+        self._row_time = 0.0  # s
+        self._way: Array | None = None  # that the arm must have come meanwhile, rad
+        self._far = False  # whether that is more than allowed
+
+    def believe(self) -> None:
+        """Take what is the same for an arm that stands, after all."""
+        if self._told and self._row:
+            self._alive = False
+        self._told = False
+        self._begin()
+
+    def look(self, before: State, now: State, h: float) -> bool:
+        """Return whether states have frozen, once.
+
+        Args:
+            before: shapes (n,).
+            now: the state after it.
+            h: time between them, s.
+        """
+        expected, self.expected = self.expected, None
+        same = now.q == before.q
+        if not (now.v == before.v if self._with_velocities else same).all():
+            if self._alive:
+                self._alive = self._row <= 1 or self._told
+            elif self._with_velocities:
+                self._alive = self._changes_at_rest(before, now) >= max(STATES, ALIVE / h)
+            self._begin()
+            self.changing += h
+            return False
+        self._changes = np.zeros_like(self._changes)
+        self._row, self._row_time, self.changing = self._row + 1, self._row_time + h, 0.0
+        if self._told:
+            return False
+        if self._alive and self._row >= ROW and self._row_time > ROW_TIME - 0.5 * h:
+            self._told = True
+        elif expected is None or not same.all():
+            self._way = None
+        else:
+            self._told = self._should_have_moved(before, expected, h)
+        return self._told
+
+    def _changes_at_rest(self, before: State, now: State) -> float:
+        """Return how often in a row the velocity of a joint at rest has changed, at most."""
+        more = self._changes + (np.abs(now.v) < REST)
+        self._changes = np.where(now.v != before.v, more, 0.0)
+        return float(self._changes.max())
+
+    def _should_have_moved(self, before: State, expected: Expected, h: float) -> bool:
+        """Return whether an arm that is said not to move must have moved since it began so."""
+        a, fading = expected.a, math.exp(-h / FADING)
+        if self._way is None:
+            self._way, self._far = np.zeros_like(a), False
+            self._held = self._way if expected.disturbance is None else expected.disturbance
+            self._speed = before.v if expected.v is None else expected.v
+        net = a + self._held
+        self._held = self._held - (1.0 - math.exp(-h / LEARNED)) * net
+        torque = np.abs(pin.crba(self._model, self._data, before.q) @ net)
+        beyond = np.maximum(torque - expected.friction * self._tau_max, 0.0)
+        share = np.divide(beyond, torque, out=np.zeros_like(a), where=torque > 0.0)
+        self._speed = fading * self._speed + h * share * net
+        self._way = fading * self._way + h * self._speed
+        far = bool((np.abs(self._way) > self._allowed).any())
+        before, self._far = self._far, far
+        return far and before  # twice: one state may come late
