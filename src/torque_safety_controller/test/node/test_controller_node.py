@@ -105,6 +105,28 @@ def test_with_a_posture_goal_it_tracks_whatever_the_order_of_names(ros):
     chain.await_mode("TRACKING")
 
 
+@pytest.mark.parametrize("held", [[], np.full(ARM.n, 0.1)], ids=["not known", "on"])
+def test_where_motors_hold_the_arm_before_it_starts_goals_fade_in(ros, held):
+    chain = NodeChain(ros)
+    chain.postures.publish(joint_state(JOINTS, 0, GOAL_Q))
+    ros.wait_until(lambda: chain.reported("goals_pending") == "1", "the goal")
+
+    def answer(stamp):
+        def send():
+            chain.bound(stamp)
+            chain.send_state(stamp, Q, V, held)
+
+        return chain.await_command(stamp, send)
+
+    rest = expected().brake(State(Q, V), AccelerationRange(LOWER, UPPER)).tau
+    goal = expected(posture=GOAL_Q).step(State(Q, V), AccelerationRange(LOWER, UPPER)).tau
+    taus = [answer(10 + 10 * k) for k in range(10)]
+    share = [np.abs(tau - rest).max() / np.abs(goal - rest).max() for tau in taus]
+    assert share[0] < 0.01  # at first as if there was no goal
+    assert 0.1 < share[-1] < 0.3  # 90 of 500 ms
+    assert (np.diff(share) < 0.05).all()
+
+
 def test_it_holds_while_bounds_are_missing_and_goes_on_by_itself(ros):
     chain = NodeChain(ros, bounds_timeout=0.1)
     stamp = give_goal(chain)

@@ -58,8 +58,9 @@ class ControllerChain:
         self.limits = ros.talk(JointTrajectory, "acceleration_limits")
         ros.hears("joint_commands")
 
-    def send_state(self, stamp: int, q, v, tau=()) -> None:
-        """Publish a state with a stamp in ms."""
+    def send_state(self, stamp: int, q, v, tau=None) -> None:
+        """Publish a state with a stamp in ms; without `tau` the motors are off."""
+        tau = [0.0] * len(self.joints) if tau is None else tau
         self.states.publish(joint_state(self.joints, stamp * MS, q, v, tau))
 
     def send_limits(self, stamp: int, lower, upper) -> None:

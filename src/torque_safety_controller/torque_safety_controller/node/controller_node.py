@@ -205,9 +205,16 @@ class ControllerNode(ArmNode):
         states = self._states
         if arrival is Arrival.ANEW and self._limits.stamp == states.answered_stamp:
             self._limits.stamp = -1  # from before the restart; its stamps may come again
+        if self._by_others():
+            self._went_wrong = "the motors held the arm before"
         states.begin()
         self._controller.reset(states.q)
         self._handover.robot_was_away()
+
+    def _by_others(self) -> bool:
+        """Return whether the motors are on, as far as is known, though nothing is commanded."""
+        effort = self._states.effort()
+        return effort is None or bool(effort.any())
 
     def _on_limits(self, message: JointTrajectory) -> None:
         if not (self.publisher_watch.admits(self._limits_topic) and self._limits.read(message)):
