@@ -31,6 +31,8 @@ from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import Topic
 
 _QUATERNION_TOLERANCE = 1e-3
+_FARTHEST = 100.0  # m; no arm is longer
+_FASTEST = 1e6  # m/s, rad/s, m/s^2 or rad/s^2; nothing is faster
 
 
 class GoalRefused(ArmSafetyError, ValueError):
@@ -79,6 +81,8 @@ def trajectory_from_message(
             for twist in given:
                 rate[:3] = R @ _vector(twist.linear)
                 rate[3:] = R @ _vector(twist.angular)
+            if (fast := np.abs(rate).max()) > _FASTEST:
+                raise GoalRefused(f"points[{k}] asks for {fast:g}; allowed: up to {_FASTEST:g}")
         pose = base * _placement(transform.translation, transform.rotation)
         time = point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec
         points.append(TrajectoryPoint(time, pose, *rates))
@@ -102,6 +106,8 @@ def _placement(p: Point | Vector3, o: Quaternion) -> pin.SE3:
     values = (p.x, p.y, p.z, o.x, o.y, o.z, o.w)
     if not all(map(math.isfinite, values)):
         raise GoalRefused("pose is not finite")
+    if (far := max(map(abs, (p.x, p.y, p.z)))) > _FARTHEST:
+        raise GoalRefused(f"position is {far:g} m away; allowed: up to {_FARTHEST:g} m")
     norm = math.hypot(o.x, o.y, o.z, o.w)
     if abs(norm - 1.0) > _QUATERNION_TOLERANCE:
         raise GoalRefused(f"orientation has norm {norm:.4g}; allowed: 1 within 0.001")

@@ -168,5 +168,5 @@ class FreezeCheck:
         self._speed = fading * self._speed + h * share * net
         self._way = fading * self._way + h * self._speed
         far = bool((np.abs(self._way) > self._allowed).any())
-        before, self._far = self._far, far
-        return far and before  # twice: one state may come late
+        once, self._far = self._far, far
+        return far and once  # twice: one state may come late
