@@ -36,10 +36,6 @@ if [ -z "$name" ] || [ ! -f "$root/benchmarks/bench_$name.py" ]; then
     exit 2
 fi
 shift
-set +u
-# shellcheck disable=SC1091
-source "$root/scripts/setup.sh"
-set -u
-export ROS_DOMAIN_ID="${ROS_DOMAIN_ID:-$((1 + $$ % 100))}"
-export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
+# shellcheck source=scripts/environment.sh
+source "$root/scripts/environment.sh"
 exec python "$root/benchmarks/bench_$name.py" "$@"

@@ -19,10 +19,6 @@ USAGE
 }
 case "${1:-}" in -h | --help) usage; exit 0 ;; esac
 root="$(cd "$(dirname "$0")/.." && pwd)"
-set +u
-# shellcheck disable=SC1091
-source "$root/scripts/setup.sh"
-set -u
-export ROS_DOMAIN_ID="${ROS_DOMAIN_ID:-$((1 + $$ % 100))}"
-export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
+# shellcheck source=scripts/environment.sh
+source "$root/scripts/environment.sh"
 exec python -W ignore "$root/test/fuzz.py" "$@"

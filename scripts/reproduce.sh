@@ -50,10 +50,6 @@ paper0 | paper1_integral | paper1_compliance | departures | state_dependent | fr
     exit 2
     ;;
 esac
-set +u
-# shellcheck disable=SC1091
-source "$root/scripts/setup.sh"
-set -u
-export ROS_DOMAIN_ID="${ROS_DOMAIN_ID:-$((1 + $$ % 100))}"
-export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
+# shellcheck source=scripts/environment.sh
+source "$root/scripts/environment.sh"
 exec python "$root/reproduction/$what.py" "$@"

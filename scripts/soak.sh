@@ -23,9 +23,6 @@ USAGE
 }
 case "${1:-}" in -h | --help) usage; exit 0 ;; esac
 root="$(cd "$(dirname "$0")/.." && pwd)"
-set +u
-# shellcheck disable=SC1091
-source "$root/scripts/setup.sh"
-set -u
-export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
+# shellcheck source=scripts/environment.sh
+source "$root/scripts/environment.sh"
 exec python "$root/reproduction/soak.py" "$@"

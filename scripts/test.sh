@@ -7,8 +7,9 @@ case "${1:-}" in
     cat <<'USAGE'
 usage: bash scripts/test.sh [options of pytest]
 
-  bash scripts/test.sh                  all tests but those of set-up, in several processes
+  bash scripts/test.sh                  all tests but the long ones, in several processes
   bash scripts/test.sh -k viability     some of them, in one
+  bash scripts/test.sh -m long -n 3     whole scenarios and commands, seconds each
   bash scripts/test.sh -m packaging     those of set-up and of copies of packages
   bash scripts/test.sh -n 2             in so many processes; 0 for this one
   bash scripts/test.sh --hypothesis-profile=explore    with other examples than last time
@@ -19,14 +20,9 @@ USAGE
     ;;
 esac
 root="$(cd "$(dirname "$0")/.." && pwd)"
-set +u
-# shellcheck disable=SC1091
-source "$root/scripts/setup.sh"
-set -u
+# shellcheck source=scripts/environment.sh
+source "$root/scripts/environment.sh"
 cd "$root"
-# A ROS domain of its own, so that other nodes do not interfere.
-export ROS_DOMAIN_ID="${ROS_DOMAIN_ID:-$((1 + $$ % 100))}"
-export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
 # So that what is compiled of tests and sources to be imported is kept for the other processes.
 unset PYTHONDONTWRITEBYTECODE
 # One process more than cores, because some tests wait.

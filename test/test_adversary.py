@@ -61,6 +61,7 @@ FOUND = [
 """Baxter's speed limit was passed by 20%: plans that end within a step were made for ever."""
 
 
+@pytest.mark.long
 def test_the_worst_episode_that_was_found_keeps_all_limits():
     found = Arena(ROWS["Baxter: goals"]).play(np.array(FOUND))
     assert found["position"] >= 0.0
@@ -69,6 +70,7 @@ def test_the_worst_episode_that_was_found_keeps_all_limits():
     assert found["outside"] == 0
 
 
+@pytest.mark.long
 def test_an_episode_can_be_played_again():
     arena, other = Arena(ROWS["Baxter: goals"]), Arena(ROWS["Baxter: goals"])
     genes = np.random.default_rng(0).random(arena.genes)
@@ -77,6 +79,7 @@ def test_an_episode_can_be_played_again():
     assert arena.play(genes) == first == other.play(genes)
 
 
+@pytest.mark.long
 def test_without_the_filter_a_short_search_passes_limits():
     least = search(Arena(ROWS["Baxter: goals, without"]), 15, 0)
     assert least["episodes"] == 15
@@ -133,6 +136,7 @@ def test_the_greedy_adversary_asks_for_the_corner_after_which_least_is_left():
     assert left(asked) <= np.quantile(others, 0.2)
 
 
+@pytest.mark.long
 def test_pieces_that_are_done_are_not_done_again(tmp_path, monkeypatch):
     monkeypatch.setattr(pieces, "RESULTS", tmp_path)
     work = [([["a", k]],) for k in range(3)]  # for dict, which every process has

@@ -19,7 +19,9 @@ NODE = "bounds_node"
 MS = 1_000_000
 
 
-@pytest.mark.parametrize("robot", ["baxter_left_arm", "panda"])
+@pytest.mark.parametrize(
+    "robot", [pytest.param("baxter_left_arm", marks=pytest.mark.long), "panda"]
+)
 def test_the_configured_margins_only_narrow_the_bounds(robot):
     values = dict.fromkeys(("acceleration_drift", "position_margin"))
     margins = read_config(robot, NODE)

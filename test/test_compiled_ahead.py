@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).resolve().parent.parent
 CONFIG = ROOT / "config"
 PACKAGES = ("viability_bounds_pkg", "torque_safety_controller", "sim_bridge")

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from direct import column
 
+pytestmark = pytest.mark.long
+
 LACKING, COMPLIANT = pushing.MODES
 
 

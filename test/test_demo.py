@@ -81,6 +81,7 @@ def test_what_it_cannot_play_is_refused_in_one_line(tmp_path, arguments, names):
     assert names in error
 
 
+@pytest.mark.long
 def test_an_imperfect_robot_may_have_further_parameters(tmp_path):
     """At half the rate its own filter passes too much: both files are read."""
     further = tmp_path / "further.yaml"
@@ -91,6 +92,7 @@ def test_an_imperfect_robot_may_have_further_parameters(tmp_path):
     assert line in result.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("apart", [[], ["--processes"]], ids=["one process", "processes"])
 def test_an_imperfect_robot_is_played_with_what_is_done_about_it(tmp_path, apart):
     path = first_goal(tmp_path, "panda")
@@ -107,6 +109,7 @@ def test_it_knows_the_bounds_there_are():
     assert f"\n{' | '.join(METHODS)}) ;;\n" in DEMO.read_text()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("when", "sent", "apart"),
     [
@@ -193,6 +196,7 @@ def play(robot, name, changed):
     return loop, loop.run(scenario.duration, each)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("robot", "changed", "remains", "near"),
     [
@@ -211,6 +215,7 @@ def test_other_demos_go_to_a_limit_and_break_none(robot, changed, remains, near)
     assert min(monitor.closest_to_q_min.min(), monitor.closest_to_q_max.min()) < near
 
 
+@pytest.mark.long
 def test_a_pushed_elbow_gives_way_once_it_is_told_to():
     loop, samples = play("talos_left_arm", "push_elbow", {})
     assert not loop.robot.monitor.violated

@@ -21,6 +21,8 @@ from viability_bounds_pkg.cli.limits_file import read_robot
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
 
+pytestmark = pytest.mark.long
+
 ROBOT = "talos_left_arm"
 GIVEN = read_config(ROBOT, "bullet_node")
 N = len(GIVEN["joints"])

@@ -30,6 +30,7 @@ def test_claims_hold_through_random_sequences():
     assert tally.facts["recoveries"] >= 3
 
 
+@pytest.mark.long
 def test_odd_files_are_refused_in_a_line_or_keep_the_claims():
     tally = Tally()
 

@@ -21,6 +21,8 @@ from compliance_hand import (
 )
 from direct import DirectLoop
 
+pytestmark = pytest.mark.long
+
 
 def test_a_pulled_hand_moves_and_stays_where_it_is_let_go():
     led = lead([(0.7, 2.0, HAND, PULL)], 3.0)

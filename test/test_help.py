@@ -19,7 +19,7 @@ EXECUTABLES = {
 }
 
 
-PARTS = {"domain.sh"}
+PARTS = {"domain.sh", "environment.sh"}
 """What is only sourced by another script."""
 
 

@@ -50,8 +50,8 @@ def play(robot, case, duration, seed=1):
 @pytest.mark.parametrize(
     ("robot", "case", "duration"),
     [
-        ("panda", "outage_stop", 4.0),
-        ("talos_left_arm", "outage_stop", 3.0),
+        pytest.param("panda", "outage_stop", 4.0, marks=pytest.mark.long),
+        pytest.param("talos_left_arm", "outage_stop", 3.0, marks=pytest.mark.long),
         ("baxter_left_arm", "all", 4.0),
     ],
 )

@@ -21,6 +21,8 @@ from paper1_integral import (
 from torque_safety_controller.qp.constraints import AccelerationRange
 from viability_bounds_pkg.state import State
 
+pytestmark = pytest.mark.long
+
 
 def error_at_rest(changed):
     loop = DirectLoop(ROBOT, changed)

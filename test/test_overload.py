@@ -12,6 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 
 
+@pytest.mark.long
 def test_a_stack_that_is_paused_keeps_the_limits(tmp_path):
     words = ["--seconds", "3", "--robot", "baxter_left_arm", "--way", "stack + robot"]
     words += ["--load", "pause safety_stack", "--out", tmp_path]

@@ -9,6 +9,8 @@ from process_faults import FAULTS, Bench, Kind
 
 from viability_bounds_pkg.testing.ros_harness import RosHarness, private_domain
 
+pytestmark = pytest.mark.long
+
 RATE = 100.0  # Hz, which a busy machine can do
 STEP = 1e-5  # rad; a h^2 / 8 in a physics step, for which only the bounds have a margin
 ALL = {"use_sim_time": True, "robot_description": "topic"}

@@ -125,6 +125,7 @@ def test_the_demo_goes_to_a_limit_and_breaks_none(tmp_path):
     assert all(name in result.stdout for name in metrics["joints"])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("command", sorted({*commands()} - {DEMO, INTERRUPTED}))
 def test_command_runs(hurried, command):
     if "scripts/demo.sh" not in command or "--help" in command:

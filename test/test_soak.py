@@ -19,6 +19,7 @@ ROOT = Path(__file__).resolve().parent.parent
 SOAK = ["bash", ROOT / "scripts" / "soak.sh", "--rate", "100", "--every", "2"]
 
 
+@pytest.mark.long
 def test_a_soak_ends_by_itself_with_a_report_of_all_that_happened(tmp_path):
     run = subprocess.run(
         [*SOAK, "--minutes", "0.15", "--out", tmp_path],
@@ -37,6 +38,7 @@ def test_a_soak_ends_by_itself_with_a_report_of_all_that_happened(tmp_path):
     assert (tmp_path / "report.md").read_text() in run.stdout
 
 
+@pytest.mark.long
 def test_ctrl_c_ends_it_with_its_report(tmp_path):
     with subprocess.Popen(
         [*SOAK, "--minutes", "60", "--out", tmp_path],

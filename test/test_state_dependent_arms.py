@@ -16,6 +16,8 @@ from viability_bounds_pkg.testing.ros_harness import read_config
 from viability_bounds_pkg.torque_margin import tightened, torque_margins
 from viability_bounds_pkg.viability import BoundsSolver
 
+pytestmark = pytest.mark.long
+
 DT = 0.002
 RACING = posture_only(2000.0, 90.0)
 

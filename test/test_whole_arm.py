@@ -53,6 +53,7 @@ def beyond(loop):
     )
 
 
+@pytest.mark.long
 def test_baxters_shoulder_keeps_its_limits_only_with_the_filter():
     without = beyond(race("baxter_left_arm", 30.0, 4, safety_filter=False))
     assert without[0] > 0.1
@@ -67,6 +68,7 @@ def test_baxters_shoulder_keeps_its_limits_only_with_the_filter():
     assert outcomes["as wanted"] > 0.9 * outcomes.total()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("robot", "seconds"), [("panda", 9.0), ("talos_left_arm", 6.0)])
 def test_arms_with_weaker_motors_keep_their_limits(robot, seconds):
     """With limits of acceleration that were found for torque limits of 100%."""

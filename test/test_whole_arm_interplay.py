@@ -9,6 +9,8 @@ from direct import DirectLoop, column
 from test_collision_avoidance import MARGIN, around_the_wall, play
 from test_whole_arm import STIFF, beyond
 
+pytestmark = pytest.mark.long
+
 STRONG = {"safety_filter": True}
 
 

@@ -16,6 +16,8 @@ from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.ros.runtime import GOAL_QOS
 from viability_bounds_pkg.testing.ros_harness import read_config
 
+pytestmark = pytest.mark.long
+
 SERVICE = f"{NODE}/enable_torque"
 TAU_MAX = np.array(read_config("panda", NODE)["torque_max"])
 
