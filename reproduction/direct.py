@@ -115,12 +115,14 @@ class DirectLoop:
         self.controller.reset(q)
         self.controller.set_posture_goal(q)
         self.controller.set_pose_goal(self.pose())
+        for k, hand in enumerate(self.controller.robot.others):
+            self.controller.set_other_pose_goal(k, self.pose(hand.frame))
 
-    def pose(self) -> pin.SE3:
-        """Return the true pose of the end effector, in the URDF's root frame."""
+    def pose(self, frame: str = "") -> pin.SE3:
+        """Return the true pose of a frame, the end effector if empty, in the URDF's root frame."""
         data = self.model.createData()
         pin.framesForwardKinematics(self.model, data, self.robot.state().q)
-        return data.oMf[self.model.getFrameId(self.controller.robot.frame)].copy()
+        return data.oMf[self.model.getFrameId(frame or self.controller.robot.frame)].copy()
 
     def run(
         self, duration: float, each: Callable[[float], None] | None = None

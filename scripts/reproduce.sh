@@ -12,6 +12,7 @@ Writes figures to results/, and prints a table with the paper's numbers and ours
   paper0 fig5        one of them
   paper1-integral    the second paper: handover, anti-windup, endurance
   paper1-compliance  pushes, poles, yielding and pressing hand
+  two-hands          two hands with one integral action, and docs/reproduction_two_hands.md (1 min)
   departures         where the controller departs from the second paper, and docs/departures.md
   state_dependent    Baxter with state-dependent acceleration limits
   friction           TALOS with friction compensation
@@ -36,7 +37,7 @@ what="${1:-all}"
 [ $# -eq 0 ] || shift
 case "$what" in -h | --help) usage; exit 0 ;; esac
 if [ "$what" = all ]; then
-    for part in paper0 paper1-integral paper1-compliance departures state_dependent friction out_of_reach stopping whole_arm; do
+    for part in paper0 paper1-integral paper1-compliance two-hands departures state_dependent friction out_of_reach stopping whole_arm; do
         bash "$root/scripts/reproduce.sh" "$part"
     done
     exit 0
@@ -44,7 +45,7 @@ fi
 what="${what//-/_}"
 [ "$what" != adversary ] || what=search_adversary
 case "$what" in
-paper0 | paper1_integral | paper1_compliance | departures | state_dependent | friction | out_of_reach | stopping | whole_arm | time_to_goal | search_adversary | imperfect | faults | process_faults | exactness) ;;
+paper0 | paper1_integral | paper1_compliance | two_hands | departures | state_dependent | friction | out_of_reach | stopping | whole_arm | time_to_goal | search_adversary | imperfect | faults | process_faults | exactness) ;;
 *)
     echo "error: unknown '$what'; --help lists what there is" >&2
     exit 2

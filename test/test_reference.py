@@ -35,7 +35,10 @@ NODES = {
 EXTRA = {
     "bounds_node": {},
     "estimator_node": {},
-    "controller_node": {"ros2_control_topic": "ros2_control_topic"},
+    "controller_node": {
+        "ros2_control_topic": "ros2_control_topic",
+        "end_effector_frame": "panda_hand panda_link5",
+    },
     "bullet_node": {"publish_clock": True, "start_paused": True, "clock": "lockstep"},
     "scenario_node": {
         "scenario": str(config_folder() / "scenarios" / "panda_press_on_table.yaml"),

@@ -6,7 +6,15 @@ from glob import glob
 from setuptools import find_packages, setup
 
 PACKAGE = "sim_bridge"
-FOLDERS = ("faults", "imperfect", "obstacles", "scenarios", "security", "two_hosts")
+FOLDERS = (
+    "faults",
+    "imperfect",
+    "obstacles",
+    "scenarios",
+    "security",
+    "two_hands",
+    "two_hosts",
+)
 CONFIG = ("config", *(f"config/{folder}" for folder in FOLDERS))
 
 setup(

@@ -2,10 +2,10 @@
 """The torque added to the model's: integral action in one of its modes, and friction's.
 
 Modes are ``none``; ``joints``, every joint stiff, (3)-(14) of [Benallegue2021]; and ``task`` and
-``position``, the end effector's pose or position stiff and its null space free, (15)-(26), which
-are as printed where the anti-windup is. The torque stays continuous when mode or settings change,
-and when a state is missing or unusable. Friction is compensated beside it, with a budget of its
-own.
+``position``, the end effectors' poses or positions stiff and their null space free, (15)-(26),
+which are as printed where the anti-windup is. The torque stays continuous when mode or settings
+change, and when a state is missing or unusable. Friction is compensated beside it, with a budget
+of its own.
 """
 
 from __future__ import annotations
@@ -70,6 +70,7 @@ class AdditionalTorque:
         settings: may be replaced between steps: the torque does not jump.
         tasks: rows of the pose's Jacobian by mode; without a null space left of them there is no
             such mode.
+        hands: end effectors whose rows are stacked to one task.
 
     Attributes:
         last: what the last step added, shape (n,), N m.
@@ -80,13 +81,16 @@ class AdditionalTorque:
     """
 
     def __init__(
-        self, settings: AdditionalSettings, tasks: Mapping[str, slice] | None = None
+        self,
+        settings: AdditionalSettings,
+        tasks: Mapping[str, slice] | None = None,
+        hands: int = 1,
     ) -> None:
         n = len(settings.integral.budget)
         self._tasks = TASKS if tasks is None else tasks
         self.actions: dict[str, IntegralAction] = {"joints": IntegralFeedback(settings.integral)}
         for mode, rows in self._tasks.items():
-            m = rows.stop - rows.start
+            m = hands * (rows.stop - rows.start)
             if m < n:
                 self.actions[mode] = NullspaceCompliance(settings.integral, m)
                 self.actions[PRINTED.format(mode)] = PrintedCompliance(settings.integral, m)
@@ -264,7 +268,11 @@ class AdditionalTorque:
     def _arm(self, robot: RobotModel, v: Array) -> ArmTerms:
         """Return what the actions need to know of the arm."""
         rows = self._tasks.get(self._mode, slice(0, 6))
-        return ArmTerms(robot.M, robot.C, robot.J[rows], robot.J_dot[rows], v)
+        J, J_dot = robot.J[rows], robot.J_dot[rows]
+        if robot.others:
+            J = np.vstack([J, *(hand.J[rows] for hand in robot.others)])
+            J_dot = np.vstack([J_dot, *(hand.J_dot[rows] for hand in robot.others)])
+        return ArmTerms(robot.M, robot.C, J, J_dot, v)
 
     def _fade(self, torque: Array) -> None:
         self._fading = torque

@@ -115,7 +115,7 @@ class Controller:
         n = robot.n
         self.robot = robot
         self.gains = gains
-        self.goals = Goals(n)
+        self.goals = Goals(n, len(robot.others))
         self.additional = additional
         self.constraints = constraints
         self.interaction = interaction
@@ -179,6 +179,10 @@ class Controller:
         """Move the end effector to `pose_des`; see `Goals.set_pose`."""
         self.goals.set_pose(pose_des, twist, twist_rate)
 
+    def set_other_pose_goal(self, hand: int, pose_des: pin.SE3) -> None:
+        """Move a further end effector to `pose_des`; see `Goals.set_other_pose`."""
+        self.goals.set_other_pose(hand, pose_des)
+
     def set_posture_goal(self, q_des: Array, v_des: Array | None = None) -> None:
         """Bring the joints to `q_des`; see `Goals.set_posture`."""
         self.goals.set_posture(q_des, v_des)
@@ -202,7 +206,7 @@ class Controller:
         if self.interaction is not None:
             tasks, contacts = self.interaction.rehearsal(self.robot, self.gains)
             self._solve(tasks, wide, None, contacts)
-        self.goals = Goals(self.robot.n)
+        self.goals = Goals(self.robot.n, len(self.robot.others))
         self.robot.rates = self.additional is not None
         self.robot.update(state, zero)
         self.reset(zero)
@@ -256,6 +260,7 @@ class Controller:
         here.posture = state.q.copy()
         here.set_posture(state.q.copy())
         here.hold(self.robot.pose)
+        here.hold_others([hand.pose for hand in self.robot.others])
         output = self._solve(here.tasks(self.gains), bounds, None)
         if not output.failure and not np.isfinite(tau).all():
             output = output._replace(failure="the torque of the motors is not finite")

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
@@ -14,8 +16,46 @@ from viability_bounds_pkg.state import State
 Array = NDArray[np.float64]
 
 
-class RobotModel:
-    """Kinematics of the end effector and dynamics of the arm at the current state.
+class HandModel:
+    """Kinematics of one end effector at the current state.
+
+    Attributes:
+        frame: its name.
+        v: velocity of the joints, shape (n,), rad/s.
+        a_last: acceleration of the joints commanded last, shape (n,), rad/s^2.
+        pose: placement in the base frame.
+        J: its Jacobian in its own axes, shape (6, n), linear rows first.
+        drift: its acceleration at zero joint acceleration, J' v, shape (6,).
+        J_dot: time derivative of J, shape (6, n).
+    """
+
+    def __init__(self, model: pin.Model, frame: str) -> None:
+        if not model.existFrame(frame):
+            raise unknown_name("frame", frame, (each.name for each in model.frames))
+        self.frame = frame
+        self._frame_id = model.getFrameId(frame)
+        self.v: Array = np.zeros(model.nv)
+        self.a_last: Array = self.v
+        self.pose = pin.SE3.Identity()
+        self.J = np.zeros((6, model.nv))
+        self.drift = np.zeros(6)
+        self.J_dot = np.zeros((6, model.nv))
+
+    def read(self, model: pin.Model, data: pin.Data) -> None:
+        """Take pose, Jacobian and drift from `data`, which has the kinematics of the state."""
+        frame, local = self._frame_id, pin.ReferenceFrame.LOCAL
+        self.pose = pin.updateFramePlacement(model, data, frame)
+        self.J = pin.getFrameJacobian(model, data, frame, local)
+        self.drift = pin.getFrameAcceleration(model, data, frame, local).vector
+
+    def read_rate(self, model: pin.Model, data: pin.Data) -> None:
+        """Take the time derivative of the Jacobian from `data`."""
+        local = pin.ReferenceFrame.LOCAL
+        self.J_dot = pin.getFrameJacobianTimeVariation(model, data, self._frame_id, local)
+
+
+class RobotModel(HandModel):
+    """Kinematics of the end effectors and dynamics of the arm at the current state.
 
     The dynamics are those in the middle of the control step that the torque will be held for,
 
@@ -31,19 +71,15 @@ class RobotModel:
         model: n joints with one coordinate each.
         frame: name of the end-effector frame.
         dt: control period that torques are held for, s; 0 evaluates at the current state.
+        others: names of the frames of further end effectors.
 
     Attributes:
         q: position, shape (n,), rad.
-        v: velocity, shape (n,), rad/s.
-        a_last: acceleration commanded last, shape (n,), rad/s^2.
-        pose: placement of the end effector in the base frame.
-        J: its Jacobian in its own axes, shape (6, n), linear rows first.
-        drift: its acceleration at zero joint acceleration, J' v, shape (6,).
+        others: the further end effectors.
         M: mass matrix, shape (n, n), kg m^2.
         h: Coriolis, centrifugal and gravity torques, shape (n,), N m.
         C: Coriolis matrix with M' - 2 C skew-symmetric, shape (n, n), N m s; with `rates`.
-        J_dot: time derivative of J, shape (6, n); with `rates`.
-        rates: whether `update` computes C and J_dot.
+        rates: whether `update` computes C and J_dot; else they are old.
         data: Pinocchio's; after `update` with the kinematics and joint Jacobians of the current
             state, at zero acceleration.
 
@@ -51,26 +87,20 @@ class RobotModel:
         RobotDescriptionError: no such frame.
     """
 
-    def __init__(self, model: pin.Model, frame: str, dt: float) -> None:
-        if not model.existFrame(frame):
-            raise unknown_name("frame", frame, (each.name for each in model.frames))
+    def __init__(
+        self, model: pin.Model, frame: str, dt: float, others: Sequence[str] = ()
+    ) -> None:
+        super().__init__(model, frame)
+        self.others = tuple(HandModel(model, each) for each in others)
         self.model = model
-        self.frame = frame
         self.dt = dt
         self.n = model.nv
-        self._frame_id = model.getFrameId(frame)
         self.data = model.createData()
         self._zero = np.zeros(self.n)
         self.q: Array = self._zero
-        self.v: Array = self._zero
-        self.a_last: Array = self._zero
-        self.pose = pin.SE3.Identity()
-        self.J = np.zeros((6, self.n))
-        self.drift = np.zeros(6)
         self.M = np.eye(self.n)
         self.h = np.zeros(self.n)
         self.C = np.zeros((self.n, self.n))
-        self.J_dot = np.zeros((6, self.n))
         self.rates = False
 
     def update(self, state: State, a_last: Array) -> None:
@@ -91,17 +121,16 @@ class RobotModel:
         # Last, because the kinematics in `data` are to be those of the current state.
         if self.rates:
             pin.computeJointJacobiansTimeVariation(model, data, q, v)
-            self.J_dot = pin.getFrameJacobianTimeVariation(
-                model, data, self._frame_id, pin.ReferenceFrame.LOCAL
-            )
+            self.read_rate(model, data)
+            for hand in self.others:
+                hand.read_rate(model, data)
         else:
             pin.computeJointJacobians(model, data, q)
         pin.forwardKinematics(model, data, q, v, self._zero)
-        self.pose = pin.updateFramePlacement(model, data, self._frame_id)
-        self.J = pin.getFrameJacobian(model, data, self._frame_id, pin.ReferenceFrame.LOCAL)
-        self.drift = pin.getFrameAcceleration(
-            model, data, self._frame_id, pin.ReferenceFrame.LOCAL
-        ).vector
+        self.read(model, data)
+        for hand in self.others:
+            hand.v, hand.a_last = v, a_last
+            hand.read(model, data)
 
     def torque(self, a: Array) -> Array:
         """Return the torque that, held for dt, gives mean acceleration `a`, shape (n,), N m."""

@@ -117,7 +117,15 @@ class TaskFrames:
     """Frames of pose goals."""
 
     base_frame: str = text("frame of pose goals; fixed to the URDF's root")
-    end_effector_frame: str = text("frame that pose goals move")
+    end_effector_frame: str = text(
+        "frame that pose goals move; of two, 'left_hand right_hand', the second one has goals of "
+        "its own, target_pose_second"
+    )
+
+    @property
+    def end_effectors(self) -> tuple[str, ...]:
+        """Names of the frames that pose goals move, at least one."""
+        return tuple(self.end_effector_frame.split()) or ("",)
 
 
 def load_model(config: RobotConfiguration, urdf: str) -> pin.Model:

@@ -93,7 +93,7 @@ class ScenarioNode(ArmNode):
         self._publisher_watch = PublisherWatch(self, self.listener.topics)
         self._first, self._period = 0, 1
         self._refused: dict[str, list[str]] | None = None  # when the messages begin; else None
-        frames = config.base_frame, config.end_effector_frame
+        frames = config.base_frame, config.end_effectors[0]
         self._goals = ScheduledPublisher(self, to_controller(config.plan, *frames))
         self._world = ScheduledPublisher(self, to_robot(config.plan, config.base_frame))
         self._due = deque(e for e in config.plan.events if isinstance(e, ServiceEvent))

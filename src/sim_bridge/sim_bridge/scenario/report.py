@@ -119,7 +119,7 @@ def _errors(config: ScenarioConfiguration, run: RecordedRun, reference: Array) -
         base = robot.link_pose(config.base_frame)
         for i in np.flatnonzero(np.isfinite(reference[:, 0])):
             robot.reset(run.q[i], rest)
-            pose = robot.link_pose(config.end_effector_frame)
+            pose = robot.link_pose(config.end_effectors[0])
             desired = base * pin.XYZQUATToSE3(reference[i])
             turn = pin.log3(pose.rotation.T @ desired.rotation)
             distance = np.linalg.norm(desired.translation - pose.translation)

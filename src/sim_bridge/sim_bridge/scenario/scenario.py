@@ -66,7 +66,7 @@ class ScenarioConfiguration(TaskFrames, LimitedRobotConfiguration):
         object.__setattr__(self, "plan", plan)
         object.__setattr__(self, "urdf", self.read_urdf())
         links = [each.get("name", "") for each in ElementTree.fromstring(self.urdf).iter("link")]
-        frames = self.end_effector_frame, self.base_frame
+        frames = self.end_effectors[0], self.base_frame
         for event in plan.events:
             allowed = ""
             if isinstance(event, PostureGoal) and set(self.joints) - set(event.positions):

@@ -63,12 +63,12 @@ def make_controller(
         config.torque_max,
         config.gains,
         config.torque_rate_max,
-        AdditionalTorque(config.additional),
+        AdditionalTorque(config.additional, hands=len(config.end_effectors)),
         config.qp_solver,
         [] if collision is None else [collision],
         make_interaction(config, robot, urdf),
         safety_filter,
-        None if safety_filter is None else make_detour(config, robot, safety_filter),
+        make_detour(config, robot, safety_filter),
         make_own_bounds(config),
     )
     controller.warm_up()
@@ -143,15 +143,19 @@ def make_own_bounds(config: ControllerConfiguration) -> BoundsSolver | None:
 
 
 def make_detour(
-    config: ControllerConfiguration, robot: RobotModel, safety_filter: SafetyFilter
-) -> Detour:
-    """Return what leads the arm where it would stand short of its goal.
+    config: ControllerConfiguration, robot: RobotModel, safety_filter: SafetyFilter | None
+) -> Detour | None:
+    """Return what leads the arm where it would stand short of its goal; None where nothing does.
+
+    It searches for ways of one end effector, not of two, and by what the safety filter knows.
 
     Args:
         config: checked parameters.
         robot: model of the arm.
         safety_filter: knows what can be held.
     """
+    if safety_filter is None or robot.others:
+        return None
     limits = config.collision
     rates = np.minimum(-limits.acceleration_min, limits.acceleration_max)
     clearance = CLEARANCE * config.dt**2 * rates
@@ -204,9 +208,11 @@ def load_robot(config: ControllerConfiguration, node: Node | None = None) -> Loa
     model = load_model(config, urdf)
     if node is not None:
         warn_of_unusual(node, config, urdf)
-    frame = config.end_effector_frame
+    frame, (first, *others) = config.end_effector_frame, config.end_effectors
+    if len(others) > 1 or first in others:
+        raise SettingError("end_effector_frame", frame, "a frame of the URDF, or two of them")
     try:
-        robot = RobotModel(model, frame, config.dt)
+        robot = RobotModel(model, first, config.dt, others)
     except RobotDescriptionError as error:
         allowed = f"a frame of the URDF ({error})"
         raise SettingError("end_effector_frame", frame, allowed) from error

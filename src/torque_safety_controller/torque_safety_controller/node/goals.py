@@ -18,7 +18,12 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from torque_safety_controller.controller import Controller
-from torque_safety_controller.node.topics import TARGET_POSE, TARGET_POSTURE, TARGET_TRAJECTORY
+from torque_safety_controller.node.topics import (
+    TARGET_POSE,
+    TARGET_POSE_SECOND,
+    TARGET_POSTURE,
+    TARGET_TRAJECTORY,
+)
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.pose_trajectory import (
@@ -139,6 +144,8 @@ def posture_from_message(
 class GoalSubscriber:
     """Subscribes to ``target_pose``, ``target_posture`` and ``target_trajectory``.
 
+    And to ``target_pose_second`` where there are two end effectors.
+
     Goals wait until they are due: a stamp of zero, or one that has passed, takes effect with the
     next control step; one ahead takes effect with the first state at or after it, which makes a
     plan of goals repeatable. Where several nodes publish one of these topics, what comes on it is
@@ -169,6 +176,8 @@ class GoalSubscriber:
         self._node, self._watch = node, watch
         self._contested: set[str] = set()
         self.listen(TARGET_POSE, self._on_pose)
+        if len(config.end_effectors) > 1:
+            self.listen(TARGET_POSE_SECOND, self._on_second_pose)
         self.listen(TARGET_POSTURE, self._on_posture)
         self.listen(TARGET_TRAJECTORY, self._on_trajectory)
         self._trajectory: PoseTrajectory | None = None
@@ -253,6 +262,13 @@ class GoalSubscriber:
             return self.refuse(TARGET_POSE, error)
         self.add(message, lambda: self._rest_at(self._base * pose))
 
+    def _on_second_pose(self, message: PoseStamped) -> None:
+        try:
+            pose = pose_from_message(message, self._config.base_frame)
+        except GoalRefused as error:
+            return self.refuse(TARGET_POSE_SECOND, error)
+        self.add(message, lambda: self._controller.set_other_pose_goal(0, self._base * pose))
+
     def _rest_at(self, pose: pin.SE3) -> None:
         self._trajectory = None
         self._controller.set_pose_goal(pose)
@@ -261,7 +277,7 @@ class GoalSubscriber:
         config = self._config
         try:
             trajectory = trajectory_from_message(
-                message, config.base_frame, config.end_effector_frame, self._base
+                message, config.base_frame, config.end_effectors[0], self._base
             )
         except GoalRefused as error:
             return self.refuse(TARGET_TRAJECTORY, error)

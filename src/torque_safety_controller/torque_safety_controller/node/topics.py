@@ -23,6 +23,14 @@ TARGET_POSE = Topic(
     (_NODE,),
     "end-effector goal in `base_frame`; a stamp in the future takes effect then",
 )
+TARGET_POSE_SECOND = Topic(
+    "target_pose_second",
+    PoseStamped,
+    GOAL_QOS,
+    (USER,),
+    (_NODE,),
+    "goal of the second end effector, where `end_effector_frame` names two; else as `target_pose`",
+)
 TARGET_POSTURE = Topic(
     "target_posture",
     JointState,
@@ -94,7 +102,7 @@ CONTROLLER_MODE = Topic(
     (USER,),
     "TRACKING, HOLD, POSITION or STOPPED, when it changes; the reasons are in `/diagnostics`",
 )
-GOALS = (TARGET_POSE, TARGET_POSTURE, TARGET_TRAJECTORY, TARGET_WRENCH)
+GOALS = (TARGET_POSE, TARGET_POSE_SECOND, TARGET_POSTURE, TARGET_TRAJECTORY, TARGET_WRENCH)
 """What the arm obeys from one node each."""
 
 TOPICS = (

@@ -96,7 +96,7 @@ class WrenchSubscriber:
             if not np.isfinite(wrench).all():
                 raise GoalRefused("wrench is not finite")
             frame = message.header.frame_id
-            hand, base = config.end_effector_frame, config.base_frame
+            hand, base = config.end_effectors[0], config.base_frame
             if frame not in ("", hand, base):
                 raise GoalRefused(f"frame_id is '{frame}'; allowed: '{hand}', '{base}' or empty")
         except GoalRefused as error:

@@ -130,7 +130,7 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
             raise SettingError("torque_reserve", self.torque_reserve, allowed)
         additional = AdditionalSettings(
             self.integral.integral_action,
-            self.integral.settings(self.torque_max),
+            self.integral.settings(self.torque_max, len(self.end_effectors)),
             DISTURBANCE_MAX * self.torque_max,
             self.friction.settings(self.torque_max),
         )

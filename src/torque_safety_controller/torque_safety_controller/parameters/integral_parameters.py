@@ -67,17 +67,18 @@ class IntegralConfiguration:
         choices=METHODS,
     )
 
-    def settings(self, tau_max: Array) -> IntegralSettings:
+    def settings(self, tau_max: Array, hands: int = 1) -> IntegralSettings:
         """Return the settings of the integral action.
 
         Args:
             tau_max: torque limits, shape (n,), N m.
+            hands: number of end effectors.
 
         Raises:
             SettingError: values that do not fit together.
         """
         rows = TASKS.get(self.integral_action)
-        if rows is not None and rows.stop >= len(tau_max):
+        if rows is not None and hands * rows.stop >= len(tau_max):
             allowed = (
                 f"'none' or 'joints': {len(tau_max)} joints have no null space left of the task"
             )

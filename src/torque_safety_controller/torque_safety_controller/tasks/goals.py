@@ -4,13 +4,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
 from torque_safety_controller.tasks.gains import Gains
-from torque_safety_controller.tasks.pose_task import PoseMotion, PoseTask, pose_error
+from torque_safety_controller.tasks.pose_task import (
+    OtherHandTask,
+    PoseMotion,
+    PoseTask,
+    pose_error,
+)
 from torque_safety_controller.tasks.posture_task import PostureTask
 from torque_safety_controller.tasks.settling_pose_task import SettlingPoseTask
 from torque_safety_controller.tasks.task import Task
@@ -19,18 +25,24 @@ Array = NDArray[np.float64]
 
 
 class Goals:
-    """A pose of the end effector, a posture of the joints, or both.
+    """Poses of end effectors, a posture of the joints, or both.
+
+    Args:
+        n: number of joints.
+        others: number of further end effectors.
 
     Attributes:
         pose_des: end-effector goal in the URDF's root frame; None until one is set.
+        others: goals of the further end effectors, likewise.
         q_des: joint goal, shape (n,), rad; None until one is set.
         posture: what the null space is held at without a joint goal, shape (n,), rad.
         taken: how often the current pose was made the goal, by `hold`; a trajectory that was
             being followed has been overruled when it grows.
     """
 
-    def __init__(self, n: int) -> None:
+    def __init__(self, n: int, others: int = 0) -> None:
         self.pose_des: pin.SE3 | None = None
+        self.others: list[pin.SE3 | None] = [None] * others
         self.q_des: Array | None = None
         self.posture = np.zeros(n)
         self.taken = 0
@@ -40,7 +52,8 @@ class Goals:
     @property
     def any(self) -> bool:
         """Whether there is something to track."""
-        return self.pose_des is not None or self.q_des is not None
+        poses = self.pose_des, *self.others
+        return self.q_des is not None or any(pose is not None for pose in poses)
 
     def set_pose(
         self,
@@ -62,6 +75,15 @@ class Goals:
         else:
             self._pose_motion = PoseMotion(twist, twist_rate)
 
+    def set_other_pose(self, hand: int, pose_des: pin.SE3) -> None:
+        """Move a further end effector to `pose_des` in the URDF's root frame.
+
+        Args:
+            hand: its index in `RobotModel.others`.
+            pose_des: goal at rest.
+        """
+        self.others = [*self.others[:hand], pose_des, *self.others[hand + 1 :]]
+
     def set_posture(self, q_des: Array, v_des: Array | None = None) -> None:
         """Bring the joints, or what the pose task leaves free of them, to `q_des`, rad.
 
@@ -76,6 +98,10 @@ class Goals:
         """Take `pose`, where the end effector is, for the goal, whatever it was."""
         self.set_pose(pose.copy())
         self.taken += 1
+
+    def hold_others(self, poses: Sequence[pin.SE3]) -> None:
+        """Take `poses`, where the further end effectors are, for their goals."""
+        self.others = [pose.copy() for pose in poses]
 
     def error(self, pose: pin.SE3) -> Array:
         """Return the error of the end effector's pose, shape (6,), m and rad, in its axes.
@@ -93,29 +119,43 @@ class Goals:
                 None for all of it.
         """
         tasks: list[Task] = []
-        if self.pose_des is not None and gains.pose_weight > 0.0:
-            # With errors of any size its curvature would slow the arm down on its way.
-            kind = PoseTask if gains.pose_error_max is None else SettlingPoseTask
-            tasks.append(
-                kind(
-                    self.pose_des,
-                    gains.pose_kp,
-                    gains.pose_kd,
-                    gains.pose_weight,
-                    self._pose_motion,
-                    stiffness,
-                    gains.pose_error_max,
-                    gains.pose_error == "separate",
-                )
-            )
+        if gains.pose_weight > 0.0:
+            if self.pose_des is not None:
+                tasks.append(_pose_task(self.pose_des, gains, self._pose_motion, stiffness))
+            tasks += [
+                OtherHandTask(_pose_task(pose_des, gains), hand)
+                for hand, pose_des in enumerate(self.others)
+                if pose_des is not None
+            ]
         tasks.append(
             PostureTask(
                 self.posture if self.q_des is None else self.q_des,
                 gains.posture_kp,
                 gains.posture_kd,
                 gains.posture_weight,
-                bool(tasks),
+                bool(tasks) and self.pose_des is not None,
                 None if self._v_des is None else gains.posture_kd * self._v_des,
+                tuple(each.hand for each in tasks if isinstance(each, OtherHandTask)),
             )
         )
         return tasks
+
+
+def _pose_task(
+    pose_des: pin.SE3,
+    gains: Gains,
+    motion: PoseMotion | None = None,
+    stiffness: Array | None = None,
+) -> PoseTask:
+    # With errors of any size its curvature would slow the arm down on its way.
+    kind = PoseTask if gains.pose_error_max is None else SettlingPoseTask
+    return kind(
+        pose_des,
+        gains.pose_kp,
+        gains.pose_kd,
+        gains.pose_weight,
+        motion,
+        stiffness,
+        gains.pose_error_max,
+        gains.pose_error == "separate",
+    )

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from torque_safety_controller.linalg.dense_kernels import apart, spring_damper
 from torque_safety_controller.qp.terms import TaskTerm
-from torque_safety_controller.robot_model import RobotModel
+from torque_safety_controller.robot_model import HandModel, RobotModel
 
 Array = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ class PoseTask:
     error_max: tuple[float, float] | None = None
     separate: bool = False
 
-    def term(self, robot: RobotModel) -> TaskTerm:
+    def term(self, robot: HandModel) -> TaskTerm:
         """Return ``J a = kp error - kd J v - J' v + feedforward`` as a term of the cost."""
         if self.separate:
             error = separate_error(robot.pose, self.pose_des)
@@ -106,6 +106,23 @@ class PoseTask:
         rate = between.act(pin.Motion(motion.twist_rate)) - pin.Motion(twist).cross(seen)
         feedforward: Array = self.kd * seen.vector + rate.vector
         return feedforward
+
+
+@dataclass(slots=True)
+class OtherHandTask:
+    """The pose task of a further end effector.
+
+    Attributes:
+        task: of its pose.
+        hand: its index in `RobotModel.others`.
+    """
+
+    task: PoseTask
+    hand: int
+
+    def term(self, robot: RobotModel) -> TaskTerm:
+        """See `PoseTask.term`."""
+        return self.task.term(robot.others[self.hand])
 
 
 def shorten(vector: Array, largest: float) -> None:

@@ -33,6 +33,8 @@ class PostureTask:
         weight: of the squared error of acceleration.
         in_null_space: whether the stiffness leaves the end effector alone.
         feedforward: ``kd v_des + a_des``, shape (n,), rad/s^2; None for a goal at rest.
+        others: indices in `RobotModel.others` of further end effectors that the stiffness leaves
+            alone, too.
     """
 
     q_des: Array
@@ -41,13 +43,17 @@ class PostureTask:
     weight: float
     in_null_space: bool = False
     feedforward: Array | None = None
+    others: tuple[int, ...] = ()
 
     def term(self, robot: RobotModel) -> TaskTerm:
         """Return ``a = kp (q_des - q) - kd v + feedforward`` as a term of the cost."""
-        if self.in_null_space:
+        hands = [robot.J] if self.in_null_space else []
+        hands += [robot.others[hand].J for hand in self.others]
+        if hands:
             # Regularised where J has lost rank; there it leaves in what the pose cannot feel.
+            J = hands[0] if len(hands) == 1 else np.vstack(hands)
             b = null_space_spring_damper(
-                robot.J, self.q_des, robot.q, robot.v, self.kp, self.kd, _RANK_REGULARISATION
+                J, self.q_des, robot.q, robot.v, self.kp, self.kd, _RANK_REGULARISATION
             )
         else:
             b = self.kp * (self.q_des - robot.q) - self.kd * robot.v

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torque_safety_controller.qp.terms import TaskTerm
-from torque_safety_controller.robot_model import RobotModel
+from torque_safety_controller.robot_model import HandModel
 from torque_safety_controller.tasks.pose_task import PoseTask
 from viability_bounds_pkg.compiled import compiled
 
@@ -50,7 +50,7 @@ class SettlingPoseTask(PoseTask):
 
     __slots__ = ()
 
-    def term(self, robot: RobotModel) -> TaskTerm:
+    def term(self, robot: HandModel) -> TaskTerm:
         """Return the term of `PoseTask`, with the curvature by the error that did not act.
 
         That error is what the last step left of the acceleration asked for,
