@@ -211,9 +211,11 @@ How integral(J's) is computed from samples the paper does not say: by the produc
 (25) exact. Near singularities J^+ is damped, where the paper assumes full rank. K is lambda
 diag(M), or lambda M with `integral_anti_windup: paper_mass`.
 
-Not there: the improvement of (27) for internal forces that the paper names and does not describe,
-one integral for several end-effector tasks at once, and the unactuated joints of III-E: bases are
-fixed.
+The improvement of (27) for internal forces, which the paper names and does not describe, is
+derived in [forces.md](forces.md#two-hands-on-one-object), for the force between two hands.
+
+Not there: internal moments, more than two end effectors in the node, and the unactuated joints of
+III-E: bases are fixed.
 
 [Benallegue2021]: references.md
 """

@@ -40,6 +40,19 @@ digests = json.loads(os.environ["PLANTED_DIGESTS"])
 compiled._digest = digests.__getitem__
 '''
 
+PLAIN = '''"""Nothing is compiled, which takes longer than most tests of a fault."""
+import functools
+from viability_bounds_pkg import compiled
+
+
+def plain(function=None, **options):
+    return plain if function is None else function
+
+
+compiled.compiled = plain
+compiled.bound = lambda function, *arguments, numbers=0: functools.partial(function, *arguments)
+'''
+
 
 def sources(tree: Path) -> list[Path]:
     """Return the modules that faults may be in."""
@@ -58,8 +71,23 @@ def tests(tree: Path, fault: dict[str, Any]) -> list[str]:
     return sorted(str(path.relative_to(tree)) for path in found if path.name in names)
 
 
-def run(tree: Path, fault: dict[str, Any], digests: dict[str, str]) -> tuple[str, str]:
-    """Return "caught", "missed" or what went wrong, and by which test."""
+def in_compiled(tree: Path, fault: dict[str, Any]) -> bool:
+    """Return whether a fault is in a file with compiled functions."""
+    (path,) = places(tree, fault)
+    return "@compiled" in path.read_text()
+
+
+def run(
+    tree: Path, fault: dict[str, Any], digests: dict[str, str], plain: bool = False
+) -> tuple[str, str]:
+    """Return "caught", "missed" or what went wrong, and by which test.
+
+    Args:
+        tree: checkout.
+        fault: row of the table.
+        digests: by which compiled code is known; none: it is compiled anew.
+        plain: compile nothing.
+    """
     with tempfile.TemporaryDirectory(prefix="fault_") as directory:
         copy = Path(directory)
         for name in COPIED:
@@ -76,7 +104,10 @@ def run(tree: Path, fault: dict[str, Any], digests: dict[str, str]) -> tuple[str
             "PLANTED_DIGESTS": json.dumps(digests),
         }
         options = ["-x", "-q", "--tb=no", "-p", "no:cacheprovider"]
-        if digests and "@compiled" not in text:
+        if plain:
+            (copy / "planted.py").write_text(PLAIN)
+            options += ["-p", "planted"]
+        elif digests and "@compiled" not in text:
             (copy / "planted.py").write_text(PLUGIN)
             options += ["-p", "planted"]
         command = [sys.executable, "-m", "pytest", *options, *tests(tree, fault)]
@@ -116,15 +147,23 @@ def main() -> int:
 
         digests = {name: _digest(name) for name in PACKAGES}
     outcomes: list[str] = []
-    healthy: dict[str, bool] = {}
+    healthy: dict[tuple[str, bool], bool] = {}
+
+    def passes(fault: dict[str, Any], plain: bool) -> bool:
+        """Return whether the tests of a fault pass without it."""
+        key = fault["tests"], plain
+        if key not in healthy:
+            sound = fault | {"new": fault["old"]}
+            healthy[key] = run(tree, sound, digests, plain)[0] == "missed"
+        return healthy[key]
+
     for fault in faults:
         if fault in lost:
             continue
-        names = fault["tests"]
-        if names not in healthy:
-            healthy[names] = run(tree, fault | {"new": fault["old"]}, digests)[0] == "missed"
-        outcome, by = run(tree, fault, digests)
-        if not healthy[names]:
+        plain = in_compiled(tree, fault) and passes(fault, plain=True)
+        if plain or passes(fault, plain=False):
+            outcome, by = run(tree, fault, digests, plain)
+        else:
             outcome, by = "not told", "its tests fail without it"
         outcomes.append(outcome)
         (path,) = places(tree, fault)

@@ -19,6 +19,7 @@ from torque_safety_controller.additional_torque import (
     AdditionalTorque,
 )
 from torque_safety_controller.contact.interaction import Interaction
+from torque_safety_controller.contact.squeeze import Squeeze
 from torque_safety_controller.qp.constraints import (
     AccelerationRange,
     Constraint,
@@ -90,10 +91,11 @@ class Controller:
         detour: leads the arm where it would stand short of its goal; None for nothing.
         own_bounds: within which it brakes while it is given no acceleration bounds; None brakes
             regardless of positions and speeds.
+        squeeze: of an object between two hands; while they press, `interaction` does nothing.
 
     Attributes:
         goals: of the end effector and the joints.
-        additional, constraints, interaction, safety_filter, detour: as given.
+        additional, constraints, interaction, safety_filter, detour, squeeze: as given.
         iterations: of the last QP.
         share: of the accelerations that the tasks want; the rest brings the arm to rest.
     """
@@ -111,6 +113,7 @@ class Controller:
         safety_filter: SafetyFilter | None = None,
         detour: Detour | None = None,
         own_bounds: BoundsSolver | None = None,
+        squeeze: Squeeze | None = None,
     ) -> None:
         n = robot.n
         self.robot = robot
@@ -121,6 +124,7 @@ class Controller:
         self.interaction = interaction
         self.safety_filter = safety_filter
         self.detour = detour
+        self.squeeze = squeeze
         self.iterations = 0
         self.share = 1.0
         self._own_bounds = own_bounds
@@ -165,6 +169,8 @@ class Controller:
             self.additional.reset()
         if self.interaction is not None:
             self.interaction.start()
+        if self.squeeze is not None:
+            self.squeeze.start()
         if self.safety_filter is not None:
             self.safety_filter.reset()
         if self.detour is not None:
@@ -294,6 +300,8 @@ class Controller:
         observer.observe(robot.v, self._a_last, known, self.tau_max, robot.M)
         if self.interaction is not None:
             self.interaction.observe(robot, self.goals, elapsed)
+        if self.squeeze is not None:
+            self.squeeze.observe(robot, self.goals, elapsed)
         if additional is None or not robot.rates:
             return None
         before = additional.integral
@@ -304,6 +312,8 @@ class Controller:
     def _tasks(self) -> tuple[list[Task], ContactForces | None]:
         """Return the tasks of a step, and the forces that contacts may exert."""
         gains, interaction = self.gains, self.interaction
+        if self.squeeze is not None and self.squeeze.presses(self.goals):
+            return self.squeeze.tasks(self.goals, gains), self.squeeze.forces(self.robot)
         if interaction is None:
             return self._by_detour(self.goals.tasks(gains)), None
         tasks, forced = self.goals.tasks(gains, interaction.stiffness), interaction.tasks(gains)
@@ -380,9 +390,12 @@ class Controller:
         tau = robot.torque(a)
         if additional is not None:
             tau = tau + additional
-        if contacts is not None and self.interaction is not None:
+        if contacts is not None:
             tau = tau - contacts.B @ solution.rho
-            self.interaction.note_forces(solution.rho)
+            if self.squeeze is not None and self.squeeze.presses(self.goals):
+                self.squeeze.note_forces(solution.rho)
+            elif self.interaction is not None:
+                self.interaction.note_forces(solution.rho)
         a = self._remember(a)
         tau = self._limiter.limited(tau)
         relaxed = solution.constraint_relaxation

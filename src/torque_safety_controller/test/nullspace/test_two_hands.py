@@ -196,3 +196,19 @@ def test_each_hand_accelerates_towards_its_own_goal(only_second):
         expected = 100.0 * error - 7.0 * 0.5 * (turns[0] + turns[1])
         found = (turns[1] - turns[0]) / SMALL
         np.testing.assert_allclose(found, expected, atol=2e-4 * np.abs(expected).max())
+
+
+def test_the_stiffness_of_the_posture_moves_neither_hand():
+    """By differences between an arm at its posture and one that is off it."""
+    q, rest, wide = Motion.start, np.zeros(16), np.full(16, 1e5)
+    gains = Gains(pose_kp=100.0, pose_kd=7.0, posture_kp=30.0, posture_kd=1.0, posture_weight=0.1)
+    found = []
+    for posture in (q, q + 0.2 * np.sin(np.arange(16))):
+        controller = Controller(robot(STEP), wide, gains)
+        controller.reset(posture)
+        controller.set_pose_goal(hands(q)[0])
+        controller.set_other_pose_goal(0, hands(q)[1])
+        found.append(controller.step(State(q, rest), AccelerationRange(-wide, wide)).a)
+    difference = found[1] - found[0]
+    assert np.abs(difference).max() > 1.0
+    assert np.abs(jacobian(q) @ difference).max() < 1e-4

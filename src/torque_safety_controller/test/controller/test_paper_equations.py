@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""(1) to (14) of the second paper, written down once more, beside the torque of the controller.
+
+Nothing of the controller is used for what is expected. Where links are comes from Pinocchio;
+masses, Coriolis torques and gravity follow from that by differences: the kinetic energy's
+matrix, its Christoffel symbols, the potential energy's gradient.
+"""
+
+from functools import cache
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from arms import load_arm
+from proxsuite import proxqp
+
+from torque_safety_controller.additional_torque import AdditionalSettings, AdditionalTorque
+from torque_safety_controller.controller import Controller
+from torque_safety_controller.integral_feedback import IntegralSettings
+from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.tasks.gains import Gains
+from viability_bounds_pkg.state import State
+
+ARM, N, STEP = load_arm("panda"), 7, 2e-3
+TINY, SMALL = 1e-4, 1e-3  # rad; rad or s, of differences of differences
+LAMBDA, SLOW, FAST, MU = 8.0, 0.4, 60.0, 0.3
+KP, KD = 120.0, 9.0
+POSE_WEIGHT, POSTURE_WEIGHT, REGULARISATION = 3.0, 0.2, 1e-6
+POSTURE_SPEED = 0.2 * np.cos(np.arange(N))  # rad/s
+LIMIT = np.array([0.05, 0.04, 0.05, 0.03, 1e-3, 1e-3, 5e-4])  # N m
+
+
+def places(q):
+    """Of the joints, and of the hand."""
+    data = ARM.model.createData()
+    pin.framesForwardKinematics(ARM.model, data, q)
+    hand = data.oMf[ARM.model.getFrameId(ARM.frame)]
+    return [*(data.oMi[i].copy() for i in range(1, N + 1)), hand.copy()]
+
+
+def jacobians(q):
+    """Of all places in their own axes, shape (n + 1, 6, n)."""
+    columns = []
+    for step in TINY * np.eye(N):
+        pairs = zip(places(q - step), places(q + step), strict=True)
+        columns.append([pin.log6(a.actInv(b)).vector / (2.0 * TINY) for a, b in pairs])
+    return np.array(columns).transpose(1, 2, 0)
+
+
+def masses(q):
+    """M of (1), from the kinetic energy of the links."""
+    inertias = [inertia.matrix() for inertia in ARM.model.inertias[1:]]
+    pairs = zip(jacobians(q)[:N], inertias, strict=True)
+    return sum(J.T @ inertia @ J for J, inertia in pairs) + np.diag(ARM.model.armature)
+
+
+def coriolis(q, v):
+    """C of (1) by Christoffel symbols, for which M' - 2 C is skew-symmetric."""
+    # d[i, j, k] is how M_ij changes with q_k.
+    d = np.stack(
+        [(masses(q + s) - masses(q - s)) / (2.0 * SMALL) for s in SMALL * np.eye(N)], axis=2
+    )
+    gamma = 0.5 * (d + d.transpose(0, 2, 1) - d.transpose(2, 1, 0))
+    return gamma @ v
+
+
+def gravity(q):
+    """g of (1), from the potential energy."""
+
+    def energy(q):
+        links = zip(places(q)[:N], ARM.model.inertias[1:], strict=True)
+        return sum(9.81 * body.mass * (place * body.lever)[2] for place, body in links)
+
+    return np.array([(energy(q + s) - energy(q - s)) / (2.0 * TINY) for s in TINY * np.eye(N)])
+
+
+def q_at(t):
+    return ARM.q_start + 0.2 * np.sin(3.0 * t + np.arange(N))
+
+
+def v_at(t):
+    return 0.6 * np.cos(3.0 * t + np.arange(N))
+
+
+def wanted(t, goal, posture):
+    """(5) to (9): the accelerations of least weighted squares, by differences along a motion."""
+    q, v = q_at(t), v_at(t)
+    rows, right, largest = [], [], POSTURE_WEIGHT
+    if goal is not None:
+        largest = POSE_WEIGHT
+        before, now, after = (places(q + h * v)[-1] for h in (-SMALL, 0.0, SMALL))
+        axes = now.rotation
+        J = np.vstack([axes @ part for part in np.split(jacobians(q)[-1], 2)])
+        # J'v: accelerations at a = 0.
+        linear = (after.translation - 2.0 * now.translation + before.translation) / SMALL**2
+        turns = [pin.log3(b.rotation @ a.rotation.T) for a, b in ((before, now), (now, after))]
+        speed, turn = np.split(J @ v, 2)
+        error = goal.translation - now.translation, pin.log3(goal.rotation @ axes.T)
+        g = np.r_[KP * error[0] - KD * speed, KP * error[1] - KD * turn]  # (7), (8)
+        drift = np.r_[linear, (turns[1] - turns[0]) / SMALL**2]
+        rows.append(np.sqrt(POSE_WEIGHT) * J)
+        right.append(np.sqrt(POSE_WEIGHT) * (g - drift))  # (9)
+        damping = -1.5 * v
+    else:
+        damping = 20.0 * (posture - q) + 1.5 * (POSTURE_SPEED - v)  # (6)
+    rows += [np.sqrt(POSTURE_WEIGHT) * np.eye(N), np.sqrt(REGULARISATION * largest) * np.eye(N)]
+    right += [np.sqrt(POSTURE_WEIGHT) * damping, np.zeros(N)]
+    return np.linalg.lstsq(np.vstack(rows), np.concatenate(right), rcond=None)[0]
+
+
+def limited(method, u, s):
+    """(10) and (11)."""
+    if method == "none" or not u.any():
+        return u
+    scale = min(1.0, (LIMIT / np.abs(u)).min())
+    if method == "scaling":
+        return scale * u
+    size = np.abs(s).max()
+    qp = proxqp.dense.QP(N, 0, N + 1)
+    qp.settings.eps_abs, qp.settings.eps_rel = 1e-11, 0.0
+    lower, upper = np.r_[-LIMIT, scale * s @ u / size], np.r_[LIMIT, np.inf]
+    qp.init(np.eye(N), -u, None, None, np.vstack([np.eye(N), s / size]), lower, upper)
+    qp.solve()
+    return qp.results.x
+
+
+@cache
+def moved(method, tracking):
+    """Play a motion; return the torques found and expected, and accelerations, per step."""
+    gains = Gains(
+        pose_kp=KP,
+        pose_kd=KD,
+        pose_weight=POSE_WEIGHT,
+        posture_kp=0.0 if tracking == "pose" else 20.0,
+        posture_kd=1.5,
+        posture_weight=POSTURE_WEIGHT,
+    )
+    budget = np.full(N, np.inf) if method == "none" else LIMIT
+    law = IntegralSettings(budget, LAMBDA, SLOW, FAST, MU, method)
+    additional = AdditionalTorque(AdditionalSettings("joints", law, np.full(N, np.inf)))
+    controller = Controller(ARM.robot(STEP), np.full(N, 1e4), gains, additional=additional)
+    controller.reset(q_at(0.0))
+    posture = q_at(0.0) + 0.3 * np.sin(np.arange(N))
+    goal = None
+    if tracking == "pose":
+        away = pin.Motion(np.array([0.06, -0.05, 0.04, 0.3, -0.2, 0.4]))
+        goal = places(q_at(0.0))[-1] * pin.exp6(away)
+        controller.set_pose_goal(goal)
+    else:
+        controller.set_posture_goal(posture, POSTURE_SPEED)
+    wide = AccelerationRange(np.full(N, -1e4), np.full(N, 1e4))
+    a_last, slow, fast, found, expected = np.zeros(N), np.zeros(N), np.zeros(N), [], []
+    for k in range(12):
+        t = k * STEP
+        q, v = q_at(t), v_at(t)
+        a = wanted(t, goal, posture)
+        half = 0.5 * STEP  # torques are those of the middle of their step
+        q_mid, v_mid = q + half * v + 0.5 * half**2 * a_last, v + half * a_last
+        if k > 0:
+            increment = a_last * STEP - (v - v_at(t - STEP))
+            slow = np.exp(-SLOW * STEP) * slow + increment  # (13)
+            fast = np.exp(-FAST * STEP) * fast + increment
+        s = MU * fast + (1.0 - MU) * slow  # (14)
+        C, K = coriolis(q_mid, v_mid), LAMBDA * np.diag(np.diag(masses(q_mid)))
+        added = C @ s + limited(method, K @ s, s)  # (3), (4)
+        q_mid, v_mid = q + half * v + 0.5 * half**2 * a, v + half * a
+        model = masses(q_mid) @ a + coriolis(q_mid, v_mid) @ v_mid + gravity(q_mid)  # (2)
+        step = controller.step(State(q, v), wide)
+        found.append((step.a, step.tau - model))
+        expected.append((a, added))
+        a_last = step.a
+    return found, expected
+
+
+@pytest.mark.parametrize("tracking", ["pose", "posture"])
+@pytest.mark.parametrize("method", ["none", "scaling", "paper"])
+def test_the_torque_is_what_the_equations_say(method, tracking):
+    found, expected = moved(method, tracking)
+    for (a, added), (a_expected, added_expected) in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a, a_expected, atol=1e-4 * np.abs(a_expected).max())
+        # The rest of the torque is some 100 N m, of which differences know 1e-7.
+        np.testing.assert_allclose(added, added_expected, atol=2e-4)
+    sizes = np.array([added for _, added in expected])
+    assert np.abs(sizes).max() > 0.04
+    if method != "none":
+        free = moved("none", tracking)[1]
+        assert np.abs(sizes - [added for _, added in free]).max() > 0.02
+
+
+def test_coriolis_and_gravity_are_those_of_the_energies():
+    """And M' - 2 C is skew-symmetric, for the C that the controller uses."""
+    q, v = q_at(0.3), v_at(0.3)
+    robot = ARM.robot(0.0)
+    robot.rates = True
+    robot.update(State(q, v), np.zeros(N))
+    np.testing.assert_allclose(np.array(robot.h), coriolis(q, v) @ v + gravity(q), atol=1e-4)
+    np.testing.assert_allclose(robot.C @ v, coriolis(q, v) @ v, atol=1e-4)
+    M_dot = (masses(q + SMALL * v) - masses(q - SMALL * v)) / (2.0 * SMALL)
+    skew = M_dot - 2.0 * robot.C
+    np.testing.assert_allclose(skew, -skew.T, atol=1e-4)
