@@ -103,7 +103,7 @@ def run(
             "PYTHONPATH": os.pathsep.join([*map(str, paths), os.environ.get("PYTHONPATH", "")]),
             "PLANTED_DIGESTS": json.dumps(digests),
         }
-        options = ["-x", "-q", "--tb=no", "-p", "no:cacheprovider"]
+        options = ["-x", "-q", "--tb=no", "-p", "no:cacheprovider", "-m", "not packaging"]
         if plain:
             (copy / "planted.py").write_text(PLAIN)
             options += ["-p", "planted"]

@@ -4,8 +4,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import two_hands
 from direct import DirectLoop
+
+pytestmark = pytest.mark.long
 
 
 def test_a_pushed_elbow_yields_and_both_hands_stay(monkeypatch):
