@@ -87,6 +87,7 @@ def test_without_the_filter_a_short_search_passes_limits():
     assert least["torque"] >= -1e-9, "the limiter keeps torques"
 
 
+@pytest.mark.long
 def test_the_search_comes_nearer_to_what_it_looks_for(monkeypatch):
     """On a landscape that is known: the distance from a point."""
     arena = Arena(ROWS["Baxter: goals"])

@@ -45,7 +45,10 @@ def assert_no_limit_broken(result):
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-@pytest.mark.parametrize(("seed", "rate"), [(0, None), (1, None), (3, 1000.0)])
+@pytest.mark.parametrize(
+    ("seed", "rate"),
+    [(0, None), (1, None), pytest.param(3, 1000.0, marks=pytest.mark.long)],
+)
 def test_random_goals_never_break_a_limit(robot, seed, rate):
     rng = np.random.default_rng(seed)
     values = load_values(robot)

@@ -164,6 +164,7 @@ def played(ros, directory, *, stopped):
         return metrics, dict(data)
 
 
+@pytest.mark.long
 def test_a_recorder_that_stands_still_changes_no_number(ros, tmp_path):
     """The robot goes on without it; what it did record is what a whole recording has."""
     metrics, part = played(ros, tmp_path / "part", stopped=True)

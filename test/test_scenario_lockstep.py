@@ -90,6 +90,7 @@ def test_the_nodes_play_what_a_loop_without_messages_plays():
     assert touched.sum() > 20
 
 
+@pytest.mark.long
 def test_a_hand_presses_on_a_table_as_hard_as_it_is_told():
     """The beginning of the scenario that is shipped: a table, parameters, tare, a wrench."""
     scenario = yaml.safe_load(

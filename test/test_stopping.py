@@ -149,7 +149,9 @@ def test_commands_held_in_rows_of_missed_periods_pass_no_limit(ros):
     assert not arm._monitor.violated
 
 
-@pytest.mark.parametrize("robot", ["panda", "talos_left_arm"])
+@pytest.mark.parametrize(
+    "robot", ["panda", pytest.param("talos_left_arm", marks=pytest.mark.long)]
+)
 def test_commands_that_return_after_outages_make_no_jolt(ros, robot):
     """Outages of up to 100 periods begin with 1 % of the commands; goals are at the limits."""
     arm = chain(ros, robot, outage_probability=0.01, outage_longest=100, imperfection_seed=3)

@@ -111,6 +111,7 @@ def test_two_link_limits_are_the_analytic_ones():
     assert limits.a_min[0] == pytest.approx(-expected, rel=1e-3)  # mirror image
 
 
+@pytest.mark.long
 def test_refined_beats_a_million_samples_with_ten_thousand_evaluations():
     model = baxter()
     space = StateSpace.of(model, *limits_of(model))

@@ -170,7 +170,9 @@ RATES = {
 }
 
 
-@pytest.mark.parametrize("seed", [0, 1], ids=["jerk", "both"])
+@pytest.mark.parametrize(
+    "seed", [pytest.param(0, id="jerk", marks=pytest.mark.long), pytest.param(1, id="both")]
+)
 def test_nor_where_rates_are_limited_and_those_are_kept(arm, seed):
     jerk, rate = RATES[arm.name][seed]
     worst, states, keeper = arm.play(
