@@ -5,12 +5,13 @@ set -eu
 usage() {
     cat <<'USAGE'
 usage: bash scripts/demo.sh [robot] [scenario] [--bounds METHOD] [--rate HZ] [--real-time]
-                            [--imperfect] [--params FILE] [--out DIRECTORY] [--processes]
+                            [--imperfect] [--params FILE]... [--out DIRECTORY] [--processes]
 
-  robot        a parameter file in config/ that has a scenario: baxter_left_arm (default), panda,
-               talos_left_arm
-  scenario     the name in config/scenarios/<robot>_<scenario>.yaml, or the path of a file,
-               see docs/scenarios.md (default: demo)
+  robot        the name of a parameter file in config/, as baxter_left_arm (default), panda and
+               talos_left_arm, or the path of one; scripts/new_robot.sh makes one from a URDF
+  scenario     the name in config/scenarios/<robot>_<scenario>.yaml, beside the robot's file, or the
+               path of a file, see docs/scenarios.md (default: demo; of a robot that has none, it
+               holds its start posture for 2 s)
   --bounds     how acceleration limits are computed: exact (default), or naive, which violates the
                limits, decre, rubrecht, damper; these without the safety filter
   --rate       control rate in Hz (default: the robot's own)
@@ -19,7 +20,8 @@ usage: bash scripts/demo.sh [robot] [scenario] [--bounds METHOD] [--rate HZ] [--
   --imperfect  with encoders, delays, motors and lost commands like those of a real robot, and
                with what is done about them, from config/imperfect/<robot>.yaml; estimator_node
                runs, too; see docs/simulated_robot.md
-  --params     a further parameter file, such as config/obstacles/panda_wall.yaml
+  --params     a further parameter file, such as config/obstacles/panda_wall.yaml; repeatable, the
+               last value given counts
   --processes  each node in a process of its own; without, robot, estimator, bounds and controller
                are one process (docs/performance.md)
   --out        where figure, data and metrics go (default: results/<robot>_<scenario>; then
@@ -39,12 +41,12 @@ value() {
 }
 
 root="$(cd "$(dirname "$0")/.." && pwd)"
-robot='' scenario='' bounds=exact rate=default params='' imperfect='' clock=lockstep out='' processes=''
+robot='' scenario='' bounds=exact rate=default params=() imperfect='' clock=lockstep out='' processes=''
 while [ $# -gt 0 ]; do
     case "$1" in
     --bounds) bounds="$(value "$@")"; shift ;;
     --rate) rate="$(value "$@")"; shift ;;
-    --params) params="$(value "$@")"; shift ;;
+    --params) params+=("$(value "$@")"); shift ;;
     --out) out="$(value "$@")"; shift ;;
     --imperfect) imperfect=yes ;;
     --processes) processes=yes ;;
@@ -62,23 +64,31 @@ while [ $# -gt 0 ]; do
     shift
 done
 robot="${robot:-baxter_left_arm}" scenario="${scenario:-demo}"
-scenarios="$root/config/scenarios"
 config="$root/config/$robot.yaml"
-if [ ! -f "$config" ] || [ ! -f "$scenarios/${robot}_demo.yaml" ]; then
-    known="$(cd "$scenarios" && ls -- *_demo.yaml | sed 's/_demo.yaml//' | tr '\n' ' ')"
-    refuse "unknown robot '$robot'; there are: $known"
+if [[ "$robot" == *.yaml && -f "$robot" ]]; then
+    config="$(realpath "$robot")"
+    robot="$(basename "$robot" .yaml)"
+elif [ ! -f "$config" ]; then
+    known="$(cd "$root/config" && ls -- *.yaml | sed 's/.yaml$//' | tr '\n' ' ')"
+    refuse "unknown robot '$robot'; there are: $known; scripts/new_robot.sh makes others"
 fi
+folder="$(dirname "$config")"
+scenarios="$folder/scenarios"
 if [ -f "$scenarios/${robot}_$scenario.yaml" ]; then
     scenario="$scenarios/${robot}_$scenario.yaml"
+elif [ ! -f "$scenario" ] && [ "$scenario" = demo ]; then
+    scenario=hold
 elif [ ! -f "$scenario" ]; then
-    known="$(cd "$scenarios" && ls -- "${robot}"_*.yaml)"
+    known="$(cd "$scenarios" 2>/dev/null && ls -- "${robot}"_*.yaml 2>/dev/null || true)"
     known="$(sed "s/^${robot}_//; s/.yaml$//" <<<"$known" | tr '\n' ' ')"
     refuse "unknown scenario '$scenario' of $robot; there are: $known"
 fi
 
-[ -z "$imperfect" ] || imperfect="$root/config/imperfect/$robot.yaml"
+[ -z "$imperfect" ] || imperfect="$folder/imperfect/$robot.yaml"
 [ -z "$imperfect" ] || [ -f "$imperfect" ] || refuse "there is no $imperfect"
-[ -z "$params" ] || [ -f "$params" ] || refuse "no parameter file '$params'"
+for each in "${params[@]}"; do
+    [ -f "$each" ] || refuse "no parameter file '$each'"
+done
 case "$bounds" in
 exact | naive | decre | rubrecht | damper) ;;
 *) refuse "--bounds is '$bounds'; allowed: exact, naive, decre, rubrecht, damper" ;;
@@ -87,6 +97,8 @@ if [ "$rate" != default ] && ! { [[ "$rate" =~ ^[0-9]*\.?[0-9]+$|^[0-9]+\.$ ]] &
     awk -v rate="$rate" 'BEGIN { exit !(0 < rate && rate <= 10000) }'; }; then
     refuse "--rate is '$rate'; allowed: a number of Hz above 0, at most 10000"
 fi
+held=''
+[ "$scenario" != hold ] || held=yes
 link=''
 if [ -z "$out" ]; then
     name="$(basename "$scenario" .yaml)"
@@ -103,9 +115,17 @@ set -u
 source "$root/scripts/domain.sh" || exit 2
 export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
 
+if [ -n "$held" ]; then
+    echo "no scenarios/${robot}_demo.yaml: the arm holds its start posture for 2 s" >&2
+    scenario="$(mktemp --suffix=.yaml)"
+    echo '{duration: 2.0, events: []}' >"$scenario"
+fi
+
 overrides=()
 [ -z "$imperfect" ] || overrides+=(--params-file "$imperfect")
-[ -z "$params" ] || overrides+=(--params-file "$params")
+for each in "${params[@]}"; do
+    overrides+=(--params-file "$each")
+done
 overrides+=(-p "clock:=$clock" -p "bounds_node:method:=$bounds" -p start_paused:=true)
 # What other bounds do is to be seen, not what the filter makes of it.
 if [ "$bounds" != exact ]; then
@@ -131,6 +151,7 @@ stop() {
     mapfile -t running < <(jobs -p)
     kill "${running[@]}" 2>/dev/null || true
     wait 2>/dev/null || true
+    [ -z "$held" ] || rm -f "$scenario"
 }
 trap stop EXIT
 trap 'exit 130' INT TERM HUP

@@ -3,14 +3,18 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from functools import lru_cache
+from typing import Any, ClassVar
+from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.exceptions import SettingError, did_you_mean
 from viability_bounds_pkg.parameter import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -26,10 +30,24 @@ from viability_bounds_pkg.robot_description import RobotDescriptionError, build_
 
 Array = NDArray[np.float64]
 
+TOPIC = "topic"
+"""Value of ``robot_description`` that asks for what the topic of that name carries."""
+
+LIMITS_OF_URDF = {
+    "position_min": "lower",
+    "position_max": "upper",
+    "velocity_max": "velocity",
+    "torque_max": "effort",
+}
+"""Parameters that are taken from the URDF where they are not given, and its attribute."""
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RobotConfiguration:
     """Which robot it is; arrays of shape (n,) in the order of its n joints."""
+
+    NOT_NEEDED: ClassVar[frozenset[str]] = frozenset()
+    """Limits that may be missing from the parameters and from the URDF."""
 
     robot_description: str = text("URDF: path, package:// URI, or 'topic': from that topic")
     joints: tuple[str, ...] = texts(
@@ -40,11 +58,18 @@ class RobotConfiguration:
     locked_positions: Array = numbers(
         "where they are, rad", default=(), note="one for each of 'locked_joints'"
     )
-    position_min: Array = joint_numbers("lower position limits, rad; -.inf for continuous joints")
-    position_max: Array = joint_numbers(
-        "upper position limits, rad; .inf for continuous joints", note="above position_min"
+    position_min: Array = joint_numbers(
+        "lower position limits, rad; -.inf for continuous joints; those of the URDF if empty",
+        default=(),
     )
-    torque_max: Array = joint_numbers("torque limits of the motors, N m", POSITIVE)
+    position_max: Array = joint_numbers(
+        "upper position limits, rad; .inf for continuous joints; those of the URDF if empty",
+        default=(),
+        note="above position_min",
+    )
+    torque_max: Array = joint_numbers(
+        "torque limits of the motors, N m; those of the URDF if empty", POSITIVE, default=()
+    )
     rotor_inertia: Array = joint_numbers(
         "inertia of the rotors as seen from the joints, kg m^2; none if empty",
         NOT_NEGATIVE,
@@ -52,7 +77,8 @@ class RobotConfiguration:
     )
 
     def __post_init__(self) -> None:
-        """Check the locked joints and the position limits."""
+        """Take limits that are not given from the URDF; check them and the locked joints."""
+        self._complete()
         names, positions = self.locked_joints, self.locked_positions
         if len(names) != len(positions):
             allowed = f"{len(names)} numbers, one for each of 'locked_joints'"
@@ -62,9 +88,28 @@ class RobotConfiguration:
         low, high = self.position_min, self.position_max
         if np.isposinf(low).any():
             raise SettingError("position_min", low, "numbers below .inf")
-        # Of different lengths where one of them is left to the URDF.
-        if len(low) == len(high) and not (low < high).all():
+        if not (low < high).all():
             raise SettingError("position_max", high, "above position_min everywhere")
+
+    def _complete(self) -> None:
+        """Fill limits that are not given with those of the URDF."""
+        missing = [name for name in LIMITS_OF_URDF if len(getattr(self, name, "given")) == 0]
+        for name in missing:
+            if self.robot_description in ("", TOPIC):
+                if name in self.NOT_NEEDED:
+                    continue
+                allowed = "a list of numbers"
+                if self.robot_description == TOPIC:
+                    allowed += ", where the URDF comes from its topic"
+                raise SettingError(name, None, allowed)
+            limits = urdf_limits(self.robot_description, self.joints)[name]
+            lacking = [each for each, value in limits.items() if value is None]
+            if lacking and name in self.NOT_NEEDED:
+                continue
+            if lacking:
+                allowed = f"given, as the URDF has no {LIMITS_OF_URDF[name]} limit of {lacking[0]}"
+                raise SettingError(name, None, allowed)
+            object.__setattr__(self, name, np.array(list(limits.values()), dtype=float))
 
     @property
     def locked(self) -> dict[str, float]:
@@ -88,7 +133,9 @@ class RobotConfiguration:
 class LimitedRobotConfiguration(RobotConfiguration):
     """A robot with velocity limits."""
 
-    velocity_max: Array = joint_numbers("speed limits, rad/s", POSITIVE)
+    velocity_max: Array = joint_numbers(
+        "speed limits, rad/s; those of the URDF if empty", POSITIVE, default=()
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -126,6 +173,54 @@ class TaskFrames:
     def end_effectors(self) -> tuple[str, ...]:
         """Names of the frames that pose goals move, at least one."""
         return tuple(self.end_effector_frame.split()) or ("",)
+
+
+@lru_cache(maxsize=16)
+def urdf_limits(
+    source: str, joints: tuple[str, ...]
+) -> Mapping[str, Mapping[str, float | None]]:
+    """Return the limits that a URDF gives joints, by the names of `LIMITS_OF_URDF` and joint.
+
+    Read once: parameters may change while nodes control a robot.
+
+    Args:
+        source: path or URI of the URDF.
+        joints: whose limits; unknown ones are left to later checks, with limits of None.
+
+    Returns:
+        rad, rad/s and N m; infinite positions of continuous joints; None where there is no limit,
+        or one that is no use: no finite number, no speed, no torque.
+
+    Raises:
+        SettingError: there is no such URDF.
+    """
+    try:
+        root = ElementTree.fromstring(read_urdf(source))
+    except RobotDescriptionError as error:
+        raise SettingError("robot_description", source, f"a URDF ({error})") from error
+    elements = {each.get("name", ""): each for each in root.findall("joint")}
+    if unknown := [name for name in joints if name not in elements]:
+        movable = [name for name, each in elements.items() if each.get("type") != "fixed"]
+        hint = did_you_mean(unknown[0], movable) or f": {', '.join(movable)}"
+        raise SettingError("joints", unknown[0], f"joints of the URDF{hint}")
+    return {
+        name: {joint: _limit(elements[joint], key) for joint in joints}
+        for name, key in LIMITS_OF_URDF.items()
+    }
+
+
+def _limit(joint: ElementTree.Element, key: str) -> float | None:
+    """Return a limit of a joint of a URDF, None where there is none to use."""
+    if joint.get("type") == "continuous" and key in ("lower", "upper"):
+        return math.inf if key == "upper" else -math.inf
+    limit = joint.find("limit")
+    try:
+        # The format gives positions a default of 0.
+        value = float("nan" if limit is None else limit.get(key, "0"))
+    except ValueError:
+        return None
+    usable = math.isfinite(value) and (value > 0.0 or key in ("lower", "upper"))
+    return value if usable else None
 
 
 def load_model(config: RobotConfiguration, urdf: str) -> pin.Model:

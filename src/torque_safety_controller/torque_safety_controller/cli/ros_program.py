@@ -21,6 +21,11 @@ def gain_limits() -> int:
     return run_program("torque_safety_controller.tools.gain_limits")
 
 
+def new_robot() -> int:
+    """Make the parameter files of an arm from its URDF."""
+    return run_program("torque_safety_controller.tools.new_robot")
+
+
 def safety_stack() -> int:
     """Run bounds, controller and estimator in one process."""
     return run_with_ros("safety_stack", "torque_safety_controller.node.safety_stack")

@@ -50,11 +50,13 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
         additional: settings of the integral action and of the friction compensation.
     """
 
+    NOT_NEEDED = frozenset({"velocity_max"})
+
     velocity_max: Array = joint_numbers(
-        "speed limits, rad/s, for jerk_max, torque_rate_max, and HOLD without bounds; none if "
-        "empty",
+        "speed limits, rad/s, for jerk_max, torque_rate_max, and HOLD without bounds; those of "
+        "the URDF if empty, or none",
         POSITIVE,
-        if_empty=np.inf,
+        default=(),
     )
     torque_rate_max: Array = joint_numbers(
         "limits of the rate of torque, N m/s; none if empty; with safety_filter",
@@ -115,6 +117,8 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
     def __post_init__(self) -> None:
         """Check all that does not depend on the URDF, and make the settings."""
         super().__post_init__()
+        if not len(self.velocity_max):
+            object.__setattr__(self, "velocity_max", np.full(len(self.joints), np.inf))
         for name in ("torque_rate_max", "jerk_max"):
             rates = getattr(self, name)
             if not (rates > 0).all():

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import shutil
 import tempfile
@@ -17,7 +16,6 @@ import numpy as np
 import pinocchio as pin
 
 from viability_bounds_pkg.estimation.state_space import Array
-from viability_bounds_pkg.parameter import redeclared
 from viability_bounds_pkg.robot_configuration import LimitedRobotConfiguration
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 from viability_bounds_pkg.user_input.parameter_files import ParameterFileError, read_files
@@ -30,16 +28,6 @@ CONTROLLER = "/**/controller_node"
 
 DIGITS = 4
 """Significant digits written."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _EstimatedRobot(LimitedRobotConfiguration):
-    """The parameters of a robot whose limits may be left to its URDF."""
-
-    position_min: Array = redeclared(LimitedRobotConfiguration, "position_min", default=())
-    position_max: Array = redeclared(LimitedRobotConfiguration, "position_max", default=())
-    velocity_max: Array = redeclared(LimitedRobotConfiguration, "velocity_max", default=())
-    torque_max: Array = redeclared(LimitedRobotConfiguration, "torque_max", default=())
 
 
 @dataclass(frozen=True)
@@ -76,29 +64,13 @@ def read_robot(path: Path) -> Robot:
         RobotDescriptionError: the URDF cannot be found or loaded, or lacks a joint; a rotor
             inertia is negative.
     """
-    config = read_files(_EstimatedRobot, [path], NODE)
+    config = read_files(LimitedRobotConfiguration, [path], NODE)
     urdf = read_urdf(config.robot_description)
     _check_limits(urdf, config.robot_description)
     model = build_model(urdf, config.joints, config.locked, config.rotor_inertia)
 
-    def limit(key: str, from_urdf: Array) -> Array:
-        given: Array = getattr(config, key)
-        if len(given):
-            return given
-        for joint, value in zip(config.joints, from_urdf, strict=True):
-            if not key.startswith("position") and not (math.isfinite(value) and value > 0):
-                raise ParameterFileError(
-                    f"{path}: joint {joint} has no limit in the URDF to use: "
-                    f"parameter '{key}' is missing"
-                )
-        return np.array(from_urdf)
-
     return Robot(
-        model,
-        limit("position_min", model.lowerPositionLimit),
-        limit("position_max", model.upperPositionLimit),
-        limit("velocity_max", model.velocityLimit),
-        limit("torque_max", model.effortLimit),
+        model, config.position_min, config.position_max, config.velocity_max, config.torque_max
     )
 
 

@@ -67,7 +67,7 @@ class BoundsConfiguration(VelocityEstimation, StateSource, ControlRate, LimitedR
     """
 
     robot_description: str = redeclared(RobotConfiguration, "robot_description", default="")
-    torque_max: Array = redeclared(RobotConfiguration, "torque_max", default=())
+    NOT_NEEDED = frozenset({"torque_max"})
     acceleration_min: Array = joint_numbers("lower acceleration limits, rad/s^2", NEGATIVE)
     acceleration_max: Array = joint_numbers("upper acceleration limits, rad/s^2", POSITIVE)
     acceleration_drift: Array = joint_numbers(

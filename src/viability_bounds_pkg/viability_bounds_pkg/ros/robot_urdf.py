@@ -10,14 +10,11 @@ from rclpy.task import Future
 from std_msgs.msg import String
 
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.robot_configuration import RobotConfiguration
+from viability_bounds_pkg.robot_configuration import TOPIC, RobotConfiguration
 from viability_bounds_pkg.robot_description import RobotDescriptionError, check_urdf
 from viability_bounds_pkg.ros.runtime import make_executor
 from viability_bounds_pkg.ros.topics import ROBOT_DESCRIPTION
 from viability_bounds_pkg.user_input.urdf_check import check_with_urdf
-
-TOPIC = "topic"
-"""Value of ``robot_description`` that asks for what the topic of that name carries."""
 
 _TOPIC_TIMEOUT = 10.0
 
@@ -36,7 +33,7 @@ def robot_urdf(config: RobotConfiguration, node: Node | None = None) -> str:
     if source != TOPIC or node is None:
         return config.read_urdf()
     try:
-        text = _urdf_from_topic(node)
+        text = urdf_from_topic(node)
         check_urdf(text, "robot_description")
     except RobotDescriptionError as error:
         raise SettingError("robot_description", source, f"a URDF ({error})") from error
@@ -83,7 +80,15 @@ def warn_of_unusual(node: Node, config: RobotConfiguration, urdf: str) -> None:
         node.get_logger().warning(line)
 
 
-def _urdf_from_topic(node: Node) -> str:
+def urdf_from_topic(node: Node) -> str:
+    """Return the text that the topic ``robot_description`` carries.
+
+    Args:
+        node: not in an executor yet.
+
+    Raises:
+        RobotDescriptionError: nothing on the topic.
+    """
     received: Future = Future()
 
     def take(message: String) -> None:

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of a new robot, found from its URDF: joints, limits, postures, margins."""

@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Speed and acceleration limits of a new robot that its torque limits can bear.
+
+The limits must be available in every state within position and speed limits. Where they are not at
+the speeds of the URDF, either the speeds are lowered, or, where a motor is too weak whatever the
+speed, the safety filter is chosen, which needs them in most states only (docs/whole_arm.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from decimal import ROUND_DOWN, ROUND_UP
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from torque_safety_controller.new_robot.chain import Chain, NewRobotError
+from viability_bounds_pkg.acceleration_limits import (
+    limits_from_worst_cases,
+    limits_in_share,
+    unavailable_share,
+)
+from viability_bounds_pkg.cli.limits_file import rounded
+from viability_bounds_pkg.estimation.discretisation_margin import discretisation_margin
+from viability_bounds_pkg.estimation.state_space import StateSpace
+from viability_bounds_pkg.estimation.velocity_scale import largest_velocity_scale
+from viability_bounds_pkg.estimation.worst_case_search import WorstCases, search_refined
+
+Array = NDArray[np.float64]
+
+CAP = 15.0
+"""Largest acceleration limit, rad/s^2, as in the shipped files: more is of little use."""
+
+RESERVE = 0.03
+"""Share of the torque that is kept back: the search may miss the worst state by little."""
+
+USEFUL = 1.0
+"""Least acceleration limit that is worth having, rad/s^2."""
+
+SLOWEST = 0.5
+"""Speeds are lowered to this share of the URDF's at most; below, the safety filter is chosen."""
+
+SHARE = 0.8
+"""Share of random states in which limits are available of joints that have none in all states."""
+
+DRIFT_RESERVE = 1.1
+"""On the largest drift found, which a search finds from below."""
+
+RATES = (500.0, 1000.0)
+"""Control rates that are tried, Hz: the first with which a held torque is precise enough."""
+
+DRIFT_SHARE = 0.2
+"""Share of an acceleration limit that the margin for the held torque may take."""
+
+SEARCH = 10_000  # evaluations
+
+
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """Limits of n joints, arrays of shape (n,).
+
+    Attributes:
+        v_max: speed limits, rad/s.
+        speed_scale: share of the URDF's speeds that they are.
+        a_min: lower acceleration limits, rad/s^2.
+        a_max: upper ones.
+        worst_min: what torque leaves in the worst states found, before the cap.
+        worst_max: the same upwards.
+        filtered: whether a joint has limits in a share of the states only: the safety filter.
+        unavailable: share of random states in which torque does not give the limits.
+        rate_hz: control rate.
+        drift: largest jerk under held torque at this rate, rad/s^3, with a reserve.
+        why: of speeds and filter, sentences for the reader.
+    """
+
+    v_max: Array
+    speed_scale: float
+    a_min: Array
+    a_max: Array
+    worst_min: Array
+    worst_max: Array
+    filtered: NDArray[np.bool_]
+    unavailable: Array
+    rate_hz: float
+    drift: Array
+    why: str
+
+
+def estimate(chain: Chain, rate_hz: float | None = None) -> Estimates:
+    """Return speed limits, acceleration limits and drift of an arm.
+
+    Args:
+        chain: the arm.
+        rate_hz: control rate, Hz; None to choose one.
+
+    Raises:
+        NewRobotError: a joint is too weak for any limits, or the drift too large for the rate.
+    """
+    model = chain.model
+    space = _space(chain, chain.v_max)
+    worst = _search(model, space)
+    scale, why = 1.0, "Those of the URDF: the torque limits leave accelerations at these speeds."
+    filtered = np.zeros(len(chain.joints), dtype=bool)
+    if _room(worst).min() < USEFUL:
+        found = largest_velocity_scale(model, space, USEFUL)
+        if found.scale >= SLOWEST:
+            scale = np.floor(100.0 * found.scale) / 100.0
+            why = (
+                f"{scale:g} of the URDF's: at higher speeds {found.joint} cannot always "
+                f"accelerate by {USEFUL:g} rad/s^2 either way."
+            )
+            space = _space(chain, rounded(scale * chain.v_max, ROUND_DOWN))
+            worst = _search(model, space)
+    filtered = _room(worst) < (USEFUL if scale == 1.0 else 0.5 * USEFUL)
+    overrides = {}
+    if filtered.any():
+        overrides, why = _in_most_states(chain, space, filtered)
+    limits = limits_from_worst_cases(model, space, worst, overrides, CAP)
+    a_min, a_max = rounded(limits.a_min, ROUND_DOWN), rounded(limits.a_max, ROUND_DOWN)
+    rate, drift = _drift(chain, space, a_min, a_max, rate_hz)
+    return Estimates(
+        v_max=space.v_max,
+        speed_scale=float(scale),
+        a_min=a_min,
+        a_max=a_max,
+        worst_min=worst.a_min,
+        worst_max=worst.a_max,
+        filtered=filtered,
+        unavailable=unavailable_share(model, space, limits),
+        rate_hz=rate,
+        drift=drift,
+        why=why,
+    )
+
+
+def _space(chain: Chain, v_max: Array) -> StateSpace:
+    torque = (1.0 - RESERVE) * chain.tau_max
+    return StateSpace.of(chain.model, chain.q_min, chain.q_max, v_max, torque)
+
+
+def _search(model: pin.Model, space: StateSpace) -> WorstCases:
+    *_, worst = search_refined(model, space, SEARCH, 0)
+    return worst
+
+
+def _room(worst: WorstCases) -> Array:
+    room: Array = np.minimum(-worst.a_min, worst.a_max)
+    return room
+
+
+def _in_most_states(
+    chain: Chain, space: StateSpace, filtered: NDArray[np.bool_]
+) -> tuple[dict[str, tuple[float, float]], str]:
+    """Return limits of the joints without any in all states, and why they are needed."""
+    usual = limits_in_share(chain.model, space, SHARE)
+    names = [name for name, each in zip(chain.joints, filtered, strict=True) if each]
+    overrides = {}
+    for name in names:
+        j = chain.joints.index(name)
+        if usual[j] < 0.5 * USEFUL:
+            raise NewRobotError(
+                f"joint '{name}': its effort limit of {chain.tau_max[j]:g} N m does not leave "
+                f"{0.5 * USEFUL:g} rad/s^2 even in {SHARE:.0%} of its states; is that what the "
+                "motor can do? Correct the URDF, narrow its position limits there, or lower its "
+                "velocity limit"
+            )
+        value = float(min(usual[j], CAP))
+        overrides[name] = (-value, value)
+    why = (
+        f"{', '.join(names)}: torque leaves no acceleration limits in all states, so they are "
+        f"those of {SHARE:.0%} of random states, and safety_filter holds the arm as a whole."
+    )
+    return overrides, why
+
+
+def _drift(
+    chain: Chain, space: StateSpace, a_min: Array, a_max: Array, rate_hz: float | None
+) -> tuple[float, Array]:
+    """Return the control rate and the largest jerk under held torque at that rate."""
+    braking = np.minimum(-a_min, a_max)
+    rates = RATES if rate_hz is None else (rate_hz,)
+    for rate in rates:
+        found = discretisation_margin(
+            chain.model, space.q_min, space.q_max, space.v_max, a_min, a_max,
+            space.tau_max, 1.0 / rate,
+        )  # fmt: skip
+        # The acceleration is right at the middle of the period: its error grows for half of it.
+        jerk = np.maximum(found.jerk, 2.0 * found.acceleration * rate)
+        drift = rounded(DRIFT_RESERVE * jerk, ROUND_UP)
+        share = drift / rate / 18.0 / braking
+        if (share <= DRIFT_SHARE).all():
+            return rate, drift
+    worst = int(np.argmax(share))
+    raise NewRobotError(
+        f"joint '{chain.joints[worst]}': its acceleration drifts by up to {drift[worst]:.3g} "
+        f"rad/s^3 under a held torque, which at {rates[-1]:g} Hz costs {share[worst]:.0%} of its "
+        f"acceleration limit, more than {DRIFT_SHARE:.0%}; a higher --rate, or a lower velocity "
+        "limit in the URDF"
+    )
