@@ -43,7 +43,6 @@ setup(
             "safety_stack = torque_safety_controller.cli.ros_program:safety_stack",
         ],
         "arm_safety.stacks": [
-            "new_robot = torque_safety_controller.cli.ros_program:new_robot",
             "safety_stack = torque_safety_controller.node.safety_stack",
         ],
     },

@@ -171,7 +171,9 @@ def _check_kinds(
                 f"joint '{name}' mimics another, as a gripper's do: it has no motor of its own; "
                 f"end the arm before it, with the tip {parent}"
             )
+    for name, each in elements.items():
         if name in mimicked:
+            parent = _link(each, "parent")
             raise NewRobotError(
                 f"joint '{name}' is one that '{mimicked[name]}' mimics, as a gripper's are; end "
                 f"the arm before it, with the tip {parent}"

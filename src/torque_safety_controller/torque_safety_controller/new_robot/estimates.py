@@ -35,8 +35,11 @@ CAP = 15.0
 RESERVE = 0.03
 """Share of the torque that is kept back: the search may miss the worst state by little."""
 
-USEFUL = 1.0
-"""Least acceleration limit that is worth having, rad/s^2."""
+USEFUL = 3.0
+"""Acceleration limit that each joint should have, rad/s^2, as the weakest of the shipped Panda."""
+
+LEAST = 1.0
+"""What is put up with where USEFUL cannot be had by lowering speeds, rad/s^2."""
 
 SLOWEST = 0.5
 """Speeds are lowered to this share of the URDF's at most; below, the safety filter is chosen."""
@@ -102,17 +105,21 @@ def estimate(chain: Chain, rate_hz: float | None = None) -> Estimates:
     worst = _search(model, space)
     scale, why = 1.0, "Those of the URDF: the torque limits leave accelerations at these speeds."
     filtered = np.zeros(len(chain.joints), dtype=bool)
-    if _room(worst).min() < USEFUL:
-        found = largest_velocity_scale(model, space, USEFUL)
+    for required in (USEFUL, LEAST):
+        if _room(worst).min() >= required:
+            break
+        found = largest_velocity_scale(model, space, required)
         if found.scale >= SLOWEST:
-            scale = np.floor(100.0 * found.scale) / 100.0
+            scale = float(np.floor(100.0 * found.scale) / 100.0)
             why = (
                 f"{scale:g} of the URDF's: at higher speeds {found.joint} cannot always "
-                f"accelerate by {USEFUL:g} rad/s^2 either way."
+                f"accelerate by {required:g} rad/s^2 either way."
             )
             space = _space(chain, rounded(scale * chain.v_max, ROUND_DOWN))
             worst = _search(model, space)
-    filtered = _room(worst) < (USEFUL if scale == 1.0 else 0.5 * USEFUL)
+            break
+    else:
+        filtered = _room(worst) < LEAST
     overrides = {}
     if filtered.any():
         overrides, why = _in_most_states(chain, space, filtered)
@@ -121,7 +128,7 @@ def estimate(chain: Chain, rate_hz: float | None = None) -> Estimates:
     rate, drift = _drift(chain, space, a_min, a_max, rate_hz)
     return Estimates(
         v_max=space.v_max,
-        speed_scale=float(scale),
+        speed_scale=scale,
         a_min=a_min,
         a_max=a_max,
         worst_min=worst.a_min,
@@ -158,10 +165,10 @@ def _in_most_states(
     overrides = {}
     for name in names:
         j = chain.joints.index(name)
-        if usual[j] < 0.5 * USEFUL:
+        if usual[j] < 0.5 * LEAST:
             raise NewRobotError(
                 f"joint '{name}': its effort limit of {chain.tau_max[j]:g} N m does not leave "
-                f"{0.5 * USEFUL:g} rad/s^2 even in {SHARE:.0%} of its states; is that what the "
+                f"{0.5 * LEAST:g} rad/s^2 even in {SHARE:.0%} of its states; is that what the "
                 "motor can do? Correct the URDF, narrow its position limits there, or lower its "
                 "velocity limit"
             )

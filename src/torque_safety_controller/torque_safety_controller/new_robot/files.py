@@ -273,10 +273,11 @@ def scenario_file(chain: Chain, estimates: Estimates, postures: Postures) -> str
     ]
     time = 0.0
     braking = np.minimum(-estimates.a_min, estimates.a_max)
-    for goal, count in zip(postures.goals, postures.at_limits, strict=True):
+    for goal in postures.goals:
         way = np.abs(goal - postures.start)
         leg = float(np.max(way / estimates.v_max + 2.0 * estimates.v_max / braking)) + 1.0
         leg = min(np.ceil(2.0 * leg) / 2.0, 15.0)
+        count = int(((goal == chain.q_min) | (goal == chain.q_max)).sum())
         events.append(f"  - time: {time:.1f} # {count} joints at a limit")
         events += _posture(chain, goal)
         time += leg

@@ -18,7 +18,8 @@ from viability_bounds_pkg.robot_description import RobotDescriptionError
 Array = NDArray[np.float64]
 
 _STARTS = 400
-_GOALS = 300
+_GOALS = 4  # at most
+_TRIES = 300  # for each
 _STEPS = 12  # of a straight way that are looked at
 _ALWAYS = 0.9  # share of postures: shapes that touch in as many are no collision of the arm
 _HELD_AT_START, _HELD_AT_GOAL = 0.6, 0.85  # of the torque limits, to hold the arm
@@ -95,14 +96,14 @@ class Postures:
     Attributes:
         start: shape (n,), rad.
         held: largest share of a torque limit that holds the arm there.
-        goals: postures with joints at their limits, one of each side where possible.
-        at_limits: how many joints have a limit in each of them.
+        goals: postures with joints at their limits.
+        reached: whether a joint is at its lower, or upper, limit in any of them, shape (n, 2).
     """
 
     start: Array
     held: float
     goals: tuple[Array, ...]
-    at_limits: tuple[int, ...]
+    reached: NDArray[np.bool_]
 
 
 def find_postures(chain: Chain, touches: SelfCollisions) -> Postures:
@@ -117,14 +118,15 @@ def find_postures(chain: Chain, touches: SelfCollisions) -> Postures:
     """
     random = np.random.default_rng(_SEED)
     start = _start(chain, touches, random)
-    goals = [_goal(chain, touches, start, random, upper) for upper in (True, False)]
-    found = [goal for goal in goals if goal is not None]
-    return Postures(
-        start=start,
-        held=_held(chain, start),
-        goals=tuple(goal for goal, _ in found),
-        at_limits=tuple(count for _, count in found),
-    )
+    goals: list[Array] = []
+    reached = np.zeros((len(start), 2), dtype=bool)
+    while len(goals) < _GOALS:
+        goal, at = _goal(chain, touches, start, random, reached)
+        if goal is None:
+            break
+        goals.append(goal)
+        reached |= at
+    return Postures(start, _held(chain, start), tuple(goals), reached)
 
 
 def _box(chain: Chain) -> tuple[Array, Array]:
@@ -177,30 +179,37 @@ def _goal(
     touches: SelfCollisions,
     start: Array,
     random: np.random.Generator,
-    upper: bool,
-) -> tuple[Array, int] | None:
-    """Return a posture with as many joints at a limit as can be found, and how many these are.
+    reached: NDArray[np.bool_],
+) -> tuple[Array | None, NDArray[np.bool_]]:
+    """Return the posture of those tried with most joints at limits where none has been yet.
 
-    Continuous joints, which have no position limits, turn by half a turn.
+    Continuous joints, which have no position limits, turn by half a turn instead.
+
+    Args:
+        chain: the arm.
+        touches: tells its collisions with itself.
+        start: from which a straight way leads there.
+        random: generator of postures.
+        reached: the limits that earlier goals have, shape (n, 2).
     """
-    limit = chain.q_max if upper else chain.q_min
-    turned = start + (np.pi if upper else -np.pi)
-    best: tuple[Array, int] | None = None
-    for k in range(_GOALS):
-        # All joints first, then fewer and fewer.
-        chosen = random.random(len(start)) < 1.0 - 0.9 * k / _GOALS
-        count = int((chosen & ~chain.continuous).sum())
-        if best is not None and count <= best[1]:
+    low = np.where(chain.continuous, start - np.pi, chain.q_min)
+    high = np.where(chain.continuous, start + np.pi, chain.q_max)
+    best, of_best, most = None, np.zeros_like(reached), 0
+    middles = _within(chain, 0.5 + _MIDDLE * (random.random((_TRIES, len(start))) - 0.5))
+    for k, q in enumerate(middles):
+        # Nearly all joints at limits first, then fewer and fewer.
+        chosen = random.random(len(start)) < 1.0 - 0.9 * k / _TRIES
+        side = random.integers(0, 2, len(start))
+        at = np.stack([chosen & (side == 0), chosen & (side == 1)], axis=1)
+        fresh = int((at & ~reached).sum())
+        if fresh <= most:
             continue
-        q = np.where(chosen, np.where(chain.continuous, turned, limit), start)
+        q = np.where(at[:, 0], low, np.where(at[:, 1], high, q))
         way = [start + share * (q - start) for share in np.linspace(0.0, 1.0, _STEPS)[1:]]
-        if count == 0 and not chosen.any():
-            continue
-        if max(_held(chain, each) for each in way) > _HELD_AT_GOAL:
-            continue
-        if not any(map(touches, way)):
-            best = q, count
-    return best
+        held = max(_held(chain, each) for each in way) <= _HELD_AT_GOAL
+        if held and not any(map(touches, way)):
+            best, of_best, most = q, at, fresh
+    return best, of_best
 
 
 def _with_absolute_meshes(urdf: str, folder: Path | None) -> str:

@@ -168,10 +168,11 @@ def _run(options: argparse.Namespace) -> int:
     postures = find_postures(chain, touches)
     if touches.trouble:
         print(f"collisions of the arm with itself are not looked at: {touches.trouble}")
-    for limit, count in zip(("upper", "lower"), postures.at_limits, strict=False):
-        print(f"scenario: {count} joints at their {limit} limits at once, and back")
-    if not postures.goals:
-        print("scenario: no way to a limit is free of collisions and can be held; it stands still")
+    bounded = ~chain.continuous
+    print(
+        f"scenario: {len(postures.goals)} goals, with {int(postures.reached[bounded].sum())} of "
+        f"the {2 * int(bounded.sum())} position limits, and back"
+    )
     if "urdf" in files:
         write_whole(files["urdf"], urdf)
     gains = GAINS | {"disturbance_time": OBSERVER_PERIODS / estimates.rate_hz}

@@ -208,27 +208,27 @@ def test_a_link_without_mass_that_carries_others_is_fine(write_robot, call):
 @pytest.mark.parametrize(
     ("case", "message"),
     [
-        ({"limit": "", "type": "continuous"}, "parameter 'velocity_max' is missing"),
+        ({"limit": "", "type": "continuous"}, "the URDF has no velocity limit of shoulder"),
         (
             {
                 "limit": "",
                 "type": "continuous",
                 "parameters": "    velocity_max: [1.0, 1.0]",
             },
-            "joint shoulder has no limit in the URDF to use: parameter 'torque_max' is missing",
+            "parameter 'torque_max' is not set; allowed: given, as the URDF has no effort limit",
         ),
-        ({"limit": ""}, "arm.urdf: joint shoulder has no effort limit"),
+        ({"limit": ""}, "'position_min' is not set; allowed: given, as the URDF has no lower limit"),
         (
             {"limit": '<limit lower="-1" upper="1" effort="30"/>'},
-            "arm.urdf: joint shoulder has no velocity limit",
+            "the URDF has no velocity limit of shoulder",
         ),
-        ({"limit": LIMIT.replace("30", "0")}, "parameter 'torque_max' is missing"),
+        ({"limit": LIMIT.replace("30", "0")}, "parameter 'torque_max' is not set"),
         ({"hand_mass": 0.0}, "joint wrist moves no inertia"),
         ({"hand_mass": 0.0, "mass": 0.0}, "joint shoulder moves no inertia"),
         ({"parameters": "    velocity_max: [1.0]"}, "'velocity_max' is [1]; allowed: 2 numbers"),
         ({"parameters": "    velocity_max: [1, fast]"}, "allowed: items of one type"),
         ({"parameters": "    velocity_max: [1, 0]"}, "allowed: finite numbers > 0"),
-        ({"parameters": "    position_min: [9, 0]"}, "joint shoulder: position limits"),
+        ({"parameters": "    position_min: [9, 0]"}, "'position_max' is [2, 2]; allowed: above"),
         (
             {"parameters": "    position_min: [3, 0]\n    position_max: [1, 1]"},
             "'position_max' is [1, 1]; allowed: above position_min",
@@ -238,7 +238,7 @@ def test_a_link_without_mass_that_carries_others_is_fine(write_robot, call):
             {"text": "/**:\n  ros__parameters:\n    robot_description: {urdf}\n"},
             "parameter 'joints' is not set",
         ),
-        ({"text": ROBOT.replace("wrist", "elbow")}, "unknown joint 'elbow'"),
+        ({"text": ROBOT.replace("wrist", "elbow")}, "parameter 'joints' is 'elbow'"),
         ({"text": ROBOT.replace("{urdf}", "/no/such.urdf")}, "/no/such.urdf: no such file"),
         ({"text": "other: 1\n"}, "'other' is not below 'ros__parameters'"),
         ({"text": "/**: 1\n"}, "'/**' is not below 'ros__parameters'"),

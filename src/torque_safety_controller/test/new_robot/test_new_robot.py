@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is found in a URDF, what is estimated from it, and what is refused."""
+
+from functools import cache
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import yaml
+
+from torque_safety_controller.new_robot.chain import NewRobotError, find_chain
+from torque_safety_controller.new_robot.estimates import CAP, LEAST, SHARE, USEFUL, estimate
+from torque_safety_controller.new_robot.hardware import (
+    GRADES,
+    acceleration_errors,
+    with_rotors,
+)
+from torque_safety_controller.new_robot.postures import SelfCollisions, find_postures
+from torque_safety_controller.tools.new_robot import main
+from viability_bounds_pkg.robot_description import read_urdf
+
+ROBOTS = "package://example-robot-data/robots/"
+UR5 = ROBOTS + "ur_description/urdf/ur5_robot.urdf"
+KINOVA = ROBOTS + "kinova_description/robots/kinova.urdf"
+BAXTER = ROBOTS + "baxter_description/urdf/baxter.urdf"
+PANDA = ROBOTS + "panda_description/urdf/panda.urdf"
+ARMS = {
+    "ur5": (UR5, "tool0"),
+    "panda": (PANDA, "panda_hand"),
+    "kinova": (KINOVA, "j2s6s200_end_effector"),
+    "baxter": (BAXTER, "left_gripper"),
+}
+
+
+@cache
+def chain_of(name):
+    urdf, tip = ARMS[name]
+    return find_chain(read_urdf(urdf), [tip])
+
+
+@cache
+def estimates_of(name):
+    return estimate(chain_of(name))
+
+
+def room(chain, estimates, rng, count):
+    """Accelerations that torque leaves up and down, each of shape (count, n), by inverse dynamics.
+
+    Half of the states are corners of the limits, where the worst ones are.
+    """
+    n, data = len(chain.joints), chain.model.createData()
+    low = np.where(chain.continuous, -np.pi, chain.q_min)
+    high = np.where(chain.continuous, np.pi, chain.q_max)
+    up, down = np.empty((count, n)), np.empty((count, n))
+    for k in range(count):
+        share, v_share = rng.random(n), rng.uniform(-1.0, 1.0, n)
+        if k % 2:
+            share, v_share = np.where(rng.random(n) < 0.5, share.round(), share), np.sign(v_share)
+        q, v = low + share * (high - low), v_share * estimates.v_max
+        h = pin.nonLinearEffects(chain.model, data, q, v)
+        inertia = np.diag(pin.crba(chain.model, data, q))
+        up[k], down[k] = (chain.tau_max - h) / inertia, (chain.tau_max + h) / inertia
+    return up, down
+
+
+@pytest.mark.parametrize("name", ["ur5", "panda"])
+def test_limits_are_available_in_every_state_tried(name):
+    chain, estimates = chain_of(name), estimates_of(name)
+    assert not estimates.filtered.any()
+    up, down = room(chain, estimates, np.random.default_rng(1), 6000)
+    assert (up >= estimates.a_max).all()
+    assert (down >= -estimates.a_min).all()
+    assert (estimates.v_max <= chain.v_max).all()
+    assert min(estimates.a_max.min(), -estimates.a_min.max()) >= LEAST
+
+
+def test_limits_are_no_smaller_than_need_be():
+    ur5, panda = estimates_of("ur5"), estimates_of("panda")
+    assert (ur5.a_max == CAP).all()
+    assert ur5.speed_scale == 1.0
+    # At its own speeds Panda's second joint has none; at 0.77 of them 3 rad/s^2 (config/panda.yaml).
+    assert 0.7 < panda.speed_scale < 0.8
+    assert 0.9 * USEFUL < panda.a_max[1] < 1.5 * USEFUL
+
+
+def test_a_weak_motor_gets_the_safety_filter_and_limits_of_most_states():
+    chain, estimates = chain_of("baxter"), estimates_of("baxter")
+    assert [n for n, f in zip(chain.joints, estimates.filtered, strict=True) if f] == ["left_s1"]
+    up, down = room(chain, estimates, np.random.default_rng(1), 4000)
+    random = slice(0, None, 2)  # those that are no corners
+    available = np.minimum(up, down)[random, 1] >= estimates.a_max[1]
+    assert SHARE - 0.05 < available.mean() < 1.0
+    assert "left_s1" in estimates.why
+
+
+def test_joints_without_end_have_no_position_limits():
+    chain = chain_of("kinova")
+    assert chain.continuous.sum() == 3
+    assert np.isinf(chain.q_max[chain.continuous]).all()
+    assert np.isfinite(chain.q_max[~chain.continuous]).all()
+
+
+def test_two_arms_are_one_chain():
+    chain = find_chain(read_urdf(BAXTER), ["left_gripper", "right_gripper"])
+    assert len(chain.joints) == 14
+    assert chain.tips[0] == "left_gripper"
+
+
+def test_start_and_goals_are_free_of_collisions_and_can_be_held():
+    chain = chain_of("ur5")
+    touches = SelfCollisions(chain, read_urdf(UR5), None)
+    assert (touches.trouble, touches.pairs > 5) == ("", True)
+    postures = find_postures(chain, touches)
+    assert postures.reached.sum() >= 6
+    for q in (postures.start, *postures.goals):
+        assert not touches(q)
+        gravity = pin.computeGeneralizedGravity(chain.model, chain.model.createData(), q)
+        assert (np.abs(gravity) <= 0.9 * chain.tau_max).all()
+    folded = np.array([0.0, -1.5, np.pi, 0.0, 0.0, 0.0])  # the forearm in the upper arm
+    assert touches(folded)
+
+
+def test_errors_of_accelerations_hold_in_nearly_all_states():
+    chain, estimates, grade = with_rotors(chain_of("ur5")), estimates_of("ur5"), GRADES[0]
+    declared, data = acceleration_errors(chain, estimates, grade), chain.model.createData()
+    rng = np.random.default_rng(2)
+    beyond = 0
+    for _ in range(500):
+        q, v = rng.uniform(chain.q_min, chain.q_max), rng.uniform(-1.0, 1.0, 6) * estimates.v_max
+        tau = pin.rnea(chain.model, data, q, v, rng.uniform(estimates.a_min, estimates.a_max))
+        constants = 1.0 + grade.constant_error * np.array([-1, 1, -1, 1, -1, 1])
+        a, wrong = (pin.aba(chain.model, data, q, v, each) for each in (tau, constants * tau))
+        beyond += (np.abs(wrong - a) > declared).any()
+    assert beyond < 0.05 * 500
+    assert (declared < 5.0).all()
+
+
+def test_missing_limits_come_from_the_urdf(tmp_path):
+    from viability_bounds_pkg.cli.limits_file import read_robot
+
+    path = tmp_path / "robot.yaml"
+    joints = ", ".join(chain_of("panda").joints)
+    text = f"/**: {{ros__parameters: {{robot_description: {PANDA}, joints: [{joints}]}}}}"
+    path.write_text(text)
+    robot = read_robot(path)
+    np.testing.assert_array_equal(robot.q_min, chain_of("panda").q_min)
+    np.testing.assert_array_equal(robot.tau_max, chain_of("panda").tau_max)
+    np.testing.assert_array_equal(robot.v_max, chain_of("panda").v_max)
+
+
+LIMIT = '<limit lower="-1" upper="2" effort="30" velocity="4"/>'
+LINK = (
+    '<link name="{}"><inertial><origin xyz="0 0 -0.2"/><mass value="{}"/>'
+    '<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+)
+
+
+def urdf(kind="revolute", limit=LIMIT, more="", mass=1.0):
+    """An arm of two joints, the second as given."""
+    second = LINK.format("hand", mass) if mass else '<link name="hand"/>'
+    return f"""<robot name="an arm"><link name="base"/>{LINK.format("upper", 2.0)}{second}
+    <joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/>
+    <axis xyz="0 1 0"/>{LIMIT}</joint>
+    <joint name="wrist" type="{kind}"><parent link="upper"/><child link="hand"/>
+    <origin xyz="0 0 -0.4"/><axis xyz="0 1 0"/>{limit}</joint>{more}</robot>"""
+
+
+FINGER = (
+    '<link name="finger"/><joint name="finger" type="revolute"><parent link="hand"/>'
+    f'<child link="finger"/><axis xyz="0 1 0"/>{LIMIT}<mimic joint="{{}}"/></joint>'
+)
+LOOP = '<joint name="rod" type="fixed"><parent link="base"/><child link="hand"/></joint>'
+
+
+@pytest.mark.parametrize(
+    ("given", "tip", "base", "words"),
+    [
+        (urdf(), "hnad", "", ["no link 'hnad'", "did you mean 'hand'"]),
+        (urdf(), "xyz", "", ["no link 'xyz'", "links at the ends: hand"]),
+        (urdf(), "base", "", ["no joint moves"]),
+        (urdf(), "upper", "hand", ["does not hang on 'hand'"]),
+        (urdf(limit=LIMIT.replace('effort="30"', "")), "hand", "", ["wrist", "no effort limit"]),
+        (urdf(limit=LIMIT.replace("30", "0")), "hand", "", ["wrist", "0 as effort limit"]),
+        (urdf(limit=LIMIT.replace('"4"', '"0"')), "hand", "", ["wrist", "velocity", "data sheet"]),
+        (urdf(limit=LIMIT.replace("30", "much")), "hand", "", ["wrist", "not a number"]),
+        (urdf(limit=LIMIT.replace('"2"', '"-1"')), "hand", "", ["no room", "continuous"]),
+        (urdf(mass=0), "hand", "", ["'wrist' moves no inertia", "<inertial>"]),
+        (urdf(more=LOOP), "hand", "", ["closed loop", "'wrist' and 'rod'"]),
+        (urdf(more=FINGER.format("wrist")), "finger", "", ["mimics another", "tip hand"]),
+        (urdf(more=FINGER.format("wrist")), "hand", "", ["'finger' mimics", "tip upper"]),
+        (urdf(kind="prismatic"), "hand", "", ["slides", "tip upper"]),
+        (urdf(kind="floating", limit=""), "hand", "", ["floating", "--base hand"]),
+    ],
+)
+def test_what_cannot_work_says_why_and_what_to_do(given, tip, base, words):
+    with pytest.raises(NewRobotError) as error:
+        find_chain(given, [tip], base)
+    text = str(error.value)
+    assert "\n" not in text
+    for word in words:
+        assert word in text
+
+
+def test_a_motor_that_is_too_weak_is_named():
+    chain = find_chain(urdf(limit=LIMIT.replace("30", "0.5")), ["hand"])
+    with pytest.raises(NewRobotError, match="'wrist': its effort limit of 0.5 N m"):
+        estimate(chain)
+
+
+def test_the_tool_refuses_in_one_line(tmp_path, capsys):
+    path = tmp_path / "arm.urdf"
+    path.write_text(urdf())
+    out = tmp_path / "config"
+    assert main([str(path), "no_link", "--out", str(out)]) == 1
+    assert main([str(tmp_path / "none.urdf"), "hand", "--out", str(out)]) == 1
+    (tmp_path / "arm.xacro").write_text('<robot xmlns:xacro="x"><xacro:arm/></robot>')
+    assert main([str(tmp_path / "arm.xacro"), "hand", "--out", str(out)]) == 1
+    errors = capsys.readouterr().err.splitlines()
+    assert [line.startswith("new_robot: ") for line in errors] == [True, True, True]
+    assert "no_link" in errors[0]
+    assert "none.urdf" in errors[1]
+    assert "xacro" in errors[2]
+    assert not list(out.rglob("*.yaml"))
+    with pytest.raises(SystemExit):
+        main([str(path), "hand", "--topic"])
+    assert "either a URDF or --topic" in capsys.readouterr().err
+
+
+def test_files_are_not_replaced_unasked_and_say_where_numbers_come_from(tmp_path, capsys):
+    path = tmp_path / "arm.urdf"
+    path.write_text(urdf())
+    assert main([str(path), "hand", "--out", str(tmp_path)]) == 0
+    assert main([str(path), "hand", "--out", str(tmp_path)]) == 1
+    assert "exists; --force replaces it" in capsys.readouterr().err
+    text = (tmp_path / "an_arm.yaml").read_text()
+    values = yaml.safe_load(text)["/**"]["ros__parameters"]
+    assert values["joints"] == ["shoulder", "wrist"]
+    assert "torque_max" not in values  # the URDF has it
+    lines = text.splitlines()
+    for name in ("rate_hz", "start_positions", "acceleration_min", "acceleration_drift"):
+        index = next(i for i, line in enumerate(lines) if line.strip().startswith(f"{name}:"))
+        assert lines[index - 1].strip().startswith("#"), name
+    for folder in ("scenarios", "imperfect"):
+        (file,) = (tmp_path / folder).iterdir()
+        assert yaml.safe_load(file.read_text())
