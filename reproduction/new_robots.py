@@ -76,11 +76,12 @@ ARMS = {
     "talos_right": Arm(
         DATA + "talos_data/robots/talos_reduced.urdf", "gripper_right_base_link", "torso_2_link"
     ),
-    "pr2_left": Arm(DATA + "pr2_description/urdf/pr2.urdf", "l_gripper_palm_link", "torso_lift_link"),
+    "pr2_left": Arm(
+        DATA + "pr2_description/urdf/pr2.urdf", "l_gripper_palm_link", "torso_lift_link"
+    ),
     "g1_left": Arm(
         DATA + "g1_description/urdf/g1_29dof_rev_1_0.urdf", "left_rubber_hand", "torso_link"
     ),
-    "alex_left": Arm(DATA + "alex_description/urdf/alex_nub_hands.urdf", "leftNub", "TORSO_LINK"),
     "romeo_left": Arm(DATA + "romeo_description/urdf/romeo_small.urdf", "l_gripper", "torso"),
     "centauro_left": Arm(DATA + "centauro_description/urdf/centauro.urdf", "arm1_8", "torso_2"),
     "baxter_both": Arm(DATA + "baxter_description/urdf/baxter.urdf", "left_gripper,right_gripper"),

@@ -176,9 +176,7 @@ class TaskFrames:
 
 
 @lru_cache(maxsize=16)
-def urdf_limits(
-    source: str, joints: tuple[str, ...]
-) -> Mapping[str, Mapping[str, float | None]]:
+def urdf_limits(source: str, joints: tuple[str, ...]) -> Mapping[str, Mapping[str, float | None]]:
     """Return the limits that a URDF gives joints, by the names of `LIMITS_OF_URDF` and joint.
 
     Read once: parameters may change while nodes control a robot.

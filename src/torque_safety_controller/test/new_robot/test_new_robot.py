@@ -78,7 +78,7 @@ def test_limits_are_no_smaller_than_need_be():
     ur5, panda = estimates_of("ur5"), estimates_of("panda")
     assert (ur5.a_max == CAP).all()
     assert ur5.speed_scale == 1.0
-    # At its own speeds Panda's second joint has none; at 0.77 of them 3 rad/s^2 (config/panda.yaml).
+    # At the URDF's speeds Panda's second joint has none; config/panda.yaml has 3 rad/s^2.
     assert 0.7 < panda.speed_scale < 0.8
     assert 0.9 * USEFUL < panda.a_max[1] < 1.5 * USEFUL
 
@@ -131,7 +131,7 @@ def test_errors_of_accelerations_hold_in_nearly_all_states():
         constants = 1.0 + grade.constant_error * np.array([-1, 1, -1, 1, -1, 1])
         a, wrong = (pin.aba(chain.model, data, q, v, each) for each in (tau, constants * tau))
         beyond += (np.abs(wrong - a) > declared).any()
-    assert beyond < 0.05 * 500
+    assert beyond < 0.01 * 500
     assert (declared < 5.0).all()
 
 

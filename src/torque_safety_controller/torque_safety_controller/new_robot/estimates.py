@@ -120,7 +120,7 @@ def estimate(chain: Chain, rate_hz: float | None = None) -> Estimates:
             break
     else:
         filtered = _room(worst) < LEAST
-    overrides = {}
+    overrides: dict[str, tuple[float, float]] = {}
     if filtered.any():
         overrides, why = _in_most_states(chain, space, filtered)
     limits = limits_from_worst_cases(model, space, worst, overrides, CAP)

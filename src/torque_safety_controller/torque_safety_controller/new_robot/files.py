@@ -105,8 +105,9 @@ def parameter_file(
             postures.start,
         ),
         (
-            f"rad/s^2. What torque leaves in the worst states found, with {RESERVE:.0%} of it kept "
-            f"back, rounded towards zero, at most {CAP:g}.{why} Found: {ends}. Not available in "
+            f"rad/s^2. What torque leaves in the worst states found, with {RESERVE:.0%} of it "
+            f"kept back, rounded towards zero, at most {CAP:g}.{why} Found: {ends}. "
+            "Not available in "
             f"{_listed(100 * e.unavailable)} % of 20000 random states.",
             "acceleration_min",
             e.a_min,
@@ -195,14 +196,14 @@ def imperfect_file(
         ("Longest row.", "missed_deadlines", grade.missed),
         ("Hz.", "motor_bandwidth", np.full(n, BANDWIDTH)),
         (
-            "rad/s^2. Errors of the torques that last are learned, so that the arm comes to rest at "
-            "its goal.",
+            "rad/s^2. Errors of the torques that last are learned, so that the arm comes to rest "
+            "at its goal.",
             "lasting_disturbance",
             np.full(n, 20.0),
         ),
         (
-            "rad/s^2. What the errors of the torques below make of the accelerations in 999 of 1000 "
-            "random states.",
+            "rad/s^2. What the errors of the torques below make of the accelerations in 999 of "
+            "1000 random states.",
             "acceleration_disturbance",
             disturbance,
         ),
@@ -261,8 +262,9 @@ def scenario_file(chain: Chain, estimates: Estimates, postures: Postures) -> str
     lines = [
         _HEAD,
         *_comment(
-            "Into position and speed limits and back. The posture task is stiff and hardly damped, "
-            "so that it overshoots its goals, which are at position limits: the bounds stop it. "
+            "Into position and speed limits and back. The posture task is stiff and hardly "
+            "damped, so that it overshoots its goals, which are at position limits: "
+            "the bounds stop it. "
             "Written by scripts/new_robot.sh.",
             "",
         ),
@@ -301,8 +303,10 @@ def _posture(chain: Chain, q: Array) -> list[str]:
 
 
 def _comment(text: str, indent: str) -> list[str]:
-    return textwrap.wrap(text, _WIDTH, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}# ",
-                         break_on_hyphens=False)  # fmt: skip
+    start = f"{indent}# "
+    return textwrap.wrap(
+        text, _WIDTH, initial_indent=start, subsequent_indent=start, break_on_hyphens=False
+    )
 
 
 def _text(title: str, sections: Iterable[tuple[str, list[Entry]]]) -> str:

@@ -96,13 +96,14 @@ def acceleration_errors(chain: Chain, estimates: Estimates, grade: Grade) -> Arr
     low = np.where(chain.continuous, -np.pi, chain.q_min)
     high = np.where(chain.continuous, np.pi, chain.q_max)
     data = chain.model.createData()
-    constant = grade.constant_error * random.choice((-1.0, 1.0), n)
     errors = np.empty((_STATES, n))
     for row in errors:
         q, v = random.uniform(low, high), random.uniform(-1.0, 1.0, n) * estimates.v_max
         a = random.uniform(estimates.a_min, estimates.a_max)
         tau = np.clip(pin.rnea(chain.model, data, q, v, a), -chain.tau_max, chain.tau_max)
         spread = grade.ripple * random.uniform(-1.0, 1.0, n) + grade.noise * random.normal(size=n)
+        # Any motor may be too strong or too weak.
+        constant = grade.constant_error * random.choice((-1.0, 1.0), n)
         wrong = constant * tau + spread * chain.tau_max
         M = np.triu(pin.crba(chain.model, data, q))
         M = M + np.triu(M, 1).T

@@ -18,7 +18,7 @@ from viability_bounds_pkg.robot_description import RobotDescriptionError
 Array = NDArray[np.float64]
 
 _STARTS = 400
-_GOALS = 4  # at most
+_GOALS = 2  # at most
 _TRIES = 300  # for each
 _STEPS = 12  # of a straight way that are looked at
 _ALWAYS = 0.9  # share of postures: shapes that touch in as many are no collision of the arm

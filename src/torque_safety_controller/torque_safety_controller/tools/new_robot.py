@@ -15,6 +15,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -41,7 +42,6 @@ from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
 from viability_bounds_pkg.robot_configuration import load_model
 from viability_bounds_pkg.robot_description import (
-    RobotDescriptionError,
     check_urdf,
     package_directories,
     read_urdf,
@@ -210,8 +210,8 @@ def _write_imperfect(
         disturbance = acceleration_errors(real, estimates, grade)
         own = {**gains, **IMPERFECT_GAINS}
         for _ in range(_ROUNDS):
-            changed = {k: v for k, v in own.items() if gains.get(k) != v}
-            changed = {"integral_action": "joints", **changed}
+            changed: dict[str, Any] = {"integral_action": "joints"}
+            changed |= {name: value for name, value in own.items() if gains.get(name) != value}
             text = imperfect_file(real, ideal, estimates, grade, disturbance, changed)
             with tempfile.NamedTemporaryFile("w", suffix=".yaml") as trial:
                 trial.write(text)

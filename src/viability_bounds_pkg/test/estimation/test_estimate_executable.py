@@ -217,7 +217,10 @@ def test_a_link_without_mass_that_carries_others_is_fine(write_robot, call):
             },
             "parameter 'torque_max' is not set; allowed: given, as the URDF has no effort limit",
         ),
-        ({"limit": ""}, "'position_min' is not set; allowed: given, as the URDF has no lower limit"),
+        (
+            {"limit": ""},
+            "'position_min' is not set; allowed: given, as the URDF has no lower limit",
+        ),
         (
             {"limit": '<limit lower="-1" upper="1" effort="30"/>'},
             "the URDF has no velocity limit of shoulder",

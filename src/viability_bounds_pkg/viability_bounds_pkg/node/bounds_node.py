@@ -21,18 +21,13 @@ from viability_bounds_pkg.node.bounds_parameters import (
     make_bounds,
 )
 from viability_bounds_pkg.node.limit_distances import LimitDistances
-from viability_bounds_pkg.robot_configuration import RobotConfiguration, load_model
+from viability_bounds_pkg.robot_configuration import TOPIC, RobotConfiguration, load_model
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, PeriodCheck, Verdict
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
-from viability_bounds_pkg.ros.robot_urdf import (
-    TOPIC,
-    DescriptionWatch,
-    robot_urdf,
-    warn_of_unusual,
-)
+from viability_bounds_pkg.ros.robot_urdf import DescriptionWatch, robot_urdf, warn_of_unusual
 from viability_bounds_pkg.ros.topics import ACCELERATION_LIMITS, state_topic
 
 

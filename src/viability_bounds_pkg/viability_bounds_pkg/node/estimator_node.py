@@ -17,19 +17,14 @@ from viability_bounds_pkg.node.estimator_parameters import (
     make_estimator,
     make_state_check,
 )
-from viability_bounds_pkg.robot_configuration import load_model
+from viability_bounds_pkg.robot_configuration import TOPIC, load_model
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.joint_command import CommandError, TorqueCommand, read_command
 from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, PeriodCheck, Verdict
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
-from viability_bounds_pkg.ros.robot_urdf import (
-    TOPIC,
-    DescriptionWatch,
-    robot_urdf,
-    warn_of_unusual,
-)
+from viability_bounds_pkg.ros.robot_urdf import DescriptionWatch, robot_urdf, warn_of_unusual
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import ESTIMATED_JOINT_STATES, JOINT_COMMANDS, JOINT_STATES
 from viability_bounds_pkg.state import State
