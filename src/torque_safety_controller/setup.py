@@ -40,6 +40,7 @@ setup(
             "gain_limits = torque_safety_controller.cli.ros_program:gain_limits",
             "identify_friction = torque_safety_controller.cli.ros_program:identify_friction",
             "safety_stack = torque_safety_controller.cli.ros_program:safety_stack",
+            "teleop = torque_safety_controller.cli.ros_program:teleop",
         ],
         "arm_safety.stacks": [
             "safety_stack = torque_safety_controller.node.safety_stack",
