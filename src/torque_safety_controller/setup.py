@@ -41,6 +41,7 @@ setup(
             "identify_friction = torque_safety_controller.cli.ros_program:identify_friction",
             "new_robot = torque_safety_controller.cli.ros_program:new_robot",
             "safety_stack = torque_safety_controller.cli.ros_program:safety_stack",
+            "teleop = torque_safety_controller.cli.ros_program:teleop",
         ],
         "arm_safety.stacks": [
             "safety_stack = torque_safety_controller.node.safety_stack",

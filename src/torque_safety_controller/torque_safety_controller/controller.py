@@ -189,9 +189,15 @@ class Controller:
         """Move a further end effector to `pose_des`; see `Goals.set_other_pose`."""
         self.goals.set_other_pose(hand, pose_des)
 
-    def set_posture_goal(self, q_des: Array, v_des: Array | None = None) -> None:
+    def set_posture_goal(
+        self, q_des: Array, v_des: Array | None = None, a_des: Array | None = None
+    ) -> None:
         """Bring the joints to `q_des`; see `Goals.set_posture`."""
-        self.goals.set_posture(q_des, v_des)
+        self.goals.set_posture(q_des, v_des, a_des)
+
+    def release_pose_goal(self) -> None:
+        """Leave the end effector without a goal; see `Goals.release_pose`."""
+        self.goals.release_pose()
 
     def warm_up(self) -> None:
         """Run every part of a step once: what is compiled at first use is compiled now.

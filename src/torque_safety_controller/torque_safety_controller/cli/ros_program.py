@@ -29,3 +29,8 @@ def new_robot() -> int:
 def safety_stack() -> int:
     """Run bounds, controller and estimator in one process."""
     return run_with_ros("safety_stack", "torque_safety_controller.node.safety_stack")
+
+
+def teleop() -> int:
+    """Run the keyboard teleoperation."""
+    return run_with_ros("teleop", "torque_safety_controller.tools.teleop")

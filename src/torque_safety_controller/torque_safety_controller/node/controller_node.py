@@ -21,11 +21,13 @@ from torque_safety_controller.node.assembly import (
 from torque_safety_controller.node.collision_report import CollisionReport
 from torque_safety_controller.node.controller_report import (
     LEVELS,
+    Shortfall,
     StepRecord,
     about_detour,
     too_weak,
 )
 from torque_safety_controller.node.declared import covered_row, declared_robot
+from torque_safety_controller.node.driving import Driving
 from torque_safety_controller.node.gain_watch import GainWatch
 from torque_safety_controller.node.goals import GoalSubscriber
 from torque_safety_controller.node.position_control import PositionControl
@@ -103,10 +105,12 @@ class ControllerNode(ArmNode):
         self._wrenches = WrenchSubscriber(
             *heard, self._controller.interaction, self._goals, config, base
         )
+        self._driving = Driving(self, self._goals, self._controller, config, base, self._states)
         self._modes = ModeKeeper()
         self._went_wrong = ""  # why the arm was braked, until it goes on
         self._rate = RateWatch(config.dt, covered_row(self))
         self._record = StepRecord(len(config.joints))
+        self._shortfall = Shortfall(config.joints, config.position_min, config.position_max)
         self._collision = CollisionReport(self.get_logger(), self._controller.constraints)
 
         self._commands = JointCommands(self, config.joints, config.ros2_control_topic)
@@ -231,7 +235,8 @@ class ControllerNode(ArmNode):
         if self._handover.by_drives:
             self._drives.go_on(stamp)
             return
-        self._goals.apply_due(self._states.stamp)
+        state = State(self._states.q, self._states.v)
+        self._goals.apply_due(self._states.stamp, state)
         contested = self._goals.contested
         if contested:
             self._went_wrong = _CONTESTED
@@ -239,7 +244,6 @@ class ControllerNode(ArmNode):
             self._rate.slow(self._went_wrong)
             self._went_wrong = ""
         self._note_rate()
-        state = State(self._states.q, self._states.v)
         now = state, AccelerationRange(self._limits.lower, self._limits.upper)
         lost = contested or self._goals.lost
         if lost or self._handover.control is Control.GIVING_BACK:
@@ -359,6 +363,11 @@ class ControllerNode(ArmNode):
         detour = about_detour(self._config.joints, self._controller)
         if detour.text:
             level, text = max(level, detour.level), f"{text}; {detour.text}"
+        short = self._shortfall.look(self._controller, time.monotonic())
+        short = short if self._modes.mode is Mode.TRACKING else ""
+        values["short_of_goal"] = short or "none"
+        if short:
+            text += f"; {short}"
         return level, text, values
 
 

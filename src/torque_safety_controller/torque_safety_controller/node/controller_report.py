@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+import pinocchio as pin
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from torque_safety_controller.controller import Controller, ControlOutput
@@ -21,6 +22,16 @@ LEVELS = {
 }
 
 _SLIGHT = 1e-3  # rad/s^2; smaller relaxations of bounds come with those of distances
+
+
+_STANDS = 1.0
+"""How long the arm stands before it is told, s."""
+
+_SLOW, _NEAR = 0.01, 0.01
+"""Speed below which it stands, rad/s; distance at which a joint is on a position limit, rad."""
+
+_AWAY, _TURNED = 0.005, 0.02
+"""What counts as short of the goal, m and rad."""
 
 
 class StepRecord:
@@ -129,6 +140,36 @@ def about_detour(joints: tuple[str, ...], controller: Controller) -> About:
         joint = int(detour.short.argmax())
         text += f": {joints[joint]} stops {1e3 * detour.short[joint]:.1f} mrad before it"
     return About(DiagnosticStatus.WARN, text)
+
+
+class Shortfall:
+    """Tells that the arm stands short of a pose that stays the goal.
+
+    Args:
+        joints: names of the n joints.
+        q_min: lower position limits, shape (n,), rad.
+        q_max: upper ones, shape (n,), rad.
+    """
+
+    def __init__(self, joints: tuple[str, ...], q_min: np.ndarray, q_max: np.ndarray) -> None:
+        self._joints, self._q_min, self._q_max = joints, q_min, q_max
+        self._goal: pin.SE3 | None = None
+        self._since = 0.0
+
+    def look(self, controller: Controller, now: float) -> str:
+        """Return by how much, at `now`, s, once it has stood for `_STANDS`; else nothing."""
+        goal, robot = controller.goals.pose_des, controller.robot
+        error = controller.goals.error(robot.pose)
+        away, turned = (float(np.linalg.norm(part)) for part in np.split(error, 2))
+        stands = float(np.abs(robot.v).max()) < _SLOW and (away > _AWAY or turned > _TURNED)
+        if goal is None or not stands or self._goal is None or goal != self._goal:
+            self._goal, self._since = None if goal is None else goal.copy(), now
+            return ""
+        if now - self._since < _STANDS:
+            return ""
+        near = np.minimum(robot.q - self._q_min, self._q_max - robot.q) < _NEAR
+        text = f"stands {1e3 * away:.0f} mm and {turned:.2f} rad short of its goal"
+        return text + (f", on limits of {_named(self._joints, near)}" if near.any() else "")
 
 
 def _named(joints: tuple[str, ...], flags: np.ndarray) -> str:

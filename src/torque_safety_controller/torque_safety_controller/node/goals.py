@@ -12,12 +12,13 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from geometry_msgs.msg import Point, PoseStamped, Quaternion, Vector3, WrenchStamped
+from geometry_msgs.msg import Point, PoseStamped, Quaternion, Vector3
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from torque_safety_controller.controller import Controller
+from torque_safety_controller.driving.motion import Motion, TrajectoryMotion
 from torque_safety_controller.node.topics import (
     TARGET_POSE,
     TARGET_POSE_SECOND,
@@ -34,6 +35,7 @@ from viability_bounds_pkg.pose_trajectory import (
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import Topic
+from viability_bounds_pkg.state import State
 
 _QUATERNION_TOLERANCE = 1e-3
 _FARTHEST = 100.0  # m; no arm is longer
@@ -50,7 +52,7 @@ def pose_from_message(message: PoseStamped, base_frame: str) -> pin.SE3:
     Raises:
         GoalRefused: another frame, a number that is not finite, a quaternion that is not unit.
     """
-    _check_frame(message, base_frame)
+    check_frame(message, base_frame)
     return _placement(message.pose.position, message.pose.orientation)
 
 
@@ -69,7 +71,7 @@ def trajectory_from_message(
     Raises:
         GoalRefused: frames, sizes or numbers that cannot be followed.
     """
-    _check_frame(message, base_frame)
+    check_frame(message, base_frame)
     if list(message.joint_names) not in ([], [end_effector_frame]):
         raise GoalRefused(
             f"joint_names is {list(message.joint_names)}; allowed: '{end_effector_frame}' or none"
@@ -84,8 +86,8 @@ def trajectory_from_message(
         rates = [np.zeros(6), np.zeros(6)]
         for rate, given in zip(rates, (point.velocities, point.accelerations), strict=True):
             for twist in given:
-                rate[:3] = R @ _vector(twist.linear)
-                rate[3:] = R @ _vector(twist.angular)
+                rate[:3] = R @ vector_of(twist.linear)
+                rate[3:] = R @ vector_of(twist.angular)
             if (fast := np.abs(rate).max()) > _FASTEST:
                 raise GoalRefused(f"points[{k}] asks for {fast:g}; allowed: up to {_FASTEST:g}")
         pose = base * _placement(transform.translation, transform.rotation)
@@ -97,13 +99,15 @@ def trajectory_from_message(
         raise GoalRefused(str(error)) from error
 
 
-def _check_frame(message: PoseStamped | MultiDOFJointTrajectory, base_frame: str) -> None:
+def check_frame(message: PoseStamped | MultiDOFJointTrajectory, base_frame: str) -> None:
+    """Refuse a message in another frame than the base's; an empty name stands for that."""
     frame = message.header.frame_id
     if frame not in ("", base_frame):
         raise GoalRefused(f"frame_id is '{frame}'; allowed: '{base_frame}' or empty")
 
 
-def _vector(message: Vector3) -> np.ndarray:
+def vector_of(message: Vector3) -> np.ndarray:
+    """Return the numbers of a message, shape (3,)."""
     return np.array([message.x, message.y, message.z])
 
 
@@ -160,6 +164,7 @@ class GoalSubscriber:
 
     Attributes:
         refused: how many goals, and publishers of goals, were refused, by topic.
+        motion: sets the goal in each control step; None for goals at rest.
     """
 
     def __init__(
@@ -180,8 +185,7 @@ class GoalSubscriber:
             self.listen(TARGET_POSE_SECOND, self._on_second_pose)
         self.listen(TARGET_POSTURE, self._on_posture)
         self.listen(TARGET_TRAJECTORY, self._on_trajectory)
-        self._trajectory: PoseTrajectory | None = None
-        self._begin = 0
+        self.motion: Motion | None = None
         self._taken = controller.goals.taken
         self.renew()
 
@@ -223,36 +227,37 @@ class GoalSubscriber:
 
     def add(
         self,
-        message: PoseStamped | JointState | MultiDOFJointTrajectory | WrenchStamped,
+        message: Any,
         apply: Callable[[], None],
     ) -> None:
         """Call `apply` when the time in the header of `message` has come."""
         self._pending.append((stamp_to_ns(message.header.stamp), apply))
         self._pending.sort(key=lambda entry: entry[0])
 
-    def apply_due(self, stamp: int) -> bool:
-        """Apply the goals that are due at `stamp`, ns, and go on with a trajectory.
+    def apply_due(self, stamp: int, state: State) -> bool:
+        """Apply the goals that are due at `stamp`, ns, and go on with a motion.
 
-        A trajectory ends where the arm has taken the pose where it was for its goal.
+        A motion ends where the arm has taken the pose where it was for its goal.
+
+        Args:
+            stamp: of the state, ns.
+            state: of the joints.
 
         Returns:
-            Whether any were due, or a trajectory is followed.
+            Whether any were due, or a motion goes on.
         """
         if self._taken != self._controller.goals.taken:
-            self._taken, self._trajectory = self._controller.goals.taken, None
+            self._taken, self.motion = self._controller.goals.taken, None
         due = False
         while self._pending and self._pending[0][0] <= stamp:
             self._pending.pop(0)[1]()
             due = True
-        if due or self._trajectory is not None:
+        if due or self.motion is not None:
             self.renew()
-        if self._trajectory is None:
+        if self.motion is None:
             return due
-        self._begin = self._begin or stamp
-        t = 1e-9 * (stamp - self._begin)
-        self._controller.set_pose_goal(*self._trajectory.sample(t))
-        if t >= self._trajectory.duration:
-            self._trajectory = None
+        if not self.motion.advance(self._controller, state, stamp):
+            self.motion = None
         return True
 
     def _on_pose(self, message: PoseStamped) -> None:
@@ -270,7 +275,7 @@ class GoalSubscriber:
         self.add(message, lambda: self._controller.set_other_pose_goal(0, self._base * pose))
 
     def _rest_at(self, pose: pin.SE3) -> None:
-        self._trajectory = None
+        self.motion = None
         self._controller.set_pose_goal(pose)
 
     def _on_trajectory(self, message: MultiDOFJointTrajectory) -> None:
@@ -281,11 +286,12 @@ class GoalSubscriber:
             )
         except GoalRefused as error:
             return self.refuse(TARGET_TRAJECTORY, error)
-        self.add(message, lambda: self._follow(trajectory, stamp_to_ns(message.header.stamp)))
+        begin = stamp_to_ns(message.header.stamp)
+        self.add(message, lambda: self.move(TrajectoryMotion(trajectory, begin)))
 
-    def _follow(self, trajectory: PoseTrajectory, begin: int) -> None:
-        """Follow a trajectory from the time `begin` on, ns; 0 for the next control step."""
-        self._trajectory, self._begin = trajectory, begin
+    def move(self, motion: Motion) -> None:
+        """Let a motion set the goal from now on."""
+        self.motion = motion
 
     def _on_posture(self, message: JointState) -> None:
         config = self._config
@@ -295,7 +301,12 @@ class GoalSubscriber:
             )
         except GoalRefused as error:
             return self.refuse(TARGET_POSTURE, error)
-        self.add(message, lambda: self._controller.set_posture_goal(q_des))
+        self.add(message, lambda: self._take_posture(q_des))
+
+    def _take_posture(self, q_des: np.ndarray) -> None:
+        if not isinstance(self.motion, TrajectoryMotion):  # which leaves the posture to others
+            self.motion = None
+        self._controller.set_posture_goal(q_des)
 
     def refuse(self, topic: Topic, reason: GoalRefused | str) -> None:
         """Count and log a goal that cannot be followed, or a publisher that cannot be heard."""

@@ -80,7 +80,7 @@ class PositionControl:
         Not before the torque of the motors is known.
         """
         states = self._states
-        if self._goals.apply_due(states.stamp):
+        if self._goals.apply_due(states.stamp, State(states.q, states.v)):
             self._logger.warning("goals from before the handover are dropped")
         try:
             tau = self._handover.average(states.q, states.effort())

@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-from geometry_msgs.msg import PoseStamped, Vector3Stamped, WrenchStamped
+from geometry_msgs.msg import PoseStamped, TwistStamped, Vector3Stamped, WrenchStamped
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
-from trajectory_msgs.msg import MultiDOFJointTrajectory
+from trajectory_msgs.msg import JointTrajectory, MultiDOFJointTrajectory
 
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, LATCHED_QOS, STATUS_QOS
 from viability_bounds_pkg.ros.topics import USER, OfferedService, Topic
@@ -57,6 +57,33 @@ TARGET_WRENCH = Topic(
     "wrench that the hand exerts in `force_directions`, N and N m; axes of the end effector (or "
     "empty) or of `base_frame`",
 )
+TARGET_JOINT_TRAJECTORY = Topic(
+    "target_joint_trajectory",
+    JointTrajectory,
+    GOAL_QOS,
+    (USER,),
+    (_NODE,),
+    "positions of all joints over time, rad, perhaps with velocities and accelerations, matched "
+    "by name; a goal for the pose is given up; without points: the joints come to rest",
+)
+JOG_HAND = Topic(
+    "jog_hand",
+    TwistStamped,
+    GOAL_QOS,
+    (USER,),
+    (_NODE,),
+    "twist of the end effector for at most 0.25 s, m/s and rad/s, in the axes of `base_frame` (or "
+    "empty) or of the end effector",
+)
+JOG_JOINTS = Topic(
+    "jog_joints",
+    JointState,
+    GOAL_QOS,
+    (USER,),
+    (_NODE,),
+    "`velocity` of the joints named for at most 0.25 s, rad/s, of the others 0; no `position`; a "
+    "goal for the pose is given up",
+)
 ROS2_CONTROL_EFFORTS = Topic(
     "<ros2_control_topic>",
     Float64MultiArray,
@@ -102,7 +129,16 @@ CONTROLLER_MODE = Topic(
     (USER,),
     "TRACKING, HOLD, POSITION or STOPPED, when it changes; the reasons are in `/diagnostics`",
 )
-GOALS = (TARGET_POSE, TARGET_POSE_SECOND, TARGET_POSTURE, TARGET_TRAJECTORY, TARGET_WRENCH)
+GOALS = (
+    TARGET_POSE,
+    TARGET_POSE_SECOND,
+    TARGET_POSTURE,
+    TARGET_TRAJECTORY,
+    TARGET_JOINT_TRAJECTORY,
+    JOG_HAND,
+    JOG_JOINTS,
+    TARGET_WRENCH,
+)
 """What the arm obeys from one node each."""
 
 TOPICS = (

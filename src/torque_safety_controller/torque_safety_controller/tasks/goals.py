@@ -48,6 +48,7 @@ class Goals:
         self.taken = 0
         self._pose_motion: PoseMotion | None = None
         self._v_des: Array | None = None
+        self._a_des: Array | None = None
 
     @property
     def any(self) -> bool:
@@ -84,15 +85,23 @@ class Goals:
         """
         self.others = [*self.others[:hand], pose_des, *self.others[hand + 1 :]]
 
-    def set_posture(self, q_des: Array, v_des: Array | None = None) -> None:
+    def release_pose(self) -> None:
+        """Leave end effectors without a goal, so that the joints' one counts in full."""
+        self.pose_des = self._pose_motion = None
+        self.others = [None] * len(self.others)
+
+    def set_posture(
+        self, q_des: Array, v_des: Array | None = None, a_des: Array | None = None
+    ) -> None:
         """Bring the joints, or what the pose task leaves free of them, to `q_des`, rad.
 
         Args:
             q_des: goal now, shape (n,), rad.
             v_des: its velocity, shape (n,), rad/s; None for a goal at rest.
+            a_des: its acceleration, shape (n,), rad/s^2; with `v_des`; None for zero.
         """
         self.q_des = q_des
-        self._v_des = v_des
+        self._v_des, self._a_des = v_des, a_des
 
     def hold(self, pose: pin.SE3) -> None:
         """Take `pose`, where the end effector is, for the goal, whatever it was."""
@@ -134,11 +143,17 @@ class Goals:
                 gains.posture_kd,
                 gains.posture_weight,
                 bool(tasks) and self.pose_des is not None,
-                None if self._v_des is None else gains.posture_kd * self._v_des,
+                self._posture_feedforward(gains),
                 tuple(each.hand for each in tasks if isinstance(each, OtherHandTask)),
             )
         )
         return tasks
+
+    def _posture_feedforward(self, gains: Gains) -> Array | None:
+        if self._v_des is None:
+            return None
+        feedforward: Array = gains.posture_kd * self._v_des
+        return feedforward if self._a_des is None else feedforward + self._a_des
 
 
 def _pose_task(

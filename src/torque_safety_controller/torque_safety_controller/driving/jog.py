@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Jogs: velocities of the joints or of the hand that count for a short time.
+
+A jog moves a goal. Its velocity w follows the commanded one u with the time constant `SMOOTHING`,
+
+    T w' = u - w,
+
+so that commands of a keyboard or joystick do not come as steps; w and w' are fed forward. The goal
+is never farther ahead of the arm than a leash: where limits hold the arm back, the goal waits.
+Without a new command for `TIMEOUT` u is zero, and the goal comes to rest.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from torque_safety_controller.controller import Controller
+from torque_safety_controller.tasks.pose_task import shorten
+from viability_bounds_pkg.state import State
+
+Array = NDArray[np.float64]
+
+TIMEOUT = 0.25
+"""How long a command counts, s of the robot's time."""
+
+SMOOTHING = 0.1
+"""T, s."""
+
+JOINT_LEASH = 0.1
+"""How far the goal of a joint may be ahead of it, rad."""
+
+HAND_LEASH = (0.05, 0.2)
+"""How far the goal of the hand may be ahead of it, m and rad."""
+
+JOINT_SPEED_MAX = 10.0
+"""Faster commands are shortened to this speed, rad/s."""
+
+HAND_SPEED_MAX = (1.0, 2.0)
+"""Faster commands are shortened to these speeds, m/s and rad/s."""
+
+_REST = 1e-4
+"""Speed of the goal at which a jog has ended, rad/s and m/s."""
+
+
+class _Jog:
+    """Velocity of a goal, by commands that count for a short time.
+
+    Attributes:
+        velocity: w of the goal, shape (k,).
+    """
+
+    def __init__(self) -> None:
+        self.velocity = np.zeros(0)
+        self._command: Array | None = None
+        self._until = self._stamp = -1
+
+    def command(self, velocity: Array) -> None:
+        """Command a velocity, shape (k,), from the next step on."""
+        self._command, self._until = velocity, -1
+
+    @property
+    def begun(self) -> bool:
+        """Whether a step has been made."""
+        return self._stamp >= 0
+
+    def _elapsed(self, stamp: int) -> float:
+        """Note a step; return the time since the last one, s, and 0 for the first."""
+        if self._until < 0:
+            self._until = stamp + round(1e9 * TIMEOUT)
+        elapsed = 1e-9 * (stamp - self._stamp) if self.begun else 0.0
+        if elapsed < 0.0:  # the robot has restarted
+            self._until = 0
+        self._stamp = stamp
+        return min(max(elapsed, 0.0), SMOOTHING)
+
+    def _wanted(self, stamp: int) -> Array:
+        """Return u, shape (k,)."""
+        if self._command is None or stamp > self._until:
+            return np.zeros_like(self.velocity)
+        return self._command
+
+    def _smooth(self, wanted: Array, elapsed: float) -> Array:
+        """Let w follow `wanted`; return w', shape (k,)."""
+        share = -math.expm1(-elapsed / SMOOTHING)
+        self.velocity = self.velocity + share * (wanted - self.velocity)
+        rate: Array = (wanted - self.velocity) / SMOOTHING
+        return rate
+
+    def _goes_on(self, stamp: int) -> bool:
+        return stamp <= self._until or float(np.abs(self.velocity).max()) > _REST
+
+
+class JointJog(_Jog):
+    """The joints move with given velocities.
+
+    Args:
+        q_min: lower position limits, shape (n,), rad.
+        q_max: upper ones, shape (n,), rad.
+        v_max: speed limits, shape (n,), rad/s; inf for none.
+    """
+
+    def __init__(self, q_min: Array, q_max: Array, v_max: Array) -> None:
+        super().__init__()
+        self._q_min, self._q_max = q_min, q_max
+        self._v_max = np.minimum(v_max, JOINT_SPEED_MAX)
+        self._q_des = np.zeros(0)
+
+    def advance(self, controller: Controller, state: State, stamp: int) -> bool:
+        """Set the goal of one control step; see `Motion`."""
+        elapsed = self._elapsed(stamp)
+        if not len(self._q_des):
+            self._q_des, self.velocity = state.q.copy(), state.v.copy()
+        wanted = self._wanted(stamp)
+        if (wanted == 0.0).all() and not self._goes_on(stamp):
+            controller.set_posture_goal(self._q_des)
+            return False
+        # All by the same share: the direction stays.
+        wanted = wanted / max(1.0, float((np.abs(wanted) / self._v_max).max()))
+        rate = self._smooth(wanted, elapsed)
+        q_des = self._q_des + elapsed * self.velocity
+        q_des = np.clip(q_des, state.q - JOINT_LEASH, state.q + JOINT_LEASH)
+        self._q_des = np.clip(q_des, self._q_min, self._q_max)
+        at_limit = q_des != self._q_des
+        self.velocity[at_limit] = rate[at_limit] = 0.0
+        controller.release_pose_goal()
+        controller.set_posture_goal(self._q_des, self.velocity, rate)
+        return True
+
+
+class HandJog(_Jog):
+    """The hand moves with a given twist.
+
+    Args:
+        speed_max: of translation, m/s, and rotation, rad/s; faster commands are shortened.
+    """
+
+    def __init__(self, speed_max: tuple[float, float] = HAND_SPEED_MAX) -> None:
+        super().__init__()
+        self._speed_max = speed_max
+        self._in_hand = False
+        self._goal: pin.SE3 | None = None
+
+    def command_twist(self, twist: Array, in_hand: bool) -> None:
+        """Command a twist from the next step on.
+
+        Args:
+            twist: linear, then angular, shape (6,), m/s and rad/s.
+            in_hand: whether its axes are those of the hand; else of the URDF's root frame.
+        """
+        twist = twist.copy()
+        shorten(twist[:3], self._speed_max[0])
+        shorten(twist[3:], self._speed_max[1])
+        self._in_hand = in_hand
+        self.command(twist)
+
+    def advance(self, controller: Controller, state: State, stamp: int) -> bool:
+        """Set the goal of one control step; see `Motion`."""
+        elapsed = self._elapsed(stamp)
+        robot = controller.robot
+        if self._goal is None:
+            # What the robot's model knows is the last step, or nothing.
+            robot.update(state, robot.a_last)
+            self._goal, self.velocity = robot.pose.copy(), robot.J @ robot.v
+        wanted = self._wanted(stamp)
+        if (wanted == 0.0).all() and not self._goes_on(stamp):
+            controller.set_pose_goal(self._goal)
+            return False
+        R = self._goal.rotation
+        if not self._in_hand:
+            wanted = (wanted.reshape(2, 3) @ R).ravel()
+        rate = self._smooth(wanted, elapsed)
+        linear, angular = self.velocity[:3], self.velocity[3:]
+        p = self._goal.translation + elapsed * R @ linear
+        R = R @ pin.exp3(elapsed * angular)
+        # The pose of the last step: one period's motion is far less than the leash.
+        ahead = p - robot.pose.translation
+        turn = pin.log3(robot.pose.rotation.T @ R)
+        shorten(ahead, HAND_LEASH[0])
+        if np.linalg.norm(turn) > HAND_LEASH[1]:
+            shorten(turn, HAND_LEASH[1])
+            R = robot.pose.rotation @ pin.exp3(turn)
+        self._goal = pin.SE3(R, robot.pose.translation + ahead)
+        controller.set_pose_goal(self._goal, self.velocity.copy(), rate)
+        return True

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trajectories of the joints: cubic or quintic polynomials between points.
+
+Between points with accelerations they are quintics, between points with velocities cubics. Points
+with positions only get the velocities of monotone interpolation (PCHIP), which does not overshoot,
+and rest at both ends.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BPoly, PchipInterpolator
+
+from torque_safety_controller.controller import Controller
+from viability_bounds_pkg.exceptions import ArmSafetyError
+from viability_bounds_pkg.state import State
+
+Array = NDArray[np.float64]
+
+ACCELERATION_MAX = 100.0
+"""Larger accelerations are not fed forward, rad/s^2: no arm has them."""
+
+
+SPEED_MAX = 1e3
+"""Trajectories that are faster anywhere are no motion of an arm, rad/s."""
+
+
+class JointTrajectoryError(ArmSafetyError, ValueError):
+    """Points that do not make a trajectory."""
+
+
+class JointPoint(NamedTuple):
+    """Where the joints are at a time."""
+
+    time: float
+    """s from the start."""
+    q: Array
+    """Shape (n,), rad."""
+    v: Array | None = None
+    """Shape (n,), rad/s; None for all points or for none."""
+    a: Array | None = None
+    """Shape (n,), rad/s^2; None for all points or for none; only with velocities."""
+
+
+class JointTrajectory:
+    """Interpolates points; before the first and after the last it rests at them.
+
+    Args:
+        points: at least one, in order of time.
+
+    Attributes:
+        points: as given.
+        duration: time of the last point, s.
+
+    Raises:
+        JointTrajectoryError: no points, times that do not grow, numbers that are not finite,
+            velocities or accelerations of some points only, or a speed above `SPEED_MAX`.
+    """
+
+    def __init__(self, points: Sequence[JointPoint]) -> None:
+        if not points:
+            raise JointTrajectoryError("points is empty; allowed: at least one point")
+        before = -math.inf
+        kind = points[0].v is None, points[0].a is None
+        for k, (time, q, v, a) in enumerate(points):
+            given = [part for part in (q, v, a) if part is not None]
+            if not (math.isfinite(time) and all(np.isfinite(part).all() for part in given)):
+                raise JointTrajectoryError(f"points[{k}] is not finite")
+            if time < 0.0 or time <= before:
+                allowed = "at least 0" if k == 0 else f"more than {before:g}, that of the last one"
+                raise JointTrajectoryError(f"points[{k}].time is {time:g}; allowed: {allowed}")
+            if (v is None, a is None) != kind or (v is None and a is not None):
+                raise JointTrajectoryError(
+                    f"points[{k}] has other parts than points[0]; allowed: positions; with "
+                    "velocities; or with velocities and accelerations; the same in all points"
+                )
+            before = time
+        self.points = tuple(points)
+        self.duration = points[-1].time
+        self._curves = _curves(self.points) if len(points) > 1 else None
+        if not (self.fastest() <= SPEED_MAX).all():
+            raise JointTrajectoryError(f"it is faster than {SPEED_MAX:g} rad/s")
+
+    def from_state(self, state: State) -> JointTrajectory:
+        """Return this trajectory with a first part that begins at a state at time 0."""
+        first = self.points[0]
+        if first.time <= 0.0:
+            return self
+        start = JointPoint(
+            0.0,
+            state.q.copy(),
+            None if first.v is None else state.v.copy(),
+            None if first.a is None else np.zeros_like(state.q),
+        )
+        try:
+            return JointTrajectory((start, *self.points))
+        except JointTrajectoryError:  # no time to get there
+            return self
+
+    def sample(self, t: float) -> tuple[Array, Array, Array]:
+        """Return positions, velocities and accelerations at time t, s; shape (n,) each."""
+        first, last = self.points[0], self.points[-1]
+        if self._curves is None or t < first.time or t >= last.time:
+            q = (first if t < first.time else last).q
+            return q.copy(), np.zeros_like(q), np.zeros_like(q)
+        q, v, a = (curve(t) for curve in self._curves)
+        return q, v, a
+
+    def fastest(self) -> Array:
+        """Return the largest speed of each joint at 8 instants between points, shape (n,)."""
+        if self._curves is None:
+            return np.zeros_like(self.points[0].q)
+        times = np.array([point.time for point in self.points])
+        fine = np.interp(np.arange(8 * len(times) - 7) / 8, np.arange(len(times)), times)
+        largest: Array = np.abs(self._curves[1](fine)).max(axis=0)
+        return largest
+
+
+def _curves(points: Sequence[JointPoint]) -> tuple[BPoly, BPoly, BPoly]:
+    """Return positions, velocities and accelerations as functions of time."""
+    times = np.array([point.time for point in points])
+    q = np.array([point.q for point in points])
+    if points[0].v is None:
+        v = PchipInterpolator(times, q).derivative()(times)
+        v[0] = v[-1] = 0.0
+    else:
+        v = np.array([point.v for point in points])
+    parts = [q, v] if points[0].a is None else [q, v, np.array([point.a for point in points])]
+    curve = BPoly.from_derivatives(times, np.stack(parts, axis=1))
+    return curve, curve.derivative(), curve.derivative(2)
+
+
+class JointMotion:
+    """The joints follow a trajectory from where they are.
+
+    Args:
+        trajectory: from the time `begin` on.
+        begin: its time 0, ns; 0 for the first step.
+        q_min: lower position limits, shape (n,), rad; between points a polynomial may pass them.
+        q_max: upper ones, shape (n,), rad.
+        v_max: speed limits, shape (n,), rad/s; more is not fed forward.
+    """
+
+    def __init__(
+        self, trajectory: JointTrajectory, begin: int, q_min: Array, q_max: Array, v_max: Array
+    ) -> None:
+        self._trajectory, self._begin = trajectory, begin
+        self._q_min, self._q_max, self._v_max = q_min, q_max, v_max
+        self._begun = False
+
+    def advance(self, controller: Controller, state: State, stamp: int) -> bool:
+        """Set the goal of one control step; see `Motion`."""
+        if not self._begun:
+            self._begun, self._begin = True, self._begin or stamp
+            self._trajectory = self._trajectory.from_state(state)
+        t = 1e-9 * (stamp - self._begin)
+        q, v, a = self._trajectory.sample(t)
+        controller.release_pose_goal()
+        controller.set_posture_goal(
+            np.clip(q, self._q_min, self._q_max),
+            np.clip(v, -self._v_max, self._v_max),
+            np.clip(a, -ACCELERATION_MAX, ACCELERATION_MAX),
+        )
+        return 0.0 <= t < self._trajectory.duration

@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Jogs and trajectories of the joints, through the real nodes in lockstep."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from arms import load_arm
+from geometry_msgs.msg import PoseStamped, TwistStamped
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from sim_bridge.nodes.bullet_node import BulletNode
+from torque_safety_controller.node.controller_node import ControllerNode
+from torque_safety_controller.tools.teleop import Teleop
+from viability_bounds_pkg.node.bounds_node import BoundsNode
+from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp, stamp_to_ns
+from viability_bounds_pkg.state import State
+from viability_bounds_pkg.testing.ros_harness import read_config
+
+KINDS = {"bounds_node": BoundsNode, "controller_node": ControllerNode, "bullet_node": BulletNode}
+PATIENT = {"clock": "lockstep", "bounds_timeout": 5.0, "state_timeout": 10.0}
+DT = 0.002
+
+
+class Driven:
+    """A Panda in lockstep, and a user who sends something at instants of the robot's time."""
+
+    def __init__(self, ros, **changed) -> None:
+        self.ros = ros
+        values = read_config("panda", *KINDS) | PATIENT | changed
+        self.joints = values["joints"]
+        self.low, self.high = np.array(values["position_min"]), np.array(values["position_max"])
+        # Not before the robot runs: publishers are found by then.
+        self.controller = ros.start(ControllerNode, values)
+        ros.start(BoundsNode, values)
+        self.hand = ros.talk(TwistStamped, "jog_hand", GOAL_QOS)
+        self.jog = ros.talk(JointState, "jog_joints", GOAL_QOS)
+        self.trajectory = ros.talk(JointTrajectory, "target_joint_trajectory", GOAL_QOS)
+        self.pose = ros.talk(PoseStamped, "target_pose", GOAL_QOS)
+        self.states = ros.listen(JointState, "joint_states")
+        ros.start(BulletNode, values)
+        ros.wait_until(lambda: len(self.states) > 2)
+
+    @property
+    def q(self) -> np.ndarray:
+        return np.array(self.states[-1].position[: len(self.joints)])
+
+    def positions(self, begin=0) -> np.ndarray:
+        return np.array([state.position[: len(self.joints)] for state in self.states[begin:]])
+
+    def run(self, duration: float, send=lambda: None, every: float = 0.05) -> None:
+        """Let robot time pass; call `send` again and again meanwhile."""
+        now, due = stamp_to_ns(self.states[-1].header.stamp), 0
+        end = now + round(1e9 * duration)
+        while now < end:
+            if now >= due:
+                send()
+                due = now + round(1e9 * every)
+            self.ros.spin(0.1)
+            now = stamp_to_ns(self.states[-1].header.stamp)
+
+    def keeps_limits(self) -> None:
+        self.ros.diagnostics.clear()
+        robot = self.ros.wait_until(lambda: self.ros.diagnostics.get("bullet_node"))
+        for key in ("position_violation_rad", "velocity_violation_rad_s"):
+            assert max(map(float, robot[key].split())) == 0.0, (key, robot[key])
+        assert max(map(float, robot["torque_ratio"].split())) <= 1.0 + 1e-9
+
+
+@pytest.fixture
+def arm(ros):
+    return Driven(ros)
+
+
+def points(*rows, step=0.5):
+    """Return points of (positions, velocities, accelerations) `step` apart, s."""
+    made = []
+    for k, parts in enumerate(rows, 1):
+        point = JointTrajectoryPoint()
+        for what, values in zip(("positions", "velocities", "accelerations"), parts, strict=False):
+            setattr(point, what, [float(value) for value in values])
+        ns = round(1e9 * k * step)
+        point.time_from_start.sec, point.time_from_start.nanosec = ns // 10**9, ns % 10**9
+        made.append(point)
+    return made
+
+
+def test_a_trajectory_is_followed_and_then_held(arm):
+    start = arm.q
+    arm.run(0.02)
+    goal = start + np.array([0.3, 0.2, -0.3, 0.2, 0.2, 0.2, 0.4])
+    names = arm.joints[::-1]  # matched by name
+    begin = stamp_to_ns(arm.states[-1].header.stamp) + 100_000_000
+    message = JointTrajectory(joint_names=names, points=points([(goal)[::-1]], step=2.0))
+    set_stamp(message.header.stamp, begin)
+    arm.trajectory.publish(message)
+    arm.run(3.5)
+    arm.keeps_limits()
+    t = (np.array(arm.states.stamps) - begin) * 1e-9 / 2.0
+    x = np.clip(t, 0.0, 1.0)[:, None]
+    meant = start + (goal - start) * (3 * x**2 - 2 * x**3)  # the cubic from rest to rest
+    assert np.abs(arm.positions() - meant).max() < 0.02  # rad; its acceleration begins with a step
+    assert np.abs(arm.q - goal).max() < 1e-3
+
+
+def test_a_jogged_joint_stops_when_no_jog_comes(arm):
+    before = arm.q
+    jog = JointState(name=[arm.joints[3]], velocity=[0.4])
+    arm.run(1.0, lambda: arm.jog.publish(jog))
+    moved = arm.q - before
+    assert 0.3 < moved[3] < 0.45
+    assert np.abs(np.delete(moved, 3)).max() < 0.01
+    arm.run(1.5)
+    stopped = arm.q
+    assert moved[3] < stopped[3] - before[3] < moved[3] + 0.4 * (0.25 + 0.1) + 0.02
+    arm.run(0.5)
+    assert np.abs(arm.q - stopped).max() < 2e-3
+    arm.keeps_limits()
+
+
+@pytest.mark.parametrize("frame", ["panda_link0", "panda_hand"])
+def test_a_jogged_hand_moves_along_the_axis_asked_for(arm, frame):
+    poses = arm.ros.listen(PoseStamped, "hand_pose")
+    jog = TwistStamped()
+    jog.header.frame_id = frame
+    jog.twist.linear.z = 0.1  # of the hand: downwards in this posture
+    arm.run(0.1)
+    arm.run(1.0, lambda: arm.hand.publish(jog))
+    arm.run(1.0)
+    arm.ros.wait_until(lambda: len(poses) > 5)
+    p = np.array([[m.pose.position.x, m.pose.position.y, m.pose.position.z] for m in poses])
+    moved = p[-1] - p[0]
+    assert np.abs(moved[:2]).max() < 0.01
+    assert 0.08 < moved[2] * (1 if frame == "panda_link0" else -1) < 0.16
+    arm.keeps_limits()
+
+
+def test_whatever_is_asked_for_limits_are_kept(arm):
+    rng = np.random.default_rng(5)
+    n = len(arm.joints)
+
+    def wild():
+        kind = rng.integers(5)
+        huge = 10.0 ** rng.uniform(-1.0, 300.0 if rng.random() < 0.2 else 2.0)
+        if kind == 0:
+            jog = TwistStamped()
+            for part in (jog.twist.linear, jog.twist.angular):
+                part.x, part.y, part.z = (huge * rng.normal(size=3)).tolist()
+            arm.hand.publish(jog)
+        elif kind == 1:
+            arm.jog.publish(JointState(name=arm.joints, velocity=list(huge * rng.normal(size=n))))
+        elif kind == 2:
+            goals = [rng.uniform(arm.low, arm.high) for _ in range(4)]
+            speeds = [(q, min(huge, 50.0) * rng.normal(size=n)) for q in goals]
+            step = 10.0 ** rng.uniform(-9.0, -0.5)
+            arm.trajectory.publish(
+                JointTrajectory(joint_names=arm.joints, points=points(*speeds, step=step))
+            )
+        elif kind == 3:
+            arm.trajectory.publish(JointTrajectory())
+        else:
+            arm.jog.publish(JointState(name=arm.joints, velocity=[math.nan] * n))
+
+    arm.run(6.0, wild, every=0.1)
+    arm.keeps_limits()
+    assert np.ptp(arm.positions(), axis=0).max() > 0.5, "the arm was hardly driven"
+    assert arm.controller._goals.refused["jog_joints"] > 3
+    told = arm.ros.wait_until(lambda: arm.ros.diagnostics.get("controller_node"))
+    assert told["mode"] == "TRACKING"
+
+
+def test_keys_jog_the_arm(arm):
+    before, node = arm.q, arm.ros.add(Node("teleop", context=arm.ros.context))
+    arm.ros.probe.destroy_publisher(arm.jog)  # else there are two
+    arm.ros.probe.destroy_publisher(arm.hand)
+    frames = "panda_link0", "panda_hand"
+    teleop = Teleop(node, arm.joints, frames, (0.1, 0.5, 0.3))
+    arm.ros.wait_until(lambda: teleop._joints.get_subscription_count())
+    arm.ros.wait_until(lambda: arm.ros.probe.count_publishers("jog_joints") == 1)
+    teleop.press("-", 0.0)
+    clock = itertools.count()
+    teleop.press("4", 0.0)  # held for 0.5 s
+    arm.run(2.0, lambda: teleop.tick(0.05 * next(clock)))
+    moved = arm.q - before
+    assert -0.25 < moved[3] < -0.1
+    assert np.abs(np.delete(moved, 3)).max() < 0.01
+    assert teleop.press("t", 0.0) == "axes of panda_hand"
+    assert teleop._message is None
+    arm.keeps_limits()
+
+
+def test_the_hand_goes_to_a_far_pose_no_faster_than_it_may_and_tells_that_it_is_out_of_reach(ros):
+    arm = Driven(ros, pose_speed_max=[0.2, 0.6])
+    goal = PoseStamped()
+    goal.pose.position.x, goal.pose.position.z = 1.3, 0.4  # 0.9 m ahead; 0.85 m can be reached
+    goal.pose.orientation.x, goal.pose.orientation.w = 1.0, 0.0
+    arm.pose.publish(goal)
+    arm.run(8.0)
+    model = load_arm("panda").robot(0.0)
+    speeds = []
+    for state in arm.states[::10]:
+        q, v = (np.array(part[:7]) for part in (state.position, state.velocity))
+        model.update(State(q, v), np.zeros(7))
+        speeds.append(np.linalg.norm((model.J @ v)[:3]))
+    assert 0.15 < max(speeds) < 0.22, max(speeds)
+    arm.keeps_limits()
+    arm.ros.wait_until(lambda: "mm and" in ros.reported("controller_node", "short_of_goal"))
+    assert 300 < float(ros.reported("controller_node", "short_of_goal").split()[1]) < 700
+
+
+def refusals(arm):
+    """Return wrong messages: publisher, message."""
+    start = list(arm.q)
+    turned = TwistStamped()
+    turned.header.frame_id = "panda_link5"
+    late = TwistStamped()
+    set_stamp(late.header.stamp, 10**18)
+    half = points([start], [start, start])
+    return [
+        (arm.hand, turned),
+        (arm.hand, late),
+        (arm.jog, JointState(name=["panda_joint9"], velocity=[0.1])),
+        (arm.jog, JointState(name=arm.joints, position=start, velocity=start)),
+        (arm.jog, JointState(name=arm.joints, velocity=[0.1])),
+        (arm.trajectory, JointTrajectory(joint_names=arm.joints[1:], points=half)),
+        (arm.trajectory, JointTrajectory(joint_names=arm.joints, points=half)),
+        (arm.trajectory, JointTrajectory(joint_names=arm.joints, points=points([[9.0] * 7]))),
+        (arm.trajectory, JointTrajectory(joint_names=arm.joints, points=points([[math.nan] * 7]))),
+    ]
+
+
+def test_what_cannot_be_followed_is_refused_and_counted(arm):
+    before = arm.q
+    for count, (publisher, message) in enumerate(refusals(arm), 1):
+        publisher.publish(message)
+        refused = arm.controller._goals.refused
+        arm.ros.wait_until(lambda: refused.total() >= count)  # noqa: B023
+    assert refused == {"jog_hand": 2, "jog_joints": 3, "target_joint_trajectory": 4}
+    assert arm.controller._goals.motion is None
+    assert np.abs(arm.q - before).max() < 1e-3
