@@ -129,7 +129,7 @@ BROKEN_URDF = __file__
         ({"torque_max": [math.inf, *ARM.tau_max[1:]]}, "torque_max", "inf"),
         ({"torque_max": [math.nan, *ARM.tau_max[1:]]}, "torque_max", "nan"),
         ({"torque_max": [50.0]}, "torque_max", "7 numbers"),
-        ({"torque_max": None}, "torque_max", "not set"),
+        ({"torque_max": None, "robot_description": "topic"}, "torque_max", "not set"),
         ({"torque_rate_max": [100.0]}, "torque_rate_max", "7 numbers"),
         ({"torque_rate_max": [0.0] * 7}, "torque_rate_max", "> 0"),
         ({"torque_rate_max": [1e3] * 7}, "torque_rate_max", "empty without safety_filter"),
@@ -139,7 +139,8 @@ BROKEN_URDF = __file__
         ({"torque_reserve": [-1.0] * 7}, "torque_reserve", ">= 0"),
         ({"torque_reserve": [1e3] * 7}, "torque_reserve", "less than 0.97 of torque_max"),
         (
-            {"jerk_max": [1e3] * 7, "safety_filter": True, "velocity_max": []},
+            {"jerk_max": [1e3] * 7, "safety_filter": True, "velocity_max": []}
+            | {"robot_description": "topic"},
             "velocity_max",
             "for jerk_max",
         ),

@@ -306,7 +306,7 @@ def test_a_second_one_does_not_start(ros):
         ({"position_error": [1e-4]}, "position_error"),
         ({"position_error": [-1e-4] * N}, "position_error"),
         ({"acceleration_disturbance": [math.nan] * N}, "acceleration_disturbance"),
-        ({"velocity_max": None}, "velocity_max"),
+        ({"velocity_max": None, "robot_description": "topic"}, "velocity_max"),
         ({"robot_description": None}, "robot_description"),
         ({"robot_description": "/no/such.urdf"}, "robot_description"),
         ({"joints": [*JOINTS[:-1], "elbow"]}, "joints"),
