@@ -56,7 +56,17 @@ RATES = (500.0, 1000.0)
 DRIFT_SHARE = 0.2
 """Share of an acceleration limit that the margin for the held torque may take."""
 
+SLOWER = 0.75
+"""Factor by which speeds are lowered as long as the drift is too large for the highest rate."""
+
+SLOWEST_FOR_DRIFT = 0.1
+"""Share of the URDF's speeds to which they are lowered for this at most."""
+
 SEARCH = 10_000  # evaluations
+
+
+class _DriftError(NewRobotError):
+    """The drift is too large for a control rate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,9 +133,21 @@ def estimate(chain: Chain, rate_hz: float | None = None) -> Estimates:
     overrides: dict[str, tuple[float, float]] = {}
     if filtered.any():
         overrides, why = _in_most_states(chain, space, filtered)
-    limits = limits_from_worst_cases(model, space, worst, overrides, CAP)
-    a_min, a_max = rounded(limits.a_min, ROUND_DOWN), rounded(limits.a_max, ROUND_DOWN)
-    rate, drift = _drift(chain, space, a_min, a_max, rate_hz)
+    slower = ""
+    while True:
+        limits = limits_from_worst_cases(model, space, worst, overrides, CAP)
+        a_min, a_max = rounded(limits.a_min, ROUND_DOWN), rounded(limits.a_max, ROUND_DOWN)
+        try:
+            rate, drift = _drift(chain, space, a_min, a_max, rate_hz)
+            break
+        except _DriftError:
+            # It grows with the square of the speeds.
+            scale = float(f"{SLOWER * scale:.2g}")
+            if scale < SLOWEST_FOR_DRIFT:
+                raise
+            slower = f" Speeds are {scale:g} of the URDF's because of the drift at this rate."
+            space = _space(chain, rounded(scale * chain.v_max, ROUND_DOWN))
+            worst = _search(model, space)
     return Estimates(
         v_max=space.v_max,
         speed_scale=scale,
@@ -137,7 +159,7 @@ def estimate(chain: Chain, rate_hz: float | None = None) -> Estimates:
         unavailable=unavailable_share(model, space, limits),
         rate_hz=rate,
         drift=drift,
-        why=why,
+        why=why + slower,
     )
 
 
@@ -199,7 +221,7 @@ def _drift(
         if (share <= DRIFT_SHARE).all():
             return rate, drift
     worst = int(np.argmax(share))
-    raise NewRobotError(
+    raise _DriftError(
         f"joint '{chain.joints[worst]}': its acceleration drifts by up to {drift[worst]:.3g} "
         f"rad/s^3 under a held torque, which at {rates[-1]:g} Hz costs {share[worst]:.0%} of its "
         f"acceleration limit, more than {DRIFT_SHARE:.0%}; a higher --rate, or a lower velocity "

@@ -21,7 +21,7 @@ _STARTS = 400
 _GOALS = 2  # at most
 _TRIES = 300  # for each
 _STEPS = 12  # of a straight way that are looked at
-_ALWAYS = 0.9  # share of postures: shapes that touch in as many are no collision of the arm
+_ALWAYS = 0.8  # share of postures: shapes that touch in as many are no collision of the arm
 _HELD_AT_START, _HELD_AT_GOAL = 0.6, 0.85  # of the torque limits, to hold the arm
 _MIDDLE = 0.6  # share of a range in which the arm starts
 _SEED = 0
@@ -75,17 +75,19 @@ class SelfCollisions:
     def _drop_those_that_always_touch(self, chain: Chain) -> None:
         """Leave out pairs that overlap nearly anywhere, as shapes of a wrist often do."""
         self._found = self._geometry.createData()
-        pairs = list(self._geometry.collisionPairs)
+        # Copies: removing one moves what Pinocchio's own refer to.
+        pairs = [(each.first, each.second) for each in self._geometry.collisionPairs]
         touching = np.zeros(len(pairs))
         random = np.random.default_rng(_SEED)
-        postures = _within(chain, random.random((20, len(chain.joints))))
+        unit = 0.5 + _MIDDLE * (random.random((40, len(chain.joints))) - 0.5)
+        postures = _within(chain, unit)
         for q in postures:
             self._update(q)
             pin.computeCollisions(self._geometry, self._found, False)
             touching += [each.isCollision() for each in self._found.collisionResults]
         for pair, count in zip(pairs, touching, strict=True):
             if count >= _ALWAYS * len(postures):
-                self._geometry.removeCollisionPair(pair)
+                self._geometry.removeCollisionPair(pin.CollisionPair(*pair))
         self._found = self._geometry.createData()
 
 
