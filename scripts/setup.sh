@@ -87,7 +87,7 @@ _install() {
             "on Ubuntu: sudo apt install python3-venv" >&2
         return 1
     fi
-    echo "setup: this downloads up to 0.5 GB, fills up to 1.8 GB in .venv, and takes minutes" >&2
+    echo "setup: this downloads up to 0.5 GB, fills up to 1.9 GB in .venv, and takes minutes" >&2
     if ! output="$("$python" -m venv --clear "${options[@]}" "$venv" 2>&1)"; then
         _explain "making .venv"
         return 1

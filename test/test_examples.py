@@ -13,6 +13,7 @@ EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 SAYS = {
     "bounds_alone": r"exact bounds 0\.0e\+00, naive bounds [1-9]",
     "chain_of_nodes": r"positions at most 0 rad beyond their\nlimits, speeds 0 rad/s",
+    "client": r"joints moved by \[0\.(2|19) .*\nhand moved by .*\none metre higher: it stands \d",
     "controller_without_ros": r"rad, .* rad/s, .* N m inside\njoints at rest on a limit: \['",
     "driver_that_stops": r"at rest after 0\.5\d\d s.*\nnearest to a limit: \d.*e-0[67] rad, \d",
     "mujoco_panda": r"largest speed 99\.\d% of its limit.*\n.*\n-\S+ rad, -\S+ rad/s, -",
@@ -27,7 +28,7 @@ def test_every_example_is_run_here():
 @pytest.mark.parametrize("name", SAYS)
 def test_example(name, capfd, monkeypatch):
     path = EXAMPLES / f"{name}.py"
-    if name == "chain_of_nodes":  # it starts ROS
+    if name in ("chain_of_nodes", "client"):  # they start ROS
         ended = subprocess.run([sys.executable, path], timeout=300, check=False)
         assert ended.returncode == 0
     else:  # `test_pip_install.py` starts them as programs

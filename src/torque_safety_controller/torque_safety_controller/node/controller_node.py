@@ -363,7 +363,7 @@ class ControllerNode(ArmNode):
         detour = about_detour(self._config.joints, self._controller)
         if detour.text:
             level, text = max(level, detour.level), f"{text}; {detour.text}"
-        short = self._shortfall.look(self._controller, time.monotonic())
+        short = self._shortfall.look(self._controller, 1e-9 * self._states.stamp)
         short = short if self._modes.mode is Mode.TRACKING else ""
         values["short_of_goal"] = short or "none"
         if short:

@@ -27,10 +27,13 @@ _SLIGHT = 1e-3  # rad/s^2; smaller relaxations of bounds come with those of dist
 _STANDS = 1.0
 """How long the arm stands before it is told, s."""
 
-_SLOW, _NEAR = 0.01, 0.01
-"""Speed below which it stands, rad/s; distance at which a joint is on a position limit, rad."""
+_PROGRESS = np.array([1e-3, 5e-3])
+"""By how much it must come nearer meanwhile, m and rad; an arm may shake where it stands."""
 
-_AWAY, _TURNED = 0.005, 0.02
+_NEAR = 0.01
+"""Distance at which a joint is on a position limit, rad."""
+
+_SHORT = np.array([0.005, 0.02])
 """What counts as short of the goal, m and rad."""
 
 
@@ -155,20 +158,29 @@ class Shortfall:
         self._joints, self._q_min, self._q_max = joints, q_min, q_max
         self._goal: pin.SE3 | None = None
         self._since = 0.0
+        self._least = np.zeros(2)
 
     def look(self, controller: Controller, now: float) -> str:
-        """Return by how much, at `now`, s, once it has stood for `_STANDS`; else nothing."""
+        """Return by how much, once it has come no nearer for `_STANDS`; else nothing.
+
+        Args:
+            controller: of the arm.
+            now: the robot's time, s.
+        """
         goal, robot = controller.goals.pose_des, controller.robot
-        error = controller.goals.error(robot.pose)
-        away, turned = (float(np.linalg.norm(part)) for part in np.split(error, 2))
-        stands = float(np.abs(robot.v).max()) < _SLOW and (away > _AWAY or turned > _TURNED)
-        if goal is None or not stands or self._goal is None or goal != self._goal:
-            self._goal, self._since = None if goal is None else goal.copy(), now
+        if goal is None:
+            self._goal = None
             return ""
-        if now - self._since < _STANDS:
+        error = controller.goals.error(robot.pose)
+        left = np.array([np.linalg.norm(part) for part in np.split(error, 2)])
+        if self._goal is None or goal != self._goal or now < self._since:
+            self._goal, self._since, self._least = goal.copy(), now, left
+        elif (self._least - left > _PROGRESS).any():
+            self._since, self._least = now, np.minimum(left, self._least)
+        if now - self._since < _STANDS or (left < _SHORT).all():
             return ""
         near = np.minimum(robot.q - self._q_min, self._q_max - robot.q) < _NEAR
-        text = f"stands {1e3 * away:.0f} mm and {turned:.2f} rad short of its goal"
+        text = f"stands {1e3 * left[0]:.0f} mm and {left[1]:.2f} rad short of its goal"
         return text + (f", on limits of {_named(self._joints, near)}" if near.any() else "")
 
 

@@ -1,0 +1,256 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An arm under this controller, from a Python program: move, wait, push, read."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from numpy.typing import NDArray
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from torque_safety_controller.node.topics import HAND_POSE, TARGET_JOINT_TRAJECTORY, TARGET_POSE
+from viability_bounds_pkg.exceptions import ArmSafetyError
+from viability_bounds_pkg.ros.runtime import GOAL_QOS, make_executor
+from viability_bounds_pkg.ros.topics import DIAGNOSTICS, JOINT_STATES, LIMIT_DISTANCES, Topic
+
+Array = NDArray[np.float64]
+
+_SETTLED = 2.0
+"""After which diagnostics are about the goal that was sent, s; they come twice a second, and the
+arm stands for 1 s before it counts as short of its goal."""
+
+
+class NotReachedError(ArmSafetyError, RuntimeError):
+    """The arm is not where it was sent; the text says why, as far as the controller knows."""
+
+
+class ArmState(NamedTuple):
+    """State of the arm, and how far inside its limits it is."""
+
+    q: Array
+    """Shape (n,), rad."""
+    v: Array
+    """Shape (n,), rad/s."""
+    tau: Array
+    """Torque of the motors, shape (n,), N m; NaN where the robot does not tell."""
+    hand: pin.SE3
+    """Pose of the hand in the base frame."""
+    margins: tuple[Array, Array, Array]
+    """Distances to the limits of position, rad, speed, rad/s, and torque, N m; shape (n,) each."""
+
+
+class ArmClient:
+    """Connects to a controller that runs, and drives its arm.
+
+    Give it to a ``with`` statement: it leaves ROS when that ends. Callbacks run only while a
+    method waits.
+
+    Args:
+        joints: names of the n joints, in the order of all arrays.
+        timeout: how long the arm may be silent, s.
+
+    Raises:
+        NotReachedError: no robot, or no controller, is heard.
+    """
+
+    def __init__(self, joints: Sequence[str], timeout: float = 30.0) -> None:
+        self._joints, self._timeout = list(joints), timeout
+        self._heard: dict[str, Any] = {}
+        self._status: dict[str, str] = {}
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context)
+        self._node = Node("arm_client", context=self._context, start_parameter_services=False)
+        self._executor = make_executor(self._context)
+        self._executor.add_node(self._node)
+        for topic in (JOINT_STATES, HAND_POSE, LIMIT_DISTANCES):
+            self._listen(topic)
+        DIAGNOSTICS.subscription(self._node, self._on_diagnostics)
+        self._poses = TARGET_POSE.publisher(self._node)
+        self._trajectories = TARGET_JOINT_TRAJECTORY.publisher(self._node)
+        self._pushes = self._node.create_publisher(WrenchStamped, "external_wrench", GOAL_QOS)
+        try:
+            ready = self._poses.get_subscription_count, self._trajectories.get_subscription_count
+            self._wait(lambda: all(count() for count in ready), timeout, "no controller is heard")
+            self.state()
+        except NotReachedError:
+            self.close()
+            raise
+
+    def __enter__(self) -> ArmClient:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave ROS; the arm keeps its last goal."""
+        self._node.destroy_node()
+        self._executor.shutdown()
+        rclpy.try_shutdown(context=self._context)
+
+    def state(self) -> ArmState:
+        """Return the next state that comes."""
+        self._heard.clear()
+        wanted = {topic.name for topic in (JOINT_STATES, HAND_POSE, LIMIT_DISTANCES)}
+        self._wait(lambda: wanted <= self._heard.keys(), self._timeout, "the robot is silent")
+        states: JointState = self._heard[JOINT_STATES.name]
+        inside: JointState = self._heard[LIMIT_DISTANCES.name]
+        return ArmState(
+            self._of(states, states.position),
+            self._of(states, states.velocity),
+            self._of(states, states.effort),
+            self._hand(),
+            (
+                self._of(inside, inside.position),
+                self._of(inside, inside.velocity),
+                self._of(inside, inside.effort),
+            ),
+        )
+
+    def move_to(
+        self,
+        pose: pin.SE3,
+        timeout: float = 30.0,
+        tolerance: tuple[float, float] = (0.005, 0.02),
+    ) -> None:
+        """Send the hand to a pose in the base frame, and wait until it is there.
+
+        Args:
+            pose: where to.
+            timeout: how long to wait, s.
+            tolerance: of translation, m, and rotation, rad.
+
+        Raises:
+            NotReachedError: it is not there, or it stands short of it.
+        """
+        message = PoseStamped()
+        p, o = message.pose.position, message.pose.orientation
+        p.x, p.y, p.z = map(float, pose.translation)
+        o.x, o.y, o.z, o.w = map(float, pin.Quaternion(pose.rotation).coeffs())
+
+        def there() -> bool:
+            if HAND_POSE.name not in self._heard:
+                return False
+            between = pose.actInv(self._hand())
+            away = np.linalg.norm(between.translation), np.linalg.norm(pin.log3(between.rotation))
+            return bool(away[0] < tolerance[0] and away[1] < tolerance[1])
+
+        self._poses.publish(message)
+        self._arrive(there, timeout)
+
+    def move_joints(
+        self,
+        q: Sequence[float] | Array,
+        duration: float,
+        timeout: float = 30.0,
+        near: float = 0.01,
+    ) -> None:
+        """Send the joints to positions, and wait until they are there.
+
+        Args:
+            q: where to, shape (n,), rad.
+            duration: of the motion, s of the robot's time.
+            timeout: how long to wait, s.
+            near: distance of each joint that counts as there, rad.
+
+        Raises:
+            NotReachedError: they are not there.
+        """
+        target = np.asarray(q, dtype=float)
+        point = JointTrajectoryPoint(positions=target.tolist())
+        nanoseconds = round(1e9 * duration)
+        point.time_from_start.sec, point.time_from_start.nanosec = divmod(nanoseconds, 10**9)
+
+        def there() -> bool:
+            states = self._heard.get(JOINT_STATES.name)
+            if states is None:
+                return False
+            return bool(np.abs(self._of(states, states.position) - target).max() < near)
+
+        self._trajectories.publish(JointTrajectory(joint_names=self._joints, points=[point]))
+        self._arrive(there, timeout)
+
+    def push(self, link: str, force: Sequence[float]) -> None:
+        """Push a link of the simulated robot, N in world axes, until another push of it.
+
+        Args:
+            link: its name.
+            force: shape (3,); zeros end the push.
+        """
+        message = WrenchStamped()
+        message.header.frame_id = link
+        part = message.wrench.force
+        part.x, part.y, part.z = map(float, force)
+        subscribers = self._pushes.get_subscription_count
+        self._wait(lambda: subscribers() > 0, self._timeout, "no simulated robot is heard")
+        self._pushes.publish(message)
+
+    def wait(self, duration: float) -> None:
+        """Let time pass, s."""
+        end = time.monotonic() + duration
+        self._wait(lambda: time.monotonic() >= end, math.inf, "")
+
+    def _arrive(self, there: Callable[[], bool], timeout: float) -> None:
+        sent, before = time.monotonic(), self._status.get("goals_refused", "none")
+        self._heard.clear()
+
+        def over() -> bool:
+            if there():
+                return True
+            refused = self._status.get("goals_refused", before)
+            if refused != before:
+                raise NotReachedError(f"the controller refused it: {refused} its log says why")
+            if time.monotonic() - sent > _SETTLED:
+                if self._status.get("mode", "TRACKING") != "TRACKING":
+                    raise NotReachedError(self._status["message"])
+                if (short := self._status.get("short_of_goal", "none")) != "none":
+                    raise NotReachedError(f"it {short}")
+            return False
+
+        self._wait(over, timeout, "it is still on its way")
+
+    def _wait(self, condition: Callable[[], bool], timeout: float, otherwise: str) -> None:
+        end = time.monotonic() + timeout
+        while not condition():
+            if time.monotonic() > end:
+                raise NotReachedError(f"after {timeout:g} s: {otherwise}")
+            self._executor.spin_once(timeout_sec=0.02)
+
+    def _listen(self, topic: Topic) -> None:
+        def hear(message: Any) -> None:
+            self._heard[topic.name] = message
+
+        topic.subscription(self._node, hear)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name.endswith("controller_node"):
+                self._status = {pair.key: pair.value for pair in status.values}
+                self._status["message"] = status.message
+
+    def _of(self, message: JointState, values: Sequence[float]) -> Array:
+        where = dict(zip(message.name, values, strict=False))
+        return np.array([where.get(joint, math.nan) for joint in self._joints])
+
+    def _hand(self) -> pin.SE3:
+        pose = self._heard[HAND_POSE.name].pose
+        p, o = pose.position, pose.orientation
+        return pin.SE3(
+            pin.Quaternion(o.w, o.x, o.y, o.z).toRotationMatrix(), np.array([p.x, p.y, p.z])
+        )
