@@ -13,12 +13,18 @@ from geometry_msgs.msg import (
     Quaternion,
     Transform,
     Twist,
+    TwistStamped,
     Vector3,
     WrenchStamped,
 )
 from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
-from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
+from trajectory_msgs.msg import (
+    JointTrajectory,
+    JointTrajectoryPoint,
+    MultiDOFJointTrajectory,
+    MultiDOFJointTrajectoryPoint,
+)
 from visualization_msgs.msg import Marker, MarkerArray
 
 from viability_bounds_pkg.ros.runtime import set_stamp
@@ -49,6 +55,9 @@ class GoodMessages:
             "target_pose": self._pose,
             "target_posture": self._posture,
             "target_trajectory": self._trajectory,
+            "target_joint_trajectory": self._joint_trajectory,
+            "jog_hand": self._jog_hand,
+            "jog_joints": self._jog_joints,
             "target_wrench": self._target_wrench,
             "external_wrench": self._push,
             "payload": self._payload,
@@ -89,6 +98,34 @@ class GoodMessages:
             set_stamp(point.time_from_start, k * 200_000_000)
             message.points.append(point)
             place = place + rng.uniform(-0.03, 0.03, 3)
+        return message
+
+    def _joint_trajectory(self, rng: np.random.Generator, stamp: int) -> JointTrajectory:
+        message = JointTrajectory(joint_names=self._joints)
+        set_stamp(message.header.stamp, stamp)
+        q, kind = self._start, rng.integers(3)
+        for k in range(1, 1 + int(rng.integers(6))):  # none to five
+            q = np.clip(q + rng.uniform(-0.2, 0.2, len(q)), self._low, self._high)
+            point = JointTrajectoryPoint(positions=q.tolist())
+            if kind > 0:
+                point.velocities = rng.uniform(-0.3, 0.3, len(q)).tolist()
+            if kind > 1:
+                point.accelerations = rng.uniform(-1.0, 1.0, len(q)).tolist()
+            set_stamp(point.time_from_start, k * 200_000_000)
+            message.points.append(point)
+        return message
+
+    def _jog_hand(self, rng: np.random.Generator, stamp: int) -> TwistStamped:
+        message = TwistStamped()
+        self._head(message.header, str(rng.choice([self._base, self._hand, ""])), stamp)
+        message.twist.linear = _vector(rng.uniform(-0.3, 0.3, 3))
+        message.twist.angular = _vector(rng.uniform(-1.0, 1.0, 3))
+        return message
+
+    def _jog_joints(self, rng: np.random.Generator, stamp: int) -> JointState:
+        names = [joint for joint in self._joints if rng.random() < 0.5] or self._joints
+        message = JointState(name=names, velocity=rng.uniform(-1.0, 1.0, len(names)).tolist())
+        set_stamp(message.header.stamp, stamp)
         return message
 
     def _target_wrench(self, rng: np.random.Generator, stamp: int) -> WrenchStamped:

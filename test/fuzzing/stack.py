@@ -64,7 +64,15 @@ STREAMS: dict[str, type] = {
     "ft_wrench": WrenchStamped,
 }
 """What nodes send each other."""
-GOALS = ("target_pose", "target_posture", "target_trajectory", "target_wrench")
+GOALS = (
+    "target_pose",
+    "target_posture",
+    "target_trajectory",
+    "target_joint_trajectory",
+    "jog_hand",
+    "jog_joints",
+    "target_wrench",
+)
 WORLD = ("external_wrench", "payload", "obstacles")
 TO_FAULTS = tuple(
     f"/bench/before_faults/{name}"

@@ -24,6 +24,7 @@ from node_chain import (
     pose_message,
     torque_for,
 )
+from rclpy.qos import qos_profile_system_default
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
@@ -217,10 +218,13 @@ def test_efforts_are_published_for_ros2_control_too(ros):
     topic = "/effort_controller/commands"
     chain = NodeChain(ros, ros2_control_topic=topic)
     efforts = ros.listen(Float64MultiArray, topic, GOAL_QOS)
+    # What forward_command_controller subscribes with.
+    by_default = ros.listen(Float64MultiArray, topic, qos_profile_system_default)
     ros.hears(topic)
     tau = chain.answer(10)
-    ros.wait_until(lambda: efforts, "efforts", each=lambda: chain.state(10))
+    ros.wait_until(lambda: efforts and by_default, "efforts", each=lambda: chain.state(10))
     np.testing.assert_array_equal(efforts[0].data, tau)
+    np.testing.assert_array_equal(by_default[0].data, tau)
 
 
 def test_torques_keep_their_limits_also_when_bounds_ask_for_more(ros):

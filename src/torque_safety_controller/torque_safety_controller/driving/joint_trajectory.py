@@ -8,13 +8,12 @@ and rest at both ends.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BPoly, PchipInterpolator
+from scipy.interpolate import PchipInterpolator, PPoly
 
 from torque_safety_controller.controller import Controller
 from viability_bounds_pkg.exceptions import ArmSafetyError
@@ -65,25 +64,35 @@ class JointTrajectory:
     def __init__(self, points: Sequence[JointPoint]) -> None:
         if not points:
             raise JointTrajectoryError("points is empty; allowed: at least one point")
-        before = -math.inf
         kind = points[0].v is None, points[0].a is None
-        for k, (time, q, v, a) in enumerate(points):
-            given = [part for part in (q, v, a) if part is not None]
-            if not (math.isfinite(time) and all(np.isfinite(part).all() for part in given)):
-                raise JointTrajectoryError(f"points[{k}] is not finite")
-            if time < 0.0 or time <= before:
-                allowed = "at least 0" if k == 0 else f"more than {before:g}, that of the last one"
-                raise JointTrajectoryError(f"points[{k}].time is {time:g}; allowed: {allowed}")
+        for k, (_, _, v, a) in enumerate(points):
             if (v is None, a is None) != kind or (v is None and a is not None):
                 raise JointTrajectoryError(
                     f"points[{k}] has other parts than points[0]; allowed: positions; with "
                     "velocities; or with velocities and accelerations; the same in all points"
                 )
-            before = time
+        # At once for all points: this runs beside control steps, and is not to delay them.
+        times, *parts = (
+            np.array(part) for part in zip(*points, strict=True) if part[0] is not None
+        )
+        finite = np.isfinite(np.column_stack([times, *parts])).all(axis=1)
+        if not finite.all():
+            raise JointTrajectoryError(f"points[{int(finite.argmin())}] is not finite")
+        if times[0] < 0.0:
+            raise JointTrajectoryError(f"points[0].time is {times[0]:g}; allowed: at least 0")
+        grows = np.diff(times) > 0.0
+        if not grows.all():
+            k = int(grows.argmin()) + 1
+            raise JointTrajectoryError(
+                f"points[{k}].time is {times[k]:g}; allowed: more than {times[k - 1]:g}, that of "
+                "the last one"
+            )
         self.points = tuple(points)
         self.duration = points[-1].time
-        self._curves = _curves(self.points) if len(points) > 1 else None
-        if not (self.fastest() <= SPEED_MAX).all():
+        with np.errstate(all="ignore"):  # what overflows is too fast
+            self._curves = _curves(times, *parts) if len(points) > 1 else None
+            fastest = self.fastest()
+        if not (fastest <= SPEED_MAX).all():
             raise JointTrajectoryError(f"it is faster than {SPEED_MAX:g} rad/s")
 
     def from_state(self, state: State) -> JointTrajectory:
@@ -115,23 +124,35 @@ class JointTrajectory:
         """Return the largest speed of each joint at 8 instants between points, shape (n,)."""
         if self._curves is None:
             return np.zeros_like(self.points[0].q)
-        times = np.array([point.time for point in self.points])
+        times = self._curves[0].x
         fine = np.interp(np.arange(8 * len(times) - 7) / 8, np.arange(len(times)), times)
         largest: Array = np.abs(self._curves[1](fine)).max(axis=0)
         return largest
 
 
-def _curves(points: Sequence[JointPoint]) -> tuple[BPoly, BPoly, BPoly]:
+def _curves(
+    times: Array, q: Array, v: Array | None = None, a: Array | None = None
+) -> tuple[PPoly, PPoly, PPoly]:
     """Return positions, velocities and accelerations as functions of time."""
-    times = np.array([point.time for point in points])
-    q = np.array([point.q for point in points])
-    if points[0].v is None:
+    if v is None:
         v = PchipInterpolator(times, q).derivative()(times)
         v[0] = v[-1] = 0.0
+    T = np.diff(times)[:, None]
+    if a is None:
+        dx, dv = q[1:] - q[:-1] - v[:-1] * T, v[1:] - v[:-1]
+        rows = [(dv * T - 2.0 * dx) / T**3, (3.0 * dx - dv * T) / T**2, v[:-1], q[:-1]]
     else:
-        v = np.array([point.v for point in points])
-    parts = [q, v] if points[0].a is None else [q, v, np.array([point.a for point in points])]
-    curve = BPoly.from_derivatives(times, np.stack(parts, axis=1))
+        dx = q[1:] - (q[:-1] + v[:-1] * T + 0.5 * a[:-1] * T**2)
+        dv, da = v[1:] - (v[:-1] + a[:-1] * T), a[1:] - a[:-1]
+        rows = [
+            (6.0 * dx - 3.0 * dv * T + 0.5 * da * T**2) / T**5,
+            (-15.0 * dx + 7.0 * dv * T - da * T**2) / T**4,
+            (10.0 * dx - 4.0 * dv * T + 0.5 * da * T**2) / T**3,
+            0.5 * a[:-1],
+            v[:-1],
+            q[:-1],
+        ]
+    curve = PPoly(np.stack(rows), times)
     return curve, curve.derivative(), curve.derivative(2)
 
 

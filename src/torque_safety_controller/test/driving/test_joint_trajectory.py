@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trajectories of the joints: between points, at their ends, from a state, refused."""
+
+import numpy as np
+import pytest
+from scipy.interpolate import BPoly
+
+from torque_safety_controller.driving.joint_trajectory import (
+    JointPoint,
+    JointTrajectory,
+    JointTrajectoryError,
+)
+from viability_bounds_pkg.state import State
+
+RNG = np.random.default_rng(3)
+TIMES = np.cumsum(RNG.uniform(0.2, 1.0, 6))
+PARTS = RNG.normal(size=(3, 6, 4))  # q, v, a
+
+
+@pytest.mark.parametrize("parts", [2, 3])
+def test_between_points_it_is_the_polynomial_that_meets_both(parts):
+    points = [JointPoint(t, *each) for t, *each in zip(TIMES, *PARTS[:parts], strict=True)]
+    trajectory = JointTrajectory(points)
+    meant = BPoly.from_derivatives(TIMES, np.stack(PARTS[:parts], axis=1))
+    for t in np.linspace(TIMES[0], TIMES[-1] - 1e-9, 50):
+        for k, found in enumerate(trajectory.sample(t)):
+            np.testing.assert_allclose(found, meant.derivative(k)(t) if k else meant(t), atol=1e-8)
+
+
+def test_positions_alone_are_joined_without_overshoot_from_rest_to_rest():
+    q = np.array([0.0, 1.0, 1.0, 0.2, 0.1])
+    trajectory = JointTrajectory([JointPoint(k, q[k : k + 1]) for k in range(5)])
+    for k in range(4):
+        inside = np.array([trajectory.sample(t)[0][0] for t in np.linspace(k, k + 1, 30)])
+        assert inside.min() > min(q[k : k + 2]) - 1e-12
+        assert inside.max() < max(q[k : k + 2]) + 1e-12
+    for t in (0.0, 4.0 - 1e-9):
+        assert abs(trajectory.sample(t)[1][0]) < 1e-6
+
+
+def test_it_begins_at_the_state_and_stays_at_its_end():
+    points = [JointPoint(t, *each) for t, *each in zip(TIMES, *PARTS, strict=True)]
+    state = State(np.full(4, 0.3), np.full(4, -0.2))
+    trajectory = JointTrajectory(points).from_state(state)
+    q, v, _ = trajectory.sample(0.0)
+    np.testing.assert_allclose((q, v), state)
+    q, v, a = trajectory.sample(TIMES[-1] + 1.0)
+    np.testing.assert_array_equal(q, PARTS[0, -1])
+    assert not v.any() and not a.any()
+
+
+@pytest.mark.parametrize(
+    ("points", "reason"),
+    [
+        ([], "points is empty"),
+        ([(0.5, [0.0]), (0.5, [1.0])], r"points\[1\].time is 0.5; allowed: more than 0.5"),
+        ([(-0.5, [0.0])], r"points\[0\].time is -0.5"),
+        ([(0.5, [0.0]), (1.0, [np.nan])], r"points\[1\] is not finite"),
+        ([(0.5, [0.0]), (1.0, [1.0], [0.0])], r"points\[1\] has other parts"),
+        ([(0.5, [0.0]), (0.5 + 1e-6, [1.0])], "faster than 1000 rad/s"),
+        ([(0.5, [0.0], [1e308]), (1.0, [1.0], [-1e308])], "faster than 1000 rad/s"),
+    ],
+)
+def test_refused(points, reason):
+    with pytest.raises(JointTrajectoryError, match=reason), np.errstate(all="ignore"):
+        JointTrajectory([JointPoint(t, *map(np.array, parts)) for t, *parts in points])
