@@ -192,6 +192,7 @@ def test_keys_jog_the_arm(arm):
     arm.keeps_limits()
 
 
+@pytest.mark.long
 def test_the_hand_goes_to_a_far_pose_no_faster_than_it_may_and_tells_that_it_is_out_of_reach(ros):
     arm = Driven(ros, pose_speed_max=[0.2, 0.6])
     goal = PoseStamped()

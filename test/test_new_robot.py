@@ -32,6 +32,7 @@ def arm(tmp_path_factory):
     return folder / "my_arm.yaml"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("options", [[], ["--imperfect"]], ids=["ideal", "imperfect"])
 def test_an_arm_of_six_joints_is_driven_into_limits_and_keeps_them(arm, tmp_path, options):
     scenario = yaml.safe_load((arm.parent / "scenarios" / "my_arm_demo.yaml").read_text())
@@ -47,6 +48,7 @@ def test_an_arm_of_six_joints_is_driven_into_limits_and_keeps_them(arm, tmp_path
     assert max(each["max_speed_ratio"] for each in metrics["joints"].values()) > 0.9
 
 
+@pytest.mark.long
 def test_without_a_scenario_the_arm_holds_still_and_params_merge(arm, tmp_path):
     alone = tmp_path / "alone.yaml"
     alone.write_text(arm.read_text())
