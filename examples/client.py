@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from torque_safety_controller.tools.arm_client import ArmClient, NotReachedError
+from torque_safety_controller.remote.arm_client import ArmClient, NotReachedError
 
 CONFIG = Path(__file__).resolve().parent.parent / "config" / "panda.yaml"
 JOINTS = [f"panda_joint{i}" for i in range(1, 8)]

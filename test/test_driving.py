@@ -14,7 +14,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from sim_bridge.nodes.bullet_node import BulletNode
 from torque_safety_controller.node.controller_node import ControllerNode
-from torque_safety_controller.tools.teleop import Teleop
+from torque_safety_controller.remote.teleop import Teleop
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp, stamp_to_ns
 from viability_bounds_pkg.state import State

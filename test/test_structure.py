@@ -34,7 +34,7 @@ ROS = {
 }
 
 
-ROS_ROOMS = {"node", "nodes", "ros", "parameters", "testing", "tools"}
+ROS_ROOMS = {"node", "nodes", "ros", "parameters", "testing", "tools", "remote"}
 """Folders whose modules may import ROS."""
 
 

@@ -33,4 +33,4 @@ def safety_stack() -> int:
 
 def teleop() -> int:
     """Run the keyboard teleoperation."""
-    return run_with_ros("teleop", "torque_safety_controller.tools.teleop")
+    return run_with_ros("teleop", "torque_safety_controller.remote.teleop")
