@@ -6,6 +6,7 @@ usage() {
     cat <<'USAGE'
 usage: bash scripts/demo.sh [robot] [scenario] [--bounds METHOD] [--rate HZ] [--real-time]
                             [--imperfect] [--params FILE]... [--out DIRECTORY] [--processes]
+                            [--view] [--record]
 
   robot        the name of a parameter file in config/, as baxter_left_arm (default), panda and
                talos_left_arm, or the path of one; scripts/new_robot.sh makes one from a URDF
@@ -24,6 +25,11 @@ usage: bash scripts/demo.sh [robot] [scenario] [--bounds METHOD] [--rate HZ] [--
                last value given counts
   --processes  each node in a process of its own; without, robot, estimator, bounds and controller
                are one process (docs/performance.md)
+  --view       shows the arm on a page in the browser, by the wall clock; Enter plays the scenario,
+               in between the arm can be driven there, Ctrl-C ends (docs/viewer.md); where standard
+               input is no terminal, the scenario is played once
+  --record     also writes all messages to recording.mcap there, for Foxglove and PlotJuggler
+               (docs/visualisation.md)
   --out        where figure, data and metrics go (default: results/<robot>_<scenario>; then
                results/demo is a link to it)
 
@@ -41,7 +47,7 @@ value() {
 }
 
 root="$(cd "$(dirname "$0")/.." && pwd)"
-robot='' scenario='' bounds=exact rate=default params=() imperfect='' clock=lockstep out='' processes=''
+robot='' scenario='' bounds=exact rate=default params=() imperfect='' clock=lockstep out='' processes='' view='' record=''
 while [ $# -gt 0 ]; do
     case "$1" in
     --bounds) bounds="$(value "$@")"; shift ;;
@@ -52,6 +58,8 @@ while [ $# -gt 0 ]; do
     --processes) processes=yes ;;
     --lockstep) clock=lockstep ;;
     --real-time) clock=real_time ;;
+    --record) record=yes ;;
+    --view) view=yes clock=real_time ;;
     -h | --help) usage; exit 0 ;;
     -*) refuse "unknown option '$1'; --help lists them" ;;
     *)
@@ -164,17 +172,31 @@ if [ -n "$processes" ]; then
 else
     start sim_bridge simulated_stack
 fi
-"$root/install/sim_bridge/lib/sim_bridge/scenario_node" --out "$out" --ros-args \
-    --log-level warn --params-file "$config" "${overrides[@]}" -p "scenario:=$scenario" &
-play=$!
+[ -z "$view" ] || start sim_bridge viewer_node
 
-# The scenario ends by itself; a node that ends before it could not start.
-status=0
-wait -n -p ended "$play" "${pids[@]}" || status=$?
-[ "$ended" = "$play" ] || exit 2
-if [ -n "$link" ] && [ "$status" -le 1 ]; then
-    # Before there was a folder for each scenario, this was one.
-    [ -L "$link" ] || [ ! -e "$link" ] || mv --backup=numbered -T "$link" "$link.old"
-    ln -sfnT "$(basename "$out")" "$link"
+# Sets `status` to that of the scenario, 2 when a node has ended, which could not start.
+play() {
+    "$root/install/sim_bridge/lib/sim_bridge/scenario_node" --out "$out" \
+        ${record:+--record "$out/recording.mcap"} --ros-args \
+        --log-level warn --params-file "$config" "${overrides[@]}" -p "scenario:=$scenario" &
+    local ended play=$!
+    status=0
+    wait -n -p ended "$play" "${pids[@]}" || status=$?
+    [ "$ended" = "$play" ] || exit 2
+    if [ -n "$link" ] && [ "$status" -le 1 ]; then
+        # Before there was a folder for each scenario, this was one.
+        [ -L "$link" ] || [ ! -e "$link" ] || mv --backup=numbered -T "$link" "$link.old"
+        ln -sfnT "$(basename "$out")" "$link"
+    fi
+}
+if [ -n "$view" ] && [ -t 0 ]; then
+    trap 'exit "${status:-0}"' INT
+    echo "Enter plays the scenario, Ctrl-C ends"
+    while read -r; do
+        play
+        echo "Enter plays the scenario, Ctrl-C ends; \"drive the arm\" on the page moves it"
+    done
+else
+    play
 fi
 exit "$status"

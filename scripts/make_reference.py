@@ -22,6 +22,7 @@ from sim_bridge.nodes import topics as bullet_topics
 from sim_bridge.nodes.bullet_parameters import BulletConfiguration
 from sim_bridge.nodes.fault_node import FaultConfiguration
 from sim_bridge.scenario.scenario import ScenarioConfiguration
+from sim_bridge.viewer.node.viewer_parameters import ViewerConfiguration
 from torque_safety_controller.node import topics as controller_topics
 from torque_safety_controller.parameters import ControllerConfiguration
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
@@ -37,6 +38,7 @@ CONFIGURATIONS = {
     "controller_node": ControllerConfiguration,
     "bullet_node": BulletConfiguration,
     "scenario_node": ScenarioConfiguration,
+    "viewer_node": ViewerConfiguration,
     "fault_node": FaultConfiguration,
 }
 TABLES = {node: parameter_table(kind) for node, kind in CONFIGURATIONS.items()}

@@ -207,11 +207,23 @@ def test_packages_are_described_alike(package):
 
 KEYS = {
     name: f"python3-{name}"
-    for name in ("hypothesis", "matplotlib", "numba", "numpy", "pytest", "scipy", "tqdm", "yaml")
+    for name in (
+        "hypothesis",
+        "matplotlib",
+        "numba",
+        "numpy",
+        "pytest",
+        "scipy",
+        "tqdm",
+        "websockets",
+        "yaml",
+    )
 } | {"pybullet": "python3-pybullet-pip"}
 """Keys of rosdep that are not named like the module."""
 
-KEYLESS = {"daqp": "daqp"}
+KEYLESS = {name: name for name in ("daqp", "viser", "trimesh", "mcap")} | {
+    "mcap_ros2": "mcap-ros2-support"
+}
 """Modules without a key of rosdep; a comment tells what to install."""
 
 

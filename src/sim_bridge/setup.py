@@ -9,6 +9,7 @@ PACKAGE = "sim_bridge"
 FOLDERS = (
     "faults",
     "imperfect",
+    "layouts",
     "obstacles",
     "scenarios",
     "security",
@@ -16,6 +17,11 @@ FOLDERS = (
     "two_hosts",
 )
 CONFIG = ("config", *(f"config/{folder}" for folder in FOLDERS))
+
+
+def _files(folder: str) -> list[str]:
+    return glob(f"{folder}/*.*ml") + glob(f"{folder}/*.json")
+
 
 setup(
     name=PACKAGE,
@@ -25,7 +31,10 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
-        *((f"share/{PACKAGE}/{folder}", glob(f"{folder}/*.*ml")) for folder in CONFIG),
+        *(
+            (f"share/{PACKAGE}/{folder}", glob(f"{folder}/*.*ml") + glob(f"{folder}/*.json"))
+            for folder in CONFIG
+        ),
     ],
     install_requires=["setuptools"],
     extras_require={"test": ["pytest", "hypothesis"]},
@@ -43,6 +52,7 @@ setup(
             "bullet_node = sim_bridge.cli.ros_program:bullet_node",
             "fault_node = sim_bridge.cli.ros_program:fault_node",
             "record_excitation = sim_bridge.cli.ros_program:record_excitation",
+            "viewer_node = sim_bridge.cli.ros_program:viewer_node",
             "simulated_stack = sim_bridge.cli.ros_program:simulated_stack",
             "scenario_node = sim_bridge.cli.ros_program:scenario_node",
         ],

@@ -29,3 +29,9 @@ def scenario_node() -> int:
 def simulated_stack() -> int:
     """Run the simulated robot and the nodes that control it in one process."""
     return run_with_ros("simulated_stack", "sim_bridge.nodes.simulated_stack")
+
+
+def viewer_node() -> int:
+    """Run the node that shows the arm in a browser."""
+    libraries = "viser", "trimesh"
+    return run_with_ros("viewer_node", "sim_bridge.viewer.node.viewer_node", libraries)

@@ -3,28 +3,57 @@
 
 from __future__ import annotations
 
+import struct
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import WrenchStamped
+from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
-from trajectory_msgs.msg import JointTrajectory
+from std_msgs.msg import String
+from trajectory_msgs.msg import JointTrajectory, MultiDOFJointTrajectory
 
+from sim_bridge.nodes.topics import EXTERNAL_WRENCH, OBSTACLES
+from sim_bridge.recording.mcap_file import McapFile
 from sim_bridge.scenario.recording import Array, RecordedRun
 from viability_bounds_pkg.ros.messages import JointStateReader, Verdict
-from viability_bounds_pkg.ros.runtime import stamp_to_ns
+from viability_bounds_pkg.ros.runtime import LATCHED_QOS, stamp_to_ns
 from viability_bounds_pkg.ros.topics import (
     ACCELERATION_LIMITS,
     FT_WRENCH,
     JOINT_COMMANDS,
     JOINT_STATES,
+    LIMIT_DISTANCES,
+    ROBOT_DESCRIPTION,
 )
 
 _RECORDING_QOS = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+_MANY = QoSProfile(depth=100)
+_FURTHER: tuple[tuple[str, type, QoSProfile], ...] = (
+    ("hand_pose", PoseStamped, _MANY),
+    (LIMIT_DISTANCES.name, LIMIT_DISTANCES.message, _MANY),
+    ("controller_mode", String, LATCHED_QOS),
+    (ROBOT_DESCRIPTION.name, ROBOT_DESCRIPTION.message, LATCHED_QOS),
+    ("target_pose", PoseStamped, _MANY),
+    ("target_posture", JointState, _MANY),
+    ("target_trajectory", MultiDOFJointTrajectory, _MANY),
+    ("target_wrench", WrenchStamped, _MANY),
+    (EXTERNAL_WRENCH.name, EXTERNAL_WRENCH.message, _MANY),
+    (OBSTACLES.name, OBSTACLES.message, _MANY),
+)
+"""What a file has besides, and the reports do not need."""
+
+
+def _stamp_of(serialized: bytes) -> int:
+    """Return the stamp, ns, of a serialized message that begins with a header."""
+    seconds, nanoseconds = struct.unpack_from("<iI", serialized, 4)
+    return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
 
 class RunListener:
@@ -33,6 +62,7 @@ class RunListener:
     Args:
         node: subscribes.
         joints: joints to record, in this order.
+        file: to which all messages go, too, as they came; None for none.
 
     Attributes:
         topics: names of those recorded.
@@ -43,7 +73,9 @@ class RunListener:
             name.
     """
 
-    def __init__(self, node: Node, joints: Sequence[str]) -> None:
+    def __init__(self, node: Node, joints: Sequence[str], file: McapFile | None = None) -> None:
+        self._file = file
+        self._unfiled: list[tuple[str, bytes]] = []
         self.stamp = self.answered = -1
         self.q: Array = np.zeros(len(joints))
         self.diagnostics: dict[str, dict[str, str]] = {
@@ -66,9 +98,44 @@ class RunListener:
             (JOINT_COMMANDS, self._on_command),
             (FT_WRENCH, self._on_wrench),
         ):
-            node.create_subscription(topic.message, topic.name, take, _RECORDING_QOS)
             self.topics += (topic.name,)
-        node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
+            self._listen(node, topic.message, topic.name, take, _RECORDING_QOS)
+        self._listen(node, DiagnosticArray, "/diagnostics", self._on_diagnostics, _MANY)
+        if file is not None:
+            for name, kind, qos in _FURTHER:
+                self._listen(node, kind, name, None, qos)
+
+    def _listen(
+        self,
+        node: Node,
+        kind: type,
+        name: str,
+        take: Callable[[Any], None] | None,
+        qos: QoSProfile,
+    ) -> None:
+        """Subscribe; what comes goes to the file, if there is one, and to `take`."""
+        if self._file is None:
+            node.create_subscription(kind, name, take, qos)
+            return
+        file, path = self._file, node.resolve_topic_name(name)
+        file.add_topic(path, kind)
+
+        def keep(serialized: bytes) -> None:
+            if take is not None:
+                take(deserialize_message(serialized, kind))
+            stamp = _stamp_of(serialized)
+            if name not in self.topics:
+                # Without a stamp of robot time, or with one in the future.
+                self._unfiled.append((path, serialized))
+                stamp = self.stamp
+            else:
+                file.write(path, serialized, stamp)
+            if stamp >= 0:  # of the last state; before the first one there is none to file under
+                for each, content in self._unfiled:
+                    file.write(each, content, stamp)
+                self._unfiled.clear()
+
+        node.create_subscription(kind, name, keep, qos, raw=True)
 
     def run(self, first: int) -> RecordedRun:
         """Return the recording from the state with stamp `first` on."""

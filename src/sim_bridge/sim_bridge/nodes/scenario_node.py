@@ -32,6 +32,7 @@ from sim_bridge.nodes.scenario_messages import (
     to_robot,
     to_service,
 )
+from sim_bridge.recording.mcap_file import McapFile
 from sim_bridge.scenario.events import ServiceEvent
 from sim_bridge.scenario.recording import RecordedRun
 from sim_bridge.scenario.scenario import ScenarioConfiguration
@@ -69,6 +70,9 @@ class ScenarioNode(ArmNode):
     take effect. In lockstep the robot is paused where a service must be called, until it has
     answered; so a run in lockstep is the same each time.
 
+    Args:
+        file: to which all messages go as they come; None for none.
+
     Attributes:
         awaits: what it waits for.
         ended: done when the scenario has ended.
@@ -79,7 +83,7 @@ class ScenarioNode(ArmNode):
     NAME = "scenario_node"
     PARAMETERS = ScenarioConfiguration
 
-    def __init__(self, **node_arguments: Any) -> None:
+    def __init__(self, *, file: McapFile | None = None, **node_arguments: Any) -> None:
         super().__init__(**node_arguments)
         with self.starting():
             robot = self.resolve_service_name(RESET.service).rpartition("/")[0]
@@ -89,7 +93,7 @@ class ScenarioNode(ArmNode):
         self.awaits = ""
         self.ended: Future[None] = Future()
         self.failure: ScenarioRefused | None = None
-        self.listener = RunListener(self, config.joints)
+        self.listener = RunListener(self, config.joints, file)
         self._publisher_watch = PublisherWatch(self, self.listener.topics)
         self._first, self._period = 0, 1
         self._refused: dict[str, list[str]] | None = None  # when the messages begin; else None
@@ -298,30 +302,36 @@ def main(args: list[str] | None = None) -> int:
     Returns:
         0 when no limit was broken, 1 when one was, 2 when the scenario could not be played.
     """
-    node = None
+    node, file = None, None
     try:
         try:
             parser = node_parser(ScenarioNode)
             parser.add_argument("--out", type=Path, metavar="DIRECTORY", help="of the report")
-            out = parser.parse_args(own_arguments(args)).out
+            parser.add_argument(
+                "--record", type=Path, metavar="FILE", help="all messages, as MCAP"
+            )
+            options = parser.parse_args(own_arguments(args))
             initialise(args)
             # An exception in a callback is more than the executor reports in one line.
             signals: list[int] = []
             for each in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(each, lambda number, _: signals.append(number))
-            node = ScenarioNode()
+            if options.record is not None:
+                options.record.parent.mkdir(parents=True, exist_ok=True)
+                file = McapFile(options.record)
+            node = ScenarioNode(file=file)
         except Exception as error:
             report_refusal(error)
             return 2
         play(node, signals=signals)
         for each in (signal.SIGINT, signal.SIGTERM):
             signal.signal(each, signal.default_int_handler)
-        if out is None:
+        if options.out is None:
             return 0
         from sim_bridge.scenario.report import write_report  # matplotlib takes a second to import
 
         bounds = node.listener.diagnostics["bounds_node"]
-        kept = write_report(out, node.config, node.recorded_run(), node.robot, bounds)
+        kept = write_report(options.out, node.config, node.recorded_run(), node.robot, bounds)
         return 0 if kept else 1
     except (TimeoutError, ScenarioRefused, OSError) as error:
         report_refusal(error)
@@ -330,6 +340,8 @@ def main(args: list[str] | None = None) -> int:
         return INTERRUPTED
     finally:
         leave(*filter(None, [node]))
+        if file is not None:
+            file.close()
 
 
 if __name__ == "__main__":

@@ -26,8 +26,8 @@ EXTERNAL_WRENCH = Topic(
     "external_wrench",
     WrenchStamped,
     GOAL_QOS,
-    (USER, "scenario_node"),
-    (_NODE,),
+    (USER, "scenario_node", "viewer_node"),
+    (_NODE, "viewer_node"),
     "a push in world axes at the origin of the link `frame_id`, N and N m; one for each link; a "
     "stamp in the future takes effect then",
 )

@@ -19,8 +19,8 @@ TARGET_POSE = Topic(
     "target_pose",
     PoseStamped,
     GOAL_QOS,
-    (USER, "scenario_node"),
-    (_NODE,),
+    (USER, "scenario_node", "viewer_node"),
+    (_NODE, "viewer_node"),
     "end-effector goal in `base_frame`; a stamp in the future takes effect then",
 )
 TARGET_POSE_SECOND = Topic(
@@ -61,7 +61,7 @@ TARGET_JOINT_TRAJECTORY = Topic(
     "target_joint_trajectory",
     JointTrajectory,
     GOAL_QOS,
-    (USER,),
+    (USER, "viewer_node"),
     (_NODE,),
     "positions of all joints over time, rad, perhaps with velocities and accelerations, matched "
     "by name; a goal for the pose is given up; without points: the joints come to rest",

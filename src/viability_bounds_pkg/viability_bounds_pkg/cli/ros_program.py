@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from importlib import import_module
 
 from viability_bounds_pkg.cli.command_line import INTERRUPTED
@@ -21,12 +21,13 @@ def run_program(module: str) -> int:
     return _run(_load(module))
 
 
-def run_with_ros(program: str, module: str) -> int:
+def run_with_ros(program: str, module: str, libraries: Collection[str] = ()) -> int:
     """Run a program that imports ROS 2, as `run_program`; return 1 without ROS 2.
 
     Args:
         program: its name, for the message.
         module: dotted name of the module.
+        libraries: others that it needs and that may be missing.
     """
     try:
         main = _load(module)
@@ -34,6 +35,9 @@ def run_with_ros(program: str, module: str) -> int:
         missing = error.name or str(error)
         if missing.split(".")[0] == module.split(".")[0]:
             raise
+        if missing in libraries:
+            print(f"{program}: needs '{missing}': pip install {missing}", file=sys.stderr)
+            return 1
         print(
             f"{program}: this program needs ROS 2 Jazzy (no Python module '{missing}'): "
             "source /opt/ros/jazzy/setup.bash, or see scripts/setup.sh",

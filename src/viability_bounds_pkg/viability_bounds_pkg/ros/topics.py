@@ -110,7 +110,7 @@ JOINT_STATES = Topic(
     JointState,
     CONTROL_QOS,
     ("bullet_node",),
-    ("bounds_node", "controller_node", "estimator_node", "scenario_node"),
+    ("bounds_node", "controller_node", "estimator_node", "scenario_node", "viewer_node"),
     "positions, rad, and velocities, rad/s; `effort` is the torque of the motors, N m; joints in "
     "any order, further joints are ignored; the stamp names the control step; `bullet_node` sends "
     "the movable joints that are locked, too",
@@ -130,7 +130,7 @@ ACCELERATION_LIMITS = Topic(
     JointTrajectory,
     CONTROL_QOS,
     ("bounds_node",),
-    ("controller_node", "scenario_node"),
+    ("controller_node", "scenario_node", "viewer_node"),
     "`points[0].accelerations` lower, `points[1].accelerations` upper, rad/s²; stamp of the state "
     "they answer",
 )
@@ -148,7 +148,7 @@ FT_WRENCH = Topic(
     WrenchStamped,
     CONTROL_QOS,
     ("bullet_node",),
-    ("controller_node", "scenario_node"),
+    ("controller_node", "scenario_node", "viewer_node"),
     "what the wrist's sensor measures, tool and bias included, in the axes of `ft_frame`, N and "
     "N m; positive is what acts on the arm; only where `ft_frame` is set",
 )
@@ -169,7 +169,7 @@ ROBOT_DESCRIPTION = Topic(
     String,
     LATCHED_QOS,
     ("bullet_node",),
-    ("bounds_node", "estimator_node", "controller_node"),
+    ("bounds_node", "estimator_node", "controller_node", "viewer_node"),
     "the URDF; read at start where the parameter `robot_description` is `topic`; that it changes "
     "later is reported",
 )
@@ -178,7 +178,7 @@ DIAGNOSTICS = Topic(
     DiagnosticArray,
     STATUS_QOS,
     ("bounds_node", "estimator_node", "controller_node", "bullet_node"),
-    ("scenario_node",),
+    ("scenario_node", "viewer_node"),
     "mode and why, refused messages by reason, margins, latency, solver, closest approach; the "
     "name of a status is that of its node with the namespace, as in `left/bullet_node`",
 )

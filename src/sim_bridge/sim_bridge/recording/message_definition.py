@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The definition of a message type as text, which a recording carries for its readers.
+
+It is made of the Python class, because the .msg files are elsewhere in each installation.
+Comments, constants and defaults are not in it; readers need the fields alone.
+"""
+
+from __future__ import annotations
+
+import re
+from importlib import import_module
+from typing import Any
+
+_PRIMITIVES = {"double": "float64", "float": "float32", "boolean": "bool", "octet": "byte"}
+"""Where the names of the interface definition language differ from those of .msg files."""
+
+_RULE = "=" * 80
+
+
+def message_definition(kind: Any) -> tuple[str, str]:
+    """Return name and definition of a message type.
+
+    Args:
+        kind: its class.
+
+    Returns:
+        Its name, as in ``sensor_msgs/msg/JointState``, and its fields, with those of all types in
+        it, in the format of ``ros2msg``.
+    """
+    texts: dict[str, str] = {}
+    name = _name(kind)
+    _describe(kind, texts)
+    text = texts.pop(name)
+    for each, fields in texts.items():
+        text += f"{_RULE}\nMSG: {each.replace('/msg/', '/')}\n{fields}"
+    return name, text
+
+
+def _name(kind: Any) -> str:
+    return f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"
+
+
+def _describe(kind: Any, texts: dict[str, str]) -> None:
+    """Add the fields of a type, and of those in it, to `texts`."""
+    if (name := _name(kind)) in texts:
+        return
+    texts[name] = ""
+    for field, written in kind.get_fields_and_field_types().items():
+        element, length = _split(written)
+        if "/" in element:
+            package, inner = element.split("/")
+            _describe(getattr(import_module(f"{package}.msg"), inner), texts)
+        texts[name] += f"{_PRIMITIVES.get(element, element)}{length} {field}\n"
+
+
+def _split(written: str) -> tuple[str, str]:
+    """Return the type of an element, and its number in brackets, empty if it is one alone."""
+    if found := re.fullmatch(r"sequence<(.*?)(?:, (\d+))?>", written):
+        return _unbounded(found[1]), f"[<={found[2]}]" if found[2] else "[]"
+    if found := re.fullmatch(r"(.*)\[(\d+)\]", written):
+        return _unbounded(found[1]), f"[{found[2]}]"
+    return _unbounded(written), ""
+
+
+def _unbounded(element: str) -> str:
+    """Return the type of a string with a bound in the form of .msg files."""
+    return re.sub(r"string<(\d+)>", r"string<=\1", element)

@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page of the viewer: what it shows and sends, alone and in a real browser."""
+
+import time
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from browser import Browser, find_browser
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from trajectory_msgs.msg import JointTrajectory
+
+from sim_bridge.nodes.bullet_node import BulletNode
+from sim_bridge.viewer.node.viewer_node import PERIOD, ViewerNode
+from sim_bridge.viewer.page import DrivingAsked, GoalAsked, JointsAsked, PushAsked, SettingAsked
+from torque_safety_controller.node.controller_node import ControllerNode
+from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.node.bounds_node import BoundsNode
+from viability_bounds_pkg.testing.ros_harness import read_config
+
+KINDS = "bounds_node", "controller_node", "bullet_node", "viewer_node"
+PATIENT = {"clock": "lockstep", "bounds_timeout": 5.0, "state_timeout": 10.0}
+AXIS = np.array([0.0, 0.0, 1.0])
+VALUES = read_config("panda", *KINDS) | PATIENT | {"viewer_port": 18080}
+
+
+class Viewed:
+    """A Panda in lockstep, and a viewer that shows it whenever the nodes have run."""
+
+    def __init__(self, ros, **changed):
+        values = VALUES | changed
+        self.ros = ros
+        self.goals = ros.listen(PoseStamped, "target_pose")
+        self.trajectories = ros.listen(JointTrajectory, "target_joint_trajectory")
+        self.pushes = ros.listen(WrenchStamped, "external_wrench")
+        self.controller = ros.start(ControllerNode, values)
+        self.bounds = ros.start(BoundsNode, values)
+        self.viewer = ros.start(ViewerNode, values)
+        self.page = self.viewer.page
+        ros.start(BulletNode, values)
+        self.wait(lambda: self.viewer._reader.stamp > 0)
+
+    def wait(self, condition, timeout=30.0):
+        """Let nodes and page run until a condition holds."""
+        end = time.monotonic() + timeout
+        while not condition():
+            assert time.monotonic() < end, "it has not come true"
+            shown = time.monotonic() + PERIOD
+            while time.monotonic() < shown:
+                self.ros.spin(0.01)
+            self.viewer.proceed()
+
+    def run(self, duration):
+        """Let time pass, s."""
+        end = time.monotonic() + duration
+        self.wait(lambda: time.monotonic() > end)
+
+    def ask(self, *requests):
+        """Do as the user of the page would."""
+        for request in requests:
+            self.page._requests.put(request)
+        self.viewer.proceed()
+
+    def hand(self):
+        return self.page._data.oMf[self.page._hand].copy()
+
+
+@pytest.fixture
+def arm(ros):
+    return Viewed(ros)
+
+
+def test_nothing_is_sent_before_the_user_drives(arm):
+    goal = pin.SE3(np.eye(3), np.array([0.4, 0.1, 0.5]))
+    arm.ask(GoalAsked(goal), JointsAsked(np.zeros(7)), PushAsked("panda_link4", np.ones(3)))
+    assert arm.controller.count_publishers("target_pose") == 0
+    arm.ask(DrivingAsked(True))
+    arm.wait(lambda: arm.controller.count_publishers("target_pose") == 1)
+    arm.ask(GoalAsked(goal), PushAsked("panda_link4", np.array([0.0, 20.0, 0.0])))
+    arm.wait(lambda: arm.goals and arm.pushes)
+    position = arm.goals[-1].pose.position
+    assert (position.x, position.y, position.z) == pytest.approx((0.4, 0.1, 0.5))
+    assert arm.pushes[-1].header.frame_id == "panda_link4"
+    assert arm.pushes[-1].wrench.force.y == 20.0
+    arm.ask(DrivingAsked(False))
+    arm.wait(lambda: arm.pushes[-1].wrench.force.y == 0.0)
+    arm.wait(lambda: arm.controller.count_publishers("target_pose") == 0)
+
+
+def test_sliders_move_the_joints(arm):
+    target = arm.viewer._reader.q + 0.1
+    arm.ask(DrivingAsked(True))
+    arm.wait(lambda: arm.controller.count_publishers("target_joint_trajectory") == 1)
+    arm.ask(JointsAsked(target))
+    arm.wait(lambda: np.abs(arm.viewer._reader.q - target).max() < 0.01)
+
+
+def test_settings_of_other_nodes_are_read_and_changed(arm):
+    values = arm.viewer._settings.values
+    arm.wait(lambda: len(values) == 3)
+    assert values["bounds_node", "method"] == "exact"
+    arm.ask(SettingAsked("bounds_node", "method", "naive"))
+    arm.wait(lambda: arm.bounds.get_parameter("method").value == "naive")
+    arm.ask(SettingAsked("controller_node", "integral_action", "task"))
+    arm.wait(lambda: arm.controller.get_parameter("integral_action").value == "task")
+    arm.ask(SettingAsked("controller_node", "integral_action", "sideways"))
+    arm.wait(lambda: "integral_action" in arm.viewer._settings.refused)
+    assert arm.controller.get_parameter("integral_action").value == "task"
+
+
+@pytest.mark.parametrize(
+    "name, value, words",
+    [
+        ("ft_frame", "wrist", "a frame of the URDF"),
+        ("end_effector_frame", "hand", "a frame of the URDF"),
+        ("viewer_host", "192.0.2.1", "an address of this machine"),
+        ("acceleration_max", [1.0], "7 numbers"),
+    ],
+)
+def test_what_cannot_be_shown_is_refused_at_start(ros, name, value, words):
+    with pytest.raises(SettingError, match=words) as refused:
+        ros.start(ViewerNode, VALUES | {name: value})
+    assert refused.value.name == name
+
+
+@pytest.mark.long
+@pytest.mark.skipif(find_browser() is None, reason="no browser: apt install chromium")
+def test_a_drag_in_a_browser_moves_the_arm(arm, tmp_path):
+    with Browser((1000, 640)) as browser:
+        browser.open(arm.page.address)
+        arm.wait(lambda: arm.page._server.get_clients())
+        arm.wait(lambda: browser.value("document.querySelector('svg.joints') !== null"))
+        assert browser.value("document.querySelectorAll('svg.joints circle').length") == 7
+        browser.value("[...document.querySelectorAll('input[type=checkbox]')].pop().click()")
+        arm.wait(lambda: arm.page._driving and arm.page._goal.visible)
+        arm.wait(lambda: arm.controller.count_publishers("target_pose") == 1)
+        start = arm.hand()
+        # The arrow of the goal's handle that points down is pulled up, when the page shows it.
+        tip, target = (np.array(pixel(arm, start.act(z * AXIS))) for z in (0.22, 0.02))
+        for _ in range(10):
+            browser.drag(tip, target, lambda: arm.run(0.7), steps=3)
+            arm.run(1.0)
+            if arm.goals:
+                break
+        arm.wait(lambda: arm.hand().translation[2] > start.translation[2] + 0.1)
+        picture = browser.screenshot(tmp_path / "page.png")
+        raised = arm.hand().translation - start.translation
+        assert np.abs(raised[:2]).max() < 0.02
+        assert len(picture) > 20_000  # an empty page has less
+    arm.wait(lambda: not arm.page._server.get_clients())
+
+
+def pixel(arm, point):
+    """Return where a point in the world is seen on the page."""
+    (client,) = arm.page._server.get_clients().values()
+    camera = client.camera
+    seen = pin.Quaternion(*camera.wxyz).toRotationMatrix().T @ (point - camera.position)
+    height = camera.image_height
+    focal = 0.5 * height / np.tan(0.5 * camera.fov)
+    return (
+        0.5 * camera.image_width + focal * seen[0] / seen[2],
+        0.5 * height + focal * seen[1] / seen[2],
+    )
