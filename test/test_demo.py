@@ -223,3 +223,12 @@ def test_a_pushed_elbow_gives_way_once_it_is_told_to():
     stiff, compliant = (np.ptp(q[(t > begin) & (t < begin + 4.0)], axis=0) for begin in (0.9, 5.9))
     assert compliant.max() > 10.0 * stiff.max()
     assert hand_errors(samples)[0].max() < 3e-3
+
+
+@pytest.mark.long
+def test_with_a_page_the_scenario_is_played_once_where_there_is_no_terminal(tmp_path):
+    path = first_goal(tmp_path, "panda")
+    result = demo("panda", path, "--view", "--out", tmp_path)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "the arm is at http://127.0.0.1:" in result.stdout
+    assert "no limit was broken" in result.stdout

@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 import pytest
 from test_reference import EXTRA, NODES, make_reference
 
+from sim_bridge.nodes import run_listener
 from sim_bridge.nodes.bullet_node import BulletNode
 from torque_safety_controller.node import safety_stack
 from viability_bounds_pkg.ros.topics import USER
@@ -85,9 +86,11 @@ def test_a_node_may_do_what_it_does_and_nothing_else(ros, name):
     # Heard at start only, where a parameter says so.
     if "robot_description" in {t.name for t in make_reference.TOPICS if name in t.sink}:
         found["subscribe"].add("/robot_description")
-    # It publishes what its scenario has.
-    if name == "scenario_node":
+    # They publish what a scenario has, and what a user does.
+    if name in ("scenario_node", "viewer_node"):
         found["publish"] |= {f"/{t.name}" for t in make_reference.TOPICS if name in t.source}
+    if name == "scenario_node":  # with --record
+        found["subscribe"] |= {f"/{topic}" for topic, _, _ in run_listener._FURTHER}
     assert found == granted(name)
     for right, names in OWN.items():
         assert names <= found[right]
