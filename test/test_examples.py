@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every example runs, keeps every limit, and says so."""
 
+import json
 import re
 import runpy
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
@@ -23,6 +25,26 @@ SAYS = {
 
 def test_every_example_is_run_here():
     assert {path.stem for path in EXAMPLES.glob("*.py")} == set(SAYS)
+
+
+def test_the_notebook_runs_cell_by_cell(capfd, monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    monkeypatch.chdir(EXAMPLES)
+    (path,) = EXAMPLES.glob("*.ipynb")
+    cells = [each for each in json.loads(path.read_text())["cells"] if each["cell_type"] == "code"]
+    assert not any(cell["outputs"] for cell in cells)
+    names = {"__name__": "__main__"}
+    try:
+        for cell in cells:
+            exec(compile("".join(cell["source"]), f"{path}:{cell['id']}", "exec"), names)
+    finally:
+        names["stack"].kill()
+    recording = names["recording"]
+    assert recording.q.shape == recording.v.shape == recording.tau.shape == (len(recording.t), 7)
+    assert len(recording.t) > 500
+    assert (np.diff(recording.t) > 0.0).all()
+    assert recording.q[:, 3].min() < -3.05  # at its limit
+    assert "refused it" in capfd.readouterr().out
 
 
 @pytest.mark.parametrize("name", SAYS)

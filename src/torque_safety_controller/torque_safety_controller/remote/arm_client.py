@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An arm under this controller, from a Python program: move, wait, push, read."""
+"""An arm under this controller, from a Python program: move, wait, push, read, record."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Any, NamedTuple
 
@@ -16,16 +17,20 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from numpy.typing import NDArray
 from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from torque_safety_controller.node.topics import HAND_POSE, TARGET_JOINT_TRAJECTORY, TARGET_POSE
+from torque_safety_controller.remote.state_recording import StateRecording
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, make_executor
 from viability_bounds_pkg.ros.topics import DIAGNOSTICS, JOINT_STATES, LIMIT_DISTANCES, Topic
 
 Array = NDArray[np.float64]
 
+_RECORDING_QOS = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""States wait here until a method waits."""
 _SETTLED = 2.0
 """After which diagnostics are about the goal that was sent, s; they come twice a second, and the
 arm stands for 1 s before it counts as short of its goal."""
@@ -200,6 +205,21 @@ class ArmClient:
         subscribers = self._pushes.get_subscription_count
         self._wait(lambda: subscribers() > 0, self._timeout, "no simulated robot is heard")
         self._pushes.publish(message)
+
+    @contextmanager
+    def record(self) -> Iterator[StateRecording]:
+        """Keep the states that come while methods of this client wait, in a ``with`` statement."""
+        recording = StateRecording(self._joints)
+        subscription = self._node.create_subscription(
+            JointState,
+            JOINT_STATES.name,
+            lambda message: recording.add(message, time.monotonic()),
+            _RECORDING_QOS,
+        )
+        try:
+            yield recording
+        finally:
+            self._node.destroy_subscription(subscription)
 
     def wait(self, duration: float) -> None:
         """Let time pass, s."""
