@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 from bench_recorder import Recorder
+from bench_viewer import Viewer
 from geometry_msgs.msg import PoseStamped
 from live_robot import (
     ONE_PROCESS,
@@ -69,8 +70,9 @@ CASES = (
     ("baxter_left_arm", 100.0),
 )
 RECORDED = "recorded"
-WAYS = RELAYS, ONE_PROCESS, RECORDED, PROCESSES
-"""`RECORDED` is one process as well."""
+VIEWED = "viewed"
+WAYS = RELAYS, ONE_PROCESS, RECORDED, VIEWED, PROCESSES
+"""`RECORDED` and `VIEWED` are one process as well."""
 SETTLING = 1.0
 """How long a robot moves before it is measured, s."""
 LONG_ENOUGH = 6.0
@@ -90,12 +92,14 @@ def measure(
 ) -> str:
     """Run a robot by the wall clock for some seconds; return the row of what came of it."""
     arguments = configuration(robot, rate, imperfect=imperfect)
-    run = ONE_PROCESS if way == RECORDED else way
+    run = ONE_PROCESS if way in (RECORDED, VIEWED) else way
     with running(run, arguments, imperfect, scheduling) as programs, ExitStack() as recording:
         user = User(goals(robot), "target_pose")
         try:
             if way == RECORDED:
                 recording.callback(Recorder(robot).end)
+            if way == VIEWED:
+                recording.callback(Viewer(arguments).end)
             user.start(programs)
             user.use(SETTLING)
             before, used, begin = user.report(), cpu_seconds(programs), time.monotonic()
