@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import signal
 import socket
 import sys
@@ -52,6 +53,8 @@ from viability_bounds_pkg.ros.topics import (
 
 PERIOD = 0.05
 """Between two pictures, s."""
+_NICENESS = 10
+"""Pictures may wait for the control where processors are few."""
 _SILENT = 1.0
 """How long without joint states until the page says so, s."""
 _SHOWN = "bullet_node", "bounds_node", "controller_node"
@@ -259,6 +262,7 @@ def main(args: list[str] | None = None) -> int:
         signals: list[int] = []
         for each in (signal.SIGINT, signal.SIGTERM):
             signal.signal(each, lambda number, _: signals.append(number))
+        os.nice(_NICENESS)
         node = ViewerNode()
         print(f"the arm is at {node.page.address}", flush=True)
         run(node, lambda: bool(signals))
