@@ -57,7 +57,7 @@ class Browser:
                 break
         else:
             raise RuntimeError("the browser did not start")
-        self._socket = connect(found[0], max_size=None)
+        self._socket = connect(found[0], max_size=None, ping_interval=None)
         self._number = 0
         self._session = None
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
@@ -88,7 +88,7 @@ class Browser:
         """Return the result of a command of the protocol."""
         self._send(method, parameters)
         while True:
-            answer = json.loads(self._socket.recv(timeout=60))
+            answer = json.loads(self._socket.recv(timeout=120))
             if answer.get("id") == self._number:
                 if "error" in answer:
                     raise RuntimeError(f"{method}: {answer['error']['message']}")
