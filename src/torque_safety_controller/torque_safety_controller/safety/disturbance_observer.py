@@ -20,11 +20,11 @@ change of the disturbance within T: after a step by d the bound is exceeded by d
 from __future__ import annotations
 
 import math
-from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torque_safety_controller.linalg import cholesky
 from viability_bounds_pkg.compiled import compiled
 
 Array = NDArray[np.float64]
@@ -49,6 +49,7 @@ class DisturbanceObserver:
         self._begun = False
         ones = np.ones(n)  # compiled now, not in a control loop
         _observe(np.zeros(n), ones, ones, ones, 1.0, 1.0, ones, np.eye(n))
+        _expect(np.zeros(n), ones, ones, np.eye(n))
         _shift(ones, -ones, ones)
 
     def reset(self) -> None:
@@ -90,12 +91,8 @@ class DisturbanceObserver:
             tau_max: torque limits, shape (n,), N m.
             M: mass matrix, shape (n, n), kg m^2.
         """
-        if self.time_constant is None or not torque.any():
-            return
-        with suppress(np.linalg.LinAlgError):
-            changed, largest = self.estimate + np.linalg.solve(M, torque), tau_max / np.diagonal(M)
-            if np.isfinite(changed).all():
-                self.estimate[:] = np.clip(changed, -largest, largest)
+        if self.time_constant is not None:
+            _expect(self.estimate, torque, tau_max, M)
 
     @property
     def known(self) -> Array | None:
@@ -131,6 +128,21 @@ def _observe(
         largest = tau_max[j] / M[j, j]
         # A NaN resets the estimate.
         estimate[j] = min(max(e, -largest), largest) if e == e and largest > 0.0 else 0.0
+
+
+@compiled
+def _expect(estimate: Array, torque: Array, tau_max: Array, M: Array) -> None:
+    """Add M^-1 torque to the estimate, in place; nothing where that is not finite."""
+    n, L = torque.size, M.copy()
+    if not torque.any() or not cholesky.factorise(L):
+        return
+    change = torque.copy().reshape(n, 1)
+    cholesky.solve(L, change)
+    if not np.isfinite(change).all():
+        return
+    for j in range(n):
+        largest = tau_max[j] / M[j, j]
+        estimate[j] = min(max(estimate[j] + change[j, 0], -largest), largest)
 
 
 @compiled

@@ -23,6 +23,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from viability_bounds_pkg.compiled import compiled
 from viability_bounds_pkg.state import State
 
 Array = NDArray[np.float64]
@@ -91,6 +92,8 @@ class FreezeCheck:
         self._model, self._data = model, model.createData()
         self._tau_max, self._allowed = tau_max, allowed
         self._with_velocities = with_velocities
+        ones = np.ones_like(tau_max)  # compiled now, not in a control loop
+        _count_changes(ones.copy(), ones, ones)
         self.reset()
 
     def reset(self) -> None:
@@ -98,7 +101,7 @@ class FreezeCheck:
         zero = np.zeros_like(self._tau_max)
         self.expected: Expected | None = None
         self.changing = 0.0
-        self._changes = zero  # of each joint at rest, one after the other
+        self._changes = zero.copy()  # of each joint at rest, one after the other
         self._alive = False  # whether there is always one
         self._told = False
         self._speed = self._held = zero
@@ -126,32 +129,27 @@ class FreezeCheck:
             h: time between them, s.
         """
         expected, self.expected = self.expected, None
-        same = now.q == before.q
-        if not (now.v == before.v if self._with_velocities else same).all():
+        same = now.v == before.v if self._with_velocities else now.q == before.q
+        if not same.all():
             if self._alive:
                 self._alive = self._row <= 1 or self._told
             elif self._with_velocities:
-                self._alive = self._changes_at_rest(before, now) >= max(STATES, ALIVE / h)
+                most = _count_changes(self._changes, before.v, now.v)
+                self._alive = most >= max(STATES, ALIVE / h)
             self._begin()
             self.changing += h
             return False
-        self._changes = np.zeros_like(self._changes)
+        self._changes.fill(0.0)
         self._row, self._row_time, self.changing = self._row + 1, self._row_time + h, 0.0
         if self._told:
             return False
         if self._alive and self._row >= ROW and self._row_time > ROW_TIME - 0.5 * h:
             self._told = True
-        elif expected is None or not same.all():
+        elif expected is None or not np.array_equal(now.q, before.q):
             self._way = None
         else:
             self._told = self._should_have_moved(before, expected, h)
         return self._told
-
-    def _changes_at_rest(self, before: State, now: State) -> float:
-        """Return how often in a row the velocity of a joint at rest has changed, at most."""
-        more = self._changes + (np.abs(now.v) < REST)
-        self._changes = np.where(now.v != before.v, more, 0.0)
-        return float(self._changes.max())
 
     def _should_have_moved(self, before: State, expected: Expected, h: float) -> bool:
         """Return whether an arm that is said not to move must have moved since it began so."""
@@ -170,3 +168,16 @@ class FreezeCheck:
         far = bool((np.abs(self._way) > self._allowed).any())
         once, self._far = self._far, far
         return far and once  # twice: one state may come late
+
+
+@compiled
+def _count_changes(changes: Array, before: Array, now: Array) -> float:
+    """Count how often in a row velocities of joints at rest have changed; return the most."""
+    most = 0.0
+    for i in range(changes.size):
+        if now[i] == before[i]:
+            changes[i] = 0.0
+        elif abs(now[i]) < REST:
+            changes[i] += 1.0
+        most = max(most, changes[i])
+    return most

@@ -18,10 +18,14 @@ does not, positions and velocities *contradict* each other: one of them has froz
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from viability_bounds_pkg.compiled import bound, compiled
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.state_estimation.freeze_check import FROZEN, Expected, FreezeCheck
 
@@ -74,6 +78,24 @@ SAMPLES = 200
 """Postures in which the largest accelerations are looked for."""
 
 
+class _Errors(NamedTuple):
+    """What states may differ by from the truth, and how fast joints may be; shapes (n,).
+
+    Attributes:
+        position: rad.
+        velocity: rad/s.
+        quarter_a: a quarter of the largest acceleration, rad/s^2.
+        limit: of the speed, rad/s.
+        fast: speed for which no velocity is known, rad/s.
+    """
+
+    position: Array
+    velocity: Array
+    quarter_a: Array
+    limit: Array
+    fast: Array
+
+
 class StateCheck:
     """Looks at the joint states of one arm, one after the other.
 
@@ -104,17 +126,24 @@ class StateCheck:
         velocity_error: Array | None,
     ) -> None:
         width = position_max - position_min
-        self._low, self._high = position_min - width, position_max + width
-        self._quarter_a = 0.25 * largest_accelerations(model, tau_max)
-        fastest = np.array(model.velocityLimit)
-        fastest = np.where((fastest > 0.0) & np.isfinite(fastest), fastest, 10.0)
-        self._fast, self._fastest = FAST * fastest, IMPOSSIBLE * fastest
-        self._position = SPREAD + 2.0 * position_error
-        self._with_velocities = velocity_error is not None
-        error = np.zeros_like(fastest) if velocity_error is None else velocity_error
-        self._velocity = SHARE * fastest + error
-        self._limit = fastest
-        self._freeze = FreezeCheck(model, tau_max, self._position, self._with_velocities)
+        limit = np.array(model.velocityLimit)
+        limit = np.where((limit > 0.0) & np.isfinite(limit), limit, 10.0)
+        known = velocity_error is not None
+        error = np.zeros_like(limit) if velocity_error is None else velocity_error
+        position, velocity = SPREAD + 2.0 * position_error, SHARE * limit + error
+        quarter_a = 0.25 * largest_accelerations(model, tau_max)
+        self._errors = _Errors(position, velocity, quarter_a, limit, FAST * limit)
+        self._with_velocities = known
+        zero = np.zeros_like
+        self._before = State(zero(limit), zero(limit))
+        self._now = State(zero(limit), zero(limit))
+        self._drift: Array = zero(limit)
+        low, high = position_min - width, position_max + width
+        self._nonsense = bound(_nonsense, self._now, low, high, IMPOSSIBLE * limit, known)
+        self._compare = bound(
+            _compare, self._before, self._now, self._errors, self._drift, known, numbers=2
+        )
+        self._freeze = FreezeCheck(model, tau_max, position, known)
         self.reset()
 
     def reset(self) -> None:
@@ -122,7 +151,7 @@ class StateCheck:
         self._last: State | None = None  # that came last, if it is no nonsense
         self._time = -np.inf  # its time, s
         self._believed: tuple[State, float] | None = None
-        self._drift: Array = np.zeros_like(self._fast)
+        self._drift.fill(0.0)
         self._agreed = 0.0  # how long states have not contradicted each other, s
         self._patience = WINDOW  # how long they must
         self._trusted = 0.0  # how long there has been no doubt, s
@@ -144,7 +173,9 @@ class StateCheck:
         h = stamp - self._time
         if self._doubt and -GAP <= h <= 0.0:
             return self._doubt  # once more, or in another order
-        nonsense = self._nonsense(state)
+        self._now.q[:], self._now.v[:] = state
+        outside, too_fast = self._nonsense()
+        nonsense = OUTSIDE if outside else TOO_FAST if too_fast else ""
         if not 0.0 < h <= GAP:
             self.reset()
         before, self._last, self._time = self._last, None if nonsense else state, stamp
@@ -157,9 +188,11 @@ class StateCheck:
                 self._believed = state, stamp
                 return ""
             before, h = state, 0.0
-        jumps = self._jumps(before, state, h)
+        self._before.q[:], self._before.v[:] = before
         frozen = self._freeze.look(before, state, h)
-        contradicts = self._contradicts(before, state, h, jumps) or frozen
+        awakes = self._doubt == FROZEN and self._freeze.changing <= h
+        jumps, contradicts = self._compare(h, float(awakes))
+        contradicts = contradicts or frozen
         self._agreed = 0.0 if jumps or contradicts else self._agreed + h
         if contradicts:
             if not self._contradiction:
@@ -177,68 +210,78 @@ class StateCheck:
             self._believed = state, stamp
         return self._doubt
 
-    def _nonsense(self, state: State) -> str:
-        """Return what is wrong with a state by itself, or nothing."""
-        if not ((self._low <= state.q) & (state.q <= self._high)).all():
-            return OUTSIDE
-        if self._with_velocities and (np.abs(state.v) > self._fastest).any():
-            return TOO_FAST
-        return ""
-
-    def _jumps(self, before: State, now: State, h: float) -> bool:
-        """Return whether no motion leads from one state to another."""
-        free = self._position + h * self._velocity + self._between(h)
-        moved = now.q - before.q
-        if not self._with_velocities:
-            return bool((np.abs(moved) > free + h * self._fast).any())
-        low, high = np.minimum(before.v, now.v), np.maximum(before.v, now.v)
-        return bool(((moved < h * low - free) | (moved > h * high + free)).any())
-
-    def _between(self, h: float) -> Array:
-        """Return how much farther than by the speeds at both ends joints come, shape (n,), rad.
-
-        Light wrists could accelerate a thousand times as much as they do: they come no farther
-        than at twice the speed limit.
-        """
-        return np.minimum(h * h * self._quarter_a, h * self._limit)
-
-    def _contradicts(self, before: State, now: State, h: float, jumps: bool) -> bool:
-        """Return whether velocities have led elsewhere than where the joints are."""
-        if not self._with_velocities:
-            return False
-        awakes = self._doubt == FROZEN and self._freeze.changing <= h
-        if jumps or awakes:  # the next states are compared among themselves
-            self._drift = np.zeros_like(self._drift)
-            return False
-        self._drift = np.exp(-h / WINDOW) * self._drift
-        self._drift += now.q - before.q - 0.5 * h * (before.v + now.v)
-        allowed = self._position + WINDOW * self._velocity + h * self._limit + self._between(h)
-        if not (np.abs(self._drift) > allowed).any():
-            return False
-        self._drift = np.zeros_like(self._drift)
-        return True
-
     def _goes_on(self, state: State, stamp: float) -> bool:
         """Return whether a state may follow that which was believed last."""
         if self._believed is None:
             return self._agreed >= self._patience
-        before, then = self._believed
+        (before, then), errors = self._believed, self._errors
         h, moved = stamp - then, state.q - before.q
         if not self._contradiction and h <= SPIKE:
-            free = self._position + STAYS + h * self._velocity
+            free = errors.position + STAYS + h * errors.velocity
             if self._with_velocities:
                 low, high = np.minimum(before.v, state.v), np.maximum(before.v, state.v)
             else:
-                low, high = -self._fast, self._fast
+                low, high = -errors.fast, errors.fast
             if ((h * low - free <= moved) & (moved <= h * high + free)).all():
                 return True
-        free = self._position + STAYS
+        free = errors.position + STAYS
         if self._patience > WINDOW or not self._with_velocities:
             free = free + STOPS * UNSURE
         on = STOPS * before.v
         near = (np.minimum(on, 0.0) - free <= moved) & (moved <= np.maximum(on, 0.0) + free)
         awake = self._doubt == FROZEN and self._freeze.changing >= WINDOW
         return bool(near.all()) and self._agreed >= (WINDOW if awake else self._patience)
+
+
+@compiled
+def _nonsense(
+    now: State, low: Array, high: Array, fastest: Array, with_velocities: bool
+) -> tuple[bool, bool]:
+    """Return whether a state is far beyond its limits: of positions, of velocities."""
+    outside = too_fast = False
+    for i in range(low.size):
+        outside = outside or not low[i] <= now.q[i] <= high[i]
+        too_fast = too_fast or (with_velocities and abs(now.v[i]) > fastest[i])
+    return outside, too_fast
+
+
+@compiled
+def _compare(
+    before: State,
+    now: State,
+    errors: _Errors,
+    drift: Array,
+    with_velocities: bool,
+    h: float,
+    begins: float,
+) -> tuple[bool, bool]:
+    """Return whether no motion leads from one state to the next, and whether they contradict.
+
+    `drift` follows, and is zero where it `begins` anew.
+    """
+    jumps = contradicts = False
+    kept = math.exp(-h / WINDOW)
+    for i in range(drift.size):
+        moved = now.q[i] - before.q[i]
+        # Light wrists could accelerate a thousand times as much as they do: between two states
+        # they come no farther than at twice the speed limit.
+        between = min(h * h * errors.quarter_a[i], h * errors.limit[i])
+        free = errors.position[i] + h * errors.velocity[i] + between
+        if with_velocities:
+            low, high = min(before.v[i], now.v[i]), max(before.v[i], now.v[i])
+        else:
+            low, high = -errors.fast[i], errors.fast[i]
+        jumps = jumps or moved < h * low - free or moved > h * high + free
+        drift[i] = kept * drift[i] + moved - 0.5 * h * (before.v[i] + now.v[i])
+        allowed = errors.position[i] + WINDOW * errors.velocity[i] + h * errors.limit[i] + between
+        contradicts = contradicts or abs(drift[i]) > allowed
+    if jumps or begins or not with_velocities:
+        # After a jump the next states are compared among themselves.
+        contradicts = False
+        drift[:] = 0.0
+    elif contradicts:
+        drift[:] = 0.0
+    return jumps, contradicts
 
 
 def largest_accelerations(model: pin.Model, tau_max: Array) -> Array:
