@@ -13,7 +13,7 @@ from viability_bounds_pkg.baselines import naive_bounds
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.node.bounds_node import BoundsNode
-from viability_bounds_pkg.ros.runtime import STATUS_QOS
+from viability_bounds_pkg.ros.runtime import SLOW_QOS, STATUS_QOS
 from viability_bounds_pkg.testing.ros_harness import (
     acceleration_limits,
     joint_state,
@@ -120,6 +120,8 @@ def test_joints_in_any_order_and_others_with_them(ros):
 def test_distances_to_limits_are_shown_by_joint_until_the_robot_is_silent(ros):
     robot = BoundsProbe(ros, torque_max=[10.0, 20.0, 30.0])
     shown = ros.listen(JointState, "limit_distances", STATUS_QOS)
+    states = ros.listen(JointState, "slow/joint_states", SLOW_QOS)
+    limits = ros.listen(JointTrajectory, "slow/acceleration_limits", SLOW_QOS)
 
     def show(stamp, tau):
         state = joint_state(JOINTS, stamp, [0.9, -0.6, 50.0], [0.5, -2.5, 0.0], tau)
@@ -132,10 +134,15 @@ def test_distances_to_limits_are_shown_by_joint_until_the_robot_is_silent(ros):
     np.testing.assert_allclose(message.velocity, [0.5, -0.5, 3.0])
     np.testing.assert_allclose(message.effort, [9.0, 18.0, -10.0])
     assert not len(show(20 * MS, []).effort)
+    # Copies of the streams come with them.
+    ros.wait_until(lambda: 20 * MS in states.stamps and 20 * MS in limits.stamps)
+    assert (states[-1].name, states[-1].position.tolist()) == (JOINTS, [0.9, -0.6, 50.0])
+    assert limits[-1] == robot.answers[-1]
     ros.run_for(VALUES["state_timeout"] + 0.1)
-    shown.clear()
+    for each in (shown, states, limits):
+        each.clear()
     ros.run_for(0.2)
-    assert not shown
+    assert not shown and not states and not limits
 
 
 def test_the_same_state_again_gets_the_same_answer_again(ros):

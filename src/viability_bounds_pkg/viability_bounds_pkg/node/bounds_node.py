@@ -20,7 +20,7 @@ from viability_bounds_pkg.node.bounds_parameters import (
     BoundsConfiguration,
     make_bounds,
 )
-from viability_bounds_pkg.node.limit_distances import LimitDistances
+from viability_bounds_pkg.node.slow_topics import SlowTopics
 from viability_bounds_pkg.robot_configuration import TOPIC, RobotConfiguration, load_model
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, PeriodCheck, Verdict
@@ -72,7 +72,7 @@ class BoundsNode(ArmNode):
             [ACCELERATION_LIMITS.name, states.name],
             needs_estimates=config.use_estimated_states,
         )
-        self._distances = LimitDistances(self, config, self._reader)
+        self._slow_topics = SlowTopics(self, config, self._reader, self._answer)
         self._diagnostics = Diagnostics(
             self, self._report, self.publisher_watch, DescriptionWatch(self)
         )

@@ -132,6 +132,11 @@ class JointStateReader:
         self.accepted += 1
         return Verdict.NEW
 
+    @property
+    def message(self) -> JointState | None:
+        """The last accepted message; None before the first."""
+        return None if self._accepted is None else self._accepted[0]
+
     def expect(self, expected: Expected) -> None:
         """Say how the arm moves from the last state on, for what tells states that cannot be."""
         if self._check is not None:

@@ -22,6 +22,9 @@ GOAL_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 STATUS_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 """What tools show: also heard where a subscription is reliable, as those of RViz are."""
 
+SLOW_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
+"""Copies of streams for who looks on: the newest is enough."""
+
 LATCHED_QOS = QoSProfile(
     depth=1,
     reliability=ReliabilityPolicy.RELIABLE,

@@ -20,7 +20,7 @@ from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory
 
 from viability_bounds_pkg.ros.direct_delivery import DirectDelivery
-from viability_bounds_pkg.ros.runtime import CONTROL_QOS, LATCHED_QOS, STATUS_QOS
+from viability_bounds_pkg.ros.runtime import CONTROL_QOS, LATCHED_QOS, SLOW_QOS, STATUS_QOS
 
 USER = "user"
 """Stands for nodes of others."""
@@ -110,7 +110,7 @@ JOINT_STATES = Topic(
     JointState,
     CONTROL_QOS,
     ("bullet_node",),
-    ("bounds_node", "controller_node", "estimator_node", "scenario_node", "viewer_node"),
+    ("bounds_node", "controller_node", "estimator_node", "scenario_node"),
     "positions, rad, and velocities, rad/s; `effort` is the torque of the motors, N m; joints in "
     "any order, further joints are ignored; the stamp names the control step; `bullet_node` sends "
     "the movable joints that are locked, too",
@@ -130,7 +130,7 @@ ACCELERATION_LIMITS = Topic(
     JointTrajectory,
     CONTROL_QOS,
     ("bounds_node",),
-    ("controller_node", "scenario_node", "viewer_node"),
+    ("controller_node", "scenario_node"),
     "`points[0].accelerations` lower, `points[1].accelerations` upper, rad/s²; stamp of the state "
     "they answer",
 )
@@ -163,6 +163,23 @@ LIMIT_DISTANCES = Topic(
     "without them; `velocity` to velocity_max, rad/s; `effort` from the motors' torque to "
     "torque_max, N m, where both are known; 20 times a second, silent when the robot is; stamp of "
     "the joint state",
+)
+SLOW_JOINT_STATES = Topic(
+    "slow/joint_states",
+    JointState,
+    SLOW_QOS,
+    ("bounds_node",),
+    ("viewer_node",),
+    "the joint state that `bounds_node` answered last, 20 times a second, silent when the robot "
+    "is: for who looks on, or is connected by a slow network",
+)
+SLOW_ACCELERATION_LIMITS = Topic(
+    "slow/acceleration_limits",
+    JointTrajectory,
+    SLOW_QOS,
+    ("bounds_node",),
+    ("viewer_node",),
+    "the last `acceleration_limits`, as `slow/joint_states`",
 )
 ROBOT_DESCRIPTION = Topic(
     "robot_description",
@@ -206,6 +223,8 @@ SHARED_TOPICS = (
     JOINT_COMMANDS,
     FT_WRENCH,
     LIMIT_DISTANCES,
+    SLOW_JOINT_STATES,
+    SLOW_ACCELERATION_LIMITS,
     ROBOT_DESCRIPTION,
     DIAGNOSTICS,
     VALUES,

@@ -45,16 +45,14 @@ from viability_bounds_pkg.ros.program import (
 from viability_bounds_pkg.ros.robot_urdf import robot_urdf
 from viability_bounds_pkg.ros.runtime import GOAL_QOS
 from viability_bounds_pkg.ros.topics import (
-    ACCELERATION_LIMITS,
     DIAGNOSTICS,
     FT_WRENCH,
-    JOINT_STATES,
+    SLOW_ACCELERATION_LIMITS,
+    SLOW_JOINT_STATES,
 )
 
 PERIOD = 0.05
 """Between two pictures, s."""
-_NICENESS = 10
-"""Pictures may wait for the control where processors are few."""
 _SILENT = 1.0
 """How long without joint states until the page says so, s."""
 _SHOWN = "bullet_node", "bounds_node", "controller_node"
@@ -65,8 +63,9 @@ _VIOLATIONS = {"position_violation_rad": "rad", "velocity_violation_rad_s": "rad
 class ViewerNode(ArmNode):
     """Shows the arm in a browser: state, limits, goal and forces, and sends what the user asks.
 
-    It takes what has come last on each topic, 20 times a second, so that its cost does not grow
-    with the rate of the robot. It publishes nothing before its user switches "drive the arm" on.
+    It subscribes to slow copies of the streams, and shows 20 times a second what has come last, so
+    that neither its cost nor that of the control grows with the rate of the robot. It publishes
+    nothing before its user switches "drive the arm" on.
 
     Attributes:
         page: what is shown.
@@ -93,8 +92,8 @@ class ViewerNode(ArmNode):
         self._status: dict[str, tuple[str, dict[str, str]]] = {}
         self._driver = Driver(self, config)
         self._settings = RemoteSettings(self)
-        JOINT_STATES.subscription(self, self._on_state)
-        ACCELERATION_LIMITS.subscription(self, self._on_limits)
+        SLOW_JOINT_STATES.subscription(self, self._on_state)
+        SLOW_ACCELERATION_LIMITS.subscription(self, self._on_limits)
         if config.ft_frame:
             FT_WRENCH.subscription(self, self._on_wrench)
         DIAGNOSTICS.subscription(self, self._on_diagnostics)
@@ -152,10 +151,11 @@ class ViewerNode(ArmNode):
         return self._acceleration
 
     def _words(self) -> str:
-        if time.monotonic() - self._reader.heard_at > _SILENT:
-            paused = self._driver is not None and self._driver.robot_paused
-            return "the simulated robot is paused" if paused else "**no joint states come**"
         lines = []
+        if time.monotonic() - self._reader.heard_at > _SILENT:
+            if self._driver is not None and self._driver.robot_paused:
+                return "the simulated robot is paused"
+            lines.append("**`bounds_node` sends no joint states**")
         message, controller = self._status.get("controller_node", ("not heard", {}))
         lines.append(f"**controller**: {message}")
         if (short := controller.get("short_of_goal", "none")) != "none":
@@ -262,7 +262,9 @@ def main(args: list[str] | None = None) -> int:
         signals: list[int] = []
         for each in (signal.SIGINT, signal.SIGTERM):
             signal.signal(each, lambda number, _: signals.append(number))
-        os.nice(_NICENESS)
+        # Pictures wait for the control, however few processors there are; a low priority is not
+        # enough: a picture that has begun would keep its processor for milliseconds.
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
         node = ViewerNode()
         print(f"the arm is at {node.page.address}", flush=True)
         run(node, lambda: bool(signals))
