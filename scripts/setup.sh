@@ -75,6 +75,11 @@ _packages() {
 
 _install() {
     local options=() output
+    if [ -L "$venv" ]; then
+        echo "setup: .venv is a link to '$(readlink "$venv")', which would be wiped; remove the" \
+            "link" >&2
+        return 1
+    fi
     if [ "$ros" = sourced ]; then
         echo "setup: ROS 2 Jazzy is sourced; making .venv on top of its Python packages" >&2
         options+=(--system-site-packages)

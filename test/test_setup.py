@@ -67,6 +67,16 @@ def test_an_index_without_the_package(copy):
     assert "network" not in said
 
 
+def test_an_environment_that_is_a_link_is_not_wiped(copy, tmp_path_factory):
+    other = tmp_path_factory.mktemp("other")
+    (other / "kept").touch()
+    (copy / ".venv").symlink_to(other)
+    code, said = set_up(copy)
+    assert code == 1
+    assert f"setup: .venv is a link to '{other}', which would be wiped; remove the link" in said
+    assert (other / "kept").exists()
+
+
 def test_an_index_out_of_reach(copy):
     # Nothing listens at port 9.
     unreachable = {"PIP_NO_INDEX": "0", "PIP_INDEX_URL": "http://127.0.0.1:9/", "PIP_RETRIES": "1"}

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 _STARTS = 400
 _GOALS = 2  # at most
-_TRIES = 300  # for each
+_TRIES = 8  # for each
 _STEPS = 12  # of a straight way that are looked at
 _ALWAYS = 0.8  # share of postures: shapes that touch in as many are no collision of the arm
 _HELD_AT_START, _HELD_AT_GOAL = 0.6, 0.85  # of the torque limits, to hold the arm
@@ -183,35 +183,41 @@ def _goal(
     random: np.random.Generator,
     reached: NDArray[np.bool_],
 ) -> tuple[Array | None, NDArray[np.bool_]]:
-    """Return the posture of those tried with most joints at limits where none has been yet.
+    """Return a posture with joints at limits where none has been yet, of those tried with most.
 
-    Continuous joints, which have no position limits, turn by half a turn instead.
+    From the start one joint after the other, in random order, is brought to a limit if the arm can
+    still go there straight. Continuous joints, which have no position limits, turn by half a turn
+    instead.
 
     Args:
         chain: the arm.
         touches: tells its collisions with itself.
         start: from which a straight way leads there.
-        random: generator of postures.
+        random: generator of orders.
         reached: the limits that earlier goals have, shape (n, 2).
     """
     low = np.where(chain.continuous, start - np.pi, chain.q_min)
     high = np.where(chain.continuous, start + np.pi, chain.q_max)
-    best, of_best, most = None, np.zeros_like(reached), 0
-    middles = _within(chain, 0.5 + _MIDDLE * (random.random((_TRIES, len(start))) - 0.5))
-    for k, q in enumerate(middles):
-        # Nearly all joints at limits first, then fewer and fewer.
-        chosen = random.random(len(start)) < 1.0 - 0.9 * k / _TRIES
-        side = random.integers(0, 2, len(start))
-        at = np.stack([chosen & (side == 0), chosen & (side == 1)], axis=1)
-        fresh = int((at & ~reached).sum())
-        if fresh <= most:
-            continue
-        q = np.where(at[:, 0], low, np.where(at[:, 1], high, q))
-        way = [start + share * (q - start) for share in np.linspace(0.0, 1.0, _STEPS)[1:]]
-        held = max(_held(chain, each) for each in way) <= _HELD_AT_GOAL
-        if held and not any(map(touches, way)):
-            best, of_best, most = q, at, fresh
+    best, of_best = None, np.zeros_like(reached)
+    for _ in range(_TRIES):
+        q, at = start, np.zeros_like(reached)
+        for joint, side in random.permutation(np.argwhere(~reached)):
+            if at[joint].any():
+                continue
+            there = q.copy()
+            there[joint] = (low, high)[side][joint]
+            if _leads_straight(chain, touches, start, there):
+                q, at[joint, side] = there, True
+        if at.sum() > of_best.sum():
+            best, of_best = q, at
     return best, of_best
+
+
+def _leads_straight(chain: Chain, touches: SelfCollisions, start: Array, q: Array) -> bool:
+    """Return whether the motors can hold the arm on the straight way, and nothing touches."""
+    way = [start + share * (q - start) for share in np.linspace(1.0, 0.0, _STEPS)[:-1]]
+    held = all(_held(chain, each) <= _HELD_AT_GOAL for each in way)
+    return held and not any(map(touches, way))
 
 
 def _with_absolute_meshes(urdf: str, folder: Path | None) -> str:
