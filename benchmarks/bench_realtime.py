@@ -5,9 +5,10 @@ Each robot plays its demo's goals by turns in the ways to run it, without and wi
 that records; diagnostics of the robot tell what was missed: periods without their command in time,
 and those that passed while the simulated robot was late itself, whose motion would have gone on.
 "both" is what a real robot would miss. A bare loop, which sleeps until the next period and does
-nothing else, shows what the machine itself can do; relays in place of bounds and controller, in
-the robot's process, what messages and simulation take. Then, in lockstep, where the time of a
-period goes.
+nothing else, shows what the machine itself can do; a busy loop, which in each period computes for
+as long as the one process, what it leaves to programs that compute; relays in place of bounds and
+controller, in the robot's process, what messages and simulation take. Then, in lockstep, where the
+time of a period goes.
 """
 
 from __future__ import annotations
@@ -89,8 +90,12 @@ def memory(programs: Programs) -> float:
 
 def measure(
     robot: str, rate: float, way: str, seconds: float, imperfect: bool, scheduling: list[str]
-) -> str:
-    """Run a robot by the wall clock for some seconds; return the row of what came of it."""
+) -> tuple[str, float]:
+    """Run a robot by the wall clock for some seconds; return what came of it.
+
+    Returns:
+        the row, and the share of a processor that was used.
+    """
     arguments = configuration(robot, rate, imperfect=imperfect)
     run = ONE_PROCESS if way in (RECORDED, VIEWED) else way
     with running(run, arguments, imperfect, scheduling) as programs, ExitStack() as recording:
@@ -115,11 +120,11 @@ def measure(
     )
     latency = [float(after[f"latency_{part}_us"]) for part in ("p50", "p99")]
     errors = [float(after[f"period_error_{part}_us"]) for part in ("p50", "p99", "max")]
-    return row(way, periods, missed, late, stopped, errors, latency, cpu, megabytes)
+    return row(way, periods, missed, late, stopped, errors, latency, cpu, megabytes), cpu
 
 
-def bare_loop(rate: float, seconds: float) -> str:
-    """Sleep until each period begins and do nothing else; return the row of what came of it."""
+def bare_loop(rate: float, seconds: float, busy: float = 0.0) -> str:
+    """Sleep until each period begins, and be busy for a share of it; return the row."""
     dt, errors, lost, periods = 1.0 / rate, RecentValues(), 0, 0
     begin = last = time.monotonic()
     used = time.process_time()
@@ -133,9 +138,11 @@ def bare_loop(rate: float, seconds: float) -> str:
         periods += 1
         due += dt * (1 + late)
         last = now
+        while time.monotonic() < now + busy * dt:
+            pass
     cpu = (time.process_time() - used) / (last - begin)
     found = [1e6 * errors.percentile(50), 1e6 * errors.percentile(99), 1e6 * errors.largest]
-    return row("bare loop", periods, 0, lost, 0, found, [], cpu, math.nan)
+    return row("busy loop" if busy else "bare loop", periods, 0, lost, 0, found, [], cpu, math.nan)
 
 
 HEAD = (
@@ -322,10 +329,12 @@ def main() -> None:
             print(HEAD)
             print(bare_loop(rate, options.seconds))
             for way in WAYS:
-                print(
-                    measure(robot, rate, way, options.seconds, options.imperfect, scheduling),
-                    flush=True,
+                line, cpu = measure(
+                    robot, rate, way, options.seconds, options.imperfect, scheduling
                 )
+                print(line, flush=True)
+                if way == ONE_PROCESS:
+                    print(bare_loop(rate, options.seconds, min(cpu, 0.95)), flush=True)
         if options.only != "ways":
             stages(robot, rate, min(options.seconds, LONG_ENOUGH), options.imperfect)
 
