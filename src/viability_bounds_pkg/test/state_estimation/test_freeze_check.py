@@ -51,19 +51,19 @@ class Arm:
 
 @pytest.mark.parametrize("rate", [100.0, 500.0, 1000.0])
 def test_an_arm_with_noise_that_stands_is_told_to_be_frozen(rate):
-    arm = Arm(rate, noise=1e-12)
+    arm = Arm(rate, noise=1e-6)
     assert not arm.play(1.1 * max(ALIVE, STATES / rate))
     arm.noise = 0.0
     refused = arm.play(0.1)
     assert min(refused) <= max(ROW_TIME, 3.0 / rate) + 2.1 / rate
     assert set(refused.values()) == {FROZEN}
-    arm.noise = 1e-12  # awake again
+    arm.noise = 1e-6  # awake again
     again = arm.play(2.0)
     assert WINDOW - arm.h <= max(again) <= WINDOW + 2.0 * arm.h
 
 
 def test_velocities_alone_that_freeze_are_told():
-    arm = Arm(noise=1e-12)
+    arm = Arm(noise=1e-6)
     assert not arm.play(1.1 * ALIVE)
     arm.noise = 0.0
 
@@ -80,9 +80,27 @@ def test_an_arm_without_noise_that_stands_is_believed_however_long():
     assert not arm.play(5.0, a=np.full(N, 0.2))  # posture error, held by a payload
 
 
+@pytest.mark.parametrize("frequency", [0.0, 3.0])
+def test_motions_that_end_and_rounding_are_no_noise(frequency):
+    """Afterwards the arm may stand, or all its joints have the same speed, to the last bit."""
+    arm = Arm()
+
+    def ends(t):
+        v = 0.009 * np.exp(-t / 0.3) * np.cos(2.0 * np.pi * frequency * t)
+        return State(REST.q, np.full(N, v))
+
+    assert not arm.play(2.0, ends)
+    assert not arm.play(0.5)
+    arm.noise = 1e-15
+    assert not arm.play(2.0)
+    arm.noise = 0.0
+    assert not arm.play(0.5)
+    assert not arm.play(0.5, lambda t: State(REST.q + t, np.full(N, 1.0)))
+
+
 def test_where_noise_ended_the_arm_is_believed_in_the_end():
     """Brakes, for example, that take it off."""
-    arm = Arm(noise=1e-12)
+    arm = Arm(noise=1e-6)
     assert not arm.play(1.1 * ALIVE)
     arm.noise = 0.0
     refused = arm.play(20.0)

@@ -3,7 +3,9 @@
 
 Velocities that stay the same to the last bit have *frozen*, or they are those of an arm that
 stands and whose sensors are too coarse to tell. Where that of a joint at rest has been seen to
-change for `ALIVE` at each state, it is the first. Otherwise it matters when the arm is to move and
+change to and fro for `ALIVE` at each state, it is the first; changes by less than `NOISE` do not
+count: they are rounding in a simulation, where joints may be equally fast to the last bit, too.
+Otherwise it matters when the arm is to move and
 positions stay the same, too. With the speed v that they report and the acceleration a that the
 motors are to give, both fading within `FADING` for what is not known,
 
@@ -40,6 +42,13 @@ LEARNED = 0.1
 ALIVE, STATES = 1.0, 200
 """How long, in s, and how often at least a joint at rest changes where its last bits are noise."""
 
+NOISE = 1e-9
+"""Change of a velocity that is more than rounding, rad/s."""
+
+TURNS = 0.25
+"""Share of changes that have another direction than those before, at least: it is noise, and not
+a motion that ends."""
+
 REST = 0.01
 """Speed below which a joint is at rest here, rad/s."""
 
@@ -72,6 +81,20 @@ class Expected(NamedTuple):
     v: Array | None = None
 
 
+class _Changes(NamedTuple):
+    """Changes of velocities, one after the other, of each joint while it is at rest; shapes (n,).
+
+    Attributes:
+        count: how many.
+        turns: how many had another direction than the one before.
+        last: the last one, rad/s.
+    """
+
+    count: Array
+    turns: Array
+    last: Array
+
+
 class FreezeCheck:
     """Looks at the joint states of one arm, one after the other.
 
@@ -93,7 +116,7 @@ class FreezeCheck:
         self._tau_max, self._allowed = tau_max, allowed
         self._with_velocities = with_velocities
         ones = np.ones_like(tau_max)  # compiled now, not in a control loop
-        _count_changes(ones.copy(), ones, ones)
+        _count_changes(ones.copy(), ones.copy(), ones.copy(), ones, ones)
         self.reset()
 
     def reset(self) -> None:
@@ -101,7 +124,7 @@ class FreezeCheck:
         zero = np.zeros_like(self._tau_max)
         self.expected: Expected | None = None
         self.changing = 0.0
-        self._changes = zero.copy()  # of each joint at rest, one after the other
+        self._changes = _Changes(zero.copy(), zero.copy(), zero.copy())
         self._alive = False  # whether there is always one
         self._told = False
         self._speed = self._held = zero
@@ -134,12 +157,13 @@ class FreezeCheck:
             if self._alive:
                 self._alive = self._row <= 1 or self._told
             elif self._with_velocities:
-                most = _count_changes(self._changes, before.v, now.v)
+                most = _count_changes(*self._changes, before.v, now.v)
                 self._alive = most >= max(STATES, ALIVE / h)
             self._begin()
             self.changing += h
             return False
-        self._changes.fill(0.0)
+        for each in self._changes:
+            each.fill(0.0)
         self._row, self._row_time, self.changing = self._row + 1, self._row_time + h, 0.0
         if self._told:
             return False
@@ -171,13 +195,20 @@ class FreezeCheck:
 
 
 @compiled
-def _count_changes(changes: Array, before: Array, now: Array) -> float:
-    """Count how often in a row velocities of joints at rest have changed; return the most."""
+def _count_changes(count: Array, turns: Array, last: Array, before: Array, now: Array) -> float:
+    """Count how often in a row velocities of joints at rest have changed by noise.
+
+    Returns the most of them.
+    """
     most = 0.0
-    for i in range(changes.size):
-        if now[i] == before[i]:
-            changes[i] = 0.0
-        elif abs(now[i]) < REST:
-            changes[i] += 1.0
-        most = max(most, changes[i])
+    for i in range(count.size):
+        change = now[i] - before[i]
+        if change == 0.0:
+            count[i] = turns[i] = 0.0
+        elif abs(change) > NOISE and abs(now[i]) < REST:
+            count[i] += 1.0
+            turns[i] += change * last[i] < 0.0
+            last[i] = change
+        if turns[i] >= TURNS * count[i]:
+            most = max(most, count[i])
     return most
