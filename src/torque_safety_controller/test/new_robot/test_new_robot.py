@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is found in a URDF, what is estimated from it, and what is refused."""
 
+import sys
 from functools import cache
 
 import numpy as np
@@ -219,11 +220,33 @@ def test_the_tool_refuses_in_one_line(tmp_path, capsys):
     assert [line.startswith("new_robot: ") for line in errors] == [True, True, True]
     assert "no_link" in errors[0]
     assert "none.urdf" in errors[1]
-    assert "xacro" in errors[2]
+    assert errors[2].endswith("fails: unknown macro name: xacro:arm; give it what it asks for")
     assert not list(out.rglob("*.yaml"))
     with pytest.raises(SystemExit):
         main([str(path), "hand", "--topic"])
     assert "either a URDF or --topic" in capsys.readouterr().err
+
+
+def test_a_file_for_xacro_is_expanded(tmp_path, monkeypatch, capsys):
+    text = urdf().replace("<robot ", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" ')
+    mass = '<mass value="2.0"'
+    assert mass in text
+    begin = text.index(">", text.index("<robot")) + 1
+    text = text.replace(mass, '<mass value="${m / 2}"')
+    text = f'{text[:begin]}<xacro:property name="m" value="4"/>{text[begin:]}'
+    path = tmp_path / "arm.urdf.xacro"
+    path.write_text(text)
+    assert main([str(path), "hand", "--name", "arm", "--out", str(tmp_path)]) == 0
+    assert mass in (tmp_path / "arm.urdf").read_text()
+    monkeypatch.setitem(sys.modules, "xacro", None)  # as if it was not there
+    assert main([str(path), "hand", "--name", "b", "--out", str(tmp_path)]) == 1
+    assert "pip install xacro, or apt install ros-jazzy-xacro" in capsys.readouterr().err
+
+
+def test_xacro_in_a_comment_is_none(tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text(urdf().replace("</robot>", "<!-- <xacro:if>\n--></robot>"))
+    assert main([str(path), "hand", "--out", str(tmp_path)]) == 0
 
 
 def test_files_are_not_replaced_unasked_and_say_where_numbers_come_from(tmp_path, capsys):

@@ -41,8 +41,9 @@ USEFUL = 3.0
 LEAST = 1.0
 """What is put up with where USEFUL cannot be had by lowering speeds, rad/s^2."""
 
-SLOWEST = 0.5
-"""Speeds are lowered to this share of the URDF's at most; below, the safety filter is chosen."""
+SLOWEST, FAST = 0.5, 1.0
+"""Speeds are lowered to this share of the URDF's at most, or while all are above so many rad/s, as
+those of unloaded motors are in some URDFs. Below, the safety filter is chosen."""
 
 SHARE = 0.8
 """Share of random states in which limits are available of joints that have none in all states."""
@@ -60,7 +61,7 @@ SLOWER = 0.75
 """Factor by which speeds are lowered as long as the drift is too large for the highest rate."""
 
 SLOWEST_FOR_DRIFT = 0.1
-"""Share of the URDF's speeds to which they are lowered for this at most."""
+"""Share of the URDF's speeds to which they are lowered for this at most, or to `FAST`."""
 
 SEARCH = 10_000  # evaluations
 
@@ -119,7 +120,7 @@ def estimate(chain: Chain, rate_hz: float | None = None) -> Estimates:
         if _room(worst).min() >= required:
             break
         found = largest_velocity_scale(model, space, required)
-        if found.scale >= SLOWEST:
+        if found.scale >= SLOWEST or found.scale * chain.v_max.min() >= FAST:
             scale = float(np.floor(100.0 * found.scale) / 100.0)
             why = (
                 f"{scale:g} of the URDF's: at higher speeds {found.joint} cannot always "
@@ -143,7 +144,7 @@ def estimate(chain: Chain, rate_hz: float | None = None) -> Estimates:
         except _DriftError:
             # It grows with the square of the speeds.
             scale = float(f"{SLOWER * scale:.2g}")
-            if scale < SLOWEST_FOR_DRIFT:
+            if scale < SLOWEST_FOR_DRIFT and scale * chain.v_max.min() < FAST:
                 raise
             slower = f" Speeds are {scale:g} of the URDF's because of the drift at this rate."
             space = _space(chain, rounded(scale * chain.v_max, ROUND_DOWN))

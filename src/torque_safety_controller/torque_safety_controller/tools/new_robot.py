@@ -8,8 +8,7 @@ writes the robot's file, one of an imperfect robot, and a scenario that drives i
 from __future__ import annotations
 
 import argparse
-import shutil
-import subprocess
+import re
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -101,7 +100,9 @@ def _read(options: argparse.Namespace) -> tuple[str, str, Path | None]:
     if options.topic:
         return _from_topic(), "", None
     path = resolve_uri(options.urdf).resolve()
-    if path.suffix == ".xacro" or "<xacro:" in path.read_text(errors="replace"):
+    # What xacro has made may have calls of it left in comments.
+    text = re.sub("<!--.*?-->", "", path.read_text(errors="replace"), flags=re.DOTALL)
+    if path.suffix == ".xacro" or "<xacro:" in text:
         return _through_xacro(path), "", path.parent
     return read_urdf(str(path)), _uri(path), path.parent
 
@@ -120,18 +121,19 @@ def _from_topic() -> str:
 
 
 def _through_xacro(path: Path) -> str:
-    program = shutil.which("xacro")
-    if program is None:
+    try:
+        import xacro
+    except ImportError as error:
         raise NewRobotError(
-            f"{path} is for xacro, which is not installed; apt install ros-jazzy-xacro, or give "
-            "a URDF made elsewhere by: xacro FILE > robot.urdf"
-        )
-    done = subprocess.run([program, str(path)], capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        lines = done.stderr.strip().splitlines() or ["no message"]
-        raise NewRobotError(f"xacro {path} fails: {lines[-1]}; give it what it asks for")
-    check_urdf(done.stdout, str(path))
-    return done.stdout
+            f"{path} is for xacro, which is not installed; pip install xacro, or apt install "
+            "ros-jazzy-xacro"
+        ) from error
+    try:
+        urdf: str = xacro.process_file(str(path)).toprettyxml(indent="  ")
+    except Exception as error:  # of many kinds: of its own, of XML, of Python in the file
+        raise NewRobotError(f"xacro {path} fails: {error}; give it what it asks for") from error
+    check_urdf(urdf, str(path))
+    return urdf
 
 
 def _uri(path: Path) -> str:

@@ -85,12 +85,12 @@ class _Changes(NamedTuple):
     """Changes of velocities, one after the other, of each joint while it is at rest; shapes (n,).
 
     Attributes:
-        count: how many.
+        number: how many.
         turns: how many had another direction than the one before.
         last: the last one, rad/s.
     """
 
-    count: Array
+    number: Array
     turns: Array
     last: Array
 
