@@ -27,8 +27,10 @@ Writes figures to results/, and prints a table with the paper's numbers and ours
   faults             messages lost, late or wrong between the nodes, in real time (20 min)
   process-faults     nodes killed, stopped, started again or late, and other faults of processes, in
                      real time (30 min)
+  false-alarms       ten minutes of random motions of each robot, ideal and imperfect: right states
+                     must not be refused (20 min)
   exactness          the bounds compared with brute force (30 min)
-  all                all of the above but time_to_goal, adversary, imperfect, faults, process-faults, exactness (default)
+  all                all of the above but time_to_goal, adversary, imperfect, faults, process-faults, false-alarms, exactness (default)
 USAGE
 }
 
@@ -45,7 +47,7 @@ fi
 what="${what//-/_}"
 [ "$what" != adversary ] || what=search_adversary
 case "$what" in
-paper0 | paper1_integral | paper1_compliance | two_hands | departures | state_dependent | friction | out_of_reach | stopping | whole_arm | time_to_goal | search_adversary | imperfect | faults | process_faults | exactness) ;;
+paper0 | paper1_integral | paper1_compliance | two_hands | departures | state_dependent | friction | out_of_reach | stopping | whole_arm | time_to_goal | search_adversary | imperfect | faults | process_faults | false_alarms | exactness) ;;
 *)
     echo "error: unknown '$what'; --help lists what there is" >&2
     exit 2

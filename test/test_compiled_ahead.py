@@ -79,3 +79,23 @@ def test_every_compiled_function_is_kept(not_kept):
 @pytest.mark.usefixtures("not_kept")
 def test_nodes_compile_nothing():
     assert run("-c", COMPILED_BY_NODES, yaml.safe_dump(PLAYED)) == ""
+
+
+def test_a_file_that_is_wrong_is_told_and_the_others_are_compiled(tmp_path):
+    (tmp_path / "obstacles").mkdir()
+    (tmp_path / "obstacles" / "panda_wall.yaml").write_text(yaml.safe_dump(OBSTACLES))
+    (tmp_path / "panda.yaml").write_text("nonsense: 3")  # the file of this name is played then
+    (tmp_path / "none_such.yaml").write_text("nonsense: 3")
+    code = "import sys, pathlib, compile as c; c.CONFIG = pathlib.Path(sys.argv[1]); c.main([])"
+    done = subprocess.run(
+        [sys.executable, "-c", code, tmp_path],
+        cwd=ROOT / "scripts",
+        env=os.environ
+        | {"PYTHONPATH": os.pathsep.join(map(str, [ROOT / "reproduction", *sys.path]))},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0
+    assert "setup: nothing is compiled for none_such.yaml: " in done.stderr
+    assert "panda" not in done.stderr
