@@ -3,7 +3,7 @@
 
 bash scripts/reproduce.sh false-alarms [--robot NAME] [--minutes N]
 
-In lockstep. Goals of the posture come after 0.3 to 9 s, so that the arm is in motion when some come
+In lockstep. Posture goals come after 0.3 to 9 s, so that the arm is in motion when some come
 and has stood for long when others do; half of their positions are limits.
 """
 
