@@ -22,6 +22,7 @@ from torque_safety_controller.tasks.pose_task import PoseTask
 from torque_safety_controller.tasks.posture_search import COST
 from torque_safety_controller.tasks.posture_task import PostureTask
 from torque_safety_controller.tasks.standstill import LOOKED_AT, PATIENCE, SHORT
+from torque_safety_controller.tasks.way_task import WayTask
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import read_config
 from viability_bounds_pkg.whole_arm.safety_filter import SafetyFilter
@@ -283,3 +284,16 @@ def test_other_ways_are_tried_where_the_arm_does_not_follow_ever_less_often():
             rests[-1] += 1
         arm.wait_for(Progress.NO_WAY)
     assert rests[0] < rests[1] < rests[2]
+
+
+@pytest.mark.parametrize(
+    ("q", "closely"), [(BELOW - [0.4, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], True), (EDGE, False)]
+)
+def test_an_arm_that_left_a_straight_way_is_kept_to_it(q, closely):
+    """On a way with corners other ways are tried instead."""
+    arm, followed = Arm(), []
+    for _ in range(2):
+        followed.append(type(arm.wait_for(Progress.LED, q)[0]))
+        while arm.detour.progress is Progress.LED:
+            arm.step(q)
+    assert followed == [PostureTask, WayTask if closely else PostureTask]
