@@ -158,6 +158,12 @@ stop() {
     local running
     mapfile -t running < <(jobs -p)
     kill "${running[@]}" 2>/dev/null || true
+    # The page has only the time that others leave: on a busy machine it would end minutes later.
+    for _ in {1..50}; do
+        kill -0 "${running[@]}" 2>/dev/null || break
+        sleep 0.1
+    done
+    kill -KILL "${running[@]}" 2>/dev/null || true
     wait 2>/dev/null || true
     [ -z "$held" ] || rm -f "$scenario"
 }

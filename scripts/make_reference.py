@@ -23,6 +23,7 @@ from sim_bridge.nodes.bullet_parameters import BulletConfiguration
 from sim_bridge.nodes.fault_node import FaultConfiguration
 from sim_bridge.scenario.scenario import ScenarioConfiguration
 from sim_bridge.viewer.node.viewer_parameters import ViewerConfiguration
+from torque_safety_controller.remote.moveit_parameters import MoveitConfiguration
 from torque_safety_controller.node import topics as controller_topics
 from torque_safety_controller.parameters import ControllerConfiguration
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
@@ -40,6 +41,7 @@ CONFIGURATIONS = {
     "scenario_node": ScenarioConfiguration,
     "viewer_node": ViewerConfiguration,
     "fault_node": FaultConfiguration,
+    "moveit_node": MoveitConfiguration,
 }
 TABLES = {node: parameter_table(kind) for node, kind in CONFIGURATIONS.items()}
 TOPICS: tuple[Topic, ...] = (*SHARED_TOPICS, *controller_topics.TOPICS, *bullet_topics.TOPICS)

@@ -117,7 +117,7 @@ def test_a_user_gives_goals_and_reads():
 
 
 def test_each_program_has_an_enclave_with_its_nodes():
-    wanted = {name: {name} for name in (*NODES, "user")} | STACKS
+    wanted = {name: {name} for name in (*NODES, "moveit_node", "user")} | STACKS
     found = {}
     for enclave in ElementTree.parse(POLICY).getroot().find("enclaves"):
         profiles = enclave.find("profiles")
@@ -147,7 +147,7 @@ def test_the_tools_of_ros_make_permissions_of_it(tmp_path):
     result = run(str(tmp_path / "keys"), ROS_DOMAIN_ID="7")
     assert result.returncode == 0, result.stderr
     assert f"export ROS_SECURITY_KEYSTORE={tmp_path}/keys" in result.stdout
-    for name in (*NODES, "user"):
+    for name in (*NODES, "moveit_node", "user"):
         folder = tmp_path / "keys" / "enclaves" / "arm" / name
         assert (folder / "permissions.p7s").stat().st_size > 0
         root = ElementTree.parse(folder / "permissions.xml").getroot()

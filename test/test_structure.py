@@ -23,6 +23,7 @@ ROS = {
     "rclpy",
     "rcl_interfaces",
     "builtin_interfaces",
+    "control_msgs",
     "diagnostic_msgs",
     "geometry_msgs",
     "rosgraph_msgs",

@@ -39,6 +39,7 @@ setup(
             "controller_node = torque_safety_controller.cli.ros_program:controller_node",
             "gain_limits = torque_safety_controller.cli.ros_program:gain_limits",
             "identify_friction = torque_safety_controller.cli.ros_program:identify_friction",
+            "moveit_node = torque_safety_controller.cli.ros_program:moveit_node",
             "new_robot = torque_safety_controller.cli.ros_program:new_robot",
             "safety_stack = torque_safety_controller.cli.ros_program:safety_stack",
             "teleop = torque_safety_controller.cli.ros_program:teleop",

@@ -33,5 +33,5 @@ def simulated_stack() -> int:
 
 def viewer_node() -> int:
     """Run the node that shows the arm in a browser."""
-    libraries = "viser", "trimesh"
+    libraries = {name: f"pip install {name}" for name in ("viser", "trimesh")}
     return run_with_ros("viewer_node", "sim_bridge.viewer.node.viewer_node", libraries)

@@ -21,6 +21,12 @@ def gain_limits() -> int:
     return run_program("torque_safety_controller.tools.gain_limits")
 
 
+def moveit_node() -> int:
+    """Run the node that takes what MoveIt sends."""
+    libraries = {"control_msgs": "apt install ros-jazzy-control-msgs"}
+    return run_with_ros("moveit_node", "torque_safety_controller.remote.moveit_node", libraries)
+
+
 def new_robot() -> int:
     """Make the parameter files of an arm from its URDF."""
     return run_program("torque_safety_controller.tools.new_robot")

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Goals that move: jogs of the hand and of the joints, and trajectories; no ROS."""
+"""Goals that move: jogs of the hand and of the joints, trajectories; no ROS."""

@@ -61,7 +61,7 @@ TARGET_JOINT_TRAJECTORY = Topic(
     "target_joint_trajectory",
     JointTrajectory,
     GOAL_QOS,
-    (USER, "viewer_node"),
+    (USER, "viewer_node", "moveit_node"),
     (_NODE,),
     "positions of all joints over time, rad, perhaps with velocities and accelerations, matched "
     "by name; a goal for the pose is given up; without points: the joints come to rest",
@@ -79,7 +79,7 @@ JOG_JOINTS = Topic(
     "jog_joints",
     JointState,
     GOAL_QOS,
-    (USER,),
+    (USER, "moveit_node"),
     (_NODE,),
     "`velocity` of the joints named for at most 0.25 s, rad/s, of the others 0; no `position`; a "
     "goal for the pose is given up",
@@ -126,7 +126,7 @@ CONTROLLER_MODE = Topic(
     String,
     LATCHED_QOS,
     (_NODE,),
-    (USER,),
+    ("moveit_node", USER),
     "TRACKING, HOLD, POSITION or STOPPED, when it changes; the reasons are in `/diagnostics`",
 )
 GOALS = (

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""For users of a controller that runs: a client for programs, and the keyboard."""
+"""For users of a controller that runs: a client for programs, the keyboard, MoveIt."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Mapping
 from importlib import import_module
 
 from viability_bounds_pkg.cli.command_line import INTERRUPTED
@@ -21,13 +21,13 @@ def run_program(module: str) -> int:
     return _run(_load(module))
 
 
-def run_with_ros(program: str, module: str, libraries: Collection[str] = ()) -> int:
+def run_with_ros(program: str, module: str, libraries: Mapping[str, str] | None = None) -> int:
     """Run a program that imports ROS 2, as `run_program`; return 1 without ROS 2.
 
     Args:
         program: its name, for the message.
         module: dotted name of the module.
-        libraries: others that it needs and that may be missing.
+        libraries: others that it needs and that may be missing, and what installs them.
     """
     try:
         main = _load(module)
@@ -35,8 +35,8 @@ def run_with_ros(program: str, module: str, libraries: Collection[str] = ()) -> 
         missing = error.name or str(error)
         if missing.split(".")[0] == module.split(".")[0]:
             raise
-        if missing in libraries:
-            print(f"{program}: needs '{missing}': pip install {missing}", file=sys.stderr)
+        if libraries and missing in libraries:
+            print(f"{program}: needs '{missing}': {libraries[missing]}", file=sys.stderr)
             return 1
         print(
             f"{program}: this program needs ROS 2 Jazzy (no Python module '{missing}'): "

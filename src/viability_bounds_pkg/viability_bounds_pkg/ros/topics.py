@@ -169,7 +169,7 @@ SLOW_JOINT_STATES = Topic(
     JointState,
     SLOW_QOS,
     ("bounds_node",),
-    ("viewer_node", USER),
+    ("viewer_node", "moveit_node", USER),
     "the joint state that `bounds_node` answered last, 20 times a second, silent when the robot "
     "is: for who looks on, or is connected by a slow network",
 )

@@ -11,6 +11,7 @@ import socket
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -253,6 +254,17 @@ def run(node: ViewerNode, ended: Callable[[], bool]) -> None:
     executor.remove_node(node)
 
 
+def _step_back() -> None:
+    """Let all threads wait for the control, however few processors there are.
+
+    A low priority is not enough: a picture that has begun would keep its processor for
+    milliseconds. Not before the page is there: on a busy machine it would never be.
+    """
+    for thread in map(int, os.listdir("/proc/self/task")):
+        with suppress(ProcessLookupError):  # one that has just ended
+            os.sched_setscheduler(thread, os.SCHED_IDLE, os.sched_param(0))
+
+
 def main(args: list[str] | None = None) -> int:
     """Serve the page until SIGINT or SIGTERM comes; return the exit code."""
     node = None
@@ -262,11 +274,9 @@ def main(args: list[str] | None = None) -> int:
         signals: list[int] = []
         for each in (signal.SIGINT, signal.SIGTERM):
             signal.signal(each, lambda number, _: signals.append(number))
-        # Pictures wait for the control, however few processors there are; a low priority is not
-        # enough: a picture that has begun would keep its processor for milliseconds.
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
         node = ViewerNode()
         print(f"the arm is at {node.page.address}", flush=True)
+        _step_back()
         run(node, lambda: bool(signals))
     except ArmSafetyError as error:
         report_refusal(error)

@@ -1,0 +1,374 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The MoveIt node: the action FollowJointTrajectory and JointJog in, goals of the controller out.
+
+It needs the package control_msgs.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from control_msgs.action import FollowJointTrajectory
+from control_msgs.msg import JointJog, JointTolerance
+from rclpy.action import ActionServer, CancelResponse
+from rclpy.action.server import ServerGoalHandle
+from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
+from rclpy.publisher import Publisher
+from rclpy.task import Future
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from torque_safety_controller.driving.execution import Execution, Progress, Tolerances
+from torque_safety_controller.remote.moveit_parameters import MoveitConfiguration
+from torque_safety_controller.node.driving import joint_trajectory_from_message
+from torque_safety_controller.node.goals import GoalRefused
+from torque_safety_controller.node.topics import (
+    CONTROLLER_MODE,
+    JOG_JOINTS,
+    TARGET_JOINT_TRAJECTORY,
+)
+from viability_bounds_pkg.ros.arm_node import ArmNode
+from viability_bounds_pkg.ros.messages import JointStateReader
+from viability_bounds_pkg.ros.parameters import NodeParameters
+from viability_bounds_pkg.ros.program import run
+from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp, stamp_to_ns
+from viability_bounds_pkg.ros.topics import SLOW_JOINT_STATES, Topic
+from viability_bounds_pkg.state import State
+
+Result = FollowJointTrajectory.Result
+Feedback = FollowJointTrajectory.Feedback
+
+PERIOD = 0.05
+"""Between two looks at the arm, s."""
+_SILENT = 1.0
+"""How long the joint states may be silent while the arm follows a trajectory, s."""
+_CONNECTING = 5.0
+"""How long the controller may take to listen, s."""
+_LEAVING = Duration(seconds=0.5)
+"""How long what was published last may take to arrive."""
+_JOG_TIME = 2.0
+"""How long after the last jog others may not jog, s."""
+
+_ENDS = {
+    Progress.REACHED: Result.SUCCESSFUL,
+    Progress.OFF_PATH: Result.PATH_TOLERANCE_VIOLATED,
+    Progress.NOT_REACHED: Result.GOAL_TOLERANCE_VIOLATED,
+}
+
+
+class Refused(GoalRefused):
+    """A goal of the action that cannot be followed; `code` is that of the action's result."""
+
+    def __init__(self, text: str, code: int = Result.INVALID_GOAL) -> None:
+        super().__init__(text)
+        self.code = code
+
+
+def tolerances_from_message(
+    given: Sequence[JointTolerance], joints: Sequence[str], default: float
+) -> Tolerances:
+    """Return the tolerances that a goal asks for: 0 stands for the default, -1 for none.
+
+    Args:
+        given: of some of the joints.
+        joints: names of the n joints.
+        default: of positions, rad; velocities have none.
+
+    Raises:
+        GoalRefused: an unknown joint, numbers that are no tolerances, or one of acceleration,
+            which is not measured.
+    """
+    n = len(joints)
+    parts = {"position": np.full(n, default), "velocity": np.full(n, math.inf)}
+    for tolerance in given:
+        if tolerance.name not in joints:
+            raise Refused(f"tolerance of unknown joint '{tolerance.name}'", Result.INVALID_JOINTS)
+        if tolerance.acceleration > 0.0:
+            raise Refused(f"{tolerance.name}: tolerance of acceleration; allowed: 0 or -1")
+        for name, part in parts.items():
+            value = getattr(tolerance, name)
+            if not (value >= 0.0 or value == -1.0):
+                raise Refused(f"{tolerance.name}: tolerance {value:g}; allowed: 0, above, or -1")
+            if value:
+                part[joints.index(tolerance.name)] = value if value > 0.0 else math.inf
+    return Tolerances(**parts)
+
+
+@dataclass(eq=False)
+class _Run:
+    """A goal of the action that has been taken."""
+
+    handle: ServerGoalHandle
+    execution: Execution | None
+    ended: Future = field(default_factory=Future)
+    result: Any = field(default_factory=Result)
+    taken: float = field(default_factory=time.monotonic)
+    sent: bool = False
+
+
+class _Outlet:
+    """A topic of goals, published only while somebody drives, so that others may otherwise."""
+
+    def __init__(self, node: ArmNode, topic: Topic) -> None:
+        self._node, self._topic = node, topic
+        self._publisher: Publisher | None = None
+
+    @property
+    def ready(self) -> bool:
+        """Whether a controller listens; the first question begins to publish."""
+        if self._publisher is None:
+            self._publisher = self._topic.publisher(self._node)
+        return self._publisher.get_subscription_count() > 0
+
+    @property
+    def others(self) -> bool:
+        """Whether another node publishes it."""
+        return self._node.count_publishers(self._topic.name) > (self._publisher is not None)
+
+    def publish(self, message: Any) -> None:
+        """Publish to those who listen."""
+        if self.ready and self._publisher is not None:
+            self._publisher.publish(message)
+
+    def close(self) -> None:
+        """Publish no more, after what was published has arrived."""
+        if self._publisher is not None:
+            self._publisher.wait_for_all_acked(_LEAVING)
+            self._node.destroy_publisher(self._publisher)
+            self._publisher = None
+
+
+class MoveitNode(ArmNode):
+    """Offers the action FollowJointTrajectory, and takes JointJog, as MoveIt sends them.
+
+    A process of its own beside the controller, whose control steps it does not delay. The last
+    goal counts: an older one is aborted. What is asked for is checked as the controller checks
+    it, and a goal that cannot be followed is aborted with the reason in its result.
+    """
+
+    NAME = "moveit_node"
+    PARAMETERS = MoveitConfiguration
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__(**node_arguments)
+        self._runs: dict[bytes, _Run] = {}
+        self._run: _Run | None = None
+        self._trajectories = _Outlet(self, TARGET_JOINT_TRAJECTORY)
+        self._jogs = _Outlet(self, JOG_JOINTS)
+        self._jogged = -math.inf
+        self._mode = ""
+        action = f"{self.get_fully_qualified_name()}/follow_joint_trajectory"
+        with self.starting():
+            self.claim("serves", action)
+            self._config = NodeParameters(self, MoveitConfiguration).configuration
+        self._reader = JointStateReader(self._config.joints)
+        SLOW_JOINT_STATES.subscription(self, self._on_state)
+        CONTROLLER_MODE.subscription(self, self._on_mode)
+        self.create_subscription(JointJog, "~/joint_jog", self._on_jog, GOAL_QOS)
+        self._server = ActionServer(
+            self,
+            FollowJointTrajectory,
+            "~/follow_joint_trajectory",
+            self._answer,
+            handle_accepted_callback=self._take,
+            cancel_callback=lambda _: CancelResponse.ACCEPT,
+        )
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(PERIOD, self._look, clock=steady)
+        self.get_logger().info(f"action {action}, jogs on {self.get_name()}/joint_jog")
+
+    def destroy_node(self) -> None:
+        """Stop what the arm was sent to do."""
+        if self._run is not None:
+            self._end(self._run, Result.INVALID_GOAL, "moveit_node ends")
+        for outlet in (self._trajectories, self._jogs):
+            outlet.close()
+        super().destroy_node()
+
+    # Goals
+
+    def _take(self, handle: ServerGoalHandle) -> None:
+        """Begin with a goal, in place of the one before."""
+        if self._run is not None:
+            self._end(self._run, Result.INVALID_GOAL, "a newer goal has come", stop=False)
+        run = self._runs[_identity(handle)] = _Run(handle, None)
+        try:
+            run.execution = self._execution(handle.request)
+            self._run = run
+        except GoalRefused as error:
+            code = error.code if isinstance(error, Refused) else Result.INVALID_GOAL
+            self._end(run, code, str(error))
+        handle.execute()
+
+    def _execution(self, goal: Any) -> Execution:
+        config, message = self._config, goal.trajectory
+        joints = list(config.joints)
+        if sorted(message.joint_names) != sorted(joints):
+            raise Refused(
+                f"joint_names is {list(message.joint_names)}; allowed: {joints} in any order",
+                Result.INVALID_JOINTS,
+            )
+        if goal.multi_dof_trajectory.points:
+            raise Refused("multi_dof_trajectory is given; allowed: trajectory")
+        if goal.component_path_tolerance or goal.component_goal_tolerance:
+            raise Refused("tolerances of components are given; allowed: those of joints")
+        trajectory = joint_trajectory_from_message(
+            message, joints, config.position_min, config.position_max
+        )
+        path = tolerances_from_message(goal.path_tolerance, joints, math.inf)
+        near = config.trajectory_goal_tolerance
+        end = tolerances_from_message(goal.goal_tolerance, joints, near)
+        patience = 1e-9 * stamp_to_ns(goal.goal_time_tolerance)
+        if patience < 0.0:
+            raise Refused(f"goal_time_tolerance is {patience:g} s; allowed: 0 or more")
+        patience = patience or config.trajectory_goal_time
+        begin = stamp_to_ns(message.header.stamp)
+        if begin and begin + round(1e9 * trajectory.duration) < self._reader.stamp:
+            late = 1e-9 * (self._reader.stamp - begin)
+            raise Refused(
+                f"header.stamp is {late:.3g} s before that of the joint states: the trajectory "
+                "has passed",
+                Result.OLD_HEADER_TIMESTAMP,
+            )
+        return Execution(joints, trajectory, path, end, patience, begin)
+
+    async def _answer(self, handle: ServerGoalHandle) -> Any:
+        """Return the result of a goal when it has ended."""
+        run = self._runs[_identity(handle)]
+        await run.ended
+        del self._runs[_identity(handle)]
+        result = run.result
+        if handle.is_cancel_requested:
+            handle.canceled()
+        elif result.error_code == Result.SUCCESSFUL:
+            handle.succeed()
+        else:
+            handle.abort()
+        return result
+
+    def _end(self, run: _Run, code: int, text: str = "", *, stop: bool = True) -> None:
+        """End a goal; `stop` lets the arm come to rest unless it is where it was to go."""
+        run.result.error_code, run.result.error_string = code, text
+        if run is self._run:
+            self._run = None
+            if code != Result.SUCCESSFUL and run.sent and stop:
+                self._trajectories.publish(JointTrajectory(joint_names=list(self._config.joints)))
+            if stop:
+                self._trajectories.close()
+        if text:
+            self.get_logger().warning(f"follow_joint_trajectory ended: {text}")
+        else:
+            self.get_logger().info("follow_joint_trajectory: reached")
+        run.ended.set_result(None)
+
+    def _look(self) -> None:
+        """Go on with the goal; let others jog when nobody does here."""
+        now, run = time.monotonic(), self._run
+        if now - self._jogged > _JOG_TIME:
+            self._jogs.close()
+        if run is None or run.execution is None:
+            return
+        if run.handle.is_cancel_requested:
+            self._end(run, Result.INVALID_GOAL, "canceled")
+        elif not run.sent:
+            self._send(run, run.execution, now)
+        elif now - self._reader.heard_at > _SILENT:
+            self._end(run, Result.PATH_TOLERANCE_VIOLATED, "the joint states are silent")
+        elif self._mode in ("STOPPED", "POSITION"):
+            text = f"the controller's mode is {self._mode}; /diagnostics tell why"
+            self._end(run, Result.PATH_TOLERANCE_VIOLATED, text)
+        else:
+            self._judge(run, run.execution)
+
+    def _send(self, run: _Run, execution: Execution, now: float) -> None:
+        heard = now - self._reader.heard_at < _SILENT
+        if self._trajectories.others:
+            name = self.resolve_topic_name(TARGET_JOINT_TRAJECTORY.name)
+            self._end(run, Result.INVALID_GOAL, f"another node publishes '{name}'")
+        elif self._trajectories.ready and heard:
+            self._trajectories.publish(run.handle.request.trajectory)
+            run.sent = True
+            ago = round(1e9 * (now - self._reader.heard_at))
+            execution.begin_at(self._state(), self._reader.stamp + ago)
+        elif now - run.taken > _CONNECTING:
+            missing = "no controller is heard" if heard else "no joint states are heard"
+            self._end(run, Result.INVALID_GOAL, f"{missing} for {_CONNECTING:g} s")
+
+    def _judge(self, run: _Run, execution: Execution) -> None:
+        """Compare the arm with the trajectory, and tell the client."""
+        state, stamp = self._state(), self._reader.stamp
+        progress = execution.look(state, stamp)
+        feedback = Feedback(joint_names=list(self._config.joints))
+        set_stamp(feedback.header.stamp, stamp)
+        q, v, a = execution.desired
+        feedback.desired = _point(q, v, a)
+        feedback.actual = _point(state.q, state.v)
+        feedback.error = _point(*execution.off)
+        set_stamp(feedback.desired.time_from_start, max(0, stamp - execution.begin))
+        run.handle.publish_feedback(feedback)
+        if progress is not Progress.GOES_ON:
+            text = execution.why
+            if text and self._mode != "TRACKING":
+                text += f"; the controller's mode is {self._mode}"
+            self._end(run, _ENDS[progress], text)
+
+    def _state(self) -> State:
+        return State(self._reader.q, self._reader.v)
+
+    # Messages
+
+    def _on_state(self, message: JointState) -> None:
+        self._reader.read(message, time.monotonic())
+
+    def _on_mode(self, message: String) -> None:
+        self._mode = message.data
+
+    def _on_jog(self, message: JointJog) -> None:
+        if len(message.displacements):
+            self.get_logger().warning(
+                "joint_jog refused: displacements are given; allowed: velocities only",
+                throttle_duration_sec=1.0,
+            )
+            return
+        if self._run is not None:
+            self._end(self._run, Result.INVALID_GOAL, "a jog has come")
+        now = time.monotonic()
+        if not self._jogs.ready and now - self._jogged < _JOG_TIME:
+            self.get_logger().warning("no controller is heard", throttle_duration_sec=1.0)
+        self._jogged = now
+        # The controller checks the rest, and says what is wrong.
+        self._jogs.publish(
+            JointState(
+                header=message.header,
+                name=list(message.joint_names),
+                velocity=message.velocities,
+            )
+        )
+
+
+def _identity(handle: ServerGoalHandle) -> bytes:
+    return bytes(handle.goal_id.uuid)
+
+
+def _point(q: np.ndarray, v: np.ndarray, a: np.ndarray | None = None) -> JointTrajectoryPoint:
+    point = JointTrajectoryPoint(positions=q.tolist(), velocities=v.tolist())
+    if a is not None:
+        point.accelerations = a.tolist()
+    return point
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the MoveIt node until it is told to stop."""
+    return run(MoveitNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of the node that takes what MoveIt sends."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from viability_bounds_pkg.parameter import above, number
+from viability_bounds_pkg.robot_configuration import RobotConfiguration
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MoveitConfiguration(RobotConfiguration):
+    """Parameters of ``moveit_node``."""
+
+    NOT_NEEDED: ClassVar[frozenset[str]] = frozenset({"torque_max"})
+
+    trajectory_goal_tolerance: float = number(
+        "how near each joint must be to the end of a trajectory whose goal_tolerance does not say "
+        "it, rad",
+        above(0.0, 1.0),
+        default=0.01,
+    )
+    trajectory_goal_time: float = number(
+        "how long after the end of a trajectory, where its goal_time_tolerance is 0, s of the "
+        "robot's time",
+        above(0.0, 600.0),
+        default=5.0,
+    )

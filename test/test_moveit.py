@@ -1,0 +1,323 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The action FollowJointTrajectory and JointJog, through the real nodes in lockstep."""
+
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from action_msgs.msg import GoalStatus
+from control_msgs_build import CompilerMissingError, import_control_msgs
+from rclpy.action import ActionClient
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool
+from test_security import expressions
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint, MultiDOFJointTrajectoryPoint
+
+from sim_bridge.nodes.bullet_node import BulletNode
+from torque_safety_controller.node.controller_node import ControllerNode
+from viability_bounds_pkg.node.bounds_node import BoundsNode
+from viability_bounds_pkg.ros.claim import TakenError
+from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp, stamp_to_ns
+from viability_bounds_pkg.testing.ros_harness import read_config
+
+pytestmark = pytest.mark.long
+
+ROOT = Path(__file__).resolve().parent.parent
+KINDS = {"bounds_node": BoundsNode, "controller_node": ControllerNode, "bullet_node": BulletNode}
+PATIENT = {"clock": "lockstep", "bounds_timeout": 5.0, "state_timeout": 10.0}
+VALUES = read_config("panda", *KINDS) | PATIENT
+JOINTS = VALUES["joints"]
+GOAL = np.array(VALUES["start_positions"]) + [0.2, 0.1, -0.2, 0.2, 0.2, 0.2, 0.3]
+TARGET = "target_joint_trajectory"
+
+
+@pytest.fixture(scope="module")
+def moveit():
+    """The module of the node, with the messages that it needs."""
+    try:
+        import_control_msgs(ROOT / "build" / "control_msgs")
+    except CompilerMissingError as error:
+        pytest.skip(str(error))
+    from torque_safety_controller.remote import moveit_node
+
+    return moveit_node
+
+
+def start_node(ros, moveit, **changed):
+    names = {*VALUES} & {"joints", "robot_description", "position_min", "position_max"}
+    return ros.start(moveit.MoveitNode, {name: VALUES[name] for name in names} | changed)
+
+
+class Goal:
+    """A goal of the action, and what has come of it."""
+
+    def __init__(self, user, goal) -> None:
+        self.feedback, self.handle, self.answer = [], None, None
+        sent = user.client.send_goal_async(goal, lambda message: self.feedback.append(message))
+        sent.add_done_callback(self._taken)
+
+    def _taken(self, future) -> None:
+        self.handle = future.result()
+        assert self.handle.accepted
+        self.handle.get_result_async().add_done_callback(self._ended)
+
+    def _ended(self, future) -> None:
+        self.answer = future.result()
+
+    @property
+    def outcome(self):
+        """Status, code and text."""
+        return self.answer.status, self.answer.result.error_code, self.answer.result.error_string
+
+
+class User:
+    """Who sends goals to a Panda in lockstep."""
+
+    def __init__(self, ros, moveit, *, robot=True, silence=10.0, **changed) -> None:
+        self.ros, self.types = ros, moveit
+        self.node = start_node(ros, moveit, **changed)
+        kind = moveit.FollowJointTrajectory
+        self.client = ActionClient(ros.probe, kind, "moveit_node/follow_joint_trajectory")
+        ros.wait_until(self.client.server_is_ready)
+        self.states = ros.listen(JointState, "joint_states")
+        if robot:
+            ros.start(ControllerNode, VALUES | {"state_timeout": silence})
+            ros.start(BoundsNode, VALUES | {"state_timeout": silence})
+            self.robot = ros.start(BulletNode, VALUES)
+            ros.wait_until(lambda: len(self.states) > 2)
+
+    @property
+    def q(self):
+        return np.array(self.states[-1].position[: len(JOINTS)])
+
+    @property
+    def v(self):
+        return np.array(self.states[-1].velocity[: len(JOINTS)])
+
+    def goal(self, q=GOAL, duration=1.0, **parts):
+        goal = self.types.FollowJointTrajectory.Goal(**parts)
+        goal.trajectory = JointTrajectory(
+            joint_names=JOINTS[::-1],  # matched by name
+            points=[JointTrajectoryPoint(positions=[float(x) for x in q][::-1])],
+        )
+        set_stamp(goal.trajectory.points[0].time_from_start, round(1e9 * duration))
+        return goal
+
+    def send(self, **parts):
+        return Goal(self, self.goal(**parts))
+
+    def wait(self, goal):
+        self.ros.wait_until(lambda: goal.answer)
+        return goal.outcome
+
+    def run(self, duration):
+        """Let robot time pass."""
+        end = stamp_to_ns(self.states[-1].header.stamp) + round(1e9 * duration)
+        self.ros.wait_until(lambda: stamp_to_ns(self.states[-1].header.stamp) > end)
+
+    def keeps_limits(self):
+        self.ros.diagnostics.clear()
+        robot = self.ros.wait_until(lambda: self.ros.diagnostics.get("bullet_node"))
+        for key in ("position_violation_rad", "velocity_violation_rad_s"):
+            assert max(map(float, robot[key].split())) == 0.0, (key, robot[key])
+        assert max(map(float, robot["torque_ratio"].split())) <= 1.0 + 1e-9
+
+
+def tolerance(moveit, joint=JOINTS[1], position=0.0, velocity=0.0, acceleration=0.0):
+    return moveit.JointTolerance(
+        name=joint, position=position, velocity=velocity, acceleration=acceleration
+    )
+
+
+def test_goals_are_reached_one_after_the_other(ros, moveit):
+    user = User(ros, moveit)
+    for q in (GOAL, np.array(VALUES["start_positions"])):
+        goal = user.send(q=q)
+        assert user.wait(goal) == (GoalStatus.STATUS_SUCCEEDED, 0, "")
+        assert np.abs(user.q - q).max() < 0.01
+        told = [each.feedback for each in goal.feedback]
+        assert len(told) > 3
+        for each in told:
+            assert list(each.joint_names) == JOINTS
+            off = np.subtract(each.desired.positions, each.actual.positions)
+            np.testing.assert_allclose(each.error.positions, off, atol=1e-12)
+            assert np.abs(off).max() < 0.05
+        # Others may drive the arm in between.
+        ros.wait_until(lambda: ros.probe.count_publishers(TARGET) == 0)
+    user.keeps_limits()
+
+
+def test_one_that_is_cancelled_stops(ros, moveit):
+    user = User(ros, moveit)
+    goal = user.send(duration=4.0)
+    ros.wait_until(lambda: len(goal.feedback) > 2 and np.abs(user.v).max() > 0.05)
+    goal.handle.cancel_goal_async()
+    assert user.wait(goal)[0] == GoalStatus.STATUS_CANCELED
+    ros.wait_until(lambda: np.abs(user.v).max() < 1e-3)
+    at = user.q
+    user.run(0.5)
+    assert np.abs(user.q - at).max() < 0.01
+    assert np.abs(user.q - GOAL).max() > 0.05
+
+
+def test_a_newer_goal_takes_the_place_of_an_older_one(ros, moveit):
+    user = User(ros, moveit)
+    first = user.send(duration=4.0)
+    ros.wait_until(lambda: first.feedback)
+    second = user.send(q=VALUES["start_positions"])
+    assert user.wait(first) == (GoalStatus.STATUS_ABORTED, -1, "a newer goal has come")
+    assert user.wait(second)[:2] == (GoalStatus.STATUS_SUCCEEDED, 0)
+    assert np.abs(user.q - VALUES["start_positions"]).max() < 0.01
+
+
+def test_one_off_its_path_stops(ros, moveit):
+    user = User(ros, moveit)
+    path = [tolerance(moveit, joint, position=0.05) for joint in JOINTS]
+    goal = user.send(q=GOAL + [1.0, 0, 0, 0, 0, 0, 0], duration=0.2, path_tolerance=path)
+    status, code, text = user.wait(goal)
+    assert (status, code) == (GoalStatus.STATUS_ABORTED, -4)
+    assert re.fullmatch(r"panda_joint1 is .* rad off; allowed: 0.05", text)
+    ros.wait_until(lambda: np.abs(user.v).max() < 1e-3)
+    assert user.q[0] < GOAL[0] + 0.9
+    user.keeps_limits()
+
+
+def test_one_that_is_not_reached_in_time_tells_how_far_it_is(ros, moveit):
+    user = User(ros, moveit, trajectory_goal_time=0.01)
+    goal = user.send(q=GOAL + [1.0, 0, 0, 0, 0, 0, 0], duration=0.2)
+    status, code, text = user.wait(goal)
+    assert (status, code) == (GoalStatus.STATUS_ABORTED, -5)
+    assert re.fullmatch(r"panda_joint1 is .* rad off; allowed: 0.01", text)
+    patient = user.send(q=GOAL + [1.0, 0, 0, 0, 0, 0, 0], duration=0.2)
+    patient.handle = None
+    more = user.goal(q=GOAL, duration=0.2)
+    set_stamp(more.goal_time_tolerance, 4_000_000_000)
+    goal = Goal(user, more)
+    assert user.wait(goal)[:2] == (GoalStatus.STATUS_SUCCEEDED, 0)
+
+
+def test_what_cannot_be_followed_is_told(ros, moveit):
+    user = User(ros, moveit)
+    before = user.q
+    far = GOAL.copy()
+    far[3] = 1.0
+
+    def with_(change):
+        goal = user.goal()
+        change(goal)
+        return goal
+
+    cases = [
+        (user.goal(q=far), -1, "points[0]: panda_joint4 is 1 rad; allowed: -3.0718 to -0.0698"),
+        (with_(lambda g: setattr(g.trajectory, "points", [])), -1, "points is empty"),
+        (with_(lambda g: g.trajectory.joint_names.pop()), -2, "joint_names is ['panda_joint7'"),
+        (
+            with_(lambda g: g.multi_dof_trajectory.points.append(MultiDOFJointTrajectoryPoint())),
+            -1,
+            "multi_dof_trajectory is given",
+        ),
+        (user.goal(path_tolerance=[tolerance(moveit, "elbow")]), -2, "unknown joint 'elbow'"),
+        (
+            user.goal(goal_tolerance=[tolerance(moveit, position=-0.5)]),
+            -1,
+            "panda_joint2: tolerance -0.5; allowed: 0, above, or -1",
+        ),
+        (
+            user.goal(path_tolerance=[tolerance(moveit, acceleration=1.0)]),
+            -1,
+            "panda_joint2: tolerance of acceleration",
+        ),
+        (with_(lambda g: set_stamp(g.trajectory.header.stamp, 1)), -3, "header.stamp is "),
+        (
+            with_(lambda g: set_stamp(g.goal_time_tolerance, -1_000_000_000)),
+            -1,
+            "goal_time_tolerance is -1 s",
+        ),
+    ]
+    user.run(1.5)
+    for request, code, text in cases:
+        status, found, why = user.wait(Goal(user, request))
+        assert (status, found) == (GoalStatus.STATUS_ABORTED, code), why
+        assert text in why
+    assert np.abs(user.q - before).max() < 0.01
+    assert ros.probe.count_publishers(TARGET) == 0
+
+
+def test_it_does_not_drive_beside_another(ros, moveit):
+    user = User(ros, moveit)
+    other = ros.talk(JointTrajectory, TARGET, GOAL_QOS)
+    ros.wait_until(lambda: user.node.count_publishers(TARGET) == 1)
+    outcome = user.wait(user.send())
+    assert outcome[1:] == (-1, f"another node publishes '/{TARGET}'")
+    ros.probe.destroy_publisher(other)
+    ros.wait_until(lambda: user.node.count_publishers(TARGET) == 0)
+    assert user.wait(user.send())[1:] == (0, "")
+
+
+def test_a_robot_that_falls_silent_ends_it(ros, moveit):
+    user = User(ros, moveit, silence=1.0)
+    goal = user.send(duration=4.0)
+    ros.wait_until(lambda: goal.feedback)
+    ros.call(SetBool, "bullet_node/pause", SetBool.Request(data=True))
+    for _ in range(100):  # nothing is on its way to it any more
+        ros.spin(0.01)
+    ros.stop(user.robot)
+    status, code, text = user.wait(goal)
+    assert (status, code) == (GoalStatus.STATUS_ABORTED, -4)
+    assert "silent" in text or "STOPPED" in text
+
+
+def test_without_a_robot_it_says_so(ros, moveit, monkeypatch):
+    monkeypatch.setattr(moveit, "_CONNECTING", 0.3)
+    user = User(ros, moveit, robot=False)
+    outcome = user.wait(user.send())
+    assert outcome[1:] == (-1, "no joint states are heard for 0.3 s")
+
+
+def test_jogs_move_a_joint_and_end_a_goal(ros, moveit):
+    user = User(ros, moveit)
+    jogs = ros.talk(moveit.JointJog, "moveit_node/joint_jog", GOAL_QOS)
+    goal = user.send(duration=8.0)
+    ros.wait_until(lambda: goal.feedback)
+    jogs.publish(moveit.JointJog(joint_names=JOINTS[5:6], displacements=[0.4]))
+    user.run(0.5)
+    assert goal.answer is None
+    before = user.q
+    jog = moveit.JointJog(joint_names=JOINTS[5:6], velocities=[0.4])
+    ros.wait_until(lambda: user.q[5] - before[5] > 0.2, each=lambda: jogs.publish(jog))
+    assert goal.outcome[:2] == (GoalStatus.STATUS_ABORTED, -1)
+    assert goal.outcome[2] == "a jog has come"
+    ros.wait_until(lambda: np.abs(user.v).max() < 1e-3)
+    ros.wait_until(lambda: ros.probe.count_publishers("jog_joints") == 0)
+    user.keeps_limits()
+
+
+def test_its_help_lists_its_parameters(moveit, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["moveit_node", "--help"])
+    with pytest.raises(SystemExit) as end:
+        moveit.main()
+    assert end.value.code == 0
+    assert "  trajectory_goal_tolerance: how near" in capsys.readouterr().out
+
+
+def test_a_second_one_of_its_name_does_not_start(ros, moveit):
+    start_node(ros, moveit)
+    with pytest.raises(TakenError, match="serves '/moveit_node/follow_joint_trajectory'"):
+        start_node(ros, moveit)
+
+
+def test_the_policy_of_security_has_its_topics(ros, moveit):
+    node = start_node(ros, moveit)
+    heard = {name for name, _ in node.get_subscriber_names_and_types_by_node("moveit_node", "/")}
+    policy = ROOT / "config" / "security" / "moveit_node.xml"
+    granted = {
+        (right, each.text.replace("~", "/moveit_node") if "~" in each.text else f"/{each.text}")
+        for element in expressions(policy)
+        for right in element.attrib
+        for each in element
+    }
+    assert {name for right, name in granted if right == "subscribe"} >= heard
+    assert ("execute", "/moveit_node/follow_joint_trajectory") in granted
+    assert {("publish", f"/{TARGET}"), ("publish", "/jog_joints")} <= granted
