@@ -47,7 +47,11 @@ def test_the_notebook_runs_cell_by_cell(capfd, monkeypatch):
     assert "refused it" in capfd.readouterr().out
 
 
-@pytest.mark.parametrize("name", SAYS)
+@pytest.mark.parametrize(
+    "name",
+    # The notebook has the client, too.
+    [pytest.param(name, marks=[pytest.mark.long] * (name == "client")) for name in SAYS],
+)
 def test_example(name, capfd, monkeypatch):
     path = EXAMPLES / f"{name}.py"
     if name in ("chain_of_nodes", "client"):  # they start ROS

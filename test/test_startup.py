@@ -110,10 +110,10 @@ def test_a_file_that_is_not_parameters_is_refused_in_one_line(tmp_path, capfd, t
 @pytest.mark.parametrize(
     ("node", "options", "sent"),
     [
-        (BOUNDS, (), signal.SIGINT),
+        pytest.param(BOUNDS, (), signal.SIGINT, marks=pytest.mark.long),
         (ESTIMATOR, (), signal.SIGTERM),
         (CONTROLLER, (), signal.SIGINT),
-        (ROBOT, ("-p", "clock:=real_time"), signal.SIGINT),
+        pytest.param(ROBOT, ("-p", "clock:=real_time"), signal.SIGINT, marks=pytest.mark.long),
         (ROBOT, ("-p", "clock:=lockstep"), signal.SIGTERM),
         (SIMULATED, ("-p", "clock:=real_time"), signal.SIGINT),
     ],

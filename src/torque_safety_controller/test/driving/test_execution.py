@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from torque_safety_controller.driving.joint_trajectory import JointPoint, JointTrajectory
 from torque_safety_controller.driving.execution import Execution, Progress, Tolerances
+from torque_safety_controller.driving.joint_trajectory import JointPoint, JointTrajectory
 from viability_bounds_pkg.state import State
 
 ANY = Tolerances(np.full(2, math.inf), np.full(2, math.inf))

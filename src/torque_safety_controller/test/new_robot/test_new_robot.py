@@ -64,7 +64,7 @@ def room(chain, estimates, rng, count):
     return up, down
 
 
-@pytest.mark.parametrize("name", ["ur5", "panda"])
+@pytest.mark.parametrize("name", ["ur5", pytest.param("panda", marks=pytest.mark.long)])
 def test_limits_are_available_in_every_state_tried(name):
     chain, estimates = chain_of(name), estimates_of(name)
     assert not estimates.filtered.any()

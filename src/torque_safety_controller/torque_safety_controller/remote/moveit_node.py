@@ -27,7 +27,6 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from torque_safety_controller.driving.execution import Execution, Progress, Tolerances
-from torque_safety_controller.remote.moveit_parameters import MoveitConfiguration
 from torque_safety_controller.node.driving import joint_trajectory_from_message
 from torque_safety_controller.node.goals import GoalRefused
 from torque_safety_controller.node.topics import (
@@ -35,6 +34,7 @@ from torque_safety_controller.node.topics import (
     JOG_JOINTS,
     TARGET_JOINT_TRAJECTORY,
 )
+from torque_safety_controller.remote.moveit_parameters import MoveitConfiguration
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import JointStateReader
 from viability_bounds_pkg.ros.parameters import NodeParameters
