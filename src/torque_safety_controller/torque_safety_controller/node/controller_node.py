@@ -242,7 +242,6 @@ class ControllerNode(ArmNode):
             self._went_wrong = _CONTESTED
         elif self._went_wrong:
             self._rate.slow(self._went_wrong)
-            self._went_wrong = ""
         self._note_rate()
         now = state, AccelerationRange(self._limits.lower, self._limits.upper)
         lost = contested or self._goals.lost
@@ -250,6 +249,8 @@ class ControllerNode(ArmNode):
             step = self._controller.brake(*now, self._states.elapsed())
         else:
             step = self._controller.step(*now, self._states.elapsed())
+        if step.tracking:  # else the arm has yet to go on
+            self._went_wrong = ""
         self._answer(step, stamp)
 
     def _note_rate(self) -> None:
