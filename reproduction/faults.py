@@ -78,11 +78,14 @@ class Bench:
         ros: runs the nodes.
         robot: name of its file.
         seed: of goals and moments.
+        hold: periods for which the robot holds a command; None for the robot's own.
     """
 
-    def __init__(self, ros: RosHarness, robot: str, seed: int) -> None:
+    def __init__(self, ros: RosHarness, robot: str, seed: int, hold: int | None) -> None:
         self._ros, self._rng = ros, np.random.default_rng(seed)
         self._values = load_values(robot) | STIFF | {"start_paused": False, "clock": "real_time"}
+        if hold is not None:
+            self._values["command_timeout"] = hold
         nodes = {}
         for topic, kind in SENDERS.items():
             arguments = ["--ros-args", "-r", f"{topic}:={BEFORE}{topic}"]
@@ -154,12 +157,14 @@ class Bench:
         return seen
 
 
-def play(robot: str, names: list[str], moments: int) -> list[tuple[str, dict[str, Any]]]:
+def play(
+    robot: str, names: list[str], moments: int, hold: int | None
+) -> list[tuple[str, dict[str, Any]]]:
     """Let a robot suffer these faults; return what each did."""
     with private_domain() as domain, tempfile.TemporaryDirectory() as folder:
         ros = RosHarness(domain)
         try:
-            seen = Bench(ros, robot, 1).suffer(names, moments, Path(folder))
+            seen = Bench(ros, robot, 1, hold).suffer(names, moments, Path(folder))
             return [(name, vars(each)) for name, each in zip(names, seen, strict=True)]
         finally:
             ros.close()
@@ -171,11 +176,16 @@ def main() -> int:
     parser.add_argument("--robot", action="append", choices=ROBOTS, help="only this one")
     parser.add_argument("--fault", action="append", choices=tuple(FAULTS), help="only this one")
     parser.add_argument("--moments", type=int, default=10, help="of each fault")
+    parser.add_argument(
+        "--hold", type=int, help="periods for which the robot holds a command; the robot's own"
+    )
     given = parser.parse_args()
     robots, names = given.robot or ROBOTS, given.fault or list(FAULTS)
     figure = Figure("faults")
     with ProcessPoolExecutor(len(robots), get_context("spawn")) as pool:
-        runs = [(robot, pool.submit(play, robot, names, given.moments)) for robot in robots]
+        runs = [
+            (robot, pool.submit(play, robot, names, given.moments, given.hold)) for robot in robots
+        ]
         for robot, run in runs:
             dt = 1.0 / load_values(robot)["rate_hz"]
             for name, seen in run.result():

@@ -2,6 +2,7 @@
 """Nodes that end, stand still, or start at random moments, in real time: limits, braking, return.
 
 bash scripts/reproduce.sh process-faults [--robot NAME] [--fault NAME] [--moments N] [--rate HZ]
+    [--hold PERIODS]
 
 Bounds and controller are processes, the robot is in this one, so that its limits are judged at
 its physics steps; where the fault is the robot's own, it is a process, too, and its diagnostics
@@ -103,6 +104,7 @@ class Bench:
         kind: how it is to run.
         rng: random numbers.
         rate: of the control loop, Hz; None for the robot's own.
+        hold: periods for which the robot holds a command; None for the robot's own.
 
     Attributes:
         programs: by name.
@@ -121,12 +123,14 @@ class Bench:
         kind: Kind,
         rng: np.random.Generator,
         rate: float | None,
+        hold: int | None = None,
     ) -> None:
         self.ros, self.rng, self._kind = ros, rng, kind
         more = [f"imperfect/{robot}"] * kind.imperfect
         changes = STIFF | {"start_paused": False, "clock": "real_time"} | dict(kind.values)
-        if rate is not None and not kind.imperfect:  # what is declared is for the robot's own
-            changes["rate_hz"] = rate
+        if not kind.imperfect:  # what is declared is for the robot's own
+            own_ways = {"rate_hz": rate, "command_timeout": hold}
+            changes |= {name: value for name, value in own_ways.items() if value is not None}
         self._own = {name: own | changes for name, own in load_node_values(robot, *more).items()}
         values = self._own[ROBOT]
         if "robot_description" in kind.values:  # the robot itself cannot take it from the topic
@@ -534,7 +538,7 @@ FAULTS = {
 
 
 def play(
-    robot: str, name: str, moments: int, seed: int, rate: float | None
+    robot: str, name: str, moments: int, seed: int, rate: float | None, hold: int | None
 ) -> tuple[Seen, float, str]:
     """Let a robot suffer a fault; return what it did, the control period, s, and why it ended."""
     kind, rng, seen, why = FAULTS[name], np.random.default_rng(seed), Seen(), ""
@@ -542,7 +546,7 @@ def play(
         with ExitStack() as stack:
             ros = RosHarness(stack.enter_context(private_domain()))
             stack.callback(ros.close)
-            bench = Bench(ros, robot, kind, rng, rate)
+            bench = Bench(ros, robot, kind, rng, rate, hold)
             stack.callback(bench.close)
             seen.timeout, dt = bench.timeout, bench.dt
             try:
@@ -578,6 +582,9 @@ def main() -> int:
     parser.add_argument("--fault", action="append", choices=tuple(FAULTS), help="only this one")
     parser.add_argument("--moments", type=int, default=10, help="of each fault")
     parser.add_argument("--rate", type=float, help="of the control loop, Hz; the robot's own")
+    parser.add_argument(
+        "--hold", type=int, help="periods for which the robot holds a command; the robot's own"
+    )
     parser.add_argument("--seed", type=int, default=1, help="of goals and moments")
     given = parser.parse_args()
     heads = (*HEADS[:3], "fault, s", *HEADS[3:])
@@ -585,7 +592,7 @@ def main() -> int:
     print(table([figure], heads), flush=True)
     for robot in given.robot or ROBOTS:
         for name in given.fault or FAULTS:
-            seen, dt, why = play(robot, name, given.moments, given.seed, given.rate)
+            seen, dt, why = play(robot, name, given.moments, given.seed, given.rate, given.hold)
             cells = seen.cells(dt)
             lasted = f"{min(seen.lasted):.2f} to {max(seen.lasted):.2f}" if seen.lasted else "-"
             said = f"FAILS: {why}" if why else cells[-1]
