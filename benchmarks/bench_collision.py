@@ -26,7 +26,7 @@ from torque_safety_controller.additional_torque import AdditionalTorque
 from torque_safety_controller.collision.avoidance import CollisionAvoidance
 from torque_safety_controller.collision.bodies import box, capsule, half_space, sphere
 from torque_safety_controller.collision.distances import Pairs
-from torque_safety_controller.collision.geometry import link_shapes, load_geometry
+from torque_safety_controller.collision.geometry import link_shapes
 from torque_safety_controller.collision.model import CollisionModel, build_collision_model
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.parameters import ControllerConfiguration
@@ -35,6 +35,7 @@ from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.robot_description import build_model, read_urdf
+from viability_bounds_pkg.robot_geometry import load_geometry
 from viability_bounds_pkg.state import State
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -3,10 +3,8 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from typing import NamedTuple
-from xml.etree import ElementTree
 
 import coal
 import numpy as np
@@ -14,11 +12,7 @@ import pinocchio as pin
 import trimesh
 from numpy.typing import NDArray
 
-from viability_bounds_pkg.robot_description import (
-    RobotDescriptionError,
-    package_directories,
-    resolve_uri,
-)
+from viability_bounds_pkg.robot_geometry import load_geometry
 
 Array = NDArray[np.float64]
 
@@ -47,26 +41,7 @@ def visual_shapes(
     Raises:
         RobotDescriptionError: a mesh cannot be found or loaded.
     """
-    # Pinocchio's own error does not name the mesh.
-    for mesh in ElementTree.fromstring(urdf).iterfind(".//visual//mesh"):
-        if "://" in (name := mesh.get("filename", "")):
-            resolve_uri(name)
-    full = pin.buildModelFromXML(urdf)
-    directories = [str(path) for path in package_directories() if path.is_dir()]
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of Pinocchio, about how it was called
-            geometry = pin.buildGeomFromUrdfString(
-                full, urdf, pin.GeometryType.VISUAL, directories
-            )
-    except (ValueError, RuntimeError) as error:
-        raise RobotDescriptionError(f"visual geometry does not load: {error}") from error
-    configuration = pin.neutral(full)
-    for name, position in locked_positions.items():
-        configuration[full.joints[full.getJointId(name)].idx_q] = position
-    kept = set(model.names)
-    locked = [i for i in range(1, full.njoints) if full.names[i] not in kept]
-    _, (geometry,) = pin.buildReducedModel(full, [geometry], locked, configuration)
+    geometry = load_geometry(urdf, model, locked_positions, "visual")
     shapes = []
     for item in geometry.geometryObjects:
         vertices, triangles = _mesh(item.geometry)

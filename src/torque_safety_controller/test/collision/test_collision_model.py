@@ -7,10 +7,11 @@ from collision_arm import panda
 
 from torque_safety_controller.collision.bodies import box, capsule, half_space, sphere
 from torque_safety_controller.collision.capsule_fit import capsules_around, fitted_capsule
-from torque_safety_controller.collision.geometry import link_shapes, load_geometry
+from torque_safety_controller.collision.geometry import link_shapes
 from torque_safety_controller.collision.model import build_collision_model
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.robot_description import RobotDescriptionError, build_model, read_urdf
+from viability_bounds_pkg.robot_geometry import load_geometry
 from viability_bounds_pkg.testing.ros_harness import read_config
 
 FEW = 300  # samples

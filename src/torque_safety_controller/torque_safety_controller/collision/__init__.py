@@ -10,7 +10,6 @@ from torque_safety_controller.collision.bodies import (
     make_obstacle,
     sphere,
 )
-from torque_safety_controller.collision.geometry import load_geometry
 from torque_safety_controller.collision.model import CollisionModel, build_collision_model
 
 __all__ = [
@@ -22,7 +21,6 @@ __all__ = [
     "build_collision_model",
     "capsule",
     "half_space",
-    "load_geometry",
     "make_obstacle",
     "sphere",
 ]

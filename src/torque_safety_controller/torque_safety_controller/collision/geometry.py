@@ -1,14 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The collision geometry of a URDF, loaded through Pinocchio and coal, as triangles of links."""
+"""The collision geometry of a URDF as triangles of links."""
 
 from __future__ import annotations
 
-import warnings
-from collections import Counter
-from collections.abc import Mapping
 from itertools import combinations, product
 from typing import NamedTuple
-from xml.etree import ElementTree
 
 import coal
 import numpy as np
@@ -16,7 +12,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from torque_safety_controller.collision.capsule_fit import Capsule
-from viability_bounds_pkg.robot_description import RobotDescriptionError, package_directories
+from viability_bounds_pkg.robot_description import RobotDescriptionError
 
 Array = NDArray[np.float64]
 
@@ -41,47 +37,12 @@ class LinkShape(NamedTuple):
     capsules: list[Capsule]
 
 
-def load_geometry(
-    urdf: str, model: pin.Model, locked_positions: Mapping[str, float] | None = None
-) -> pin.GeometryModel:
-    """Return the collision geometry for a model of `robot_description.build_model`.
-
-    Args:
-        urdf: text of the URDF.
-        model: made of it, other joints locked.
-        locked_positions: as given to `build_model`, rad.
-
-    Raises:
-        RobotDescriptionError: a mesh cannot be found or loaded, or a shape is not understood.
-    """
-    full = pin.buildModelFromXML(urdf)
-    directories = [str(path) for path in package_directories() if path.is_dir()]
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of Pinocchio, about how it was called
-            geometry = pin.buildGeomFromUrdfString(
-                full, urdf, pin.GeometryType.COLLISION, directories
-            )
-    except (ValueError, RuntimeError) as error:
-        raise RobotDescriptionError(f"collision geometry does not load: {error}") from error
-    _check_complete(urdf, full, geometry)
-    configuration = pin.neutral(full)
-    for name, position in (locked_positions or {}).items():
-        configuration[full.joints[full.getJointId(name)].idx_q] = position
-    kept = set(model.names)
-    locked = [i for i in range(1, full.njoints) if full.names[i] not in kept]
-    reduced, (geometry,) = pin.buildReducedModel(full, [geometry], locked, configuration)
-    if list(reduced.names) != list(model.names):
-        raise RobotDescriptionError("the model was not made of this URDF")
-    return geometry
-
-
 def link_shapes(model: pin.Model, geometry: pin.GeometryModel) -> list[LinkShape]:
     """Return the shapes of all links that have any, base to tip.
 
     Args:
         model: with the joints that the geometry hangs on.
-        geometry: of `load_geometry`.
+        geometry: of `robot_geometry.load_geometry`.
 
     Raises:
         RobotDescriptionError: a kind of geometry that a URDF does not have.
@@ -107,17 +68,6 @@ def link_shapes(model: pin.Model, geometry: pin.GeometryModel) -> list[LinkShape
             triangles=np.vstack([shape.triangles, triangles + len(shape.vertices)]),
         )
     return sorted(shapes.values(), key=lambda shape: shape.joint)
-
-
-def _check_complete(urdf: str, model: pin.Model, geometry: pin.GeometryModel) -> None:
-    """Raise if a shape of the URDF is missing: its parser drops what it does not understand."""
-    found = Counter(model.frames[item.parentFrame].name for item in geometry.geometryObjects)
-    for link in ElementTree.fromstring(urdf).iter("link"):
-        name, shapes = link.get("name", ""), len(link.findall("collision"))
-        if model.existFrame(name) and found[name] != shapes:
-            raise RobotDescriptionError(
-                f"link {name!r}: only {found[name]} of {shapes} collision shapes were understood"
-            )
 
 
 def _mesh(item: pin.GeometryObject) -> tuple[Array, NDArray[np.int64]]:

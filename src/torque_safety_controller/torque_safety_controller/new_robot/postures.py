@@ -11,9 +11,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from torque_safety_controller.collision.geometry import load_geometry
 from torque_safety_controller.new_robot.chain import Chain, NewRobotError
 from viability_bounds_pkg.robot_description import RobotDescriptionError
+from viability_bounds_pkg.robot_geometry import load_geometry
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,6 @@ import pinocchio as pin
 
 from torque_safety_controller.additional_torque import AdditionalTorque
 from torque_safety_controller.collision.avoidance import CollisionAvoidance
-from torque_safety_controller.collision.geometry import load_geometry
 from torque_safety_controller.collision.model import build_collision_model
 from torque_safety_controller.contact.contacts import Contacts, FrictionContact
 from torque_safety_controller.contact.interaction import Interaction
@@ -27,6 +26,7 @@ from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 from viability_bounds_pkg.robot_configuration import load_model
 from viability_bounds_pkg.robot_description import RobotDescriptionError, inertia_beyond
+from viability_bounds_pkg.robot_geometry import load_geometry
 from viability_bounds_pkg.ros.robot_urdf import robot_urdf, warn_of_unusual
 from viability_bounds_pkg.state_estimation.state_check import StateCheck
 from viability_bounds_pkg.stopping.coordinated_stop import MARGIN

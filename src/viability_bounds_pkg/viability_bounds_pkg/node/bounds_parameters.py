@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -54,6 +54,18 @@ METHODS = ("exact", *BASELINES)
 LIMITS = ("worst_case", "state_dependent")
 PEAK = 3.0
 """Default of ``acceleration_peak``, in limits of the worst case."""
+
+
+def limits_of(config: Any) -> JointLimits:
+    """Return the limits in a configuration that has these fields of `BoundsConfiguration`."""
+    return JointLimits(
+        config.joints,
+        config.position_min,
+        config.position_max,
+        config.velocity_max,
+        config.acceleration_min,
+        config.acceleration_max,
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -126,14 +138,7 @@ class BoundsConfiguration(VelocityEstimation, StateSource, ControlRate, LimitedR
     def __post_init__(self) -> None:
         """Make limits and margins, which must leave something to move with."""
         super().__post_init__()
-        limits = JointLimits(
-            self.joints,
-            self.position_min,
-            self.position_max,
-            self.velocity_max,
-            self.acceleration_min,
-            self.acceleration_max,
-        )
+        limits = limits_of(self)
         object.__setattr__(self, "limits", limits)
         object.__setattr__(self, "margins", self._margins(limits))
         object.__setattr__(self, "uncertainty", self.loop.margins(self.declared))

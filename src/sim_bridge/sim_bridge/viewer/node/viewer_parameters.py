@@ -9,7 +9,7 @@ from numpy import float64
 from numpy.typing import NDArray
 
 from viability_bounds_pkg.joint_limits import JointLimits
-from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
+from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, limits_of
 from viability_bounds_pkg.parameter import Range, redeclared, text, whole_number
 from viability_bounds_pkg.robot_configuration import LimitedRobotConfiguration, TaskFrames
 
@@ -36,12 +36,4 @@ class ViewerConfiguration(TaskFrames, LimitedRobotConfiguration):
     def __post_init__(self) -> None:
         """Make the limits."""
         super().__post_init__()
-        limits = JointLimits(
-            self.joints,
-            self.position_min,
-            self.position_max,
-            self.velocity_max,
-            self.acceleration_min,
-            self.acceleration_max,
-        )
-        object.__setattr__(self, "limits", limits)
+        object.__setattr__(self, "limits", limits_of(self))
