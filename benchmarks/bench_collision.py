@@ -34,8 +34,7 @@ from torque_safety_controller.qp.constraints import AccelerationRange
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
 from viability_bounds_pkg.parameter import read
-from viability_bounds_pkg.robot_description import build_model, read_urdf
-from viability_bounds_pkg.robot_geometry import load_geometry
+from viability_bounds_pkg.robot_description import build_model, load_geometry, read_urdf
 from viability_bounds_pkg.state import State
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -10,8 +10,12 @@ from torque_safety_controller.collision.capsule_fit import capsules_around, fitt
 from torque_safety_controller.collision.geometry import link_shapes
 from torque_safety_controller.collision.model import build_collision_model
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.robot_description import RobotDescriptionError, build_model, read_urdf
-from viability_bounds_pkg.robot_geometry import load_geometry
+from viability_bounds_pkg.robot_description import (
+    RobotDescriptionError,
+    build_model,
+    load_geometry,
+    read_urdf,
+)
 from viability_bounds_pkg.testing.ros_harness import read_config
 
 FEW = 300  # samples
@@ -163,7 +167,7 @@ def test_a_shape_that_the_parser_drops_is_an_error():
 def test_a_mesh_that_is_missing_is_an_error():
     urdf = SHAPES.format('<mesh filename="package://nowhere/arm.stl"/>')
     model = build_model(urdf, ["turn"])
-    with pytest.raises(RobotDescriptionError, match="collision geometry"):
+    with pytest.raises(RobotDescriptionError, match="package://nowhere/arm.stl: no package"):
         load_geometry(urdf, model)
 
 

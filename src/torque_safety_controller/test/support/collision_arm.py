@@ -18,8 +18,7 @@ from torque_safety_controller.collision.avoidance import (
 from torque_safety_controller.collision.bodies import box, capsule, half_space, sphere
 from torque_safety_controller.collision.model import CollisionModel, build_collision_model
 from viability_bounds_pkg.joint_limits import JointLimits
-from viability_bounds_pkg.robot_description import build_model, read_urdf
-from viability_bounds_pkg.robot_geometry import load_geometry
+from viability_bounds_pkg.robot_description import build_model, load_geometry, read_urdf
 from viability_bounds_pkg.testing.ros_harness import read_config
 from viability_bounds_pkg.viability import BoundsSolver
 

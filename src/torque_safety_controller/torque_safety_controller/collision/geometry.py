@@ -42,7 +42,7 @@ def link_shapes(model: pin.Model, geometry: pin.GeometryModel) -> list[LinkShape
 
     Args:
         model: with the joints that the geometry hangs on.
-        geometry: of `robot_geometry.load_geometry`.
+        geometry: of `robot_description.load_geometry`.
 
     Raises:
         RobotDescriptionError: a kind of geometry that a URDF does not have.

@@ -61,7 +61,7 @@ def build_collision_model(
 
     Args:
         model: n joints with one coordinate each.
-        geometry: of `robot_geometry.load_geometry`.
+        geometry: of `robot_description.load_geometry`.
         q_start: a configuration free of collisions, shape (n,), rad: of the pairs chosen
             automatically, those that are near each other there are left out.
         obstacles: that every link is kept away from which can move.

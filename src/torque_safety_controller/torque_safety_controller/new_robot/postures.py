@@ -12,8 +12,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from torque_safety_controller.new_robot.chain import Chain, NewRobotError
-from viability_bounds_pkg.robot_description import RobotDescriptionError
-from viability_bounds_pkg.robot_geometry import load_geometry
+from viability_bounds_pkg.robot_description import RobotDescriptionError, load_geometry
 
 Array = NDArray[np.float64]
 

@@ -25,8 +25,11 @@ from viability_bounds_pkg.exceptions import SettingError, did_you_mean
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 from viability_bounds_pkg.robot_configuration import load_model
-from viability_bounds_pkg.robot_description import RobotDescriptionError, inertia_beyond
-from viability_bounds_pkg.robot_geometry import load_geometry
+from viability_bounds_pkg.robot_description import (
+    RobotDescriptionError,
+    inertia_beyond,
+    load_geometry,
+)
 from viability_bounds_pkg.ros.robot_urdf import robot_urdf, warn_of_unusual
 from viability_bounds_pkg.state_estimation.state_check import StateCheck
 from viability_bounds_pkg.stopping.coordinated_stop import MARGIN
