@@ -52,6 +52,9 @@ Array = NDArray[np.float64]
 _UNBOUNDED = 1e6
 """Stands for the width of bounds that are not there, rad/s^2."""
 
+_STANDS = 1e-9
+"""A joint that is slower stands: rounding may be its velocity, rad/s."""
+
 
 class ControlOutput(NamedTuple):
     """Result of one control step.
@@ -355,6 +358,8 @@ class Controller:
             bounds = AccelerationRange(self.safety_filter.lower, self.safety_filter.upper)
             if self.lost:
                 tasks = [DampingTask(self.gains.hold_kd)]
+        elif self.share < 1.0:
+            bounds = return_gently(bounds, robot.v, self.share)
         if disturbance is not None:
             bounds = AccelerationRange(*self._observer.shift(*bounds))
         parts = [each.constraint(robot, bounds, disturbance) for each in self.constraints]
@@ -449,6 +454,25 @@ class Controller:
     def _remember(self, a: Array) -> Array:
         self._a_last = a if math.isfinite(a.dot(a)) else np.zeros(self.robot.n)
         return self._a_last
+
+
+def return_gently(bounds: AccelerationRange, v: Array, share: float) -> AccelerationRange:
+    """Return bounds that push a joint which stands beyond them by a share only.
+
+    An arm may have been stopped within the margins of a position limit; its bounds then demand to
+    be back after a period, by a jolt. Here such a joint just gets no farther, and returns
+    with the share. One that moves towards its limit brakes as it must.
+
+    Args:
+        bounds: of the joints, shape (n,) each, rad/s^2.
+        v: their velocities, shape (n,), rad/s.
+        share: of what the bounds demand, from 0 to 1.
+    """
+    lower, upper = bounds
+    return AccelerationRange(
+        np.where((lower > 0.0) & (v > -_STANDS), share * lower, lower),
+        np.where((upper < 0.0) & (v < _STANDS), share * upper, upper),
+    )
 
 
 def _around(rest: Array, bounds: AccelerationRange, share: float) -> AccelerationRange:

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Joints that stand beyond their bounds' margins return without a jolt, and get no farther."""
+
+import numpy as np
+import pytest
+
+from torque_safety_controller.controller import return_gently
+from torque_safety_controller.qp.constraints import AccelerationRange
+from viability_bounds_pkg.joint_limits import JointLimits
+from viability_bounds_pkg.viability import BoundsSolver
+
+DT = 0.004
+LIMITS = JointLimits(
+    ["a", "b"],
+    np.array([-1.0, -2.0]),
+    np.array([1.0, 0.5]),
+    np.array([1.7, 2.0]),
+    np.array([-3.0, -15.0]),
+    np.array([3.0, 15.0]),
+)
+
+
+@pytest.mark.parametrize("ahead", [1, 2])
+def test_what_brakes_a_joint_within_its_range_stays(ahead):
+    solver = BoundsSolver(LIMITS, ahead * DT, period=DT)
+    rng = np.random.default_rng(3)
+    # Most of them so near to a limit, and so fast, that they must brake.
+    side = rng.choice([-1.0, 1.0], (20_000, 2))
+    edge = np.where(side > 0.0, LIMITS.q_max, LIMITS.q_min)
+    q = edge - side * 10.0 ** rng.uniform(-9.0, -0.5, side.shape)
+    low, high = solver.velocity_range(q)
+    v = np.clip(
+        side * np.abs(np.where(side > 0.0, high, low)) * rng.uniform(0.0, 1.0, side.shape) ** 0.2,
+        low,
+        high,
+    )
+    found = solver.bounds(q, v)
+    bounds = AccelerationRange(found.lower, found.upper)
+    assert found.viable.mean() > 0.99
+    assert ((bounds.lower > 0.0) | (bounds.upper < 0.0)).mean() > 0.1
+    eased = return_gently(bounds, v, 0.0)
+    inside = found.viable
+    np.testing.assert_allclose(eased.lower[inside], bounds.lower[inside], atol=1e-6)
+    np.testing.assert_allclose(eased.upper[inside], bounds.upper[inside], atol=1e-6)
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize("beyond", [1e-6, 1e-4, 3e-3])
+def test_a_joint_that_stands_beyond_its_margin_returns_in_half_a_second(side, beyond):
+    solver = BoundsSolver(LIMITS, 2.0 * DT, period=DT)
+    edge = LIMITS.q_max if side > 0.0 else LIMITS.q_min
+    q, v, before = edge + side * beyond, np.zeros(2), np.zeros(2)
+    for k in range(125):
+        found = solver.bounds(q, v)
+        share = min(1.0, (k + 1) * DT / 0.5)
+        low, high = return_gently(AccelerationRange(found.lower, found.upper), v, share)
+        a = np.clip(0.0, low, high)
+        farther = side * (v * DT + 0.5 * a * DT**2)
+        assert (farther <= 1e-12).all()
+        if k < 3:  # the bounds demand all at once
+            assert np.abs(a - before).max() <= 1.01 * DT / 0.5 * LIMITS.a_max.max()
+        q, v, before = q + v * DT + 0.5 * a * DT**2, v + a * DT, a
+    assert (side * (q - edge) <= 1e-9).all()
+    assert np.abs(v).max() < 0.1
