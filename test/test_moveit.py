@@ -172,6 +172,17 @@ def test_a_newer_goal_takes_the_place_of_an_older_one(ros, moveit):
     assert np.abs(user.q - VALUES["start_positions"]).max() < 0.01
 
 
+def test_a_newer_goal_that_is_refused_leaves_the_older_one(ros, moveit):
+    user = User(ros, moveit)
+    first = user.send(duration=2.0)
+    ros.wait_until(lambda: first.feedback)
+    far = GOAL.copy()
+    far[3] = 1.0
+    assert user.wait(user.send(q=far))[:2] == (GoalStatus.STATUS_ABORTED, -1)
+    assert user.wait(first) == (GoalStatus.STATUS_SUCCEEDED, 0, "")
+    ros.wait_until(lambda: ros.probe.count_publishers(TARGET) == 0)
+
+
 def test_one_off_its_path_stops(ros, moveit):
     user = User(ros, moveit)
     path = [tolerance(moveit, joint, position=0.05) for joint in JOINTS]
@@ -225,7 +236,7 @@ def test_what_cannot_be_followed_is_told(ros, moveit):
             "panda_joint2: tolerance -0.5; allowed: 0, above, or -1",
         ),
         (
-            user.goal(path_tolerance=[tolerance(moveit, acceleration=1.0)]),
+            user.goal(path_tolerance=[tolerance(moveit, acceleration=float("nan"))]),
             -1,
             "panda_joint2: tolerance of acceleration",
         ),

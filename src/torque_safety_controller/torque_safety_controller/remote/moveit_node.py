@@ -91,7 +91,7 @@ def tolerances_from_message(
     for tolerance in given:
         if tolerance.name not in joints:
             raise Refused(f"tolerance of unknown joint '{tolerance.name}'", Result.INVALID_JOINTS)
-        if tolerance.acceleration > 0.0:
+        if tolerance.acceleration not in (0.0, -1.0):
             raise Refused(f"{tolerance.name}: tolerance of acceleration; allowed: 0 or -1")
         for name, part in parts.items():
             value = getattr(tolerance, name)
@@ -112,6 +112,8 @@ class _Run:
     result: Any = field(default_factory=Result)
     taken: float = field(default_factory=time.monotonic)
     sent: bool = False
+    moves: bool = False
+    """Whether the arm moves by it, or still by the one before."""
 
 
 class _Outlet:
@@ -197,15 +199,17 @@ class MoveitNode(ArmNode):
 
     def _take(self, handle: ServerGoalHandle) -> None:
         """Begin with a goal, in place of the one before."""
-        if self._run is not None:
-            self._end(self._run, Result.INVALID_GOAL, "a newer goal has come", stop=False)
         run = self._runs[_identity(handle)] = _Run(handle, None)
         try:
             run.execution = self._execution(handle.request)
-            self._run = run
-        except GoalRefused as error:
+        except GoalRefused as error:  # the one before goes on
             code = error.code if isinstance(error, Refused) else Result.INVALID_GOAL
             self._end(run, code, str(error))
+        else:
+            if self._run is not None:
+                run.moves = self._run.moves
+                self._end(self._run, Result.INVALID_GOAL, "a newer goal has come", stop=False)
+            self._run = run
         handle.execute()
 
     def _execution(self, goal: Any) -> Execution:
@@ -259,7 +263,7 @@ class MoveitNode(ArmNode):
         run.result.error_code, run.result.error_string = code, text
         if run is self._run:
             self._run = None
-            if code != Result.SUCCESSFUL and run.sent and stop:
+            if code != Result.SUCCESSFUL and run.moves and stop:
                 self._trajectories.publish(JointTrajectory(joint_names=list(self._config.joints)))
             if stop:
                 self._trajectories.close()
@@ -295,7 +299,7 @@ class MoveitNode(ArmNode):
             self._end(run, Result.INVALID_GOAL, f"another node publishes '{name}'")
         elif self._trajectories.ready and heard:
             self._trajectories.publish(run.handle.request.trajectory)
-            run.sent = True
+            run.sent = run.moves = True
             ago = round(1e9 * (now - self._reader.heard_at))
             execution.begin_at(self._state(), self._reader.stamp + ago)
         elif now - run.taken > _CONNECTING:
