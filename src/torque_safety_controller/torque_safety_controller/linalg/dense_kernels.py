@@ -29,33 +29,6 @@ def middle_of_step(q: Array, v: Array, a: Array, dt: float) -> tuple[Array, Arra
 
 
 @compiled
-def spring_damper(J: Array, v: Array, error: Array, drift: Array, kp: float, kd: float) -> Array:
-    """Return ``kp error - kd J v - drift``, shape (m,), J of shape (m, n)."""
-    m, n = J.shape
-    b = np.empty(m)
-    for i in range(m):
-        speed = 0.0
-        for k in range(n):
-            speed += J[i, k] * v[k]
-        b[i] = kp * error[i] - kd * speed - drift[i]
-    return b
-
-
-@compiled
-def apart(b: Array, twist: Array) -> Array:
-    """Return `b`, accelerations less J'v, with the hand's origin accelerated for its twist's.
-
-    The linear rows of J a + J'v are the rate of the velocity in axes that turn with w; the origin
-    accelerates by w x v more. Shape (6,), linear first, both in the hand's axes.
-    """
-    result = b.copy()
-    result[0] -= twist[4] * twist[2] - twist[5] * twist[1]
-    result[1] -= twist[5] * twist[0] - twist[3] * twist[2]
-    result[2] -= twist[3] * twist[1] - twist[4] * twist[0]
-    return result
-
-
-@compiled
 def null_space_spring_damper(
     J: Array, q_des: Array, q: Array, v: Array, kp: float, kd: float, regularisation: float
 ) -> Array:

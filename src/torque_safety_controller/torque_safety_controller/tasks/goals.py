@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Sequence
 
 import numpy as np
@@ -49,6 +50,7 @@ class Goals:
         self._pose_motion: PoseMotion | None = None
         self._v_des: Array | None = None
         self._a_des: Array | None = None
+        self._made: tuple[tuple[object, ...], list[Task]] | None = None
 
     @property
     def any(self) -> bool:
@@ -127,6 +129,16 @@ class Goals:
             stiffness: share of `gains.pose_kp` in each of the end effector's axes, shape (6,);
                 None for all of it.
         """
+        made_of = (
+            *(gains, stiffness, self.pose_des, self.others, self._pose_motion),
+            *(self.q_des, self.posture, self._v_des, self._a_des),
+        )
+        # Mostly nothing has changed since the last step.
+        if self._made is None or not all(map(operator.is_, made_of, self._made[0])):
+            self._made = made_of, self._make_tasks(gains, stiffness)
+        return self._made[1].copy()
+
+    def _make_tasks(self, gains: Gains, stiffness: Array | None) -> list[Task]:
         tasks: list[Task] = []
         if gains.pose_weight > 0.0:
             if self.pose_des is not None:

@@ -21,9 +21,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from torque_safety_controller.linalg.dense_kernels import apart, spring_damper
 from torque_safety_controller.qp.terms import TaskTerm
 from torque_safety_controller.robot_model import HandModel, RobotModel
+from viability_bounds_pkg.compiled import compiled
 
 Array = NDArray[np.float64]
 
@@ -75,14 +75,11 @@ class PoseTask:
             shorten(error[3:], self.error_max[1])
         if self.stiffness is not None:
             error = self.stiffness * error
-        b = spring_damper(robot.J, robot.v, error, robot.drift, self.kp, self.kd)
-        twist = robot.J @ robot.v
-        if self.separate:
-            b = apart(b, twist)
-            if self.motion is not None:
-                b += self._separate_feedforward(robot.pose, self.motion)
+        b = _spring_damper(robot.J, robot.v, error, robot.drift, self.kp, self.kd, self.separate)
+        if self.motion is not None and self.separate:
+            b += self._separate_feedforward(robot.pose, self.motion)
         elif self.motion is not None:
-            b = b + self._feedforward(robot.pose, twist, self.motion)
+            b += self._feedforward(robot.pose, robot.J @ robot.v, self.motion)
         return TaskTerm(robot.J, b, self.weight)
 
     def _separate_feedforward(self, pose: pin.SE3, motion: PoseMotion) -> Array:
@@ -150,9 +147,10 @@ def pose_difference(pose: pin.SE3, pose_des: pin.SE3) -> PoseDifference:
 
 def separate_error(pose: pin.SE3, pose_des: pin.SE3) -> Array:
     """Return ``(R'(p_d - p), log(R'R_d))``, shape (6,), m and rad, in the hand's axes."""
+    between = pose.actInv(pose_des)
     error = np.empty(6)
-    error[:3] = pose.actInv(pose_des.translation)
-    error[3:] = pin.log3(pose.rotation.T @ pose_des.rotation)
+    error[:3] = between.translation
+    error[3:] = pin.log3(between.rotation)
     return error
 
 
@@ -160,3 +158,25 @@ def pose_error(pose: pin.SE3, pose_des: pin.SE3) -> Array:
     """Return ``log(H^-1 H_des)``, shape (6,): m, then rad, in the end effector's axes."""
     error: Array = pin.log6(pose.actInv(pose_des)).vector
     return error
+
+
+@compiled
+def _spring_damper(
+    J: Array, v: Array, error: Array, drift: Array, kp: float, kd: float, separate: bool
+) -> Array:
+    """Return the accelerations ``kp error - kd J v - J' v``, shape (6,), in the hand's axes.
+
+    With `separate` those of the hand's origin are meant: the linear rows of J a + J' v are the
+    rate of the velocity in axes that turn with w, and the origin accelerates by w x v more.
+    """
+    n = len(v)
+    b, twist = np.empty(6), np.zeros(6)
+    for i in range(6):
+        for k in range(n):
+            twist[i] += J[i, k] * v[k]
+        b[i] = kp * error[i] - kd * twist[i] - drift[i]
+    if separate:
+        b[0] -= twist[4] * twist[2] - twist[5] * twist[1]
+        b[1] -= twist[5] * twist[0] - twist[3] * twist[2]
+        b[2] -= twist[3] * twist[1] - twist[4] * twist[0]
+    return b

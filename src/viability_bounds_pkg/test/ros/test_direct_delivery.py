@@ -51,7 +51,7 @@ def at(message):
 def test_all_get_the_same_object_once_and_others_get_it_too(ros):
     process = Process(ros)
     outside = ros.listen(JointState, "joint_states")
-    ros.wait_until(lambda: process.states.get_subscription_count() == 3)
+    ros.wait_until(lambda: process.states.has_others)
     message = state(1)
     process.states.publish(message)
     ros.wait_until(lambda: outside and process.both_heard(1))
@@ -68,8 +68,7 @@ def test_who_looks_on_gets_a_copy_when_the_command_has_come(ros, monkeypatch):
     JOINT_STATES.subscription(process.node("controller"), process.answers.publish)
     JOINT_COMMANDS.subscription(process.node("stepping"), lambda _: course.append("command taken"))
     outside = [ros.listen(JointState, "joint_states"), ros.listen(JointState, "joint_commands")]
-    ros.wait_until(lambda: process.states.get_subscription_count() == 4)
-    ros.wait_until(lambda: process.answers.get_subscription_count() == 3)
+    ros.wait_until(lambda: process.states.has_others and process.answers.has_others)
     publish = Publisher.publish
 
     def noted(publisher, message):

@@ -39,19 +39,14 @@ class AccelerationBounds(NamedTuple):
 
 def solve(q: Array, v: Array, table: JointTable) -> AccelerationBounds:
     """Return the bounds of states of shape (n,) or (batch, n), rad and rad/s."""
-    n = len(table.limits)
-    states = (q.size // n, n)
-    lower, upper = np.empty(q.shape), np.empty(q.shape)
-    viable = np.empty(q.shape, dtype=np.bool_)
-    _solve(
-        q.reshape(states),
-        v.reshape(states),
-        table.limits,
-        table.curves,
-        lower.reshape(states),
-        upper.reshape(states),
-        viable.reshape(states),
-    )
+    lower, upper = np.empty(q.size), np.empty(q.size)
+    viable = np.empty(q.size, dtype=np.bool_)
+    batch = q.ndim > 1
+    if batch:
+        shape, q, v = q.shape, q.ravel(), v.ravel()
+    _solve(q, v, table.limits, table.curves, lower, upper, viable)
+    if batch:
+        lower, upper, viable = (each.reshape(shape) for each in (lower, upper, viable))
     return AccelerationBounds(lower, upper, viable)
 
 
@@ -65,10 +60,13 @@ def _solve(
     upper: Array,
     viable: NDArray[np.bool_],
 ) -> None:
-    for i in range(len(q)):
-        for j in range(len(limits)):
-            lower[i, j], upper[i, j], viable[i, j] = joint_bounds(
-                q[i, j], v[i, j], limits[j, 0], limits[j, 1], curves
+    """Write the bounds of states one after the other, each of as many joints as `limits`."""
+    n = len(limits)
+    for first in range(0, len(q), n):
+        for j in range(n):
+            i = first + j
+            lower[i], upper[i], viable[i] = joint_bounds(
+                q[i], v[i], limits[j, 0], limits[j, 1], curves
             )
 
 

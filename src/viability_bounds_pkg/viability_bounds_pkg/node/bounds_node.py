@@ -133,7 +133,7 @@ class BoundsNode(ArmNode):
             points[0].accelerations = array("d", bounds.lower.tobytes())
             points[1].accelerations = array("d", bounds.upper.tobytes())
             self._answer.header.stamp = message.header.stamp
-            if not bounds.viable.all():
+            if False in bounds.viable.tolist():  # faster than NumPy's for few
                 self._outside += ~bounds.viable
             self._answered += 1
         self._publisher.publish(self._answer)

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from typing import Any, cast
 
-from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -53,7 +53,11 @@ class DirectDelivery:
 
     def publisher(self, node: Node, message: type, name: str, qos: QoSProfile) -> Publisher:
         """Return a publisher whose messages the nodes of this process get directly."""
-        publisher = node.create_publisher(message, name, qos, publisher_class=_DirectPublisher)
+        # To count subscribers at each message takes longer than to deliver it.
+        events = PublisherEventCallbacks(matched=lambda info: direct.note(info.current_count))
+        publisher = node.create_publisher(
+            message, name, qos, event_callbacks=events, publisher_class=_DirectPublisher
+        )
         stream = self._stream(node, name)
         direct = cast(_DirectPublisher, publisher)
         direct.stream, direct.deliver = stream, lambda sent: self._send(node, direct, sent)
@@ -134,6 +138,7 @@ class _DirectPublisher(Publisher):
 
     stream: _Stream
     deliver: Callable[[Any], bool]
+    _subscribers = 0
 
     def publish(self, msg: Any) -> None:
         """Send a message."""
@@ -143,7 +148,11 @@ class _DirectPublisher(Publisher):
     @property
     def has_others(self) -> bool:
         """Whether anybody outside of the process subscribes."""
-        return self.get_subscription_count() > len(self.stream.subscriptions)
+        return self._subscribers > len(self.stream.subscriptions)
+
+    def note(self, subscribers: int) -> None:
+        """Take how many subscribe now, those of this process included."""
+        self._subscribers = subscribers
 
 
 class _Stream:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections import Counter
 from collections.abc import Callable, Sequence
 
@@ -55,7 +56,7 @@ class LimitsReader:
             np.isfinite(lower).all() and np.isfinite(upper).all()
         ):
             return self._refuse("not finite")
-        if not (lower <= upper).all():
+        if not all(map(operator.le, lower.tolist(), upper.tolist())):
             return self._refuse("lower above upper")
         self.lower, self.upper = lower, upper
         self.stamp = stamp_to_ns(message.header.stamp)
