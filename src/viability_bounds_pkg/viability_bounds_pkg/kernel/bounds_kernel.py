@@ -41,13 +41,12 @@ def solve(q: Array, v: Array, table: JointTable) -> AccelerationBounds:
     """Return the bounds of states of shape (n,) or (batch, n), rad and rad/s."""
     lower, upper = np.empty(q.size), np.empty(q.size)
     viable = np.empty(q.size, dtype=np.bool_)
-    batch = q.ndim > 1
-    if batch:
-        shape, q, v = q.shape, q.ravel(), v.ravel()
-    _solve(q, v, table.limits, table.curves, lower, upper, viable)
-    if batch:
-        lower, upper, viable = (each.reshape(shape) for each in (lower, upper, viable))
-    return AccelerationBounds(lower, upper, viable)
+    if q.ndim == 1:  # to reshape takes longer than to find the bounds of one arm
+        _solve(q, v, table.limits, table.curves, lower, upper, viable)
+        return AccelerationBounds(lower, upper, viable)
+    _solve(q.ravel(), v.ravel(), table.limits, table.curves, lower, upper, viable)
+    shape = q.shape
+    return AccelerationBounds(lower.reshape(shape), upper.reshape(shape), viable.reshape(shape))
 
 
 @compiled(error_model="numpy")

@@ -53,6 +53,7 @@ class DirectDelivery:
 
     def publisher(self, node: Node, message: type, name: str, qos: QoSProfile) -> Publisher:
         """Return a publisher whose messages the nodes of this process get directly."""
+        direct: _DirectPublisher
         # To count subscribers at each message takes longer than to deliver it.
         events = PublisherEventCallbacks(matched=lambda info: direct.note(info.current_count))
         publisher = node.create_publisher(
