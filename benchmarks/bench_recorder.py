@@ -15,6 +15,7 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
+from functools import partial
 
 import rclpy
 from live_robot import (
@@ -33,6 +34,7 @@ from rclpy.task import Future
 
 from sim_bridge.nodes.run_listener import RunListener
 from viability_bounds_pkg.ros.runtime import make_executor
+from viability_bounds_pkg.testing.executables import as_child
 from viability_bounds_pkg.testing.ros_harness import read_config
 
 CASES = (("panda", 500.0), ("talos_left_arm", 1000.0))
@@ -75,7 +77,10 @@ class Recorder:
 
     def __init__(self, robot: str) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, __file__, "--record", robot], stdout=subprocess.PIPE, text=True
+            [sys.executable, __file__, "--record", robot],
+            stdout=subprocess.PIPE,
+            text=True,
+            preexec_fn=partial(as_child, signal.SIGKILL),  # it may stand still
         )
         assert self._process.stdout is not None
         self._process.stdout.readline()

@@ -18,6 +18,7 @@ from geometry_msgs.msg import PoseStamped
 from std_srvs.srv import SetBool
 
 from viability_bounds_pkg.ros.runtime import GOAL_QOS
+from viability_bounds_pkg.testing.executables import as_child
 from viability_bounds_pkg.testing.ros_harness import RosHarness
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -136,7 +137,8 @@ def running(
     started = {
         name: subprocess.Popen(
             [*command, *scheduling, "--ros-args"]
-            + [*arguments, "--log-level", "error", "-p", "start_paused:=true"]
+            + [*arguments, "--log-level", "error", "-p", "start_paused:=true"],
+            preexec_fn=as_child,
         )
         for name, command in commands.items()
     }

@@ -38,6 +38,7 @@ from live_robot import (
 from sensor_msgs.msg import JointState
 
 from viability_bounds_pkg.cli.scheduling import add_scheduling
+from viability_bounds_pkg.testing.executables import as_child
 from viability_bounds_pkg.testing.ros_harness import joint_state, private_domain, read_config
 
 ROBOTS = ("panda", "talos_left_arm", "baxter_left_arm")
@@ -82,7 +83,7 @@ def corners(robot: str, rng: np.random.Generator) -> list[JointState]:
 def busy() -> Iterator[None]:
     """Compute without end, in a process for each processor."""
     loops = [
-        subprocess.Popen([sys.executable, "-c", "while True: pass"])
+        subprocess.Popen([sys.executable, "-c", "while True: pass"], preexec_fn=as_child)
         for _ in range(os.cpu_count() or 1)
     ]
     try:

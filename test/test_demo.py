@@ -17,7 +17,7 @@ from direct import DirectLoop, column, hand_errors
 from sim_bridge.scenario.events import ParameterChange, PoseGoal, Push
 from sim_bridge.scenario.scenario import load_scenario
 from viability_bounds_pkg.node.bounds_parameters import METHODS
-from viability_bounds_pkg.testing.executables import interruptible
+from viability_bounds_pkg.testing.executables import as_child
 
 ROOT = Path(__file__).resolve().parent.parent
 DEMO = ROOT / "scripts" / "demo.sh"
@@ -125,7 +125,7 @@ def test_a_signal_takes_down_all_of_it(tmp_path, when, sent, apart):
         stderr=subprocess.PIPE,
         text=True,
         env=environment,
-        preexec_fn=interruptible,
+        preexec_fn=as_child,
     )
 
     def nodes():

@@ -22,6 +22,7 @@ from sim_bridge.nodes import simulated_stack
 from torque_safety_controller.node import safety_stack
 from viability_bounds_pkg.ros.direct_delivery import DirectDelivery
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS
+from viability_bounds_pkg.testing.executables import as_child
 from viability_bounds_pkg.testing.ros_harness import joint_state
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -71,6 +72,7 @@ def running(ros, stack, *arguments):
         env=os.environ | {"ROS_DOMAIN_ID": str(ros.domain)},
         stderr=subprocess.PIPE,
         text=True,
+        preexec_fn=as_child,
     )
     try:
         yield process
@@ -139,6 +141,7 @@ def played(ros, directory, *, stopped):
             + [ROOT / "config" / "panda.yaml", "-p", f"scenario:={scenario}", *lockstep],
             env=os.environ | {"ROS_DOMAIN_ID": str(ros.domain)},
             stdout=subprocess.DEVNULL,
+            preexec_fn=partial(as_child, signal.SIGKILL),  # it may stand still
         )
         try:
             if stopped:

@@ -13,7 +13,7 @@ from soak_record import Episode, Memory, Record
 
 from sim_bridge.faults.timeline import load_timeline
 from sim_bridge.nodes.fault_node import STREAMS
-from viability_bounds_pkg.testing.executables import interruptible
+from viability_bounds_pkg.testing.executables import as_child
 
 ROOT = Path(__file__).resolve().parent.parent
 SOAK = ["bash", ROOT / "scripts" / "soak.sh", "--rate", "100", "--every", "2"]
@@ -44,7 +44,7 @@ def test_ctrl_c_ends_it_with_its_report(tmp_path):
         [*SOAK, "--minutes", "60", "--out", tmp_path],
         stdout=subprocess.PIPE,
         text=True,
-        preexec_fn=interruptible,
+        preexec_fn=as_child,
     ) as run:
         try:
             next(line for line in run.stdout if " min  goals " in line)

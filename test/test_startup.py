@@ -12,7 +12,7 @@ import yaml
 from sim_bridge.nodes import bullet_node
 from torque_safety_controller.node import controller_node
 from viability_bounds_pkg.node import bounds_node, estimator_node
-from viability_bounds_pkg.testing.executables import interruptible
+from viability_bounds_pkg.testing.executables import as_child
 
 ROOT = Path(__file__).resolve().parent.parent
 DEADLINE = 30.0  # s
@@ -133,7 +133,7 @@ def test_nodes_end_when_told_to(ros, node, options, sent):
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        preexec_fn=interruptible,
+        preexec_fn=as_child,
     )
     try:
         # It spins when its first timer has run.
@@ -155,7 +155,7 @@ def test_what_the_system_refuses_to_schedule_is_said_and_the_node_runs(tmp_path)
     cpu = 1000  # of no machine that runs tests
     words = command(BOUNDS, "--params-file", parameter_file(tmp_path))
     words[1:1] = ["--cpus", str(cpu)]
-    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as node:
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True, preexec_fn=as_child) as node:
         try:
             line = next(line for line in node.stderr if "scheduling" in line)
             assert node.poll() is None

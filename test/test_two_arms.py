@@ -15,6 +15,7 @@ from sim_bridge.nodes.bullet_node import BulletNode
 from sim_bridge.nodes.scenario_node import ScenarioNode
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
+from viability_bounds_pkg.testing.executables import as_child
 from viability_bounds_pkg.testing.ros_harness import RosHarness, overrides, private_domain
 
 LOCKSTEP = {
@@ -106,7 +107,7 @@ def alone(tmp_path_factory):
 @contextmanager
 def busy():
     """A process that leaves the nodes no core to themselves."""
-    process = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+    process = subprocess.Popen([sys.executable, "-c", "while True: pass"], preexec_fn=as_child)
     try:
         yield
     finally:

@@ -9,10 +9,10 @@ setup(
     name=PACKAGE,
     version="0.1.0",
     packages=find_packages(exclude=["test"]),
-    package_data={PACKAGE: ["py.typed", "ros/*_names.txt"]},
+    package_data={PACKAGE: ["py.typed", "ros/*_names.txt", "ros/fastdds.xml"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
-        (f"share/{PACKAGE}", ["package.xml"]),
+        (f"share/{PACKAGE}", ["package.xml", f"{PACKAGE}/ros/fastdds.xml"]),
     ],
     python_requires=">=3.10",
     install_requires=[

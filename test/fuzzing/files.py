@@ -31,7 +31,7 @@ from hypothesis import (
 from hypothesis import strategies as st
 from hypothesis.errors import DidNotReproduce
 
-from viability_bounds_pkg.testing.executables import environment, interruptible
+from viability_bounds_pkg.testing.executables import as_child, environment
 from viability_bounds_pkg.testing.ros_harness import config_folder
 
 ROBOTS = ("panda", "baxter_left_arm", "talos_left_arm")
@@ -163,7 +163,7 @@ def _process(name: str, words: list[str]) -> programs.Ended:
             stdout=subprocess.DEVNULL,
             stderr=written,
             env=environment(),
-            preexec_fn=interruptible,
+            preexec_fn=as_child,
         )
 
         def text_now() -> str:

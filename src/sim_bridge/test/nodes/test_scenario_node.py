@@ -10,7 +10,7 @@ from ament_index_python.packages import get_package_prefix
 
 from sim_bridge.nodes.scenario_node import ScenarioNode
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.testing.executables import interruptible
+from viability_bounds_pkg.testing.executables import as_child
 from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
 
 DEADLINE = 30.0  # s
@@ -79,7 +79,7 @@ def waiting(directory):
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        preexec_fn=interruptible,
+        preexec_fn=as_child,
     )
     try:
         assert "waiting" in process.stdout.readline()

@@ -12,8 +12,8 @@ from two_joint_robot import parameters_in
 
 from viability_bounds_pkg.testing.executables import (
     TIME_LIMIT,
+    as_child,
     environment,
-    interruptible,
 )
 
 
@@ -39,7 +39,7 @@ def start(code, *arguments):
         stderr=subprocess.PIPE,
         text=True,
         env=environment(),
-        preexec_fn=interruptible,
+        preexec_fn=as_child,
     )
 
 

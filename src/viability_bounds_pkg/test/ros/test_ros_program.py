@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import viability_bounds_pkg
-from viability_bounds_pkg.testing.executables import interruptible
+from viability_bounds_pkg.testing.executables import as_child
 
 PACKAGES = str(Path(viability_bounds_pkg.__file__).resolve().parents[1])
 INTERRUPT = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n"
@@ -26,7 +26,7 @@ def call(directory, program, function, arguments):
         text=True,
         timeout=30,
         check=False,
-        preexec_fn=interruptible,
+        preexec_fn=as_child,
     )
 
 

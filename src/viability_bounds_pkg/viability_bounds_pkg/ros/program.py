@@ -30,7 +30,7 @@ from viability_bounds_pkg.ros.ros_arguments import (
     is_known_remapping,
     ros_rules,
 )
-from viability_bounds_pkg.ros.runtime import EventsExecutor, make_executor
+from viability_bounds_pkg.ros.runtime import EventsExecutor, make_executor, settle_dds
 from viability_bounds_pkg.user_input.parameter_files import check_parameter_files
 
 _SIGNAL_CHECK_PERIOD = 0.2
@@ -103,6 +103,7 @@ def node_parser(kind: type[ArmNode]) -> Parser:
 def initialise(args: Sequence[str] | None) -> None:
     """Initialise rclpy with the arguments given, of the process if None."""
     arguments = list(sys.argv if args is None else args)
+    settle_dds(os.environ)
     # Its own signal handlers would shut down the context in the middle of a callback.
     rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     note_arguments(rclpy.get_default_context(), arguments)

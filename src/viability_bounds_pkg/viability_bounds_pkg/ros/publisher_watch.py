@@ -54,6 +54,8 @@ class PublisherWatch:
             node.resolve_topic_name(topic.name) for topic in (JOINT_STATES, ESTIMATED_JOINT_STATES)
         )
         self._node = node
+        # Held by the interpreter's lock, so that no other thread destroys the node meanwhile.
+        self._count = node.handle.get_count_publishers
         self._topics = [node.resolve_topic_name(topic) for topic in topics]
         # When a publisher without a name was first seen, and each of several, by its identity.
         self._nameless: dict[str, float] = {}
@@ -92,12 +94,13 @@ class PublisherWatch:
         Args:
             topic: its name, resolved.
         """
-        with self._node.handle:
-            count = self._node.handle.get_count_publishers(topic)
-        if count <= 1:
-            self._looked.pop(topic, None)
-            if topic in self.rivals:
-                self.look()
+        # On the control path. A subscription counts its publishers faster, but a little after it
+        # takes their messages: the graph has a publisher before.
+        if self._count(topic) <= 1:
+            if self._looked or self.rivals:
+                self._looked.pop(topic, None)
+                if topic in self.rivals:
+                    self.look()
             return True
         now = time.monotonic()
         if now - self._looked.get(topic, -math.inf) > _AGAIN:

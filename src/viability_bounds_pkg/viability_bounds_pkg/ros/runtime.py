@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every node here needs from ROS: quality of service, an executor, stamps."""
+"""What every node here needs from ROS: quality of service, an executor, stamps, DDS settings."""
 
 from __future__ import annotations
+
+from collections.abc import MutableMapping
+from pathlib import Path
 
 from builtin_interfaces.msg import Time
 from rclpy.context import Context
@@ -31,6 +34,28 @@ LATCHED_QOS = QoSProfile(
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 """Sent once, received also by subscribers that come later: robot_description."""
+
+_PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
+_WITH_UDP = "", "DEFAULT", "UDPv4"
+"""Built-in transports with which messages can come by UDP."""
+
+
+def settle_dds(environment: MutableMapping[str, str], folder: Path | None = None) -> None:
+    """Choose settings of Fast DDS by which nodes that start again are heard soon, `fastdds.xml`.
+
+    Users who have settings of their own, or other transports, keep them. Call it before the first
+    node of a process is made.
+
+    Args:
+        environment: of the process; its children inherit it.
+        folder: working directory, in which Fast DDS looks for settings, too; None for the process'
+            own.
+    """
+    own = (folder or Path.cwd()) / "DEFAULT_FASTRTPS_PROFILES.xml"
+    transports = environment.get("FASTDDS_BUILTIN_TRANSPORTS", "")
+    if environment.get(_PROFILES) or own.exists() or transports not in _WITH_UDP:
+        return
+    environment[_PROFILES] = str(Path(__file__).with_name("fastdds.xml"))
 
 
 def make_executor(context: Context | None = None) -> Executor:

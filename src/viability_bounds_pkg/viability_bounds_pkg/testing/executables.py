@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import resource
 import signal
@@ -16,6 +17,9 @@ import pytest
 
 TIME_LIMIT = 60.0
 """For a process, s."""
+
+_LIBC = ctypes.CDLL(None)
+_PR_SET_PDEATHSIG = 1  # of Linux
 
 
 def environment() -> dict[str, str]:
@@ -34,9 +38,16 @@ def room_on_disk(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def interruptible() -> None:
-    """Let SIGINT end the process to be started: in the background it is ignored by inheritance."""
+def as_child(end: signal.Signals = signal.SIGTERM) -> None:
+    """Let SIGINT end the process to be started, and the end of this one, also when it is killed.
+
+    In the background SIGINT is ignored by inheritance.
+
+    Args:
+        end: signal that the process gets when this one has ended.
+    """
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    _LIBC.prctl(_PR_SET_PDEATHSIG, end)
 
 
 def started(*arguments: Any) -> subprocess.CompletedProcess[str]:
@@ -48,7 +59,7 @@ def started(*arguments: Any) -> subprocess.CompletedProcess[str]:
         env=environment(),
         timeout=TIME_LIMIT,
         check=False,
-        preexec_fn=interruptible,
+        preexec_fn=as_child,
     )
 
 

@@ -8,12 +8,13 @@ import resource
 import signal
 import subprocess
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
 from ament_index_python.packages import get_package_prefix
 
-from viability_bounds_pkg.testing.executables import interruptible
+from viability_bounds_pkg.testing.executables import as_child
 
 PACKAGES = {
     "bounds_node": "viability_bounds_pkg",
@@ -71,7 +72,7 @@ class NodeProgram:
             env=self._environment,
             stderr=self._errors,
             text=True,
-            preexec_fn=interruptible,
+            preexec_fn=partial(as_child, signal.SIGKILL),  # it may stand still
         )
 
     def send(self, number: signal.Signals) -> None:

@@ -36,7 +36,13 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.ros.runtime import CONTROL_QOS, make_executor, set_stamp, stamp_to_ns
+from viability_bounds_pkg.ros.runtime import (
+    CONTROL_QOS,
+    make_executor,
+    set_stamp,
+    settle_dds,
+    stamp_to_ns,
+)
 from viability_bounds_pkg.user_input.yaml_file import read_yaml
 
 
@@ -131,6 +137,7 @@ class RosHarness:
 
     def __init__(self, domain: int) -> None:
         self.domain = domain
+        settle_dds(os.environ)  # as the programs do
         self.context = rclpy.Context()
         rclpy.init(
             args=[],
