@@ -10,6 +10,11 @@ then: the same accelerations. So one plan, once found, is enough for ever.
 N is chosen from one time T for the whole arm: a joint takes longer where it would have to brake
 harder than A, and less where it would pass its position limit. m and w are as long as it takes for
 the acceleration to change gently, where its changes are limited.
+
+Arguments, for n joints, arrays of shape (n,): positions q, rad, and velocities v, rad/s, at the
+beginning of a plan; accelerations a of the period before, rad/s^2; the time T of the plan and the
+control period dt, s; the change of acceleration from period to period that is `gentle`, rad/s^2,
+inf for any. Functions of one joint, j, take its own q, v and a.
 """
 
 from __future__ import annotations
@@ -143,18 +148,7 @@ def make_course(
     dt: float,
     course: Course,
 ) -> None:
-    """Fill in the course of the plan of time `T`.
-
-    Args:
-        q: positions, shape (n,), rad.
-        v: velocities, shape (n,), rad/s.
-        a: accelerations of the period before, shape (n,), rad/s^2.
-        T: s.
-        gentle: change of accelerations from period to period, shape (n,), rad/s^2; inf for any.
-        limits: what it keeps to.
-        dt: control period, s.
-        course: filled in.
-    """
+    """Fill in the course of the plan of time `T`."""
     for j in range(q.size):
         course.moving[j], course.rising[j], course.falling[j] = _course_of(
             j, q[j], v[j], a[j], T, gentle, limits, dt
@@ -184,19 +178,8 @@ def repair(
 ) -> bool:
     """Fill in a course in which joints that have drifted stand before their limits again.
 
-    Args:
-        q: positions, shape (n,), rad.
-        v: velocities, shape (n,), rad/s.
-        a: accelerations of the period before, shape (n,), rad/s^2.
-        T: time of the plan, s.
-        gentle: change of accelerations from period to period, shape (n,), rad/s^2.
-        limits: of the joints.
-        dt: control period, s.
-        course: of the plan in hand.
-        repaired: filled in: the same, but for joints that end beyond by more than `DRIFTED`.
-
-    Returns:
-        Whether there are such joints.
+    `repaired` is `course`, that of the plan in hand, but for joints that end beyond a limit by
+    more than `DRIFTED`; returns whether there are such joints.
     """
     found = False
     for j in range(q.size):
@@ -225,18 +208,9 @@ def viable_range(
 ) -> None:
     """Narrow ranges of accelerations to those after which each joint by itself has a plan.
 
-    Args:
-        q: positions, shape (n,), rad.
-        v: velocities, shape (n,), rad/s.
-        plan: accelerations of the plan in hand, shape (n,), rad/s^2.
-        last: accelerations of the period before, shape (n,), rad/s^2.
-        T: time of the plans, s.
-        gentle: change of accelerations in the plans, shape (n,), rad/s^2.
-        limits: of the joints.
-        dt: control period, s.
-        low: lower ends, shape (n,), rad/s^2; narrowed in place. Where nothing in the range is
-            possible, what is nearest to it.
-        high: upper ends.
+    `low` and `high`, the ends of the ranges, rad/s^2, change in place; where nothing in a range is
+    possible, to what is nearest to it. `plan` has the accelerations of the plan in hand, `last`
+    those of the period before, rad/s^2.
     """
     for j in range(q.size):
         change = limits.change_max[j]
