@@ -155,16 +155,13 @@ def make_course(
         )
 
 
-@compiled
 def rest_of(course: Course, rest: Course) -> None:
     """Fill in what is left of a course after a period: at least one."""
-    for j in range(course.moving.size):
-        rest.moving[j] = max(course.moving[j] - 1, 1)
-        rest.rising[j] = max(course.rising[j] - 1, 1)
-        rest.falling[j] = min(course.falling[j], rest.moving[j])
+    np.maximum(course.moving - 1, 1, out=rest.moving)
+    np.maximum(course.rising - 1, 1, out=rest.rising)
+    np.minimum(course.falling, rest.moving, out=rest.falling)
 
 
-@compiled
 def repair(
     q: Array,
     v: Array,
@@ -176,21 +173,22 @@ def repair(
     course: Course,
     repaired: Course,
 ) -> bool:
-    """Fill in a course in which joints that have drifted stand before their limits again.
+    """Return whether joints have drifted: their plan ends beyond a limit by more than `DRIFTED`.
 
-    `repaired` is `course`, that of the plan in hand, but for joints that end beyond a limit by
-    more than `DRIFTED`; returns whether there are such joints.
+    Then `repaired` is filled in: `course`, that of the plan in hand, but for these joints, which
+    stand before their limits again.
     """
-    found = False
-    for j in range(q.size):
-        N, m, w = course.moving[j], course.rising[j], course.falling[j]
+    beyond = np.empty(q.size)
+    for j, (N, m, w) in enumerate(zip(*course, strict=True)):
         low, high = limits.q_min[j], limits.q_max[j]
-        beyond = passed(q[j], v[j], a[j], (N, m, w), low, high, dt)
-        if beyond > DRIFTED * limits.tolerance[j]:
-            found = True
-            N, m, w = _course_of(j, q[j], v[j], a[j], T, gentle, limits, dt)
-        repaired.moving[j], repaired.rising[j], repaired.falling[j] = N, m, w
-    return found
+        beyond[j] = passed(q[j], v[j], a[j], (N, m, w), low, high, dt)
+    fine = ~(beyond > DRIFTED * limits.tolerance)
+    if fine.all():
+        return False
+    make_course(q, v, a, T, gentle, limits, dt, repaired)
+    for new, old in zip(repaired, course, strict=True):
+        new[fine] = old[fine]
+    return True
 
 
 @compiled
