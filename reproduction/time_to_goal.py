@@ -22,7 +22,6 @@ from pieces import in_pieces
 from whole_arm import CLEAR, DATA_SHEET, KEPT_FREE, arrive, random_goal
 
 from viability_bounds_pkg.estimation.discretisation_margin import discretisation_margin
-from viability_bounds_pkg.node.bounds_parameters import PEAK
 
 ROBOT = "panda"
 STIFF = {"posture_kp": 400.0, "posture_kd": 40.0, "posture_weight": 1.0, "pose_weight": 0.0}
@@ -42,13 +41,10 @@ class Limits(NamedTuple):
     """rad/s^2; None for those of the file."""
     speeds: list[float] | None = None
     """rad/s; None for those of the file."""
-    by_state: bool = False
-    """Whether acceleration limits depend on the state."""
 
 
 ROWS = {
     "worst case": Limits(False),
-    "state dependent": Limits(False, by_state=True),
     "filter": Limits(True),
     "filter, data sheet": Limits(True, DATA_SHEET),
     "filter, twice the data sheet": Limits(True, [2.0 * a for a in DATA_SHEET]),
@@ -68,14 +64,13 @@ def parameters(row: Limits) -> dict[str, Any]:
     limits, config = file.limits, file.config
     a_max = limits.a_max if row.accelerations is None else np.array(row.accelerations)
     v_max = config.velocity_max if row.speeds is None else np.array(row.speeds)
-    largest = PEAK * a_max if row.by_state else a_max
     found = discretisation_margin(
         file.model,
         limits.q_min,
         limits.q_max,
         v_max,
-        -largest,
-        largest,
+        -a_max,
+        a_max,
         config.torque_max,
         config.dt,
     )
@@ -85,7 +80,6 @@ def parameters(row: Limits) -> dict[str, Any]:
         "acceleration_max": a_max.tolist(),
         "velocity_max": v_max.tolist(),
         "acceleration_drift": (1.1 * found.jerk).tolist(),
-        "acceleration_limits": "state_dependent" if row.by_state else "worst_case",
     }
 
 

@@ -55,7 +55,7 @@ def compile_all() -> None:
                 play(path.stem, {})
             except ArmSafetyError as error:  # a file of the user's; its nodes will say so, too
                 print(f"setup: nothing is compiled for {path.name}: {error}", file=sys.stderr)
-        play("panda", {"acceleration_limits": "state_dependent", **wall["ros__parameters"]})
+        play("panda", wall["ros__parameters"])
         touch()
         stop()
         LimitsReader(["joint"])

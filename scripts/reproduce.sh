@@ -14,7 +14,6 @@ Writes figures to results/, and prints a table with the paper's numbers and ours
   paper1-compliance  pushes, poles, yielding and pressing hand
   two-hands          two hands with one integral action, and docs/reproduction_two_hands.md (1 min)
   departures         where the controller departs from the second paper, and docs/departures.md
-  state_dependent    Baxter with state-dependent acceleration limits
   friction           TALOS with friction compensation
   out_of_reach       hands sent out of reach, without and with a largest speed (2 min)
   stopping           commands fail: the drives' own stop beside the brakes, and its cost (2 min)
@@ -39,7 +38,7 @@ what="${1:-all}"
 [ $# -eq 0 ] || shift
 case "$what" in -h | --help) usage; exit 0 ;; esac
 if [ "$what" = all ]; then
-    for part in paper0 paper1-integral paper1-compliance two-hands departures state_dependent friction out_of_reach stopping whole_arm; do
+    for part in paper0 paper1-integral paper1-compliance two-hands departures friction out_of_reach stopping whole_arm; do
         bash "$root/scripts/reproduce.sh" "$part"
     done
     exit 0
@@ -47,7 +46,7 @@ fi
 what="${what//-/_}"
 [ "$what" != adversary ] || what=search_adversary
 case "$what" in
-paper0 | paper1_integral | paper1_compliance | two_hands | departures | state_dependent | friction | out_of_reach | stopping | whole_arm | time_to_goal | search_adversary | imperfect | faults | process_faults | false_alarms | exactness) ;;
+paper0 | paper1_integral | paper1_compliance | two_hands | departures | friction | out_of_reach | stopping | whole_arm | time_to_goal | search_adversary | imperfect | faults | process_faults | false_alarms | exactness) ;;
 *)
     echo "error: unknown '$what'; --help lists what there is" >&2
     exit 2

@@ -48,7 +48,7 @@ PLAYED = [
     ["baxter_left_arm", {}],
     ["panda", {}],
     ["talos_left_arm", {}],
-    ["baxter_left_arm", {"acceleration_limits": "state_dependent", "integral_action": "task"}],
+    ["baxter_left_arm", {"integral_action": "task"}],
     ["panda", OBSTACLES["/**/controller_node"]["ros__parameters"]],
 ]
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import itertools
 import re
 import shlex
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -148,35 +149,35 @@ def gets(capfd):
     return wait
 
 
+@contextmanager
+def run_nodes(*kinds, **changes):
+    with private_domain() as domain:
+        running = Running(RosHarness(domain))
+        for kind in kinds:
+            running.start(kind, **changes)
+        yield running
+        running.ros.close()
+
+
 @pytest.fixture(scope="module")
 def nodes():
     """A bounds node and a controller without a robot."""
-    with private_domain() as domain:
-        running = Running(RosHarness(domain))
-        running.start(BoundsNode)
-        running.start(ControllerNode)
+    with run_nodes(BoundsNode, ControllerNode) as running:
         yield running
-        running.ros.close()
 
 
 @pytest.fixture(scope="module")
 def controller():
     """A controller alone, which obeys limits of others."""
-    with private_domain() as domain:
-        running = Running(RosHarness(domain))
-        running.start(ControllerNode)
+    with run_nodes(ControllerNode) as running:
         yield running
-        running.ros.close()
 
 
 @pytest.fixture(scope="module")
 def robot():
     """A robot in lockstep that waits for its first command."""
-    with private_domain() as domain:
-        running = Running(RosHarness(domain))
-        running.start(BulletNode, clock="lockstep")
+    with run_nodes(BulletNode, clock="lockstep") as running:
         yield running
-        running.ros.close()
 
 
 def imported(name: str) -> Any:

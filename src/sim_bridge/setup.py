@@ -31,10 +31,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
-        *(
-            (f"share/{PACKAGE}/{folder}", glob(f"{folder}/*.*ml") + glob(f"{folder}/*.json"))
-            for folder in CONFIG
-        ),
+        *((f"share/{PACKAGE}/{folder}", _files(folder)) for folder in CONFIG),
     ],
     install_requires=["setuptools"],
     extras_require={"test": ["pytest", "hypothesis"]},

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import functools
-import gc
 import os
 import signal
 import subprocess
@@ -19,7 +18,7 @@ import yaml
 from fuzzing import programs
 from fuzzing.edit import Edit, exploring
 from fuzzing.file_edits import file_edits, odd_file
-from fuzzing.messages import Failure, Keep, Show, failed
+from fuzzing.messages import Failure, Keep, Show, broken
 from fuzzing.tally import TAKEN, ClaimBroken, Tally
 from hypothesis import (
     currently_in_test_context,
@@ -29,7 +28,6 @@ from hypothesis import (
     seed,
 )
 from hypothesis import strategies as st
-from hypothesis.errors import DidNotReproduce
 
 from viability_bounds_pkg.testing.executables import as_child, environment
 from viability_bounds_pkg.testing.ros_harness import config_folder
@@ -214,16 +212,7 @@ def play(
 
     if case is not None:
         all_files = reproduce_failure(hypothesis.__version__, case)(all_files)
-    try:
-        all_files()
-    except DidNotReproduce:
-        return None
-    except Exception as error:
-        failure = failed(number, error)
-    else:
-        return None
-    gc.collect()  # nodes that the error left
-    return failure
+    return broken(number, all_files)
 
 
 def fuzz(count: int, first: int, tally: Tally, show: Show, keep: Keep) -> list[Failure]:

@@ -8,6 +8,7 @@ import re
 import time
 import traceback
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import hypothesis
@@ -52,11 +53,14 @@ def play(number: int, tally: Tally, *, case: bytes | None = None) -> Failure | N
     machine = seed(number)(type("Machine", (Machine,), {"tally": tally}))
     if case is not None:
         machine = reproduce_failure(hypothesis.__version__, case)(machine)
+    settings = exploring(EXAMPLES, stateful_step_count=STEPS)
+    return broken(number, partial(run_state_machine_as_test, machine, settings=settings))
+
+
+def broken(number: int, part: Callable[[], object]) -> Failure | None:
+    """Run a part; return what broke in it."""
     try:
-        run_state_machine_as_test(
-            machine,
-            settings=exploring(EXAMPLES, stateful_step_count=STEPS),
-        )
+        part()
     except DidNotReproduce:
         return None
     except Exception as error:

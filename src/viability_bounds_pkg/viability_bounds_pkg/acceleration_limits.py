@@ -226,18 +226,9 @@ def limits_from_worst_cases(
     overrides: Mapping[str, tuple[float, float]] | None = None,
     cap: ArrayLike | None = None,
 ) -> AccelerationLimits:
-    """Apply overrides and caps to the limits that a search found.
+    """Apply overrides and caps to the limits that a search of `space` found.
 
-    Args:
-        model: the robot.
-        space: what was searched, with the torque available.
-        worst: the outcome of the search.
-        overrides: as in `estimate_acceleration_limits`.
-        cap: as in `estimate_acceleration_limits`.
-
-    Raises:
-        EmptyIntervalError: a joint without override is left no interval.
-        LimitEstimateError: bad overrides or caps.
+    Arguments and errors as of `estimate_acceleration_limits`.
     """
     check_adjustments(model, overrides, cap)
     overrides = dict(overrides or {})
@@ -261,14 +252,8 @@ def unavailable_share(
 ) -> Array:
     """Return the share of 20,000 random states in which torque does not allow a joint's limits.
 
-    Args:
-        model: the robot.
-        space: the box of states, with the torque available.
-        limits: what is asked for.
-
-    Returns:
-        Shares in [0, 1], shape (n,): zero in all but rare states for limits that were found,
-        large for an override that gravity alone forbids.
+    Shape (n,): nearly zero for limits that were found, large for an override that gravity alone
+    forbids. `space` is the box of states, with the torque available.
     """
     wanted = np.stack([limits.a_max, -limits.a_min])
     share: Array = np.mean(np.any(_random_room(model, space) < wanted, axis=1), axis=0)
@@ -280,13 +265,8 @@ def limits_in_share(model: pin.Model, space: StateSpace, share: float) -> Array:
 
     For joints that have no interval in all states: the safety filter needs no more than that.
 
-    Args:
-        model: the robot.
-        space: the box of states, with the torque available.
-        share: of the states, in (0, 1).
-
-    Returns:
-        Limits of each joint, shape (n,), rad/s^2; not positive where there are none.
+    `space` is the box of states, with the torque available; `share` is in (0, 1). Shape (n,),
+    rad/s^2; not positive where there are none.
     """
     either = _random_room(model, space).min(axis=1)
     limits: Array = np.quantile(either, 1.0 - share, axis=0, method="lower")

@@ -13,6 +13,9 @@ clipped to the acceleration limits and, if they still cross, both set to their m
   Rubrecht2012], reconstructed from what [DelPrete2018] says of them; `docs/bounds.md` gives the
   reasons. The joint is taken to move with one velocity u throughout the step and to change it
   from step to step by at most ``a dt``, a pseudo-acceleration.
+
+Arguments of all: position q and velocity v, shape (n,) or (batch, n), rad and rad/s; the limits of
+n joints; the step dt, s.
 """
 
 from __future__ import annotations
@@ -29,14 +32,7 @@ Array = NDArray[np.float64]
 
 
 def naive_bounds(q: ArrayLike, v: ArrayLike, limits: JointLimits, dt: float) -> AccelerationBounds:
-    """Return the accelerations that keep the limits at the end of one step: eq. (2).
-
-    Args:
-        q: shape (n,) or (batch, n), rad.
-        v: same shape, rad/s.
-        limits: of n joints.
-        dt: step, s.
-    """
+    """Return the accelerations that keep the limits at the end of one step: eq. (2)."""
     q, v = np.asarray(q, dtype=np.float64), np.asarray(v, dtype=np.float64)
     lower = np.maximum((-limits.v_max - v) / dt, 2.0 * (limits.q_min - q - dt * v) / dt**2)
     upper = np.minimum((limits.v_max - v) / dt, 2.0 * (limits.q_max - q - dt * v) / dt**2)
@@ -46,7 +42,7 @@ def naive_bounds(q: ArrayLike, v: ArrayLike, limits: JointLimits, dt: float) -> 
 def damper_velocity_range(
     q: ArrayLike, limits: JointLimits, influence: float, gain: float
 ) -> tuple[Array, Array]:
-    """Return the speeds that a linear velocity damper allows; arguments as `damper_bounds`."""
+    """Return the speeds that a linear velocity damper allows, as in `damper_bounds`."""
     q = np.asarray(q, dtype=np.float64)
 
     def towards(room: Array) -> Array:
@@ -66,13 +62,7 @@ def damper_bounds(
 ) -> AccelerationBounds:
     """Return the accelerations that obey a linear velocity damper at the end of the step.
 
-    Args:
-        q: shape (n,) or (batch, n), rad.
-        v: same shape, rad/s.
-        limits: of n joints.
-        dt: step, s.
-        influence: distance to a limit from which on the damper acts, rad.
-        gain: speed it allows at `influence`, rad/s.
+    It acts nearer to a limit than `influence`, rad, and allows the speed `gain`, rad/s, there.
     """
     return _to_reach(v, damper_velocity_range(q, limits, influence, gain), limits, dt)
 
@@ -81,15 +71,8 @@ def decre_velocity_range(q: ArrayLike, limits: JointLimits, dt: float) -> tuple[
     """Return the velocities for the next step that [Decre2009] allows (reconstruction).
 
     ``u <= min(v_max, sqrt(2 a room), room / dt)``: the joint can brake in time if it starts at
-    once, and is inside when the step ends. Towards the upper limit a is ``-a_min``.
-
-    Args:
-        q: shape (n,) or (batch, n), rad.
-        limits: of n joints.
-        dt: step, s.
-
-    Returns:
-        Lowest and highest velocity, each of the shape of `q`, rad/s.
+    once, and is inside when the step ends. Towards the upper limit a is ``-a_min``. The lowest and
+    the highest velocity have the shape of `q`, rad/s.
     """
 
     def towards(room: Array, braking: Array) -> Array:
@@ -102,15 +85,8 @@ def rubrecht_velocity_range(q: ArrayLike, limits: JointLimits, dt: float) -> tup
     """Return the velocities for the next step that [Rubrecht2012] allows (reconstruction).
 
     ``dt u + u^2 / (2 a) <= room``: the joint can brake in time after a step at velocity u. Then
-    ``u - a dt`` is always allowed in the next step, so that there is no conflict.
-
-    Args:
-        q: shape (n,) or (batch, n), rad.
-        limits: of n joints.
-        dt: step, s.
-
-    Returns:
-        Lowest and highest velocity, each of the shape of `q`, rad/s.
+    ``u - a dt`` is always allowed in the next step, so that there is no conflict. The lowest and
+    the highest velocity have the shape of `q`, rad/s.
     """
 
     def towards(room: Array, braking: Array) -> Array:
@@ -123,28 +99,14 @@ def rubrecht_velocity_range(q: ArrayLike, limits: JointLimits, dt: float) -> tup
 
 
 def decre_bounds(q: ArrayLike, v: ArrayLike, limits: JointLimits, dt: float) -> AccelerationBounds:
-    """Return the accelerations that end the step inside `decre_velocity_range`.
-
-    Args:
-        q: shape (n,) or (batch, n), rad.
-        v: same shape, rad/s.
-        limits: of n joints.
-        dt: step, s.
-    """
+    """Return the accelerations that end the step inside `decre_velocity_range`."""
     return _to_reach(v, decre_velocity_range(q, limits, dt), limits, dt)
 
 
 def rubrecht_bounds(
     q: ArrayLike, v: ArrayLike, limits: JointLimits, dt: float
 ) -> AccelerationBounds:
-    """Return the accelerations that end the step inside `rubrecht_velocity_range`.
-
-    Args:
-        q: shape (n,) or (batch, n), rad.
-        v: same shape, rad/s.
-        limits: of n joints.
-        dt: step, s.
-    """
+    """Return the accelerations that end the step inside `rubrecht_velocity_range`."""
     return _to_reach(v, rubrecht_velocity_range(q, limits, dt), limits, dt)
 
 

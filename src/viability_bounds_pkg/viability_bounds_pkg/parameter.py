@@ -241,18 +241,19 @@ def _field(**row: Any) -> Any:
     return field(metadata=metadata, default=parameter.default)
 
 
-def parameter_table(kind: type) -> tuple[Parameter, ...]:
-    """Return the parameters that a dataclass and its groups declare, in their order."""
-    return _table(kind, "")
+def parameter_table(kind: type, prefix: str = "") -> tuple[Parameter, ...]:
+    """Return the parameters that a dataclass and its groups declare, in their order.
 
-
-def _table(kind: type, prefix: str) -> tuple[Parameter, ...]:
+    Args:
+        kind: the dataclass.
+        prefix: of the names, as in `group`.
+    """
     rows: list[Parameter] = []
     for each in fields(kind):
         if _PARAMETER in each.metadata:
             rows.append(replace(each.metadata[_PARAMETER], name=prefix + each.name))
         elif _GROUP in each.metadata:
-            rows += _table(*each.metadata[_GROUP])
+            rows += parameter_table(*each.metadata[_GROUP])
     return tuple(rows)
 
 
@@ -309,7 +310,7 @@ def check(settings: Any, prefix: str = "") -> None:
     Raises:
         SettingError: a value of another type, or not allowed.
     """
-    for row in _table(type(settings), prefix):
+    for row in parameter_table(type(settings), prefix):
         row.coerce(getattr(settings, row.name.removeprefix(prefix)))
 
 

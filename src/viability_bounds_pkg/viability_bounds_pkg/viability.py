@@ -158,21 +158,8 @@ def acceleration_bounds(
 ) -> AccelerationBounds:
     """Return the largest interval of accelerations that keeps the limits for ever: problem (4).
 
-    A function for `BoundsSolver(limits, dt, ...).bounds(q, v)`, which documents the arguments;
-    the solver is kept for the next call with the same settings.
-
-    Args:
-        q: shape (n,) or (batch, n), rad.
-        v: same shape, rad/s.
-        limits: of n joints.
-        dt: step, s.
-        margin: shape (n,), rad/s^2, or None.
-        period: control period, s, at most `dt`; None means `dt`.
-        position_error: shape (n,), rad, or None.
-        velocity_error: shape (n,), rad/s, or None.
-
-    Raises:
-        JointLimitsError: an argument is unusable, or the shapes of `q` and `v`.
+    A function for `BoundsSolver(limits, dt, ...).bounds(q, v)`, which documents arguments and
+    errors; the solver is kept for the next call with the same settings.
     """
     if margin is not None:
         margin = tuple(checked_margin(margin, limits).tolist())
@@ -236,15 +223,10 @@ def _make_table(
     braking: Array,
     curved: NDArray[np.bool_],
 ) -> JointTable:
-    """Return the kernel's table; `braking` is of shape (n, 2), towards upper and lower limit.
+    """Return the kernel's table.
 
-    Args:
-        limits: of n joints.
-        dt: step, s.
-        margins: shape (n,), rad/s^2.
-        velocity_errors: shape (n,), rad/s.
-        braking: shape (n, 2), rad/s^2.
-        curved: joints whose kernel is the one of discrete time, shape (n,).
+    `braking` is of shape (n, 2), towards the upper and the lower limit, rad/s^2; `curved`, shape
+    (n,), tells which kernels are those of discrete time.
     """
     ranges = np.stack([limits.q_max, -limits.q_min], axis=1)
     length = ranges.sum(axis=1, keepdims=True)

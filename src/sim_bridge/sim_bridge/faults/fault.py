@@ -84,10 +84,13 @@ def _share(value: Any, where: str) -> float:
     return float(value)
 
 
-def _field(value: Any, where: str) -> str:
-    if value not in FIELDS:
-        raise refuse(where, value, f"one of {', '.join(FIELDS)}")
-    return str(value)
+def _one_of(*allowed: str) -> Check:
+    def check(value: Any, where: str) -> str:
+        if value not in allowed:
+            raise refuse(where, value, f"one of {', '.join(allowed)}")
+        return str(value)
+
+    return check
 
 
 def _names(value: Any, where: str) -> tuple[str, ...]:
@@ -101,15 +104,6 @@ def _two_names(value: Any, where: str) -> tuple[str, ...]:
     if len(set(names)) != 2 or len(names) != 2:
         raise refuse(where, value, "the names of two joints")
     return names
-
-
-CORRUPTIONS = ("nan", "inf", "huge", "short", "names")
-
-
-def _how(value: Any, where: str) -> str:
-    if value not in CORRUPTIONS:
-        raise refuse(where, value, f"one of {', '.join(CORRUPTIONS)}")
-    return str(value)
 
 
 @dataclass(kw_only=True)
@@ -153,13 +147,24 @@ class Duplicate(Fault):
 
 
 @dataclass(kw_only=True)
-class Reorder(Fault):
+class _Holding(Fault):
+    """Messages may be held back."""
+
+    _held: list[Passage] = dataclasses.field(default_factory=list)
+
+    def finish(self) -> list[Passage]:
+        """Return what was held back."""
+        held, self._held = self._held, []
+        return held
+
+
+@dataclass(kw_only=True)
+class Reorder(_Holding):
     """A message comes after the one that follows it."""
 
     KIND = "reorder"
     FIELDS = {"probability": _share}
     probability: float = 1.0
-    _held: list[Passage] = dataclasses.field(default_factory=list)
 
     def _spoil(self, passing: Passage, rng: np.random.Generator) -> list[Passage]:
         if self._held:
@@ -169,27 +174,16 @@ class Reorder(Fault):
             return []
         return [passing]
 
-    def finish(self) -> list[Passage]:
-        """Return what was held back."""
-        held, self._held = self._held, []
-        return held
-
 
 @dataclass(kw_only=True)
-class Burst(Fault):
+class Burst(_Holding):
     """Messages are held back, and come all at once when the fault ends."""
 
     KIND = "burst"
-    _held: list[Passage] = dataclasses.field(default_factory=list)
 
     def _spoil(self, passing: Passage, rng: np.random.Generator) -> list[Passage]:
         self._held.append(passing)
         return []
-
-    def finish(self) -> list[Passage]:
-        """Return what was held back."""
-        held, self._held = self._held, []
-        return held
 
 
 @dataclass(kw_only=True)
@@ -209,7 +203,7 @@ class Stamp(Fault):
 class _Values(Fault):
     """Numbers of a message change: of one field or all, of some joints or all."""
 
-    FIELDS = {"field": _field, "joints": _names}
+    FIELDS = {"field": _one_of(*FIELDS), "joints": _names}
     field: str = ""
     joints: tuple[str, ...] = ()
 
@@ -310,7 +304,11 @@ class Corrupt(_Values):
     """
 
     KIND = "corrupt"
-    FIELDS = {**_Values.FIELDS, "how": _how, "probability": _share}
+    FIELDS = {
+        **_Values.FIELDS,
+        "how": _one_of("nan", "inf", "huge", "short", "names"),
+        "probability": _share,
+    }
     how: str = "nan"
     probability: float = 1.0
 

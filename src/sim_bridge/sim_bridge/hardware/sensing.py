@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_bridge.hardware.delay_line import DelayLine
 from sim_bridge.hardware.imperfections import Imperfections
-from sim_bridge.hardware.low_pass import LowPass
 from sim_bridge.hardware.noise import ClippedNoise, Stream
 
 Array = NDArray[np.float64]
@@ -63,20 +63,19 @@ class Sensing:
         self._noises = position_noise, self._velocity_noise, self._effort_noise
         self._encoders = Encoders(given.encoder_resolution, position_noise)
         self._by_difference = given.velocity_source == "encoder"
-        cutoff = given.velocity_filter_hz
-        self._filter = LowPass(cutoff, dt) if cutoff > 0.0 else None
+        # v' = omega (u - v), exact for inputs that are constant in a period; 0 without a filter.
+        self._filter_gain = -math.expm1(-2.0 * math.pi * given.velocity_filter_hz * dt)
 
     def reset(self, q: Array, v: Array, effort: Array) -> JointReading:
         """Begin anew at a state that has lasted for long; return its reading."""
         for noise in self._noises:
             noise.reset()
         self._last = self._encoders.read(q)
-        if self._filter is not None:
-            self._filter.reset(v)
+        self._filtered = v
         first = JointReading(
             self._last, self._velocity_noise.added_to(v), self._effort_noise.added_to(effort)
         )
-        self._line = DelayLine(self._delay, first)
+        self._under_way = deque([first] * self._delay)
         return first
 
     def read(self, q: Array, v: Array, effort: Array) -> JointReading:
@@ -91,10 +90,11 @@ class Sensing:
         if self._by_difference:
             v = (position - self._last) / self._dt
         self._last = position
-        if self._filter is not None:
-            v = self._filter.update(v)
-        return self._line.shift(
+        if self._filter_gain > 0.0:
+            v = self._filtered = self._filtered + self._filter_gain * (v - self._filtered)
+        self._under_way.append(
             JointReading(
                 position, self._velocity_noise.added_to(v), self._effort_noise.added_to(effort)
             )
         )
+        return self._under_way.popleft()

@@ -13,12 +13,7 @@ from sensor_msgs.msg import JointState
 from sim_bridge.hardware.communication import CommandPath
 from sim_bridge.nodes.bullet_parameters import BulletConfiguration
 from viability_bounds_pkg.recent_values import RecentValues
-from viability_bounds_pkg.ros.joint_command import (
-    CommandError,
-    JointCommand,
-    TorqueCommand,
-    read_command,
-)
+from viability_bounds_pkg.ros.joint_command import JointCommand, TorqueCommand, accept_command
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 
 _STRAYS = 50
@@ -116,13 +111,7 @@ class CommandStream:
                 self.acting = None
 
     def _read(self, message: JointState) -> JointCommand | None:
-        try:
-            command = read_command(message, self._joints)
-        except CommandError as error:
-            self._refused[str(error)] += 1
-            if self._refused[str(error)] == 1:
-                self._warn(f"joint_commands refused: {error}")
-            return None
+        command = accept_command(message, self._joints, self._refused, self._warn)
         if isinstance(command, TorqueCommand):
             tau, tau_max = command.tau, self._config.torque_max
             self.torque_ratio = max(self.torque_ratio, float(np.max(np.abs(tau) / tau_max)))

@@ -9,7 +9,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -275,7 +275,7 @@ def play(
     for each in (node, *others):
         executor.add_node(each)
     seen, moved_at, shown_at = None, time.monotonic(), -math.inf
-    with nullcontext() if quiet else Progress(node.config.plan.duration) as progress:
+    with nullcontext() if quiet else closing(Progress(node.config.plan.duration)) as progress:
         while not (node.ended.done() or signals) and rclpy.ok(context=node.context):
             # Many callbacks in a call: a tenth of the time of a period in lockstep would go into
             # calls for one each.

@@ -188,11 +188,7 @@ class JointPictures:
 
 def _kernel(limits: JointLimits, k: int) -> Array | None:
     """Return the border of the kernel of a joint, shape (m, 2), rad and rad/s; None if endless."""
-    one = JointLimits(
-        limits.names[k : k + 1],
-        *(getattr(limits, each)[k : k + 1] for each in ("q_min", "q_max", "v_max")),
-        *(getattr(limits, each)[k : k + 1] for each in ("a_min", "a_max")),
-    )
+    one = limits.of_joint(k)
     low, high = float(one.q_min[0]), float(one.q_max[0])
     if not (math.isfinite(low) and math.isfinite(high)):
         return None

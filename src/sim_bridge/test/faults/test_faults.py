@@ -10,8 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from sim_bridge.faults import FAULTS, FaultyStream, TimelineError, load_timeline
+from sim_bridge.faults.fault import FAULTS
+from sim_bridge.faults.faulty_stream import FaultyStream
 from sim_bridge.faults.message_values import stamp_of
+from sim_bridge.faults.timeline import TimelineError, load_timeline
 from viability_bounds_pkg.testing.ros_harness import joint_state
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "config" / "faults"

@@ -4,9 +4,7 @@ import math
 import numpy as np
 import pytest
 
-from sim_bridge.hardware.delay_line import DelayLine
 from sim_bridge.hardware.imperfections import Imperfections
-from sim_bridge.hardware.low_pass import LowPass
 from sim_bridge.hardware.noise import ClippedNoise, Stream
 from sim_bridge.hardware.sensing import Encoders, Sensing
 from viability_bounds_pkg.exceptions import SettingError
@@ -87,16 +85,6 @@ def test_velocity_from_encoders_is_the_difference_over_a_period():
     assert np.abs(velocity[1:] - middle).max() <= 1e-3 / DT + 1e-9
 
 
-def test_the_filter_follows_its_step_response():
-    cutoff = 30.0
-    low_pass = LowPass(cutoff, DT)
-    low_pass.reset(np.array([0.0, 1.0]))
-    got = np.array([low_pass.update(np.array([1.0, 1.0])) for _ in range(60)])
-    t = DT * np.arange(1, 61)
-    np.testing.assert_allclose(got[:, 0], 1.0 - np.exp(-2.0 * math.pi * cutoff * t), rtol=1e-12)
-    np.testing.assert_array_equal(got[:, 1], 1.0)
-
-
 def test_the_drive_filters_velocities_and_nothing_else():
     q, v = np.zeros((40, N)), np.ones((40, N))
     v[0] = 0.0
@@ -106,12 +94,6 @@ def test_the_drive_filters_velocities_and_nothing_else():
     np.testing.assert_allclose(velocity, expected * np.ones(N), rtol=1e-12)
     np.testing.assert_array_equal(read, q)
     np.testing.assert_array_equal(effort, v)
-
-
-@pytest.mark.parametrize("delay", [0, 1, 3])
-def test_a_delay_line_returns_what_was_put_in_so_many_calls_ago(delay):
-    line = DelayLine(delay, "first")
-    assert [line.shift(k) for k in range(6)] == ["first"] * delay + list(range(6 - delay))
 
 
 @pytest.mark.parametrize("delay", [1, 2, 5])

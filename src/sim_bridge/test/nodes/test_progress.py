@@ -3,7 +3,7 @@ import fcntl
 import os
 import struct
 import termios
-from contextlib import redirect_stdout
+from contextlib import closing, redirect_stdout
 
 from sim_bridge.nodes import progress
 from sim_bridge.nodes.progress import Progress
@@ -12,7 +12,7 @@ from sim_bridge.nodes.progress import Progress
 def test_in_a_file_it_is_a_few_lines(capsys, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
-    with Progress(8.0) as shown:
+    with closing(Progress(8.0)) as shown:
         for _ in range(200):
             now[0] += 0.1
             shown.wait("getting ready: there is no paused robot")
@@ -30,7 +30,7 @@ def test_on_a_terminal_it_is_one_line():
     reader, writer = os.openpty()
     fcntl.ioctl(writer, termios.TIOCSWINSZ, struct.pack("HHHH", 30, 100, 0, 0))
     with open(writer, "w") as terminal, redirect_stdout(terminal):
-        with Progress(8.0) as shown:
+        with closing(Progress(8.0)) as shown:
             for k in range(1, 9):
                 shown.show(float(k), "TRACKING")
         terminal.flush()

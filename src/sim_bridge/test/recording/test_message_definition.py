@@ -2,6 +2,7 @@
 """The definitions are read by mcap_ros2, which parses them and decodes messages by them."""
 
 import io
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -48,7 +49,7 @@ def equal(ours, read):
 @pytest.mark.parametrize("message", filled(), ids=lambda message: type(message).__name__)
 def test_an_independent_reader_decodes_what_was_written(tmp_path, message):
     path = tmp_path / "one.mcap"
-    with McapFile(path) as file:
+    with closing(McapFile(path)) as file:
         file.add_topic("/topic", type(message))
         file.write("/topic", serialize_message(message), 12_345)
     reader = make_reader(io.BytesIO(path.read_bytes()), decoder_factories=[DecoderFactory()])

@@ -365,6 +365,8 @@ def test_limits_and_rates_are_read_only(ros):
         ({"acceleration_drift": [1.0, math.inf, 1.0]}, "acceleration_drift", "inf"),
         ({"position_margin": -1e-3}, "position_margin", "-0.001"),
         ({"position_margin": math.nan}, "position_margin", "nan"),
+        ({"torque_max": [1.0]}, "torque_max", "3 numbers"),
+        ({"robot_description": "/nowhere.urdf"}, "robot_description", "/nowhere.urdf"),
         ({"joints": ["turn", "lift", "turn"]}, "joints", "['turn', 'lift', 'turn']"),
         ({"joints": ["turn", "", "spin"]}, "joints", "['turn', '', 'spin']"),
         ({"joints": None}, "joints", "not set"),

@@ -151,20 +151,6 @@ def test_two_declarations_that_are_both_too_large():
         make_bounds(configured(position_error=[3.0] * 7, velocity_error=[3.0] * 7), None)
 
 
-@pytest.mark.parametrize(
-    "changed",
-    [
-        {"position_error": [1e-4] * 7},
-        {"missed_deadlines": 1},
-        {"acceleration_disturbance": [0.1] * 7, **ESTIMATED},
-    ],
-)
-def test_state_dependent_limits_do_not_know_errors(changed):
-    config = configured(acceleration_limits="state_dependent", **changed)
-    with pytest.raises(SettingError, match="worst_case, where errors of the states"):
-        make_bounds(config, None)
-
-
 def overlay(tmp_path, text):
     path = tmp_path / "more.yaml"
     path.write_text("/**:\n  ros__parameters:\n" + "".join(f"    {line}\n" for line in text))

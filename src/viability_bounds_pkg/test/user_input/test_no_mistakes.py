@@ -8,13 +8,10 @@ import pytest
 from viability_bounds_pkg.exceptions import did_you_mean
 from viability_bounds_pkg.ros.given_parameters import foreign_sections
 from viability_bounds_pkg.ros.ros_arguments import check_ros_arguments
-from viability_bounds_pkg.user_input import (
-    YamlError,
-    check_parameter_files,
-    check_with_urdf,
-    load_yaml,
-    unknown_parameters,
-)
+from viability_bounds_pkg.user_input.known_names import unknown_parameters
+from viability_bounds_pkg.user_input.parameter_files import check_parameter_files
+from viability_bounds_pkg.user_input.urdf_check import check_with_urdf
+from viability_bounds_pkg.user_input.yaml_file import YamlError, load_yaml
 
 
 @pytest.mark.parametrize(

@@ -219,17 +219,8 @@ def search_refined(
     the very worst of each joint and side first, until the evaluations are spent or `PATIENCE`
     rounds over all limits bring nothing.
 
-    Args:
-        model: the robot.
-        space: where states are searched, and the torque limits.
-        evaluations: the most evaluations of the dynamics, derivatives included.
-        seed: of the random generator.
-
-    Yields:
-        What has been found so far.
-
-    Raises:
-        LimitEstimateError: fewer than one evaluation, or a joint that moves no inertia.
+    As `search_by_sampling`, but `evaluations` is the most evaluations of the dynamics, derivatives
+    included.
     """
     if evaluations < 1:
         raise LimitEstimateError(f"samples must be at least 1, is {evaluations}")
@@ -281,17 +272,10 @@ def _descend(
     joint: int,
     evaluations: int,
 ) -> None:
-    """Minimise one joint's room on one side from `start`; every state met feeds the tracker.
+    """Minimise the room of joint `joint` upwards (side 0) or downwards (1), and tell the tracker.
 
-    Args:
-        model: the robot.
-        data: of `model`.
-        space: the box searched.
-        tracker: what has been found; updated.
-        start: a point of the unit cube, shape (2 n,).
-        side: 0 for the room upwards, 1 for the room downwards.
-        joint: index of the joint.
-        evaluations: the count of the tracker at which to stop.
+    From `start`, a point of the unit cube, shape (2 n,), until the tracker has counted
+    `evaluations`.
     """
     sign = 1.0 - 2.0 * side
     width = np.concatenate([space.q_max - space.q_min, 2.0 * space.v_max])

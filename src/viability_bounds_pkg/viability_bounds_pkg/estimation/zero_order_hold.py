@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The zero-order hold error: how motion differs from constant acceleration under held torque."""
+"""The zero-order hold error: how motion differs from constant acceleration under held torque.
+
+Arguments: Pinocchio's model of n joints; at the beginning of a period of dt, s, positions q,
+velocities v and the accelerations a that are wanted, shape (batch, n), rad, rad/s, rad/s^2; the
+torques tau that are held, shape (batch, n), N m.
+"""
 
 from __future__ import annotations
 
@@ -18,17 +23,7 @@ def mid_step_torque(model: pin.Model, q: Array, v: Array, a: Array, dt: float) -
     """Return the torque for `a` at the middle of a period in which `a` is constant.
 
     Holding it, the acceleration is off by about half a period times the jerk at the start and,
-    the other way, at the end, and right on average to second order in `dt`.
-
-    Args:
-        model: the robot.
-        q: positions, shape (batch, n), rad.
-        v: velocities, shape (batch, n), rad/s.
-        a: accelerations wanted, shape (batch, n), rad/s^2.
-        dt: period, s; zero gives the plain inverse dynamics of the state.
-
-    Returns:
-        Torques, shape (batch, n), N m.
+    the other way, at the end, and right on average to second order in `dt`. Shape (batch, n), N m.
     """
     q_mid = q + 0.5 * dt * v + 0.125 * dt**2 * a
     return _batch(pin.rnea, model, q_mid, v + 0.5 * dt * a, a)
@@ -38,16 +33,8 @@ def jerk_under_held_torque(model: pin.Model, q: Array, v: Array, a: Array) -> tu
     """Return the torque for `a` and the jerk while it is held.
 
     The time derivative of ``M a + h = tau`` at constant tau: ``M da/dt`` is
-    ``-(dtau/dq v + dtau/dv a)``, with the partial derivatives of the inverse dynamics.
-
-    Args:
-        model: the robot.
-        q: positions, shape (batch, n), rad.
-        v: velocities, shape (batch, n), rad/s.
-        a: accelerations, shape (batch, n), rad/s^2.
-
-    Returns:
-        Torques, shape (batch, n), N m, and jerks, shape (batch, n), rad/s^3.
+    ``-(dtau/dq v + dtau/dv a)``, with the partial derivatives of the inverse dynamics. Both are of
+    shape (batch, n), N m and rad/s^3.
     """
     data = model.createData()
     tau, drive = np.empty_like(q), np.empty_like(q)
@@ -67,17 +54,7 @@ def zero_order_hold_error(
     Classical Runge-Kutta; a(t) is looked at where the integrator's steps begin and end, which
     includes both ends of the period, where the error, linear in time to first order, is largest.
 
-    Args:
-        model: the robot.
-        q: positions at the start, shape (batch, n), rad.
-        v: velocities at the start, shape (batch, n), rad/s.
-        a: accelerations wanted, shape (batch, n), rad/s^2.
-        tau: torques held, shape (batch, n), N m.
-        dt: period, s.
-        substeps: integration steps.
-
-    Returns:
-        Errors of acceleration, mean acceleration and position, shape (batch, 3, n).
+    They are those of acceleration, mean acceleration and position, shape (batch, 3, n).
     """
     step = dt / substeps
     q_now, v_now = q, v

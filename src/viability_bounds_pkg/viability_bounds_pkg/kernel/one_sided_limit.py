@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from viability_bounds_pkg.compiled import compiled
 from viability_bounds_pkg.kernel.discrete_kernel import StoppingCurve
 
 Array = NDArray[np.float64]
@@ -112,8 +111,13 @@ def make_table(
     limits["dt"], limits["half_dt"] = dt, 0.5 * dt
     limits["v_max"], limits["margin"], limits["tolerance"] = v_max, margin, tolerance
     limits["velocity_error"] = velocity_error
-    shape = limits.shape
-    set_braking(limits, *(np.broadcast_to(x, shape).astype(float) for x in (braking, low, high)))
+    limits["low"], limits["high"] = low, high
+    b, speed = np.asarray(braking), limits["v_max"]
+    k = 0.5 * b * dt
+    limits["twice_braking"], limits["k"] = 2.0 * b, k
+    # Not zero even if dt is tiny, so that no room at all does not make 0 / 0.
+    limits["k_squared"] = np.maximum(k * k, _TINY)
+    limits["free"] = limits["half_dt"] * speed + 0.5 * speed * speed / b
     points: list[NDArray[np.void]] = [np.zeros(0, dtype=CURVE_POINT)]
     for j, pair in enumerate(curves):
         length = float(position[j].sum())
@@ -126,25 +130,6 @@ def make_table(
             room = _room_at_full_speed(limit, curve, float(points[-1]["speed"][-1]))
             limit["free"] = 0.5 * dt * limit["v_max"] + room
     return JointTable(limits, np.concatenate(points))
-
-
-@compiled
-def set_braking(limits: NDArray[np.void], braking: Array, low: Array, high: Array) -> None:
-    """Give limits another braking and other input limits, each of shape (n, 2), rad/s^2.
-
-    A limit with a stopping curve that is not a parabola keeps its braking.
-    """
-    for j in range(len(limits)):
-        for side in range(2):
-            limit = limits[j, side]
-            limit.low, limit.high = low[j, side], high[j, side]
-            if limit.points == 0:
-                b, v_max = braking[j, side], limit.v_max
-                k = 0.5 * b * limit.dt
-                limit.twice_braking, limit.k = 2.0 * b, k
-                # Not zero even if dt is tiny, so that no room at all does not make 0 / 0.
-                limit.k_squared = max(k * k, _TINY)
-                limit.free = limit.half_dt * v_max + 0.5 * v_max * v_max / b
 
 
 def _inverse_stopping_curve(

@@ -6,10 +6,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
 from viability_bounds_pkg import baselines, viability
@@ -21,7 +20,6 @@ from viability_bounds_pkg.parameter import (
     POSITIVE,
     Range,
     above,
-    check_per_joint,
     group,
     joint_numbers,
     number,
@@ -34,10 +32,9 @@ from viability_bounds_pkg.robot_configuration import (
     RobotConfiguration,
     StateSource,
 )
-from viability_bounds_pkg.state_dependent.limits import StateDependentBounds
-from viability_bounds_pkg.torque_margin import TorqueMargins, tightened, torque_margins
+from viability_bounds_pkg.torque_margin import TorqueMargins, torque_margins
 from viability_bounds_pkg.uncertainty.declared import DeclaredUncertainty, VelocityEstimation
-from viability_bounds_pkg.uncertainty.feasible import declared_names, refusal
+from viability_bounds_pkg.uncertainty.feasible import refusal
 from viability_bounds_pkg.uncertainty.margins import Loop, UncertaintyMargins
 
 Array = NDArray[np.float64]
@@ -51,9 +48,6 @@ BASELINES = {
 """Methods to compare with."""
 
 METHODS = ("exact", *BASELINES)
-LIMITS = ("worst_case", "state_dependent")
-PEAK = 3.0
-"""Default of ``acceleration_peak``, in limits of the worst case."""
 
 
 def limits_of(config: Any) -> JointLimits:
@@ -80,6 +74,7 @@ class BoundsConfiguration(VelocityEstimation, StateSource, ControlRate, LimitedR
 
     robot_description: str = redeclared(RobotConfiguration, "robot_description", default="")
     NOT_NEEDED = frozenset({"torque_max"})
+    acceleration_limits: ClassVar[str] = "worst_case"
     acceleration_min: Array = joint_numbers("lower acceleration limits, rad/s^2", NEGATIVE)
     acceleration_max: Array = joint_numbers("upper acceleration limits, rad/s^2", POSITIVE)
     acceleration_drift: Array = joint_numbers(
@@ -101,18 +96,6 @@ class BoundsConfiguration(VelocityEstimation, StateSource, ControlRate, LimitedR
         Range(1.0, 1e3),
         default=2.0,
         live=True,
-    )
-    acceleration_limits: str = text(
-        "for method exact: worst_case, or state_dependent, which exceeds the limits above where "
-        "the torque limits allow it; needs robot_description and torque_max",
-        default="worst_case",
-        choices=LIMITS,
-    )
-    acceleration_peak: Array = joint_numbers(
-        f"largest acceleration that state_dependent allows, rad/s^2; {PEAK:g} times the limits "
-        "above if empty",
-        POSITIVE,
-        default=(),
     )
     method: str = text(
         "how bounds are computed: exact keeps the limits; the others are for comparison",
@@ -195,30 +178,24 @@ class Bounds(NamedTuple):
 
     Attributes:
         solve: from positions and velocities.
-        state_dependent: whose method `solve` is, with state-dependent limits.
+        state_dependent: none.
     """
 
     solve: Callable[[Array, Array], viability.AccelerationBounds]
-    state_dependent: StateDependentBounds | None = None
+    state_dependent: Any = None
 
 
-def make_bounds(
-    config: BoundsConfiguration, load_model: Callable[[RobotConfiguration], pin.Model]
-) -> Bounds:
+def make_bounds(config: BoundsConfiguration, load_model: object = None) -> Bounds:
     """Return how the bounds are computed.
 
     Args:
         config: parameters of the node.
-        load_model: returns the arm's model, asked for only where it is needed.
+        load_model: not used.
 
     Raises:
-        SettingError: state-dependent limits without what they need; declarations that leave no
-            bounds.
+        SettingError: declarations that leave no bounds.
     """
     limits, horizon = config.limits, config.horizon
-    if config.method == "exact" and config.acceleration_limits == "state_dependent":
-        state_dependent = _state_dependent(config, load_model)
-        return Bounds(state_dependent.bounds, state_dependent)
     if config.method == "exact":
         try:
             return Bounds(config.loop.bounds(config.declared).bounds)
@@ -234,32 +211,3 @@ def _too_long(config: BoundsConfiguration, error: ArmSafetyError) -> SettingErro
     """Return the error for a horizon that leaves a joint no bounds, whatever is declared."""
     value, allowed = config.bounds_dt_factor, f"what leaves each joint bounds: {error}"
     return SettingError("bounds_dt_factor", value, allowed)
-
-
-def _state_dependent(
-    config: BoundsConfiguration, load_model: Callable[[RobotConfiguration], pin.Model]
-) -> StateDependentBounds:
-    limits, margins = config.limits, config.margins
-    if not config.robot_description:
-        allowed = "a URDF, for state-dependent acceleration limits"
-        raise SettingError("robot_description", config.robot_description, allowed)
-    others = set(declared_names(config.declared)) - {"acceleration_disturbance"}
-    if others or config.uncertainty.velocity_error.any():
-        allowed = "worst_case, where errors of the states, delays or missed deadlines are declared"
-        raise SettingError("acceleration_limits", config.acceleration_limits, allowed)
-    worst = np.maximum(-limits.a_min, limits.a_max)
-    peak = config.acceleration_peak if len(config.acceleration_peak) else PEAK * worst
-    if (peak < worst).any():
-        allowed = f"at least that of the worst case, {worst}"
-        raise SettingError("acceleration_peak", peak, allowed)
-    check_per_joint("torque_max", config.torque_max, limits.names)
-    return StateDependentBounds(
-        load_model(config),
-        tightened(limits, margins),
-        config.torque_max,
-        peak,
-        config.horizon,
-        margins.acceleration,
-        config.dt,
-        margins.position,
-    )

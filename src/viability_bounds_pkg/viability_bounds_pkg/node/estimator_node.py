@@ -19,7 +19,7 @@ from viability_bounds_pkg.node.estimator_parameters import (
 )
 from viability_bounds_pkg.robot_configuration import TOPIC, load_model
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.joint_command import CommandError, TorqueCommand, read_command
+from viability_bounds_pkg.ros.joint_command import TorqueCommand, accept_command
 from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, PeriodCheck, Verdict
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
@@ -113,12 +113,8 @@ class EstimatorNode(ArmNode):
         if not self.publisher_watch.admits(self._commands_topic):
             return
         self.commands_heard += 1
-        try:
-            command = read_command(message, self._joints)
-        except CommandError as error:
-            self._refused[str(error)] += 1
-            if self._refused[str(error)] == 1:
-                self._warn(f"joint_commands refused: {error}")
+        command = accept_command(message, self._joints, self._refused, self._warn)
+        if command is None:
             return
         tau = None
         if isinstance(command, TorqueCommand):

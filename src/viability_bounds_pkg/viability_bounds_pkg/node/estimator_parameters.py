@@ -31,12 +31,7 @@ class EstimatorConfiguration(VelocityEstimation, ControlRate, LimitedRobotConfig
 
 
 def make_estimator(config: EstimatorConfiguration, model: pin.Model) -> StateEstimator:
-    """Return the estimator.
-
-    Args:
-        config: parameters of the node.
-        model: of the arm.
-    """
+    """Return the estimator of an arm."""
     declared = config.declared
     return StateEstimator(
         model,
@@ -52,12 +47,7 @@ def make_estimator(config: EstimatorConfiguration, model: pin.Model) -> StateEst
 
 
 def make_state_check(config: EstimatorConfiguration, model: pin.Model) -> StateCheck:
-    """Return what tells reported states that cannot be.
-
-    Args:
-        config: parameters of the node.
-        model: of the arm.
-    """
+    """Return the check of the reported states of an arm."""
     declared = config.declared
     return StateCheck(
         model,

@@ -9,13 +9,12 @@ names that no node has. Here the last value given counts, null is none, and all 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 from weakref import WeakKeyDictionary
 
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.ros.ros_arguments import ros_rules
-from viability_bounds_pkg.user_input.known_names import unknown_parameters
 from viability_bounds_pkg.user_input.parameter_files import flat, sections_of
 from viability_bounds_pkg.user_input.yaml_file import load_yaml, read_yaml
 
@@ -105,17 +104,6 @@ def _sections_of_files(arguments: Sequence[str]) -> list[str]:
         for word in ("--ros-args", flag, value)
     ]
     return list(dict.fromkeys(section for section, _ in _sections(files_only)))
-
-
-def refuse_unknown(given: Iterable[str], known: Iterable[str]) -> None:
-    """Raise `UnknownParameterError` for names that neither the node nor another one has.
-
-    Args:
-        given: names of parameters for which there are values.
-        known: names of those that the node has.
-    """
-    if unknown := unknown_parameters(given, known):
-        raise UnknownParameterError(unknown)
 
 
 def _sections(arguments: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -49,6 +50,29 @@ def read_command(message: JointState, joints: Sequence[str]) -> JointCommand:
     velocity = message.velocity or [0.0] * len(message.name)
     q, v = (_in_order(message, values, joints) for values in (message.position, velocity))
     return PositionCommand(q, v)
+
+
+def accept_command(
+    message: JointState,
+    joints: Sequence[str],
+    refused: Counter[str],
+    warn: Callable[[str], object],
+) -> JointCommand | None:
+    """Return the command in a message, None if it is invalid; the first one of a kind is logged.
+
+    Args:
+        message: that has come.
+        joints: as for `read_command`.
+        refused: counts invalid commands by reason.
+        warn: logs.
+    """
+    try:
+        return read_command(message, joints)
+    except CommandError as error:
+        refused[str(error)] += 1
+        if refused[str(error)] == 1:
+            warn(f"joint_commands refused: {error}")
+        return None
 
 
 def _in_order(message: JointState, values: list[float], joints: Sequence[str]) -> Array:

@@ -24,13 +24,14 @@ from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError, did_yo
 from viability_bounds_pkg.parameter import REQUIRED, Parameter, parameter_table, read
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.given_parameters import (
+    UnknownParameterError,
     arguments_of,
     foreign_sections,
     given_parameters,
     refuse_renamed,
-    refuse_unknown,
     why_missing,
 )
+from viability_bounds_pkg.user_input.known_names import unknown_parameters
 
 Configuration = TypeVar("Configuration")
 
@@ -135,7 +136,8 @@ def _settle(node: Node, given: Mapping[str, Any], known: Sequence[str]) -> None:
             values.pop(name, None)
         elif name not in values or _differs(values[name].value, value):
             values[name] = RosParameter(name, value=value)
-    refuse_unknown(values, known)
+    if unknown := unknown_parameters(values, known):
+        raise UnknownParameterError(unknown)
 
 
 def _differs(read: Any, given: Any) -> bool:

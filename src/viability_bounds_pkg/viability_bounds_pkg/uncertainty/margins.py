@@ -133,15 +133,5 @@ class Loop(NamedTuple):
 
     def of_joint(self, j: int) -> Loop:
         """Return the loop of joint j alone."""
-        one, limits = slice(j, j + 1), self.limits
-        return self._replace(
-            limits=JointLimits(
-                limits.names[one],
-                limits.q_min[one],
-                limits.q_max[one],
-                limits.v_max[one],
-                limits.a_min[one],
-                limits.a_max[one],
-            ),
-            torque_margins=TorqueMargins(*(each[one] for each in self.torque_margins)),
-        )
+        own = TorqueMargins(*(each[j : j + 1] for each in self.torque_margins))
+        return self._replace(limits=self.limits.of_joint(j), torque_margins=own)

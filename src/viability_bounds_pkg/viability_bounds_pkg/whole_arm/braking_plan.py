@@ -10,6 +10,11 @@ then: the same accelerations. So one plan, once found, is enough for ever.
 N is chosen from one time T for the whole arm: a joint takes longer where it would have to brake
 harder than A, and less where it would pass its position limit. m and w are as long as it takes for
 the acceleration to change gently, where its changes are limited.
+
+Arguments, for n joints, arrays of shape (n,): positions q, rad, and velocities v, rad/s, at the
+beginning of a plan; accelerations a of the period before, rad/s^2; the time T of the plan and the
+control period dt, s; the change of acceleration from period to period that is `gentle`, rad/s^2,
+inf for any. Functions of one joint, j, take its own q, v and a.
 """
 
 from __future__ import annotations
@@ -143,34 +148,20 @@ def make_course(
     dt: float,
     course: Course,
 ) -> None:
-    """Fill in the course of the plan of time `T`.
-
-    Args:
-        q: positions, shape (n,), rad.
-        v: velocities, shape (n,), rad/s.
-        a: accelerations of the period before, shape (n,), rad/s^2.
-        T: s.
-        gentle: change of accelerations from period to period, shape (n,), rad/s^2; inf for any.
-        limits: what it keeps to.
-        dt: control period, s.
-        course: filled in.
-    """
+    """Fill in the course of the plan of time `T`."""
     for j in range(q.size):
         course.moving[j], course.rising[j], course.falling[j] = _course_of(
             j, q[j], v[j], a[j], T, gentle, limits, dt
         )
 
 
-@compiled
 def rest_of(course: Course, rest: Course) -> None:
     """Fill in what is left of a course after a period: at least one."""
-    for j in range(course.moving.size):
-        rest.moving[j] = max(course.moving[j] - 1, 1)
-        rest.rising[j] = max(course.rising[j] - 1, 1)
-        rest.falling[j] = min(course.falling[j], rest.moving[j])
+    np.maximum(course.moving - 1, 1, out=rest.moving)
+    np.maximum(course.rising - 1, 1, out=rest.rising)
+    np.minimum(course.falling, rest.moving, out=rest.falling)
 
 
-@compiled
 def repair(
     q: Array,
     v: Array,
@@ -182,32 +173,22 @@ def repair(
     course: Course,
     repaired: Course,
 ) -> bool:
-    """Fill in a course in which joints that have drifted stand before their limits again.
+    """Return whether joints have drifted: their plan ends beyond a limit by more than `DRIFTED`.
 
-    Args:
-        q: positions, shape (n,), rad.
-        v: velocities, shape (n,), rad/s.
-        a: accelerations of the period before, shape (n,), rad/s^2.
-        T: time of the plan, s.
-        gentle: change of accelerations from period to period, shape (n,), rad/s^2.
-        limits: of the joints.
-        dt: control period, s.
-        course: of the plan in hand.
-        repaired: filled in: the same, but for joints that end beyond by more than `DRIFTED`.
-
-    Returns:
-        Whether there are such joints.
+    Then `repaired` is filled in: `course`, that of the plan in hand, but for these joints, which
+    stand before their limits again.
     """
-    found = False
-    for j in range(q.size):
-        N, m, w = course.moving[j], course.rising[j], course.falling[j]
+    beyond = np.empty(q.size)
+    for j, (N, m, w) in enumerate(zip(*course, strict=True)):
         low, high = limits.q_min[j], limits.q_max[j]
-        beyond = passed(q[j], v[j], a[j], (N, m, w), low, high, dt)
-        if beyond > DRIFTED * limits.tolerance[j]:
-            found = True
-            N, m, w = _course_of(j, q[j], v[j], a[j], T, gentle, limits, dt)
-        repaired.moving[j], repaired.rising[j], repaired.falling[j] = N, m, w
-    return found
+        beyond[j] = passed(q[j], v[j], a[j], (N, m, w), low, high, dt)
+    fine = ~(beyond > DRIFTED * limits.tolerance)
+    if fine.all():
+        return False
+    make_course(q, v, a, T, gentle, limits, dt, repaired)
+    for new, old in zip(repaired, course, strict=True):
+        new[fine] = old[fine]
+    return True
 
 
 @compiled
@@ -225,18 +206,9 @@ def viable_range(
 ) -> None:
     """Narrow ranges of accelerations to those after which each joint by itself has a plan.
 
-    Args:
-        q: positions, shape (n,), rad.
-        v: velocities, shape (n,), rad/s.
-        plan: accelerations of the plan in hand, shape (n,), rad/s^2.
-        last: accelerations of the period before, shape (n,), rad/s^2.
-        T: time of the plans, s.
-        gentle: change of accelerations in the plans, shape (n,), rad/s^2.
-        limits: of the joints.
-        dt: control period, s.
-        low: lower ends, shape (n,), rad/s^2; narrowed in place. Where nothing in the range is
-            possible, what is nearest to it.
-        high: upper ends.
+    `low` and `high`, the ends of the ranges, rad/s^2, change in place; where nothing in a range is
+    possible, to what is nearest to it. `plan` has the accelerations of the plan in hand, `last`
+    those of the period before, rad/s^2.
     """
     for j in range(q.size):
         change = limits.change_max[j]

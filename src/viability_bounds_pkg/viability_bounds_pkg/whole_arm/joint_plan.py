@@ -8,6 +8,10 @@ With a the acceleration of the period before and d the deceleration between,
 
 for k = 0 .. N-1, and d such that the joint stands after them. Within a period the acceleration is
 constant. With m = w = 1 that is one constant deceleration from now until the stop.
+
+Arguments: position q, rad, and velocity v, rad/s, at the beginning; acceleration a of the period
+before, rad/s^2; N, m, and w, at most N + 1 - m; control period dt, s; lowest and highest position,
+q_min and q_max, rad.
 """
 
 from __future__ import annotations
@@ -24,16 +28,7 @@ ROUNDING = 1e-9
 
 @compiled
 def joint_shape(v: float, a: float, N: int, m: int, w: int, dt: float) -> tuple[float, float]:
-    """Return d of one joint, and the change of its acceleration in each period of rising.
-
-    Args:
-        v: velocity, rad/s.
-        a: acceleration of the period before, rad/s^2.
-        N: periods until it stands.
-        m: periods of rising.
-        w: periods of falling, at most N + 1 - m.
-        dt: control period, s.
-    """
+    """Return d, and the change of the acceleration in each of the first m periods."""
     d = (v / dt + 0.5 * a * (m - 1)) / (N - 0.5 * (m + w) + 1.0)
     return d, -(a + d) / m
 
@@ -42,15 +37,9 @@ def joint_shape(v: float, a: float, N: int, m: int, w: int, dt: float) -> tuple[
 def after(
     q: float, v: float, count: float, a: float, change: float, dt: float
 ) -> tuple[float, float]:
-    """Return position and velocity after periods whose acceleration changes at a constant rate.
+    """Return position and velocity after `count` periods.
 
-    Args:
-        q: position, rad.
-        v: velocity, rad/s.
-        count: number of periods.
-        a: acceleration in the first period, rad/s^2.
-        change: of the acceleration from period to period, rad/s^2.
-        dt: control period, s.
+    `a` is the acceleration in the first of them, `change` that from each to the next, rad/s^2.
     """
     pairs = 0.5 * count * (count - 1.0)
     moved = a * (pairs + 0.5 * count) + change * pairs * ((count - 2.0) / 3.0 + 0.5)
@@ -61,9 +50,9 @@ def after(
 def joint_state(
     q: float, v: float, a: float, N: int, m: int, w: int, dt: float, k: int
 ) -> tuple[float, float, float]:
-    """Return position, velocity and acceleration of one joint at the beginning of period k.
+    """Return position, velocity and acceleration at the beginning of period k.
 
-    Linear in (q, v, a). Arguments as of `joint_shape`.
+    They are linear in (q, v, a).
     """
     d, change = joint_shape(v, a, N, m, w, dt)
     if k < m and k < N:
@@ -97,23 +86,10 @@ def joint_excess(
     v_max: float,
     change_max: float,
 ) -> tuple[float, float]:
-    """Return by how far one joint's plan, or the present state, passes its limits at worst.
+    """Return by how far the plan, or the present state, passes its limits at worst.
 
-    Args:
-        q: position, rad.
-        v: velocity, rad/s.
-        a: acceleration of the period before, rad/s^2.
-        N: periods until it stands.
-        m: periods of rising.
-        w: periods of falling.
-        dt: control period, s.
-        q_min: lowest position, rad.
-        q_max: highest, rad.
-        v_max: speed, rad/s.
-        change_max: change of the acceleration from period to period, rad/s^2.
-
-    Returns:
-        Excess of position, rad; of speed and change of acceleration, as a share of their limits.
+    The excess of position, rad; and that of speed and of the change of acceleration from period to
+    period, as a share of their limits `v_max`, rad/s, and `change_max`, rad/s^2.
     """
     end, _, _ = joint_state(q, v, a, N, m, w, dt, N)
     high, low = max(q, end), min(q, end)
@@ -160,19 +136,11 @@ def joint_course(
     gentle: float,
     dt: float,
 ) -> tuple[int, int, int]:
-    """Return N, m and w of one joint in the plan of time `T`.
+    """Return N, m and w in the plan of time `T`, s.
 
-    Args:
-        q: position, rad.
-        v: velocity, rad/s.
-        a: acceleration of the period before, rad/s^2.
-        T: s.
-        q_min: lowest position at which it is to stand, rad.
-        q_max: highest, rad.
-        tolerance: by how far it may stand beyond where only braking harder than A would help, rad.
-        braking: A, rad/s^2.
-        gentle: change of the acceleration from period to period, rad/s^2; inf for any.
-        dt: control period, s.
+    The joint may stand beyond a limit by `tolerance`, rad, where only braking harder than A,
+    `braking`, rad/s^2, would help. `gentle` is the change of its acceleration from period to
+    period, rad/s^2, inf for any.
     """
     speed = abs(v)
     if gentle == np.inf:
@@ -210,7 +178,7 @@ def passed(
     q_max: float,
     dt: float,
 ) -> float:
-    """Return by how far a joint's plan passes its position limits."""
+    """Return by how far a plan passes the position limits, rad."""
     N, m, w = course
     return joint_excess(q, v, a, N, m, w, dt, q_min, q_max, np.inf, np.inf)[0]
 

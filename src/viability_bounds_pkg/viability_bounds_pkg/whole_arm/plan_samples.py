@@ -103,18 +103,8 @@ def fill_plan(
 ) -> tuple[int, float, float]:
     """Fill in the states and accelerations of a plan at its samples, but for the step before.
 
-    Args:
-        q: positions at its beginning, shape (n,), rad.
-        v: velocities, shape (n,), rad/s.
-        a: accelerations of the period before, shape (n,), rad/s^2.
-        course: of the plan.
-        limits: of the joints.
-        dt: control period, s.
-        smooth: see `fill_clock`.
-        clock: filled in likewise.
-        positions: of the samples, shape (samples(n, smooth), n), rad.
-        velocities: likewise, rad/s.
-        accelerations: likewise, rad/s^2.
+    The clock is filled in as by `fill_clock`, and so are arrays of shape (samples(n, smooth), n):
+    positions, rad, velocities, rad/s, accelerations, rad/s^2. Others are as in `braking_plan`.
 
     Returns:
         How many samples there are; by how far the plan, or the present state, passes limits of

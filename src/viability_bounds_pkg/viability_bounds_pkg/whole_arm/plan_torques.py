@@ -96,17 +96,7 @@ class PlanTorques:
         extra: Array,
         step: State | None = None,
     ) -> None:
-        """Make the plan of time `T`, and `follow` it.
-
-        Args:
-            q: positions at its beginning, shape (n,), rad.
-            v: velocities, shape (n,), rad/s.
-            a: accelerations of the period before, shape (n,), rad/s^2.
-            T: time of the plan, s.
-            gentle: change of accelerations from period to period, shape (n,), rad/s^2.
-            extra: torque that the motors give besides, shape (n,), N m.
-            step: see `follow`.
-        """
+        """Make the plan of time `T`, s, and `follow` it; `gentle` as in `braking_plan`."""
         make_course(q, v, a, T, gentle, self._limits, self._dt, self.course)
         self.follow(q, v, a, self.course, extra, step)
 

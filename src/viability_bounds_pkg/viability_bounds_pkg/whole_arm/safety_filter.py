@@ -300,7 +300,8 @@ class SafetyFilter:
     def _warm_up(self) -> None:
         """Compile everything now and not in a control loop."""
         zero = np.zeros_like(self.usable)
-        self.look(zero, zero, zero, zero - 1.0, zero + 1.0)
+        for _ in range(2):  # a plan is begun, then carried on
+            self.look(zero, zero, zero, zero - 1.0, zero + 1.0)
         self._rows({FIRST: [0]})
         self.choose(zero)
         self.reset()
