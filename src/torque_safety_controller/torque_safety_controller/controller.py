@@ -101,6 +101,7 @@ class Controller:
         additional, constraints, interaction, safety_filter, detour, squeeze: as given.
         iterations: of the last QP.
         share: of the accelerations that the tasks want; the rest brings the arm to rest.
+        rough: whether velocities are estimates, with noise also of an arm that stands.
     """
 
     def __init__(
@@ -130,6 +131,7 @@ class Controller:
         self.squeeze = squeeze
         self.iterations = 0
         self.share = 1.0
+        self.rough = False
         self._own_bounds = own_bounds
         self._limiter = TorqueLimiter(tau_max, torque_rate_max, robot.dt)
         self._qp = InverseDynamicsQP(n, solver=solver)
@@ -359,7 +361,8 @@ class Controller:
             if self.lost:
                 tasks = [DampingTask(self.gains.hold_kd)]
         elif self.share < 1.0:
-            bounds = return_gently(bounds, robot.v, self.share)
+            period = robot.dt if self.rough else None
+            bounds = return_gently(bounds, robot.v, self.share, period)
         if disturbance is not None:
             bounds = AccelerationRange(*self._observer.shift(*bounds))
         parts = [each.constraint(robot, bounds, disturbance) for each in self.constraints]
@@ -456,22 +459,32 @@ class Controller:
         return self._a_last
 
 
-def return_gently(bounds: AccelerationRange, v: Array, share: float) -> AccelerationRange:
+def return_gently(
+    bounds: AccelerationRange, v: Array, share: float, period: float | None = None
+) -> AccelerationRange:
     """Return bounds that push a joint which stands beyond them by a share only.
 
     An arm may have been stopped within the margins of a position limit; its bounds then demand to
     be back after a period, by a jolt. Here such a joint just gets no farther, and returns
-    with the share. One that moves towards its limit brakes as it must.
+    with the share. One that moves towards its limit brakes as it must; where that may be noise, it
+    need not do more than stand at the end of the period: the noise would choose between a push
+    and none.
 
     Args:
         bounds: of the joints, shape (n,) each, rad/s^2.
         v: their velocities, shape (n,), rad/s.
         share: of what the bounds demand, from 0 to 1.
+        period: of control, s, where `v` has noise, for which the bounds have margins; else None.
     """
     lower, upper = bounds
+    if period is None:
+        up = np.where(v > -_STANDS, 0.0, np.inf)
+        down = np.where(v < _STANDS, 0.0, -np.inf)
+    else:
+        up = down = -v / period
     return AccelerationRange(
-        np.where((lower > 0.0) & (v > -_STANDS), share * lower, lower),
-        np.where((upper < 0.0) & (v < _STANDS), share * upper, upper),
+        np.where(lower > 0.0, np.minimum(np.maximum(share * lower, up), lower), lower),
+        np.where(upper < 0.0, np.maximum(np.minimum(share * upper, down), upper), upper),
     )
 
 

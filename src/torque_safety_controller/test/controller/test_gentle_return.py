@@ -62,3 +62,26 @@ def test_a_joint_that_stands_beyond_its_margin_returns_in_half_a_second(side, be
         q, v, before = q + v * DT + 0.5 * a * DT**2, v + a * DT, a
     assert (side * (q - edge) <= 1e-9).all()
     assert np.abs(v).max() < 0.1
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_noise_of_a_velocity_does_not_choose_between_a_push_and_none(side):
+    """As of an arm that stands beyond its margin, whose velocities are estimates."""
+    q = LIMITS.q_max + 1e-3 if side > 0.0 else LIMITS.q_min - 1e-3
+    solver = BoundsSolver(LIMITS, 2.0 * DT, period=DT)
+
+    def least(speed, period):
+        v = np.full(2, side * speed)
+        found = solver.bounds(q, v)
+        bounds = AccelerationRange(found.lower, found.upper)
+        low, high = return_gently(bounds, v, 0.0, period)
+        return -side * np.clip(0.0, low, high), -side * np.clip(0.0, *bounds)
+
+    for speed in (1e-6, 1e-3):
+        np.testing.assert_allclose(least(-speed, DT)[0], 0.0)
+        np.testing.assert_allclose(least(speed, DT)[0], speed / DT)  # it stands in a period
+        eased, demanded = least(speed, None)
+        np.testing.assert_allclose(eased, demanded)  # without noise it does move
+    eased, demanded = least(0.1, DT)
+    np.testing.assert_allclose(eased, demanded)  # as it must
+    assert (demanded >= 2.9).all()

@@ -74,6 +74,7 @@ def make_controller(
         make_detour(config, robot, safety_filter),
         make_own_bounds(config),
     )
+    controller.rough = config.use_estimated_states
     controller.warm_up()
     return controller, base
 
