@@ -97,8 +97,7 @@ class CommandStream:
     def receive(self, sent: JointCommand | None) -> None:
         """Take the command that arrives in the present period, or hold the last one.
 
-        Args:
-            sent: the one sent in it; None if there is none.
+        `sent` is the one that was sent in it; None if there is none.
         """
         arrived = self.path.arriving(sent)
         if arrived is not None:

@@ -88,7 +88,8 @@ class CoordinatedStop:
 
     Call `begin` once when a command is missing, then at each step of the drive `follow` as long as
     the last command is held, `torque` when it is not any more, and `follow` again with those that
-    return, until `returned`. Arrays are of shape (n,), in the order of `limits.names`.
+    return, until `returned`. Arrays are of shape (n,), in the order of `limits.names`: positions
+    q, rad, velocities v, rad/s, accelerations a, rad/s^2, torques, N m.
 
     Args:
         model: the arm, with the joints of `limits` in any order, one degree of freedom each.
@@ -159,12 +160,7 @@ class CoordinatedStop:
         self.begin(np.zeros(len(names)), np.zeros(len(names)))
 
     def begin(self, q: ArrayLike, v: ArrayLike) -> None:
-        """Begin a stop; what an earlier one held and observed is forgotten.
-
-        Args:
-            q: positions, rad.
-            v: velocities, rad/s.
-        """
+        """Begin a stop; what an earlier one held and observed is forgotten."""
         n = len(self._limits)
         q = joint_array("q", q, self._limits.names)
         v = joint_array("v", v, self._limits.names)
@@ -185,23 +181,15 @@ class CoordinatedStop:
         return through and not (self._resting or self._share_left > 0.0)
 
     def time_to_rest(self, v: Array) -> float:
-        """Return how long the arm takes from velocities `v` to rest at most, but for a few steps.
-
-        Args:
-            v: velocities, rad/s.
-        """
+        """Return how long the arm takes to rest at most, but for a few steps, s."""
         return float((np.abs(v) / self._braking(v)).max())
 
     def torque(self, q: Array, v: Array, motor_torque: Array | None = None) -> Array:
         """Return the torques to ask of the motors for the next step of the drive, N m.
 
-        They are finite and within the torque limits for every finite state.
-
-        Args:
-            q: positions, rad.
-            v: velocities, rad/s.
-            motor_torque: that of the motors now, N m; used where they have a lag. None where it
-                is unknown: the lag is not accounted for then.
+        They are finite and within the torque limits for every finite state. `motor_torque` is that
+        of the motors now, used where they have a lag; None where it is unknown: the lag is not
+        accounted for then.
         """
         return self._torque(q, v, motor_torque, None)
 
@@ -211,12 +199,6 @@ class CoordinatedStop:
         """Return the torques nearest to a command that keep the limits, N m; else as `torque`.
 
         After steps of a stop they go on from its torque.
-
-        Args:
-            q: positions, rad.
-            v: velocities, rad/s.
-            command: torques that are commanded, N m.
-            motor_torque: as of `torque`.
         """
         return self._torque(q, v, motor_torque, command)
 
@@ -269,13 +251,7 @@ class CoordinatedStop:
         )
 
     def _harder(self, q: Array, v: Array, a: Array) -> Array:
-        """Return `a`, or more braking where that stops a joint outside its kernel in time.
-
-        Args:
-            q: positions, rad.
-            v: velocities, rad/s.
-            a: accelerations within the bounds, rad/s^2.
-        """
+        """Return `a`, or more braking where that stops a joint outside its kernel in time."""
         limits, speed = self._limits, np.abs(v)
         room = np.where(v > 0.0, limits.q_max - q, q - limits.q_min)
         at_once = speed / self._dt

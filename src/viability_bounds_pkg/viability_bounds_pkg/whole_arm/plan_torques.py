@@ -111,13 +111,9 @@ class PlanTorques:
     ) -> None:
         """Compute the plan of a given course, and what it leaves of the limits.
 
-        Args:
-            q: positions at its beginning, shape (n,), rad.
-            v: velocities, shape (n,), rad/s.
-            a: accelerations of the period before, shape (n,), rad/s^2.
-            course: when each joint does what.
-            extra: torque that the motors give besides, shape (n,), N m.
-            step: state in which that period began; None if the plan begins now.
+        q, v and a are as in `braking_plan`. `extra` is the torque that the motors give besides,
+        shape (n,), N m; `step` is the state in which the period before began, None if the plan
+        begins now.
         """
         if course is not self.course:
             copy_course(course, self.course)

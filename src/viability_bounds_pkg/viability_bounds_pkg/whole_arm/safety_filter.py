@@ -362,9 +362,8 @@ class SafetyFilter:
     def _go_on(self, before: State) -> None:
         """Look at the plan in hand; where joints have drifted towards a limit, repair it.
 
-        Args:
-            before: state in which the step before began: from its torques, too, a repaired plan
-                must not change too fast.
+        From the torques in `before`, where the step before began, too, a repaired plan must not
+        change too fast.
         """
         plans, begin, last, extra = self._plans, self._state, self._last, self._extra
         drifted = repair(
@@ -421,9 +420,6 @@ class SafetyFilter:
 
         In proportion to how hard the joints brake, and small enough that all joints may change
         at once, whatever their signs. What else changes torques has the rest of the limits.
-
-        Args:
-            q: positions, shape (n,), rad.
         """
         M = pin.crba(self._model, self._data, q)
         inertia = np.abs(np.triu(M) + np.triu(M, 1).T)
@@ -493,11 +489,10 @@ class SafetyFilter:
         copy_course(self._plans.course, self._course)
 
     def _take(self, a: Array, other: float) -> bool:
-        """Take the plan after `a` that needs least, of those that are safe; False without one.
+        """Take the plan after a step of `a` that needs least, of those that are safe.
 
-        Args:
-            a: acceleration of the step, shape (n,), rad/s^2.
-            other: time of a plan to try besides that of the plan in hand and its rest, s.
+        Besides the time of the plan in hand and its rest, the time `other` is tried, s. Returns
+        False without a safe plan.
         """
         best, now, taken = np.inf, self._time, False
         for T, course in (
@@ -517,11 +512,8 @@ class SafetyFilter:
     def _safe(self, a: Array, plan: float | Course) -> bool:
         """Return whether a plan after a step is within the limits.
 
-        Where the plan in hand is not, because of a disturbance, it must not be worse.
-
-        Args:
-            a: acceleration of the step, shape (n,), rad/s^2.
-            plan: its time, s, or its course.
+        Where the plan in hand is not, because of a disturbance, it must not be worse. The plan is
+        given by its time, s, or by its course.
         """
         plans, begin = self._plans, self._state
         q, v = begin.after(a, self._dt)
