@@ -83,7 +83,7 @@ def step(
     M, C, J, J_dot, v = arm
     if not usable(arm, a_ref, torque, initialise):
         return False
-    J_plus, J_plus_dot, _ = dynamically_consistent_inverse(J, J_dot, M, C + C.T, THRESHOLD)
+    J_plus, J_plus_dot = dynamically_consistent_inverse(J, J_dot, M, C + C.T, THRESHOLD)
     root_M = np.sqrt(np.diag(M))
     if initialise > 0.0:
         a = initial_memory(law, arm, J_plus, torque)
