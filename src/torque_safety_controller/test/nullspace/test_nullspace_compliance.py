@@ -13,7 +13,7 @@ from torque_safety_controller.integral_feedback import (
     IntegralFeedback,
 )
 from torque_safety_controller.linalg.generalized_inverse import THRESHOLD, TaskShapeError
-from torque_safety_controller.nullspace import NullspaceCompliance
+from torque_safety_controller.nullspace.compliance import NullspaceCompliance
 from torque_safety_controller.nullspace.kernels import (
     energy_product,
     law_torque,

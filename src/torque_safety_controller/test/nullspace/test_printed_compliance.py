@@ -15,7 +15,7 @@ from proxsuite import proxqp
 from task_arm import TaskArm, arm_terms
 
 from torque_safety_controller.integral_feedback import IntegralSettings
-from torque_safety_controller.nullspace import NullspaceCompliance, PrintedCompliance
+from torque_safety_controller.nullspace.compliance import NullspaceCompliance, PrintedCompliance
 
 STEP = 1e-3  # s
 SMALL = 1e-5  # s; of differences
