@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from torque_safety_controller.anti_windup import clip, project, scale_factor
 from torque_safety_controller.integral_feedback.action import ArmTerms
-from torque_safety_controller.integral_feedback.gain_matrix import gain_torque
+from torque_safety_controller.integral_feedback.kernels import gain_torque
 from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors
 from torque_safety_controller.integral_feedback.settings import (
     NONE,
