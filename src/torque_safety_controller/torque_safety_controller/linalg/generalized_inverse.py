@@ -25,24 +25,11 @@ from torque_safety_controller.linalg.singularity_damping import (
     is_clear_of_singularities,
 )
 from viability_bounds_pkg.compiled import compiled
-from viability_bounds_pkg.exceptions import ArmSafetyError
 
 Array = NDArray[np.float64]
 
 THRESHOLD = 0.03
 """Singular value of J below which its direction is damped."""
-
-
-class TaskShapeError(ArmSafetyError, ValueError):
-    """A task that leaves an arm no null space."""
-
-
-def check_task_shape(m: int, n: int) -> None:
-    """Raise `TaskShapeError` unless a task of m rows leaves n joints a null space."""
-    if not 0 < m < n:
-        raise TaskShapeError(
-            f"a task of {m} rows for {n} joints; null-space compliance needs 1 to {n - 1} rows"
-        )
 
 
 @compiled

@@ -26,11 +26,15 @@ from numpy.typing import NDArray
 
 from torque_safety_controller.integral_feedback.action import ArmTerms, IntegralAction
 from torque_safety_controller.integral_feedback.settings import IntegralSettings, Law
-from torque_safety_controller.linalg.generalized_inverse import check_task_shape
 from torque_safety_controller.nullspace import kernels, printed
 from viability_bounds_pkg.compiled import bound
+from viability_bounds_pkg.exceptions import ArmSafetyError
 
 Array = NDArray[np.float64]
+
+
+class TaskShapeError(ArmSafetyError, ValueError):
+    """A task that leaves an arm no null space."""
 
 
 class NullspaceCompliance(IntegralAction):
@@ -52,7 +56,10 @@ class NullspaceCompliance(IntegralAction):
 
     def __init__(self, settings: IntegralSettings, m: int) -> None:
         n = len(settings.budget)
-        check_task_shape(m, n)
+        if not 0 < m < n:
+            raise TaskShapeError(
+                f"a task of {m} rows for {n} joints; null-space compliance needs 1 to {n - 1} rows"
+            )
         shapes = {"integral": (m,), "J": (m, n)}
         fields = (np.zeros(shapes.get(name, (n,))) for name in self._MEMORY._fields)
         J, J_dot = np.zeros((2, m, n))
