@@ -25,7 +25,7 @@ from torque_safety_controller.linalg.generalized_inverse import (
     THRESHOLD,
     dynamically_consistent_inverse,
 )
-from torque_safety_controller.nullspace import NullspaceCompliance
+from torque_safety_controller.nullspace.compliance import NullspaceCompliance
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 
 ROOT = Path(__file__).resolve().parent.parent

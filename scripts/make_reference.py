@@ -24,7 +24,7 @@ from sim_bridge.nodes.fault_node import FaultConfiguration
 from sim_bridge.scenario.scenario import ScenarioConfiguration
 from sim_bridge.viewer.node.viewer_parameters import ViewerConfiguration
 from torque_safety_controller.node import topics as controller_topics
-from torque_safety_controller.parameters import ControllerConfiguration
+from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.remote.moveit_parameters import MoveitConfiguration
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 from viability_bounds_pkg.node.estimator_parameters import EstimatorConfiguration

@@ -11,7 +11,6 @@ of its own.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,8 +21,7 @@ from torque_safety_controller.friction.settings import FrictionSettings, no_fric
 from torque_safety_controller.integral_feedback.action import ArmTerms, IntegralAction
 from torque_safety_controller.integral_feedback.feedback import IntegralFeedback
 from torque_safety_controller.integral_feedback.settings import IntegralSettings
-from torque_safety_controller.nullspace.compliance import NullspaceCompliance
-from torque_safety_controller.nullspace.printed import PrintedCompliance
+from torque_safety_controller.nullspace.compliance import NullspaceCompliance, PrintedCompliance
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.compiled import compiled
 
@@ -68,9 +66,8 @@ class AdditionalTorque:
 
     Args:
         settings: may be replaced between steps: the torque does not jump.
-        tasks: rows of the pose's Jacobian by mode; without a null space left of them there is no
-            such mode.
-        hands: end effectors whose rows are stacked to one task.
+        hands: end effectors whose rows are stacked to one task; a mode of `TASKS` whose rows leave
+            no null space is not there.
 
     Attributes:
         last: what the last step added, shape (n,), N m.
@@ -80,16 +77,10 @@ class AdditionalTorque:
         friction: the friction compensation.
     """
 
-    def __init__(
-        self,
-        settings: AdditionalSettings,
-        tasks: Mapping[str, slice] | None = None,
-        hands: int = 1,
-    ) -> None:
+    def __init__(self, settings: AdditionalSettings, hands: int = 1) -> None:
         n = len(settings.integral.budget)
-        self._tasks = TASKS if tasks is None else tasks
         self.actions: dict[str, IntegralAction] = {"joints": IntegralFeedback(settings.integral)}
-        for mode, rows in self._tasks.items():
+        for mode, rows in TASKS.items():
             m = hands * (rows.stop - rows.start)
             if m < n:
                 self.actions[mode] = NullspaceCompliance(settings.integral, m)
@@ -234,7 +225,7 @@ class AdditionalTorque:
     def _chosen(self) -> IntegralAction | None:
         """Return the action that the settings ask for."""
         mode = self._settings.mode
-        if mode in self._tasks and self._settings.integral.anti_windup != "qp":
+        if mode in TASKS and self._settings.integral.anti_windup != "qp":
             mode = PRINTED.format(mode)
         return self.actions.get(mode)
 
@@ -267,7 +258,7 @@ class AdditionalTorque:
 
     def _arm(self, robot: RobotModel, v: Array) -> ArmTerms:
         """Return what the actions need to know of the arm."""
-        rows = self._tasks.get(self._mode, slice(0, 6))
+        rows = TASKS.get(self._mode, slice(0, 6))
         J, J_dot = robot.J[rows], robot.J_dot[rows]
         if robot.others:
             J = np.vstack([J, *(hand.J[rows] for hand in robot.others)])

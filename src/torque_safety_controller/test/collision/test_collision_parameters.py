@@ -8,8 +8,8 @@ from collision_arm import panda
 from torque_safety_controller.collision.avoidance import CollisionSettings
 from torque_safety_controller.collision.bodies import SHAPES, make_obstacle
 from torque_safety_controller.node.assembly import load_collision
-from torque_safety_controller.parameters import ControllerConfiguration
 from torque_safety_controller.parameters.collision_parameters import CollisionConfiguration
+from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import parameter_table, read
 from viability_bounds_pkg.testing.ros_harness import read_config

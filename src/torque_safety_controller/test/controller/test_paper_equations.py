@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from arms import load_arm
-from proxsuite import proxqp
+from general_solver import nearest
 
 from torque_safety_controller.additional_torque import AdditionalSettings, AdditionalTorque
 from torque_safety_controller.controller import Controller
@@ -115,13 +115,7 @@ def limited(method, u, s):
     scale = min(1.0, (LIMIT / np.abs(u)).min())
     if method == "scaling":
         return scale * u
-    size = np.abs(s).max()
-    qp = proxqp.dense.QP(N, 0, N + 1)
-    qp.settings.eps_abs, qp.settings.eps_rel = 1e-11, 0.0
-    lower, upper = np.r_[-LIMIT, scale * s @ u / size], np.r_[LIMIT, np.inf]
-    qp.init(np.eye(N), -u, None, None, np.vstack([np.eye(N), s / size]), lower, upper)
-    qp.solve()
-    return qp.results.x
+    return nearest(u, -LIMIT, LIMIT, s, scale * s @ u)
 
 
 @cache

@@ -14,7 +14,6 @@ from integral_loop import (
     BUDGET,
     DT,
     LAMBDA,
-    POSITION,
     REST,
     IntegralLoop,
     N,
@@ -25,7 +24,6 @@ from integral_loop import (
 
 from torque_safety_controller.additional_torque import (
     MODES,
-    TASKS,
     AdditionalTorque,
 )
 from viability_bounds_pkg.state import State
@@ -145,7 +143,7 @@ def test_a_beginning_with_numbers_beyond_sense_is_put_off(mode):
     assert relative(loop.additional.last) > 0.02
 
 
-@pytest.mark.parametrize("mode", ["joints", "task"])
+@pytest.mark.parametrize("mode", ["joints", "position"])
 def test_a_state_far_away_kicks_no_joint(mode):
     """The arm is put elsewhere, as by a reset: other inertias, and far from its reference."""
     rng = np.random.default_rng(3)
@@ -228,7 +226,7 @@ STEPS = st.lists(
 def test_it_is_finite_and_never_raises(first, steps):
     robot = ARM.robot(DT)
     robot.rates = True
-    additional = AdditionalTorque(make_settings(first), TASKS | {"task": POSITION})
+    additional = AdditionalTorque(make_settings(first))
     with np.errstate(all="ignore"):
         for q, v, a, elapsed, mode, theta in steps:
             if mode is not None:

@@ -4,6 +4,7 @@
 import daqp
 import numpy as np
 import pytest
+from general_solver import nearest
 from integral_terms import (
     SHARP,
     N,
@@ -14,7 +15,6 @@ from integral_terms import (
     torque_now,
     uncorrected,
 )
-from proxsuite import proxqp
 
 from torque_safety_controller.anti_windup import project_to_limits, scale_to_limits
 from torque_safety_controller.integral_feedback import (
@@ -26,20 +26,10 @@ from torque_safety_controller.integral_feedback.leaky_integrator import leak_fac
 
 def extended_qp(M, s, u, limit, w):
     """(11) with a leak, as a general QP; docs/integral_action.md."""
-    n = len(s)
     s = s / np.abs(s).max()
     momentum = M @ s
-    size = np.linalg.norm(momentum)
-    qp = proxqp.dense.QP(n + 1, 0, n + 2)
-    qp.settings.eps_abs, qp.settings.eps_rel = 1e-11, 0.0
-    qp.settings.check_duality_gap = True
-    qp.settings.eps_duality_gap_abs, qp.settings.eps_duality_gap_rel = 1e-11, 0.0
-    C = np.vstack([np.eye(n + 1), np.r_[s, s @ momentum / size]])
-    lower, upper = np.r_[-limit, 0.0, s @ w], np.r_[limit, np.inf, np.inf]
-    qp.init(np.eye(n + 1), -np.r_[u, 0.0], None, None, C, lower, upper)
-    qp.solve()
-    assert qp.results.info.status == proxqp.QPSolverOutput.PROXQP_SOLVED
-    return np.array(qp.results.x)[:n]
+    row = np.r_[s, s @ momentum / np.linalg.norm(momentum)]
+    return nearest(np.r_[u, 0.0], np.r_[-limit, 0.0], np.r_[limit, np.inf], row, s @ w)[:-1]
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -8,8 +8,6 @@ from hypothesis import strategies as st
 from task_arm import TaskArm
 
 from torque_safety_controller.linalg.generalized_inverse import (
-    TaskShapeError,
-    check_task_shape,
     dynamically_consistent_inverse,
 )
 from torque_safety_controller.linalg.singularity_damping import damping, is_clear_of_singularities
@@ -19,7 +17,7 @@ ARMS = ("panda", "baxter_left_arm", "talos")
 
 
 def inverse(terms, threshold):
-    """J^+, its derivative, and whether it is damped."""
+    """J^+ and its derivative."""
     return dynamically_consistent_inverse(
         terms.J, terms.J_dot, terms.M, terms.C + terms.C.T, threshold
     )
@@ -42,14 +40,13 @@ def test_definition(robot):
     arm = TaskArm(robot)
     for q, v in states(arm, 20):
         terms = arm.terms(q, v)
-        J_plus, _, damped = inverse(terms, NEVER)
+        J_plus, _ = inverse(terms, NEVER)
         N = np.eye(arm.n) - J_plus @ terms.J
         # Torques in its null space do not accelerate the task.
         torque = N.T @ np.random.default_rng(1).normal(size=arm.n)
         a = terms.J @ np.linalg.solve(terms.M, torque)
         np.testing.assert_allclose(a, 0.0, atol=1e-7 * np.abs(J_plus).max())
         np.testing.assert_allclose(terms.J @ J_plus, np.eye(6), atol=1e-8)
-        assert not damped
 
 
 @pytest.mark.parametrize("threshold", [NEVER, 0.1, 0.4, 2.0])
@@ -58,13 +55,14 @@ def test_derivative_is_that_of_what_is_returned(robot, threshold):
     """Central differences along motions, with no, some and all directions damped."""
     arm, h, damped = TaskArm(robot), 1e-5, 0
     for q, v in states(arm, 15):
-        _, J_plus_dot, is_damped = inverse(arm.terms(q, v), threshold)
+        terms = arm.terms(q, v)
+        J_plus_dot = inverse(terms, threshold)[1]
         above, below = (inverse(arm.terms(q + k * v, v), threshold)[0] for k in (h, -h))
         expected = (above - below) / (2.0 * h)
         size = np.abs(expected).max()
         assert size > 0.1
         np.testing.assert_allclose(J_plus_dot, expected, atol=1e-6 * size)
-        damped += is_damped
+        damped += not is_clear_of_singularities(terms.J @ terms.J.T, threshold)
     if threshold in (NEVER, 2.0):
         assert damped == (15 if threshold == 2.0 else 0)
 
@@ -73,7 +71,7 @@ def test_derivative_is_that_of_what_is_returned(robot, threshold):
 def test_any_number_of_rows(rows):
     arm, h = TaskArm("talos", rows), 1e-5
     for q, v in states(arm, 5):
-        _, J_plus_dot, _ = inverse(arm.terms(q, v), 0.05)
+        _, J_plus_dot = inverse(arm.terms(q, v), 0.05)
         above, below = (inverse(arm.terms(q + k * v, v), 0.05)[0] for k in (h, -h))
         expected = (above - below) / (2.0 * h)
         np.testing.assert_allclose(J_plus_dot, expected, atol=1e-6 * np.abs(expected).max())
@@ -83,7 +81,7 @@ def test_what_damping_leaves_is_exact_in_the_other_directions():
     arm, threshold = TaskArm("talos"), 0.3
     for q, v in states(arm, 20):
         terms = arm.terms(q, v)
-        J_plus, _, _ = inverse(terms, threshold)
+        J_plus, _ = inverse(terms, threshold)
         U, singular, _ = np.linalg.svd(terms.J)
         assert singular[-1] < threshold < singular[0]
         D = arm.n / np.trace(terms.M) * damping_of(terms.J, threshold)
@@ -99,10 +97,9 @@ def test_above_the_threshold_it_has_no_effect_at_all():
     terms = arm.terms(arm.posture, np.ones(arm.n))
     smallest = np.linalg.svd(terms.J)[1][-1]
     x, y = inverse(terms, NEVER), inverse(terms, 0.999 * smallest)
-    assert not y[2]
     np.testing.assert_array_equal(x[0], y[0])
     np.testing.assert_array_equal(x[1], y[1])
-    assert inverse(terms, 1.001 * smallest)[2]
+    assert not np.array_equal(x[0], inverse(terms, 1.001 * smallest)[0])
 
 
 def test_derivative_does_not_jump_at_the_threshold():
@@ -123,7 +120,7 @@ def test_derivative_where_singular_values_meet():
     rng = np.random.default_rng(2)
     J = np.ascontiguousarray(0.1 * np.linalg.qr(rng.normal(size=(5, 5)))[0][:3])
     J_dot, M, h = rng.normal(size=J.shape), np.eye(5), 1e-6
-    _, J_plus_dot, _ = dynamically_consistent_inverse(J, J_dot, M, 0.0 * M, 0.2)
+    _, J_plus_dot = dynamically_consistent_inverse(J, J_dot, M, 0.0 * M, 0.2)
     above, below = (
         dynamically_consistent_inverse(J + k * J_dot, J_dot, M, 0.0 * M, 0.2)[0] for k in (h, -h)
     )
@@ -144,7 +141,7 @@ def test_gain_is_bounded_whatever_the_rank(rng, m, rank, exponent):
     J_dot = rng.normal(size=(m, n))
     A = rng.normal(size=(n, n))
     M = A @ A.T + 0.01 * np.eye(n)
-    J_plus, J_plus_dot, _ = dynamically_consistent_inverse(J, J_dot, M, A + A.T, threshold)
+    J_plus, J_plus_dot = dynamically_consistent_inverse(J, J_dot, M, A + A.T, threshold)
     assert np.isfinite(J_plus_dot).all()
     size = np.linalg.norm(np.linalg.cholesky(M).T @ J_plus, 2)
     assert size < 1.16 / threshold * np.sqrt(np.trace(M))
@@ -167,12 +164,6 @@ def test_singularities_are_told_by_the_smallest_singular_value():
         smallest = np.linalg.svd(J)[1][-1]
         for factor in (0.5, 0.999, 1.001, 2.0):
             assert is_clear_of_singularities(J @ J.T, factor * smallest) == (factor < 1.0)
-
-
-@pytest.mark.parametrize("m, n", [(7, 7), (8, 7), (0, 7)])
-def test_a_task_without_null_space_is_refused(m, n):
-    with pytest.raises(TaskShapeError, match=rf"{m} rows for {n} joints; .* 1 to 6 rows"):
-        check_task_shape(m, n)
 
 
 def test_what_is_no_mass_matrix_is_refused():

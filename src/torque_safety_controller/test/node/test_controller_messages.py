@@ -122,21 +122,6 @@ def changed_pose(frame="base", **fields) -> PoseStamped:
         changed_pose(ow=math.nan),
         changed_pose(ox=0.0, oy=0.0, oz=0.0, ow=0.0),
         changed_pose(ox=0.0, oy=0.0, oz=0.0, ow=1.01),
-    ],
-)
-def test_poses_that_cannot_be_followed_are_refused_and_counted(ros, message):
-    chain = NodeChain(ros)
-    chain.answer(10)
-    chain.poses.publish(message)
-    ros.wait_until(lambda: chain.reported("goals_refused") == "target_pose: 1;", "the refusal")
-    chain.answer(20)
-    assert chain.reported("goals_pending") == "0"
-    assert chain.reported("mode") == "HOLD"
-
-
-@pytest.mark.parametrize(
-    "message",
-    [
         joint_state(JOINTS[1:], 0, Q[1:]),
         joint_state(JOINTS, 0, Q[1:]),
         joint_state([], 0, []),
@@ -146,12 +131,15 @@ def test_poses_that_cannot_be_followed_are_refused_and_counted(ros, message):
         joint_state(JOINTS, 0, [ARM.q_min[0] - 0.01, *Q[1:]]),
     ],
 )
-def test_postures_that_cannot_be_followed_are_refused_and_counted(ros, message):
+def test_goals_that_cannot_be_followed_are_refused_and_counted(ros, message):
     chain = NodeChain(ros)
     chain.answer(10)
-    chain.postures.publish(message)
-    ros.wait_until(lambda: chain.reported("goals_refused") == "target_posture: 1;", "the refusal")
+    pose = isinstance(message, PoseStamped)
+    (chain.poses if pose else chain.postures).publish(message)
+    refused = f"{'target_pose' if pose else 'target_posture'}: 1;"
+    ros.wait_until(lambda: chain.reported("goals_refused") == refused, "the refusal")
     chain.answer(20)
+    assert chain.reported("goals_pending") == "0"
     assert chain.reported("mode") == "HOLD"
 
 

@@ -15,7 +15,7 @@ from std_srvs.srv import Trigger
 
 from torque_safety_controller.contact import interaction
 from torque_safety_controller.node.assembly import make_controller
-from torque_safety_controller.parameters import ControllerConfiguration
+from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import parameter_table, read
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS, set_stamp

@@ -15,7 +15,7 @@ from torque_safety_controller.integral_feedback import (
     IntegralSettings,
 )
 from torque_safety_controller.integral_feedback.settings import WIDENING_TIME
-from torque_safety_controller.nullspace import NullspaceCompliance
+from torque_safety_controller.nullspace.compliance import NullspaceCompliance
 from torque_safety_controller.nullspace.kernels import (
     FADING_TIME,
 )

@@ -11,7 +11,7 @@ from torque_safety_controller.linalg.generalized_inverse import (
     THRESHOLD,
     dynamically_consistent_inverse,
 )
-from torque_safety_controller.nullspace import NullspaceCompliance
+from torque_safety_controller.nullspace.compliance import NullspaceCompliance
 from torque_safety_controller.nullspace.kernels import energy_product
 
 NEVER_FORGETS = dict(slow_leak_rate=0.0, fast_leak_rate=0.0)

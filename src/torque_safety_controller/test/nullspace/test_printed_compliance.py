@@ -8,74 +8,32 @@ differences along the motion, (11) by ProxQP.
 from dataclasses import replace
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from compliance_run import DT, ComplianceRun, unlimited
-from proxsuite import proxqp
+from general_solver import nearest
+from printed_law import FAST, LAMBDA, MU, SLOW, STEP, PrintedLaw
 from task_arm import TaskArm, arm_terms
 
 from torque_safety_controller.integral_feedback import IntegralSettings
-from torque_safety_controller.nullspace import NullspaceCompliance, PrintedCompliance
+from torque_safety_controller.nullspace.compliance import NullspaceCompliance, PrintedCompliance
 
-STEP = 1e-3  # s
 SMALL = 1e-5  # s; of differences
-LAMBDA, MU, SLOW, FAST = 7.0, 0.3, 0.4, 60.0
 
 
-class Motion:
-    """An arm on a given motion, and what (16) to (26) say of it."""
+class Motion(PrintedLaw):
+    """A real arm on a motion, and how its torque is limited."""
 
-    def __init__(self, robot, rows, limit, limited, mass):
+    def __init__(self, robot, rows, limit, limit_torque, mass):
         self.arm = TaskArm(robot, rows, armature=0.1)
-        self.limit, self.limited, self.mass = limit, limited, mass
-        self.s = self.a = self.slow = self.fast = np.zeros(self.arm.n)
-        self.integral = np.zeros(rows)
+        super().__init__(self.arm.model, self.arm.posture, rows, 0.3, 2.0, SMALL)
+        self.limit, self.limit_torque, self.mass = limit, limit_torque, mass
         self.binding = 0
-
-    def q(self, t):
-        k = np.arange(self.arm.n)
-        return self.arm.posture + 0.3 * np.sin(2.0 * t + k)
-
-    def v(self, t):
-        return 0.6 * np.cos(2.0 * t + np.arange(self.arm.n))
-
-    def a_ref(self, t):
-        return 4.0 * np.cos(5.0 * t + 2.0 * np.arange(self.arm.n))
-
-    def M(self, t):
-        upper = np.triu(pin.crba(self.arm.model, self.arm.model.createData(), self.q(t)))
-        return upper + np.triu(upper, 1).T
 
     def J(self, t):
         return self.arm.terms(self.q(t), self.v(t)).J
 
-    def inverse(self, t):
-        """J^+, dynamically consistent."""
-        M_inv_JT = np.linalg.solve(self.M(t), self.J(t).T)
-        return M_inv_JT @ np.linalg.inv(self.J(t) @ M_inv_JT)
-
-    @staticmethod
-    def rate(f, t):
-        return (f(t + SMALL) - f(t - SMALL)) / (2.0 * SMALL)
-
-    def expected(self, t):
-        """Return the torque of the step that ends at t."""
-        arm, dt = self.arm, STEP
-        C = pin.computeCoriolisMatrix(arm.model, arm.model.createData(), self.q(t), self.v(t))
-        M, J, J_plus = self.M(t), self.J(t), self.inverse(t)
-        K = LAMBDA * (M if self.mass else np.diag(np.diag(M)))
-        s_last, a_last = self.s, self.a
-        self.s = s_last + self.a_ref(t - dt) * dt - (self.v(t) - self.v(t - dt))
-        middle = 0.5 * (s_last + self.s)
-        self.integral = self.integral + dt * self.rate(self.J, t - 0.5 * dt) @ middle
-        self.a = self.s - J_plus @ self.integral  # (16)
-        self.slow = np.exp(-SLOW * dt) * self.slow + self.a - a_last  # (13)
-        self.fast = np.exp(-FAST * dt) * self.fast + self.a - a_last
-        P = J_plus @ J
-        u_K = (1.0 - MU) * P.T @ K @ P @ self.slow + MU * K @ self.fast  # (26)
-        feedforward = C @ self.a - M @ J_plus @ self.rate(self.J, t) @ self.s
-        feedforward -= M @ self.rate(self.inverse, t) @ self.integral
-        return feedforward + self.limited(self, u_K)  # (21)
+    def limited(self, u):
+        return self.limit_torque(self, u)
 
 
 def free(motion, u):
@@ -93,14 +51,10 @@ def scaled(motion, u):
 
 def solved(motion, u):
     """(11), with a for s: what u takes energy out of."""
-    n, a, limit = len(u), motion.a / np.abs(motion.a).max(), motion.limit
-    qp = proxqp.dense.QP(n, 0, n + 1)
-    qp.settings.eps_abs, qp.settings.eps_rel = 1e-11, 0.0
-    lower = np.r_[-limit, factor(u, limit) * a @ u]
-    qp.init(np.eye(n), -u, None, None, np.vstack([np.eye(n), a]), lower, np.r_[limit, np.inf])
-    qp.solve()
-    motion.binding += np.abs(qp.results.x - np.clip(u, -limit, limit)).max() > 1e-3
-    return qp.results.x
+    limit = motion.limit
+    x = nearest(u, -limit, limit, motion.a, factor(u, limit) * motion.a @ u)
+    motion.binding += np.abs(x - np.clip(u, -limit, limit)).max() > 1e-3
+    return x
 
 
 LIMITED = {"none": free, "scaling": scaled, "paper": solved, "paper_mass": solved}

@@ -9,11 +9,12 @@ from functools import cache
 import numpy as np
 import pinocchio as pin
 import pytest
+from printed_law import FAST, LAMBDA, MU, SLOW, STEP, PrintedLaw
 
 from torque_safety_controller.additional_torque import AdditionalSettings, AdditionalTorque
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.integral_feedback import IntegralSettings
-from torque_safety_controller.nullspace import NullspaceCompliance
+from torque_safety_controller.nullspace.compliance import NullspaceCompliance
 from torque_safety_controller.qp.constraints import AccelerationRange
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks.gains import Gains
@@ -21,8 +22,7 @@ from viability_bounds_pkg.robot_description import build_model, read_urdf
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import read_config
 
-STEP, SMALL, TINY = 1e-3, 1e-4, 1e-5  # s; s, rad, of differences
-LAMBDA, MU, SLOW, FAST = 7.0, 0.3, 0.4, 60.0
+SMALL, TINY = 1e-4, 1e-5  # s; rad; of differences
 
 
 @cache
@@ -62,62 +62,20 @@ def jacobian(q):
     return np.array(columns).T / (2.0 * TINY)
 
 
-class Motion:
-    """A given motion, and what (13), (16), (21) and (26) say of it."""
+class Motion(PrintedLaw):
+    """Both arms on a motion."""
 
     start = np.array(config()["start_positions"])
-    n = len(start)
-    k = np.arange(n)
 
     def __init__(self):
-        self.s = self.a = self.slow = self.fast = np.zeros(self.n)
-        self.integral = np.zeros(12)
-
-    def q(self, t):
-        return self.start + 0.05 * np.sin(3.0 * t + self.k)
-
-    def v(self, t):
-        return 0.15 * np.cos(3.0 * t + self.k)
-
-    def a_ref(self, t):
-        return 4.0 * np.cos(5.0 * t + 2.0 * self.k)
-
-    def M(self, t):
-        upper = np.triu(pin.crba(model(), model().createData(), self.q(t)))
-        return upper + np.triu(upper, 1).T
+        super().__init__(model(), self.start, 12, 0.05, 3.0, SMALL)
 
     def J(self, t):
         return jacobian(self.q(t))
 
-    def inverse(self, t):
-        J, M_inv_JT = self.J(t), np.linalg.solve(self.M(t), self.J(t).T)
-        return M_inv_JT @ np.linalg.inv(J @ M_inv_JT)
-
-    @staticmethod
-    def rate(f, t):
-        return (f(t + SMALL) - f(t - SMALL)) / (2.0 * SMALL)
-
-    def expected(self, t):
-        """Return the torque of the step that ends at t."""
-        dt = STEP
-        C = pin.computeCoriolisMatrix(model(), model().createData(), self.q(t), self.v(t))
-        M, J, J_plus = self.M(t), self.J(t), self.inverse(t)
-        s_last, a_last = self.s, self.a
-        self.s = s_last + self.a_ref(t - dt) * dt - (self.v(t) - self.v(t - dt))
-        self.integral = self.integral + dt * self.rate(self.J, t - 0.5 * dt) @ (
-            0.5 * (s_last + self.s)
-        )
-        self.a = self.s - J_plus @ self.integral  # (16)
-        self.slow = np.exp(-SLOW * dt) * self.slow + self.a - a_last  # (13)
-        self.fast = np.exp(-FAST * dt) * self.fast + self.a - a_last
-        K, P = LAMBDA * np.diag(np.diag(M)), J_plus @ J
-        u_K = (1.0 - MU) * P.T @ K @ P @ self.slow + MU * K @ self.fast  # (26)
-        inner = J_plus @ self.rate(self.J, t) @ self.s + self.rate(self.inverse, t) @ self.integral
-        return C @ self.a - M @ inner + u_K  # (21)
-
 
 def additional(anti_windup, **changed):
-    budget = np.full(Motion.n, np.inf)
+    budget = np.full(len(Motion.start), np.inf)
     law = IntegralSettings(budget, LAMBDA, SLOW, FAST, MU, anti_windup)
     law = IntegralSettings(budget, anti_windup=anti_windup, **changed) if changed else law
     return AdditionalTorque(AdditionalSettings("task", law, budget), hands=2)

@@ -8,7 +8,7 @@ from torque_safety_controller.integral_feedback import (
     ArmTerms,
     IntegralSettings,
 )
-from torque_safety_controller.nullspace import NullspaceCompliance
+from torque_safety_controller.nullspace.compliance import NullspaceCompliance
 from torque_safety_controller.nullspace.kernels import (
     energy_product,
 )

@@ -86,7 +86,7 @@ def integral(arm, mode, **changed) -> AdditionalSettings:
 
 def with_integral(arm, mode="joints", gains=GAINS, rate=None, **changed) -> Controller:
     """A controller at 1 kHz."""
-    additional = AdditionalTorque(integral(arm, mode, **changed), {"task": slice(0, 3)})
+    additional = AdditionalTorque(integral(arm, mode, **changed))
     return Controller(arm.robot(KHZ), arm.tau_max, gains, rate, additional)
 
 

@@ -7,11 +7,7 @@ from functools import cache
 import numpy as np
 from arms import load_arm
 
-from torque_safety_controller.additional_torque import (
-    TASKS,
-    AdditionalSettings,
-    AdditionalTorque,
-)
+from torque_safety_controller.additional_torque import AdditionalSettings, AdditionalTorque
 from torque_safety_controller.integral_feedback import IntegralSettings
 from viability_bounds_pkg.state import State
 
@@ -23,7 +19,6 @@ BUDGET = 0.2 * ARM.tau_max
 REST = np.zeros(N)
 # N m; what acts on the joints and the model does not know.
 DISTURBANCE = 0.06 * ARM.tau_max * np.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0])
-POSITION = slice(0, 3)
 
 
 def make_settings(mode="joints", disturbance=2.0, **changed) -> AdditionalSettings:
@@ -34,10 +29,10 @@ def make_settings(mode="joints", disturbance=2.0, **changed) -> AdditionalSettin
 class IntegralLoop:
     """An arm that holds its posture by a spring and a damper, and the additional torque."""
 
-    def __init__(self, mode="joints", rows=POSITION, **changed) -> None:
+    def __init__(self, mode="joints", **changed) -> None:
         self.robot = ARM.robot(DT)
         self.robot.rates = True
-        self.additional = AdditionalTorque(make_settings(mode, **changed), TASKS | {"task": rows})
+        self.additional = AdditionalTorque(make_settings(mode, **changed))
         self.q, self.v, self.a = ARM.q_start.copy(), REST, REST
         self.torques = [REST]
 

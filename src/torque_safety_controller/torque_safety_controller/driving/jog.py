@@ -6,7 +6,7 @@ A jog moves a goal. Its velocity w follows the commanded one u with the time con
     T w' = u - w,
 
 so that commands of a keyboard or joystick do not come as steps; w and w' are fed forward. The goal
-is never farther ahead of the arm than a leash: where limits hold the arm back, the goal waits.
+is ahead of the arm by a largest lead at most: where limits hold the arm back, the goal waits.
 Without a new command for `TIMEOUT` u is zero, and the goal comes to rest.
 """
 
@@ -30,11 +30,11 @@ TIMEOUT = 0.25
 SMOOTHING = 0.1
 """T, s."""
 
-JOINT_LEASH = 0.1
-"""How far the goal of a joint may be ahead of it, rad."""
+JOINT_LEAD = 0.1
+"""Largest distance of the goal of a joint ahead of it, rad."""
 
-HAND_LEASH = (0.05, 0.2)
-"""How far the goal of the hand may be ahead of it, m and rad."""
+HAND_LEAD = (0.05, 0.2)
+"""Largest distance of the goal of the hand ahead of it, m and rad."""
 
 JOINT_SPEED_MAX = 10.0
 """Faster commands are shortened to this speed, rad/s."""
@@ -122,7 +122,7 @@ class JointJog(_Jog):
         wanted = wanted / max(1.0, float((np.abs(wanted) / self._v_max).max()))
         rate = self._smooth(wanted, elapsed)
         q_des = self._q_des + elapsed * self.velocity
-        q_des = np.clip(q_des, state.q - JOINT_LEASH, state.q + JOINT_LEASH)
+        q_des = np.clip(q_des, state.q - JOINT_LEAD, state.q + JOINT_LEAD)
         self._q_des = np.clip(q_des, self._q_min, self._q_max)
         at_limit = q_des != self._q_des
         self.velocity[at_limit] = rate[at_limit] = 0.0
@@ -176,12 +176,12 @@ class HandJog(_Jog):
         linear, angular = self.velocity[:3], self.velocity[3:]
         p = self._goal.translation + elapsed * R @ linear
         R = R @ pin.exp3(elapsed * angular)
-        # The pose of the last step: one period's motion is far less than the leash.
+        # The pose of the last step: one period's motion is far less than the lead.
         ahead = p - robot.pose.translation
         turn = pin.log3(robot.pose.rotation.T @ R)
-        shorten(ahead, HAND_LEASH[0])
-        if np.linalg.norm(turn) > HAND_LEASH[1]:
-            shorten(turn, HAND_LEASH[1])
+        shorten(ahead, HAND_LEAD[0])
+        if np.linalg.norm(turn) > HAND_LEAD[1]:
+            shorten(turn, HAND_LEAD[1])
             R = robot.pose.rotation @ pin.exp3(turn)
         self._goal = pin.SE3(R, robot.pose.translation + ahead)
         controller.set_pose_goal(self._goal, self.velocity.copy(), rate)

@@ -18,8 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torque_safety_controller.integral_feedback.action import ArmTerms, IntegralAction
-from torque_safety_controller.integral_feedback.gain_matrix import gain_matrix
-from torque_safety_controller.integral_feedback.kernels import Memory, evaluate, step
+from torque_safety_controller.integral_feedback.kernels import (
+    Memory,
+    evaluate,
+    gain_matrix,
+    step,
+)
 from torque_safety_controller.integral_feedback.leaky_integrator import mix
 from torque_safety_controller.integral_feedback.settings import QP, IntegralSettings, Law
 from viability_bounds_pkg.compiled import bound

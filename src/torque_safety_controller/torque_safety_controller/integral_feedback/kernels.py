@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One step of the joints' integral action, compiled; `docs/integral_action.md` derives it."""
+"""One step of the joints' integral action, compiled; `docs/integral_action.md` derives it.
+
+[Benallegue2021] allows any positive definite gain K and takes lambda diag(M). With that, (11) is
+the clip of each component by itself; with lambda M it is not.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +19,6 @@ from torque_safety_controller.anti_windup import (
     project,
     scale_factor,
 )
-from torque_safety_controller.integral_feedback.gain_matrix import gain_torque
 from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors, mix
 from torque_safety_controller.integral_feedback.settings import (
     NONE,
@@ -193,3 +196,19 @@ def _shrink(memory: Memory, mu: float, s: Array, excess: Array, own: Array) -> N
                 memory.fast[i] *= kept
             if slow > 0.0:
                 memory.slow[i] *= kept
+
+
+@compiled
+def gain_torque(law: Law, M: Array, s: Array) -> Array:
+    """Return K s, shape (n,), N m, for the mass matrix M, shape (n, n), and s, shape (n,)."""
+    if law.method == PAPER_MASS:
+        return law.gain * (M @ s)
+    return law.gain * np.diag(M) * s
+
+
+@compiled
+def gain_matrix(law: Law, M: Array) -> Array:
+    """Return K, shape (n, n), N m s, for the mass matrix M, shape (n, n)."""
+    if law.method == PAPER_MASS:
+        return law.gain * M
+    return law.gain * np.diag(np.diag(M))

@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small dense linear algebra, compiled: for matrices of 7 columns NumPy is mostly overhead.
+"""Small dense linear algebra: for matrices of 7 columns NumPy is mostly overhead.
 
-Each function is here because NumPy's way costs more than 3 % of a control step more
+A function is compiled where NumPy's way costs more than 3 % of a control step more
 (`scripts/bench.sh step`).
 """
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
+from torque_safety_controller.linalg.cholesky import factorise, solve
 from viability_bounds_pkg.compiled import compiled
 
 Array = NDArray[np.float64]
@@ -39,31 +38,15 @@ def null_space_spring_damper(
     m, n = J.shape
     error = q_des - q
     b = kp * error - kd * v
-    # Cholesky's factor of J J' + regularisation I, row by row.
-    L = np.empty((m, m))
-    y = np.empty(m)
+    A, y = regularisation * np.eye(m), np.zeros((m, 1))
     for i in range(m):
-        s = 0.0
         for k in range(n):
-            s += J[i, k] * error[k]
-        for j in range(i + 1):
-            p = regularisation if i == j else 0.0
+            y[i, 0] += J[i, k] * error[k]
+            for j in range(i + 1):
+                A[i, j] += J[i, k] * J[j, k]
+    if factorise(A):
+        solve(A, y)
+        for i in range(m - 1, -1, -1):
             for k in range(n):
-                p += J[i, k] * J[j, k]
-            for k in range(j):
-                p -= L[i, k] * L[j, k]
-            if i > j:
-                L[i, j] = p / L[j, j]
-                s -= L[i, j] * y[j]
-            elif 0.0 < p < np.inf:
-                L[i, i] = math.sqrt(p)
-            else:
-                return b
-        y[i] = s / L[i, i]
-    for i in range(m - 1, -1, -1):
-        for k in range(i + 1, m):
-            y[i] -= L[k, i] * y[k]
-        y[i] /= L[i, i]
-        for k in range(n):
-            b[k] -= kp * J[i, k] * y[i]
+                b[k] -= kp * J[i, k] * y[i, 0]
     return b

@@ -25,7 +25,6 @@ from torque_safety_controller.linalg.singularity_damping import (
     is_clear_of_singularities,
 )
 from viability_bounds_pkg.compiled import compiled
-from viability_bounds_pkg.exceptions import ArmSafetyError
 
 Array = NDArray[np.float64]
 
@@ -33,23 +32,11 @@ THRESHOLD = 0.03
 """Singular value of J below which its direction is damped."""
 
 
-class TaskShapeError(ArmSafetyError, ValueError):
-    """A task that leaves an arm no null space."""
-
-
-def check_task_shape(m: int, n: int) -> None:
-    """Raise `TaskShapeError` unless a task of m rows leaves n joints a null space."""
-    if not 0 < m < n:
-        raise TaskShapeError(
-            f"a task of {m} rows for {n} joints; null-space compliance needs 1 to {n - 1} rows"
-        )
-
-
 @compiled
 def dynamically_consistent_inverse(
     J: Array, J_dot: Array, M: Array, M_dot: Array, threshold: float
-) -> tuple[Array, Array, bool]:
-    """Return J^+ and its time derivative, shape (n, m) each, and whether J^+ is damped.
+) -> tuple[Array, Array]:
+    """Return J^+ and its time derivative, shape (n, m) each.
 
     Args:
         J: Jacobian of the task, shape (m, n) with m < n.
@@ -70,8 +57,7 @@ def dynamically_consistent_inverse(
     M_dot_X, J_dot_X = M_dot @ X, J_dot @ X
     Y, Y_dot = J @ X, J_dot_X + J_dot_X.T - X.T @ M_dot_X
     G = J @ J.T
-    damped = not is_clear_of_singularities(G, threshold)
-    if damped:
+    if not is_clear_of_singularities(G, threshold):
         half = J_dot @ J.T
         D, D_dot = damping(G, half + half.T, threshold)
         trace = np.trace(M)
@@ -87,4 +73,4 @@ def dynamically_consistent_inverse(
     solve(L, X_dot)
     J_plus_dot = (X_dot - J_plus.T @ Y_dot).T.copy()
     solve(Y, J_plus_dot)
-    return J_plus.T.copy(), J_plus_dot.T.copy(), damped
+    return J_plus.T.copy(), J_plus_dot.T.copy()

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which gains a robot bears: its loops with delay, motor lag and estimated states; no ROS."""
+"""Largest gains of a robot: its loops with delay, motor lag and estimated states; no ROS."""

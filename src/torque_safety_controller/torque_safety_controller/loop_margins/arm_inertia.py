@@ -46,8 +46,7 @@ class ArmInertia:
         data, random = model.createData(), np.random.default_rng(_SEED)
         matrices = np.empty((_POSTURES, model.nv, model.nv))
         for M in matrices:
-            upper = np.triu(pin.crba(model, data, random.uniform(low, high)))
-            M[:] = upper + np.triu(upper, 1).T
+            M[:] = pin.crba(model, data, random.uniform(low, high))
         scale = 1.0 / np.sqrt(np.diagonal(matrices, axis1=1, axis2=2))
         shares = np.linalg.eigvalsh(matrices * scale[:, :, None] * scale[:, None, :])
         return ArmInertia(matrices, (1.0 / float(shares.max()), 1.0 / float(shares.min())))

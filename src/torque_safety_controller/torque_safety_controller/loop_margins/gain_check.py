@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The gains of a parameter file beside the largest that the robot bears."""
+"""Compares gains with the largest that delay, motors and encoders of a robot allow."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ Array = NDArray[np.float64]
 
 MARGIN = 0.5
 """Modulus margin that is asked of the loop of a joint: then its gain margin is at least 2, its
-phase margin at least 29 degrees, and it bears half to one and a half times the inertia."""
+phase margin at least 29 degrees, and its inertia may be 0.5 to 1.5 times that of the model."""
 
 LIMIT_MARGIN = 0.3
-"""That of a joint at its limit, where bound and disturbance observer only ever ask for less: it
-bears an inertia 30% off, and that of the model is assumed to be at most 20% off."""
+"""That of a joint at its limit, where bound and disturbance observer only ever ask for less: its
+inertia may be 30% off, and is assumed to be at most 20% off."""
 
 TORQUE_STEP = 0.05
 """Share of `torque_max` by which the resolution may change a torque from period to period."""

@@ -102,13 +102,9 @@ class OpenLoop(NamedTuple):
     c: Array
     dt: float
 
-    def spectral_radius(self, factor: float = 1.0) -> float:
-        """Return the largest magnitude of the closed loop's poles.
-
-        Args:
-            factor: of the gain: true over modelled acceleration.
-        """
-        closed = self.A + factor * np.outer(self.b, self.c)
+    def spectral_radius(self) -> float:
+        """Return the largest magnitude of the closed loop's poles."""
+        closed = self.A + np.outer(self.b, self.c)
         return float(np.abs(np.linalg.eigvals(closed)).max())
 
     def modulus_margin(self) -> float:

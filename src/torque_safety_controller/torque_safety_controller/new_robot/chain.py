@@ -75,14 +75,15 @@ def find_chain(urdf: str, tips: Sequence[str], base: str = "") -> Chain:
     links = [each.get("name", "") for each in root.findall("link")]
     for what, link in (*(("tip", tip) for tip in tips), *((("base", base),) if base else ())):
         if link not in links:
-            ends = ", ".join(link for link in links if link not in _parents(root))
+            parents = {_link(joint, "parent") for joint in root.findall("joint")}
+            ends = ", ".join(link for link in links if link not in parents)
             hint = did_you_mean(link, links) or f"; links at the ends: {ends}"
             raise NewRobotError(f"the URDF has no link '{link}' for the {what}{hint}")
     elements: dict[str, Element] = {}
     for tip in tips:
         elements |= _way(above, tip, base)
     moving = {name: each for name, each in elements.items() if each.get("type") in _MOVING}
-    _check_kinds(root, elements, moving, tips, base)
+    _check_kinds(root, above, elements, moving, tips, base)
     limits = np.array([_limits(name, each) for name, each in moving.items()]).T
     order = kinematic_order(urdf, tuple(moving))
     q_min, q_max, v_max, tau_max = limits[:, [list(moving).index(name) for name in order]]
@@ -107,10 +108,6 @@ def find_chain(urdf: str, tips: Sequence[str], base: str = "") -> Chain:
 def _link(joint: Element, end: str) -> str:
     element = joint.find(end)
     return "" if element is None else element.get("link", "")
-
-
-def _parents(root: Element) -> set[str]:
-    return {_link(joint, "parent") for joint in root.findall("joint")}
 
 
 def _joints_above(root: Element) -> dict[str, Element]:
@@ -149,6 +146,7 @@ def _way(above: Mapping[str, Element], tip: str, base: str) -> dict[str, Element
 
 def _check_kinds(
     root: Element,
+    above: Mapping[str, Element],
     elements: Mapping[str, Element],
     moving: Mapping[str, Element],
     tips: Sequence[str],
@@ -184,16 +182,13 @@ def _check_kinds(
             "be a link behind the arm's last joint"
         )
     for tip in tips:
-        last = [each for each in moving.values() if _is_above(root, each, tip)][-1]
+        way = _way(above, tip, "")
+        last = [each for name, each in moving.items() if name in way][-1]
         if last.get("type") == "prismatic" and len(moving) > 1:
             raise NewRobotError(
                 f"joint '{last.get('name')}', the last before '{tip}', slides, as a gripper's do; "
                 f"end the arm before it, with the tip {_link(last, 'parent')}"
             )
-
-
-def _is_above(root: Element, joint: Element, tip: str) -> bool:
-    return joint.get("name", "") in _way(_joints_above(root), tip, "")
 
 
 def _limits(name: str, joint: Element) -> tuple[float, float, float, float]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Speed and acceleration limits of a new robot that its torque limits can bear.
+"""Speed and acceleration limits of a new robot that its torque limits allow.
 
 The limits must be available in every state within position and speed limits. Where they are not at
 the speeds of the URDF, either the speeds are lowered, or, where a motor is too weak whatever the

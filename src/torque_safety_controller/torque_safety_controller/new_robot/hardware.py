@@ -105,7 +105,5 @@ def acceleration_errors(chain: Chain, estimates: Estimates, grade: Grade) -> Arr
         # Any motor may be too strong or too weak.
         constant = grade.constant_error * random.choice((-1.0, 1.0), n)
         wrong = constant * tau + spread * chain.tau_max
-        M = np.triu(pin.crba(chain.model, data, q))
-        M = M + np.triu(M, 1).T
-        row[:] = np.abs(np.linalg.solve(M, wrong))
+        row[:] = np.abs(np.linalg.solve(pin.crba(chain.model, data, q), wrong))
     return rounded(np.quantile(errors, _QUANTILE, axis=0), ROUND_UP)

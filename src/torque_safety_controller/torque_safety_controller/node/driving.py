@@ -157,16 +157,12 @@ class Driving:
 
     def _on_hand(self, message: TwistStamped) -> None:
         hand, frame = self._config.end_effectors[0], message.header.frame_id
-        try:
-            if frame not in ("", self._config.base_frame, hand):
-                raise GoalRefused(
-                    f"frame_id is '{frame}'; allowed: '{hand}', '{self._config.base_frame}' or "
-                    "empty"
-                )
-            twist = twist_from_message(message)
-            self._check_stamp(message.header)
-        except GoalRefused as error:
-            return self._goals.refuse(JOG_HAND, error)
+        if frame not in ("", self._config.base_frame, hand):
+            raise GoalRefused(
+                f"frame_id is '{frame}'; allowed: '{hand}', '{self._config.base_frame}' or empty"
+            )
+        twist = twist_from_message(message)
+        self._check_stamp(message.header)
         in_hand = frame == hand
         if not in_hand:
             twist = (twist.reshape(2, 3) @ self._base.rotation.T).ravel()
@@ -187,11 +183,8 @@ class Driving:
         return float(largest[0]), float(largest[1])
 
     def _on_joints(self, message: JointState) -> None:
-        try:
-            velocities = velocities_from_message(message, self._config.joints)
-            self._check_stamp(message.header)
-        except GoalRefused as error:
-            return self._goals.refuse(JOG_JOINTS, error)
+        velocities = velocities_from_message(message, self._config.joints)
+        self._check_stamp(message.header)
         self._goals.add(message, lambda: self._jog_joints(velocities))
 
     def _jog_joints(self, velocities: np.ndarray) -> None:
@@ -206,12 +199,9 @@ class Driving:
         if not message.points:  # as controllers of trajectories take it: stop
             self._goals.add(message, lambda: self._jog_joints(np.zeros(len(config.joints))))
             return
-        try:
-            trajectory = joint_trajectory_from_message(
-                message, config.joints, config.position_min, config.position_max
-            )
-        except GoalRefused as error:
-            return self._goals.refuse(TARGET_JOINT_TRAJECTORY, error)
+        trajectory = joint_trajectory_from_message(
+            message, config.joints, config.position_min, config.position_max
+        )
         begin = stamp_to_ns(message.header.stamp)
         fastest = trajectory.fastest() / config.velocity_max
         if (worst := int(fastest.argmax())) >= 0 and fastest[worst] > 1.0:

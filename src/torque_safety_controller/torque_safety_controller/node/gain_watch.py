@@ -29,7 +29,7 @@ class GainWatch:
 
     def __init__(self, node: Node, model: pin.Model, config: ControllerConfiguration) -> None:
         self._log = node.get_logger()
-        self._told: set[tuple[str, float]] = set()
+        self._warned: set[tuple[str, float]] = set()
         self._robot, self._model = declared_robot(node), model
         self._inertia: ArmInertia | None = None
         self._judged: ControllerConfiguration | None = None
@@ -45,7 +45,7 @@ class GainWatch:
             threading.Thread(target=self._judge, args=(self._robot, config), daemon=True).start()
 
     def close(self) -> None:
-        """Say nothing more."""
+        """Log no more warnings."""
         self._judged = None
 
     def _judge(self, robot: BoundsConfiguration, config: ControllerConfiguration) -> None:
@@ -55,6 +55,6 @@ class GainWatch:
             if config is not self._judged:
                 return  # the gains have changed again, or the node is gone
             key = limit.name, limit.value
-            if limit.exceeded and key not in self._told:
-                self._told.add(key)
+            if limit.exceeded and key not in self._warned:
+                self._warned.add(key)
                 self._log.warning(str(limit))

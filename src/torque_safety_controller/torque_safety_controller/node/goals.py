@@ -210,12 +210,18 @@ class GoalSubscriber:
         self._renewed_at = time.monotonic()
 
     def listen(self, topic: Topic, callback: Callable[[Any], None]) -> None:
-        """Subscribe to a topic of goals; `callback` gets those of a node that is alone with it."""
+        """Subscribe to a topic of goals; `callback` gets those of a node that is alone with it.
+
+        It may raise `GoalRefused`.
+        """
         name = self._node.resolve_topic_name(topic.name)
 
         def receive(message: Any) -> None:
             if self._watch.admits(name):
-                callback(message)
+                try:
+                    callback(message)
+                except GoalRefused as error:
+                    self.refuse(topic, error)
                 return
             if name in self._contested:  # told already; more may come at any rate
                 self.refused[topic.name] += 1
@@ -225,11 +231,7 @@ class GoalSubscriber:
 
         topic.subscription(self._node, receive, partial(self.refuse, topic))
 
-    def add(
-        self,
-        message: Any,
-        apply: Callable[[], None],
-    ) -> None:
+    def add(self, message: Any, apply: Callable[[], None]) -> None:
         """Call `apply` when the time in the header of `message` has come."""
         self._pending.append((stamp_to_ns(message.header.stamp), apply))
         self._pending.sort(key=lambda entry: entry[0])
@@ -261,17 +263,11 @@ class GoalSubscriber:
         return True
 
     def _on_pose(self, message: PoseStamped) -> None:
-        try:
-            pose = pose_from_message(message, self._config.base_frame)
-        except GoalRefused as error:
-            return self.refuse(TARGET_POSE, error)
+        pose = pose_from_message(message, self._config.base_frame)
         self.add(message, lambda: self._rest_at(self._base * pose))
 
     def _on_second_pose(self, message: PoseStamped) -> None:
-        try:
-            pose = pose_from_message(message, self._config.base_frame)
-        except GoalRefused as error:
-            return self.refuse(TARGET_POSE_SECOND, error)
+        pose = pose_from_message(message, self._config.base_frame)
         self.add(message, lambda: self._controller.set_other_pose_goal(0, self._base * pose))
 
     def _rest_at(self, pose: pin.SE3) -> None:
@@ -280,12 +276,9 @@ class GoalSubscriber:
 
     def _on_trajectory(self, message: MultiDOFJointTrajectory) -> None:
         config = self._config
-        try:
-            trajectory = trajectory_from_message(
-                message, config.base_frame, config.end_effectors[0], self._base
-            )
-        except GoalRefused as error:
-            return self.refuse(TARGET_TRAJECTORY, error)
+        trajectory = trajectory_from_message(
+            message, config.base_frame, config.end_effectors[0], self._base
+        )
         begin = stamp_to_ns(message.header.stamp)
         self.add(message, lambda: self.move(TrajectoryMotion(trajectory, begin)))
 
@@ -295,12 +288,9 @@ class GoalSubscriber:
 
     def _on_posture(self, message: JointState) -> None:
         config = self._config
-        try:
-            q_des = posture_from_message(
-                message, config.joints, config.position_min, config.position_max
-            )
-        except GoalRefused as error:
-            return self.refuse(TARGET_POSTURE, error)
+        q_des = posture_from_message(
+            message, config.joints, config.position_min, config.position_max
+        )
         self.add(message, lambda: self._take_posture(q_des))
 
     def _take_posture(self, q_des: np.ndarray) -> None:

@@ -89,26 +89,21 @@ class WrenchSubscriber:
 
     def _on_target(self, message: WrenchStamped) -> None:
         config, interaction = self._config, self._interaction
-        try:
-            if interaction is None or interaction.sensor is None:
-                raise GoalRefused("there is no force/torque sensor, 'ft_frame'")
-            wrench = wrench_of(message)
-            if not np.isfinite(wrench).all():
-                raise GoalRefused("wrench is not finite")
-            frame = message.header.frame_id
-            hand, base = config.end_effectors[0], config.base_frame
-            if frame not in ("", hand, base):
-                raise GoalRefused(f"frame_id is '{frame}'; allowed: '{hand}', '{base}' or empty")
-        except GoalRefused as error:
-            self._goals.refuse(TARGET_WRENCH, error)
-            return
+        if interaction is None or interaction.sensor is None:
+            raise GoalRefused("there is no force/torque sensor, 'ft_frame'")
+        wrench = wrench_of(message)
+        if not np.isfinite(wrench).all():
+            raise GoalRefused("wrench is not finite")
+        frame = message.header.frame_id
+        hand, base = config.end_effectors[0], config.base_frame
+        if frame not in ("", hand, base):
+            raise GoalRefused(f"frame_id is '{frame}'; allowed: '{hand}', '{base}' or empty")
         rotation = self._base.rotation if frame == config.base_frame else None
         self._goals.add(message, lambda: self._apply(interaction, wrench, rotation))
 
     def _apply(self, interaction: Interaction, wrench: Array, rotation: Array | None) -> None:
         if not interaction.settings.directions.any():
-            error = GoalRefused("no direction of 'force_directions' is set")
-            self._goals.refuse(TARGET_WRENCH, error)
+            self._goals.refuse(TARGET_WRENCH, "no direction of 'force_directions' is set")
             return
         interaction.set_target(wrench, rotation)
 

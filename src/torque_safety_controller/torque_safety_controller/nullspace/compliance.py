@@ -18,17 +18,29 @@ nothing in it grows for ever.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any, ClassVar
 
-from torque_safety_controller.integral_feedback.action import ArmTerms
-from torque_safety_controller.integral_feedback.settings import IntegralSettings
-from torque_safety_controller.nullspace.kernels import FADING_TIME, NullspaceMemory, step
-from torque_safety_controller.nullspace.task_action import TaskAction
+import numpy as np
+from numpy.typing import NDArray
+
+from torque_safety_controller.integral_feedback.action import ArmTerms, IntegralAction
+from torque_safety_controller.integral_feedback.settings import IntegralSettings, Law
+from torque_safety_controller.nullspace import kernels, printed
+from viability_bounds_pkg.compiled import bound
+from viability_bounds_pkg.exceptions import ArmSafetyError
+
+Array = NDArray[np.float64]
 
 
-class NullspaceCompliance(TaskAction):
+class TaskShapeError(ArmSafetyError, ValueError):
+    """A task that leaves an arm no null space."""
+
+
+class NullspaceCompliance(IntegralAction):
     """Additional torque that is stiff in a task of m < n rows; a change of settings keeps s.
 
-    An initial torque that the task does not feel fades with `FADING_TIME`.
+    An initial torque that the task does not feel fades with `kernels.FADING_TIME`.
 
     Args:
         settings: their number of joints stays.
@@ -38,15 +50,73 @@ class NullspaceCompliance(TaskAction):
         TaskShapeError: `m` leaves n joints no null space.
     """
 
-    memory: NullspaceMemory
+    _MEMORY: ClassVar[Any] = kernels.NullspaceMemory
+    """`integral` has m numbers, `J` has shape (m, n), all others have n numbers."""
+    _KERNEL: ClassVar[Callable[..., bool]] = kernels.step
 
     def __init__(self, settings: IntegralSettings, m: int) -> None:
-        super().__init__(settings, m, NullspaceMemory, step)
+        n = len(settings.budget)
+        if not 0 < m < n:
+            raise TaskShapeError(
+                f"a task of {m} rows for {n} joints; null-space compliance needs 1 to {n - 1} rows"
+            )
+        shapes = {"integral": (m,), "J": (m, n)}
+        fields = (np.zeros(shapes.get(name, (n,))) for name in self._MEMORY._fields)
+        J, J_dot = np.zeros((2, m, n))
+        self._arm = ArmTerms(np.eye(n), np.zeros((n, n)), J, J_dot, np.zeros(n))
+        super().__init__(settings, self._MEMORY(*fields), (*self._arm, np.zeros(n)))
+
+    def _use(self, law: Law) -> None:
+        self._law = law
+        results = self._torque, self.saturated
+        self._step = bound(
+            self._KERNEL, self.memory, law, self._arm, self._inputs[-1], *results, numbers=2
+        )
+
+    def reset(self, arm: ArmTerms) -> None:
+        """See `IntegralAction`."""
+        super().reset(arm)
+        self.memory.J[:] = arm.J
+
+    def torque(self, arm: ArmTerms, a_last: Array, dt: float) -> Array:
+        """See `IntegralAction`."""
+        return self._next(arm, a_last, dt, initialise=0.0)
+
+    def initialise(self, torque: Array, arm: ArmTerms) -> Array:
+        """See `IntegralAction`; the slow memory takes what the task feels of it."""
+        self._torque[:] = torque
+        return self._next(arm, arm.v, 0.0, initialise=1.0)
 
     def skip(self, arm: ArmTerms, dt: float) -> None:
         """See `IntegralAction`."""
         super().skip(arm, dt)
+        self.memory.J[:] = arm.J
+        self._leak(dt)
+
+    def _leak(self, dt: float) -> None:
+        """Let the memory leak for a time, s."""
         memory, decay = self.memory, math.exp(-self._law.slow_leak_rate * dt)
         for array in (memory.a, memory.s, memory.integral, memory.root):
             array *= decay
-        memory.offset[:] *= math.exp(-dt / FADING_TIME)
+        memory.offset[:] *= math.exp(-dt / kernels.FADING_TIME)
+
+    def _next(self, arm: ArmTerms, a_last: Array, dt: float, initialise: float) -> Array:
+        self._take(*arm, a_last)
+        try:
+            usable = self._step(dt, initialise)
+        except np.linalg.LinAlgError as error:
+            raise ValueError("M must be positive definite") from error
+        if not usable:
+            raise ValueError("M must be positive definite, and all numbers finite")
+        return self._torque.copy()
+
+
+class PrintedCompliance(NullspaceCompliance):
+    """The same by (16), (21) and (26) as printed: see `printed`."""
+
+    _MEMORY = printed.PrintedMemory
+    _KERNEL = printed.step
+
+    def _leak(self, dt: float) -> None:
+        self.memory.slow[:] *= math.exp(-self._law.slow_leak_rate * dt)
+        self.memory.fast[:] *= math.exp(-self._law.fast_leak_rate * dt)

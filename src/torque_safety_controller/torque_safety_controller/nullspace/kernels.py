@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from torque_safety_controller.anti_windup import clip, scale_factor
 from torque_safety_controller.integral_feedback.action import ArmTerms
-from torque_safety_controller.integral_feedback.gain_matrix import gain_matrix
+from torque_safety_controller.integral_feedback.kernels import gain_matrix
 from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors
 from torque_safety_controller.integral_feedback.settings import WIDENING_TIME, Law
 from torque_safety_controller.linalg.generalized_inverse import (
@@ -83,7 +83,7 @@ def step(
     M, C, J, J_dot, v = arm
     if not usable(arm, a_ref, torque, initialise):
         return False
-    J_plus, J_plus_dot, _ = dynamically_consistent_inverse(J, J_dot, M, C + C.T, THRESHOLD)
+    J_plus, J_plus_dot = dynamically_consistent_inverse(J, J_dot, M, C + C.T, THRESHOLD)
     root_M = np.sqrt(np.diag(M))
     if initialise > 0.0:
         a = initial_memory(law, arm, J_plus, torque)

@@ -21,13 +21,12 @@ from numpy.typing import NDArray
 
 from torque_safety_controller.anti_windup import clip, project, scale_factor
 from torque_safety_controller.integral_feedback.action import ArmTerms
-from torque_safety_controller.integral_feedback.gain_matrix import gain_torque
+from torque_safety_controller.integral_feedback.kernels import gain_torque
 from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors
 from torque_safety_controller.integral_feedback.settings import (
     NONE,
     SCALING,
     WIDENING_TIME,
-    IntegralSettings,
     Law,
 )
 from torque_safety_controller.linalg.generalized_inverse import (
@@ -35,7 +34,6 @@ from torque_safety_controller.linalg.generalized_inverse import (
     dynamically_consistent_inverse,
 )
 from torque_safety_controller.nullspace.kernels import initial_memory, usable
-from torque_safety_controller.nullspace.task_action import TaskAction
 from viability_bounds_pkg.compiled import compiled
 
 Array = NDArray[np.float64]
@@ -64,29 +62,6 @@ class PrintedMemory(NamedTuple):
     J: Array
 
 
-class PrintedCompliance(TaskAction):
-    """Additional torque of (16), (21) and (26), for a task of m < n rows.
-
-    Args:
-        settings: their number of joints stays.
-        m: rows of the task's Jacobian.
-
-    Raises:
-        TaskShapeError: `m` leaves n joints no null space.
-    """
-
-    memory: PrintedMemory
-
-    def __init__(self, settings: IntegralSettings, m: int) -> None:
-        super().__init__(settings, m, PrintedMemory, step)
-
-    def skip(self, arm: ArmTerms, dt: float) -> None:
-        """See `IntegralAction`."""
-        super().skip(arm, dt)
-        self.memory.slow[:] *= math.exp(-self._law.slow_leak_rate * dt)
-        self.memory.fast[:] *= math.exp(-self._law.fast_leak_rate * dt)
-
-
 @compiled
 def step(
     memory: PrintedMemory,
@@ -108,7 +83,7 @@ def step(
     M, C, J, J_dot, v = arm
     if not usable(arm, a_ref, torque, initialise):
         return False
-    J_plus, J_plus_dot, _ = dynamically_consistent_inverse(J, J_dot, M, C + C.T, THRESHOLD)
+    J_plus, J_plus_dot = dynamically_consistent_inverse(J, J_dot, M, C + C.T, THRESHOLD)
     if initialise > 0.0:
         s = initial_memory(law, arm, J_plus, torque)
         integral = np.zeros(len(J))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Command line tool that prints gains beside the largest that a robot bears.
+"""Command line tool that prints gains beside the largest that a robot allows.
 
 Reads a robot's parameter files: delay, bandwidth of the motors and resolution of the encoders, as
 declared for bounds_node, and the gains of controller_node.

@@ -188,7 +188,7 @@ def _run(options: argparse.Namespace) -> int:
             break
         gains = _lowered(gains, beyond)
     else:
-        raise NewRobotError(f"no gains bear this rate: {beyond[0]}; a higher --rate")
+        raise NewRobotError(f"no gains suit this rate: {beyond[0]}; a higher --rate")
     write_whole(files["scenario"], scenario_file(chain, estimates, postures))
     _write_imperfect(chain, estimates, gains, files)
     for name, path in files.items():
@@ -240,7 +240,7 @@ def _write_imperfect(
 
 
 def _exceeded(paths: Sequence[Path]) -> list[GainLimit]:
-    """Return the gains of parameter files that are beyond what the robot bears.
+    """Return the gains of parameter files that are too large for the robot.
 
     Raises:
         ArmSafetyError: the files leave no bounds.
@@ -254,7 +254,7 @@ def _exceeded(paths: Sequence[Path]) -> list[GainLimit]:
 
 
 def _lowered(gains: dict[str, float], beyond: Sequence[GainLimit]) -> dict[str, float]:
-    """Return gains, with those that are too large lowered to what the robot bears."""
+    """Return gains, with those that are too large lowered to their limits."""
     changed = dict(gains)
     for each in beyond:
         task, _, kind = each.name.rpartition("_")
