@@ -53,6 +53,7 @@ class Seen:
         again: time until it went on, s.
         steps: largest change of torque in a period as it went on, share of torque_max.
         lasted: how long the faults were there, s.
+        brakes: whether the arm has to brake; where not, it may for other reasons.
         timeout: periods for which the robot holds a command before it stops itself.
     """
 
@@ -65,6 +66,7 @@ class Seen:
     steps: list[float] = field(default_factory=list)
     lasted: list[float] = field(default_factory=list)
     timeout: int = 0
+    brakes: bool = True
 
     def note_limits(self, monitor: LimitMonitor) -> None:
         """Add what a robot saw at its physics steps."""
@@ -79,7 +81,6 @@ class Seen:
         end: float,
         dt: float,
         tau_max: np.ndarray,
-        brakes: bool = True,
     ) -> None:
         """Add what the trace shows of a fault.
 
@@ -89,11 +90,10 @@ class Seen:
             end: of it.
             dt: control period, s.
             tau_max: torque limits, shape (n,), N m.
-            brakes: whether the arm has to brake; where not, it does for other reasons.
         """
         t = np.array([each.t for each in trace])
         braking, stopped = (np.array([each[k] for each in trace], dtype=bool) for k in (1, 2))
-        first = np.flatnonzero((t >= begin) & (t < end) & braking & brakes)
+        first = np.flatnonzero((t >= begin) & (t < end) & braking)
         if first.size:
             by_robot = bool(stopped[first[0]])
             # A state shows what the robot has done in the period before it.
@@ -105,7 +105,7 @@ class Seen:
         self.lasted.append(end - begin)
         after = np.flatnonzero((t >= end) & ~braking)
         self.again.append(float(t[after[0]] - end) if after.size else np.inf)
-        if not after.size or (brakes and not first.size):
+        if not after.size or (self.brakes and not first.size):
             return
         back = after[0]
         last = np.flatnonzero((t > t[back] + RETURN) | ((t > t[back]) & braking))
@@ -125,7 +125,7 @@ class Seen:
         if self.position > 0.0 or self.speed > 0.0 or self.torque > 1.0 + 1e-9:
             wrong.append("a limit was passed")
         in_time = np.where(np.array(self.by_robot), self.timeout + 1, HOLD_IN_TIME / dt)
-        if (np.array(self.braking) > in_time).any():
+        if self.brakes and not (np.array(self.braking) <= in_time).all():  # nor where it did not
             wrong.append("braking")
         if max(self.again, default=0.0) > AGAIN:
             wrong.append("not in time again")

@@ -16,11 +16,11 @@ Most sensors are far better. So it is *learned* for each joint what share of the
     share = max |e| / (h `SHARE` v_max + LAG |v - v0|, the latter where e has the sign of v - v0),
 
 and `FACTOR` times this share is the tolerance, once `ENOUGH` states in motion have shown it.
-Where e is beyond it the state is *undecided*: an impact, a stamp that came late, or a lie. The next
-one decides: over both periods the sum of e must be within what impacts and tolerances explain. At
-the onset of a bias b of the velocities e is -h b / 2, which an impact at the very end of the period
-gives as well: one state cannot tell them apart. Then the sum is -3 h b / 2, and h b / 2 may be an
-impact; after positions have frozen it is -2 h v.
+Where e is beyond it the state is *undecided*: an impact, a stamp that came late, or a lie. The
+next one decides: over both periods the sum of e must be within what impacts and tolerances
+explain. At the onset of a bias b of the velocities e is -h b / 2, which an impact at the very end
+of the period gives as well: one state cannot tell them apart. Then the sum is -3 h b / 2, and
+h b / 2 may be an impact; after positions have frozen it is -2 h v.
 """
 
 from __future__ import annotations
