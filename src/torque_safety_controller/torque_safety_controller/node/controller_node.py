@@ -363,6 +363,7 @@ class ControllerNode(ArmNode):
                 "goals_pending": len(self._goals),
                 "goals_refused": self._goals.refused,
                 "states_refused": self._states.refused,
+                "states_undecided": self._states.undecided,
                 "limits_refused": self._limits.refused,
             }
         )

@@ -69,6 +69,7 @@ class JointStateReader:
         stamp: its stamp, ns.
         heard_at: when it came, or was repeated last, s.
         refused: how many messages were dropped, by reason.
+        undecided: how many states were left until the next one.
     """
 
     LEAVES_UNDECIDED = False
@@ -88,6 +89,7 @@ class JointStateReader:
         self.stamp = -1
         self.heard_at = -math.inf
         self.refused: Counter[str] = Counter()
+        self.undecided, self._left = 0, -1
         self._joints = tuple(joints)
         self._reset_after = reset_after
         self._accepted_at = -math.inf
@@ -134,6 +136,8 @@ class JointStateReader:
             if wrong != UNDECIDED:
                 return self._refuse("cannot be", wrong)
             if self.LEAVES_UNDECIDED:
+                self.undecided += self._left != stamp
+                self._left = stamp
                 return Verdict.UNDECIDED
         self.q, self.v, self.stamp = q, v, stamp
         self._accepted = message, self._index
