@@ -56,11 +56,14 @@ class Kind(NamedTuple):
         what: it does to them, as in a file of faults.
         brakes: whether the arm has to brake: none of the messages can be used. Where it leaves
             some that can, limits have to be kept, and the goal to be followed again afterwards.
+        believed: states at its begin that are answered before it can be told: the first one of
+            what freezes is right; velocities that are the same must be so for 10 ms.
     """
 
     topic: str
     what: str
     brakes: bool = True
+    believed: int = 0
 
 
 FAULTS = {
@@ -80,10 +83,12 @@ FAULTS = {
     "commands not finite": Kind("joint_commands", "corrupt: {how: nan}"),
     "states of other joints": Kind("joint_states", "corrupt: {how: names}"),
     "degrees for radians": Kind("joint_states", "scale: {factor: 57.3}"),
-    "states frozen": Kind("joint_states", "freeze: "),
-    "positions frozen": Kind("joint_states", "freeze: {field: position}"),
+    "states frozen": Kind("joint_states", "freeze: ", believed=6),
+    "positions frozen": Kind("joint_states", "freeze: {field: position}", believed=2),
     "positions with a bias": Kind("joint_states", "bias: {offset: 0.3, field: position}"),
-    "velocities with a bias": Kind("joint_states", "bias: {offset: 0.6, field: velocity}"),
+    "velocities with a bias": Kind(
+        "joint_states", "bias: {offset: 0.6, field: velocity}", believed=1
+    ),
     "stamps of the past": Kind("joint_states", "stamp: {offset: -0.3}"),
     "stamps of the future": Kind("joint_states", "stamp: {offset: 0.3}"),
     "another robot": Kind("joint_states", "rival: {offset: 0.5}"),
@@ -144,7 +149,7 @@ class Bench:
         begins = 2.0 + EPISODE * np.arange(count) + self._rng.uniform(0.0, 1.0, count)
         entries = "\n".join(
             f"  - {{time: {begin:.4f}, duration: {DURATION}, topic: {topic}, {what}}}"
-            for begin, (topic, what, _) in zip(
+            for begin, (topic, what, *_) in zip(
                 begins.tolist(),
                 (FAULTS[name] for name in names for _ in range(moments)),
                 strict=True,
@@ -156,11 +161,11 @@ class Bench:
         self._ros.wait_until(lambda: faults._begin >= 0, "the first state")
         start = 1e-9 * faults._begin
         return [
-            self._suffer(start + some, FAULTS[name].brakes)
+            self._suffer(start + some, FAULTS[name])
             for name, some in zip(names, begins.reshape(-1, moments), strict=True)
         ]
 
-    def _suffer(self, begins: np.ndarray, brakes: bool) -> Seen:
+    def _suffer(self, begins: np.ndarray, kind: Kind) -> Seen:
         """Go on until after the last of these moments; return what happened."""
         monitor, trace, asked = self._arm._monitor, self._trace, -np.inf
         monitor.reset()
@@ -173,7 +178,7 @@ class Bench:
                 asked = now
             self._ros.spin(0.05)
         timeout = self._arm.get_parameter("command_timeout").value
-        seen = Seen(timeout=timeout, brakes=brakes)
+        seen = Seen(timeout=timeout, brakes=kind.brakes, believed=kind.believed)
         seen.note_limits(monitor)
         tau_max = np.array(self._values["torque_max"])
         for begin in begins.tolist():

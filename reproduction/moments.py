@@ -54,6 +54,7 @@ class Seen:
         steps: largest change of torque in a period as it went on, share of torque_max.
         lasted: how long the faults were there, s.
         brakes: whether the arm has to brake; where not, it may for other reasons.
+        believed: wrong states that are answered at most before they are told.
         timeout: periods for which the robot holds a command before it stops itself.
     """
 
@@ -67,6 +68,7 @@ class Seen:
     lasted: list[float] = field(default_factory=list)
     timeout: int = 0
     brakes: bool = True
+    believed: int = 0
 
     def note_limits(self, monitor: LimitMonitor) -> None:
         """Add what a robot saw at its physics steps."""
@@ -108,6 +110,8 @@ class Seen:
         if not after.size or (self.brakes and not first.size):
             return
         back = after[0]
+        if not (self.brakes or braking[max(back - 1, 0)]):
+            return  # it had not been brought to rest, or had gone on before
         last = np.flatnonzero((t > t[back] + RETURN) | ((t > t[back]) & braking))
         stop = last[0] if last.size else len(trace)
         tau = np.array([each.tau for each in trace[max(back - 1, 0) : stop]])
@@ -124,7 +128,8 @@ class Seen:
         wrong = []
         if self.position > 0.0 or self.speed > 0.0 or self.torque > 1.0 + 1e-9:
             wrong.append("a limit was passed")
-        in_time = np.where(np.array(self.by_robot), self.timeout + 1, HOLD_IN_TIME / dt)
+        stop = self.believed + self.timeout + 1
+        in_time = np.where(np.array(self.by_robot), stop, HOLD_IN_TIME / dt)
         if self.brakes and not (np.array(self.braking) <= in_time).all():  # nor where it did not
             wrong.append("braking")
         if max(self.again, default=0.0) > AGAIN:
