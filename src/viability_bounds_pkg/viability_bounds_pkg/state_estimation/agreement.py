@@ -39,9 +39,9 @@ Array = NDArray[np.float64]
 LAG = 5e-3
 """Time constant of a filter of the velocities, taken for possible, s."""
 
-FACTOR, LEAST = 3.0, 0.2
-"""Tolerance of e as a multiple of the largest seen, and at least as a share of what may be: 1% of
-the speed limit, and a filter of 1 ms."""
+FACTOR, LEAST = 3.0, 0.05
+"""Tolerance of e as a multiple of the largest seen, and at least as a share of what may be: 0.25%
+of the speed limit, and a filter of 0.25 ms."""
 
 ENOUGH = 200
 """States in motion, faster than errors of velocities, after which that tolerance is relied on."""
