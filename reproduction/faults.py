@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Each kind of fault between the nodes at random moments, in real time: limits, braking, return.
 
-bash scripts/reproduce.sh faults [--robot NAME] [--moments N]
+bash scripts/reproduce.sh faults [--robot NAME] [--fault NAME] [--moments N] [--rate HZ]
+    [--hold PERIODS]
 
 Robot, bounds and controller in one process, the fault node between them. Goals are random corners
 of the position limits, one a second, with stiff gains; from the start of a fault until the arm
@@ -15,7 +16,7 @@ import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from chain import load_values
@@ -45,29 +46,54 @@ SENDERS = {
 DURATION = 0.6  # s of a fault
 EPISODE = 4.0  # s from one to the next
 RECOVERY = 1.0  # s after a fault before there is another goal
+
+
+class Kind(NamedTuple):
+    """A kind of fault.
+
+    Attributes:
+        topic: whose messages it spoils.
+        what: it does to them, as in a file of faults.
+        brakes: whether the arm has to brake: none of the messages can be used. Where it leaves
+            some that can, limits have to be kept, and the goal to be followed again afterwards.
+        believed: states at its begin that are answered before it can be told: the first one of
+            what freezes is right; velocities that are the same must be so for 10 ms.
+    """
+
+    topic: str
+    what: str
+    brakes: bool = True
+    believed: int = 0
+
+
 FAULTS = {
-    "states lost": ("joint_states", "drop: "),
-    "limits lost": ("acceleration_limits", "drop: "),
-    "commands lost": ("joint_commands", "drop: "),
-    "a third of the states lost": ("joint_states", "drop: {probability: 0.33}"),
-    "commands 20 ms late": ("joint_commands", "delay: {delay: 0.02}"),
-    "a burst of commands": ("joint_commands", "burst: "),
-    "states twice": ("joint_states", "duplicate: "),
-    "states in another order": ("joint_states", "reorder: "),
-    "states not finite": ("joint_states", "corrupt: {how: nan}"),
-    "limits not finite": ("acceleration_limits", "corrupt: {how: nan}"),
-    "commands not finite": ("joint_commands", "corrupt: {how: nan}"),
-    "states of other joints": ("joint_states", "corrupt: {how: names}"),
-    "degrees for radians": ("joint_states", "scale: {factor: 57.3}"),
-    "states frozen": ("joint_states", "freeze: "),
-    "positions frozen": ("joint_states", "freeze: {field: position}"),
-    "positions with a bias": ("joint_states", "bias: {offset: 0.3, field: position}"),
-    "velocities with a bias": ("joint_states", "bias: {offset: 0.6, field: velocity}"),
-    "stamps of the past": ("joint_states", "stamp: {offset: -0.3}"),
-    "stamps of the future": ("joint_states", "stamp: {offset: 0.3}"),
-    "another robot": ("joint_states", "rival: {offset: 0.5}"),
-    "other limits": ("acceleration_limits", "rival: {offset: 50}"),
-    "another controller": ("joint_commands", "rival: {offset: 5}"),
+    "states lost": Kind("joint_states", "drop: "),
+    "limits lost": Kind("acceleration_limits", "drop: "),
+    "commands lost": Kind("joint_commands", "drop: "),
+    # Rows of three or more are one in 27: the robot bears five.
+    "a third of the states lost": Kind("joint_states", "drop: {probability: 0.33}", brakes=False),
+    "commands 20 ms late": Kind("joint_commands", "delay: {delay: 0.02}"),
+    "a burst of commands": Kind("joint_commands", "burst: "),
+    # The second one says what the first did.
+    "states twice": Kind("joint_states", "duplicate: ", brakes=False),
+    # Every second state is the newest one when it comes.
+    "states in another order": Kind("joint_states", "reorder: ", brakes=False),
+    "states not finite": Kind("joint_states", "corrupt: {how: nan}"),
+    "limits not finite": Kind("acceleration_limits", "corrupt: {how: nan}"),
+    "commands not finite": Kind("joint_commands", "corrupt: {how: nan}"),
+    "states of other joints": Kind("joint_states", "corrupt: {how: names}"),
+    "degrees for radians": Kind("joint_states", "scale: {factor: 57.3}"),
+    "states frozen": Kind("joint_states", "freeze: ", believed=6),
+    "positions frozen": Kind("joint_states", "freeze: {field: position}", believed=2),
+    "positions with a bias": Kind("joint_states", "bias: {offset: 0.3, field: position}"),
+    "velocities with a bias": Kind(
+        "joint_states", "bias: {offset: 0.6, field: velocity}", believed=1
+    ),
+    "stamps of the past": Kind("joint_states", "stamp: {offset: -0.3}"),
+    "stamps of the future": Kind("joint_states", "stamp: {offset: 0.3}"),
+    "another robot": Kind("joint_states", "rival: {offset: 0.5}"),
+    "other limits": Kind("acceleration_limits", "rival: {offset: 50}"),
+    "another controller": Kind("joint_commands", "rival: {offset: 5}"),
 }
 
 
@@ -78,14 +104,13 @@ class Bench:
         ros: runs the nodes.
         robot: name of its file.
         seed: of goals and moments.
-        hold: periods for which the robot holds a command; None for the robot's own.
+        own: parameters that differ from the file, by name.
     """
 
-    def __init__(self, ros: RosHarness, robot: str, seed: int, hold: int | None) -> None:
+    def __init__(self, ros: RosHarness, robot: str, seed: int, own: dict[str, Any]) -> None:
         self._ros, self._rng = ros, np.random.default_rng(seed)
         self._values = load_values(robot) | STIFF | {"start_paused": False, "clock": "real_time"}
-        if hold is not None:
-            self._values["command_timeout"] = hold
+        self._values |= own
         nodes = {}
         for topic, kind in SENDERS.items():
             arguments = ["--ros-args", "-r", f"{topic}:={BEFORE}{topic}"]
@@ -124,7 +149,7 @@ class Bench:
         begins = 2.0 + EPISODE * np.arange(count) + self._rng.uniform(0.0, 1.0, count)
         entries = "\n".join(
             f"  - {{time: {begin:.4f}, duration: {DURATION}, topic: {topic}, {what}}}"
-            for begin, (topic, what) in zip(
+            for begin, (topic, what, *_) in zip(
                 begins.tolist(),
                 (FAULTS[name] for name in names for _ in range(moments)),
                 strict=True,
@@ -135,9 +160,12 @@ class Bench:
         faults: Any = self._ros.start(FaultNode, {"faults": str(path)})
         self._ros.wait_until(lambda: faults._begin >= 0, "the first state")
         start = 1e-9 * faults._begin
-        return [self._suffer(start + some) for some in begins.reshape(-1, moments)]
+        return [
+            self._suffer(start + some, FAULTS[name])
+            for name, some in zip(names, begins.reshape(-1, moments), strict=True)
+        ]
 
-    def _suffer(self, begins: np.ndarray) -> Seen:
+    def _suffer(self, begins: np.ndarray, kind: Kind) -> Seen:
         """Go on until after the last of these moments; return what happened."""
         monitor, trace, asked = self._arm._monitor, self._trace, -np.inf
         monitor.reset()
@@ -149,7 +177,8 @@ class Bench:
                 self._ask()
                 asked = now
             self._ros.spin(0.05)
-        seen = Seen(timeout=self._arm.get_parameter("command_timeout").value)
+        timeout = self._arm.get_parameter("command_timeout").value
+        seen = Seen(timeout=timeout, brakes=kind.brakes, believed=kind.believed)
         seen.note_limits(monitor)
         tau_max = np.array(self._values["torque_max"])
         for begin in begins.tolist():
@@ -158,13 +187,13 @@ class Bench:
 
 
 def play(
-    robot: str, names: list[str], moments: int, hold: int | None
+    robot: str, names: list[str], moments: int, own: dict[str, Any]
 ) -> list[tuple[str, dict[str, Any]]]:
     """Let a robot suffer these faults; return what each did."""
     with private_domain() as domain, tempfile.TemporaryDirectory() as folder:
         ros = RosHarness(domain)
         try:
-            seen = Bench(ros, robot, 1, hold).suffer(names, moments, Path(folder))
+            seen = Bench(ros, robot, 1, own).suffer(names, moments, Path(folder))
             return [(name, vars(each)) for name, each in zip(names, seen, strict=True)]
         finally:
             ros.close()
@@ -179,15 +208,16 @@ def main() -> int:
     parser.add_argument(
         "--hold", type=int, help="periods for which the robot holds a command; the robot's own"
     )
+    parser.add_argument("--rate", type=float, help="of the control loop, Hz; the robot's own")
     given = parser.parse_args()
+    own = {"rate_hz": given.rate, "command_timeout": given.hold}
+    own = {name: value for name, value in own.items() if value is not None}
     robots, names = given.robot or ROBOTS, given.fault or list(FAULTS)
     figure = Figure("faults")
     with ProcessPoolExecutor(len(robots), get_context("spawn")) as pool:
-        runs = [
-            (robot, pool.submit(play, robot, names, given.moments, given.hold)) for robot in robots
-        ]
+        runs = [(robot, pool.submit(play, robot, names, given.moments, own)) for robot in robots]
         for robot, run in runs:
-            dt = 1.0 / load_values(robot)["rate_hz"]
+            dt = 1.0 / (given.rate or load_values(robot)["rate_hz"])
             for name, seen in run.result():
                 figure.rows.append((robot, name, *Seen(**seen).cells(dt)))
     print(table([figure], HEADS))

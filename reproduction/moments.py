@@ -53,6 +53,8 @@ class Seen:
         again: time until it went on, s.
         steps: largest change of torque in a period as it went on, share of torque_max.
         lasted: how long the faults were there, s.
+        brakes: whether the arm has to brake; where not, it may for other reasons.
+        believed: wrong states that are answered at most before they are told.
         timeout: periods for which the robot holds a command before it stops itself.
     """
 
@@ -65,6 +67,8 @@ class Seen:
     steps: list[float] = field(default_factory=list)
     lasted: list[float] = field(default_factory=list)
     timeout: int = 0
+    brakes: bool = True
+    believed: int = 0
 
     def note_limits(self, monitor: LimitMonitor) -> None:
         """Add what a robot saw at its physics steps."""
@@ -79,7 +83,6 @@ class Seen:
         end: float,
         dt: float,
         tau_max: np.ndarray,
-        brakes: bool = True,
     ) -> None:
         """Add what the trace shows of a fault.
 
@@ -89,11 +92,10 @@ class Seen:
             end: of it.
             dt: control period, s.
             tau_max: torque limits, shape (n,), N m.
-            brakes: whether the arm has to brake; where not, it does for other reasons.
         """
         t = np.array([each.t for each in trace])
         braking, stopped = (np.array([each[k] for each in trace], dtype=bool) for k in (1, 2))
-        first = np.flatnonzero((t >= begin) & (t < end) & braking & brakes)
+        first = np.flatnonzero((t >= begin) & (t < end) & braking)
         if first.size:
             by_robot = bool(stopped[first[0]])
             # A state shows what the robot has done in the period before it.
@@ -105,9 +107,11 @@ class Seen:
         self.lasted.append(end - begin)
         after = np.flatnonzero((t >= end) & ~braking)
         self.again.append(float(t[after[0]] - end) if after.size else np.inf)
-        if not after.size or (brakes and not first.size):
+        if not after.size or (self.brakes and not first.size):
             return
         back = after[0]
+        if not (self.brakes or braking[max(back - 1, 0)]):
+            return  # it had not been brought to rest, or had gone on before
         last = np.flatnonzero((t > t[back] + RETURN) | ((t > t[back]) & braking))
         stop = last[0] if last.size else len(trace)
         tau = np.array([each.tau for each in trace[max(back - 1, 0) : stop]])
@@ -124,8 +128,9 @@ class Seen:
         wrong = []
         if self.position > 0.0 or self.speed > 0.0 or self.torque > 1.0 + 1e-9:
             wrong.append("a limit was passed")
-        in_time = np.where(np.array(self.by_robot), self.timeout + 1, HOLD_IN_TIME / dt)
-        if (np.array(self.braking) > in_time).any():
+        stop = self.believed + self.timeout + 1
+        in_time = np.where(np.array(self.by_robot), stop, HOLD_IN_TIME / dt)
+        if self.brakes and not (np.array(self.braking) <= in_time).all():  # nor where it did not
             wrong.append("braking")
         if max(self.again, default=0.0) > AGAIN:
             wrong.append("not in time again")

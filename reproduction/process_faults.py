@@ -329,8 +329,7 @@ class Bench:
             self.spin()
             since = min(since, time.monotonic()) if self.tracking else math.inf
         begin = max(begin, self._marked)
-        brakes = self._kind.brakes
-        seen.note_moment(self._trace, begin, end, self.dt, self._tau_max, brakes)
+        seen.note_moment(self._trace, begin, end, self.dt, self._tau_max)
 
     def note_limits(self, seen: Seen) -> None:
         """Add how far limits were passed until now."""
@@ -541,7 +540,8 @@ def play(
     robot: str, name: str, moments: int, seed: int, rate: float | None, hold: int | None
 ) -> tuple[Seen, float, str]:
     """Let a robot suffer a fault; return what it did, the control period, s, and why it ended."""
-    kind, rng, seen, why = FAULTS[name], np.random.default_rng(seed), Seen(), ""
+    kind, rng, why = FAULTS[name], np.random.default_rng(seed), ""
+    seen = Seen(brakes=kind.brakes)
     for count in [1] * moments if kind.late else [moments]:
         with ExitStack() as stack:
             ros = RosHarness(stack.enter_context(private_domain()))

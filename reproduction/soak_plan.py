@@ -62,7 +62,7 @@ def timeline(planned: list[Slot], every: float) -> str:
     lines = [f"topics: [{', '.join(SENDERS)}]", "faults:"]
     for k, slot in enumerate(planned):
         if slot.between:
-            topic, what = FAULTS[slot.name]
+            topic, what, *_ = FAULTS[slot.name]
             when = f"time: {LEAD + k * every:.3f}, duration: {slot.duration:.3f}"
             lines.append(f"  - {{{when}, topic: {topic}, {what}}}")
     return "\n".join(lines) + ("\n" if len(lines) > 2 else " []\n")

@@ -51,7 +51,7 @@ def bench():
     ],
 )
 def test_limits_are_kept_and_the_arm_goes_on(bench, fault, brakes):
-    seen = Seen(timeout=bench.timeout)
+    seen = Seen(timeout=bench.timeout, brakes=brakes)
     bench.motion(0.5)
     bench.arm._monitor.reset()
     bench.suffer(seen, FAULTS[fault].course(bench))

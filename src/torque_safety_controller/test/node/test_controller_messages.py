@@ -241,6 +241,34 @@ def test_a_state_beyond_sense_is_refused_and_forgotten(ros):
     )
 
 
+def test_a_state_that_may_be_wrong_is_answered_by_the_command_before(ros):
+    """An impact, or a bias of the velocities: the next state tells."""
+    chain = NodeChain(ros)
+    q, v, h, stamp = Q.copy(), 0.2 * ARM.v_max, 0.01, 0
+
+    def goes_on(states):
+        nonlocal q, stamp
+        for _ in range(states):
+            q, stamp = q + h * v, stamp + 10
+            tau = chain.answer(stamp, q, v)
+        return tau
+
+    tau = goes_on(230)
+    impact = v - 0.5
+    q, v, stamp = q + h * v, impact, stamp + 10
+    np.testing.assert_array_equal(chain.answer(stamp, q, v), tau)
+    tau = goes_on(30)
+    assert chain.reported("states_refused") == "none"
+    q, stamp = q + h * v, stamp + 10
+    np.testing.assert_array_equal(chain.answer(stamp, q, v + 0.5), tau)
+    q, stamp = q + h * v, stamp + 10
+    ros.wait_until(
+        lambda: "cannot be" in chain.reported("states_refused"),
+        each=lambda: chain.both(stamp, q, v + 0.5),
+    )
+    assert chain.reported("states_undecided") == "2"
+
+
 def test_an_estimate_without_a_solution_is_held_and_forgotten(ros):
     chain = NodeChain(ros, use_estimated_states=True)  # estimates are not checked once more
     stamp = give_goal(chain)

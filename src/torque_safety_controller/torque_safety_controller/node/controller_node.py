@@ -177,6 +177,9 @@ class ControllerNode(ArmNode):
         if arrival is Arrival.REFUSED:
             self._on_refused(stamp)
             return
+        if arrival is Arrival.UNDECIDED:
+            self._wait(stamp)
+            return
         if arrival is Arrival.REPEAT:
             if states.answered_stamp == states.stamp:
                 self._commands.again(stamp)
@@ -203,6 +206,14 @@ class ControllerNode(ArmNode):
         elif in_row == _UNSEEN:
             self._went_wrong = states.why_refused
             self._enter(Mode.STOPPED, self._went_wrong)
+
+    def _wait(self, stamp: Any) -> None:
+        """Let the last command act for a period more: the next state decides about this one."""
+        states = self._states
+        if self._handover.by_drives:
+            self._drives.hold(stamp)
+        elif states.answered_stamp == states.stamp and not states.refused_in_row:
+            self._commands.again(stamp)
 
     def _begin(self, arrival: Arrival) -> None:
         """Start anew: the robot was silent, or restarted."""
@@ -352,6 +363,7 @@ class ControllerNode(ArmNode):
                 "goals_pending": len(self._goals),
                 "goals_refused": self._goals.refused,
                 "states_refused": self._states.refused,
+                "states_undecided": self._states.undecided,
                 "limits_refused": self._limits.refused,
             }
         )

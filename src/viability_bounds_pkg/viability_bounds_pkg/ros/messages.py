@@ -25,7 +25,7 @@ from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import DIAGNOSTICS, VALUES
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.state_estimation.freeze_check import Expected
-from viability_bounds_pkg.state_estimation.state_check import StateCheck
+from viability_bounds_pkg.state_estimation.state_check import UNDECIDED, StateCheck
 
 Report = Callable[[], tuple[bytes, str, dict[str, Any]]]
 """Returns level, message and values of a status."""
@@ -44,6 +44,8 @@ class Verdict(Enum):
     """The stamp and the values of the last accepted message: the robot repeats its state."""
     REFUSED = 3
     """Dropped and counted; the arrays hold what they held."""
+    UNDECIDED = 4
+    """The next one tells whether it is wrong; the arrays hold what they held."""
 
 
 class JointStateReader:
@@ -60,12 +62,17 @@ class JointStateReader:
         check: tells states that cannot be; None to believe what is finite.
 
     Attributes:
+        LEAVES_UNDECIDED: whether a state that may be wrong is left until the next one decides;
+            else it is believed.
         accepted: how many new states were accepted.
         q, v: position and velocity of the last accepted message, shape (n,), rad and rad/s.
         stamp: its stamp, ns.
         heard_at: when it came, or was repeated last, s.
         refused: how many messages were dropped, by reason.
+        undecided: how many states were left until the next one.
     """
+
+    LEAVES_UNDECIDED = False
 
     def __init__(
         self,
@@ -82,6 +89,7 @@ class JointStateReader:
         self.stamp = -1
         self.heard_at = -math.inf
         self.refused: Counter[str] = Counter()
+        self.undecided, self._left = 0, -1
         self._joints = tuple(joints)
         self._reset_after = reset_after
         self._accepted_at = -math.inf
@@ -125,7 +133,12 @@ class JointStateReader:
             if not restarted:
                 return self._refuse("other values under the same stamp")
         if self._check is not None and (wrong := self._check.look(State(q, v), 1e-9 * stamp)):
-            return self._refuse("cannot be", wrong)
+            if wrong != UNDECIDED:
+                return self._refuse("cannot be", wrong)
+            if self.LEAVES_UNDECIDED:
+                self.undecided += self._left != stamp
+                self._left = stamp
+                return Verdict.UNDECIDED
         self.q, self.v, self.stamp = q, v, stamp
         self._accepted = message, self._index
         self._accepted_at = self.heard_at = now

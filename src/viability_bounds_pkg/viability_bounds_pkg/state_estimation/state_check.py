@@ -14,6 +14,8 @@ trapezoidal rule is far closer, because its errors hardly add up. So
 
 stays within errors of positions and `WINDOW` times those of speeds, one impact allowed; where it
 does not, positions and velocities *contradict* each other: one of them has frozen, or has a bias.
+
+With good sensors `agreement.py` tells it within two states.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ from numpy.typing import NDArray
 
 from viability_bounds_pkg.compiled import bound, compiled
 from viability_bounds_pkg.state import State
+from viability_bounds_pkg.state_estimation.agreement import Agreement
 from viability_bounds_pkg.state_estimation.freeze_check import FROZEN, Expected, FreezeCheck
 
 Array = NDArray[np.float64]
@@ -50,7 +53,7 @@ SHARE = 0.05
 FAST = 2.0
 """How many times faster than its limit a joint may move, where velocities are not known."""
 
-FORGIVEN = 10.0
+FORGIVEN = 1.5
 """Time without a contradiction after which the next one is taken for the first, s."""
 
 SPIKE = 0.03
@@ -67,6 +70,12 @@ STAYS = 0.05
 
 UNSURE = 1.0
 """Error of that speed where positions and velocities contradict each other, rad/s."""
+
+STUCK = 10.0
+"""How long states must agree where the position of a joint that moved is still the same, s."""
+
+UNDECIDED = "undecided: an impact, or wrong"
+"""Said of a state that the next one decides about."""
 
 JUMP = "no motion leads there from the last"
 CONTRADICTION = "positions contradict velocities"
@@ -99,12 +108,14 @@ class _Errors(NamedTuple):
 class StateCheck:
     """Looks at the joint states of one arm, one after the other.
 
+    A state that is `UNDECIDED` is neither wrong nor believed: the next one decides.
+
     After a jump states are believed again at once if they go on within `SPIKE` where the last one
     that was believed leads to. Otherwise, and after a contradiction, they must agree with each
     other for `WINDOW` and show the arm where it can be after a stop. What froze agrees with an arm
     that stands: after each contradiction it takes twice as long, except for states that were the
-    same and change again. A gap of `GAP` in the stamps, as the restart of a robot makes one, is a
-    new beginning.
+    same and change again; and `STUCK` while the position of a joint that moved stays the same. A
+    gap of `GAP` in the stamps, as the restart of a robot makes one, is a new beginning.
 
     Args:
         model: the arm, n joints with one coordinate each.
@@ -143,6 +154,7 @@ class StateCheck:
         self._compare = bound(
             _compare, self._before, self._now, self._errors, self._drift, known, numbers=2
         )
+        self._agreement = Agreement(self._before, self._now, velocity)
         self._freeze = FreezeCheck(model, tau_max, position, known)
         self.reset()
 
@@ -152,6 +164,7 @@ class StateCheck:
         self._time = -np.inf  # its time, s
         self._believed: tuple[State, float] | None = None
         self._drift.fill(0.0)
+        self._agreement.reset()
         self._agreed = 0.0  # how long states have not contradicted each other, s
         self._patience = WINDOW  # how long they must
         self._trusted = 0.0  # how long there has been no doubt, s
@@ -164,15 +177,15 @@ class StateCheck:
         self._freeze.expected = expected
 
     def look(self, state: State, stamp: float) -> str:
-        """Look at the next state; return what is wrong, or nothing.
+        """Look at the next state; return what is wrong, `UNDECIDED`, or nothing.
 
         Args:
             state: finite, shapes (n,).
             stamp: its time, s.
         """
         h = stamp - self._time
-        if self._doubt and -GAP <= h <= 0.0:
-            return self._doubt  # once more, or in another order
+        if (self._doubt or self._agreement.undecided) and -GAP <= h <= 0.0:
+            return self._doubt or UNDECIDED  # once more, or in another order
         self._now.q[:], self._now.v[:] = state
         outside, too_fast = self._nonsense()
         nonsense = OUTSIDE if outside else TOO_FAST if too_fast else ""
@@ -192,6 +205,9 @@ class StateCheck:
         frozen = self._freeze.look(before, state, h)
         awakes = self._doubt == FROZEN and self._freeze.changing <= h
         jumps, contradicts = self._compare(h, float(awakes))
+        if self._with_velocities:
+            apart = self._agreement.contradicts(h, stamp, bool(self._doubt))
+            contradicts = contradicts or (apart and not jumps)
         contradicts = contradicts or frozen
         self._agreed = 0.0 if jumps or contradicts else self._agreed + h
         if contradicts:
@@ -200,6 +216,10 @@ class StateCheck:
             self._contradiction, self._doubt = True, FROZEN if frozen else CONTRADICTION
         elif jumps and not self._doubt:
             self._doubt = JUMP
+        elif self._agreement.undecided:
+            return UNDECIDED
+        if self._doubt:
+            self._agreement.undecided = False
         if self._doubt and self._goes_on(state, stamp):
             self._doubt, self._contradiction = "", False
             self._freeze.believe()
@@ -229,8 +249,13 @@ class StateCheck:
             free = free + STOPS * UNSURE
         on = STOPS * before.v
         near = (np.minimum(on, 0.0) - free <= moved) & (moved <= np.maximum(on, 0.0) + free)
-        awake = self._doubt == FROZEN and self._freeze.changing >= WINDOW
-        return bool(near.all()) and self._agreed >= (WINDOW if awake else self._patience)
+        if self._doubt == FROZEN and self._freeze.changing >= WINDOW:
+            patience = WINDOW
+        elif ((state.q == before.q) & (np.abs(before.v) > errors.velocity)).any():
+            patience = max(self._patience, STUCK)
+        else:
+            patience = self._patience
+        return bool(near.all()) and self._agreed >= patience
 
 
 @compiled

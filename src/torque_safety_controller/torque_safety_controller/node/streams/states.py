@@ -28,6 +28,8 @@ class Arrival(Enum):
     """The last state, repeated: this was lost, or its answer."""
     REFUSED = 5
     """Dropped and counted."""
+    UNDECIDED = 6
+    """The next state tells whether it is wrong."""
 
 
 class StateStream(JointStateReader):
@@ -39,6 +41,8 @@ class StateStream(JointStateReader):
         warn: told in words when a state is dropped for a reason for the first time.
         check: tells states that cannot be; None to believe what is finite.
 
+    A state that is undecided counts as one that was lost, until the next one.
+
     Attributes:
         message_at: when the last message came, usable or not, s on the steady clock.
         message_stamp: its stamp, as in messages.
@@ -48,6 +52,8 @@ class StateStream(JointStateReader):
         refused_in_row: states dropped since the last usable one, of an arm that is answered.
         missed: whether states of the arm that was answered were missing before the last one.
     """
+
+    LEAVES_UNDECIDED = True
 
     def __init__(
         self,
@@ -71,6 +77,8 @@ class StateStream(JointStateReader):
         verdict = self.read(message, now)
         if verdict is Verdict.REFUSED:
             return Arrival.REFUSED
+        if verdict is Verdict.UNDECIDED:
+            return Arrival.UNDECIDED
         self.refused_in_row = 0
         silent = self.silent(now)
         self.usable_at = now
