@@ -99,7 +99,7 @@ class CollisionRobot:
 
     def bounds(self):
         """Return the function from a state to bounds that its parameter file describes."""
-        return make_bounds(read(BoundsConfiguration, self.values), lambda _: self.model).solve
+        return make_bounds(read(BoundsConfiguration, self.values))
 
     def states(self, speed: float = 1.0) -> list[tuple[np.ndarray, ...]]:
         """Return arguments of `CollisionAvoidance.rows`."""

@@ -71,7 +71,7 @@ def drive(method: str = "exact", duration: float = DURATION, seed: int = 0) -> E
     values = node_parameters(FILES, "/**/bounds_node") | {"method": method}
     config = read(BoundsConfiguration, values)
     model = load_model(config, config.read_urdf())
-    bounds = make_bounds(config, lambda _: model).solve
+    bounds = make_bounds(config)
     frames = read_files(TaskFrames, FILES, "/**/controller_node")
     gains = read(Gains, node_parameters(FILES, "/**/controller_node") | {"pose_kp": 100.0})
     dt, tau_max, v_max = config.dt, config.torque_max, config.velocity_max

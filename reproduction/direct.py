@@ -69,7 +69,7 @@ class DirectLoop:
         self.model = load_model(config, config.urdf)
         bounds = self._configuration("bounds_node", BoundsConfiguration)
         self.limits = bounds.limits
-        self.bounds = make_bounds(bounds, lambda _: self.model).solve
+        self.bounds = make_bounds(bounds)
         self.controller, _ = assembly.make_controller(self._controller_configuration())
         self.sensing = True
         self._sensor = None

@@ -19,7 +19,7 @@ def test_the_configured_margins_only_narrow_the_bounds(robot):
 
     def solver(parameters):
         config = read(BoundsConfiguration, parameters)
-        return config.limits, make_bounds(config, load_model=None).solve
+        return config.limits, make_bounds(config)
 
     _, with_margins = solver(margins)
     limits, without = solver(margins | {"acceleration_drift": [], "position_margin": 0.0})

@@ -62,7 +62,7 @@ def largest_step(robot, joint, seconds, delay=0, **changed) -> float:
     config = configured(ControllerConfiguration, "controller_node")
     arm = make_robot(bullet)
     model = load_model(bullet, bullet.urdf)
-    solve = make_bounds(bounds, lambda _: model).solve
+    solve = make_bounds(bounds)
     controller, _ = make_controller(config)
     q = np.array(bullet.start_positions)
     arm.reset(q, np.zeros(len(q)))

@@ -26,7 +26,9 @@ from numpy.typing import NDArray
 
 from torque_safety_controller.integral_feedback.action import ArmTerms, IntegralAction
 from torque_safety_controller.integral_feedback.settings import IntegralSettings, Law
-from torque_safety_controller.nullspace import kernels, printed
+from torque_safety_controller.nullspace.kernels import FADING_TIME, NullspaceMemory, step
+from torque_safety_controller.nullspace.printed import PrintedMemory
+from torque_safety_controller.nullspace.printed import step as printed_step
 from viability_bounds_pkg.compiled import bound
 from viability_bounds_pkg.exceptions import ArmSafetyError
 
@@ -40,7 +42,7 @@ class TaskShapeError(ArmSafetyError, ValueError):
 class NullspaceCompliance(IntegralAction):
     """Additional torque that is stiff in a task of m < n rows; a change of settings keeps s.
 
-    An initial torque that the task does not feel fades with `kernels.FADING_TIME`.
+    An initial torque that the task does not feel fades with `FADING_TIME`.
 
     Args:
         settings: their number of joints stays.
@@ -50,9 +52,9 @@ class NullspaceCompliance(IntegralAction):
         TaskShapeError: `m` leaves n joints no null space.
     """
 
-    _MEMORY: ClassVar[Any] = kernels.NullspaceMemory
+    _MEMORY: ClassVar[Any] = NullspaceMemory
     """`integral` has m numbers, `J` has shape (m, n), all others have n numbers."""
-    _KERNEL: ClassVar[Callable[..., bool]] = kernels.step
+    _KERNEL: ClassVar[Callable[..., bool]] = step
 
     def __init__(self, settings: IntegralSettings, m: int) -> None:
         n = len(settings.budget)
@@ -98,7 +100,7 @@ class NullspaceCompliance(IntegralAction):
         memory, decay = self.memory, math.exp(-self._law.slow_leak_rate * dt)
         for array in (memory.a, memory.s, memory.integral, memory.root):
             array *= decay
-        memory.offset[:] *= math.exp(-dt / kernels.FADING_TIME)
+        memory.offset[:] *= math.exp(-dt / FADING_TIME)
 
     def _next(self, arm: ArmTerms, a_last: Array, dt: float, initialise: float) -> Array:
         self._take(*arm, a_last)
@@ -114,8 +116,8 @@ class NullspaceCompliance(IntegralAction):
 class PrintedCompliance(NullspaceCompliance):
     """The same by (16), (21) and (26) as printed: see `printed`."""
 
-    _MEMORY = printed.PrintedMemory
-    _KERNEL = printed.step
+    _MEMORY = PrintedMemory
+    _KERNEL = printed_step
 
     def _leak(self, dt: float) -> None:
         self.memory.slow[:] *= math.exp(-self._law.slow_leak_rate * dt)

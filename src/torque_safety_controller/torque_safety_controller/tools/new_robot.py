@@ -248,7 +248,7 @@ def _exceeded(paths: Sequence[Path]) -> list[GainLimit]:
     config = read_files(ControllerConfiguration, paths, CONTROLLER)
     robot = read_files(BoundsConfiguration, paths, NODE)
     model = load_model(config, config.read_urdf())
-    make_bounds(robot, lambda _: model)
+    make_bounds(robot)
     inertia = ArmInertia.of(model, config.position_min, config.position_max)
     return [each for each in gain_check(config, robot, inertia).limits() if each.exceeded]
 

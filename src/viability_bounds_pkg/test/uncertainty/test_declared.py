@@ -70,7 +70,7 @@ def test_rows_of_missed_deadlines_and_late_commands_lengthen_the_horizon():
 @pytest.mark.parametrize("more", [{}, ESTIMATED])
 def test_joints_rest_and_keep_a_speed_where_the_tool_says(more):
     config = configured(**DECLARED, **more)
-    bounds, reach = make_bounds(config, None).solve, reach_of(config.loop, config.declared)
+    bounds, reach = make_bounds(config), reach_of(config.loop, config.declared)
     limits, still = config.limits, np.zeros(7)
     np.testing.assert_allclose(
         bounds(limits.q_max - reach.rest[:, 0], still).upper, 0.0, atol=1e-7
@@ -109,7 +109,7 @@ def test_shares_are_what_one_would_gain():
 )
 def test_declarations_without_bounds_are_refused_with_what_would_do(changed, name, joint):
     with pytest.raises(SettingError) as refused:
-        make_bounds(configured(**changed), None)
+        make_bounds(configured(**changed))
     text = str(refused.value)
     assert "\n" not in text
     pattern = (
@@ -130,10 +130,10 @@ def test_declarations_without_bounds_are_refused_with_what_would_do(changed, nam
             new[j] = tried
         one = configured(**{**changed, name: new})
         if good:
-            make_bounds(configured(**_of_joint(changed | {name: new}, j)), None)
+            make_bounds(configured(**_of_joint(changed | {name: new}, j)))
         else:
             with pytest.raises((SettingError, JointLimitsError)):
-                make_bounds(one, None)
+                make_bounds(one)
 
 
 def _of_joint(changed, j):
@@ -148,7 +148,7 @@ def _of_joint(changed, j):
 
 def test_two_declarations_that_are_both_too_large():
     with pytest.raises(SettingError, match="less for 'panda_joint1' at 500 Hz, and less of vel"):
-        make_bounds(configured(position_error=[3.0] * 7, velocity_error=[3.0] * 7), None)
+        make_bounds(configured(position_error=[3.0] * 7, velocity_error=[3.0] * 7))
 
 
 def overlay(tmp_path, text):

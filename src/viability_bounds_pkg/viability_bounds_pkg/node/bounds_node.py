@@ -9,25 +9,23 @@ from array import array
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from viability_bounds_pkg import viability
 from viability_bounds_pkg.node.bounds_parameters import (
-    Bounds,
     BoundsConfiguration,
     make_bounds,
 )
 from viability_bounds_pkg.node.slow_topics import SlowTopics
-from viability_bounds_pkg.robot_configuration import TOPIC, RobotConfiguration, load_model
+from viability_bounds_pkg.robot_configuration import TOPIC
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, PeriodCheck, Verdict
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
-from viability_bounds_pkg.ros.robot_urdf import DescriptionWatch, robot_urdf, warn_of_unusual
+from viability_bounds_pkg.ros.robot_urdf import DescriptionWatch, warn_of_unusual
 from viability_bounds_pkg.ros.topics import ACCELERATION_LIMITS, state_topic
 
 
@@ -45,17 +43,15 @@ class BoundsNode(ArmNode):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__(**node_arguments)
-        self._model: pin.Model | None = None
         with self.starting(ACCELERATION_LIMITS):
             self._node_parameters = NodeParameters(
-                self, BoundsConfiguration, self._configure, self._make_bounds
+                self, BoundsConfiguration, self._configure, make_bounds
             )
             config = self._node_parameters.configuration
             if config.robot_description not in ("", TOPIC):
                 warn_of_unusual(self, config, config.read_urdf())
-            self._bounds = self._make_bounds(config)
+            self._bounds = make_bounds(config)
         joints = config.joints
-        self._longest_ns = round(1.5e9 * config.dt)
         self._reader = JointStateReader(joints, config.state_timeout, self._warn)
         self._period = PeriodCheck(config.dt, self._warn)
         self._answered = 0
@@ -77,24 +73,13 @@ class BoundsNode(ArmNode):
             self, self._report, self.publisher_watch, DescriptionWatch(self)
         )
         self._warn_of_affected_joints(config)
-        self.announce(
-            joints, config.rate_hz, f"method {config.method}, limits {config.acceleration_limits}"
-        )
+        self.announce(joints, config.rate_hz, f"method {config.method}")
 
     def _warn(self, text: str) -> None:
         self.get_logger().warning(text)
 
-    def _load_model(self, robot: RobotConfiguration) -> pin.Model:
-        """Return the model, loaded once: parameters that change it are read-only."""
-        if self._model is None:
-            self._model = load_model(robot, robot_urdf(robot, self))
-        return self._model
-
-    def _make_bounds(self, config: BoundsConfiguration) -> Bounds:
-        return make_bounds(config, self._load_model)
-
     def _configure(self, config: BoundsConfiguration) -> None:
-        self._bounds = self._make_bounds(config)
+        self._bounds = make_bounds(config)
         self._warn_of_affected_joints(config)
 
     def _warn_of_affected_joints(self, config: BoundsConfiguration) -> None:
@@ -119,16 +104,11 @@ class BoundsNode(ArmNode):
     def _on_state(self, message: JointState) -> None:
         if not self.publisher_watch.admits(self._states_topic):
             return
-        last = self._reader.stamp
         verdict = self._reader.read(message, time.monotonic())
         if verdict is Verdict.REFUSED:
             return
         if verdict is Verdict.NEW:
-            if self._bounds.state_dependent is not None:
-                elapsed = self._reader.stamp - last
-                if not 0 < elapsed <= self._longest_ns:
-                    self._bounds.state_dependent.reset()
-            bounds = self._bounds.solve(self._reader.q, self._reader.v)
+            bounds = self._bounds(self._reader.q, self._reader.v)
             points = self._answer.points
             points[0].accelerations = array("d", bounds.lower.tobytes())
             points[1].accelerations = array("d", bounds.upper.tobytes())
@@ -155,8 +135,6 @@ class BoundsNode(ArmNode):
             "states_refused": self._reader.refused,
             "states_outside_kernel_by_joint": self._outside,
         }
-        if self._bounds.state_dependent is not None:
-            values["steps_by_limits"] = self._bounds.state_dependent.outcomes
         if silent:
             return DiagnosticStatus.WARN, "no joint state yet", values
         if self._reader.refused:

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,7 +74,6 @@ class BoundsConfiguration(VelocityEstimation, StateSource, ControlRate, LimitedR
 
     robot_description: str = redeclared(RobotConfiguration, "robot_description", default="")
     NOT_NEEDED = frozenset({"torque_max"})
-    acceleration_limits: ClassVar[str] = "worst_case"
     acceleration_min: Array = joint_numbers("lower acceleration limits, rad/s^2", NEGATIVE)
     acceleration_max: Array = joint_numbers("upper acceleration limits, rad/s^2", POSITIVE)
     acceleration_drift: Array = joint_numbers(
@@ -173,24 +172,12 @@ class BoundsConfiguration(VelocityEstimation, StateSource, ControlRate, LimitedR
         return margins
 
 
-class Bounds(NamedTuple):
-    """How the bounds are computed.
-
-    Attributes:
-        solve: from positions and velocities.
-        state_dependent: none.
-    """
-
-    solve: Callable[[Array, Array], viability.AccelerationBounds]
-    state_dependent: Any = None
+Bounds = Callable[[Array, Array], viability.AccelerationBounds]
+"""Computes the bounds from positions and velocities."""
 
 
-def make_bounds(config: BoundsConfiguration, load_model: object = None) -> Bounds:
+def make_bounds(config: BoundsConfiguration) -> Bounds:
     """Return how the bounds are computed.
-
-    Args:
-        config: parameters of the node.
-        load_model: not used.
 
     Raises:
         SettingError: declarations that leave no bounds.
@@ -198,13 +185,13 @@ def make_bounds(config: BoundsConfiguration, load_model: object = None) -> Bound
     limits, horizon = config.limits, config.horizon
     if config.method == "exact":
         try:
-            return Bounds(config.loop.bounds(config.declared).bounds)
+            return config.loop.bounds(config.declared).bounds
         except JointLimitsError as error:
             found = refusal(config.loop, config.declared, error)
             raise found if isinstance(found, SettingError) else _too_long(config, found) from error
     own = {"influence": config.damper_influence, "gain": config.damper_gain}
     settings = own if config.method == "damper" else {}
-    return Bounds(partial(BASELINES[config.method], limits=limits, dt=horizon, **settings))
+    return partial(BASELINES[config.method], limits=limits, dt=horizon, **settings)
 
 
 def _too_long(config: BoundsConfiguration, error: ArmSafetyError) -> SettingError:
