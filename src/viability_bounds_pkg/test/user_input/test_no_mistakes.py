@@ -96,7 +96,8 @@ def test_limits_and_joints_as_in_the_urdf_are_nothing_unusual():
     urdf = (
         "<robot name='r'><joint name='turn' type='revolute'>"
         "<limit lower='-1' upper='1' velocity='2' effort='3'/></joint>"
-        "<joint name='wheel' type='continuous'/></robot>"
+        "<joint name='wheel' type='continuous'/>"
+        "<transmission name='t'><joint name='turn'/></transmission></robot>"
     )
     assert check_with_urdf(Robot(), urdf) == []
     Robot.torque_max = [3.1, 99.0]

@@ -29,7 +29,9 @@ def check_with_urdf(config: RobotConfiguration, urdf: str) -> list[str]:
     Raises:
         SettingError: a joint that the URDF does not have, or angles that must be degrees.
     """
-    elements = {each.get("name", ""): each for each in ElementTree.fromstring(urdf).iter("joint")}
+    # Those of transmissions have the same names, and nothing to compare with.
+    joints = ElementTree.fromstring(urdf).findall("joint")
+    elements = {each.get("name", ""): each for each in joints}
     for name in config.joints:
         if name not in elements:
             movable = [k for k, each in elements.items() if each.get("type") != "fixed"]
