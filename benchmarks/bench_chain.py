@@ -137,6 +137,7 @@ def main() -> None:
     parser.add_argument("--block", type=int, default=500, help="cycles before the other's turn")
     parser.add_argument("--imperfect", action="store_true", help="also with all remedies")
     options = parser.parse_args()
+    options.block = min(options.block, options.cycles)
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     rclpy.init()
     values = parameters(options.robot)
