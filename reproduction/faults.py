@@ -70,7 +70,7 @@ FAULTS = {
     "states lost": Kind("joint_states", "drop: "),
     "limits lost": Kind("acceleration_limits", "drop: "),
     "commands lost": Kind("joint_commands", "drop: "),
-    # Rows of three or more are one in 27: the robot bears five.
+    # Those that come can be used; the robot may stop itself after a long row of lost ones.
     "a third of the states lost": Kind("joint_states", "drop: {probability: 0.33}", brakes=False),
     "commands 20 ms late": Kind("joint_commands", "delay: {delay: 0.02}"),
     "a burst of commands": Kind("joint_commands", "burst: "),
