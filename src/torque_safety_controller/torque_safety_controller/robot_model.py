@@ -124,9 +124,9 @@ class RobotModel(HandModel):
             self.read_rate(model, data)
             for hand in self.others:
                 hand.read_rate(model, data)
-        else:
-            pin.computeJointJacobians(model, data, q)
         pin.forwardKinematics(model, data, q, v, self._zero)
+        if not self.rates:
+            pin.computeJointJacobians(model, data)  # of the positions in `data`
         self.read(model, data)
         for hand in self.others:
             hand.v, hand.a_last = v, a_last

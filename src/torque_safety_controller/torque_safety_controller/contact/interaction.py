@@ -267,8 +267,9 @@ class Interaction:
             gains: of the tasks.
         """
         settings, sensor, weight = self._settings, self.sensor, gains.pose_weight
-        active = self.state in (Compliance.FORCE, Compliance.YIELDING)
-        if sensor is None or weight == 0.0 or not active:
+        if sensor is None or weight == 0.0:
+            return []
+        if self.state not in (Compliance.FORCE, Compliance.YIELDING):
             return []
         F, rate = sensor.wrench, sensor.rate
         if self.state is Compliance.YIELDING:

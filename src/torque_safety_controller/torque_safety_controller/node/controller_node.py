@@ -174,26 +174,28 @@ class ControllerNode(ArmNode):
             return
         states, stamp = self._states, message.header.stamp
         arrival = states.take(message, time.monotonic())
-        if arrival is Arrival.REFUSED:
-            self._on_refused(stamp)
+        if arrival is not Arrival.NEXT and not self._begins(arrival, stamp):
             return
-        if arrival is Arrival.UNDECIDED:
-            self._wait(stamp)
-            return
-        if arrival is Arrival.REPEAT:
-            if states.answered_stamp == states.stamp:
-                self._commands.again(stamp)
-            return
-        if states.missed:
-            self._went_wrong = "joint states were missing"
-        if arrival is not Arrival.NEXT:
-            self._begin(arrival)
         if self._handover.control is Control.POSITION:
             self._drives.hold(stamp)
         elif self._limits.stamp == states.stamp:
             self._track(stamp)
         elif self._limits.lost:
             self._hold(stamp)
+
+    def _begins(self, arrival: Arrival, stamp: Any) -> bool:
+        """Deal with a state that is not the next one; return whether the arm begins anew."""
+        states = self._states
+        if arrival is Arrival.REFUSED:
+            self._on_refused(stamp)
+        elif arrival is Arrival.UNDECIDED:
+            self._wait(stamp)
+        elif arrival is not Arrival.REPEAT:
+            self._begin(arrival)
+            return True
+        elif states.answered_stamp == states.stamp:
+            self._commands.again(stamp)
+        return False
 
     def _on_refused(self, stamp: Any) -> None:
         """Leave the arm to the robot's own stop, or to its drives: nothing is known of it."""
@@ -218,6 +220,8 @@ class ControllerNode(ArmNode):
     def _begin(self, arrival: Arrival) -> None:
         """Start anew: the robot was silent, or restarted."""
         states = self._states
+        if states.missed:
+            self._went_wrong = "joint states were missing"
         if arrival is Arrival.ANEW and self._limits.stamp == states.answered_stamp:
             self._limits.stamp = -1  # from before the restart; its stamps may come again
         if self._by_others():

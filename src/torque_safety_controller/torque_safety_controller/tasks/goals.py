@@ -55,8 +55,9 @@ class Goals:
     @property
     def any(self) -> bool:
         """Whether there is something to track."""
-        poses = self.pose_des, *self.others
-        return self.q_des is not None or any(pose is not None for pose in poses)
+        if self.pose_des is not None or self.q_des is not None:
+            return True
+        return any(pose is not None for pose in self.others)
 
     def set_pose(
         self,

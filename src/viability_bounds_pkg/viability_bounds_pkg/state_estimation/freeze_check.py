@@ -25,7 +25,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from viability_bounds_pkg.compiled import compiled
+from viability_bounds_pkg.compiled import bound, compiled
 from viability_bounds_pkg.state import State
 
 Array = NDArray[np.float64]
@@ -102,6 +102,8 @@ class FreezeCheck:
         model: the arm, n joints with one coordinate each.
         tau_max: torque limits, shape (n,), N m.
         allowed: how far the arm may seem to lag behind, shape (n,), rad.
+        before: a state, read at each call.
+        now: that after it.
         with_velocities: whether the velocities of states tell anything.
 
     Attributes:
@@ -110,24 +112,30 @@ class FreezeCheck:
     """
 
     def __init__(
-        self, model: pin.Model, tau_max: Array, allowed: Array, with_velocities: bool
+        self,
+        model: pin.Model,
+        tau_max: Array,
+        allowed: Array,
+        before: State,
+        now: State,
+        with_velocities: bool,
     ) -> None:
         self._model, self._data = model, model.createData()
         self._tau_max, self._allowed = tau_max, allowed
-        self._with_velocities = with_velocities
-        ones = np.ones_like(tau_max)  # compiled now, not in a control loop
-        _count_changes(ones.copy(), ones.copy(), ones.copy(), ones, ones)
+        self._before, self._now = before, now
+        self._changes = _Changes(*(np.zeros_like(tau_max) for _ in _Changes._fields))
+        self._note_changes = bound(_note_changes, before, now, self._changes, with_velocities)
         self.reset()
 
     def reset(self) -> None:
         """Begin anew: any state may come next."""
-        zero = np.zeros_like(self._tau_max)
         self.expected: Expected | None = None
         self.changing = 0.0
-        self._changes = _Changes(zero.copy(), zero.copy(), zero.copy())
+        for each in self._changes:
+            each.fill(0.0)
         self._alive = False  # whether there is always one
         self._told = False
-        self._speed = self._held = zero
+        self._speed = self._held = np.zeros_like(self._tau_max)
         self._begin()
 
     def _begin(self) -> None:
@@ -143,48 +151,43 @@ class FreezeCheck:
         self._told = False
         self._begin()
 
-    def look(self, before: State, now: State, h: float) -> bool:
+    def look(self, h: float) -> bool:
         """Return whether states have frozen, once.
 
         Args:
-            before: shapes (n,).
-            now: the state after it.
-            h: time between them, s.
+            h: time between both, s.
         """
         expected, self.expected = self.expected, None
-        same = now.v == before.v if self._with_velocities else now.q == before.q
-        if not same.all():
+        same, most = self._note_changes()
+        if not same:
             if self._alive:
                 self._alive = self._row <= 1 or self._told
-            elif self._with_velocities:
-                most = _count_changes(*self._changes, before.v, now.v)
-                self._alive = most >= max(STATES, ALIVE / h)
+            else:
+                self._alive = h > 0.0 and most >= max(STATES, ALIVE / h)
             self._begin()
             self.changing += h
             return False
-        for each in self._changes:
-            each.fill(0.0)
         self._row, self._row_time, self.changing = self._row + 1, self._row_time + h, 0.0
         if self._told:
             return False
         if self._alive and self._row >= ROW and self._row_time > ROW_TIME - 0.5 * h:
             self._told = True
-        elif expected is None or not np.array_equal(now.q, before.q):
+        elif expected is None or not np.array_equal(self._now.q, self._before.q):
             self._way = None
         else:
-            self._told = self._should_have_moved(before, expected, h)
+            self._told = self._should_have_moved(expected, h)
         return self._told
 
-    def _should_have_moved(self, before: State, expected: Expected, h: float) -> bool:
+    def _should_have_moved(self, expected: Expected, h: float) -> bool:
         """Return whether an arm that is said not to move must have moved since it began so."""
         a, fading = expected.a, math.exp(-h / FADING)
         if self._way is None:
             self._way, self._far = np.zeros_like(a), False
             self._held = self._way if expected.disturbance is None else expected.disturbance
-            self._speed = before.v if expected.v is None else expected.v
+            self._speed = self._before.v.copy() if expected.v is None else expected.v
         net = a + self._held
         self._held = self._held - (1.0 - math.exp(-h / LEARNED)) * net
-        torque = np.abs(pin.crba(self._model, self._data, before.q) @ net)
+        torque = np.abs(pin.crba(self._model, self._data, self._before.q) @ net)
         beyond = np.maximum(torque - expected.friction * self._tau_max, 0.0)
         share = np.divide(beyond, torque, out=np.zeros_like(a), where=torque > 0.0)
         self._speed = fading * self._speed + h * share * net
@@ -195,20 +198,30 @@ class FreezeCheck:
 
 
 @compiled
-def _count_changes(count: Array, turns: Array, last: Array, before: Array, now: Array) -> float:
+def _note_changes(
+    before: State, now: State, changes: _Changes, with_velocities: bool
+) -> tuple[bool, float]:
     """Count how often in a row velocities of joints at rest have changed by noise.
 
-    Returns the most of them.
+    Returns whether the velocities of all joints are the same, or the positions where velocities
+    tell nothing; and the most changes of a joint.
     """
-    most = 0.0
-    for i in range(count.size):
-        change = now[i] - before[i]
-        if change == 0.0:
-            count[i] = turns[i] = 0.0
-        elif abs(change) > NOISE and abs(now[i]) < REST:
-            count[i] += 1.0
-            turns[i] += change * last[i] < 0.0
-            last[i] = change
-        if turns[i] >= TURNS * count[i]:
-            most = max(most, count[i])
-    return most
+    n, most, same = now.v.size, 0.0, True
+    for i in range(n):
+        change = now.v[i] - before.v[i] if with_velocities else now.q[i] - before.q[i]
+        same = same and change == 0.0
+    for i in range(n):
+        change = now.v[i] - before.v[i]
+        if same:
+            changes.number[i] = changes.turns[i] = changes.last[i] = 0.0
+        elif not with_velocities:
+            pass
+        elif change == 0.0:
+            changes.number[i] = changes.turns[i] = 0.0
+        elif abs(change) > NOISE and abs(now.v[i]) < REST:
+            changes.number[i] += 1.0
+            changes.turns[i] += change * changes.last[i] < 0.0
+            changes.last[i] = change
+        if changes.turns[i] >= TURNS * changes.number[i]:
+            most = max(most, changes.number[i])
+    return same, most

@@ -145,22 +145,22 @@ class StateCheck:
         quarter_a = 0.25 * largest_accelerations(model, tau_max)
         self._errors = _Errors(position, velocity, quarter_a, limit, FAST * limit)
         self._with_velocities = known
-        zero = np.zeros_like
-        self._before = State(zero(limit), zero(limit))
-        self._now = State(zero(limit), zero(limit))
-        self._drift: Array = zero(limit)
+        # The last state that came, and the one that is looked at, where compiled code reads them.
+        self._both = np.zeros((2, 2, model.nv))
+        self._before, self._now = (State(q, v) for q, v in self._both)
+        self._drift: Array = np.zeros_like(limit)
         low, high = position_min - width, position_max + width
         self._nonsense = bound(_nonsense, self._now, low, high, IMPOSSIBLE * limit, known)
         self._compare = bound(
             _compare, self._before, self._now, self._errors, self._drift, known, numbers=2
         )
         self._agreement = Agreement(self._before, self._now, velocity)
-        self._freeze = FreezeCheck(model, tau_max, position, known)
+        self._freeze = FreezeCheck(model, tau_max, position, self._before, self._now, known)
         self.reset()
 
     def reset(self) -> None:
         """Begin anew: any state may come next."""
-        self._last: State | None = None  # that came last, if it is no nonsense
+        self._goes = False  # whether one came before, and was no nonsense
         self._time = -np.inf  # its time, s
         self._believed: tuple[State, float] | None = None
         self._drift.fill(0.0)
@@ -186,23 +186,23 @@ class StateCheck:
         h = stamp - self._time
         if (self._doubt or self._agreement.undecided) and -GAP <= h <= 0.0:
             return self._doubt or UNDECIDED  # once more, or in another order
+        self._both[0] = self._both[1]
         self._now.q[:], self._now.v[:] = state
         outside, too_fast = self._nonsense()
         nonsense = OUTSIDE if outside else TOO_FAST if too_fast else ""
         if not 0.0 < h <= GAP:
             self.reset()
-        before, self._last, self._time = self._last, None if nonsense else state, stamp
+        goes, self._goes, self._time = self._goes, not nonsense, stamp
         if nonsense:
             self._doubt, self._agreed = nonsense, 0.0
             return nonsense
-        if before is None:  # at the beginning, or after nonsense
+        if not goes:  # at the beginning, or after nonsense
             self._agreed = 0.0
             if not self._doubt:
                 self._believed = state, stamp
                 return ""
-            before, h = state, 0.0
-        self._before.q[:], self._before.v[:] = before
-        frozen = self._freeze.look(before, state, h)
+            self._both[0], h = self._both[1], 0.0
+        frozen = self._freeze.look(h)
         awakes = self._doubt == FROZEN and self._freeze.changing <= h
         jumps, contradicts = self._compare(h, float(awakes))
         if self._with_velocities:

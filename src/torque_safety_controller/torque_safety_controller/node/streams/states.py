@@ -75,15 +75,13 @@ class StateStream(JointStateReader):
         self.message_at, self.message_stamp = now, message.header.stamp
         last, was_at = self.stamp, self.q
         verdict = self.read(message, now)
-        if verdict is Verdict.REFUSED:
-            return Arrival.REFUSED
-        if verdict is Verdict.UNDECIDED:
-            return Arrival.UNDECIDED
+        if verdict is not Verdict.NEW and verdict is not Verdict.REPEAT:
+            return Arrival.REFUSED if verdict is Verdict.REFUSED else Arrival.UNDECIDED
         self.refused_in_row = 0
         silent = self.silent(now)
         self.usable_at = now
         self.missed = silent and 0 <= self.answered_stamp <= last < self.stamp
-        if verdict is Verdict.REPEAT:
+        if verdict is not Verdict.NEW:
             return Arrival.BACK if silent else Arrival.REPEAT
         # Where the time alone has leapt, the arm goes on without a jolt.
         elsewhere = self.stamp - last >= 1e9 * RESTART and bool(
