@@ -22,6 +22,7 @@ from torque_safety_controller.node.topics import JOG_HAND, JOG_JOINTS
 from viability_bounds_pkg.cli.command_line import Parser, positive, run_tool
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.robot_configuration import RobotConfiguration, TaskFrames
+from viability_bounds_pkg.ros.runtime import settle_dds
 from viability_bounds_pkg.user_input.parameter_files import read_files
 
 HELP = """keys, while held:
@@ -158,6 +159,7 @@ def _run(options: argparse.Namespace) -> int:
     section = "/**/controller_node"
     joints = read_files(RobotConfiguration, options.params_file, section).joints
     frames = read_files(TaskFrames, options.params_file, section)
+    settle_dds(os.environ)
     with raw_terminal() as terminal:
         rclpy.init(args=[])
         node = Node("teleop", start_parameter_services=False)
