@@ -359,3 +359,13 @@ def test_nothing_is_sent_once_it_is_stopped(ros):
     chain.commands.clear()
     ros.run_for(0.1, each=lambda: chain.state(50, bad))
     assert not chain.commands
+
+
+def test_a_robot_that_is_put_elsewhere_is_held_there_however_near(ros):
+    """The drives would jump to where they held it before: found by fuzzing, with a reset."""
+    chain = HandoverChain(ros)
+    chain.answer()
+    assert_position(chain.answer(Q + 0.06))  # pushed away
+    chain.stamp += 1500
+    assert_position(chain.answer(Q + 0.03), Q + 0.03)
+    assert_position(chain.answer(Q + 0.031), Q + 0.03)

@@ -176,6 +176,9 @@ class ControllerNode(ArmNode):
         arrival = states.take(message, time.monotonic())
         if arrival is not Arrival.NEXT and not self._begins(arrival, stamp):
             return
+        if states.leapt and self._handover.by_drives:
+            # They would jump to where the arm was held before, from where it has been put.
+            self._handover.robot_was_away()
         if self._handover.control is Control.POSITION:
             self._drives.hold(stamp)
         elif self._limits.stamp == states.stamp:

@@ -51,6 +51,8 @@ class StateStream(JointStateReader):
         answered_stamp: of the state answered last, ns; -1 if there is none since it began.
         refused_in_row: states dropped since the last usable one, of an arm that is answered.
         missed: whether states of the arm that was answered were missing before the last one.
+        leapt: whether the stamp of the last one is so much later that the robot may have started
+            again.
     """
 
     LEAVES_UNDECIDED = True
@@ -68,7 +70,7 @@ class StateStream(JointStateReader):
         self.message_stamp: Any = None
         self.answered_stamp = -1
         self.refused_in_row = 0
-        self.missed = False
+        self.missed = self.leapt = False
 
     def take(self, message: JointState, now: float) -> Arrival:
         """Take a message that arrived at `now`, in s on the steady clock."""
@@ -84,9 +86,8 @@ class StateStream(JointStateReader):
         if verdict is not Verdict.NEW:
             return Arrival.BACK if silent else Arrival.REPEAT
         # Where the time alone has leapt, the arm goes on without a jolt.
-        elsewhere = self.stamp - last >= 1e9 * RESTART and bool(
-            (np.abs(self.q - was_at) > STAYS).any()
-        )
+        self.leapt = self.stamp - last >= 1e9 * RESTART
+        elsewhere = self.leapt and bool((np.abs(self.q - was_at) > STAYS).any())
         if silent or self.stamp <= last or elsewhere:
             return Arrival.ANEW
         if self.answered_stamp == last:
