@@ -34,7 +34,7 @@ from torque_safety_controller.node.position_control import PositionControl
 from torque_safety_controller.node.state_publisher import StatePublisher
 from torque_safety_controller.node.streams.joint_commands import JointCommands
 from torque_safety_controller.node.streams.limits import LimitsReader
-from torque_safety_controller.node.streams.states import Arrival, StateStream
+from torque_safety_controller.node.streams.states import UNSEEN, Arrival, StateStream
 from torque_safety_controller.node.topics import GOALS
 from torque_safety_controller.node.wrenches import WrenchSubscriber
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
@@ -58,8 +58,6 @@ from viability_bounds_pkg.state import State
 
 _STALE = "acceleration limits are stale"
 _CONTESTED = "several nodes publish goals"
-_UNSEEN = 3
-"""At which joint state in a row that cannot be used the mode is STOPPED."""
 
 
 class ControllerNode(ArmNode):
@@ -176,7 +174,7 @@ class ControllerNode(ArmNode):
         arrival = states.take(message, time.monotonic())
         if arrival is not Arrival.NEXT and not self._begins(arrival, stamp):
             return
-        if states.leapt and self._handover.by_drives:
+        if states.unseen and self._handover.by_drives:
             # They would jump to where the arm was held before, from where it has been put.
             self._handover.robot_was_away()
         if self._handover.control is Control.POSITION:
@@ -208,7 +206,7 @@ class ControllerNode(ArmNode):
         in_row = states.count_refused()
         if self._handover.by_drives:
             self._drives.hold(stamp)
-        elif in_row == _UNSEEN:
+        elif in_row == UNSEEN:
             self._went_wrong = states.why_refused
             self._enter(Mode.STOPPED, self._went_wrong)
 

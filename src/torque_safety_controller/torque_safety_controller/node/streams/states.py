@@ -14,6 +14,9 @@ from sensor_msgs.msg import JointState
 from viability_bounds_pkg.ros.messages import JointStateReader, Verdict
 from viability_bounds_pkg.state_estimation.state_check import RESTART, STAYS, StateCheck
 
+UNSEEN = 3
+"""States in a row that cannot be used after which nothing is known of the arm."""
+
 
 class Arrival(Enum):
     """What a joint state is to those who answer it."""
@@ -51,8 +54,8 @@ class StateStream(JointStateReader):
         answered_stamp: of the state answered last, ns; -1 if there is none since it began.
         refused_in_row: states dropped since the last usable one, of an arm that is answered.
         missed: whether states of the arm that was answered were missing before the last one.
-        leapt: whether the stamp of the last one is so much later that the robot may have started
-            again.
+        unseen: whether the arm may have been put elsewhere before the last one: stamps have leapt
+            as after a start of the robot, or `UNSEEN` states were dropped.
     """
 
     LEAVES_UNDECIDED = True
@@ -70,7 +73,7 @@ class StateStream(JointStateReader):
         self.message_stamp: Any = None
         self.answered_stamp = -1
         self.refused_in_row = 0
-        self.missed = self.leapt = False
+        self.missed = self.unseen = False
 
     def take(self, message: JointState, now: float) -> Arrival:
         """Take a message that arrived at `now`, in s on the steady clock."""
@@ -79,15 +82,16 @@ class StateStream(JointStateReader):
         verdict = self.read(message, now)
         if verdict is not Verdict.NEW and verdict is not Verdict.REPEAT:
             return Arrival.REFUSED if verdict is Verdict.REFUSED else Arrival.UNDECIDED
-        self.refused_in_row = 0
+        dropped, self.refused_in_row = self.refused_in_row, 0
         silent = self.silent(now)
         self.usable_at = now
         self.missed = silent and 0 <= self.answered_stamp <= last < self.stamp
         if verdict is not Verdict.NEW:
             return Arrival.BACK if silent else Arrival.REPEAT
         # Where the time alone has leapt, the arm goes on without a jolt.
-        self.leapt = self.stamp - last >= 1e9 * RESTART
-        elsewhere = self.leapt and bool((np.abs(self.q - was_at) > STAYS).any())
+        leapt = self.stamp - last >= 1e9 * RESTART
+        self.unseen = leapt or dropped >= UNSEEN
+        elsewhere = leapt and bool((np.abs(self.q - was_at) > STAYS).any())
         if silent or self.stamp <= last or elsewhere:
             return Arrival.ANEW
         if self.answered_stamp == last:
