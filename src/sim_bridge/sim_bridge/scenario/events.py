@@ -192,10 +192,10 @@ def _trigger(value: Any, where: str) -> str:
 
 
 def _node(value: Any, where: str) -> str:
-    known = graph_names("node")
-    if hint := did_you_mean(name(value, where), known) if value not in known else "":
-        raise refuse(where, value, f"the name of a node{hint}")
-    return value
+    known, node = graph_names("node"), name(value, where)
+    if hint := did_you_mean(node, known) if node not in known else "":
+        raise refuse(where, node, f"the name of a node{hint}")
+    return node
 
 
 def _service(value: Any, where: str) -> str:

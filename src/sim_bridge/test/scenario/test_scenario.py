@@ -177,6 +177,7 @@ BOX = "name: a, shape: box, size: [1, 1, 1], position: [0, 0, 0]"
         ("remove_obstacle", "{name: a}", "names 'a'; there are: none"),
         ("enable_torque", "1", "true or false"),
         ("parameters", "{values: {a: 1}}", "parameters.node"),
+        ("parameters", "{node: [1, 2.0], values: {a: 1}}", "parameters.node"),
         ("parameters", "{node: n, values: {}}", "parameters.values"),
         ("parameters", "{node: n, values: {a: [1, x]}}", "values.a"),
         ("parameters", "{node: n, values: {a: [true]}}", "values.a"),

@@ -113,3 +113,34 @@ def test_an_interrupt_that_is_lost_during_the_start_ends_the_node_all_the_same()
     done = started("-c", INTERRUPTED_AT_START)
     assert done.returncode == 0, done.stderr
     assert not {word for word in ("Traceback", "Exception", "Error") if word in done.stderr}
+
+
+REFUSED = """
+import os
+import signal
+import sys
+from dataclasses import dataclass
+from viability_bounds_pkg.exceptions import ArmSafetyError
+from viability_bounds_pkg.ros.arm_node import ArmNode
+from viability_bounds_pkg.ros.program import run
+
+@dataclass
+class Nothing:
+    pass
+
+class Refused(ArmNode):
+    NAME = "refused"
+    PARAMETERS = Nothing
+
+    def __init__(self):
+        raise ArmSafetyError("it cannot be")
+
+code = run(Refused, ["refused"])
+os.kill(os.getpid(), signal.SIGINT)
+sys.exit(code)
+"""
+
+
+def test_an_interrupt_while_a_program_ends_changes_nothing():
+    done = started("-c", REFUSED)
+    assert (done.returncode, done.stderr) == (1, "error: it cannot be\n")

@@ -195,6 +195,9 @@ def run_together(
         report_refusal(error)
         return 1
     finally:
+        # It ends already, and with the code that it is to end with.
+        for each in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(each, signal.SIG_IGN)
         leave(*nodes)
         gc.unfreeze()
     return 0
