@@ -44,6 +44,7 @@ from viability_bounds_pkg.node.estimator_node import EstimatorNode
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 from viability_bounds_pkg.ros.given_parameters import given_parameters, note_arguments
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp, stamp_to_ns
+from viability_bounds_pkg.state_estimation.state_check import GAP
 from viability_bounds_pkg.testing.ros_harness import config_folder
 
 VARIANTS: dict[str, tuple[str, ...]] = {
@@ -502,7 +503,10 @@ class Stack:
         self.wire.call(robot, "reset", Trigger.Request())
         # With a stamp ahead of the robot's, which it believed, the controller does not see it, and
         # drives go back to where they held the arm, at speeds that are their own.
-        blind = controller is not None and controller._states.stamp > robot._stamp
+        ahead = 0 if controller is None else controller._states.stamp - robot._stamp
+        if -1e9 * GAP <= ahead < 0:  # the gap in time that tells of a reset is missing
+            self.wire.call(robot, "reset", Trigger.Request())
+        blind = ahead > 0
         drives = controller is not None and controller._handover.by_drives
         self.trusted = not (self.rivals or self._felt_wrong or (blind and drives))
 

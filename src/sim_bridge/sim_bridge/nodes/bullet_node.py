@@ -98,6 +98,7 @@ class BulletNode(ArmNode):
         self._paused = config.start_paused
         # In lockstep robot time starts at one period: a stamp of zero means "no stamp".
         self._stamp = 0 if config.lockstep else self.get_clock().now().nanoseconds
+        self._has_moved = False
         self._advanced = True
         self._refused: Counter[str] = Counter()
         self._world = WorldSubscriber(
@@ -226,6 +227,7 @@ class BulletNode(ArmNode):
         if self._sensing is not None:
             self._reading = self._sensing.read(*self._true_state())
         self._periods += 1
+        self._has_moved = True
         self._advanced = True
         if self._periods >= self._pause_at:
             self._pause_at = math.inf
@@ -276,9 +278,9 @@ class BulletNode(ArmNode):
     # Services
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        q, v, _ = self._robot.state()
-        if v.any() or not np.allclose(q, self._config.start_positions, rtol=0.0, atol=1e-6):
-            # As robots that start again: else the leap is taken for a state that cannot be.
+        if self._has_moved:
+            # As robots that start again: else the leap is taken for a state that cannot be. Also
+            # where it is at its start: the last reset may not have been told.
             self._stamp += round(1e9 * RESTART)
         self._restart()
         self._next_state()
