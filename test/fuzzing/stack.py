@@ -82,6 +82,7 @@ TO_FAULTS = tuple(
 TOPICS = (*STREAMS, *GOALS, *WORLD, "/clock", "/diagnostics", *TO_FAULTS)
 """All that any node subscribes to while it runs."""
 
+_AHEAD = 2.0  # s; a stamp that is farther ahead is forgotten after `state_timeout`
 _ROUNDING = 1e-9
 _SEEN = {"hand_pose": PoseStamped, "hand_position_error": Vector3Stamped}
 """Topics for tools that cost nothing without a subscriber."""
@@ -500,15 +501,18 @@ class Stack:
     def reset(self) -> None:
         """Put the robot at its start."""
         robot, controller = self.nodes["bullet_node"], self.nodes.get("controller_node")
-        self.wire.call(robot, "reset", Trigger.Request())
-        # With a stamp ahead of the robot's, which it believed, the controller does not see it, and
-        # drives go back to where they held the arm, at speeds that are their own.
-        ahead = 0 if controller is None else controller._states.stamp - robot._stamp
-        if -1e9 * GAP <= ahead < 0:  # the gap in time that tells of a reset is missing
+        for _ in range(3):
             self.wire.call(robot, "reset", Trigger.Request())
-        blind = ahead > 0
-        drives = controller is not None and controller._handover.by_drives
-        self.trusted = not (self.rivals or self._felt_wrong or (blind and drives))
+            ahead = -np.inf
+            if controller is not None:
+                ahead = 1e-9 * (controller._states.stamp - robot._stamp)
+            # Where a stamp ahead was believed, the gap in time that tells of a reset is missing.
+            if not -GAP <= ahead < _AHEAD:
+                break
+        # Then the controller does not see it, and drives go back to where they held the arm, at
+        # speeds that are their own.
+        blind = ahead > 0.0 and controller._handover.by_drives
+        self.trusted = not (self.rivals or self._felt_wrong or blind)
 
     def pause(self, on: bool) -> None:
         """Let robot time stop, or go on."""
