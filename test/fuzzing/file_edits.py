@@ -224,12 +224,19 @@ def _scale(document: Any, edit: Edit) -> str:
     if place := _pick(places, edit):
         value = place.value
         place.put(
-            [each * edit.value for each in value]
+            [_product(each, edit.value) for each in value]
             if isinstance(value, list)
-            else value * edit.value
+            else _product(value, edit.value)
         )
         return str(place.key)
     return ""
+
+
+def _product(number: float, factor: float) -> float:
+    try:
+        return number * factor
+    except OverflowError:  # of a whole number
+        return math.inf
 
 
 def _length(document: Any, edit: Edit) -> str:

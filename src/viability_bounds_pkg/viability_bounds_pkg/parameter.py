@@ -22,6 +22,9 @@ from viability_bounds_pkg.exceptions import SettingError, did_you_mean
 Array = NDArray[np.float64]
 Configuration = TypeVar("Configuration")
 
+LARGEST = 1e12
+"""Larger finite numbers no parameter has: their squares would soon be none."""
+
 REQUIRED = object()
 """Default of a parameter that has none: the node does not start without a value."""
 
@@ -109,6 +112,8 @@ class Parameter:
                 raise SettingError(self.name, None, self._kind_name())
             return np.array(self.default) if self.kind == list[float] else self.default
         converted = self._convert(value)
+        if self.kind in (float, list[float]) and _is_absurd(converted):
+            raise SettingError(self.name, value, f"numbers up to {LARGEST:g} in size")
         if not self._allows(converted):
             hint = did_you_mean(value, self.choices) if self.choices else ""
             raise SettingError(self.name, value, self.constraints + hint)
@@ -173,6 +178,12 @@ class Parameter:
 
 
 _SCALARS = {float: "a number", int: "a whole number", bool: "true or false", str: "a string"}
+
+
+def _is_absurd(value: float | Array) -> bool:
+    """Return whether there is a finite number that is larger than any should be."""
+    size = np.abs(value)
+    return bool(((size > LARGEST) & (size < np.inf)).any())
 
 
 def _is_sequence(value: Any) -> bool:

@@ -18,7 +18,7 @@ from viability_bounds_pkg.exceptions import SettingError, did_you_mean
 from viability_bounds_pkg.parameter import (
     NOT_NEGATIVE,
     POSITIVE,
-    above,
+    Range,
     joint_numbers,
     number,
     numbers,
@@ -142,7 +142,7 @@ class LimitedRobotConfiguration(RobotConfiguration):
 class ControlRate:
     """Rate of a control loop."""
 
-    rate_hz: float = number("rate of the control loop, Hz", above(0.0, 1e4))
+    rate_hz: float = number("rate of the control loop, Hz", Range(1.0, 1e4))
 
     @property
     def dt(self) -> float:

@@ -146,7 +146,7 @@ BROKEN_URDF = __file__
         ),
         ({"position_min": list(ARM.q_max)}, "position_max", "above position_min"),
         ({"position_max": [1.0]}, "position_max", "7 numbers"),
-        ({"rate_hz": 0.0}, "rate_hz", "> 0"),
+        ({"rate_hz": 0.0}, "rate_hz", ">= 1"),
         ({"rate_hz": math.nan}, "rate_hz", "nan"),
         ({"pose_kp": -10.0}, "pose_kp", "-10"),
         ({"pose_kd": -3.0}, "pose_kd", "-3"),

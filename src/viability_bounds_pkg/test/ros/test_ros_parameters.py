@@ -256,6 +256,10 @@ def test_parameters_of_others_are_left_alone(ros):
         ({"rate": 2e3}, "parameter 'rate' is 2000; allowed: a number > 0 and <= 1000"),
         ({"rate": math.nan}, "parameter 'rate' is nan; allowed: a number > 0 and <= 1000"),
         ({"limits": [1.0, 0.0]}, "parameter 'limits' is [1, 0]; allowed: finite numbers > 0, one"),
+        (
+            {"limits": [1.0, 1e13]},
+            "parameter 'limits' is [1, 1e+13]; allowed: numbers up to 1e+12 in size",
+        ),
         ({"limits": [1.0, math.inf]}, "parameter 'limits' is [1, inf]; allowed: finite numbers"),
         ({"extra": [1.0]}, "parameter 'extra' is [1]; allowed: 2 numbers, one for each of "),
         ({"extra": [1.0, math.nan]}, "parameter 'extra' is [1, nan]; allowed: numbers, not NaN"),
