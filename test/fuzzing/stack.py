@@ -37,7 +37,7 @@ from sim_bridge.nodes.bullet_node import BulletNode
 from sim_bridge.nodes.fault_node import FaultNode
 from sim_bridge.nodes.scenario_node import ScenarioNode
 from torque_safety_controller.node.controller_node import ControllerNode
-from torque_safety_controller.safety.handover import Control
+from torque_safety_controller.safety.handover import PATIENCE, Control
 from torque_safety_controller.safety.modes import Mode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.node.estimator_node import EstimatorNode
@@ -600,7 +600,10 @@ class Stack:
         self.wire.send("/target_pose", self._pose_at(q))
         self.wire.send("/target_posture", self.good.posture(q))
         row = 0  # of periods that were answered, tracking
-        for k in range(round(_AGAIN / self.dt)):
+        by_drives = controller._handover.control is not Control.TORQUE
+        # The torque of the motors has to be known before it is taken over.
+        patience = _AGAIN + by_drives * PATIENCE
+        for k in range(round(patience / self.dt)):
             before = self.commands
             self.period()
             tracking = controller._modes.mode is Mode.TRACKING and self.commands > before
@@ -611,7 +614,7 @@ class Stack:
                 self.enable_torque(True)
         else:
             raise ClaimBroken(
-                f"not tracking again within {_AGAIN} s: {controller._modes.mode.value}, "
+                f"not tracking again within {patience} s: {controller._modes.mode.value}, "
                 f"{controller._modes.reason}; {self.commands} commands"
             )
         self.tally.facts["recoveries"] += 1
