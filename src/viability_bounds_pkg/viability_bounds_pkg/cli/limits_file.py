@@ -17,7 +17,7 @@ import pinocchio as pin
 
 from viability_bounds_pkg.estimation.state_space import Array
 from viability_bounds_pkg.robot_configuration import LimitedRobotConfiguration
-from viability_bounds_pkg.robot_description import build_model, read_urdf
+from viability_bounds_pkg.robot_description import build_model
 from viability_bounds_pkg.user_input.parameter_files import ParameterFileError, read_files
 
 NODE = "/**/bounds_node"
@@ -61,11 +61,11 @@ def read_robot(path: Path) -> Robot:
     Raises:
         ParameterFileError: the file cannot be read, is no parameter file, or a parameter is
             missing or of the wrong type or length.
-        RobotDescriptionError: the URDF cannot be found or loaded, or lacks a joint; a rotor
-            inertia is negative.
+        SettingError: the URDF cannot be found.
+        RobotDescriptionError: it cannot be loaded, or lacks a joint; a rotor inertia is negative.
     """
     config = read_files(LimitedRobotConfiguration, [path], NODE)
-    urdf = read_urdf(config.robot_description)
+    urdf = config.read_urdf()
     _check_limits(urdf, config.robot_description)
     model = build_model(urdf, config.joints, config.locked, config.rotor_inertia)
 
