@@ -52,8 +52,9 @@ Array = NDArray[np.float64]
 _UNBOUNDED = 1e6
 """Stands for the width of bounds that are not there, rad/s^2."""
 
-_STANDS = 1e-9
-"""A joint that is slower stands: rounding may be its velocity, rad/s."""
+_STANDS, _CREEPS = 1e-9, 1e-5
+"""A joint that is slower stands, as rounding may be its velocity; one that stands but for what a
+controller leaves, rad/s: it gets on by less than 0.1 um in a period."""
 
 
 class ControlOutput(NamedTuple):
@@ -361,8 +362,7 @@ class Controller:
             if self.lost:
                 tasks = [DampingTask(self.gains.hold_kd)]
         elif self.share < 1.0:
-            period = robot.dt if self.rough else None
-            bounds = return_gently(bounds, robot.v, self.share, period)
+            bounds = return_gently(bounds, robot.v, self.share, robot.dt, self.rough)
         if disturbance is not None:
             bounds = AccelerationRange(*self._observer.shift(*bounds))
         parts = [each.constraint(robot, bounds, disturbance) for each in self.constraints]
@@ -460,28 +460,28 @@ class Controller:
 
 
 def return_gently(
-    bounds: AccelerationRange, v: Array, share: float, period: float | None = None
+    bounds: AccelerationRange, v: Array, share: float, period: float, rough: bool = False
 ) -> AccelerationRange:
     """Return bounds that push a joint which stands beyond them by a share only.
 
     An arm may have been stopped within the margins of a position limit; its bounds then demand to
-    be back after a period, by a jolt. Here such a joint just gets no farther, and returns
-    with the share. One that moves towards its limit brakes as it must; where that may be noise, it
-    need not do more than stand at the end of the period: the noise would choose between a push
-    and none.
+    be back after a period, by a jolt. Here such a joint just stands at the end of the period, and
+    returns with the share. One that moves towards its limit brakes as it must; where that may be
+    noise, it need not do more than stand, either: the noise would choose between a push and none.
 
     Args:
         bounds: of the joints, shape (n,) each, rad/s^2.
         v: their velocities, shape (n,), rad/s.
         share: of what the bounds demand, from 0 to 1.
-        period: of control, s, where `v` has noise, for which the bounds have margins; else None.
+        period: of control, s.
+        rough: whether `v` has noise, for which the bounds have margins.
     """
     lower, upper = bounds
-    if period is None:
-        up = np.where(v > -_STANDS, 0.0, np.inf)
-        down = np.where(v < _STANDS, 0.0, -np.inf)
-    else:
-        up = down = -v / period
+    # Where the bounds leave no choice the joint is beyond what they keep.
+    slow = np.inf if rough else np.where(lower == upper, _CREEPS, _STANDS)
+    stop = -v / period
+    up = np.where(v > -slow, stop, np.inf)
+    down = np.where(v < slow, stop, -np.inf)
     return AccelerationRange(
         np.where(lower > 0.0, np.minimum(np.maximum(share * lower, up), lower), lower),
         np.where(upper < 0.0, np.maximum(np.minimum(share * upper, down), upper), upper),
