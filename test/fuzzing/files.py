@@ -45,6 +45,11 @@ _MODULES = {
     "safety_stack": "torque_safety_controller.node.safety_stack",
     "fault_node": "sim_bridge.nodes.fault_node",
 }
+_RUN = (
+    "import sys; from viability_bounds_pkg.cli.ros_program import run_program\n"
+    "sys.exit(run_program(sys.argv.pop(1)))"
+)
+"""What an executable does."""
 _REALLY = 5
 """Each so many parts, files are read by executables in processes of their own."""
 _START = 20.0
@@ -157,7 +162,7 @@ def _process(name: str, words: list[str]) -> programs.Ended:
     """Start an executable; end it when it says that it has started."""
     with tempfile.TemporaryFile() as written:
         process = subprocess.Popen(
-            [sys.executable, "-m", _MODULES[name], *words],
+            [sys.executable, "-c", _RUN, _MODULES[name], *words],
             stdout=subprocess.DEVNULL,
             stderr=written,
             env=environment(),

@@ -36,8 +36,14 @@ def call(directory, program, function, arguments):
         (INTERRUPT + "main = int\n", -signal.SIGINT),
         (f"def main():\n    {INTERRUPT.replace(chr(10), chr(10) + '    ')}return 0\n", 130),
         ("def main(): return 3\n", 3),
+        (
+            "import atexit, os, signal\n"
+            "atexit.register(os.kill, os.getpid(), signal.SIGINT)\n"
+            "def main(): return 3\n",
+            3,
+        ),
     ],
-    ids=["imports", "main", "undisturbed"],
+    ids=["imports", "main", "undisturbed", "end"],
 )
 @pytest.mark.parametrize(
     ("function", "arguments"),

@@ -197,7 +197,7 @@ def run_together(
     finally:
         # It ends already, and with the code that it is to end with.
         for each in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(each, signal.SIG_IGN)
+            signal.signal(each, lambda *_: None)
         leave(*nodes)
         gc.unfreeze()
     return 0
