@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from chain import load_values
+from chain import load_node_values, load_values
 from figure import Figure, table
 from moments import HEADS, ROBOTS, STIFF, Corners, Sample, Seen
 from sensor_msgs.msg import JointState
@@ -109,15 +109,17 @@ class Bench:
 
     def __init__(self, ros: RosHarness, robot: str, seed: int, own: dict[str, Any]) -> None:
         self._ros, self._rng = ros, np.random.default_rng(seed)
-        self._values = load_values(robot) | STIFF | {"start_paused": False, "clock": "real_time"}
-        self._values |= own
+        own = STIFF | {"start_paused": False, "clock": "real_time"} | own
+        # Of each its own: the bounds of TALOS keep speeds below those that the robot may have.
+        by_node = load_node_values(robot)
+        self._values = by_node[BulletNode.NAME] | own
         nodes = {}
         for topic, kind in SENDERS.items():
             arguments = ["--ros-args", "-r", f"{topic}:={BEFORE}{topic}"]
             nodes[topic] = ros.add(
                 kind(
                     context=ros.context,
-                    parameter_overrides=overrides(self._values),
+                    parameter_overrides=overrides(by_node[kind.NAME] | own),
                     cli_args=arguments,
                 )
             )
