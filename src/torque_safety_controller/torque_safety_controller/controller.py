@@ -52,9 +52,11 @@ Array = NDArray[np.float64]
 _UNBOUNDED = 1e6
 """Stands for the width of bounds that are not there, rad/s^2."""
 
-_STANDS, _CREEPS = 1e-9, 1e-5
-"""A joint that is slower stands, as rounding may be its velocity; one that stands but for what a
-controller leaves, rad/s: it gets on by less than 0.1 um in a period."""
+_STANDS = 1e-9
+"""A joint that is slower stands: rounding may be its velocity, rad/s."""
+
+_CREEPS = 1e-5
+"""A joint that was stopped may still have such a speed, rad/s: less than 0.1 urad in 10 ms."""
 
 
 class ControlOutput(NamedTuple):

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 Configuration = TypeVar("Configuration")
 
 LARGEST = 1e12
-"""Larger finite numbers no parameter has: their squares would soon be none."""
+"""No parameter of a robot has a larger finite number; computing with such numbers overflows."""
 
 REQUIRED = object()
 """Default of a parameter that has none: the node does not start without a value."""

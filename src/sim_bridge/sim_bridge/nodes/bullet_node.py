@@ -280,7 +280,7 @@ class BulletNode(ArmNode):
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._has_moved:
             # As robots that start again: else the leap is taken for a state that cannot be. Also
-            # where it is at its start: the last reset may not have been told.
+            # where it is at its start already: the controller may not have seen the last reset.
             self._stamp += round(1e9 * RESTART)
         self._restart()
         self._next_state()

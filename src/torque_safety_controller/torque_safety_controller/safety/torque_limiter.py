@@ -8,8 +8,6 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from viability_bounds_pkg.compiled import compiled
-
 
 class TorqueLimiter:
     """Clips torques to their limits and to the rate limit; replaces those that are not finite.
@@ -55,14 +53,5 @@ class TorqueLimiter:
         if not math.isfinite(tau.dot(tau)):
             tau = np.zeros(self.tau_max.size) if self.last is None else self.last
         lower, upper = self.range()
-        self.last = _clipped(tau, lower, upper)
+        self.last = np.minimum(np.maximum(tau, lower), upper)
         return self.last
-
-
-@compiled
-def _clipped(tau: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Return `tau` within limits; NumPy takes three times as long for few joints."""
-    within = np.empty_like(tau)
-    for i in range(tau.size):
-        within[i] = min(max(tau[i], lower[i]), upper[i])
-    return within

@@ -44,17 +44,21 @@ def test_a_node_says_when_its_start_had_to_compile(compiles):
     assert not compiles or "scripts/setup.sh" in said[0]
 
 
-INTERRUPTED = """
+SMALL_NODE = """
 import os
+import signal
 import sys
 from dataclasses import dataclass
-from std_msgs.msg import Header
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.program import run
 
 @dataclass
 class Nothing:
     pass
+"""
+
+INTERRUPTED = f"""{SMALL_NODE}
+from std_msgs.msg import Header
 
 class Busy(ArmNode):
     NAME = "busy"
@@ -81,17 +85,7 @@ def test_a_signal_lets_the_callback_end_that_it_interrupts(sent):
     assert not {word for word in ("Traceback", "Exception", "Error") if word in done.stderr}
 
 
-INTERRUPTED_AT_START = """
-import os
-import signal
-import sys
-from dataclasses import dataclass
-from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.program import run
-
-@dataclass
-class Nothing:
-    pass
+INTERRUPTED_AT_START = f"""{SMALL_NODE}
 
 class Slow(ArmNode):
     NAME = "slow"
@@ -115,18 +109,8 @@ def test_an_interrupt_that_is_lost_during_the_start_ends_the_node_all_the_same()
     assert not {word for word in ("Traceback", "Exception", "Error") if word in done.stderr}
 
 
-REFUSED = """
-import os
-import signal
-import sys
-from dataclasses import dataclass
+REFUSED = f"""{SMALL_NODE}
 from viability_bounds_pkg.exceptions import ArmSafetyError
-from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.program import run
-
-@dataclass
-class Nothing:
-    pass
 
 class Refused(ArmNode):
     NAME = "refused"

@@ -67,7 +67,7 @@ def _run(main: Callable[[], int]) -> int:
         code = main()
     except KeyboardInterrupt:
         code = INTERRUPTED
-    # It has ended: a signal while the interpreter does is not to change how.
+    # A signal while the interpreter ends must not change the exit code, either.
     for each in (signal.SIGINT, signal.SIGTERM):
         signal.signal(each, signal.SIG_IGN)
     return code

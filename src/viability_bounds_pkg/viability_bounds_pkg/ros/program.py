@@ -195,7 +195,7 @@ def run_together(
         report_refusal(error)
         return 1
     finally:
-        # It ends already, and with the code that it is to end with.
+        # The program is ending: a further signal must not change its exit code.
         for each in (signal.SIGINT, signal.SIGTERM):
             signal.signal(each, lambda *_: None)
         leave(*nodes)

@@ -163,7 +163,7 @@ class FreezeCheck:
             if self._alive:
                 self._alive = self._row <= 1 or self._told
             else:
-                self._alive = h > 0.0 and most >= max(STATES, ALIVE / h)
+                self._alive = most >= max(STATES, ALIVE / h)
             self._begin()
             self.changing += h
             return False
