@@ -132,7 +132,7 @@ def drive(executor, probe: Probe, model, cycles: int) -> list[float]:
 def main() -> None:
     """Run the benchmark and print medians, 99th percentiles and ratios."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--robot", default="baxter_left_arm")
+    parser.add_argument("--robot", default="panda", help="default: panda, as its step is plain")
     parser.add_argument("--cycles", type=int, default=8000, help="of each chain")
     parser.add_argument("--block", type=int, default=500, help="cycles before the other's turn")
     parser.add_argument("--imperfect", action="store_true", help="also with all remedies")

@@ -38,13 +38,14 @@ def goals(values, rng):
         yield np.where(rng.random(len(low)) < 0.5, low, high)
 
 
-def chain(ros, robot, **of_robot):
+def chain(ros, robot, effort_tolerance=0.03, **of_robot):
     """Start the nodes in lockstep; return that of the robot."""
     arm = ros.start(
         BulletNode, read_config(robot, "bullet_node") | of_robot | {"clock": "lockstep"}
     )
     ros.start(BoundsNode, read_config(robot, "bounds_node"))
-    ros.start(ControllerNode, read_config(robot, "controller_node") | HASTE)
+    of_controller = HASTE | {"effort_tolerance": effort_tolerance}
+    ros.start(ControllerNode, read_config(robot, "controller_node") | of_controller)
     return arm
 
 
@@ -154,7 +155,8 @@ def test_commands_held_in_rows_of_missed_periods_pass_no_limit(ros):
 )
 def test_commands_that_return_after_outages_make_no_jolt(ros, robot):
     """Outages of up to 100 periods begin with 1 % of the commands; goals are at the limits."""
-    arm = chain(ros, robot, outage_probability=0.01, outage_longest=100, imperfection_seed=3)
+    outages = {"outage_probability": 0.01, "outage_longest": 100, "imperfection_seed": 3}
+    arm = chain(ros, robot, effort_tolerance=0.0, **outages)  # the controller does not help
     tau_max, stop = arm._config.torque_max, arm._stop
     sent, given, last = [], [], np.zeros(len(tau_max))
     follow, update = stop.follow, arm._monitor.update
@@ -229,4 +231,41 @@ def test_the_arm_is_slowed_after_a_row_of_states_that_is_too_long_and_goes_on(ro
     assert controller._rate.share == 1.0
     assert "the arm goes on" in capfd.readouterr().err
     assert np.abs(arm.true_positions - goal).max() < 0.02
+    assert not arm._monitor.violated
+
+
+@pytest.mark.parametrize("robot", ["panda", "talos_left_arm"])
+def test_no_torque_steps_where_commands_are_lost_while_states_come(ros, robot):
+    """In motion to limits, for 0.6 s; the robot stops itself meanwhile."""
+    arm = chain(ros, robot, command_timeout=2)
+    values, path, taus = read_config(robot, "bullet_node"), arm._commands.path, []
+    arriving, begin = path.arriving, arm._next_state
+    rate, tau_max = values["rate_hz"], np.array(values["torque_max"])
+    lost = False
+
+    def watched_begin():
+        taus.append(arm._robot.believed_torque)
+        begin()
+
+    def play(seconds):
+        end = arm._periods + round(seconds * rate)
+        ros.wait_until(lambda: arm._periods >= end, "control periods", timeout=60.0)
+
+    path.arriving = lambda sent: arriving(None if lost else sent)
+    arm._next_state = watched_begin
+    user = ros.talk(JointState, "target_posture", GOAL_QOS)
+    rng = np.random.default_rng(1)
+    for posture, _ in zip(goals(values, rng), range(4), strict=False):
+        user.publish(joint_state(values["joints"], 0, posture))
+        play(rng.uniform(0.2, 0.4))
+        lost = True
+        play(0.6)
+        assert arm._stop.at_rest
+        lost, first = False, len(taus)
+        play(0.12)
+        steps = np.abs(np.diff(taus[first - 2 : first + round(0.1 * rate)], axis=0))
+        assert (steps / tau_max).max() < 0.02
+        play(0.4)
+        assert np.abs(arm._robot.state().v).max() > 0.3, "it does not go on"
+        play(0.6)
     assert not arm._monitor.violated

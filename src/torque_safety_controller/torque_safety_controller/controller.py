@@ -105,6 +105,8 @@ class Controller:
         iterations: of the last QP.
         share: of the accelerations that the tasks want; the rest brings the arm to rest.
         rough: whether velocities are estimates, with noise also of an arm that stands.
+        obeyed: whether the last commands act, as far as is known; while they do not, nothing is
+            learned from how the arm moves.
     """
 
     def __init__(
@@ -135,6 +137,7 @@ class Controller:
         self.iterations = 0
         self.share = 1.0
         self.rough = False
+        self.obeyed = True
         self._own_bounds = own_bounds
         self._limiter = TorqueLimiter(tau_max, torque_rate_max, robot.dt)
         self._qp = InverseDynamicsQP(n, solver=solver)
@@ -157,7 +160,8 @@ class Controller:
     def expected(self) -> Expected:
         """Return how the arm moves after the last step."""
         idle = self.additional is None or self.additional.idle
-        return Expected(self._a_last, FRICTION if idle else STICTION, self._observer.known)
+        a = self._a_last if self.obeyed else self._no_torque
+        return Expected(a, FRICTION if idle else STICTION, self._observer.known)
 
     @property
     def lost(self) -> bool:
@@ -168,6 +172,10 @@ class Controller:
         """Forget the past; `q` becomes the posture that the null space is held at."""
         self._forget()
         self.goals.posture = q.copy()
+
+    def forget_disturbance(self) -> None:
+        """Forget what was learned of disturbances: it was of something else."""
+        self._observer.reset()
 
     def _forget(self) -> None:
         self._a_last = np.zeros(self.robot.n)
@@ -310,7 +318,7 @@ class Controller:
         elapsed = robot.dt if elapsed is None else elapsed
         observer = self._observer
         observer.time_constant = self.gains.disturbance_time
-        known = elapsed if elapsed <= LONGEST_GAP * robot.dt else 0.0
+        known = elapsed if self.obeyed and elapsed <= LONGEST_GAP * robot.dt else 0.0
         observer.observe(robot.v, self._a_last, known, self.tau_max, robot.M)
         if self.interaction is not None:
             self.interaction.observe(robot, self.goals, elapsed)
@@ -319,7 +327,8 @@ class Controller:
         if additional is None or not robot.rates:
             return None
         before = additional.integral
-        torque = additional.torque(robot, robot.v, self._a_last, elapsed)
+        time = elapsed if self.obeyed else math.inf
+        torque = additional.torque(robot, robot.v, self._a_last, time)
         observer.expect(additional.integral - before, self.tau_max, robot.M)
         return torque
 

@@ -131,6 +131,61 @@ def test_where_motors_hold_the_arm_before_it_starts_goals_fade_in(ros, held, bef
     assert (np.diff(share) < 0.05).all()
 
 
+class Motors:
+    """Motors that give what is commanded, or something else, in states of an arm at rest."""
+
+    def __init__(self, ros, **changed):
+        self.chain = NodeChain(ros, **changed)
+        self.stamp, self.tau = 0, np.zeros(ARM.n)
+        self.chain.postures.publish(joint_state(JOINTS, 0, GOAL_Q))
+        ros.wait_until(lambda: self.chain.reported("goals_pending") == "1", "the goal")
+
+    def answer(self, count, effort=None):
+        """Answer states; return by how much of the goal's torques the last command is."""
+        at_rest = np.zeros(ARM.n)
+        for _ in range(count):
+            self.stamp += 10
+            given = self.tau if effort is None else effort
+
+            def send(given=given):
+                self.chain.bound(self.stamp)
+                self.chain.send_state(self.stamp, Q, at_rest, given)
+
+            self.tau = self.chain.await_command(self.stamp, send)
+        bounds = AccelerationRange(LOWER, UPPER)
+        rest = expected().brake(State(Q, at_rest), bounds).tau
+        goal = expected(posture=GOAL_Q).step(State(Q, at_rest), bounds).tau
+        return np.abs(self.tau - rest).max() / np.abs(goal - rest).max()
+
+
+def test_while_the_motors_give_other_torques_the_arm_is_slowed(ros, capfd):
+    motors = Motors(ros)
+    assert motors.answer(150) == pytest.approx(1.0)
+    others = -motors.tau
+    assert motors.answer(2, others) == pytest.approx(1.0)
+    shares = [motors.answer(1, others) for _ in range(20)]
+    assert max(shares) < 0.1
+    motors.chain.ros.wait_until(
+        lambda: motors.chain.reported("commands_ignored") == "1", "the report"
+    )
+    said = "the motors do not give the torques that were sent"
+    assert said in ros.diagnostics[NODE]["message"]
+    assert capfd.readouterr().err.count(f"{said}: the arm is slowed") == 1
+    shares = [motors.answer(1) for _ in range(60)]
+    assert shares[-1] == pytest.approx(1.0)
+    assert (np.diff(shares) < 0.05).all()
+
+
+@pytest.mark.parametrize("changed", [{}, {"effort_tolerance": 0.0}], ids=["unknown", "not wanted"])
+def test_motors_that_cannot_be_compared_change_nothing(ros, changed):
+    motors = Motors(ros, **changed)
+    others = np.full(ARM.n, 0.1)  # motors that are on
+    motors.answer(60, None if changed else others)
+    assert motors.answer(20, others) == pytest.approx(1.0)
+    ros.run_for(0.1)
+    assert motors.chain.reported("commands_ignored") == "0"
+
+
 def test_it_holds_while_bounds_are_missing_and_goes_on_by_itself(ros):
     chain = NodeChain(ros, bounds_timeout=0.1)
     stamp = give_goal(chain)

@@ -27,7 +27,6 @@ KNOWN = {row.name for row in parameter_table(ControllerConfiguration)}
 FORCES = {
     "ft_frame": "panda_link8",
     "ft_tool": [0.0, 0.0, 0.0, 0.0],
-    "ft_timeout": 0.021,
     "force_directions": [0.0, 0.0, 1.0, 0.0, 0.0, 0.0],
     "yield_threshold": [10.0, 2.0],
     "contacts": ["{frame: panda_hand, point: [0, 0, 0.1], normal: [0, 0, -1], friction: 0.5}"],
@@ -211,7 +210,6 @@ def contact(**changed):
         ({"ft_tool": [1.0, 0.0, 1.0]}, "ft_tool"),
         ({"ft_tool": [1.0, 0.0, 1.0, math.nan]}, "ft_tool"),
         ({"ft_filter_hz": 0.0}, "ft_filter_hz"),
-        ({"ft_timeout": -1.0}, "ft_timeout"),
         ({"force_directions": [1.0] * 5}, "force_directions"),
         ({"force_directions": [0.5] * 6}, "force_directions"),
         ({"admittance_kp": [-1.0, 0.1]}, "admittance_kp"),
@@ -245,17 +243,13 @@ def test_each_parameter_reaches_the_settings():
         admittance_speed_max=[0.1, 0.4],
         yield_threshold=[3.0, 4.0],
         ft_filter_hz=9.0,
-        ft_timeout=0.5,
     ).interaction
     settings = interaction.settings
     gains = settings.gains
     assert (gains.kp, gains.speed_max) == ((0.2, 0.03), (0.1, 0.4))
     assert settings.yield_threshold == (3.0, 4.0)
     np.testing.assert_array_equal(settings.directions, [0, 0, 1, 0, 0, 0])
-    assert (interaction.sensor.settings.filter_hz, interaction.sensor.settings.timeout) == (
-        9.0,
-        0.5,
-    )
+    assert interaction.sensor.settings.filter_hz == 9.0
     assert build(yield_threshold=[]).interaction.settings.yield_threshold is None
 
 

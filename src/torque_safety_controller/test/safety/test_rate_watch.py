@@ -49,3 +49,20 @@ def test_what_had_gone_wrong_slows_the_arm_too():
     said = [watch.note(DT) for _ in range(round(RETURN_TIME / DT) + 1)]
     assert watch.share == 1.0
     assert [each for each in said if each] == ["the arm goes on"]
+
+
+def test_what_is_doubted_takes_the_share_down_as_fast_as_it_grows():
+    watch = RateWatch(DT, 2)
+    watch.slow("not obeyed")
+    for _ in range(20):
+        watch.note(DT)
+    high = watch.share
+    for _ in range(5):
+        watch.ease(DT)
+        watch.note(DT)
+    assert watch.share == pytest.approx(high - 5 * DT / RETURN_TIME)
+    for _ in range(50):
+        watch.ease(DT)
+        watch.note(DT)
+    watch.ease(None)  # the first state
+    assert 0.0 <= watch.share <= 2 * DT / RETURN_TIME

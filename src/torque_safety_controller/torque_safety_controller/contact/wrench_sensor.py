@@ -35,17 +35,16 @@ class WrenchError(ArmSafetyError, ValueError):
 
 @dataclass(frozen=True)
 class SensorSettings:
-    """How measurements are taken."""
+    """How measurements are taken.
+
+    Attributes:
+        timeout: how long without a wrench before force control ends, s; not a parameter.
+    """
 
     filter_hz: float = number(
         "cut-off frequency of the wrench's filter, Hz", above(0.0, 1e4), default=30.0, live=True
     )
-    timeout: float = number(
-        "how long without a wrench before force control ends, s",
-        above(0.0, 60.0),
-        default=0.05,
-        live=True,
-    )
+    timeout: float = 0.05
 
 
 class WrenchSensor:

@@ -26,7 +26,7 @@ from torque_safety_controller.node.controller_report import (
     about_detour,
     too_weak,
 )
-from torque_safety_controller.node.declared import covered_row, declared_robot
+from torque_safety_controller.node.declared import covered_row, declared_robot, longest_way
 from torque_safety_controller.node.driving import Driving
 from torque_safety_controller.node.gain_watch import GainWatch
 from torque_safety_controller.node.goals import GoalSubscriber
@@ -39,6 +39,7 @@ from torque_safety_controller.node.topics import GOALS
 from torque_safety_controller.node.wrenches import WrenchSubscriber
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.safety.command_watch import CommandWatch
 from torque_safety_controller.safety.handover import Control, Handover
 from torque_safety_controller.safety.modes import Mode, ModeKeeper
 from torque_safety_controller.safety.rate_watch import RateWatch
@@ -58,6 +59,7 @@ from viability_bounds_pkg.state import State
 
 _STALE = "acceleration limits are stale"
 _CONTESTED = "several nodes publish goals"
+_IGNORED = "the motors do not give the torques that were sent"
 
 
 class ControllerNode(ArmNode):
@@ -107,6 +109,9 @@ class ControllerNode(ArmNode):
         self._modes = ModeKeeper()
         self._went_wrong = ""  # why the arm was braked, until it goes on
         self._rate = RateWatch(config.dt, covered_row(self))
+        self._compared = config.effort_tolerance > 0.0
+        tolerance = config.effort_tolerance * config.torque_max
+        self._watched = CommandWatch(tolerance, longest_way(self))
         self._record = StepRecord(len(config.joints))
         self._shortfall = Shortfall(config.joints, config.position_min, config.position_max)
         self._collision = CollisionReport(self.get_logger(), self._controller.constraints)
@@ -178,6 +183,7 @@ class ControllerNode(ArmNode):
             # They would jump to where the arm was held before, from where it has been put.
             self._handover.robot_was_away()
         if self._handover.control is Control.POSITION:
+            self._watched.reset()
             self._drives.hold(stamp)
         elif self._limits.stamp == states.stamp:
             self._track(stamp)
@@ -228,6 +234,7 @@ class ControllerNode(ArmNode):
         if self._by_others():
             self._went_wrong = "the motors held the arm before"
         states.begin()
+        self._watched.reset()
         self._controller.reset(states.q)
         self._handover.robot_was_away()
 
@@ -253,6 +260,7 @@ class ControllerNode(ArmNode):
             return
         state = State(self._states.q, self._states.v)
         self._goals.apply_due(self._states.stamp, state)
+        self._watch_commands()
         contested = self._goals.contested
         if contested:
             self._went_wrong = _CONTESTED
@@ -269,6 +277,22 @@ class ControllerNode(ArmNode):
             self._went_wrong = ""
         self._answer(step, stamp)
 
+    def _watch_commands(self) -> None:
+        """Slow the arm while its motors do not give the torques that were sent."""
+        watched = self._watched
+        if not (self._compared and self._states.copy_effort(watched.effort)):
+            return
+        doubted = watched.doubted
+        self._controller.obeyed = watched.look(self._rate.slowed)
+        if not watched.ignored:
+            return
+        self._controller.forget_disturbance()
+        if doubted:  # perhaps commands act again: no jolt
+            self._rate.ease(self._states.elapsed())
+        else:
+            self._rate.slow(_IGNORED)
+            self._warn(f"{_IGNORED}: the arm is slowed")
+
     def _note_rate(self) -> None:
         """Slow the arm if too many states were not answered."""
         if news := self._rate.note(self._states.elapsed()):
@@ -280,6 +304,7 @@ class ControllerNode(ArmNode):
         states, now = self._states, time.monotonic()
         elapsed = states.elapsed() or 0.0
         self._commands.torque(step.tau, stamp)
+        self._watched.note(step.tau)
         states.answered()
         states.expect(self._controller.expected())
         self._record.note(step, now - states.message_at)
@@ -308,6 +333,7 @@ class ControllerNode(ArmNode):
 
     def _hold(self, stamp: Any) -> None:
         """Answer the newest state without acceleration limits."""
+        self._watch_commands()
         self._went_wrong = _STALE
         self._note_rate()
         state = State(self._states.q, self._states.v)
@@ -365,6 +391,8 @@ class ControllerNode(ArmNode):
                 "goal_share": self._rate.share,
                 "missed_rows_too_long": self._rate.too_long,
                 "missed_row_longest": self._rate.longest,
+                "commands_ignored": self._watched.times,
+                "effort_difference": self._watched.seen * self._config.effort_tolerance,
                 "goals_pending": len(self._goals),
                 "goals_refused": self._goals.refused,
                 "states_refused": self._states.refused,

@@ -27,6 +27,16 @@ def declared_robot(node: Node) -> BoundsConfiguration | None:
         return None
 
 
+def longest_way(node: Node) -> int:
+    """Return how many of the last commands may act at a state, by what is declared.
+
+    Late ones and missed periods count; two are added for what nobody declares.
+    """
+    robot = declared_robot(node)
+    late = 0 if robot is None else robot.declared.delay + robot.declared.delay_jitter
+    return 3 + late + covered_row(node)
+
+
 def covered_row(node: Node) -> int:
     """Return how many missed periods in a row the bounds beside a node cover."""
     robot = declared_robot(node)

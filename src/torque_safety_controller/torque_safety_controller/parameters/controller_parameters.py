@@ -109,6 +109,12 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
     goal_timeout: float = number(
         "age of a goal before HOLD, s; 0: never", Range(0.0, 1e5), default=0.0
     )
+    effort_tolerance: float = number(
+        "by how much torques of joint states may differ from those that were commanded, share of "
+        "torque_max; beyond, commands count as not acting, and the arm is slowed; 0: not compared",
+        Range(0.0, 2.0),
+        default=0.03,
+    )
     ros2_control_topic: str = text(
         "where to publish efforts as std_msgs/Float64MultiArray too; empty: nowhere", default=""
     )

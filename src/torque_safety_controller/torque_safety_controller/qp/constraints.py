@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torque_safety_controller.robot_model import RobotModel
+from viability_bounds_pkg.compiled import compiled
 
 Array = NDArray[np.float64]
 
@@ -21,6 +23,24 @@ class AccelerationRange(NamedTuple):
     """Shape (n,), rad/s^2; -inf for no bound."""
     upper: Array
     """Shape (n,), rad/s^2, not below `lower`; inf for no bound."""
+
+
+def fault_of(lower: Array, upper: Array) -> str:
+    """Return what is wrong with finite bounds, shape (n,) each, in words; empty for nothing."""
+    return _FAULTS[_fault(lower, upper)]
+
+
+_FAULTS = "", "not finite", "lower above upper"
+
+
+@compiled
+def _fault(lower: Array, upper: Array) -> int:
+    crossed = False
+    for i in range(lower.size):
+        if not (math.isfinite(lower[i]) and math.isfinite(upper[i])):
+            return 1
+        crossed = crossed or lower[i] > upper[i]
+    return 2 if crossed else 0
 
 
 class LinearConstraints(NamedTuple):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The last checks of a torque, the disturbance observer, modes and handover."""
 
+from torque_safety_controller.safety.command_watch import CommandWatch
 from torque_safety_controller.safety.disturbance_observer import DisturbanceObserver
 from torque_safety_controller.safety.handover import Control, Handover, HandoverRefused
 from torque_safety_controller.safety.modes import Mode, ModeKeeper
@@ -8,6 +9,7 @@ from torque_safety_controller.safety.rate_watch import RateWatch
 from torque_safety_controller.safety.torque_limiter import TorqueLimiter
 
 __all__ = [
+    "CommandWatch",
     "Control",
     "DisturbanceObserver",
     "Handover",

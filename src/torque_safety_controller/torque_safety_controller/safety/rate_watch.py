@@ -37,6 +37,10 @@ class RateWatch:
         """Take the share to zero, because of what had gone wrong until now."""
         self.share, self._why = 0.0, why
 
+    def ease(self, elapsed: float | None) -> None:
+        """Let the share go down as fast as it grows, for a state: `note` will count it, too."""
+        self.share = max(0.0, self.share - 2.0 * (elapsed or 0.0) / RETURN_TIME)
+
     def note(self, elapsed: float | None) -> str:
         """Take the time since the last answered state; return what to log, mostly nothing.
 

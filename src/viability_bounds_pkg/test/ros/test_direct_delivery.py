@@ -183,3 +183,16 @@ def test_a_node_that_goes_takes_its_subscriptions_along(ros):
             process.delivery.leave(node)
             ros.stop(node)
     ros.wait_until(lambda: outside.get_subscription_count() == 0)
+
+
+def test_it_tells_whether_messages_can_only_be_those_of_one_publisher_here(ros, others):
+    process = Process(ros)
+    topic = "/joint_states"
+    assert process.delivery.within(topic)
+    assert not process.delivery.within("/joint_states_of_others")
+    theirs = others.talk(JointState, "joint_states")
+    ros.wait_until(lambda: not process.delivery.within(topic))
+    others.probe.destroy_publisher(theirs)
+    ros.wait_until(lambda: process.delivery.within(topic), each=others.spin)
+    JOINT_STATES.publisher(process.node("second_robot"))  # both deliver directly
+    assert not process.delivery.within(topic)

@@ -81,6 +81,15 @@ class DirectDelivery:
         stream.settle()
         return subscription
 
+    def within(self, topic: str) -> bool:
+        """Return whether messages of a topic can only be those of one publisher in this process.
+
+        Args:
+            topic: its name, resolved.
+        """
+        stream = self._streams.get(topic)
+        return stream is not None and stream.direct and stream.publishers == 1
+
     def leave(self, node: Node) -> None:
         """Give a node back its subscriptions, so that they are destroyed with it."""
         for stream in self._streams.values():

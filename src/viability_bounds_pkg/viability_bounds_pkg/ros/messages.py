@@ -160,15 +160,22 @@ class JointStateReader:
 
         None where it does not tell, for each joint, a finite number.
         """
+        tau = np.empty_like(self.q)
+        return tau if self.copy_effort(tau) and np.isfinite(tau).all() else None
+
+    def copy_effort(self, tau: NDArray[np.float64]) -> bool:
+        """Write that torque, finite or not, to `tau`, shape (n,), N m.
+
+        Returns:
+            Whether there is one.
+        """
         if self._accepted is None:
-            return None
+            return False
         message, index = self._accepted
         if len(message.effort) != len(message.name):
-            return None
-        tau = np.array(message.effort)
-        if index is not None:
-            tau = tau[index]
-        return tau if np.isfinite(tau).all() else None
+            return False
+        tau[:] = message.effort if index is None else np.array(message.effort)[index]
+        return True
 
     def with_state(self, state: State) -> JointState:
         """Return the last accepted message with another state of the joints, all else as it is."""

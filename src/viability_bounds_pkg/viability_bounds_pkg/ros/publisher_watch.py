@@ -11,6 +11,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from viability_bounds_pkg.ros.direct_delivery import DirectDelivery
 from viability_bounds_pkg.ros.topics import ESTIMATED_JOINT_STATES, JOINT_STATES
 
 _PERIOD = 1.0
@@ -54,6 +55,7 @@ class PublisherWatch:
             node.resolve_topic_name(topic.name) for topic in (JOINT_STATES, ESTIMATED_JOINT_STATES)
         )
         self._node = node
+        self._direct: DirectDelivery | None = getattr(node, "direct_delivery", None)
         # Held by the interpreter's lock, so that no other thread destroys the node meanwhile.
         self._count = node.handle.get_count_publishers
         self._topics = [node.resolve_topic_name(topic) for topic in topics]
@@ -95,8 +97,10 @@ class PublisherWatch:
             topic: its name, resolved.
         """
         # On the control path. A subscription counts its publishers faster, but a little after it
-        # takes their messages: the graph has a publisher before.
-        if self._count(topic) <= 1:
+        # takes their messages: the graph has a publisher before. What is delivered directly does
+        # not come from elsewhere: as soon as another publisher matches, nothing is.
+        within = self._direct is not None and self._direct.within(topic)
+        if within or self._count(topic) <= 1:
             if self._looked or self.rivals:
                 self._looked.pop(topic, None)
                 if topic in self.rivals:

@@ -3,14 +3,13 @@
 
 from __future__ import annotations
 
-import math
-import operator
 from collections import Counter
 from collections.abc import Callable, Sequence
 
 import numpy as np
 from trajectory_msgs.msg import JointTrajectory
 
+from torque_safety_controller.qp.constraints import fault_of
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 
 
@@ -51,13 +50,8 @@ class LimitsReader:
                 return self._refuse("missing joint", f": there is no '{missing}'")
             index = [where[joint] for joint in self._joints]
             lower, upper = lower[index], upper[index]
-        # The sum is the quick test, NumPy's the exact one, of the joints that count.
-        if not math.isfinite(sum(first.accelerations) + sum(second.accelerations)) and not (
-            np.isfinite(lower).all() and np.isfinite(upper).all()
-        ):
-            return self._refuse("not finite")
-        if not all(map(operator.le, lower.tolist(), upper.tolist())):
-            return self._refuse("lower above upper")
+        if fault := fault_of(lower, upper):
+            return self._refuse(fault)
         self.lower, self.upper = lower, upper
         self.stamp = stamp_to_ns(message.header.stamp)
         return True

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the controller takes from the parameters of the bounds node beside it."""
+
+import pytest
+from rclpy.context import Context
+
+from torque_safety_controller.node.declared import covered_row, longest_way
+from viability_bounds_pkg.ros.given_parameters import note_arguments
+from viability_bounds_pkg.testing.ros_harness import config_folder
+
+
+class Beside:
+    """Stands for a node with a command line."""
+
+    def __init__(self, *rules):
+        self.context = Context()
+        note_arguments(self.context, ["--ros-args", *rules])
+
+    def get_namespace(self):
+        return "/"
+
+
+@pytest.mark.parametrize(
+    ("given", "row", "way"),
+    [
+        ((), 1, 4),
+        (("delay:=2", "missed_deadlines:=4"), 4, 9),
+        (("delay:=2", "delay_jitter:=3", "missed_deadlines:=4"), 4, 12),
+        (("bounds_node:delay:=1",), 1, 5),
+        (("controller_node:delay:=1",), 1, 4),
+    ],
+)
+def test_late_and_missed_commands_are_within_reach(given, row, way):
+    rules = [word for rule in given for word in ("-p", rule)]
+    node = Beside("--params-file", str(config_folder() / "panda.yaml"), *rules)
+    assert (covered_row(node), longest_way(node)) == (row, way)
+
+
+def test_without_a_file_little_is_declared():
+    assert (covered_row(Beside()), longest_way(Beside())) == (1, 4)
