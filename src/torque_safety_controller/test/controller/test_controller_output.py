@@ -2,6 +2,7 @@
 """What the controller sends: finite and within the limits, whatever comes."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from arms import load_arm
@@ -11,6 +12,7 @@ from controllers import (
     VECTORS,
     assert_may_be_sent,
     gravity,
+    integral,
     make,
     pose_at,
     posture_only,
@@ -20,6 +22,7 @@ from controllers import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from torque_safety_controller.additional_torque import AdditionalTorque
 from torque_safety_controller.qp.constraints import AccelerationRange
 from viability_bounds_pkg.state import State
 
@@ -217,3 +220,27 @@ def test_where_the_motors_cannot_let_it_rest_the_bounds_count_alone(arm):
     step = controller.step(state, wide(arm))
     assert step.relaxation is None
     assert np.abs(step.a).max() > 0.01, "it rests"
+
+
+def test_nothing_is_learned_from_a_motion_that_was_not_commanded():
+    """Neither of disturbances nor by the integral action; the torque does not jump."""
+    arm = load_arm("panda")
+    controller = make(arm, additional=AdditionalTorque(integral(arm, "joints")))
+    controller.gains = replace(controller.gains, disturbance_time=0.0)
+    controller.reset(arm.q_start)
+    controller.set_posture_goal(arm.q_start + 0.1)
+    at_rest = State(arm.q_start, np.zeros(arm.n))
+    for _ in range(20):
+        controller.step(at_rest, wide(arm))
+    learned, torque = controller._observer.estimate.copy(), controller.additional.integral
+    assert learned.any() and torque.any()
+    controller.obeyed = False
+    for k in range(20):
+        controller.step(State(arm.q_start, np.full(arm.n, 0.01 * k)), wide(arm))
+    # What the additional torque changes by as it goes on counts.
+    np.testing.assert_allclose(controller._observer.estimate, learned, rtol=0.05)
+    np.testing.assert_allclose(controller.additional.integral, torque, rtol=0.05)
+    assert not controller.expected().a.any()
+    controller.obeyed = True
+    controller.step(State(arm.q_start, np.full(arm.n, 0.5)), wide(arm))
+    assert np.abs(controller._observer.estimate - learned).max() > 10.0

@@ -176,6 +176,19 @@ def test_while_the_motors_give_other_torques_the_arm_is_slowed(ros, capfd):
     assert (np.diff(shares) < 0.05).all()
 
 
+def test_what_was_learned_until_the_motors_were_told_is_forgotten(ros):
+    motors = Motors(ros, disturbance_time=0.0)
+    motors.answer(150)  # states of an arm that does not move
+    observer = motors.chain.node._controller._observer
+    learned = observer.estimate.copy()
+    assert np.abs(learned).max() > 0.5
+    others = -motors.tau
+    motors.answer(2, others)
+    np.testing.assert_array_equal(observer.estimate, learned)  # nothing is learned from these
+    motors.answer(1, others)
+    assert not observer.estimate.any()
+
+
 @pytest.mark.parametrize("changed", [{}, {"effort_tolerance": 0.0}], ids=["unknown", "not wanted"])
 def test_motors_that_cannot_be_compared_change_nothing(ros, changed):
     motors = Motors(ros, **changed)
