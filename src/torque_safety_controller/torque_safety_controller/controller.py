@@ -160,8 +160,7 @@ class Controller:
     def expected(self) -> Expected:
         """Return how the arm moves after the last step."""
         idle = self.additional is None or self.additional.idle
-        a = self._a_last if self.obeyed else self._no_torque
-        return Expected(a, FRICTION if idle else STICTION, self._observer.known)
+        return Expected(self._a_last, FRICTION if idle else STICTION, self._observer.known)
 
     @property
     def lost(self) -> bool:

@@ -108,6 +108,7 @@ class BulletRobot(BulletBody):
         self._driving = False
         self._law: CoordinatedStop | None = None  # the one in charge
         self._stepped = False  # since the last reset
+        self._v_before = self._v  # at the begin of the last physics step, rad/s
 
     @property
     def finite(self) -> bool:
@@ -238,7 +239,11 @@ class BulletRobot(BulletBody):
         if self._law is not law:
             self._driving = False
             self._release_brakes()
-            law.begin(*self.state()[:2])
+            q, v, _ = self.state()
+            if self._stepped:
+                law.begin(q, v, self.believed_torque, (v - self._v_before) / self.physics_dt)
+            else:
+                law.begin(q, v)
             self._law = law
         motors = self._motors
 
@@ -287,6 +292,7 @@ class BulletRobot(BulletBody):
                 applied = [state[3] for state in states]
                 self._motor_torque[:] = np.clip(applied, -self._brakes, self._brakes)
             if remaining == 1:
+                self._v_before = before[1]
                 self._measure(*before, self._v)
             if self.monitor is not None:
                 self.monitor.update(self._q, self._v, self._motor_torque)

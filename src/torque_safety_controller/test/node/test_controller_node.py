@@ -29,6 +29,7 @@ from node_chain import (
 )
 
 from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.safety.modes import Mode
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import joint_state
@@ -145,7 +146,7 @@ class Motors:
         at_rest = np.zeros(ARM.n)
         for _ in range(count):
             self.stamp += 10
-            given = self.tau if effort is None else effort
+            given = self.tau if effort is None else effort + 1e-9 * (self.stamp % 20)
 
             def send(given=given):
                 self.chain.bound(self.stamp)
@@ -187,6 +188,28 @@ def test_what_was_learned_until_the_motors_were_told_is_forgotten(ros):
     np.testing.assert_array_equal(observer.estimate, learned)  # nothing is learned from these
     motors.answer(1, others)
     assert not observer.estimate.any()
+
+
+def test_motors_whose_other_torques_have_frozen_are_sent_nothing_for_a_while(ros):
+    motors = Motors(ros)
+    motors.answer(150)
+    chain, frozen, answered = motors.chain, -motors.tau, []
+    for _ in range(100):
+        motors.stamp += 10
+        chain.bound(motors.stamp)
+        chain.send_state(motors.stamp, Q, np.zeros(ARM.n), frozen)
+        ros.wait_until(lambda: chain.node._states.answered_stamp == motors.stamp * MS, "the state")
+        if chain.node._modes.mode is Mode.STOPPED:
+            assert "to the last bit" in chain.node._modes.reason
+        else:
+            answered.append(motors.stamp)
+    ros.run_for(0.05)
+    assert chain.commands.stamps[-len(answered) :] == [stamp * MS for stamp in answered]
+    gaps = np.diff(answered)
+    assert np.count_nonzero(gaps >= 400) == 2  # it is tried again
+    assert np.count_nonzero(gaps == 10) < 15
+    assert motors.answer(60) == pytest.approx(1.0)
+    chain.await_mode("TRACKING")
 
 
 @pytest.mark.parametrize("changed", [{}, {"effort_tolerance": 0.0}], ids=["unknown", "not wanted"])

@@ -4,10 +4,11 @@
 import numpy as np
 import pytest
 
-from torque_safety_controller.safety.command_watch import ENOUGH, IGNORED, CommandWatch
+from torque_safety_controller.safety.command_watch import AGAIN, ENOUGH, IGNORED, CommandWatch
 
 TOLERANCE = np.array([1.0, 0.5])  # N m
 REACH = 3
+DT = 0.002  # s
 
 
 def wave(k):
@@ -25,8 +26,11 @@ class Loop:
     def look(self, off=0.0, effort=None):
         """Show a state, `off` tolerances beside the command; return whether it agrees."""
         given = self.sent[-1 - min(self.late, len(self.sent) - 1)] if self.sent else np.zeros(2)
-        self.watch.effort[:] = given + off * TOLERANCE if effort is None else effort
-        agrees = self.watch.look(self.slowed)
+        # The last bits of a sensor change.
+        self.watch.effort[:] = given + off * TOLERANCE + 1e-9 * (len(self.sent) % 2)
+        if effort is not None:
+            self.watch.effort[:] = effort
+        agrees = self.watch.look(self.slowed, DT)
         self.slowed = self.slowed or self.watch.ignored
         self.sent.append(wave(len(self.sent) if self.moving else 30))
         self.watch.note(self.sent[-1])
@@ -40,7 +44,8 @@ class Loop:
 def test_commands_that_act_within_their_reach_are_never_doubted(late):
     loop = Loop(late, moving=True)
     loop.agree(500)
-    assert (loop.watch.times, loop.watch.seen) == (0, 0.0)
+    assert loop.watch.times == 0
+    assert loop.watch.seen < 1e-8
 
 
 def test_commands_that_act_later_are_ignored():
@@ -115,4 +120,23 @@ def test_a_restart_forgets_the_commands():
     loop.watch.reset()
     assert not (loop.watch.ignored or loop.watch.doubted)
     assert loop.look(off=5.0)  # of the arm that was there before
+    assert loop.watch.times == 1
+
+
+def test_torques_that_stay_the_same_to_the_last_bit_are_stuck_and_tried_again():
+    loop = Loop()
+    loop.agree()
+    frozen = loop.sent[-1] + 3.0 * TOLERANCE
+    seen = []
+    for _ in range(round(3 * AGAIN / DT)):
+        assert not loop.look(effort=frozen)
+        seen.append(loop.watch.stuck)
+    assert seen.index(True) == IGNORED  # the first one was another
+    tried = np.flatnonzero(np.diff(np.array(seen, dtype=int)) == -1)
+    assert np.diff(tried) * DT == pytest.approx(AGAIN, abs=10 * DT)
+    while not loop.watch.stuck:
+        loop.look(effort=frozen)
+    assert not loop.look(effort=frozen + 1e-9)  # they change: it sees the motors again
+    assert not loop.watch.stuck
+    assert loop.watch.ignored
     assert loop.watch.times == 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -60,6 +61,7 @@ from viability_bounds_pkg.state import State
 _STALE = "acceleration limits are stale"
 _CONTESTED = "several nodes publish goals"
 _IGNORED = "the motors do not give the torques that were sent"
+_STUCK = f"{_IGNORED}, and theirs stay the same to the last bit"
 
 
 class ControllerNode(ArmNode):
@@ -201,6 +203,8 @@ class ControllerNode(ArmNode):
             self._begin(arrival)
             return True
         elif states.answered_stamp == states.stamp:
+            if self._watched.stuck:  # a robot that waits for the answer, as in lockstep
+                self._watched.retry()
             self._commands.again(stamp)
         return False
 
@@ -260,7 +264,8 @@ class ControllerNode(ArmNode):
             return
         state = State(self._states.q, self._states.v)
         self._goals.apply_due(self._states.stamp, state)
-        self._watch_commands()
+        if not self._sees_motors():
+            return
         contested = self._goals.contested
         if contested:
             self._went_wrong = _CONTESTED
@@ -277,26 +282,35 @@ class ControllerNode(ArmNode):
             self._went_wrong = ""
         self._answer(step, stamp)
 
-    def _watch_commands(self) -> None:
-        """Slow the arm while its motors do not give the torques that were sent."""
-        watched = self._watched
-        if not (self._compared and self._states.copy_effort(watched.effort)):
-            return
-        doubted = watched.doubted
-        self._controller.obeyed = watched.look(self._rate.slowed)
+    def _sees_motors(self) -> bool:
+        """Slow the arm while its motors do not give the torques that were sent.
+
+        Returns:
+            Whether the newest state is to be answered: what it says of the motors has not frozen.
+        """
+        watched, states = self._watched, self._states
+        if not (self._compared and states.copy_effort(watched.effort)):
+            return True
+        doubted, elapsed = watched.doubted, states.elapsed()
+        self._controller.obeyed = watched.look(self._rate.slowed, elapsed or 0.0)
         if not watched.ignored:
-            return
+            return True
         self._controller.forget_disturbance()
-        if doubted:  # perhaps commands act again: no jolt
-            self._rate.ease(self._states.elapsed())
+        if watched.stuck:
+            states.answered()  # by silence
+            self._went_wrong = _STUCK
+            self._enter(Mode.STOPPED, _STUCK)
+        elif doubted:  # perhaps commands act again: no jolt
+            self._rate.ease(elapsed)
         else:
             self._rate.slow(_IGNORED)
-            self._warn(f"{_IGNORED}: the arm is slowed")
+            self._later(self._warn, f"{_IGNORED}: the arm is slowed")
+        return not watched.stuck
 
     def _note_rate(self) -> None:
         """Slow the arm if too many states were not answered."""
         if news := self._rate.note(self._states.elapsed()):
-            self._warn(news)
+            self._later(self._warn, news)
         self._controller.share = self._rate.share
 
     def _answer(self, step: ControlOutput, stamp: Any) -> None:
@@ -333,7 +347,8 @@ class ControllerNode(ArmNode):
 
     def _hold(self, stamp: Any) -> None:
         """Answer the newest state without acceleration limits."""
-        self._watch_commands()
+        if not self._sees_motors():
+            return
         self._went_wrong = _STALE
         self._note_rate()
         state = State(self._states.q, self._states.v)
@@ -360,9 +375,18 @@ class ControllerNode(ArmNode):
 
     def _enter(self, mode: Mode, reason: str) -> None:
         before = self._modes.mode
-        if not self._modes.set(mode, reason):
-            return
-        if mode is not before:
+        if self._modes.set(mode, reason):
+            self._later(self._tell, mode, reason, mode is not before)
+
+    def _later(self, tell: Callable[..., None], *what: Any) -> None:
+        """Tell something when the command has left: at 1 kHz a log line takes half a period."""
+        if self.executor is None:
+            tell(*what)
+        else:
+            self.executor.create_task(tell, *what)
+
+    def _tell(self, mode: Mode, reason: str, new: bool) -> None:
+        if new:
             self._published.mode(mode)
         text = f"{mode.value}: {reason}"
         # One call site per severity: rclpy ties the two together.

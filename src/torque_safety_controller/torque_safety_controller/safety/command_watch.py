@@ -9,6 +9,10 @@ The torque of a state is that of a command some periods ago: it is compared with
 last ones. An arm that has stopped is asked for little at first, so that what holds it differs
 little from the commands: until the arm has gone on the tolerance is smaller, twice what differed
 while the commands acted.
+
+Where the torque that does not agree is the same to the last bit as well, states have frozen, and
+what is sent moves the arm unseen; or the robot has stopped itself, and its sensors are coarse. In
+either case nothing is to be sent, but once in a while, so that it is seen when that has ended.
 """
 
 from __future__ import annotations
@@ -26,6 +30,9 @@ other units or places, or zeros."""
 
 IGNORED = 3
 """States in a row that do not agree after which commands count as ignored."""
+
+AGAIN = 0.4
+"""Time after which commands are tried again, s."""
 
 _LEAST = 0.1
 """Smaller tolerance, as a share of the usual one, where nothing differed."""
@@ -47,50 +54,64 @@ class CommandWatch:
         in_row: states that do not agree, since the last one that does.
         doubted: whether commands were ignored, and the arm has not gone on yet.
         times: how often that began.
+        stuck: whether torques do not agree and stay the same to the last bit.
         seen: largest difference lately while the commands acted, as a share of the tolerance.
     """
 
     def __init__(self, tolerance: Array, reach: int) -> None:
         self.effort = np.zeros_like(tolerance)
         self._sent = np.zeros((reach, tolerance.size))
-        self._off = bound(_farthest, self.effort, self._sent, tolerance)
+        self._before = np.zeros_like(tolerance)  # `effort` of the last state
+        self._look = bound(_look, self.effort, self._before, self._sent, tolerance)
         self._next = self.times = 0
         self.seen = 0.0
         self.reset()
 
     def reset(self) -> None:
         """Forget all commands."""
-        self.in_row = self._agreed = 0
+        self._agreed = 0
         self.doubted = self._known = False
+        self.retry()
+
+    def retry(self) -> None:
+        """Have the next states answered, whatever their torques."""
+        self.in_row = self._same = 0
+        self.stuck, self._stuck_for = False, 0.0
 
     @property
     def ignored(self) -> bool:
         """Whether the commands do not act."""
         return self.in_row >= IGNORED
 
-    def look(self, slowed: bool) -> bool:
+    def look(self, slowed: bool, elapsed: float) -> bool:
         """Return whether `effort` agrees with the commands, or it is not known yet whether it may.
 
         What is not finite agrees with nothing.
 
         Args:
             slowed: whether the arm has not gone on yet after something went wrong.
+            elapsed: time since the last state, s.
         """
+        off, same = self._look()
         if not self._known:
             return True
-        off = self._off()
         self.doubted = self.doubted and slowed
         if off <= (min(1.0, max(_LEAST, 2.0 * self.seen)) if self.doubted else 1.0):
             if not self.doubted:
                 self.seen = max((1.0 - _FORGETS) * self.seen, off)
             self._agreed += 1
-            self.in_row = 0
+            self.retry()
             return True
         if self._agreed < ENOUGH:
             self._agreed = 0
             return True
         self.seen += _LEARNS * max(0.0, min(off, 1.0) - self.seen)
         self.in_row += 1
+        self._same = self._same + 1 if same else 0
+        self.stuck = self._same >= IGNORED
+        self._stuck_for = self._stuck_for + elapsed if self.stuck else 0.0
+        if self._stuck_for > AGAIN:
+            self.retry()
         if self.ignored and not self.doubted:
             self.doubted = True
             self.times += 1
@@ -106,9 +127,12 @@ class CommandWatch:
 
 
 @compiled
-def _farthest(effort: Array, sent: Array, tolerance: Array) -> float:
-    """Return by how much of its tolerance a joint is outside the range of `sent`, shape (m, n)."""
-    most = 0.0
+def _look(effort: Array, before: Array, sent: Array, tolerance: Array) -> tuple[float, bool]:
+    """Return by how much of its tolerance a joint is outside the range of `sent`, shape (m, n).
+
+    And whether all torques are as before.
+    """
+    most, same = 0.0, True
     for j in range(effort.size):
         low = high = sent[0, j]
         for i in range(1, len(sent)):
@@ -116,4 +140,6 @@ def _farthest(effort: Array, sent: Array, tolerance: Array) -> float:
         off = max(low - effort[j], effort[j] - high) / tolerance[j]
         if not off <= most:
             most = off if off == off else np.inf
-    return most
+        same = same and effort[j] == before[j]
+        before[j] = effort[j]
+    return most, same

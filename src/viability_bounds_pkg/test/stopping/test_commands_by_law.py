@@ -84,3 +84,20 @@ def test_a_command_after_a_stop_takes_effect_without_a_step(arm):
         assert first > 0.1, "there was no step to avoid"
         assert largest < 0.2 * first
         assert tau == pytest.approx(command, abs=5e-3 * arm.tau_max.max())
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_friction_that_is_known_when_the_law_takes_over_is_no_step(arm, known):
+    """A command that balances friction, held for a period; in motion and at rest."""
+    rng = np.random.default_rng(4)
+    stop, largest = arm.stop(observer_time=0.002), 0.0
+    for speed in (0.0, 0.2):
+        q, v = arm.inside(rng)
+        v = speed * v
+        friction = 0.1 * arm.tau_max * rng.choice([-1.0, 1.0], arm.n)
+        a = rng.uniform(-1.0, 1.0, arm.n)
+        command = pin.rnea(arm.model, arm.data, q, v, a) + friction
+        stop.begin(q, v, *((command, a) if known else ()))
+        steps = np.abs(stop.follow(q, v, command) - command) / arm.tau_max
+        largest = max(largest, float(steps.max()))
+    assert largest < 1e-3 if known else largest > 0.03

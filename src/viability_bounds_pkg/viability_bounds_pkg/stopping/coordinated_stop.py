@@ -159,8 +159,19 @@ class CoordinatedStop:
         self._lowest, self._highest = limits.q_min + clear, limits.q_max - clear
         self.begin(np.zeros(len(names)), np.zeros(len(names)))
 
-    def begin(self, q: ArrayLike, v: ArrayLike) -> None:
-        """Begin a stop; what an earlier one held and observed is forgotten."""
+    def begin(
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        motor_torque: Array | None = None,
+        acceleration: Array | None = None,
+    ) -> None:
+        """Begin a stop; what an earlier one held and observed is forgotten.
+
+        With an observer, and where the motors' last torque and the acceleration that it gave are
+        told, what acts besides is balanced from the first step on, not only once it is observed:
+        friction that is not known may be a torque step.
+        """
         n = len(self._limits)
         q = joint_array("q", q, self._limits.names)
         v = joint_array("v", v, self._limits.names)
@@ -169,6 +180,9 @@ class CoordinatedStop:
         self._place = q.copy()
         self._disturbance = np.zeros(n)
         self._expected = v.copy()
+        if self._share and motor_torque is not None and acceleration is not None:
+            besides = self._inverse_dynamics(q, v, acceleration) - motor_torque
+            self._disturbance = np.clip(besides, -self._tau_max, self._tau_max)
         self._M: Array | None = None
         self._resting = False  # the last step was one of a stop
         self._difference, self._share_left = np.zeros(n), 0.0
