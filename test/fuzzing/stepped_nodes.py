@@ -89,7 +89,7 @@ class _Sent(NamedTuple):
 
 
 class Wire:
-    """Takes messages from nodes to nodes; its methods are those that `Topic` wants.
+    """Takes messages from nodes to nodes; its methods are those that others want.
 
     Args:
         clock: of the nodes.
@@ -111,7 +111,7 @@ class Wire:
         self._queue: deque[_Sent] = deque()
         self._due: dict[Any, float] = {}
 
-    # For `Topic`
+    # For `Topic` and `PublisherWatch`
 
     def publisher(self, node: Node, message: type, name: str, qos: QoSProfile) -> Publisher:
         """Return a publisher whose messages wait here."""
@@ -129,6 +129,10 @@ class Wire:
     ) -> Subscription:
         """Return a subscription."""
         return node.create_subscription(message, name, receive, qos)
+
+    def within(self, topic: str) -> bool:
+        """Return that messages may come from elsewhere, too: rivals do."""
+        return False
 
     def leave(self, node: Node) -> None:
         """Forget a node that is destroyed."""
