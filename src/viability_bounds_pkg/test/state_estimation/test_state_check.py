@@ -12,6 +12,7 @@ from viability_bounds_pkg.state_estimation.state_check import (
     CONTRADICTION,
     GAP,
     JUMP,
+    ONCE_MORE,
     OUTSIDE,
     STUCK,
     TOO_FAST,
@@ -258,6 +259,24 @@ def test_a_gap_is_a_new_beginning():
     assert check.look(sine(1.0), 1.0 + 0.9 * GAP) == JUMP
     assert not check.look(sine(2.0), 1.0 + 2.0 * GAP)
     assert not check.look(sine(3.0), 0.5)  # a robot that begins again
+
+
+@pytest.mark.parametrize("other", ["values", "stamp", "nothing"])
+def test_a_state_that_comes_again_and_again_is_that_of_a_robot_that_waits(other):
+    check = make_check()
+    for k in range(300):
+        assert not check.look(sine(k * H), 5.0 + k * H)
+    there, stamp = sine(2.0), 5.0 + 300 * H
+    assert check.look(there, stamp) == JUMP
+    for k in range(ONCE_MORE - 1):
+        assert check.look(there, stamp) == JUMP, k
+    if other == "values":
+        assert check.look(sine(2.1), stamp) == JUMP
+    elif other == "stamp":
+        assert check.look(there, stamp + H)
+    else:
+        assert not check.look(there, stamp)
+        assert not check.look(sine(2.0 + H), stamp + H)
 
 
 def test_where_velocities_are_not_known_jumps_are_told():

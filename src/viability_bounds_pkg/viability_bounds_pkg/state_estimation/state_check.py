@@ -74,6 +74,10 @@ UNSURE = 1.0
 STUCK = 10.0
 """How long states must agree where the position of a joint that moved is still the same, s."""
 
+ONCE_MORE = 4
+"""How often a state that is not believed comes again, the same with its stamp, until it is: a robot
+that waits for its answer, as in lockstep, sends no other."""
+
 UNDECIDED = "undecided: an impact, or wrong"
 """Said of a state that the next one decides about."""
 
@@ -169,6 +173,7 @@ class StateCheck:
         self._patience = WINDOW  # how long they must
         self._trusted = 0.0  # how long there has been no doubt, s
         self._doubt = ""
+        self._again = 0  # how often the last state has come once more
         self._contradiction = False  # whether it is more than a jump
         self._freeze.reset()
 
@@ -185,7 +190,13 @@ class StateCheck:
         """
         h = stamp - self._time
         if (self._doubt or self._agreement.undecided) and -GAP <= h <= 0.0:
-            return self._doubt or UNDECIDED  # once more, or in another order
+            same = h == 0.0 and all(map(np.array_equal, self._now, state))
+            self._again = self._again + 1 if same else 0
+            if self._again < ONCE_MORE:
+                return self._doubt or UNDECIDED  # once more, or in another order
+            self.reset()
+            h = np.inf
+        self._again = 0
         self._both[0] = self._both[1]
         self._now.q[:], self._now.v[:] = state
         outside, too_fast = self._nonsense()
