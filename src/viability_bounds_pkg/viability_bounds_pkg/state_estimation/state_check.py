@@ -75,8 +75,8 @@ STUCK = 10.0
 """How long states must agree where the position of a joint that moved is still the same, s."""
 
 ONCE_MORE = 4
-"""How often a state that is not believed comes again, the same with its stamp, until it is: a robot
-that waits for its answer, as in lockstep, sends no other."""
+"""How often a state that is not believed comes again, with its stamp, until it is: a robot that
+waits for its answer, as in lockstep, sends no other."""
 
 UNDECIDED = "undecided: an impact, or wrong"
 """Said of a state that the next one decides about."""
