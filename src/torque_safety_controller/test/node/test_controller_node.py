@@ -190,6 +190,21 @@ def test_what_was_learned_until_the_motors_were_told_is_forgotten(ros):
     assert not observer.estimate.any()
 
 
+def test_where_torques_are_not_reported_any_more_commands_count_as_obeyed(ros):
+    motors = Motors(ros)
+    motors.answer(150)
+    motors.answer(5, -motors.tau)
+    assert not motors.chain.node._controller.obeyed
+    motors.stamp += 10
+
+    def send():
+        motors.chain.bound(motors.stamp)
+        motors.chain.send_state(motors.stamp, Q, np.zeros(ARM.n), [])
+
+    motors.chain.await_command(motors.stamp, send)
+    assert motors.chain.node._controller.obeyed
+
+
 def test_motors_whose_other_torques_have_frozen_are_sent_nothing_for_a_while(ros):
     motors = Motors(ros)
     motors.answer(150)

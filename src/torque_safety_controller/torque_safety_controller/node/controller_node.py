@@ -290,6 +290,7 @@ class ControllerNode(ArmNode):
         """
         watched, states = self._watched, self._states
         if not (self._compared and states.copy_effort(watched.effort)):
+            self._controller.obeyed = True  # as far as is known
             return True
         doubted, elapsed = watched.doubted, states.elapsed()
         self._controller.obeyed = watched.look(self._rate.slowed, elapsed or 0.0)
