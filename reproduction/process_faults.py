@@ -195,6 +195,8 @@ class Bench:
         now = self.now() if self.arm is None else 1e-9 * stamp_to_ns(message.header.stamp)
         tau = dict(zip(message.name, message.effort, strict=True))
         torques = np.array([tau[joint] for joint in self._joints])
+        if not torques.any():  # the first state of a robot that has started: nothing has acted
+            torques.fill(np.nan)
         self._trace.append(Sample(now, not self.tracking, self._stopped(), torques))
 
     def now(self) -> float:
@@ -388,13 +390,13 @@ def restarted(name: str) -> Callable[[Bench], Course]:
     return course
 
 
-def stood_still(*names: str) -> Callable[[Bench], Course]:
-    """Nodes stand still for a random time."""
+def stood_still(*names: str, least: float = STILL[0]) -> Callable[[Bench], Course]:
+    """Nodes stand still for a random time, at least for `least`, s."""
 
     def course(bench: Bench) -> Course:
         for name in names:
             bench.programs[name].stand_still()
-        yield from bench.wait(bench.rng.uniform(*STILL))
+        yield from bench.wait(bench.rng.uniform(least, STILL[1]))
         for name in names:
             bench.programs[name].go_on()
 
@@ -522,7 +524,8 @@ FAULTS = {
     ),
     "robot killed": Kind(killed(ROBOT), WITH_ROBOT),
     "robot restarted": Kind(restarted(ROBOT), WITH_ROBOT),
-    "robot stopped and continued": Kind(stood_still(ROBOT), WITH_ROBOT),
+    # The controller tells it within 100 ms.
+    "robot stopped and continued": Kind(stood_still(ROBOT, least=0.2), WITH_ROBOT),
     "bounds late": Kind(late(BOUNDS), late=BOUNDS),
     "controller late": Kind(late(CONTROLLER), late=CONTROLLER),
     "robot late": Kind(late(ROBOT), late=ROBOT),

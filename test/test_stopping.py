@@ -13,6 +13,7 @@ from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.nodes.bullet_node import BulletNode
 from sim_bridge.nodes.bullet_parameters import make_robot, make_stop
 from torque_safety_controller.node.controller_node import ControllerNode
+from torque_safety_controller.safety.rate_watch import RateWatch
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.ros.runtime import GOAL_QOS
 from viability_bounds_pkg.state import State
@@ -201,6 +202,33 @@ def test_no_limit_is_passed_in_hold_without_acceleration_limits(robot):
                 arm.step(loop.controller.hold(State(q, v)).tau, loop.config.substeps)
             assert not arm.monitor.violated
     assert fastest > 0.5, "the arm was hardly driven"
+
+
+def test_after_hold_an_arm_goes_on_without_a_jolt_wherever_it_stopped():
+    """Also within the margins of a limit, where friction lets go of a joint now and then."""
+    loop = DirectLoop("talos_left_arm", HASTE)
+    rng, rate = np.random.default_rng(1), RateWatch(loop.dt, 1)
+    postures, controller = goals(read_config("talos_left_arm"), rng), loop.controller
+    steps = []
+    with closing(loop.robot) as arm:
+        for _ in range(12):
+            controller.set_posture_goal(next(postures))
+            loop.run(rng.uniform(0.3, 1.2))
+            for _ in range(round(0.4 / loop.dt)):
+                q, v, _ = arm.state()
+                arm.step(controller.hold(State(q, v)).tau, loop.config.substeps)
+            rate.slow("it was in HOLD")
+            last = arm.believed_torque
+            for _ in range(round(0.1 / loop.dt)):
+                rate.note(loop.dt)
+                controller.share = rate.share
+                loop.step()
+                tau = arm.believed_torque
+                steps.append(np.abs((tau - last) / loop.config.torque_max).max())
+                last = tau
+            controller.share = 1.0
+        assert not arm.monitor.violated
+    assert max(steps) < 0.02
 
 
 def test_the_arm_is_slowed_after_a_row_of_states_that_is_too_long_and_goes_on(ros, capfd):

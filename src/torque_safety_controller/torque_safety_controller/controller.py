@@ -58,6 +58,16 @@ _STANDS = 1e-9
 _CREEPS = 1e-5
 """A joint that was stopped may still have such a speed, rad/s: less than 0.1 urad in 10 ms."""
 
+_PART = 0.25
+"""Of the room to a limit in which a joint within margins may come to rest: it brakes less and less
+as it comes nearer."""
+
+_RETURN_TIME = 0.02
+"""T: in which a joint comes to rest, and to its bounds, s."""
+
+_RETURN = 0.5
+"""By which it sets out for them, rad/s^2."""
+
 
 class ControlOutput(NamedTuple):
     """Result of one control step.
@@ -372,7 +382,9 @@ class Controller:
             if self.lost:
                 tasks = [DampingTask(self.gains.hold_kd)]
         elif self.share < 1.0:
-            bounds = return_gently(bounds, robot.v, self.share, robot.dt, self.rough)
+            bounds = return_gently(
+                bounds, robot.v, self._room(), self.share, robot.dt, self.rough
+            )
         if disturbance is not None:
             bounds = AccelerationRange(*self._observer.shift(*bounds))
         parts = [each.constraint(robot, bounds, disturbance) for each in self.constraints]
@@ -427,6 +439,13 @@ class Controller:
             relaxed = relaxed[: -len(rows.G)] if len(relaxed) > len(rows.G) else None
         return ControlOutput(tau, a, not self.lost, solution.relaxation, "", relaxed)
 
+    def _room(self) -> Array:
+        """Return the room to the position limit ahead, as far as limits are known."""
+        if self._own_bounds is None:
+            return self._no_torque
+        limits, q = self._own_bounds.limits, self.robot.q
+        return np.where(self.robot.v > 0.0, limits.q_max - q, q - limits.q_min)
+
     def _look_ahead(
         self, bounds: AccelerationRange, additional: Array | None, disturbance: Array | None
     ) -> LinearConstraints | None:
@@ -470,31 +489,52 @@ class Controller:
 
 
 def return_gently(
-    bounds: AccelerationRange, v: Array, share: float, period: float, rough: bool = False
+    bounds: AccelerationRange,
+    v: Array,
+    room: Array,
+    share: float,
+    period: float,
+    rough: bool = False,
 ) -> AccelerationRange:
     """Return bounds that push a joint which stands beyond them by a share only.
 
     An arm may have been stopped within the margins of a position limit; its bounds then demand to
-    be back after a period, by a jolt. Here such a joint just stands at the end of the period, and
-    returns with the share. One that moves towards its limit brakes as it must; where that may be
-    noise, it need not do more than stand, either: the noise would choose between a push and none.
+    be back after two periods, by a jolt. Here such a joint returns with the share: one that is d
+    beyond its bounds, which ask for 0.5 d / period^2 at most, is asked for
+
+        a = share / (1 - share) max(d / T^2, `_RETURN`) - v / T,    T = `_RETURN_TIME`.
+
+    One that moves towards its limit brakes as it must, or so that it comes to rest in T and in a
+    part of the room that is left to the limit itself, if that is less; where its speed may be
+    noise, it need not do more than stand: the noise would choose between a push and none.
 
     Args:
         bounds: of the joints, shape (n,) each, rad/s^2.
         v: their velocities, shape (n,), rad/s.
+        room: that is left to the position limit ahead, without margins, shape (n,), rad.
         share: of what the bounds demand, from 0 to 1.
         period: of control, s.
         rough: whether `v` has noise, for which the bounds have margins.
     """
     lower, upper = bounds
+    speed = np.abs(v)
+    way = _PART * room - period * speed
+    with np.errstate(divide="ignore", invalid="ignore"):
+        brake = np.where(way > 0.0, np.maximum(speed / _RETURN_TIME, 0.5 * v * v / way), np.inf)
     # Where the bounds leave no choice the joint is beyond what they keep.
     slow = np.inf if rough else np.where(lower == upper, _CREEPS, _STANDS)
+    brake = np.where(speed < slow, np.minimum(brake, speed / period), brake)
     stop = -v / period
-    up = np.where(v > -slow, stop, np.inf)
-    down = np.where(v < slow, stop, -np.inf)
+    grown = share / (1.0 - share) if share < 1.0 else np.inf
+    per_way = 2.0 * (period / _RETURN_TIME) ** 2
+    up = grown * np.maximum(per_way * lower, _RETURN) - v / _RETURN_TIME
+    down = grown * np.minimum(per_way * upper, -_RETURN) - v / _RETURN_TIME
+    up, down = np.minimum(share * lower, up), np.maximum(share * upper, down)
+    up = np.maximum(up, np.where(v < 0.0, brake, stop))
+    down = np.minimum(down, np.where(v > 0.0, -brake, stop))
     return AccelerationRange(
-        np.where(lower > 0.0, np.minimum(np.maximum(share * lower, up), lower), lower),
-        np.where(upper < 0.0, np.maximum(np.minimum(share * upper, down), upper), upper),
+        np.where(lower > 0.0, np.minimum(up, lower), lower),
+        np.where(upper < 0.0, np.maximum(down, upper), upper),
     )
 
 

@@ -47,7 +47,7 @@ from viability_bounds_pkg.state_estimation.state_check import RESTART
 
 Array = NDArray[np.float64]
 
-_RETRY_PERIOD = 0.2
+_RETRY_PERIOD = 0.05
 _CONTROL = {TorqueCommand: "torque", PositionCommand: "position"}
 
 

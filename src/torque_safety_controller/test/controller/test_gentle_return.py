@@ -18,6 +18,7 @@ LIMITS = JointLimits(
     np.array([-3.0, -15.0]),
     np.array([3.0, 15.0]),
 )
+NO_ROOM = np.zeros(2)
 
 
 @pytest.mark.parametrize("ahead", [1, 2])
@@ -38,7 +39,8 @@ def test_what_brakes_a_joint_within_its_range_stays(ahead):
     bounds = AccelerationRange(found.lower, found.upper)
     assert found.viable.mean() > 0.99
     assert ((bounds.lower > 0.0) | (bounds.upper < 0.0)).mean() > 0.1
-    eased = return_gently(bounds, v, 0.0, DT)
+    room = np.where(v > 0.0, LIMITS.q_max - q, q - LIMITS.q_min)
+    eased = return_gently(bounds, v, room, 0.0, DT)
     inside = found.viable
     np.testing.assert_allclose(eased.lower[inside], bounds.lower[inside], atol=1e-6)
     np.testing.assert_allclose(eased.upper[inside], bounds.upper[inside], atol=1e-6)
@@ -53,7 +55,8 @@ def test_a_joint_that_stands_beyond_its_margin_returns_in_half_a_second(side, be
     for k in range(125):
         found = solver.bounds(q, v)
         share = min(1.0, (k + 1) * DT / 0.5)
-        low, high = return_gently(AccelerationRange(found.lower, found.upper), v, share, DT)
+        bounds = AccelerationRange(found.lower, found.upper)
+        low, high = return_gently(bounds, v, NO_ROOM, share, DT)
         a = np.clip(0.0, low, high)
         farther = side * (v * DT + 0.5 * a * DT**2)
         assert (farther <= 1e-12).all()
@@ -74,7 +77,7 @@ def test_noise_of_a_velocity_does_not_choose_between_a_push_and_none(side):
         v = np.full(2, side * speed)
         found = solver.bounds(q, v)
         bounds = AccelerationRange(found.lower, found.upper)
-        low, high = return_gently(bounds, v, 0.0, DT, rough)
+        low, high = return_gently(bounds, v, NO_ROOM, 0.0, DT, rough)
         return -side * np.clip(0.0, low, high), -side * np.clip(0.0, *bounds)
 
     for speed in (1e-6, 1e-3):
@@ -87,3 +90,73 @@ def test_noise_of_a_velocity_does_not_choose_between_a_push_and_none(side):
     eased, demanded = least(0.1, True)
     np.testing.assert_allclose(eased, demanded)  # as it must
     assert (demanded >= 2.9).all()
+
+
+MARGIN = 2e-3  # rad
+
+
+@pytest.fixture(scope="module")
+def within_margins():
+    """Return bounds that keep `MARGIN`, and a disturbance, as of an arm with friction."""
+    inner = JointLimits(
+        LIMITS.names,
+        LIMITS.q_min + MARGIN,
+        LIMITS.q_max - MARGIN,
+        LIMITS.v_max,
+        LIMITS.a_min,
+        LIMITS.a_max,
+    )
+    return BoundsSolver(inner, 2e-3, np.array([0.5, 5.0]), period=1e-3)
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_within_the_margins_the_limit_is_never_passed_whatever_the_speed(within_margins, side):
+    """It brakes gently, and always enough: also where the share does not grow."""
+    rng = np.random.default_rng(5)
+    edge = LIMITS.q_max if side > 0.0 else LIMITS.q_min
+    for _ in range(60):
+        room = MARGIN * rng.uniform(0.01, 1.0, 2)
+        # As fast as lets it stop in a half of the room, at most.
+        v = side * np.sqrt(LIMITS.a_max * room) * 10.0 ** rng.uniform(-5.0, 0.0, 2)
+        q, least, share = edge - side * room, 0.5 * room, rng.uniform(0.0, 0.9)
+        for _ in range(400):
+            found = within_margins.bounds(q, v)
+            bounds = AccelerationRange(found.lower, found.upper)
+            ahead = np.where(v > 0.0, LIMITS.q_max - q, q - LIMITS.q_min)
+            low, high = return_gently(bounds, v, ahead, share, 1e-3)
+            a = np.clip(0.0, low, high)
+            q, v = q + v * 1e-3 + 0.5e-6 * a, v + 1e-3 * a
+            assert (side * (edge - q) > 0.0).all()
+        assert (side * (edge - q) >= 0.2 * least).all()
+        assert (side * v < 1e-3).all()  # it has stopped, or comes back
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_push_by_friction_within_the_margins_is_no_jolt(within_margins, side):
+    """The bounds ask for all that there is, and did so in every other period."""
+    q = (LIMITS.q_max if side > 0.0 else LIMITS.q_min) - 0.9 * side * MARGIN
+    room = np.full(2, 0.9 * MARGIN)
+    for speed in (1e-9, 1e-6, 1e-4, 1e-3):
+        v = np.full(2, side * speed)
+        found = within_margins.bounds(q, v)
+        bounds = AccelerationRange(found.lower, found.upper)
+        low, high = return_gently(bounds, v, room, 0.0, 1e-3)
+        assert (-side * np.clip(0.0, *bounds) >= 2.9).all()
+        least = -side * np.clip(0.0, low, high)
+        assert ((least > 0.0) & (least <= 60.0 * speed)).all()
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_it_comes_back_to_its_bounds_slower_and_slower(within_margins, side):
+    """Without them it was pushed with all of the margin until it was back, and then let go."""
+    edge = (LIMITS.q_max if side > 0.0 else LIMITS.q_min) - side * MARGIN
+    q, v, before = edge + 0.2 * side * MARGIN, np.zeros(2), np.zeros(2)
+    room = np.full(2, 0.8 * MARGIN)
+    for k in range(500):
+        found = within_margins.bounds(q, v)
+        bounds = AccelerationRange(found.lower, found.upper)
+        low, high = return_gently(bounds, v, room, min(1.0, (k + 1) * 2e-3), 1e-3)
+        a = np.clip(-20.0 * v, low, high)
+        assert np.abs(a - before).max() < 0.05 * LIMITS.a_max.max()
+        q, v, before = q + v * 1e-3 + 0.5e-6 * a, v + 1e-3 * a, a
+    assert (side * (q - edge) <= 1e-5).all()

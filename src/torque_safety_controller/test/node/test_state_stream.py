@@ -38,7 +38,8 @@ def arrives(stream, stamp, now, q=Q):
         (100, Q, 10.6, Arrival.BACK),
         (100, MOVED, 10.6, Arrival.ANEW),  # another robot at the same time
         (100, MOVED, 10.01, Arrival.REFUSED),
-        (102, Q, 10.6, Arrival.ANEW),
+        (102, Q, 10.6, Arrival.NEXT),  # its time stood still, as of a halted simulation
+        (700, Q, 10.6, Arrival.ANEW),
         (50, Q, 10.01, Arrival.REFUSED),
         (50, Q, 10.6, Arrival.ANEW),
         (1200, Q, 10.01, Arrival.NEXT),  # the time alone has leapt

@@ -58,6 +58,10 @@ from viability_bounds_pkg.ros.topics import (
 )
 from viability_bounds_pkg.state import State
 
+QUIET = 1.5
+"""Time without a joint state after which the robot is silent, in times of `bounds_timeout`."""
+
+_SILENT = "no joint state"
 _STALE = "acceleration limits are stale"
 _CONTESTED = "several nodes publish goals"
 _IGNORED = "the motors do not give the torques that were sent"
@@ -109,6 +113,7 @@ class ControllerNode(ArmNode):
         )
         self._driving = Driving(self, self._goals, self._controller, config, base, self._states)
         self._modes = ModeKeeper()
+        self._before = self._modes.mode, self._modes.reason  # the robot fell silent
         self._went_wrong = ""  # why the arm was braked, until it goes on
         self._rate = RateWatch(config.dt, covered_row(self))
         self._compared = config.effort_tolerance > 0.0
@@ -205,6 +210,8 @@ class ControllerNode(ArmNode):
         elif states.answered_stamp == states.stamp:
             if self._watched.stuck:  # a robot that waits for the answer, as in lockstep
                 self._watched.retry()
+            elif self._modes.reason == _SILENT:  # it was late only
+                self._enter(*self._before)
             self._commands.again(stamp)
         return False
 
@@ -359,10 +366,11 @@ class ControllerNode(ArmNode):
 
     def _watch(self) -> None:
         now, config, states = time.monotonic(), self._config, self._states
-        if states.silent(now):
+        quiet = now - states.message_at > QUIET * config.bounds_timeout
+        if quiet or states.silent(now):
             if self._modes.mode is not Mode.STOPPED:
-                quiet = now - states.message_at > config.state_timeout
-                silent = self.publisher_watch.several or "no joint state"
+                self._before = self._modes.mode, self._modes.reason
+                silent = self.publisher_watch.several or _SILENT
                 self._enter(Mode.STOPPED, silent if quiet else states.why_refused)
             return
         if states.waits(now) > config.bounds_timeout:

@@ -98,13 +98,16 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
         choices=CONTROLS,
     )
     bounds_timeout: float = number(
-        "how long a state waits for its acceleration limits, or a usable state for another, "
-        "before HOLD, s",
+        "how long a state waits for its acceleration limits before HOLD, s; without a joint state "
+        "for 1.5 times as long: STOPPED",
         above(0.0, 3600.0),
         default=0.05,
     )
     state_timeout: float = number(
-        "how long without a usable joint state before STOPPED, s", above(0.0, 3600.0), default=0.5
+        "how long without a usable joint state until the arm may be elsewhere, and all begins anew "
+        "with the next one, s",
+        above(0.0, 3600.0),
+        default=0.5,
     )
     goal_timeout: float = number(
         "age of a goal before HOLD, s; 0: never", Range(0.0, 1e5), default=0.0

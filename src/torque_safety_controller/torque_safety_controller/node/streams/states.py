@@ -88,6 +88,8 @@ class StateStream(JointStateReader):
         self.missed = silent and 0 <= self.answered_stamp <= last < self.stamp
         if verdict is not Verdict.NEW:
             return Arrival.BACK if silent else Arrival.REPEAT
+        if last >= 0:  # where its time stood still, as of a halted simulation, the arm did, too
+            silent = silent and self.stamp - last > 1e9 * self._timeout
         # Where the time alone has leapt, the arm goes on without a jolt.
         leapt = self.stamp - last >= 1e9 * RESTART
         self.unseen = leapt or dropped >= UNSEEN
