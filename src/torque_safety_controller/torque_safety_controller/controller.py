@@ -382,9 +382,7 @@ class Controller:
             if self.lost:
                 tasks = [DampingTask(self.gains.hold_kd)]
         elif self.share < 1.0:
-            bounds = return_gently(
-                bounds, robot.v, self._room(), self.share, robot.dt, self.rough
-            )
+            bounds = return_gently(bounds, robot.v, self._room(), self.share, robot.dt, self.rough)
         if disturbance is not None:
             bounds = AccelerationRange(*self._observer.shift(*bounds))
         parts = [each.constraint(robot, bounds, disturbance) for each in self.constraints]

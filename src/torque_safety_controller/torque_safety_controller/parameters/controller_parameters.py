@@ -104,7 +104,7 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
         default=0.05,
     )
     state_timeout: float = number(
-        "how long without a usable joint state until the arm may be elsewhere, and all begins anew "
+        "how long without a usable joint state until the arm may be elsewhere and all begins anew "
         "with the next one, s",
         above(0.0, 3600.0),
         default=0.5,
