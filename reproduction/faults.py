@@ -44,6 +44,7 @@ SENDERS = {
     "joint_commands": ControllerNode,
 }
 DURATION = 0.6  # s of a fault
+TWO_JOINTS = "[second, fourth]"  # of the robot's own names
 EPISODE = 4.0  # s from one to the next
 RECOVERY = 1.0  # s after a fault before there is another goal
 
@@ -82,6 +83,7 @@ FAULTS = {
     "limits not finite": Kind("acceleration_limits", "corrupt: {how: nan}"),
     "commands not finite": Kind("joint_commands", "corrupt: {how: nan}"),
     "states of other joints": Kind("joint_states", "corrupt: {how: names}"),
+    "joints swapped": Kind("joint_states", f"swap: {{joints: {TWO_JOINTS}}}"),
     "degrees for radians": Kind("joint_states", "scale: {factor: 57.3}"),
     "states frozen": Kind("joint_states", "freeze: ", believed=6),
     "positions frozen": Kind("joint_states", "freeze: {field: position}", believed=2),
@@ -157,6 +159,8 @@ class Bench:
                 strict=True,
             )
         )
+        joints = self._values["joints"]
+        entries = entries.replace(TWO_JOINTS, f"[{joints[1]}, {joints[3]}]")
         path = folder / "faults.yaml"
         path.write_text(f"topics: [{', '.join(SENDERS)}]\nfaults:\n{entries}\n")
         faults: Any = self._ros.start(FaultNode, {"faults": str(path)})

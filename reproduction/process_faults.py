@@ -27,6 +27,7 @@ from chain import ROOT, load_node_values
 from figure import Figure, table
 from moments import AGAIN, HEADS, RETURN, ROBOTS, STIFF, Corners, Sample, Seen
 from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -237,6 +238,10 @@ class Bench:
         """End all programs."""
         for program in self.programs.values():
             program.end()
+
+    def ask(self, publisher: Any) -> None:
+        """Publish a goal that is not the user's."""
+        publisher.publish(joint_state(self._joints, 0, self._corners.draw()))
 
     def spin(self) -> None:
         """Run callbacks for a moment, and do what the user does."""
@@ -489,6 +494,21 @@ def other_description(bench: Bench) -> Course:
     bench.ros.probe.destroy_publisher(publisher)
 
 
+def another_user(bench: Bench) -> Course:
+    """Another node publishes goals, too."""
+    node = bench.ros.add(Node("another_user", context=bench.ros.context))
+    publisher = node.create_publisher(JointState, "target_posture", GOAL_QOS)
+    while not publisher.get_subscription_count():
+        yield
+    yield from bench.wait(0.2)  # until all know of it
+    bench.mark()
+    end = time.monotonic() + WILD
+    while time.monotonic() < end:
+        bench.ask(publisher)
+        yield from bench.wait(0.02)
+    bench.ros.stop(node)
+
+
 def nothing(bench: Bench) -> Course:
     """What the others are compared with."""
     yield from bench.wait(0.5)
@@ -533,6 +553,7 @@ FAULTS = {
     "wild integral action": Kind(wild_integral, brakes=False),
     "the clock jumps": Kind(clock_jumps, values={"use_sim_time": True}, brakes=False),
     "no room for logs": Kind(no_room),
+    "another user": Kind(another_user),
     "another robot description": Kind(
         other_description, values={"robot_description": "topic"}, brakes=False
     ),
