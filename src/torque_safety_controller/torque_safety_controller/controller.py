@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import replace
@@ -42,7 +42,7 @@ from torque_safety_controller.tasks.goals import Goals
 from torque_safety_controller.tasks.task import Task
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.state_estimation.freeze_check import FRICTION, STICTION, Expected
-from viability_bounds_pkg.viability import BoundsSolver
+from viability_bounds_pkg.viability import AccelerationBounds
 from viability_bounds_pkg.whole_arm.safety_filter import UNHURRIED, USUAL, SafetyFilter
 
 __all__ = ["ControlOutput", "Controller", "Gains"]
@@ -61,6 +61,12 @@ _CREEPS = 1e-5
 _PART = 0.25
 """Of the room to a limit in which a joint within margins may come to rest: it brakes less and less
 as it comes nearer."""
+
+_RESERVE = 1e-3
+"""Of the room to a limit that is left for what nobody foresees, rad."""
+
+_LATE = 3
+"""Periods that a command may come late."""
 
 _RETURN_TIME = 0.02
 """T: in which a joint comes to rest, and to its bounds, s."""
@@ -107,6 +113,8 @@ class Controller:
         detour: leads the arm where it would stand short of its goal; None for nothing.
         own_bounds: within which it brakes while it is given no acceleration bounds; None brakes
             regardless of positions and speeds.
+        position_limits: without margins, lower and upper, shape (n,), rad; while it is slowed it
+            brakes gently within the margins, which None forbids.
         squeeze: of an object between two hands; while they press, `interaction` does nothing.
 
     Attributes:
@@ -131,7 +139,8 @@ class Controller:
         interaction: Interaction | None = None,
         safety_filter: SafetyFilter | None = None,
         detour: Detour | None = None,
-        own_bounds: BoundsSolver | None = None,
+        own_bounds: Callable[[Array, Array], AccelerationBounds] | None = None,
+        position_limits: tuple[Array, Array] | None = None,
         squeeze: Squeeze | None = None,
     ) -> None:
         n = robot.n
@@ -149,6 +158,7 @@ class Controller:
         self.rough = False
         self.obeyed = True
         self._own_bounds = own_bounds
+        self._position_limits = position_limits
         self._limiter = TorqueLimiter(tau_max, torque_rate_max, robot.dt)
         self._qp = InverseDynamicsQP(n, solver=solver)
         self._observer = DisturbanceObserver(n, gains.disturbance_time)
@@ -315,7 +325,7 @@ class Controller:
         Joints brake with `hold_kd`, within bounds of its own, or else as hard as motors allow.
         """
         if self._own_bounds is not None:
-            lower, upper, _ = self._own_bounds.bounds(state.q, state.v)
+            lower, upper, _ = self._own_bounds(state.q, state.v)
             return self.brake(state, AccelerationRange(lower, upper), elapsed)
         return self._hold(self._begin(state, elapsed), "")
 
@@ -439,10 +449,10 @@ class Controller:
 
     def _room(self) -> Array:
         """Return the room to the position limit ahead, as far as limits are known."""
-        if self._own_bounds is None:
+        if self._position_limits is None:
             return self._no_torque
-        limits, q = self._own_bounds.limits, self.robot.q
-        return np.where(self.robot.v > 0.0, limits.q_max - q, q - limits.q_min)
+        (low, high), q = self._position_limits, self.robot.q
+        return np.where(self.robot.v > 0.0, high - q, q - low)
 
     def _look_ahead(
         self, bounds: AccelerationRange, additional: Array | None, disturbance: Array | None
@@ -516,7 +526,7 @@ def return_gently(
     """
     lower, upper = bounds
     speed = np.abs(v)
-    way = _PART * room - period * speed
+    way = _PART * (room - _RESERVE) - _LATE * period * speed
     with np.errstate(divide="ignore", invalid="ignore"):
         brake = np.where(way > 0.0, np.maximum(speed / _RETURN_TIME, 0.5 * v * v / way), np.inf)
     # Where the bounds leave no choice the joint is beyond what they keep.

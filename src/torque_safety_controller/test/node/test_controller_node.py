@@ -306,6 +306,18 @@ def test_stamps_that_stay_old_are_taken_for_a_restart(ros):
     ros.wait_until(lambda: re.search("old stamp: [1-9]", chain.reported("states_refused")))
 
 
+def test_what_was_learned_of_disturbances_is_forgotten_after_a_row_that_is_too_long(ros):
+    """After a reset a wrist that had been driven wild was driven at 10 rad/s: found by fuzzing."""
+    chain = NodeChain(ros, disturbance_time=0.02)
+    stamp = give_goal(chain)
+    learned = chain.node._controller._observer.estimate
+    learned[:] = 5.0
+    chain.answer(stamp + 5)
+    assert learned.any()
+    chain.answer(stamp + 105)
+    assert not learned.any()
+
+
 def test_silence_stops_it_and_a_new_state_wakes_it(ros):
     chain = NodeChain(ros, state_timeout=0.2, bounds_timeout=0.1)
     stamp = give_goal(chain)

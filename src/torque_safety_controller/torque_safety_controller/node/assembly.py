@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -21,9 +22,13 @@ from torque_safety_controller.parameters.interaction_parameters import ContactPo
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks.detour import Detour
 from torque_safety_controller.tasks.detour_search import DetourSearch
-from viability_bounds_pkg.exceptions import SettingError, did_you_mean
+from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError, did_you_mean
 from viability_bounds_pkg.joint_limits import JointLimits
-from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
+from viability_bounds_pkg.node.bounds_parameters import (
+    Bounds,
+    BoundsConfiguration,
+    make_bounds,
+)
 from viability_bounds_pkg.robot_configuration import load_model
 from viability_bounds_pkg.robot_description import (
     RobotDescriptionError,
@@ -47,13 +52,16 @@ _NEAR = 0.028  # m; beyond margin and reserve, pairs that never come nearer need
 
 
 def make_controller(
-    config: ControllerConfiguration, node: Node | None = None
+    config: ControllerConfiguration,
+    node: Node | None = None,
+    declared: BoundsConfiguration | None = None,
 ) -> tuple[Controller, pin.SE3]:
     """Return a controller, warmed up, and the placement of the base frame.
 
     Args:
         config: checked parameters.
         node: listens for the URDF if it comes from a topic.
+        declared: of the robot, for the bounds node.
 
     Raises:
         SettingError: parameters that do not fit the URDF.
@@ -72,7 +80,8 @@ def make_controller(
         make_interaction(config, robot, urdf),
         safety_filter,
         make_detour(config, robot, safety_filter),
-        make_own_bounds(config),
+        make_own_bounds(config, declared),
+        (config.position_min, config.position_max),
     )
     controller.rough = config.use_estimated_states
     controller.warm_up()
@@ -127,14 +136,22 @@ def make_safety_filter(config: ControllerConfiguration, model: pin.Model) -> Saf
     )
 
 
-def make_own_bounds(config: ControllerConfiguration) -> BoundsSolver | None:
+def make_own_bounds(
+    config: ControllerConfiguration, declared: BoundsConfiguration | None
+) -> Bounds | None:
     """Return the bounds in HOLD while those of ``acceleration_limits`` are stale.
 
-    They know nothing of declared errors and delays, and keep a share of the acceleration instead.
+    They are those of the bounds node, as far as its parameters are known and its method keeps
+    limits. Else they know nothing of declared errors and delays, and keep a share of the
+    acceleration instead.
 
     Args:
         config: checked parameters; None is returned where they lack limits.
+        declared: parameters of the bounds node.
     """
+    if declared is not None and declared.method == "exact":
+        with suppress(ArmSafetyError):  # the node that they are for says so
+            return make_bounds(declared)
     low, high = config.collision.acceleration_min, config.collision.acceleration_max
     n = len(config.joints)
     if not (len(low) == len(high) == n and np.isfinite(config.velocity_max).all()):
@@ -143,7 +160,7 @@ def make_own_bounds(config: ControllerConfiguration) -> BoundsSolver | None:
         config.joints, config.position_min, config.position_max, config.velocity_max, low, high
     )
     margin = MARGIN * np.minimum(-low, high)
-    return BoundsSolver(limits, HORIZON * config.dt, margin, period=config.dt)
+    return BoundsSolver(limits, HORIZON * config.dt, margin, period=config.dt).bounds
 
 
 def make_detour(

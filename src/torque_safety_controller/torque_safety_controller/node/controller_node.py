@@ -85,7 +85,7 @@ class ControllerNode(ArmNode):
         with self.starting(JOINT_COMMANDS):
             self._node_parameters = NodeParameters(self, ControllerConfiguration, self._configure)
             config = self._node_parameters.configuration
-            self._controller, base = make_controller(config, self)
+            self._controller, base = make_controller(config, self, declared_robot(self))
         self._config = config
         self._handover = Handover(
             config.start_control,
@@ -317,8 +317,11 @@ class ControllerNode(ArmNode):
 
     def _note_rate(self) -> None:
         """Slow the arm if too many states were not answered."""
+        before = self._rate.too_long
         if news := self._rate.note(self._states.elapsed()):
             self._later(self._warn, news)
+        if self._rate.too_long > before:  # the robot may have stopped itself, and much has changed
+            self._controller.forget_disturbance()
         self._controller.share = self._rate.share
 
     def _answer(self, step: ControlOutput, stamp: Any) -> None:
