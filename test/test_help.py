@@ -19,7 +19,7 @@ EXECUTABLES = {
 }
 
 
-PARTS = {"domain.sh", "environment.sh"}
+PARTS = {"domain.sh", "environment.sh", "options.sh"}
 """What is only sourced by another script."""
 
 
