@@ -17,6 +17,7 @@ from talos_joints import (
     H,
     N,
     Q,
+    random_step,
     reset_raw,
     single_joint,
     talos,
@@ -36,10 +37,7 @@ def test_rotors_are_on_the_diagonal_of_the_inertia_matrix(talos_model):
     data = talos_model.createData()
     with talos(rotor_inertia=ROTORS) as robot:
         for _ in range(20):
-            q, v, tau = rng.uniform(-1.0, 1.0, (3, N)) * np.array([[1.5], [3.0], [50.0]])
-            reset_raw(robot, q, v)
-            robot.step(tau)
-            a = (robot.state().v - v) / H
+            q, v, tau, a = random_step(robot, rng, (1.5, 3.0, 50.0))
             expected = pin.aba(talos_model, data, q, v, tau)
             np.testing.assert_allclose(a, expected, atol=1e-11 * np.abs(expected).max())
 
@@ -82,10 +80,8 @@ def test_heavier_links_move_as_if_the_urdf_said_so():
     data = heavy.createData()
     with talos(scales=scales) as robot:
         for _ in range(5):
-            q, v, tau = rng.uniform(-1.0, 1.0, (3, N)) * np.array([[1.0], [2.0], [30.0]])
-            reset_raw(robot, q, v)
-            robot.step(tau)
-            a, expected = (robot.state().v - v) / H, pin.aba(heavy, data, q, v, tau)
+            q, v, tau, a = random_step(robot, rng, (1.0, 2.0, 30.0))
+            expected = pin.aba(heavy, data, q, v, tau)
             np.testing.assert_allclose(a, expected, atol=1e-10 * np.abs(expected).max())
             nominal = pin.aba(model, model.createData(), q, v, tau)
             assert np.abs(nominal - expected).max() > 1e-2

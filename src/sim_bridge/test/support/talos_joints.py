@@ -75,3 +75,14 @@ def talos_model():
 def reset_raw(robot, q, v):
     """Put PyBullet's own positions, half a step ahead of the state, at q."""
     robot.reset(q - 0.5 * robot.physics_dt * v, v)
+
+
+def random_step(robot, rng, largest):
+    """Play a physics step from a random state under a random torque.
+
+    Returns q, v and tau, up to `largest` in size, and the acceleration that came of them.
+    """
+    q, v, tau = rng.uniform(-1.0, 1.0, (3, N)) * np.reshape(largest, (3, 1))
+    reset_raw(robot, q, v)
+    robot.step(tau)
+    return q, v, tau, (robot.state().v - v) / H
