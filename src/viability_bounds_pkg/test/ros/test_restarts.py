@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from small_node import SMALL_NODE
 from std_msgs.msg import String
 
 from viability_bounds_pkg.ros import runtime
@@ -20,21 +21,12 @@ from viability_bounds_pkg.testing.executables import as_child, environment
 STARTS = 3
 UNUSED = 30  # a place among those that nodes of one host are looked for at
 
-ANSWERS = """
-import os, sys
-from dataclasses import dataclass
+ANSWERS = f"""{SMALL_NODE}
 from std_msgs.msg import String
-from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS
 
-@dataclass
-class Nothing:
-    pass
-
-class Answers(ArmNode):
+class Answers(SmallNode):
     NAME = "answers"
-    PARAMETERS = Nothing
 
     def __init__(self):
         super().__init__()
