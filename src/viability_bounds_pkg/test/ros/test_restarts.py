@@ -95,9 +95,11 @@ def test_programs_announce_themselves_oftener_than_by_default(ros):
     assert min(np.diff(times)[-2:]) < 1.5
 
 
-def test_settings_of_users_are_kept(tmp_path):
+def test_settings_of_users_are_kept(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
     def chosen(**given):
-        settle_dds(given, tmp_path)
+        settle_dds(given)
         return given
 
     name = "FASTRTPS_DEFAULT_PROFILES_FILE"
