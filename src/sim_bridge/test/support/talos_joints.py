@@ -77,12 +77,14 @@ def reset_raw(robot, q, v):
     robot.reset(q - 0.5 * robot.physics_dt * v, v)
 
 
-def random_step(robot, rng, largest):
-    """Play a physics step from a random state under a random torque.
+def random_steps(robot, count, seed, largest):
+    """Play physics steps from random states under random torques.
 
-    Returns q, v and tau, up to `largest` in size, and the acceleration that came of them.
+    Yields q, v and tau, up to `largest` in size, and the acceleration that came of them.
     """
-    q, v, tau = rng.uniform(-1.0, 1.0, (3, N)) * np.reshape(largest, (3, 1))
-    reset_raw(robot, q, v)
-    robot.step(tau)
-    return q, v, tau, (robot.state().v - v) / H
+    rng = np.random.default_rng(seed)
+    for _ in range(count):
+        q, v, tau = rng.uniform(-1.0, 1.0, (3, N)) * np.reshape(largest, (3, 1))
+        reset_raw(robot, q, v)
+        robot.step(tau)
+        yield q, v, tau, (robot.state().v - v) / H
