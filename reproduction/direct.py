@@ -26,6 +26,7 @@ from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, mak
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.robot_configuration import load_model
 from viability_bounds_pkg.state import State
+from viability_bounds_pkg.stopping.coordinated_stop import CoordinatedStop
 from viability_bounds_pkg.user_input.yaml_file import read_yaml
 
 Configuration = TypeVar("Configuration")
@@ -162,6 +163,21 @@ class DirectLoop:
         )
         self._record(q, v, self.robot.state().motor_torque)
 
+    def act(self, law: CoordinatedStop, tau: np.ndarray, missed_in_row: int) -> None:
+        """Play the robot's part of a period as its node does where commands may be missing.
+
+        Args:
+            law: by which the robot stops itself.
+            tau: the last command, shape (n,), N m.
+            missed_in_row: for how many periods none has come.
+        """
+        if missed_in_row > self.config.command_timeout:
+            self.robot.stop(law, self.config.substeps)
+        elif missed_in_row or self.robot.returning:
+            self.robot.follow(law, tau, self.config.substeps)
+        else:
+            self.robot.step(tau, self.config.substeps)
+
     def bumpless_transfer(self, q_des: np.ndarray) -> None:
         """Prepare torque control in a step that is still the drives'."""
         q, v, tau = self.robot.state()
@@ -183,6 +199,12 @@ class DirectLoop:
             )
         )
         self.t += self.dt
+
+
+def posture_at_limits(rng: np.random.Generator, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return a random posture with about 6 of 10 joints at a limit, shape (n,), rad."""
+    goal, side = rng.uniform(low, high), rng.random(low.size)
+    return np.where(side < 0.3, low, np.where(side < 0.6, high, goal))
 
 
 def column(samples: tuple[Sample, ...], name: str) -> np.ndarray:

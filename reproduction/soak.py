@@ -39,6 +39,7 @@ from std_msgs.msg import String
 
 from sim_bridge.nodes.fault_node import BEFORE
 from torque_safety_controller.safety.modes import Mode
+from viability_bounds_pkg.ros.messages import pose_message
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS, LATCHED_QOS, stamp_to_ns
 from viability_bounds_pkg.testing.node_program import NodeProgram
 from viability_bounds_pkg.testing.ros_harness import RosHarness, joint_state, private_domain
@@ -298,13 +299,7 @@ class Soak:
             values = own if hand else STIFF
             messages = [Parameter(k, value=v).to_parameter_msg() for k, v in values.items()]
             self._setter.call_async(SetParameters.Request(parameters=messages))
-        message = PoseStamped()
-        message.header.frame_id = self._arm.config.base_frame
-        pose = self._arm.pose(q)
-        p, o = message.pose.position, message.pose.orientation
-        p.x, p.y, p.z = pose.translation.tolist()
-        o.x, o.y, o.z, o.w = pin.Quaternion(pose.rotation).coeffs().tolist()
-        self._pose.publish(message)
+        self._pose.publish(pose_message(self._arm.pose(q), self._arm.config.base_frame))
         if not hand:
             self._posture.publish(joint_state(self._arm.config.joints, 0, q))
 

@@ -36,17 +36,9 @@ usage: bash scripts/demo.sh [robot] [scenario] [--bounds METHOD] [--rate HZ] [--
 Exits with 0 when no limit was violated, 1 when one was, 2 when it could not run.
 USAGE
 }
-
-refuse() {
-    echo "error: $*" >&2
-    exit 2
-}
-value() {
-    [ $# -gt 1 ] || refuse "$1 needs a value"
-    echo "$2"
-}
-
 root="$(cd "$(dirname "$0")/.." && pwd)"
+# shellcheck source=scripts/options.sh
+source "$root/scripts/options.sh"
 robot='' scenario='' bounds=exact rate=default params=() imperfect='' clock=lockstep out='' processes='' view='' record=''
 while [ $# -gt 0 ]; do
     case "$1" in

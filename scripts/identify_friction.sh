@@ -13,22 +13,14 @@ usage: bash scripts/identify_friction.sh [robot] [-o FILE] [--recording FILE]
                 simulation and kept next to the parameter file
 USAGE
 }
-
-refuse() {
-    echo "error: $*" >&2
-    exit 2
-}
-value() {
-    [ $# -gt 1 ] || refuse "$1 needs a value"
-    realpath -m -- "$2"
-}
-
 root="$(cd "$(dirname "$0")/.." && pwd)"
+# shellcheck source=scripts/options.sh
+source "$root/scripts/options.sh"
 robot=talos_left_arm output='' recording=''
 while [ $# -gt 0 ]; do
     case "$1" in
-    -o | --output) output="$(value "$@")"; shift ;;
-    --recording) recording="$(value "$@")"; shift ;;
+    -o | --output) output="$(value "$@")"; output="$(realpath -m -- "$output")"; shift ;;
+    --recording) recording="$(value "$@")"; recording="$(realpath -m -- "$recording")"; shift ;;
     -h | --help) usage; exit 0 ;;
     -*) refuse "unknown option '$1'; --help lists them" ;;
     *) robot="$1" ;;

@@ -28,17 +28,15 @@ not run.
 USAGE
 }
 root="$(cd "$(dirname "$0")/.." && pwd)"
+# shellcheck source=scripts/options.sh
+source "$root/scripts/options.sh"
 arguments=() ideal='' out="$root/config" table=''
 while [ $# -gt 0 ]; do
     case "$1" in
     -h | --help) usage; exit 0 ;;
     --ideal) ideal=yes ;;
     --table) table=yes ;;
-    --out)
-        [ $# -gt 1 ] || { echo "error: --out needs a value" >&2; exit 2; }
-        out="$(realpath -m "$2")"
-        shift
-        ;;
+    --out) out="$(value "$@")"; out="$(realpath -m "$out")"; shift ;;
     *) arguments+=("$1") ;;
     esac
     shift

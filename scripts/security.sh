@@ -11,16 +11,14 @@ ROS_DOMAIN_ID, by `ros2 security` of the ROS that is sourced, and says how to us
 exists, it is brought up to date. See docs/security.md.
 USAGE
 }
-refuse() {
-    echo "error: $*" >&2
-    exit 2
-}
+root="$(cd "$(dirname "$0")/.." && pwd)"
+# shellcheck source=scripts/options.sh
+source "$root/scripts/options.sh"
 case "${1:-}" in
 -h | --help) usage; exit 0 ;;
 '' | -*) refuse "name the folder to make; see --help" ;;
 esac
 [ $# -eq 1 ] || refuse "one folder, not $#; see --help"
-root="$(cd "$(dirname "$0")/.." && pwd)"
 ros2 security --help >/dev/null 2>&1 ||
     refuse "there is no 'ros2 security': source ROS 2 with ros-jazzy-sros2, see docs/security.md"
 umask 077 # the keys are for this user only

@@ -3,25 +3,23 @@
 
 import os
 import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
+
+from viability_bounds_pkg.testing.executables import run_to_end
 
 pytestmark = pytest.mark.packaging
 ROOT = Path(__file__).resolve().parent.parent
 
 
 def colcon(workspace, *arguments):
-    ended = subprocess.run(
-        ["colcon", "--log-base", workspace / "log", *arguments],
+    ended = run_to_end(
+        *("colcon", "--log-base", workspace / "log", *arguments),
         cwd=workspace,
         # Options of these tests are not for those of the copy.
         env={k: v for k, v in os.environ.items() if not k.startswith("PYTEST_")},
-        capture_output=True,
-        text=True,
         timeout=300,
-        check=False,
     )
     assert ended.returncode == 0, ended.stdout + ended.stderr
     return ended.stdout

@@ -2,12 +2,13 @@
 """Set-up compiles everything, so that neither starts of nodes nor control steps have to."""
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 import yaml
+
+from viability_bounds_pkg.testing.executables import run_to_end
 
 pytestmark = pytest.mark.long
 
@@ -55,13 +56,11 @@ PLAYED = [
 
 def run(*arguments):
     paths = [*(ROOT / "src" / name for name in PACKAGES), ROOT / "reproduction"]
-    result = subprocess.run(
-        [sys.executable, *arguments],
+    result = run_to_end(
+        *(sys.executable, *arguments),
         cwd=ROOT,
         env=os.environ | {"PYTHONPATH": os.pathsep.join(map(str, [*paths, *sys.path]))},
-        capture_output=True,
-        text=True,
-        check=False,
+        timeout=None,
     )
     assert result.returncode == 0, result.stderr
     return result.stdout.strip()
@@ -88,14 +87,12 @@ def test_a_file_that_is_wrong_is_told_and_the_others_are_compiled(tmp_path):
     (tmp_path / "panda.yaml").write_text("nonsense: 3")  # the file of this name is played then
     (tmp_path / "none_such.yaml").write_text("nonsense: 3")
     code = "import sys, pathlib, compile as c; c.CONFIG = pathlib.Path(sys.argv[1]); c.main([])"
-    done = subprocess.run(
-        [sys.executable, "-c", code, tmp_path],
+    done = run_to_end(
+        *(sys.executable, "-c", code, tmp_path),
         cwd=ROOT / "scripts",
         env=os.environ
         | {"PYTHONPATH": os.pathsep.join(map(str, [ROOT / "reproduction", *sys.path]))},
-        capture_output=True,
-        text=True,
-        check=False,
+        timeout=None,
     )
     assert done.returncode == 0
     assert "setup: nothing is compiled for none_such.yaml: " in done.stderr

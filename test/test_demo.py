@@ -17,7 +17,7 @@ from direct import DirectLoop, column, hand_errors
 from sim_bridge.scenario.events import ParameterChange, PoseGoal, Push
 from sim_bridge.scenario.scenario import load_scenario
 from viability_bounds_pkg.node.bounds_parameters import METHODS
-from viability_bounds_pkg.testing.executables import as_child
+from viability_bounds_pkg.testing.executables import as_child, run_to_end
 
 ROOT = Path(__file__).resolve().parent.parent
 DEMO = ROOT / "scripts" / "demo.sh"
@@ -25,13 +25,7 @@ SCENARIOS = ROOT / "config" / "scenarios"
 
 
 def demo(*arguments):
-    return subprocess.run(
-        ["bash", DEMO, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    return run_to_end("bash", DEMO, *arguments)
 
 
 def first_goal(directory, robot):

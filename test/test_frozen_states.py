@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from direct import DirectLoop
+from direct import DirectLoop, posture_at_limits
 
 from sim_bridge.nodes.bullet_parameters import make_stop
 from torque_safety_controller.node.assembly import make_state_check
@@ -68,9 +68,7 @@ def play(
         for k in range(round(seconds / config.dt)):
             t = k * config.dt
             if k % round(goals / config.dt) == 0:
-                goal, side = rng.uniform(low, high), rng.random(low.size)
-                goal = np.where(side < 0.3, low, np.where(side < 0.6, high, goal))
-                loop.controller.set_posture_goal(goal)
+                loop.controller.set_posture_goal(posture_at_limits(rng, low, high))
             q, v, _ = arm.state()
             state = State(q.copy(), v.copy())
             last = int(np.count_nonzero(begins <= t)) - 1
@@ -96,12 +94,7 @@ def play(
                 after.setdefault(last, int((t - begins[last]) / config.dt) + 1)
             elif not first and not wrong and last in after:
                 again.setdefault(last, t - begins[last] - LASTS)
-            if in_row > config.command_timeout:
-                arm.stop(law, config.substeps)
-            elif in_row or arm.returning:
-                arm.follow(law, tau, config.substeps)
-            else:
-                arm.step(tau, config.substeps)
+            loop.act(law, tau, in_row)
         position = float(arm.monitor.max_position_violation.max())
         speed = float(arm.monitor.max_velocity_violation.max())
         return Played(position, speed, begins.size, list(after.values()), list(again.values()))

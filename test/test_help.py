@@ -2,12 +2,13 @@
 """Every script and executable says with --help what it is for."""
 
 import importlib.util
-import subprocess
 import sys
 from importlib.metadata import distribution
 from pathlib import Path
 
 import pytest
+
+from viability_bounds_pkg.testing.executables import run_to_end
 
 ROOT = Path(__file__).resolve().parent.parent
 SCRIPTS = ROOT / "scripts"
@@ -19,7 +20,7 @@ EXECUTABLES = {
 }
 
 
-PARTS = {"domain.sh", "environment.sh"}
+PARTS = {"domain.sh", "environment.sh", "options.sh"}
 """What is only sourced by another script."""
 
 
@@ -29,22 +30,14 @@ PARTS = {"domain.sh", "environment.sh"}
     ids=lambda path: path.name,
 )
 def test_help_of_a_shell_script(script):
-    result = subprocess.run(
-        ["bash", script, "--help"], capture_output=True, text=True, timeout=30, check=False
-    )
+    result = run_to_end("bash", script, "--help")
     assert (result.returncode, result.stderr) == (0, "")
     assert result.stdout.startswith("usage: ")
     assert script.name in result.stdout.splitlines()[0]
 
 
 def test_help_of_a_script_that_is_sourced():
-    result = subprocess.run(
-        ["bash", "-c", f"source {SCRIPTS}/setup.sh --help && echo it goes on"],
-        capture_output=True,
-        text=True,
-        timeout=30,
-        check=False,
-    )
+    result = run_to_end("bash", "-c", f"source {SCRIPTS}/setup.sh --help && echo it goes on")
     assert result.stdout.startswith("usage: source scripts/setup.sh")
     assert result.stdout.endswith("it goes on\n")
 

@@ -5,7 +5,7 @@ from contextlib import closing
 
 import numpy as np
 import pytest
-from direct import DirectLoop
+from direct import DirectLoop, posture_at_limits
 
 from sim_bridge.nodes.bullet_parameters import make_stop
 from torque_safety_controller.qp.constraints import AccelerationRange
@@ -30,9 +30,7 @@ def play(mode: str, seed: int) -> tuple[float, float, int]:
     with closing(robot):
         for k in range(round(SECONDS * RATE)):
             if k % RATE == 0:
-                goal, side = rng.uniform(low, high), rng.random(low.size)
-                goal = np.where(side < 0.3, low, np.where(side < 0.6, high, goal))
-                loop.controller.set_posture_goal(goal)
+                loop.controller.set_posture_goal(posture_at_limits(rng, low, high))
             if k and row == 0 and rng.random() < PROBABILITY:
                 row = int(rng.integers(1, LONGEST + 1))
             lost, row = row > 0, max(0, row - 1)
@@ -46,12 +44,7 @@ def play(mode: str, seed: int) -> tuple[float, float, int]:
                 tau, in_row = step.tau, 0
             else:
                 in_row, missing = in_row + 1, missing + 1
-            if in_row > config.command_timeout:
-                robot.stop(law, config.substeps)
-            elif in_row or robot.returning:
-                robot.follow(law, tau, config.substeps)
-            else:
-                robot.step(tau, config.substeps)
+            loop.act(law, tau, in_row)
         monitor = robot.monitor
         farthest = monitor.max_position_violation.max(), monitor.max_velocity_violation.max()
         return float(farthest[0]), float(farthest[1]), missing

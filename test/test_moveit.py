@@ -117,13 +117,6 @@ class User:
         end = stamp_to_ns(self.states[-1].header.stamp) + round(1e9 * duration)
         self.ros.wait_until(lambda: stamp_to_ns(self.states[-1].header.stamp) > end)
 
-    def keeps_limits(self):
-        self.ros.diagnostics.clear()
-        robot = self.ros.wait_until(lambda: self.ros.diagnostics.get("bullet_node"))
-        for key in ("position_violation_rad", "velocity_violation_rad_s"):
-            assert max(map(float, robot[key].split())) == 0.0, (key, robot[key])
-        assert max(map(float, robot["torque_ratio"].split())) <= 1.0 + 1e-9
-
 
 def tolerance(moveit, joint=JOINTS[1], position=0.0, velocity=0.0, acceleration=0.0):
     return moveit.JointTolerance(
@@ -146,7 +139,7 @@ def test_goals_are_reached_one_after_the_other(ros, moveit):
             assert np.abs(off).max() < 0.05
         # Others may drive the arm in between.
         ros.wait_until(lambda: ros.probe.count_publishers(TARGET) == 0)
-    user.keeps_limits()
+    user.ros.assert_limits_kept()
 
 
 def test_one_that_is_cancelled_stops(ros, moveit):
@@ -192,7 +185,7 @@ def test_one_off_its_path_stops(ros, moveit):
     assert re.fullmatch(r"panda_joint1 is .* rad off; allowed: 0.05", text)
     ros.wait_until(lambda: np.abs(user.v).max() < 1e-3)
     assert user.q[0] < GOAL[0] + 0.9
-    user.keeps_limits()
+    user.ros.assert_limits_kept()
 
 
 def test_one_that_is_not_reached_in_time_tells_how_far_it_is(ros, moveit):
@@ -302,7 +295,7 @@ def test_jogs_move_a_joint_and_end_a_goal(ros, moveit):
     assert goal.outcome[2] == "a jog has come"
     ros.wait_until(lambda: np.abs(user.v).max() < 1e-3)
     ros.wait_until(lambda: ros.probe.count_publishers("jog_joints") == 0)
-    user.keeps_limits()
+    user.ros.assert_limits_kept()
 
 
 def test_its_help_lists_its_parameters(moveit, monkeypatch, capsys):

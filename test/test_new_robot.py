@@ -2,26 +2,20 @@
 """From a URDF to an arm that keeps its limits, as a user does it."""
 
 import json
-import subprocess
 from pathlib import Path
 
 import pytest
 import yaml
 
 from torque_safety_controller.tools.new_robot import main
+from viability_bounds_pkg.testing.executables import run_to_end
 
 ROOT = Path(__file__).resolve().parent.parent
 UR5 = "package://example-robot-data/robots/ur_description/urdf/ur5_robot.urdf"
 
 
 def demo(*arguments):
-    return subprocess.run(
-        ["bash", ROOT / "scripts" / "demo.sh", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    return run_to_end("bash", ROOT / "scripts" / "demo.sh", *arguments)
 
 
 @pytest.fixture(scope="module")

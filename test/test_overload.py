@@ -3,11 +3,12 @@
 
 import importlib
 import json
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from viability_bounds_pkg.testing.executables import run_to_end
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -16,13 +17,7 @@ ROOT = Path(__file__).resolve().parent.parent
 def test_a_stack_that_is_paused_keeps_the_limits(tmp_path):
     words = ["--seconds", "3", "--robot", "baxter_left_arm", "--way", "stack + robot"]
     words += ["--load", "pause safety_stack", "--out", tmp_path]
-    run = subprocess.run(
-        ["bash", ROOT / "scripts" / "overload.sh", *words],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    run = run_to_end("bash", ROOT / "scripts" / "overload.sh", *words)
     assert run.returncode == 0, run.stdout + run.stderr
     (found,) = json.loads((tmp_path / "metrics.json").read_text())
     assert found["missed"] > 0, "no pause had an effect"

@@ -10,12 +10,13 @@ and downloads the dependencies, and other Pythons than the one that runs the tes
 import importlib.metadata as metadata
 import re
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+
+from viability_bounds_pkg.testing.executables import run_to_end
 
 pytestmark = pytest.mark.packaging
 
@@ -28,10 +29,8 @@ assert importlib.util.find_spec("pytest") is None
 """
 
 
-def run(*command, **options):
-    ended = subprocess.run(
-        list(map(str, command)), capture_output=True, text=True, check=False, **options
-    )
+def run(*command):
+    ended = run_to_end(*command, timeout=None)
     assert ended.returncode == 0, ended.stdout + ended.stderr
     return ended.stdout
 
@@ -45,12 +44,7 @@ def build_wheels(folder):
     makes_wheels = major_minor >= (70, 1) or shutil.which("wheel") is not None
     command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "-w", folder]
     command += ["--no-build-isolation"] if makes_wheels else []
-    ended = subprocess.run(
-        [*map(str, command), *(str(folder / package) for package in OWN)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    ended = run_to_end(*command, *(folder / package for package in OWN), timeout=None)
     if ended.returncode and not makes_wheels:
         pytest.skip(f"setuptools here makes no wheels, and pip gets no other: {ended.stderr}")
     assert ended.returncode == 0, ended.stderr
@@ -98,16 +92,13 @@ def environment(tmp_path_factory):
     return venv
 
 
-def in_environment(environment, *command, **options):
+def in_environment(environment, *command):
     # No PYTHONPATH, which a sourced ROS sets.
-    return subprocess.run(
-        [str(environment / "bin" / command[0]), *map(str, command[1:])],
-        capture_output=True,
-        text=True,
-        check=False,
+    return run_to_end(
+        *(environment / "bin" / command[0], *command[1:]),
+        timeout=None,
         env={"PATH": "/usr/bin:/bin", "NUMBA_CACHE_DIR": str(environment / "cache")},
         cwd=environment,
-        **options,
     )
 
 

@@ -4,11 +4,12 @@
 import json
 import re
 import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
 import yaml
+
+from viability_bounds_pkg.testing.executables import run_to_end
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text()
@@ -50,9 +51,7 @@ def commands():
 
 
 def run(command, tree=ROOT):
-    return subprocess.run(
-        command.split(), cwd=tree, capture_output=True, text=True, timeout=300, check=False
-    )
+    return run_to_end(*command.split(), cwd=tree, timeout=300)
 
 
 def hurry(entry, factor):

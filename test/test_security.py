@@ -4,7 +4,6 @@
 import os
 import re
 import shutil
-import subprocess
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -15,6 +14,7 @@ from sim_bridge.nodes import run_listener
 from sim_bridge.nodes.bullet_node import BulletNode
 from torque_safety_controller.node import safety_stack
 from viability_bounds_pkg.ros.topics import USER
+from viability_bounds_pkg.testing.executables import run_to_end
 from viability_bounds_pkg.testing.ros_harness import read_config
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -29,9 +29,7 @@ NAMED_BY_A_PARAMETER = "ros2_control_topic"
 OWN = {"publish": {"/parameter_events", "/rosout"}, "subscribe": {"/clock"}}
 """What every node has from ROS."""
 HAS_TOOLS = (
-    shutil.which("ros2") is not None
-    and subprocess.run(["ros2", "security", "--help"], capture_output=True, check=False).returncode
-    == 0
+    shutil.which("ros2") is not None and run_to_end("ros2", "security", "--help").returncode == 0
 )
 
 
@@ -132,14 +130,7 @@ def test_each_program_has_an_enclave_with_its_nodes():
 
 
 def run(*words, **environment):
-    return subprocess.run(
-        ["bash", SCRIPT, *words],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        env=os.environ | environment,
-        check=False,
-    )
+    return run_to_end("bash", SCRIPT, *words, env=os.environ | environment)
 
 
 @pytest.mark.skipif(not HAS_TOOLS, reason="there is no `ros2 security` here")
@@ -188,13 +179,8 @@ def test_a_node_that_cannot_be_secured_does_not_start_and_says_why(tmp_path):
     command += [ROOT / "config" / "panda.yaml", "--enclave", "/arm/bounds_node"]
     expected = [f"error: .*SECURITY ERROR: directory '{enclave}' does not exist", "error: .+"]
     for pattern in expected:
-        result = subprocess.run(
-            command,
-            env=os.environ | secured | {"ROS_SECURITY_KEYSTORE": str(tmp_path)},
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=False,
+        result = run_to_end(
+            *command, env=os.environ | secured | {"ROS_SECURITY_KEYSTORE": str(tmp_path)}
         )
         assert result.returncode == 1
         assert re.match(pattern, result.stderr.splitlines()[-1]), result.stderr

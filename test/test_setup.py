@@ -15,6 +15,8 @@ from pathlib import Path
 
 import pytest
 
+from viability_bounds_pkg.testing.executables import run_to_end
+
 pytestmark = pytest.mark.packaging
 ROOT = Path(__file__).resolve().parent.parent
 PYTHON = sys._base_executable
@@ -36,17 +38,13 @@ def set_up(copy, **environment):
     inherited = {name: value for name, value in os.environ.items() if name not in away}
     inherited = {n: value for n, value in inherited.items() if not n.startswith("PIP_")}
     offline = {"PIP_CONFIG_FILE": os.devnull, "PIP_NO_INDEX": "1", "PIP_NO_CACHE_DIR": "1"}
-    ended = subprocess.run(
-        ["bash", "-c", "source scripts/setup.sh"],
+    ended = run_to_end(
+        *("bash", "-c", "source scripts/setup.sh"),
         cwd=copy,
         env=inherited
         | offline
         | {"PYTHON": PYTHON, "PIP_FIND_LINKS": str(copy / "index")}
         | {name: value for name, value in environment.items() if value is not None},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
     )
     return ended.returncode, ended.stdout + ended.stderr
 
@@ -91,13 +89,9 @@ def test_an_index_out_of_reach(copy):
 def test_a_full_disk(copy, size, doing):
     venv = copy / ".venv"
     venv.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", f"size={size}", "none", venv],
-        capture_output=True,
-        check=False,
-    )
+    mounted = run_to_end("mount", "-t", "tmpfs", "-o", f"size={size}", "none", venv)
     if mounted.returncode:
-        pytest.skip(f"no small disk can be made here: {mounted.stderr.decode()}")
+        pytest.skip(f"no small disk can be made here: {mounted.stderr}")
     try:
         name = copy / "index" / f"{PYBULLET}-py3-none-any.whl"
         with zipfile.ZipFile(name, "w", zipfile.ZIP_DEFLATED) as wheel:
@@ -199,9 +193,7 @@ def test_the_page_on_installation():
     page = (ROOT / "docs" / "installation.md").read_text()
     commands = "".join(re.findall(r"```bash\n(.*?)```", page, re.DOTALL))
     assert "setup.sh" in commands
-    ended = subprocess.run(
-        ["bash", "-ec", commands], cwd=ROOT, capture_output=True, text=True, check=False
-    )
+    ended = run_to_end("bash", "-ec", commands, cwd=ROOT)
     assert ended.returncode == 0, ended.stderr
     said = "".join((ROOT / "scripts" / name).read_text() for name in ("setup.sh", "packages.py"))
     explained = re.findall(r"^\| `(.*?)` \|", page, re.MULTILINE)

@@ -13,7 +13,7 @@ from soak_record import Episode, Memory, Record
 
 from sim_bridge.faults.timeline import load_timeline
 from sim_bridge.nodes.fault_node import STREAMS
-from viability_bounds_pkg.testing.executables import as_child
+from viability_bounds_pkg.testing.executables import as_child, run_to_end
 
 ROOT = Path(__file__).resolve().parent.parent
 SOAK = ["bash", ROOT / "scripts" / "soak.sh", "--rate", "100", "--every", "2"]
@@ -21,13 +21,7 @@ SOAK = ["bash", ROOT / "scripts" / "soak.sh", "--rate", "100", "--every", "2"]
 
 @pytest.mark.long
 def test_a_soak_ends_by_itself_with_a_report_of_all_that_happened(tmp_path):
-    run = subprocess.run(
-        [*SOAK, "--minutes", "0.15", "--out", tmp_path],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    run = run_to_end(*SOAK, "--minutes", "0.15", "--out", tmp_path)
     found = json.loads((tmp_path / "metrics.json").read_text())
     # On a busy machine the arm may go on late, which is said.
     assert not [each for each in found["wrong"] if not each.startswith("no motion after")]

@@ -3,10 +3,11 @@
 
 import json
 import re
-import subprocess
 from pathlib import Path
 
 import pytest
+
+from viability_bounds_pkg.testing.executables import run_to_end
 
 ROOT = Path(__file__).resolve().parent.parent
 SCRIPT = ROOT / "test" / "two_hosts.sh"
@@ -15,13 +16,7 @@ SCRIPT = ROOT / "test" / "two_hosts.sh"
 @pytest.mark.packaging
 def test_limits_are_kept_across_hosts_and_the_arm_goes_on_after_cuts(tmp_path):
     out = tmp_path / "numbers.json"
-    result = subprocess.run(
-        ["bash", SCRIPT, "--seconds", "10", "--out", out],
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+    result = run_to_end("bash", SCRIPT, "--seconds", "10", "--out", out, timeout=300)
     assert result.returncode == 0, result.stdout + result.stderr
     if "skipped" in result.stdout:
         pytest.skip(result.stdout.strip())
@@ -39,13 +34,7 @@ def test_where_there_are_no_namespaces_it_says_so_in_one_line(tmp_path):
     unshare = tmp_path / "unshare"
     unshare.write_text("#!/bin/sh\necho 'unshare: Operation not permitted' >&2\nexit 1\n")
     unshare.chmod(0o755)
-    result = subprocess.run(
-        ["bash", "-c", f'PATH="{tmp_path}:$PATH" exec bash {SCRIPT}'],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    result = run_to_end("bash", "-c", f'PATH="{tmp_path}:$PATH" exec bash {SCRIPT}')
     assert (result.returncode, result.stderr) == (0, "")
     assert result.stdout == (
         "two_hosts: skipped: no network namespaces here (unshare: Operation not permitted)\n"

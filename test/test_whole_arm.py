@@ -53,16 +53,20 @@ def beyond(loop):
     )
 
 
+def assert_kept(loop):
+    position, speed, torque = beyond(loop)
+    assert position == 0.0
+    assert speed == 0.0
+    assert torque <= 1.0 + 1e-9
+
+
 @pytest.mark.long
 def test_baxters_shoulder_keeps_its_limits_only_with_the_filter():
     without = beyond(race("baxter_left_arm", 30.0, 4, safety_filter=False))
     assert without[0] > 0.1
     assert without[1] > 0.1
     loop = race("baxter_left_arm", 30.0, 4, safety_filter=True)
-    position, speed, torque = beyond(loop)
-    assert position == 0.0
-    assert speed == 0.0
-    assert torque <= 1.0 + 1e-9
+    assert_kept(loop)
     outcomes = loop.controller.safety_filter.outcomes
     assert outcomes["outside"] == 0
     assert outcomes["as wanted"] > 0.9 * outcomes.total()
@@ -74,10 +78,7 @@ def test_arms_with_weaker_motors_keep_their_limits(robot, seconds):
     """With limits of acceleration that were found for torque limits of 100%."""
     tau_max = DirectLoop(robot).config.torque_max
     loop = race(robot, seconds, 0, safety_filter=True, torque_max=(0.6 * tau_max).tolist())
-    position, speed, torque = beyond(loop)
-    assert position == 0.0
-    assert speed == 0.0
-    assert torque <= 1.0 + 1e-9
+    assert_kept(loop)
 
 
 @pytest.mark.parametrize("gains", [STIFF, {"pose_weight": 0.0, "posture_weight": 1.0}])

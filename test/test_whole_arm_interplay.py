@@ -7,7 +7,7 @@ import pytest
 from compliance_hand import ELBOW, ELBOW_PUSH, FORCE, PANDA, lead, press
 from direct import DirectLoop, column
 from test_collision_avoidance import MARGIN, around_the_wall, play
-from test_whole_arm import STIFF, beyond
+from test_whole_arm import STIFF, assert_kept, beyond
 
 pytestmark = pytest.mark.long
 
@@ -34,13 +34,6 @@ def race(loop, seconds, seed, each=None, pause=3.0):
                 each(loop)
             outputs.append(loop.step())
     return outputs
-
-
-def assert_kept(loop):
-    position, speed, torque = beyond(loop)
-    assert position == 0.0
-    assert speed == 0.0
-    assert torque <= 1.0 + 1e-9
 
 
 def test_integral_torque_for_a_small_payload_counts_in_plans():

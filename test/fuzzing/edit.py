@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from hypothesis import HealthCheck, Phase, settings
+from hypothesis import strategies as st
 
 
 @dataclass(frozen=True)
@@ -22,6 +24,16 @@ class Edit:
     kind: str
     where: int = 0
     value: Any = None
+
+
+def with_values(where: st.SearchStrategy[int], **kinds: Sequence[Any]) -> st.SearchStrategy[Edit]:
+    """Return a strategy of changes of some kinds, each with the values that it may have."""
+    return st.one_of(
+        *(
+            st.builds(Edit, st.just(kind), where, st.sampled_from(values))
+            for kind, values in kinds.items()
+        )
+    )
 
 
 def exploring(examples: int, **own: Any) -> settings:

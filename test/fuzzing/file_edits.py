@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import yaml
-from fuzzing.edit import Edit
+from fuzzing.edit import Edit, with_values
 from hypothesis import strategies as st
 
 VALUES: tuple[Any, ...] = (
@@ -140,16 +140,14 @@ def file_edits(most: int = 2) -> st.SearchStrategy[tuple[Edit, ...]]:
     """Return a strategy of one to `most` changes; nine of ten are of what a file says."""
     where = st.integers(0, 255)
     of_values = st.one_of(
-        st.builds(Edit, st.just("value"), where, st.sampled_from(VALUES)),
-        st.builds(Edit, st.just("number"), where, st.sampled_from(NUMBERS)),
-        st.builds(Edit, st.just("scale"), where, st.sampled_from(FACTORS)),
-        st.builds(Edit, st.just("length"), where, st.sampled_from((0, 1, 3, 6, 8, 24))),
+        with_values(
+            where, value=VALUES, number=NUMBERS, scale=FACTORS, length=(0, 1, 3, 6, 8, 24)
+        ),
         st.builds(Edit, st.sampled_from(("drop", "rename", "nest", "double", "add")), where),
         st.builds(Edit, st.just("swap"), where, where),
     )
     of_text = st.one_of(
-        st.builds(Edit, st.just("line"), where, st.sampled_from(("drop", "twice", "indent"))),
-        st.builds(Edit, st.just("insert"), where, st.sampled_from(TEXTS)),
+        with_values(where, line=("drop", "twice", "indent"), insert=TEXTS),
         st.builds(Edit, st.just("byte"), where, st.integers(0, 255)),
         st.builds(Edit, st.just("cut"), where),
     )

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
-from fuzzing.edit import Edit
+from fuzzing.edit import Edit, with_values
 from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
 
@@ -138,15 +138,10 @@ def edits(most: int = 3) -> st.SearchStrategy[tuple[Edit, ...]]:
     """Return a strategy of up to `most` changes; none at all is one of the examples."""
     where = st.integers(0, 63)
     one = st.one_of(
-        st.builds(Edit, st.just("number"), where, st.sampled_from(NUMBERS)),
-        st.builds(Edit, st.just("scale"), where, st.sampled_from(FACTORS)),
-        st.builds(Edit, st.just("size"), where, st.sampled_from(SIZES)),
+        with_values(where, number=NUMBERS, scale=FACTORS, size=SIZES),
         st.builds(Edit, st.just("swap"), where, st.integers(0, 40)),
         st.builds(Edit, st.just("double"), where),
-        st.builds(Edit, st.just("text"), where, st.sampled_from(NAMES)),
-        st.builds(Edit, st.just("whole"), where, st.sampled_from(WHOLE)),
-        st.builds(Edit, st.just("leap"), where, st.sampled_from(TIMES)),
-        st.builds(Edit, st.just("stamp"), where, st.sampled_from(STAMPS)),
+        with_values(where, text=NAMES, whole=WHOLE, leap=TIMES, stamp=STAMPS),
     )
     return st.lists(one, max_size=most).map(tuple)
 

@@ -5,9 +5,8 @@ import sys
 from pathlib import Path
 
 from viability_bounds_pkg.testing.fixtures import graph_of_its_own, ros, shared_ros
+from viability_bounds_pkg.testing.two_joint_robot import write_robot
 
 sys.path.insert(0, str(Path(__file__).resolve().parent / "support"))
-
-from two_joint_robot import write_robot
 
 __all__ = ["graph_of_its_own", "ros", "shared_ros", "write_robot"]

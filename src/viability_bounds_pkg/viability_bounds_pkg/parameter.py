@@ -25,6 +25,9 @@ Configuration = TypeVar("Configuration")
 LARGEST = 1e12
 """No parameter of a robot has a larger finite number; computing with such numbers overflows."""
 
+MOST_PERIODS = 100
+"""Longest delay and row of missed deadlines, control periods."""
+
 REQUIRED = object()
 """Default of a parameter that has none: the node does not start without a value."""
 
@@ -232,6 +235,21 @@ def numbers(description: str, within: Range | None = None, **more: Any) -> Any:
 def joint_numbers(description: str, within: Range | None = None, **more: Any) -> Any:
     """Return the field of an array with one number a joint; `more` as for `numbers`."""
     return numbers(description, within, per_joint=True, **more)
+
+
+def joint_amounts(description: str, **more: Any) -> Any:
+    """Return the field of an array of numbers >= 0, one a joint; all 0 if it is left out."""
+    return joint_numbers(description, NOT_NEGATIVE, if_empty=0.0, **more)
+
+
+def periods(description: str) -> Any:
+    """Return the field of a number of control periods, 0 if it is left out."""
+    return whole_number(description, Range(0, MOST_PERIODS), default=0)
+
+
+def timeout(description: str, default: float) -> Any:
+    """Return the field of a time, s, that something is waited for or lasts at most."""
+    return number(description, above(0.0, 3600.0), default=default)
 
 
 def group(kind: type, prefix: str = "") -> Any:

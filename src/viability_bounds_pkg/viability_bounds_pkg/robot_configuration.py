@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from viability_bounds_pkg.exceptions import SettingError, did_you_mean
 from viability_bounds_pkg.parameter import (
-    NOT_NEGATIVE,
     POSITIVE,
     Range,
+    joint_amounts,
     joint_numbers,
     number,
     numbers,
@@ -70,10 +70,8 @@ class RobotConfiguration:
     torque_max: Array = joint_numbers(
         "torque limits of the motors, N m; those of the URDF if empty", POSITIVE, default=()
     )
-    rotor_inertia: Array = joint_numbers(
-        "inertia of the rotors as seen from the joints, kg m^2; none if empty",
-        NOT_NEGATIVE,
-        if_empty=0.0,
+    rotor_inertia: Array = joint_amounts(
+        "inertia of the rotors as seen from the joints, kg m^2; none if empty"
     )
 
     def __post_init__(self) -> None:

@@ -107,15 +107,24 @@ def _two_names(value: Any, where: str) -> tuple[str, ...]:
 
 
 @dataclass(kw_only=True)
-class Drop(Fault):
-    """Messages are lost."""
+class _AtRandom(Fault):
+    """Acts on a message with `probability`."""
 
-    KIND = "drop"
     FIELDS = {"probability": _share}
     probability: float = 1.0
 
+    def _acts(self, rng: np.random.Generator) -> bool:
+        return rng.random() < self.probability
+
+
+@dataclass(kw_only=True)
+class Drop(_AtRandom):
+    """Messages are lost."""
+
+    KIND = "drop"
+
     def _spoil(self, passing: Passage, rng: np.random.Generator) -> list[Passage]:
-        return [] if rng.random() < self.probability else [passing]
+        return [] if self._acts(rng) else [passing]
 
 
 @dataclass(kw_only=True)
@@ -133,15 +142,13 @@ class Delay(Fault):
 
 
 @dataclass(kw_only=True)
-class Duplicate(Fault):
+class Duplicate(_AtRandom):
     """Messages come twice."""
 
     KIND = "duplicate"
-    FIELDS = {"probability": _share}
-    probability: float = 1.0
 
     def _spoil(self, passing: Passage, rng: np.random.Generator) -> list[Passage]:
-        if rng.random() < self.probability:
+        if self._acts(rng):
             return [passing, passing._replace(message=deepcopy(passing.message))]
         return [passing]
 
@@ -159,17 +166,15 @@ class _Holding(Fault):
 
 
 @dataclass(kw_only=True)
-class Reorder(_Holding):
+class Reorder(_AtRandom, _Holding):
     """A message comes after the one that follows it."""
 
     KIND = "reorder"
-    FIELDS = {"probability": _share}
-    probability: float = 1.0
 
     def _spoil(self, passing: Passage, rng: np.random.Generator) -> list[Passage]:
         if self._held:
             return [passing, self._held.pop()]
-        if rng.random() < self.probability:
+        if self._acts(rng):
             self._held.append(passing)
             return []
         return [passing]
@@ -294,26 +299,24 @@ class Swap(Fault):
 
 
 @dataclass(kw_only=True)
-class Corrupt(_Values):
+class Corrupt(_AtRandom, _Values):
     """A message becomes one that no sender means.
 
     Attributes:
         how: numbers become ``nan``, ``inf`` or ``huge`` (1e300), the last is missing (``short``; a
             wrench always has six), or the ``names`` of the joints, or of its frame, are others.
-        probability: that it happens to a message.
     """
 
     KIND = "corrupt"
     FIELDS = {
         **_Values.FIELDS,
         "how": _one_of("nan", "inf", "huge", "short", "names"),
-        "probability": _share,
+        **_AtRandom.FIELDS,
     }
     how: str = "nan"
-    probability: float = 1.0
 
     def _spoil(self, passing: Passage, rng: np.random.Generator) -> list[Passage]:
-        if rng.random() >= self.probability:
+        if not self._acts(rng):
             return [passing]
         message = passing.message
         if self.how == "names":

@@ -10,31 +10,26 @@ from numpy.typing import NDArray
 
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import (
-    NOT_NEGATIVE,
     Range,
+    joint_amounts,
     joint_numbers,
     number,
+    periods,
     text,
     whole_number,
 )
 
 Array = NDArray[np.float64]
 
-_DELAY = Range(0, 100)
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Imperfections:
     """What distinguishes real hardware from an ideal one; arrays of shape (n,)."""
 
-    encoder_resolution: Array = joint_numbers(
-        "step of the encoders, rad; 0 or empty: exact", NOT_NEGATIVE, if_empty=0.0
-    )
-    position_noise: Array = joint_numbers(
+    encoder_resolution: Array = joint_amounts("step of the encoders, rad; 0 or empty: exact")
+    position_noise: Array = joint_amounts(
         "standard deviation of the encoders' noise, before it is rounded to their steps and "
-        "clipped at 3 of it, rad; none if empty",
-        NOT_NEGATIVE,
-        if_empty=0.0,
+        "clipped at 3 of it, rad; none if empty"
     )
     velocity_source: str = text(
         "exact: the true velocity; encoder: difference of two encoder positions over a period",
@@ -47,24 +42,16 @@ class Imperfections:
         default=0.0,
         note="below half of rate_hz",
     )
-    velocity_noise: Array = joint_numbers(
+    velocity_noise: Array = joint_amounts(
         "standard deviation of the noise of reported velocities, clipped at 3 of it, rad/s; none "
-        "if empty",
-        NOT_NEGATIVE,
-        if_empty=0.0,
+        "if empty"
     )
-    state_delay: int = whole_number(
-        "control periods by which states are reported late", _DELAY, default=0
+    state_delay: int = periods("control periods by which states are reported late")
+    command_delay: int = periods(
+        "control periods by which commands act late; in real time they may come so much later"
     )
-    command_delay: int = whole_number(
-        "control periods by which commands act late; in real time they may come so much later",
-        _DELAY,
-        default=0,
-    )
-    motor_bandwidth: Array = joint_numbers(
-        "bandwidth of the motors' torque, a first-order lag, Hz; 0 or empty: infinite",
-        NOT_NEGATIVE,
-        if_empty=0.0,
+    motor_bandwidth: Array = joint_amounts(
+        "bandwidth of the motors' torque, a first-order lag, Hz; 0 or empty: infinite"
     )
     torque_constant_error: Array = joint_numbers(
         "share by which the true torque is larger than the reported one; 0 if empty",

@@ -28,12 +28,15 @@ from viability_bounds_pkg.parameter import (
     Range,
     above,
     group,
+    joint_amounts,
     joint_numbers,
     number,
     numbers,
+    periods,
     switch,
     text,
     texts,
+    timeout,
     whole_number,
 )
 from viability_bounds_pkg.robot_configuration import ControlRate, LimitedRobotConfiguration
@@ -72,11 +75,9 @@ class BulletConfiguration(ControlRate, LimitedRobotConfiguration):
         Range(1, 1000),
         default=5,
     )
-    missed_deadlines: int = whole_number(
+    missed_deadlines: int = periods(
         "longest such row that the bounds are declared to cover; where command_timeout is longer, "
-        "this is logged; 0: not declared",
-        Range(0, 100),
-        default=0,
+        "this is logged; 0: not declared"
     )
     acceleration_min: Array = joint_numbers(
         "lower acceleration limits when the robot stops itself, rad/s^2; it brakes with all its "
@@ -99,17 +100,15 @@ class BulletConfiguration(ControlRate, LimitedRobotConfiguration):
         live=True,
     )
     publish_clock: bool = switch("publish /clock", default=False)
-    friction_coulomb: Array = joint_numbers(
-        "dry friction of moving joints, N m; none if empty", NOT_NEGATIVE, if_empty=0.0
-    )
+    friction_coulomb: Array = joint_amounts("dry friction of moving joints, N m; none if empty")
     friction_static: Array = joint_numbers(
         "dry friction of joints at rest, N m; that of moving ones if empty",
         NOT_NEGATIVE,
         default=(),
         note="at least friction_coulomb",
     )
-    friction_viscous: Array = joint_numbers(
-        "friction that grows with speed, N m s/rad; none if empty", NOT_NEGATIVE, if_empty=0.0
+    friction_viscous: Array = joint_amounts(
+        "friction that grows with speed, N m s/rad; none if empty"
     )
     stribeck_velocity: Array = joint_numbers(
         "speed at which static has become Coulomb friction but for 1/e of the difference, rad/s; "
@@ -131,9 +130,7 @@ class BulletConfiguration(ControlRate, LimitedRobotConfiguration):
         default=(),
         note="one for each of 'mass_scale_links'",
     )
-    external_wrench_timeout: float = number(
-        "how long a push lasts, s of robot time", above(0.0, 3600.0), default=0.5
-    )
+    external_wrench_timeout: float = timeout("how long a push lasts, s of robot time", default=0.5)
     material: ContactMaterial = group(ContactMaterial, "obstacle_")
     sensor: SensorConfiguration = group(SensorConfiguration)
     imperfections: Imperfections = group(Imperfections)

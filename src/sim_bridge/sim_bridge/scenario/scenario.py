@@ -20,7 +20,7 @@ from sim_bridge.scenario.events import (
 )
 from sim_bridge.scenario.fields import ScenarioError, positive, read_fields, refuse
 from viability_bounds_pkg.exceptions import SettingError, did_you_mean
-from viability_bounds_pkg.parameter import above, number, text
+from viability_bounds_pkg.parameter import text, timeout
 from viability_bounds_pkg.robot_configuration import LimitedRobotConfiguration, TaskFrames
 from viability_bounds_pkg.user_input.yaml_file import YamlError, read_yaml
 
@@ -49,9 +49,7 @@ class ScenarioConfiguration(TaskFrames, LimitedRobotConfiguration):
 
     robot_name: str = text("name of the robot in the report", default="robot")
     scenario: str = text("YAML file of the scenario")
-    ready_timeout: float = number(
-        "how long the other nodes may take to start, s", above(0.0, 3600.0), default=180.0
-    )
+    ready_timeout: float = timeout("how long the other nodes may take to start, s", default=180.0)
     urdf: str = field(init=False)
     plan: Scenario = field(init=False)
 

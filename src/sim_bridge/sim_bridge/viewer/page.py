@@ -219,7 +219,8 @@ class Page:
     def _frame_arm(self) -> None:
         """Put the camera where it sees all of the arm, beside the panel."""
         self._framed = True
-        points = np.array([self._data.oMf[self._hand].translation, *self._joint_origins()])
+        places = (self._data.oMf[self._hand], *list(self._data.oMi)[1:])
+        points = np.array([place.translation for place in places])
         low, high = points.min(axis=0), points.max(axis=0)
         middle, size = 0.5 * (low + high), max(float(np.linalg.norm(high - low)), 0.5)
         away = np.array([0.9, -1.1, 0.5])
@@ -228,9 +229,6 @@ class Page:
         self._server.initial_camera.look_at = tuple(
             middle + 0.2 * size * np.array([1.0, 0.8, 0.0])
         )
-
-    def _joint_origins(self) -> list[Array]:
-        return [self._data.oMi[k].translation for k in range(1, self._model.njoints)]
 
     def _show_goal(self, goal: pin.SE3 | None) -> None:
         """Let the goal's handle be where the goal is; without one, at the hand."""
@@ -288,8 +286,11 @@ class Page:
         with tabs.add_tab("Joints"):
             self._joint_pictures = gui.add_html("")
         with tabs.add_tab("Drive"):
-            links = [frame.name for frame in self._model.frames if _is_moving_link(frame)]
-            links = links or [""]
+            links = [
+                frame.name
+                for frame in self._model.frames
+                if frame.type == pin.FrameType.BODY and frame.parentJoint > 0
+            ] or [""]
             self._link = gui.add_dropdown("push link", links, initial_value=links[len(links) // 2])
             self._stiffness = gui.add_slider("push, N per metre of drag", 20.0, 500.0, 10.0, 200.0)
             self._sliders = [self._add_slider(k) for k in range(len(self._limits))]
@@ -377,7 +378,3 @@ def _place(node: viser.SceneNodeHandle, pose: pin.SE3) -> None:
     x, y, z, w = pin.Quaternion(pose.rotation).coeffs()
     node.wxyz = w, x, y, z
     node.position = np.array(pose.translation)
-
-
-def _is_moving_link(frame: pin.Frame) -> bool:
-    return frame.type == pin.FrameType.BODY and frame.parentJoint > 0

@@ -17,6 +17,7 @@ from talos_joints import (
     H,
     N,
     Q,
+    random_steps,
     reset_raw,
     single_joint,
     talos,
@@ -32,14 +33,9 @@ from viability_bounds_pkg.robot_description import (
 
 
 def test_rotors_are_on_the_diagonal_of_the_inertia_matrix(talos_model):
-    rng = np.random.default_rng(1)
     data = talos_model.createData()
     with talos(rotor_inertia=ROTORS) as robot:
-        for _ in range(20):
-            q, v, tau = rng.uniform(-1.0, 1.0, (3, N)) * np.array([[1.5], [3.0], [50.0]])
-            reset_raw(robot, q, v)
-            robot.step(tau)
-            a = (robot.state().v - v) / H
+        for q, v, tau, a in random_steps(robot, 20, 1, (1.5, 3.0, 50.0)):
             expected = pin.aba(talos_model, data, q, v, tau)
             np.testing.assert_allclose(a, expected, atol=1e-11 * np.abs(expected).max())
 
@@ -69,7 +65,6 @@ def test_rotors_of_prismatic_joints_and_of_some_joints_only():
 
 def test_heavier_links_move_as_if_the_urdf_said_so():
     scales = {"arm_left_4_link": 1.1, "torso_2_link": 0.8, "arm_right_3_link": 3.0}
-    rng = np.random.default_rng(5)
     urdf = read_urdf(TALOS)
     model = build_model(urdf, JOINTS)
     root = ElementTree.fromstring(urdf)
@@ -81,11 +76,8 @@ def test_heavier_links_move_as_if_the_urdf_said_so():
     heavy = build_model(ElementTree.tostring(root, encoding="unicode"), JOINTS)
     data = heavy.createData()
     with talos(scales=scales) as robot:
-        for _ in range(5):
-            q, v, tau = rng.uniform(-1.0, 1.0, (3, N)) * np.array([[1.0], [2.0], [30.0]])
-            reset_raw(robot, q, v)
-            robot.step(tau)
-            a, expected = (robot.state().v - v) / H, pin.aba(heavy, data, q, v, tau)
+        for q, v, tau, a in random_steps(robot, 5, 5, (1.0, 2.0, 30.0)):
+            expected = pin.aba(heavy, data, q, v, tau)
             np.testing.assert_allclose(a, expected, atol=1e-10 * np.abs(expected).max())
             nominal = pin.aba(model, model.createData(), q, v, tau)
             assert np.abs(nominal - expected).max() > 1e-2

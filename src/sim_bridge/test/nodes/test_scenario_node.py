@@ -10,7 +10,7 @@ from ament_index_python.packages import get_package_prefix
 
 from sim_bridge.nodes.scenario_node import ScenarioNode
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.testing.executables import as_child
+from viability_bounds_pkg.testing.executables import as_child, run_to_end
 from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
 
 DEADLINE = 30.0  # s
@@ -44,9 +44,7 @@ def assert_refused(result, *names):
 
 
 def run(*arguments):
-    return subprocess.run(
-        command(*arguments), capture_output=True, text=True, timeout=DEADLINE, check=False
-    )
+    return run_to_end(*command(*arguments), timeout=DEADLINE)
 
 
 def test_a_posture_must_have_every_joint(ros, tmp_path):

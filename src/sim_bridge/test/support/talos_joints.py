@@ -75,3 +75,16 @@ def talos_model():
 def reset_raw(robot, q, v):
     """Put PyBullet's own positions, half a step ahead of the state, at q."""
     robot.reset(q - 0.5 * robot.physics_dt * v, v)
+
+
+def random_steps(robot, count, seed, largest):
+    """Play physics steps from random states under random torques.
+
+    Yields q, v and tau, up to `largest` in size, and the acceleration that came of them.
+    """
+    rng = np.random.default_rng(seed)
+    for _ in range(count):
+        q, v, tau = rng.uniform(-1.0, 1.0, (3, N)) * np.reshape(largest, (3, 1))
+        reset_raw(robot, q, v)
+        robot.step(tau)
+        yield q, v, tau, (robot.state().v - v) / H

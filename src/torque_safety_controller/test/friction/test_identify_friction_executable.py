@@ -18,36 +18,13 @@ from viability_bounds_pkg.testing.executables import called, started
 
 MODULE = "torque_safety_controller.cli.identify_friction"
 
-LIMIT = 60.0
-
-LIMIT = '<limit lower="-2" upper="2" effort="30" velocity="4"/>'
-URDF = f"""
-<robot name="arm"><link name="base"/>
-<joint name="shoulder" type="revolute"><parent link="base"/><child link="arm"/>
-<axis xyz="0 1 0"/>{LIMIT}</joint>
-<link name="arm"><inertial><origin xyz="0 0 -0.5"/><mass value="2"/>
-<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial></link>
-<joint name="wrist" type="revolute"><parent link="arm"/><child link="hand"/>
-<origin xyz="0 0 -0.5"/><axis xyz="0 1 0"/>{LIMIT}</joint>
-<link name="hand"><inertial><origin xyz="0 0 -0.1"/><mass value="0.5"/>
-<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>
-"""
-ROBOT = """\
-/**:
-  ros__parameters:
-    robot_description: {urdf}
-    joints: [shoulder, wrist]
-"""
 TRUTH = FrictionModel([3.0, 0.4], [4.0, 0.5], [0.5, 0.1], [0.03, 0.03])
 
 
 @pytest.fixture
-def robot(tmp_path):
+def robot(write_robot):
     """Path of a robot's parameter file."""
-    (tmp_path / "arm.urdf").write_text(URDF)
-    path = tmp_path / "robot.yaml"
-    path.write_text(ROBOT.format(urdf=tmp_path / "arm.urdf"))
-    return path
+    return write_robot()
 
 
 @pytest.fixture

@@ -4,7 +4,6 @@
 import math
 
 import numpy as np
-import pinocchio as pin
 import pytest
 import yaml
 from arms import load_arm
@@ -18,6 +17,7 @@ from torque_safety_controller.node.assembly import make_controller
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import parameter_table, read
+from viability_bounds_pkg.ros.messages import pose_message
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS, set_stamp
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import read_config
@@ -81,12 +81,7 @@ class WrenchChain(ControllerChain):
     def give_pose(self) -> None:
         pose = ARM.robot(0.0)
         pose.update(State(ARM.q_start, np.zeros(ARM.n)), np.zeros(ARM.n))
-        message = PoseStamped()
-        p = message.pose.position
-        p.x, p.y, p.z = map(float, pose.pose.translation)
-        o = message.pose.orientation
-        o.x, o.y, o.z, o.w = map(float, pin.Quaternion(pose.pose.rotation).coeffs())
-        self.poses.publish(message)
+        self.poses.publish(pose_message(pose.pose))
         self.until("mode", "TRACKING")
 
 

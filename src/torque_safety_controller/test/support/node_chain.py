@@ -11,7 +11,8 @@ from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import JointState
 
 from torque_safety_controller.controller import Controller
-from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp
+from viability_bounds_pkg.ros import messages
+from viability_bounds_pkg.ros.runtime import GOAL_QOS
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import read_config
 
@@ -55,13 +56,7 @@ GOAL = pose_at(GOAL_Q)
 
 
 def pose_message(pose: pin.SE3, frame="base", stamp=0) -> PoseStamped:
-    message = PoseStamped()
-    message.header.frame_id = frame
-    set_stamp(message.header.stamp, stamp)
-    p, o = message.pose.position, message.pose.orientation
-    p.x, p.y, p.z = map(float, pose.translation)
-    o.x, o.y, o.z, o.w = map(float, pin.Quaternion(pose.rotation).coeffs())
-    return message
+    return messages.pose_message(pose, frame, stamp)
 
 
 class NodeChain(ControllerChain):

@@ -130,16 +130,12 @@ def find_postures(chain: Chain, touches: SelfCollisions) -> Postures:
     return Postures(start, _held(chain, start), tuple(goals), reached)
 
 
-def _box(chain: Chain) -> tuple[Array, Array]:
-    """Return positions to look among, a turn around the middle where there are more."""
+def _within(chain: Chain, unit: Array) -> Array:
+    """Return positions to look among, by numbers from 0 to 1; no more than a turn of them."""
     low, high = np.maximum(chain.q_min, -1e3), np.minimum(chain.q_max, 1e3)
     middle = np.where(chain.continuous, 0.0, 0.5 * (low + high))
     half = np.minimum(0.5 * (high - low), np.pi)
-    return middle - half, middle + half
-
-
-def _within(chain: Chain, unit: Array) -> Array:
-    low, high = _box(chain)
+    low, high = middle - half, middle + half
     return np.asarray(low + unit * (high - low))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
-from geometry_msgs.msg import PoseStamped, Vector3Stamped
+from geometry_msgs.msg import Vector3Stamped
 from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -21,8 +21,7 @@ from torque_safety_controller.node.topics import (
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.safety.modes import Mode
 from torque_safety_controller.tasks.pose_task import pose_difference
-from viability_bounds_pkg.ros.messages import JointStateReader
-from viability_bounds_pkg.ros.runtime import set_stamp
+from viability_bounds_pkg.ros.messages import JointStateReader, pose_message
 
 Array = NDArray[np.float64]
 
@@ -73,22 +72,17 @@ class StatePublisher:
         publishers = self._pose, self._position_error, self._orientation_error
         if self._stopped or not any(each.get_subscription_count() for each in publishers):
             return
-        header = Header(frame_id=self._base_frame)
-        set_stamp(header.stamp, self._states.stamp)
         pin.forwardKinematics(self._model, self._data, self._states.q)
         pose = pin.updateFramePlacement(self._model, self._data, self._frame)
         pose = self._base.actInv(pose)
-        message = PoseStamped(header=header)
-        p, o = message.pose.position, message.pose.orientation
-        p.x, p.y, p.z = pose.translation.tolist()
-        o.x, o.y, o.z, o.w = pin.Quaternion(pose.rotation).coeffs().tolist()
+        message = pose_message(pose, self._base_frame, self._states.stamp)
         self._pose.publish(message)
         goal = self._controller.goals.pose_des
         if goal is None:
             return
         difference = pose_difference(pose, self._base.actInv(goal))
-        self._position_error.publish(_vector(header, difference.translation))
-        self._orientation_error.publish(_vector(header, difference.rotation))
+        self._position_error.publish(_vector(message.header, difference.translation))
+        self._orientation_error.publish(_vector(message.header, difference.rotation))
 
 
 def _vector(header: Header, values: Array) -> Vector3Stamped:

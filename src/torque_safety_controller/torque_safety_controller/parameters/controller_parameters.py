@@ -18,15 +18,15 @@ from torque_safety_controller.safety.modes import CONTROLS
 from torque_safety_controller.tasks.gains import Gains
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import (
-    NOT_NEGATIVE,
     POSITIVE,
     Range,
-    above,
     group,
+    joint_amounts,
     joint_numbers,
     number,
     switch,
     text,
+    timeout,
 )
 from viability_bounds_pkg.robot_configuration import (
     ControlRate,
@@ -76,11 +76,9 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
         "state then",
         default=False,
     )
-    torque_reserve: Array = joint_numbers(
+    torque_reserve: Array = joint_amounts(
         "torque that safety_filter leaves unplanned, for pushes, payloads and errors of the "
         "motors, which no model knows, N m; none if empty",
-        NOT_NEGATIVE,
-        if_empty=0.0,
         note="less than 0.97 of torque_max",
     )
     qp_solver: str = text(
@@ -97,16 +95,14 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
         default="torque",
         choices=CONTROLS,
     )
-    bounds_timeout: float = number(
+    bounds_timeout: float = timeout(
         "how long a state waits for its acceleration limits before HOLD, s; without a joint state "
         "for 1.5 times as long: STOPPED",
-        above(0.0, 3600.0),
         default=0.05,
     )
-    state_timeout: float = number(
+    state_timeout: float = timeout(
         "how long without a usable joint state until the arm may be elsewhere and all begins anew "
         "with the next one, s",
-        above(0.0, 3600.0),
         default=0.5,
     )
     goal_timeout: float = number(

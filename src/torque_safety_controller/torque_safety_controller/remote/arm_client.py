@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped, WrenchStamped
+from geometry_msgs.msg import WrenchStamped
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -23,6 +23,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from torque_safety_controller.node.topics import HAND_POSE, TARGET_JOINT_TRAJECTORY, TARGET_POSE
 from torque_safety_controller.remote.state_recording import StateRecording
 from viability_bounds_pkg.exceptions import ArmSafetyError
+from viability_bounds_pkg.ros.messages import pose_message
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, make_executor
 from viability_bounds_pkg.ros.topics import DIAGNOSTICS, JOINT_STATES, LIMIT_DISTANCES, Topic
 
@@ -138,10 +139,6 @@ class ArmClient:
         Raises:
             NotReachedError: it is not there, or it stands short of it.
         """
-        message = PoseStamped()
-        p, o = message.pose.position, message.pose.orientation
-        p.x, p.y, p.z = map(float, pose.translation)
-        o.x, o.y, o.z, o.w = map(float, pin.Quaternion(pose.rotation).coeffs())
 
         def there() -> bool:
             if HAND_POSE.name not in self._heard:
@@ -150,7 +147,7 @@ class ArmClient:
             away = np.linalg.norm(between.translation), np.linalg.norm(pin.log3(between.rotation))
             return bool(away[0] < tolerance[0] and away[1] < tolerance[1])
 
-        self._poses.publish(message)
+        self._poses.publish(pose_message(pose))
         self._arrive(there, timeout)
 
     def move_joints(

@@ -15,12 +15,10 @@ class DampingTask:
 
     Attributes:
         kd: damping, 1/s.
-        weight: of the squared error of acceleration.
     """
 
     kd: float
-    weight: float = 1.0
 
     def term(self, robot: RobotModel) -> TaskTerm:
         """Return ``a = -kd v`` as a term of the cost."""
-        return TaskTerm(None, -self.kd * robot.v, self.weight)
+        return TaskTerm(None, -self.kd * robot.v, 1.0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,15 @@ OFF = -1.0
 """Of ``disturbance_time``: disturbances are not estimated."""
 
 
+def _damping(task: str) -> Any:
+    return number(
+        f"damping of the {task} task, 1/s; -1: critical, 2 sqrt(kp)",
+        above(0.0, 1e4, special=CRITICAL),
+        default=CRITICAL,
+        live=True,
+    )
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Gains:
     """What may change while the controller runs.
@@ -31,12 +41,7 @@ class Gains:
     """
 
     pose_kp: float = number("stiffness of the pose task, 1/s^2", Range(0.0, 1e5), live=True)
-    pose_kd: float = number(
-        "damping of the pose task, 1/s; -1: critical, 2 sqrt(kp)",
-        above(0.0, 1e4, special=CRITICAL),
-        default=CRITICAL,
-        live=True,
-    )
+    pose_kd: float = _damping("pose")
     pose_weight: float = number(
         "weight of the pose task; 0: no pose task", Range(0.0, 1e5), default=1.0, live=True
     )
@@ -56,12 +61,7 @@ class Gains:
         live=True,
     )
     posture_kp: float = number("stiffness of the posture task, 1/s^2", Range(0.0, 1e5), live=True)
-    posture_kd: float = number(
-        "damping of the posture task, 1/s; -1: critical, 2 sqrt(kp)",
-        above(0.0, 1e4, special=CRITICAL),
-        default=CRITICAL,
-        live=True,
-    )
+    posture_kd: float = _damping("posture")
     posture_weight: float = number(
         "weight of the posture task", above(0.0, 1e5), default=1e-3, live=True
     )

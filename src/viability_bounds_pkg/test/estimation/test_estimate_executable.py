@@ -9,7 +9,6 @@ from functools import partial
 import numpy as np
 import pytest
 import yaml
-from two_joint_robot import LIMIT, ROBOT, parameters_in
 
 from viability_bounds_pkg.cli import limits_file
 from viability_bounds_pkg.cli.estimate_acceleration_limits import main
@@ -17,6 +16,7 @@ from viability_bounds_pkg.testing.executables import (
     called,
     started,
 )
+from viability_bounds_pkg.testing.two_joint_robot import LIMIT, ROBOT, parameters_in
 
 MODULE = "viability_bounds_pkg.cli.estimate_acceleration_limits"
 

@@ -8,13 +8,12 @@ import subprocess
 import sys
 import threading
 
-from two_joint_robot import parameters_in
-
 from viability_bounds_pkg.testing.executables import (
     TIME_LIMIT,
     as_child,
     environment,
 )
+from viability_bounds_pkg.testing.two_joint_robot import parameters_in
 
 
 def interrupt_when(process, ready):

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from small_node import SMALL_NODE
 from std_msgs.msg import String
 
 from viability_bounds_pkg.ros import runtime
@@ -20,21 +21,12 @@ from viability_bounds_pkg.testing.executables import as_child, environment
 STARTS = 3
 UNUSED = 30  # a place among those that nodes of one host are looked for at
 
-ANSWERS = """
-import os, sys
-from dataclasses import dataclass
+ANSWERS = f"""{SMALL_NODE}
 from std_msgs.msg import String
-from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS
 
-@dataclass
-class Nothing:
-    pass
-
-class Answers(ArmNode):
+class Answers(SmallNode):
     NAME = "answers"
-    PARAMETERS = Nothing
 
     def __init__(self):
         super().__init__()
@@ -103,9 +95,11 @@ def test_programs_announce_themselves_oftener_than_by_default(ros):
     assert min(np.diff(times)[-2:]) < 1.5
 
 
-def test_settings_of_users_are_kept(tmp_path):
+def test_settings_of_users_are_kept(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
     def chosen(**given):
-        settle_dds(given, tmp_path)
+        settle_dds(given)
         return given
 
     name = "FASTRTPS_DEFAULT_PROFILES_FILE"

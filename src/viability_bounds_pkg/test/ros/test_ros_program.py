@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import viability_bounds_pkg
-from viability_bounds_pkg.testing.executables import as_child
+from viability_bounds_pkg.testing.executables import as_child, run_to_end
 
 PACKAGES = str(Path(viability_bounds_pkg.__file__).resolve().parents[1])
 INTERRUPT = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n"
@@ -19,13 +19,9 @@ CALL = "import sys; from viability_bounds_pkg.cli.ros_program import {0}; sys.ex
 
 def call(directory, program, function, arguments):
     (directory / "slow_program.py").write_text(program)
-    return subprocess.run(
-        [sys.executable, "-c", CALL.format(function, arguments)],
+    return run_to_end(
+        *(sys.executable, "-c", CALL.format(function, arguments)),
         env=os.environ | {"PYTHONPATH": f"{directory}{os.pathsep}{PACKAGES}"},
-        capture_output=True,
-        text=True,
-        timeout=30,
-        check=False,
         preexec_fn=as_child,
     )
 

@@ -2,28 +2,20 @@
 import signal
 
 import pytest
+from small_node import SMALL_NODE
 
 from viability_bounds_pkg.testing.executables import started
 
-SCRIPT = """
-import sys
+SCRIPT = f"""{SMALL_NODE}
 import rclpy
 from numba import njit
-from dataclasses import dataclass
-from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.program import run
 
 @njit
 def add(x):
     return x + 1
 
-@dataclass
-class Nothing:
-    pass
-
-class Quick(ArmNode):
+class Quick(SmallNode):
     NAME = "quick"
-    PARAMETERS = Nothing
 
     def __init__(self):
         super().__init__()
@@ -44,25 +36,16 @@ def test_a_node_says_when_its_start_had_to_compile(compiles):
     assert not compiles or "scripts/setup.sh" in said[0]
 
 
-SMALL_NODE = """
-import os
-import signal
-import sys
-from dataclasses import dataclass
-from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.program import run
+def assert_ends_well(done):
+    assert done.returncode == 0, done.stderr
+    assert not {word for word in ("Traceback", "Exception", "Error") if word in done.stderr}
 
-@dataclass
-class Nothing:
-    pass
-"""
 
 INTERRUPTED = f"""{SMALL_NODE}
 from std_msgs.msg import Header
 
-class Busy(ArmNode):
+class Busy(SmallNode):
     NAME = "busy"
-    PARAMETERS = Nothing
 
     def __init__(self):
         super().__init__()
@@ -81,15 +64,13 @@ sys.exit(run(Busy, ["busy"]))
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_lets_the_callback_end_that_it_interrupts(sent):
     done = started("-c", INTERRUPTED, int(sent))
-    assert done.returncode == 0, done.stderr
-    assert not {word for word in ("Traceback", "Exception", "Error") if word in done.stderr}
+    assert_ends_well(done)
 
 
 INTERRUPTED_AT_START = f"""{SMALL_NODE}
 
-class Slow(ArmNode):
+class Slow(SmallNode):
     NAME = "slow"
-    PARAMETERS = Nothing
 
     def __init__(self):
         super().__init__()
@@ -105,16 +86,14 @@ sys.exit(run(Slow, ["slow"]))
 
 def test_an_interrupt_that_is_lost_during_the_start_ends_the_node_all_the_same():
     done = started("-c", INTERRUPTED_AT_START)
-    assert done.returncode == 0, done.stderr
-    assert not {word for word in ("Traceback", "Exception", "Error") if word in done.stderr}
+    assert_ends_well(done)
 
 
 REFUSED = f"""{SMALL_NODE}
 from viability_bounds_pkg.exceptions import ArmSafetyError
 
-class Refused(ArmNode):
+class Refused(SmallNode):
     NAME = "refused"
-    PARAMETERS = Nothing
 
     def __init__(self):
         raise ArmSafetyError("it cannot be")

@@ -4,6 +4,7 @@
 import numpy as np
 import pinocchio as pin
 import pytest
+from sample_arm import MODEL, NONE, TAU_MAX, N
 
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.state_estimation.freeze_check import (
@@ -17,11 +18,6 @@ from viability_bounds_pkg.state_estimation.freeze_check import (
 )
 from viability_bounds_pkg.state_estimation.state_check import WINDOW, StateCheck
 
-MODEL = pin.buildSampleModelManipulator()
-N = MODEL.nv
-MODEL.velocityLimit[:] = 2.0
-TAU_MAX = np.full(N, 50.0)
-NONE = np.zeros(N)
 REST = State(np.linspace(-0.5, 0.7, N), NONE)
 M = pin.crba(MODEL, MODEL.createData(), REST.q)
 

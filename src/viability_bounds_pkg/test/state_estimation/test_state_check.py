@@ -6,6 +6,7 @@ import pinocchio as pin
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sample_arm import MODEL, NONE, TAU_MAX, N
 
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.state_estimation.state_check import (
@@ -22,12 +23,7 @@ from viability_bounds_pkg.state_estimation.state_check import (
     largest_accelerations,
 )
 
-MODEL = pin.buildSampleModelManipulator()
-N = MODEL.nv
-MODEL.velocityLimit[:] = 2.0
-TAU_MAX = np.full(N, 50.0)
 A = largest_accelerations(MODEL, TAU_MAX)
-NONE = np.zeros(N)
 LIMIT = np.full(N, 2.5)
 H = 0.002
 

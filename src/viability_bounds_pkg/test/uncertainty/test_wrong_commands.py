@@ -3,7 +3,6 @@
 
 from itertools import product
 
-import numpy as np
 import pytest
 
 from viability_bounds_pkg.uncertainty.declared import DeclaredUncertainty
@@ -59,16 +58,7 @@ def most(weights):
     + [(0, 0, 2), (2, 0, 0), (0, 2, 0), (1, 2, 0)],
 )
 def test_no_order_of_commands_does_more_than_is_kept_back_for(delay, jitter, missed):
-    none = np.zeros(1)
-    declared = DeclaredUncertainty(
-        position_error=none,
-        velocity_error=none,
-        acceleration_disturbance=none,
-        delay=delay,
-        delay_jitter=jitter,
-        missed_deadlines=missed,
-        motor_bandwidth=none,
-    )
+    declared = DeclaredUncertainty(delay=delay, delay_jitter=jitter, missed_deadlines=missed)
     weights = [counts(acting, delay) for acting in acting_commands(delay, jitter, missed)]
     velocity = max(most(v) for v, _ in weights)
     position = max(most(p) for _, p in weights)

@@ -75,18 +75,13 @@ class BoundsNode(ArmNode):
         self._warn_of_affected_joints(config)
         self.announce(joints, config.rate_hz, f"method {config.method}")
 
-    def _warn(self, text: str) -> None:
-        self.get_logger().warning(text)
-
     def _configure(self, config: BoundsConfiguration) -> None:
         self._bounds = make_bounds(config)
         self._warn_of_affected_joints(config)
 
     def _warn_of_affected_joints(self, config: BoundsConfiguration) -> None:
         if config.method != "exact":
-            self.get_logger().warning(
-                f"method '{config.method}' does not keep the limits; it is for comparison"
-            )
+            self._warn(f"method '{config.method}' does not keep the limits; it is for comparison")
             return
         holds = viability.discrete_time_condition(
             config.limits,

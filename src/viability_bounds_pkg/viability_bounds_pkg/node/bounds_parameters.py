@@ -16,15 +16,16 @@ from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError
 from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
 from viability_bounds_pkg.parameter import (
     NEGATIVE,
-    NOT_NEGATIVE,
     POSITIVE,
     Range,
     above,
     group,
+    joint_amounts,
     joint_numbers,
     number,
     redeclared,
     text,
+    timeout,
 )
 from viability_bounds_pkg.robot_configuration import (
     ControlRate,
@@ -76,11 +77,9 @@ class BoundsConfiguration(VelocityEstimation, StateSource, ControlRate, LimitedR
     NOT_NEEDED = frozenset({"torque_max"})
     acceleration_min: Array = joint_numbers("lower acceleration limits, rad/s^2", NEGATIVE)
     acceleration_max: Array = joint_numbers("upper acceleration limits, rad/s^2", POSITIVE)
-    acceleration_drift: Array = joint_numbers(
+    acceleration_drift: Array = joint_amounts(
         "largest jerk under held torque, rad/s^3; the bounds are tightened by the error that it "
-        "causes within a control period; 0 if empty",
-        NOT_NEGATIVE,
-        if_empty=0.0,
+        "causes within a control period; 0 if empty"
     )
     declared: DeclaredUncertainty = group(DeclaredUncertainty)
     position_margin: float = number(
@@ -110,8 +109,8 @@ class BoundsConfiguration(VelocityEstimation, StateSource, ControlRate, LimitedR
     damper_gain: float = number(
         "for method damper: speed allowed there, rad/s", above(0.0, 1e3), default=1.0
     )
-    state_timeout: float = number(
-        "silence after which older stamps are accepted again, s", above(0.0, 3600.0), default=0.5
+    state_timeout: float = timeout(
+        "silence after which older stamps are accepted again, s", default=0.5
     )
     limits: JointLimits = field(init=False)
     margins: TorqueMargins = field(init=False)

@@ -80,9 +80,6 @@ class EstimatorNode(ArmNode):
             f"{lag.min():.3g} to {lag.max():.3g} ms",
         )
 
-    def _warn(self, text: str) -> None:
-        self.get_logger().warning(text)
-
     def _on_state(self, message: JointState) -> None:
         if not self.publisher_watch.admits(self._states_topic):
             return

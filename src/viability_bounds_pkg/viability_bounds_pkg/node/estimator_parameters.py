@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import pinocchio as pin
 
-from viability_bounds_pkg.parameter import above, group, number
+from viability_bounds_pkg.parameter import group, timeout
 from viability_bounds_pkg.robot_configuration import ControlRate, LimitedRobotConfiguration
 from viability_bounds_pkg.state_estimation.estimator import StateEstimator
 from viability_bounds_pkg.state_estimation.observer import ObserverDesign
@@ -20,8 +20,8 @@ class EstimatorConfiguration(VelocityEstimation, ControlRate, LimitedRobotConfig
     """Parameters of the estimator node."""
 
     declared: DeclaredUncertainty = group(DeclaredUncertainty)
-    state_timeout: float = number(
-        "silence after which older stamps are accepted again, s", above(0.0, 3600.0), default=0.5
+    state_timeout: float = timeout(
+        "silence after which older stamps are accepted again, s", default=0.5
     )
 
     @property

@@ -62,6 +62,9 @@ class ArmNode(Node):
             raise RosArgumentError(" ".join(str(error).split(", at /")[0].split())) from error
         self._guard()
 
+    def _warn(self, text: str) -> None:
+        self.get_logger().warning(text)
+
     def _guard(self) -> None:
         """Refuse what ends a node inside of rclpy: times before 0, parameters of no type."""
         source = self._time_source  # subscribes now, or when use_sim_time becomes true
@@ -79,7 +82,7 @@ class ArmNode(Node):
             take(message)
         elif not self._told_of_clock:
             self._told_of_clock = True
-            self.get_logger().warning(f"/clock refused: {message.clock.sec} s, before 0")
+            self._warn(f"/clock refused: {message.clock.sec} s, before 0")
 
     def _on_set_parameters(self, take: Callable[..., Any], request: Any, response: Any) -> Any:
         types = {kind.value for kind in Parameter.Type}

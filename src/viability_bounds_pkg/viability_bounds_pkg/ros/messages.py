@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages into arrays: names matched, sizes, values and stamps checked, refusals counted."""
+"""Messages into arrays and back: names matched, values and stamps checked, refusals counted."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from enum import Enum
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseStamped
 from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -21,7 +23,7 @@ from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 from viability_bounds_pkg.exceptions import did_you_mean
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.robot_urdf import DescriptionWatch
-from viability_bounds_pkg.ros.runtime import stamp_to_ns
+from viability_bounds_pkg.ros.runtime import set_stamp, stamp_to_ns
 from viability_bounds_pkg.ros.topics import DIAGNOSTICS, VALUES
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.state_estimation.freeze_check import Expected
@@ -306,6 +308,17 @@ def _numbers(values: Mapping[str, Any]) -> Float64MultiArray:
             size = len(numbers)
             message.layout.dim.append(MultiArrayDimension(label=key, size=size, stride=size))
             message.data.extend(numbers.tolist())
+    return message
+
+
+def pose_message(pose: pin.SE3, frame: str = "", stamp: int = 0) -> PoseStamped:
+    """Return a pose in the axes of a frame as a message, with a stamp in ns."""
+    message = PoseStamped()
+    message.header.frame_id = frame
+    set_stamp(message.header.stamp, stamp)
+    p, o = message.pose.position, message.pose.orientation
+    p.x, p.y, p.z = pose.translation.tolist()
+    o.x, o.y, o.z, o.w = pin.Quaternion(pose.rotation).coeffs().tolist()
     return message
 
 

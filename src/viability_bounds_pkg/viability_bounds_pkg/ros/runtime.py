@@ -40,7 +40,7 @@ _WITH_UDP = "", "DEFAULT", "UDPv4"
 """Built-in transports with which messages can come by UDP."""
 
 
-def settle_dds(environment: MutableMapping[str, str], folder: Path | None = None) -> None:
+def settle_dds(environment: MutableMapping[str, str]) -> None:
     """Choose settings of Fast DDS by which nodes that start again are heard soon, `fastdds.xml`.
 
     Users who have settings of their own, or other transports, keep them. Call it before the first
@@ -48,10 +48,8 @@ def settle_dds(environment: MutableMapping[str, str], folder: Path | None = None
 
     Args:
         environment: of the process; its children inherit it.
-        folder: working directory, in which Fast DDS looks for settings, too; None for the process'
-            own.
     """
-    own = (folder or Path.cwd()) / "DEFAULT_FASTRTPS_PROFILES.xml"
+    own = Path("DEFAULT_FASTRTPS_PROFILES.xml")  # in the working directory, where it looks, too
     transports = environment.get("FASTDDS_BUILTIN_TRANSPORTS", "")
     if environment.get(_PROFILES) or own.exists() or transports not in _WITH_UDP:
         return

@@ -50,15 +50,29 @@ def as_child(end: signal.Signals = signal.SIGTERM) -> None:
     _LIBC.prctl(_PR_SET_PDEATHSIG, end)
 
 
+def run_to_end(
+    *command: Any, timeout: float | None = 120.0, **options: Any
+) -> subprocess.CompletedProcess[str]:
+    """Return how a program ended and what it said.
+
+    Args:
+        command: its words.
+        timeout: the longest that it may take, s.
+        options: others of `subprocess.run`.
+    """
+    words = list(map(str, command))
+    return subprocess.run(
+        words, capture_output=True, text=True, timeout=timeout, check=False, **options
+    )
+
+
 def started(*arguments: Any) -> subprocess.CompletedProcess[str]:
     """Return how Python ended that was started with arguments such as ``-m module``."""
-    return subprocess.run(
-        [sys.executable, *map(str, arguments)],
-        capture_output=True,
-        text=True,
+    return run_to_end(
+        sys.executable,
+        *arguments,
         env=environment(),
         timeout=TIME_LIMIT,
-        check=False,
         preexec_fn=as_child,
     )
 

@@ -293,6 +293,14 @@ class RosHarness:
         for result in self.set_parameters(node, **values):
             assert result.successful, result.reason
 
+    def assert_limits_kept(self) -> None:
+        """Check that the simulated robot has never been beyond a limit since its last reset."""
+        self.diagnostics.clear()
+        robot = self.wait_until(lambda: self.diagnostics.get("bullet_node"))
+        for key in ("position_violation_rad", "velocity_violation_rad_s"):
+            assert max(map(float, robot[key].split())) == 0.0, (key, robot[key])
+        assert max(map(float, robot["torque_ratio"].split())) <= 1.0 + 1e-9, robot["torque_ratio"]
+
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             values = {value.key: value.value for value in status.values}

@@ -12,19 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from viability_bounds_pkg.parameter import (
-    NOT_NEGATIVE,
-    Range,
-    joint_numbers,
-    switch,
-    whole_number,
-)
+from viability_bounds_pkg.parameter import joint_amounts, periods, switch
 from viability_bounds_pkg.state_estimation.observer import ObserverDesign, design_observer
 
 Array = NDArray[np.float64]
-
-MOST_PERIODS = 100
-"""Longest delay and row of missed deadlines that can be declared, control periods."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -42,52 +33,34 @@ class VelocityEstimation:
 class DeclaredUncertainty:
     """Largest errors of states, times and accelerations; arrays of shape (n,)."""
 
-    position_error: Array = joint_numbers(
+    position_error: Array = joint_amounts(
         "largest error of a reported position, rad: resolution and noise of the encoder; 0 if "
-        "empty",
-        NOT_NEGATIVE,
-        if_empty=0.0,
+        "empty"
     )
-    velocity_error: Array = joint_numbers(
+    velocity_error: Array = joint_amounts(
         "largest error of a reported velocity, rad/s; 0 if empty",
-        NOT_NEGATIVE,
-        if_empty=0.0,
         note="not used with use_estimated_states, where the observer's own error counts",
     )
-    acceleration_disturbance: Array = joint_numbers(
+    acceleration_disturbance: Array = joint_amounts(
         "how much more than commanded the joints may accelerate by what the model does not know, "
-        "friction, payloads, pushes, rad/s^2; the bounds are tightened by it; 0 if empty",
-        NOT_NEGATIVE,
-        if_empty=0.0,
+        "friction, payloads, pushes, rad/s^2; the bounds are tightened by it; 0 if empty"
     )
-    lasting_disturbance: Array = joint_numbers(
+    lasting_disturbance: Array = joint_amounts(
         "up to which the estimator learns what the model does not know and lasts, friction, "
         "payloads, wrong masses, rad/s^2, so that velocities of joints at rest have no bias; its "
-        "errors are guaranteed where acceleration_disturbance covers the rest; 0 if empty",
-        NOT_NEGATIVE,
-        if_empty=0.0,
+        "errors are guaranteed where acceleration_disturbance covers the rest; 0 if empty"
     )
-    delay: int = whole_number(
+    delay: int = periods(
         "control periods from the instant of a reported state to the one when the command that "
-        "answers it begins to act",
-        Range(0, MOST_PERIODS),
-        default=0,
+        "answers it begins to act"
     )
-    delay_jitter: int = whole_number(
-        "control periods by which the delay may be longer at times",
-        Range(0, MOST_PERIODS),
-        default=0,
-    )
-    missed_deadlines: int = whole_number(
+    delay_jitter: int = periods("control periods by which the delay may be longer at times")
+    missed_deadlines: int = periods(
         "longest row of control periods in which no new command arrives and the robot keeps the "
-        "last one",
-        Range(0, MOST_PERIODS),
-        default=0,
+        "last one"
     )
-    motor_bandwidth: Array = joint_numbers(
-        "bandwidth of the motors' torque as a first-order lag, Hz; 0 or empty: no lag",
-        NOT_NEGATIVE,
-        if_empty=0.0,
+    motor_bandwidth: Array = joint_amounts(
+        "bandwidth of the motors' torque as a first-order lag, Hz; 0 or empty: no lag"
     )
 
     @property

@@ -15,6 +15,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from sim_bridge.nodes.topics import EXTERNAL_WRENCH
 from sim_bridge.viewer.node.viewer_parameters import ViewerConfiguration
 from sim_bridge.viewer.page import DrivingAsked, GoalAsked, JointsAsked, PushAsked, Request
+from viability_bounds_pkg.ros.messages import pose_message
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp
 
 _SLIDE = 0.5
@@ -75,7 +76,7 @@ class Driver:
         if isinstance(request, DrivingAsked):
             (self.start if request.begin else self.stop)()
         elif isinstance(request, GoalAsked) and self._poses is not None:
-            self._poses.publish(_pose_message(request.pose, self._config.base_frame))
+            self._poses.publish(pose_message(request.pose, self._config.base_frame))
         elif isinstance(request, JointsAsked) and self._trajectories is not None:
             self._trajectories.publish(self._trajectory(request.q))
         elif isinstance(request, PushAsked):
@@ -107,12 +108,3 @@ def pose_of(message: PoseStamped) -> pin.SE3 | None:
         return None
     rotation = pin.Quaternion(numbers[:4] / length).toRotationMatrix()
     return pin.SE3(rotation, numbers[4:])
-
-
-def _pose_message(pose: pin.SE3, frame: str) -> PoseStamped:
-    message = PoseStamped()
-    message.header.frame_id = frame
-    p, o = message.pose.position, message.pose.orientation
-    p.x, p.y, p.z = map(float, pose.translation)
-    o.x, o.y, o.z, o.w = map(float, pin.Quaternion(pose.rotation).coeffs())
-    return message

@@ -3,6 +3,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
 import pytest
 import yaml
 
@@ -33,17 +37,17 @@ ROBOT = """\
 
 
 @pytest.fixture
-def write_robot(tmp_path):
+def write_robot(tmp_path: Path) -> Callable[..., Path]:
     """Writes a robot's URDF and parameter file; returns the latter's path."""
 
     def write(
-        limit=LIMIT,
-        type="revolute",
-        mass=2.0,
-        hand_mass=0.5,
-        parameters="",
-        text=ROBOT,
-    ):
+        limit: str = LIMIT,
+        type: str = "revolute",
+        mass: float = 2.0,
+        hand_mass: float = 0.5,
+        parameters: str = "",
+        text: str = ROBOT,
+    ) -> Path:
         urdf = tmp_path / "arm.urdf"
         urdf.write_text(
             URDF.format(limit=limit, type=type, mass=mass, hand_mass=hand_mass, limits=LIMITS)
@@ -55,5 +59,7 @@ def write_robot(tmp_path):
     return write
 
 
-def parameters_in(text):
-    return yaml.safe_load(text)["/**/bounds_node"]["ros__parameters"]
+def parameters_in(text: str) -> dict[str, Any]:
+    """Return the parameters of the bounds node in a file."""
+    parameters: dict[str, Any] = yaml.safe_load(text)["/**/bounds_node"]["ros__parameters"]
+    return parameters
