@@ -174,9 +174,6 @@ class ControllerNode(ArmNode):
         if self._gains is not None:
             self._gains.look(config)
 
-    def _warn(self, text: str) -> None:
-        self.get_logger().warning(text)
-
     # Streams
 
     def _on_state(self, message: JointState) -> None:
