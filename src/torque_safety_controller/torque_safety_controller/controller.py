@@ -74,6 +74,9 @@ _RETURN_TIME = 0.02
 _RETURN = 0.5
 """By which it sets out for them, rad/s^2."""
 
+_HASTE = 4.0
+"""How much more it is where less than `_RESERVE` is left, in times of what is missing / T^2."""
+
 
 class ControlOutput(NamedTuple):
     """Result of one control step.
@@ -447,12 +450,12 @@ class Controller:
             relaxed = relaxed[: -len(rows.G)] if len(relaxed) > len(rows.G) else None
         return ControlOutput(tau, a, not self.lost, solution.relaxation, "", relaxed)
 
-    def _room(self) -> Array:
-        """Return the room to the position limit ahead, as far as limits are known."""
+    def _room(self) -> tuple[Array, Array]:
+        """Return the room to the lower and the upper position limit, as far as they are known."""
         if self._position_limits is None:
-            return self._no_torque
+            return self._no_torque, self._no_torque
         (low, high), q = self._position_limits, self.robot.q
-        return np.where(self.robot.v > 0.0, high - q, q - low)
+        return q - low, high - q
 
     def _look_ahead(
         self, bounds: AccelerationRange, additional: Array | None, disturbance: Array | None
@@ -499,7 +502,7 @@ class Controller:
 def return_gently(
     bounds: AccelerationRange,
     v: Array,
-    room: Array,
+    room: tuple[Array, Array],
     share: float,
     period: float,
     rough: bool = False,
@@ -510,7 +513,9 @@ def return_gently(
     be back after two periods, by a jolt. Here such a joint returns with the share: one that is d
     beyond its bounds, which ask for 0.5 d / period^2 at most, is asked for
 
-        a = share / (1 - share) max(d / T^2, `_RETURN`) - v / T,    T = `_RETURN_TIME`.
+        a = share / (1 - share) max(d / T^2, `_RETURN`) - v / T,    T = `_RETURN_TIME`,
+
+    and more where hardly anything is left of the margin.
 
     One that moves towards its limit brakes as it must, or so that it comes to rest in T and in a
     part of the room that is left to the limit itself, if that is less; where its speed may be
@@ -519,14 +524,16 @@ def return_gently(
     Args:
         bounds: of the joints, shape (n,) each, rad/s^2.
         v: their velocities, shape (n,), rad/s.
-        room: that is left to the position limit ahead, without margins, shape (n,), rad.
+        room: that is left to the lower and the upper position limit, without margins, shape (n,)
+            each, rad.
         share: of what the bounds demand, from 0 to 1.
         period: of control, s.
         rough: whether `v` has noise, for which the bounds have margins.
     """
     lower, upper = bounds
     speed = np.abs(v)
-    way = _PART * (room - _RESERVE) - _LATE * period * speed
+    spare = room[0] - _RESERVE, room[1] - _RESERVE
+    way = _PART * np.where(v > 0.0, spare[1], spare[0]) - _LATE * period * speed
     with np.errstate(divide="ignore", invalid="ignore"):
         brake = np.where(way > 0.0, np.maximum(speed / _RETURN_TIME, 0.5 * v * v / way), np.inf)
     # Where the bounds leave no choice the joint is beyond what they keep.
@@ -535,8 +542,9 @@ def return_gently(
     stop = -v / period
     grown = share / (1.0 - share) if share < 1.0 else np.inf
     per_way = 2.0 * (period / _RETURN_TIME) ** 2
-    up = grown * np.maximum(per_way * lower, _RETURN) - v / _RETURN_TIME
-    down = grown * np.minimum(per_way * upper, -_RETURN) - v / _RETURN_TIME
+    least = (np.maximum(_RETURN, -_HASTE * each / _RETURN_TIME**2) for each in spare)
+    up = grown * np.maximum(per_way * lower, next(least)) - v / _RETURN_TIME
+    down = grown * np.minimum(per_way * upper, -next(least)) - v / _RETURN_TIME
     up, down = np.minimum(share * lower, up), np.maximum(share * upper, down)
     up = np.maximum(up, np.where(v < 0.0, brake, stop))
     down = np.minimum(down, np.where(v > 0.0, -brake, stop))

@@ -18,7 +18,7 @@ LIMITS = JointLimits(
     np.array([-3.0, -15.0]),
     np.array([3.0, 15.0]),
 )
-NO_ROOM = np.zeros(2)
+NO_ROOM = np.zeros(2), np.zeros(2)
 
 
 @pytest.mark.parametrize("ahead", [1, 2])
@@ -39,7 +39,7 @@ def test_what_brakes_a_joint_within_its_range_stays(ahead):
     bounds = AccelerationRange(found.lower, found.upper)
     assert found.viable.mean() > 0.99
     assert ((bounds.lower > 0.0) | (bounds.upper < 0.0)).mean() > 0.1
-    room = np.where(v > 0.0, LIMITS.q_max - q, q - LIMITS.q_min)
+    room = q - LIMITS.q_min, LIMITS.q_max - q
     eased = return_gently(bounds, v, room, 0.0, DT)
     inside = found.viable
     np.testing.assert_allclose(eased.lower[inside], bounds.lower[inside], atol=1e-6)
@@ -122,8 +122,8 @@ def test_within_the_margins_the_limit_is_never_passed_whatever_the_speed(within_
         for _ in range(400):
             found = within_margins.bounds(q, v)
             bounds = AccelerationRange(found.lower, found.upper)
-            ahead = np.where(v > 0.0, LIMITS.q_max - q, q - LIMITS.q_min)
-            low, high = return_gently(bounds, v, ahead, share, 1e-3)
+            ways = q - LIMITS.q_min, LIMITS.q_max - q
+            low, high = return_gently(bounds, v, ways, share, 1e-3)
             a = np.clip(0.0, low, high)
             q, v = q + v * 1e-3 + 0.5e-6 * a, v + 1e-3 * a
             assert (side * (edge - q) > 0.0).all()
@@ -135,7 +135,7 @@ def test_within_the_margins_the_limit_is_never_passed_whatever_the_speed(within_
 def test_a_push_by_friction_within_the_margins_is_no_jolt(within_margins, side):
     """The bounds ask for all that there is, and did so in every other period."""
     q = (LIMITS.q_max if side > 0.0 else LIMITS.q_min) - 0.9 * side * MARGIN
-    room = np.full(2, 0.9 * MARGIN)
+    room = np.full(2, 0.9 * MARGIN), np.full(2, 0.9 * MARGIN)
     for speed in (1e-9, 1e-6, 1e-4, 1e-3):
         v = np.full(2, side * speed)
         found = within_margins.bounds(q, v)
@@ -151,7 +151,7 @@ def test_it_comes_back_to_its_bounds_slower_and_slower(within_margins, side):
     """Without them it was pushed with all of the margin until it was back, and then let go."""
     edge = (LIMITS.q_max if side > 0.0 else LIMITS.q_min) - side * MARGIN
     q, v, before = edge + 0.2 * side * MARGIN, np.zeros(2), np.zeros(2)
-    room = np.full(2, 0.8 * MARGIN)
+    room = np.full(2, 0.8 * MARGIN), np.full(2, 0.8 * MARGIN)
     for k in range(500):
         found = within_margins.bounds(q, v)
         bounds = AccelerationRange(found.lower, found.upper)
