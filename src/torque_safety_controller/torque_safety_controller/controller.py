@@ -56,7 +56,7 @@ _STANDS = 1e-9
 """A joint that is slower stands: rounding may be its velocity, rad/s."""
 
 _SOFT = 0.03
-"""Part of itself by which braking gets less in a period, where an arm that is slowed still moves."""
+"""Part of itself by which braking gets less in a period, where a slowed arm still moves."""
 
 _CREEPS = 1e-5
 """A joint that was stopped may still have such a speed, rad/s: less than 0.1 urad in 10 ms."""
