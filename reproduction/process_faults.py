@@ -86,6 +86,8 @@ class Kind:
             its own then.
         values: parameters of all nodes that differ.
         brakes: whether the arm has to be brought to rest.
+        halts: whether its time stands still: it goes on in the middle of its motion, in which
+            torques step without a fault, too.
     """
 
     course: Callable[[Bench], Course]
@@ -94,6 +96,7 @@ class Kind:
     late: str = ""
     values: Mapping[str, Any] = field(default_factory=dict)
     brakes: bool = True
+    halts: bool = False
 
 
 class Bench:
@@ -337,6 +340,8 @@ class Bench:
             since = min(since, time.monotonic()) if self.tracking else math.inf
         begin = max(begin, self._marked)
         seen.note_moment(self._trace, begin, end, self.dt, self._tau_max)
+        if self._kind.halts:
+            seen.steps.clear()
 
     def note_limits(self, seen: Seen) -> None:
         """Add how far limits were passed until now."""
@@ -545,7 +550,7 @@ FAULTS = {
     "robot killed": Kind(killed(ROBOT), WITH_ROBOT),
     "robot restarted": Kind(restarted(ROBOT), WITH_ROBOT),
     # The controller tells it within 100 ms.
-    "robot stopped and continued": Kind(stood_still(ROBOT, least=0.2), WITH_ROBOT),
+    "robot stopped and continued": Kind(stood_still(ROBOT, least=0.2), WITH_ROBOT, halts=True),
     "bounds late": Kind(late(BOUNDS), late=BOUNDS),
     "controller late": Kind(late(CONTROLLER), late=CONTROLLER),
     "robot late": Kind(late(ROBOT), late=ROBOT),
