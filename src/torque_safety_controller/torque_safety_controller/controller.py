@@ -55,9 +55,6 @@ _UNBOUNDED = 1e6
 _STANDS = 1e-9
 """A joint that is slower stands: rounding may be its velocity, rad/s."""
 
-_SOFT = 0.03
-"""Part of itself by which braking gets less in a period, where a slowed arm still moves."""
-
 _CREEPS = 1e-5
 """A joint that was stopped may still have such a speed, rad/s: less than 0.1 urad in 10 ms."""
 
@@ -405,7 +402,7 @@ class Controller:
         terms = [task.term(robot) for task in tasks]
         eased = bounds
         if self.share < 1.0:
-            rest = -min(self.gains.hold_kd, _SOFT / robot.dt) * robot.v
+            rest = -self.gains.hold_kd * robot.v
             terms = [each.mixed(rest, self.share) for each in terms]
             eased = _around(rest, bounds, self.share)
 

@@ -190,7 +190,7 @@ def test_a_share_of_the_goals_mixes_their_accelerations_with_those_of_braking():
     found = {}
     for controller.share in (0.0, 0.25, 1.0):
         found[controller.share] = controller.step(state, wide(arm)).a
-    rest = -min(controller.gains.hold_kd, 0.03 / arm.dt) * state.v
+    rest = -controller.gains.hold_kd * state.v
     np.testing.assert_allclose(found[0.0], rest, atol=1e-3)
     np.testing.assert_allclose(found[0.25], 0.25 * found[1.0] + 0.75 * rest, atol=1e-3)
     assert np.abs(found[1.0] - rest).max() > 0.1
