@@ -34,6 +34,7 @@ from torque_safety_controller.qp.inverse_dynamics_qp import (
 from torque_safety_controller.qp.quadratic_program import NoSolutionFound
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.safety.disturbance_observer import DisturbanceObserver
+from torque_safety_controller.safety.gentle_return import return_gently
 from torque_safety_controller.safety.torque_limiter import TorqueLimiter
 from torque_safety_controller.tasks.damping_task import DampingTask
 from torque_safety_controller.tasks.detour import Detour, Progress
@@ -51,31 +52,6 @@ Array = NDArray[np.float64]
 
 _UNBOUNDED = 1e6
 """Stands for the width of bounds that are not there, rad/s^2."""
-
-_STANDS = 1e-9
-"""A joint that is slower stands: rounding may be its velocity, rad/s."""
-
-_CREEPS = 1e-5
-"""A joint that was stopped may still have such a speed, rad/s: less than 0.1 urad in 10 ms."""
-
-_PART = 0.25
-"""Of the room to a limit in which a joint within margins may come to rest: it brakes less and less
-as it comes nearer."""
-
-_RESERVE = 1e-3
-"""Of the room to a limit that is left for what nobody foresees, rad."""
-
-_LATE = 3
-"""Periods that a command may come late."""
-
-_RETURN_TIME = 0.02
-"""T: in which a joint comes to rest, and to its bounds, s."""
-
-_RETURN = 0.5
-"""By which it sets out for them, rad/s^2."""
-
-_HASTE = 4.0
-"""How much more it is where less than `_RESERVE` is left, in times of what is missing / T^2."""
 
 
 class ControlOutput(NamedTuple):
@@ -497,61 +473,6 @@ class Controller:
     def _remember(self, a: Array) -> Array:
         self._a_last = a if math.isfinite(a.dot(a)) else np.zeros(self.robot.n)
         return self._a_last
-
-
-def return_gently(
-    bounds: AccelerationRange,
-    v: Array,
-    room: tuple[Array, Array],
-    share: float,
-    period: float,
-    rough: bool = False,
-) -> AccelerationRange:
-    """Return bounds that push a joint which stands beyond them by a share only.
-
-    An arm may have been stopped within the margins of a position limit; its bounds then demand to
-    be back after two periods, by a jolt. Here such a joint returns with the share: one that is d
-    beyond its bounds, which ask for 0.5 d / period^2 at most, is asked for
-
-        a = share / (1 - share) max(d / T^2, `_RETURN`) - v / T,    T = `_RETURN_TIME`,
-
-    and more where hardly anything is left of the margin.
-
-    One that moves towards its limit brakes as it must, or so that it comes to rest in T and in a
-    part of the room that is left to the limit itself, if that is less; where its speed may be
-    noise, it need not do more than stand: the noise would choose between a push and none.
-
-    Args:
-        bounds: of the joints, shape (n,) each, rad/s^2.
-        v: their velocities, shape (n,), rad/s.
-        room: that is left to the lower and the upper position limit, without margins, shape (n,)
-            each, rad.
-        share: of what the bounds demand, from 0 to 1.
-        period: of control, s.
-        rough: whether `v` has noise, for which the bounds have margins.
-    """
-    lower, upper = bounds
-    speed = np.abs(v)
-    spare = room[0] - _RESERVE, room[1] - _RESERVE
-    way = _PART * np.where(v > 0.0, spare[1], spare[0]) - _LATE * period * speed
-    with np.errstate(divide="ignore", invalid="ignore"):
-        brake = np.where(way > 0.0, np.maximum(speed / _RETURN_TIME, 0.5 * v * v / way), np.inf)
-    # Where the bounds leave no choice the joint is beyond what they keep.
-    slow = np.inf if rough else np.where(lower == upper, _CREEPS, _STANDS)
-    brake = np.where(speed < slow, np.minimum(brake, speed / period), brake)
-    stop = -v / period
-    grown = share / (1.0 - share) if share < 1.0 else np.inf
-    per_way = 2.0 * (period / _RETURN_TIME) ** 2
-    least = (np.maximum(_RETURN, -_HASTE * each / _RETURN_TIME**2) for each in spare)
-    up = grown * np.maximum(per_way * lower, next(least)) - v / _RETURN_TIME
-    down = grown * np.minimum(per_way * upper, -next(least)) - v / _RETURN_TIME
-    up, down = np.minimum(share * lower, up), np.maximum(share * upper, down)
-    up = np.maximum(up, np.where(v < 0.0, brake, stop))
-    down = np.minimum(down, np.where(v > 0.0, -brake, stop))
-    return AccelerationRange(
-        np.where(lower > 0.0, np.minimum(up, lower), lower),
-        np.where(upper < 0.0, np.maximum(down, upper), upper),
-    )
 
 
 def _around(rest: Array, bounds: AccelerationRange, share: float) -> AccelerationRange:

@@ -48,6 +48,8 @@ from viability_bounds_pkg.state_estimation.state_check import RESTART
 Array = NDArray[np.float64]
 
 _RETRY_PERIOD = 0.05
+"""Shorter than the 75 ms after which a controller takes the robot for silent, s."""
+
 _CONTROL = {TorqueCommand: "torque", PositionCommand: "position"}
 
 

@@ -58,7 +58,7 @@ from viability_bounds_pkg.ros.topics import (
 )
 from viability_bounds_pkg.state import State
 
-QUIET = 1.5
+_QUIET = 1.5
 """Time without a joint state after which the robot is silent, in times of `bounds_timeout`."""
 
 _SILENT = "no joint state"
@@ -113,7 +113,7 @@ class ControllerNode(ArmNode):
         )
         self._driving = Driving(self, self._goals, self._controller, config, base, self._states)
         self._modes = ModeKeeper()
-        self._before = self._modes.mode, self._modes.reason  # the robot fell silent
+        self._before = self._modes.mode, self._modes.reason  # what they were before silence
         self._went_wrong = ""  # why the arm was braked, until it goes on
         self._rate = RateWatch(config.dt, covered_row(self))
         self._compared = config.effort_tolerance > 0.0
@@ -366,7 +366,7 @@ class ControllerNode(ArmNode):
 
     def _watch(self) -> None:
         now, config, states = time.monotonic(), self._config, self._states
-        quiet = now - states.message_at > QUIET * config.bounds_timeout
+        quiet = now - states.message_at > _QUIET * config.bounds_timeout
         if quiet or states.silent(now):
             if self._modes.mode is not Mode.STOPPED:
                 self._before = self._modes.mode, self._modes.reason

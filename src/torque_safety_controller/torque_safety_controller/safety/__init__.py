@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The last checks of a torque, the disturbance observer, modes and handover."""
+"""Last checks of a torque, disturbances, modes, handover, and how a slowed arm goes on."""
 
 from torque_safety_controller.safety.command_watch import CommandWatch
 from torque_safety_controller.safety.disturbance_observer import DisturbanceObserver
+from torque_safety_controller.safety.gentle_return import return_gently
 from torque_safety_controller.safety.handover import Control, Handover, HandoverRefused
 from torque_safety_controller.safety.modes import Mode, ModeKeeper
 from torque_safety_controller.safety.rate_watch import RateWatch
@@ -18,4 +19,5 @@ __all__ = [
     "ModeKeeper",
     "RateWatch",
     "TorqueLimiter",
+    "return_gently",
 ]

@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from torque_safety_controller.controller import return_gently
 from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.safety.gentle_return import return_gently
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.viability import BoundsSolver
 
@@ -110,7 +110,7 @@ def within_margins():
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_within_the_margins_the_limit_is_never_passed_whatever_the_speed(within_margins, side):
+def test_within_the_margins_a_joint_that_can_stop_passes_no_limit(within_margins, side):
     """It brakes gently, and always enough: also where the share does not grow."""
     rng = np.random.default_rng(5)
     edge = LIMITS.q_max if side > 0.0 else LIMITS.q_min

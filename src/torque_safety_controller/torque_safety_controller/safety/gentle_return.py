@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bounds by which an arm goes on gently that was stopped within the margins of a limit.
+
+`docs/stopping.md`, "The controller's part", derives them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torque_safety_controller.qp.constraints import AccelerationRange
+
+Array = NDArray[np.float64]
+
+_STANDS = 1e-9
+"""A joint that is slower stands: rounding may be its velocity, rad/s."""
+
+_CREEPS = 1e-5
+"""A joint that was stopped may still have such a speed, rad/s: less than 0.1 urad in 10 ms."""
+
+_TIME = 0.02
+"""T: in which a joint comes to rest, and back to its bounds, s."""
+
+_PART = 0.25
+"""Part of the room to the reserve in which a joint may come to rest; it brakes less on the way."""
+
+_RESERVE = 1e-3
+"""Distance from the limit itself within which a joint brakes as its bounds ask, rad."""
+
+_LATE = 3
+"""Periods that a command may come late."""
+
+_LEAST = 0.5
+"""Acceleration by which a joint sets out for its bounds, at half of the share, rad/s^2."""
+
+_HASTE = 4.0
+"""How much sooner a joint leaves the reserve than it returns to its bounds."""
+
+
+def return_gently(
+    bounds: AccelerationRange,
+    v: Array,
+    room: tuple[Array, Array],
+    share: float,
+    period: float,
+    rough: bool = False,
+) -> AccelerationRange:
+    """Return bounds that push a joint which stands beyond them by a share only.
+
+    An arm may have been stopped within the margins of a position limit; its bounds then demand to
+    be back after two periods, by a jolt. Here such a joint returns with the share: one that is d
+    beyond its bounds, which ask for 0.5 d / period^2 and for their margins besides, is asked for
+
+        a = share / (1 - share) max(d / T^2, `_LEAST`) - v / T,    T = `_TIME`,
+
+    and for more within `_RESERVE` of the limit itself; at most for its share of the bounds.
+
+    One that moves towards its limit brakes as its bounds ask, or so that it comes to rest in T and
+    in a part of the room to the reserve, if that is less. Where its speed may be noise, it need
+    not do more than stand: the noise would choose between a push and none.
+
+    Args:
+        bounds: of the joints, shape (n,) each, rad/s^2.
+        v: their velocities, shape (n,), rad/s.
+        room: that is left to the lower and the upper position limit, without margins, shape (n,)
+            each, rad.
+        share: of what the bounds demand, from 0 to 1.
+        period: of control, s.
+        rough: whether `v` has noise, for which the bounds have margins.
+    """
+    lower, upper = bounds
+    speed, stop = np.abs(v), -v / period
+    # Where the bounds leave no choice the joint is beyond what they keep.
+    slow = np.inf if rough else np.where(lower == upper, _CREEPS, _STANDS)
+    to_reserve = room[0] - _RESERVE, room[1] - _RESERVE
+    way = _PART * np.where(v > 0.0, to_reserve[1], to_reserve[0]) - _LATE * period * speed
+    with np.errstate(divide="ignore", invalid="ignore"):
+        brake = np.where(way > 0.0, np.maximum(speed / _TIME, 0.5 * v * v / way), np.inf)
+    brake = np.where(speed < slow, np.minimum(brake, speed / period), brake)
+
+    grown = share / (1.0 - share) if share < 1.0 else np.inf
+    per_way = 2.0 * (period / _TIME) ** 2
+    per_missing = _HASTE / _TIME**2
+    up = np.maximum(np.maximum(per_way * lower, _LEAST), -per_missing * to_reserve[0])
+    down = np.minimum(np.minimum(per_way * upper, -_LEAST), per_missing * to_reserve[1])
+    up = np.minimum(share * lower, grown * up - v / _TIME)
+    down = np.maximum(share * upper, grown * down - v / _TIME)
+    up = np.maximum(up, np.where(v < 0.0, brake, stop))
+    down = np.minimum(down, np.where(v > 0.0, -brake, stop))
+    return AccelerationRange(
+        np.where(lower > 0.0, np.minimum(up, lower), lower),
+        np.where(upper < 0.0, np.maximum(down, upper), upper),
+    )
