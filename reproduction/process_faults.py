@@ -135,7 +135,10 @@ class Bench:
         if not kind.imperfect:  # what is declared is for the robot's own
             own_ways = {"rate_hz": rate, "command_timeout": hold}
             changes |= {name: value for name, value in own_ways.items() if value is not None}
-        self._own = {name: own | changes for name, own in load_node_values(robot, *more).items()}
+        found = load_node_values(robot, *more)
+        if kind.imperfect:  # noise of the torques would count as their steps
+            changes["current_noise"] = [0.0] * len(found[ROBOT]["joints"])
+        self._own = {name: own | changes for name, own in found.items()}
         values = self._own[ROBOT]
         if "robot_description" in kind.values:  # the robot itself cannot take it from the topic
             values["robot_description"] = load_node_values(robot)[ROBOT]["robot_description"]

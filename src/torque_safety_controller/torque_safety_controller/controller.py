@@ -50,6 +50,9 @@ __all__ = ["ControlOutput", "Controller", "Gains"]
 
 Array = NDArray[np.float64]
 
+_REST = 0.02
+"""Torque of braking with which an arm nearly rests, share of the torque limits."""
+
 _UNBOUNDED = 1e6
 """Stands for the width of bounds that are not there, rad/s^2."""
 
@@ -101,6 +104,7 @@ class Controller:
         additional, constraints, interaction, safety_filter, detour, squeeze: as given.
         iterations: of the last QP.
         share: of the accelerations that the tasks want; the rest brings the arm to rest.
+        at_rest: whether the share is zero and hardly any torque is left that brakes the arm.
         rough: whether velocities are estimates, with noise also of an arm that stands.
         obeyed: whether the last commands act, as far as is known; while they do not, nothing is
             learned from how the arm moves.
@@ -134,6 +138,7 @@ class Controller:
         self.squeeze = squeeze
         self.iterations = 0
         self.share = 1.0
+        self.at_rest = False
         self.rough = False
         self.obeyed = True
         self._own_bounds = own_bounds
@@ -177,6 +182,7 @@ class Controller:
 
     def _forget(self) -> None:
         self._a_last = np.zeros(self.robot.n)
+        self.at_rest = False
         self._limiter.reset()
         self._observer.reset()
         if self.additional is not None:
@@ -424,7 +430,8 @@ class Controller:
         relaxed = solution.constraint_relaxation
         if relaxed is not None and rows is not None:
             relaxed = relaxed[: -len(rows.G)] if len(relaxed) > len(rows.G) else None
-        return ControlOutput(tau, a, not self.lost, solution.relaxation, "", relaxed)
+        tracking = self.share > 0.0 and not self.lost
+        return ControlOutput(tau, a, tracking, solution.relaxation, "", relaxed)
 
     def _room(self) -> tuple[Array, Array]:
         """Return the room to the lower and the upper position limit, as far as they are known."""
@@ -472,6 +479,9 @@ class Controller:
 
     def _remember(self, a: Array) -> Array:
         self._a_last = a if math.isfinite(a.dot(a)) else np.zeros(self.robot.n)
+        self.at_rest = self.share == 0.0 and bool(
+            (np.abs(self.robot.M @ self._a_last) <= _REST * self.tau_max).all()
+        )
         return self._a_last
 
 

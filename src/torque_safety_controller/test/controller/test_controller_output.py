@@ -196,6 +196,24 @@ def test_a_share_of_the_goals_mixes_their_accelerations_with_those_of_braking():
     assert np.abs(found[1.0] - rest).max() > 0.1
 
 
+def test_it_tracks_nothing_while_the_share_is_zero_and_tells_when_it_rests(arm):
+    controller = strong(arm, gains=posture_only(100.0, 20.0))
+    controller.set_posture_goal(arm.q_start + 1.0)
+    robot, kd = arm.robot(), controller.gains.hold_kd
+    for share, speed in ((0.0, 1.0), (0.0, 1e-4), (0.1, 1e-4), (0.0, 0.0)):
+        controller.share = share
+        v = np.full(arm.n, speed)
+        for act in (controller.step, controller.brake):
+            step = act(State(arm.q_start, v), wide(arm))
+            assert step.tracking == (share > 0.0 and act == controller.step)
+            robot.update(State(arm.q_start, v), v)
+            rests = (np.abs(robot.M @ (kd * v)) < 0.02 * controller.tau_max).all()
+            assert controller.at_rest == (rests and share == 0.0)
+    assert controller.at_rest
+    controller.reset(arm.q_start)
+    assert not controller.at_rest, "it is not known"
+
+
 def test_a_far_goal_gets_its_effect_back_without_a_jolt(arm):
     """However far away it is, and however stiff the gains: the bounds open with the share."""
     bounds = AccelerationRange(np.full(arm.n, -15.0), np.full(arm.n, 15.0))

@@ -237,7 +237,8 @@ def test_a_state_beyond_sense_is_refused_and_forgotten(ros):
     )
     stamps = iter(range(stamp + 2, stamp + 2000))
     ros.wait_until(
-        lambda: chain.reported("mode") == "TRACKING", each=lambda: chain.both(next(stamps))
+        lambda: chain.reported("mode") == "TRACKING",
+        each=lambda: chain.both(next(stamps), v=REST),
     )
 
 

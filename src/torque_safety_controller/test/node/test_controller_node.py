@@ -16,6 +16,7 @@ from node_chain import (
     GOAL_Q,
     JOINTS,
     LOWER,
+    REST,
     SAME_TORQUE,
     UPPER,
     NodeChain,
@@ -253,7 +254,12 @@ def test_it_holds_while_bounds_are_missing_and_goes_on_by_itself(ros):
         chain.await_command(stamp + k, lambda k=k: chain.state(stamp + k))
     assert chain.reported("mode") == "HOLD"
     stamps = iter(range(stamp + 30, stamp + 2000))
-    chain.await_mode("TRACKING", each=lambda: chain.both(next(stamps)))
+    # It goes on when it has come to rest.
+    stops = "comes to rest: acceleration limits are stale"
+    chain.await_mode("HOLD", stops, each=lambda: chain.both(next(stamps)))
+    ros.run_for(0.2, each=lambda: chain.both(next(stamps)))
+    assert chain.reported("mode") == "HOLD"
+    chain.await_mode("TRACKING", each=lambda: chain.both(next(stamps), v=REST))
 
 
 def test_slow_robots_are_not_taken_for_missing_bounds(ros):
@@ -290,7 +296,7 @@ def test_states_that_are_refused_are_not_answered_so_that_the_robot_stops(ros, b
     ros.run_for(0.15, each=send)
     assert not chain.commands
     stamps = iter(range(stamp + 20, stamp + 2000))
-    chain.await_mode("TRACKING", each=lambda: chain.both(next(stamps)))
+    chain.await_mode("TRACKING", each=lambda: chain.both(next(stamps), v=REST))
     ros.wait_until(lambda: re.search(f"{bad}: [1-9]", chain.reported("states_refused")))
 
 
@@ -302,7 +308,7 @@ def test_stamps_that_stay_old_are_taken_for_a_restart(ros):
     chain.await_mode(
         "STOPPED", "joint states are refused: old stamp", each=lambda: chain.both(next(earlier))
     )
-    chain.await_mode("TRACKING", each=lambda: chain.both(next(earlier)))
+    chain.await_mode("TRACKING", each=lambda: chain.both(next(earlier), v=REST))
     ros.wait_until(lambda: re.search("old stamp: [1-9]", chain.reported("states_refused")))
 
 

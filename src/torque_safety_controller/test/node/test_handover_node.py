@@ -113,9 +113,9 @@ def test_it_goes_over_to_the_torque_of_the_motors_and_back(ros):
     assert_position(chain.answer(Q + 1e-3))
     first = assert_torque(chain.answer(Q + 1e-3))
     assert (np.abs(first - TAU) < SMALL).all()
-    chain.await_report(mode="TRACKING", control="torque")
     for _ in range(3):
         assert_torque(chain.answer(Q + 1e-3))
+    chain.await_report(mode="TRACKING", control="torque")
     chain.enable(False)
     assert_position(chain.answer(Q + 2e-3), Q + 1e-3)
     chain.await_report(mode="POSITION", reason="enable_torque", control="position")
@@ -184,6 +184,7 @@ def test_goals_from_before_the_handover_are_dropped(ros):
     chain.answer()
     first = assert_torque(chain.answer())
     assert (np.abs(first - TAU) < SMALL).all()
+    chain.answer()
     chain.await_report(goals_pending="0", mode="TRACKING")
     ros.diagnostics.clear()
     ros.wait_until(lambda: ros.reported(NODE, "position_error_m"))

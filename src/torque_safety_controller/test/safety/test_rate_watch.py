@@ -3,7 +3,7 @@
 
 import pytest
 
-from torque_safety_controller.safety.rate_watch import RETURN_TIME, RateWatch
+from torque_safety_controller.safety.rate_watch import REST_TIME, RETURN_TIME, RateWatch
 
 DT = 0.002  # s
 
@@ -49,6 +49,31 @@ def test_what_had_gone_wrong_slows_the_arm_too():
     said = [watch.note(DT) for _ in range(round(RETURN_TIME / DT) + 1)]
     assert watch.share == 1.0
     assert [each for each in said if each] == ["the arm goes on"]
+
+
+def test_the_arm_comes_to_rest_before_it_goes_on():
+    watch = RateWatch(DT, 2)
+    watch.slow("no limits")
+    for _ in range(50):
+        watch.note(DT, at_rest=False)
+        watch.slow("no limits")  # told until it goes on
+    assert watch.share == 0.0
+    watch.note(DT, at_rest=True)
+    assert watch.share > 0.0
+    # Only at the beginning: what goals ask for is no braking.
+    watch.note(DT, at_rest=False)
+    assert watch.share == pytest.approx(2 * DT / RETURN_TIME)
+
+
+def test_an_arm_that_is_shaken_goes_on_too():
+    watch = RateWatch(DT, 2)
+    for _ in range(2):
+        watch.slow("no limits")
+        waited = 0
+        while watch.share == 0.0:
+            watch.note(DT, at_rest=False)
+            waited += 1
+        assert waited * DT == pytest.approx(REST_TIME, abs=2 * DT)
 
 
 def test_what_is_doubted_takes_the_share_down_as_fast_as_it_grows():

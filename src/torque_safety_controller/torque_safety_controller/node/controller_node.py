@@ -315,7 +315,7 @@ class ControllerNode(ArmNode):
     def _note_rate(self) -> None:
         """Slow the arm if too many states were not answered."""
         before = self._rate.too_long
-        if news := self._rate.note(self._states.elapsed()):
+        if news := self._rate.note(self._states.elapsed(), self._controller.at_rest):
             self._later(self._warn, news)
         if self._rate.too_long > before:  # the robot may have stopped itself, and much has changed
             self._controller.forget_disturbance()
@@ -351,7 +351,11 @@ class ControllerNode(ArmNode):
             return "no plan within all limits is known"
         if self._goals.contested:
             return _CONTESTED
-        return "goal lost" if self._goals.lost else "no goal"
+        if self._goals.lost:
+            return "goal lost"
+        if self._rate.share == 0.0 and self._controller.goals.any:
+            return f"comes to rest: {self._rate.why}"
+        return "no goal"
 
     def _hold(self, stamp: Any) -> None:
         """Answer the newest state without acceleration limits."""

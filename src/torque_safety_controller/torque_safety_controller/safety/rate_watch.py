@@ -6,6 +6,9 @@ from __future__ import annotations
 RETURN_TIME = 0.5
 """Until goals have all of their effect again, s of robot time."""
 
+REST_TIME = 1.0
+"""In which the arm is to come to rest before it goes on, s: one that is shaken never does."""
+
 _ROUNDING = 0.5
 """Of the time between two states, control periods."""
 
@@ -14,8 +17,8 @@ class RateWatch:
     """Share of the goals by which the arm may move, from the times of the states answered.
 
     Each row of unanswered states that is longer than the bounds cover takes the share to zero, and
-    so does `slow`; then it grows to one within `RETURN_TIME`. All times are those of the states'
-    stamps, so that in lockstep nothing depends on the machine.
+    so does `slow`; when the arm rests it grows to one within `RETURN_TIME`. All times are those of
+    the states' stamps, so that in lockstep nothing depends on the machine.
 
     Args:
         dt: control period, s.
@@ -25,27 +28,32 @@ class RateWatch:
         share: from 0, the arm is brought to rest, to 1.
         too_long: number of rows that were longer than covered.
         longest: row of unanswered states so far.
+        why: the share was taken to zero, the last time.
     """
 
     def __init__(self, dt: float, covered: int) -> None:
         self._dt, self._covered = dt, covered
         self.share = 1.0
         self.too_long = self.longest = 0
-        self._why = ""
+        self.why = ""
+        self._stopping = 0.0
 
     def slow(self, why: str) -> None:
         """Take the share to zero, because of what had gone wrong until now."""
-        self.share, self._why = 0.0, why
+        if self.share > 0.0:
+            self._stopping = 0.0
+        self.share, self.why = 0.0, why
 
     def ease(self, elapsed: float | None) -> None:
         """Let the share go down as fast as it grows, for a state: `note` will count it, too."""
         self.share = max(0.0, self.share - 2.0 * (elapsed or 0.0) / RETURN_TIME)
 
-    def note(self, elapsed: float | None) -> str:
+    def note(self, elapsed: float | None, at_rest: bool = True) -> str:
         """Take the time since the last answered state; return what to log, mostly nothing.
 
         Args:
             elapsed: s; None if there was no such state.
+            at_rest: whether the arm has come to rest, where the share is zero.
         """
         if elapsed is None:
             return ""
@@ -57,6 +65,9 @@ class RateWatch:
             self.slow(f"too many {what}")
             self.too_long += 1
             return "" if was_slowed else f"{row} {what}: the arm is slowed"
+        if self.share == 0.0 and not at_rest and self._stopping < REST_TIME:
+            self._stopping += elapsed
+            return ""
         self.share = min(1.0, self.share + elapsed / RETURN_TIME)
         if was_slowed and not self.slowed:
             return "the arm goes on"
@@ -70,4 +81,4 @@ class RateWatch:
     @property
     def trouble(self) -> str:
         """What to report; empty if there is nothing."""
-        return f"slowed to {self.share:.0%}: {self._why}" if self.slowed else ""
+        return f"slowed to {self.share:.0%}: {self.why}" if self.slowed else ""
