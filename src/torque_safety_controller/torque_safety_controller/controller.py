@@ -430,8 +430,7 @@ class Controller:
         relaxed = solution.constraint_relaxation
         if relaxed is not None and rows is not None:
             relaxed = relaxed[: -len(rows.G)] if len(relaxed) > len(rows.G) else None
-        tracking = self.share > 0.0 and not self.lost
-        return ControlOutput(tau, a, tracking, solution.relaxation, "", relaxed)
+        return ControlOutput(tau, a, not self.lost, solution.relaxation, "", relaxed)
 
     def _room(self) -> tuple[Array, Array]:
         """Return the room to the lower and the upper position limit, as far as they are known."""

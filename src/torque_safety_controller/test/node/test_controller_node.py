@@ -262,6 +262,22 @@ def test_it_holds_while_bounds_are_missing_and_goes_on_by_itself(ros):
     chain.await_mode("TRACKING", each=lambda: chain.both(next(stamps), v=REST))
 
 
+def test_a_controller_that_was_paused_in_motion_lets_the_arm_come_to_rest(ros):
+    """It goes on by its goals only then; a shorter row slows the arm, and that is all."""
+    chain = NodeChain(ros, bounds_timeout=0.2)
+    stamp = give_goal(chain)
+    chain.answer(stamp + 100)
+    ros.wait_until(lambda: chain.reported("missed_rows_too_long") == "1")
+    assert chain.reported("mode") == "TRACKING"
+    stamps = iter(range(stamp + 401, stamp + 2000))
+    chain.answer(stamp + 400)
+    paused = "comes to rest: states were not answered"
+    chain.await_mode("HOLD", paused, each=lambda: chain.both(next(stamps)))
+    ros.run_for(0.2, each=lambda: chain.both(next(stamps)))
+    assert chain.reported("mode") == "HOLD"
+    chain.await_mode("TRACKING", each=lambda: chain.both(next(stamps), v=REST))
+
+
 def test_slow_robots_are_not_taken_for_missing_bounds(ros):
     """The time-out counts from the state, not from the last answer."""
     chain = NodeChain(ros, bounds_timeout=0.8)

@@ -64,6 +64,7 @@ _QUIET = 1.5
 _SILENT = "no joint state"
 _STALE = "acceleration limits are stale"
 _CONTESTED = "several nodes publish goals"
+_PAUSED = "states were not answered for longer than bounds_timeout"
 _IGNORED = "the motors do not give the torques that were sent"
 _STUCK = f"{_IGNORED}, and theirs stay the same to the last bit"
 
@@ -282,8 +283,8 @@ class ControllerNode(ArmNode):
             step = self._controller.brake(*now, self._states.elapsed())
         else:
             step = self._controller.step(*now, self._states.elapsed())
-        if step.tracking:  # else the arm has yet to go on
-            self._went_wrong = ""
+        if step.tracking and (self._rate.share > 0.0 or self._controller.at_rest):
+            self._went_wrong = ""  # else the arm has yet to go on
         self._answer(step, stamp)
 
     def _sees_motors(self) -> bool:
@@ -314,11 +315,13 @@ class ControllerNode(ArmNode):
 
     def _note_rate(self) -> None:
         """Slow the arm if too many states were not answered."""
-        before = self._rate.too_long
-        if news := self._rate.note(self._states.elapsed(), self._controller.at_rest):
+        before, elapsed = self._rate.too_long, self._states.elapsed() or 0.0
+        if news := self._rate.note(elapsed, self._controller.at_rest):
             self._later(self._warn, news)
         if self._rate.too_long > before:  # the robot may have stopped itself, and much has changed
             self._controller.forget_disturbance()
+            if elapsed > self._config.bounds_timeout:
+                self._went_wrong = _PAUSED
         self._controller.share = self._rate.share
 
     def _answer(self, step: ControlOutput, stamp: Any) -> None:
@@ -333,7 +336,7 @@ class ControllerNode(ArmNode):
         self._wrenches.note()
         self._collision.note(step)
         self._went_wrong = self._went_wrong or step.failure
-        if step.tracking:
+        if step.tracking and not self._went_wrong:
             self._enter(Mode.TRACKING, "goal")
         else:
             self._enter(Mode.HOLD, self._why_hold(step))
@@ -353,9 +356,7 @@ class ControllerNode(ArmNode):
             return _CONTESTED
         if self._goals.lost:
             return "goal lost"
-        if self._rate.share == 0.0 and self._controller.goals.any:
-            return f"comes to rest: {self._rate.why}"
-        return "no goal"
+        return f"comes to rest: {self._went_wrong}" if self._controller.goals.any else "no goal"
 
     def _hold(self, stamp: Any) -> None:
         """Answer the newest state without acceleration limits."""

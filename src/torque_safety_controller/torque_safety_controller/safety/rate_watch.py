@@ -28,21 +28,20 @@ class RateWatch:
         share: from 0, the arm is brought to rest, to 1.
         too_long: number of rows that were longer than covered.
         longest: row of unanswered states so far.
-        why: the share was taken to zero, the last time.
     """
 
     def __init__(self, dt: float, covered: int) -> None:
         self._dt, self._covered = dt, covered
         self.share = 1.0
         self.too_long = self.longest = 0
-        self.why = ""
+        self._why = ""
         self._stopping = 0.0
 
     def slow(self, why: str) -> None:
         """Take the share to zero, because of what had gone wrong until now."""
         if self.share > 0.0:
             self._stopping = 0.0
-        self.share, self.why = 0.0, why
+        self.share, self._why = 0.0, why
 
     def ease(self, elapsed: float | None) -> None:
         """Let the share go down as fast as it grows, for a state: `note` will count it, too."""
@@ -81,4 +80,4 @@ class RateWatch:
     @property
     def trouble(self) -> str:
         """What to report; empty if there is nothing."""
-        return f"slowed to {self.share:.0%}: {self.why}" if self.slowed else ""
+        return f"slowed to {self.share:.0%}: {self._why}" if self.slowed else ""
