@@ -246,17 +246,17 @@ def test_the_arm_is_slowed_after_a_row_of_states_that_is_too_long_and_goes_on(ro
         ros.wait_until(lambda: arm._periods >= end, "control periods", timeout=60.0)
 
     play(0.1)
-    assert controller._rate.share == 1.0
+    assert controller._recovery.rate.share == 1.0
     for _ in range(4):  # states that the controller does not see
         arm._advance()
         arm._next_state()
-    ros.wait_until(lambda: controller._rate.too_long, "a row that is too long")
+    ros.wait_until(lambda: controller._recovery.rate.too_long, "a row that is too long")
     play(0.2)
     assert "the bounds cover 1: the arm is slowed" in capfd.readouterr().err
-    assert 0.0 < controller._rate.share < 1.0
+    assert 0.0 < controller._recovery.rate.share < 1.0
     assert "slowed to" in controller._report()[1]
     play(3.0)
-    assert controller._rate.share == 1.0
+    assert controller._recovery.rate.share == 1.0
     assert "the arm goes on" in capfd.readouterr().err
     assert np.abs(arm.true_positions - goal).max() < 0.02
     assert not arm._monitor.violated

@@ -10,7 +10,7 @@ from direct import DirectLoop, column
 from time_to_goal import SHORT, near_goal
 from whole_arm import CASES, CLEAR, POSE, arrive, make_loop, random_goal
 
-from torque_safety_controller.node.controller_report import about_detour
+from torque_safety_controller.node.reports.controller_report import about_detour
 from torque_safety_controller.tasks.detour import Progress
 
 STIFF = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}

@@ -6,6 +6,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -19,20 +20,21 @@ from torque_safety_controller.node.assembly import (
     make_controller,
     make_state_check,
 )
-from torque_safety_controller.node.collision_report import CollisionReport
-from torque_safety_controller.node.controller_report import (
+from torque_safety_controller.node.declared import covered_row, declared_robot, longest_way
+from torque_safety_controller.node.driving import Driving
+from torque_safety_controller.node.gain_watch import GainWatch
+from torque_safety_controller.node.goals import GoalSubscriber
+from torque_safety_controller.node.position_control import PositionControl
+from torque_safety_controller.node.recovery import STUCK, Recovery
+from torque_safety_controller.node.reports.collision_report import CollisionReport
+from torque_safety_controller.node.reports.controller_report import (
     LEVELS,
     Shortfall,
     StepRecord,
     about_detour,
     too_weak,
 )
-from torque_safety_controller.node.declared import covered_row, declared_robot, longest_way
-from torque_safety_controller.node.driving import Driving
-from torque_safety_controller.node.gain_watch import GainWatch
-from torque_safety_controller.node.goals import GoalSubscriber
-from torque_safety_controller.node.position_control import PositionControl
-from torque_safety_controller.node.state_publisher import StatePublisher
+from torque_safety_controller.node.reports.state_publisher import StatePublisher
 from torque_safety_controller.node.streams.joint_commands import JointCommands
 from torque_safety_controller.node.streams.limits import LimitsReader
 from torque_safety_controller.node.streams.states import UNSEEN, Arrival, StateStream
@@ -40,10 +42,8 @@ from torque_safety_controller.node.topics import GOALS
 from torque_safety_controller.node.wrenches import WrenchSubscriber
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.qp.constraints import AccelerationRange
-from torque_safety_controller.safety.command_watch import CommandWatch
 from torque_safety_controller.safety.handover import Control, Handover
 from torque_safety_controller.safety.modes import Mode, ModeKeeper
-from torque_safety_controller.safety.rate_watch import RateWatch
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import Diagnostics, PeriodCheck
 from viability_bounds_pkg.ros.parameters import NodeParameters
@@ -64,9 +64,6 @@ _QUIET = 1.5
 _SILENT = "no joint state"
 _STALE = "acceleration limits are stale"
 _CONTESTED = "several nodes publish goals"
-_PAUSED = "states were not answered for longer than bounds_timeout"
-_IGNORED = "the motors do not give the torques that were sent"
-_STUCK = f"{_IGNORED}, and theirs stay the same to the last bit"
 
 
 class ControllerNode(ArmNode):
@@ -115,11 +112,14 @@ class ControllerNode(ArmNode):
         self._driving = Driving(self, self._goals, self._controller, config, base, self._states)
         self._modes = ModeKeeper()
         self._before = self._modes.mode, self._modes.reason  # what they were before silence
-        self._went_wrong = ""  # why the arm was braked, until it goes on
-        self._rate = RateWatch(config.dt, covered_row(self))
-        self._compared = config.effort_tolerance > 0.0
-        tolerance = config.effort_tolerance * config.torque_max
-        self._watched = CommandWatch(tolerance, longest_way(self))
+        self._recovery = Recovery(
+            self._controller,
+            self._states,
+            config,
+            covered_row(self),
+            longest_way(self),
+            partial(self._later, self._warn),
+        )
         self._record = StepRecord(len(config.joints))
         self._shortfall = Shortfall(config.joints, config.position_min, config.position_max)
         self._collision = CollisionReport(self.get_logger(), self._controller.constraints)
@@ -188,7 +188,7 @@ class ControllerNode(ArmNode):
             # They would jump to where the arm was held before, from where it has been put.
             self._handover.robot_was_away()
         if self._handover.control is Control.POSITION:
-            self._watched.reset()
+            self._recovery.motors.reset()
             self._drives.hold(stamp)
         elif self._limits.stamp == states.stamp:
             self._track(stamp)
@@ -206,8 +206,8 @@ class ControllerNode(ArmNode):
             self._begin(arrival)
             return True
         elif states.answered_stamp == states.stamp:
-            if self._watched.stuck:  # a robot that waits for the answer, as in lockstep
-                self._watched.retry()
+            if self._recovery.motors.stuck:  # a robot that waits for the answer, as in lockstep
+                self._recovery.motors.retry()
             elif self._modes.reason == _SILENT:  # it was late only
                 self._enter(*self._before)
             self._commands.again(stamp)
@@ -222,8 +222,8 @@ class ControllerNode(ArmNode):
         if self._handover.by_drives:
             self._drives.hold(stamp)
         elif in_row == UNSEEN:
-            self._went_wrong = states.why_refused
-            self._enter(Mode.STOPPED, self._went_wrong)
+            self._recovery.why = states.why_refused
+            self._enter(Mode.STOPPED, states.why_refused)
 
     def _wait(self, stamp: Any) -> None:
         """Let the last command act for a period more: the next state decides about this one."""
@@ -237,13 +237,13 @@ class ControllerNode(ArmNode):
         """Start anew: the robot was silent, or restarted."""
         states = self._states
         if states.missed:
-            self._went_wrong = "joint states were missing"
+            self._recovery.why = "joint states were missing"
         if arrival is Arrival.ANEW and self._limits.stamp == states.answered_stamp:
             self._limits.stamp = -1  # from before the restart; its stamps may come again
         if self._by_others():
-            self._went_wrong = "the motors held the arm before"
+            self._recovery.why = "the motors held the arm before"
         states.begin()
-        self._watched.reset()
+        self._recovery.motors.reset()
         self._controller.reset(states.q)
         self._handover.robot_was_away()
 
@@ -273,70 +273,40 @@ class ControllerNode(ArmNode):
             return
         contested = self._goals.contested
         if contested:
-            self._went_wrong = _CONTESTED
-        elif self._went_wrong:
-            self._rate.slow(self._went_wrong)
-        self._note_rate()
+            self._recovery.why = _CONTESTED
+        else:
+            self._recovery.slow()
+        self._recovery.look()
         now = state, AccelerationRange(self._limits.lower, self._limits.upper)
         lost = contested or self._goals.lost
         if lost or self._handover.control is Control.GIVING_BACK:
             step = self._controller.brake(*now, self._states.elapsed())
         else:
             step = self._controller.step(*now, self._states.elapsed())
-        if step.tracking and (self._rate.share > 0.0 or self._controller.at_rest):
-            self._went_wrong = ""  # else the arm has yet to go on
+        self._recovery.note(step)
         self._answer(step, stamp)
 
     def _sees_motors(self) -> bool:
-        """Slow the arm while its motors do not give the torques that were sent.
-
-        Returns:
-            Whether the newest state is to be answered: what it says of the motors has not frozen.
-        """
-        watched, states = self._watched, self._states
-        if not (self._compared and states.copy_effort(watched.effort)):
-            self._controller.obeyed = True  # as far as is known
+        """Return whether the newest state is to be answered; else the robot is to stop itself."""
+        if self._recovery.sees_motors():
             return True
-        doubted, elapsed = watched.doubted, states.elapsed()
-        self._controller.obeyed = watched.look(self._rate.slowed, elapsed or 0.0)
-        if not watched.ignored:
-            return True
-        self._controller.forget_disturbance()
-        if watched.stuck:
-            states.answered()  # by silence
-            self._went_wrong = _STUCK
-            self._enter(Mode.STOPPED, _STUCK)
-        elif doubted:  # perhaps commands act again: no jolt
-            self._rate.ease(elapsed)
-        else:
-            self._rate.slow(_IGNORED)
-            self._later(self._warn, f"{_IGNORED}: the arm is slowed")
-        return not watched.stuck
-
-    def _note_rate(self) -> None:
-        """Slow the arm if too many states were not answered."""
-        before, elapsed = self._rate.too_long, self._states.elapsed() or 0.0
-        if news := self._rate.note(elapsed, self._controller.at_rest):
-            self._later(self._warn, news)
-        if self._rate.too_long > before:  # the robot may have stopped itself, and much has changed
-            self._controller.forget_disturbance()
-            if elapsed > self._config.bounds_timeout:
-                self._went_wrong = _PAUSED
-        self._controller.share = self._rate.share
+        self._states.answered()  # by silence
+        self._enter(Mode.STOPPED, STUCK)
+        return False
 
     def _answer(self, step: ControlOutput, stamp: Any) -> None:
         """Publish the torques of `step` for the state with `stamp`."""
         states, now = self._states, time.monotonic()
         elapsed = states.elapsed() or 0.0
         self._commands.torque(step.tau, stamp)
-        self._watched.note(step.tau)
+        self._recovery.motors.note(step.tau)
         states.answered()
         states.expect(self._controller.expected())
         self._record.note(step, now - states.message_at)
         self._wrenches.note()
         self._collision.note(step)
-        self._went_wrong = self._went_wrong or step.failure
-        if step.tracking and not self._went_wrong:
+        self._recovery.why = self._recovery.why or step.failure
+        if step.tracking and not self._recovery.why:
             self._enter(Mode.TRACKING, "goal")
         else:
             self._enter(Mode.HOLD, self._why_hold(step))
@@ -356,14 +326,16 @@ class ControllerNode(ArmNode):
             return _CONTESTED
         if self._goals.lost:
             return "goal lost"
-        return f"comes to rest: {self._went_wrong}" if self._controller.goals.any else "no goal"
+        if self._controller.goals.any:
+            return f"comes to rest: {self._recovery.why}"
+        return "no goal"
 
     def _hold(self, stamp: Any) -> None:
         """Answer the newest state without acceleration limits."""
         if not self._sees_motors():
             return
-        self._went_wrong = _STALE
-        self._note_rate()
+        self._recovery.why = _STALE
+        self._recovery.look()
         state = State(self._states.q, self._states.v)
         self._answer(self._controller.hold(state, self._states.elapsed()), stamp)
 
@@ -420,17 +392,13 @@ class ControllerNode(ArmNode):
         values |= (
             self._collision.values()
             | self._wrenches.values()
+            | self._recovery.values()
             | {
                 "mode": self._modes.mode.value,
                 "reason": self._modes.reason,
                 "mode_changes": self._modes.changes,
                 "control": self._handover.control.value,
                 "integral_action": self._config.integral.integral_action,
-                "goal_share": self._rate.share,
-                "missed_rows_too_long": self._rate.too_long,
-                "missed_row_longest": self._rate.longest,
-                "commands_ignored": self._watched.times,
-                "effort_difference": self._watched.seen * self._config.effort_tolerance,
                 "goals_pending": len(self._goals),
                 "goals_refused": self._goals.refused,
                 "states_refused": self._states.refused,
@@ -441,7 +409,12 @@ class ControllerNode(ArmNode):
         level, text = LEVELS[self._modes.mode], f"{self._modes.mode.value}: {self._modes.reason}"
         weak = too_weak(self._config.joints, self._controller)
         weak = weak and f"the arm cannot be held where it would come to rest: {weak}"
-        troubles = self._rate.trouble, self._collision.too_near, self._wrenches.trouble, weak
+        troubles = (
+            self._recovery.rate.trouble,
+            self._collision.too_near,
+            self._wrenches.trouble,
+            weak,
+        )
         for trouble in filter(None, troubles):
             level, text = max(level, DiagnosticStatus.WARN), f"{text}; {trouble}"
         detour = about_detour(self._config.joints, self._controller)

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How the arm is slowed when something goes wrong, and goes on when the cause has gone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from torque_safety_controller.controller import Controller, ControlOutput
+from torque_safety_controller.node.streams.states import StateStream
+from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
+from torque_safety_controller.safety.command_watch import CommandWatch
+from torque_safety_controller.safety.rate_watch import RateWatch
+
+_PAUSED = "states were not answered for longer than bounds_timeout"
+_IGNORED = "the motors do not give the torques that were sent"
+STUCK = f"{_IGNORED}, and theirs stay the same to the last bit"
+
+
+class Recovery:
+    """Sets the share of the goals by which the controller may move the arm.
+
+    `docs/stopping.md`, "The controller's part", says why.
+
+    Args:
+        controller: of the arm.
+        states: of the robot.
+        config: of the controller.
+        covered: longest row of unanswered states that the bounds hold for.
+        on_way: commands of which one acts, at most.
+        warn: takes what to log.
+
+    Attributes:
+        why: the arm was braked, until it goes on; empty when it does.
+        rate: share of the goals.
+        motors: whether they do as they are told.
+    """
+
+    def __init__(
+        self,
+        controller: Controller,
+        states: StateStream,
+        config: ControllerConfiguration,
+        covered: int,
+        on_way: int,
+        warn: Callable[[str], None],
+    ) -> None:
+        self._controller, self._states, self._warn = controller, states, warn
+        self._pause = config.bounds_timeout
+        self._tolerance = config.effort_tolerance
+        self.why = ""
+        self.rate = RateWatch(config.dt, covered)
+        self.motors = CommandWatch(config.effort_tolerance * config.torque_max, on_way)
+
+    def sees_motors(self) -> bool:
+        """Slow the arm while its motors do not give the torques that were sent.
+
+        Returns:
+            Whether the newest state is to be answered: what it says of the motors has not frozen.
+        """
+        motors, states, controller = self.motors, self._states, self._controller
+        if self._tolerance <= 0.0 or not states.copy_effort(motors.effort):
+            controller.obeyed = True  # as far as is known
+            return True
+        doubted, elapsed = motors.doubted, states.elapsed()
+        controller.obeyed = motors.look(self.rate.slowed, elapsed or 0.0)
+        if not motors.ignored:
+            return True
+        controller.forget_disturbance()
+        if motors.stuck:
+            self.why = STUCK
+        elif doubted:  # perhaps commands act again: no jolt
+            self.rate.ease(elapsed)
+        else:
+            self.rate.slow(_IGNORED)
+            self._warn(f"{_IGNORED}: the arm is slowed")
+        return not motors.stuck
+
+    def look(self) -> None:
+        """Slow the arm if too many states were not answered; else let it go on."""
+        rate, controller = self.rate, self._controller
+        before, elapsed = rate.too_long, self._states.elapsed() or 0.0
+        if news := rate.note(elapsed, controller.at_rest):
+            self._warn(news)
+        if rate.too_long > before:  # the robot may have stopped itself, and much has changed
+            controller.forget_disturbance()
+            if elapsed > self._pause:
+                self.why = _PAUSED
+        controller.share = rate.share
+
+    def slow(self) -> None:
+        """Let the goals have no effect, after something went wrong."""
+        if self.why:
+            self.rate.slow(self.why)
+
+    def note(self, step: ControlOutput) -> None:
+        """Take a step of the controller towards its goals: the arm goes on if it rests."""
+        if step.tracking and (self.rate.share > 0.0 or self._controller.at_rest):
+            self.why = ""
+
+    def values(self) -> dict[str, Any]:
+        """Return values for diagnostics."""
+        return {
+            "goal_share": self.rate.share,
+            "missed_rows_too_long": self.rate.too_long,
+            "missed_row_longest": self.rate.longest,
+            "commands_ignored": self.motors.times,
+            "effort_difference": self.motors.seen * self._tolerance,
+        }
