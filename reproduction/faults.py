@@ -22,21 +22,24 @@ import numpy as np
 from chain import load_node_values, load_values
 from figure import Figure, table
 from moments import HEADS, ROBOTS, STIFF, Corners, Sample, Seen
+from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
+from watched_robot import WatchedRobot
 
 from sim_bridge.nodes.bullet_node import BulletNode
 from sim_bridge.nodes.fault_node import BEFORE, FaultNode
 from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.safety.modes import Mode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
-from viability_bounds_pkg.ros.runtime import GOAL_QOS, stamp_to_ns
-from viability_bounds_pkg.ros.topics import JOINT_STATES
+from viability_bounds_pkg.ros.runtime import GOAL_QOS
 from viability_bounds_pkg.testing.ros_harness import (
     RosHarness,
     joint_state,
     overrides,
     private_domain,
 )
+
+Array = NDArray[np.float64]
 
 SENDERS = {
     "joint_states": BulletNode,
@@ -115,34 +118,25 @@ class Bench:
         # Of each its own: the bounds of TALOS keep speeds below those that the robot may have.
         by_node = load_node_values(robot)
         self._values = by_node[BulletNode.NAME] | own
-        nodes = {}
-        for topic, kind in SENDERS.items():
-            arguments = ["--ros-args", "-r", f"{topic}:={BEFORE}{topic}"]
-            nodes[topic] = ros.add(
-                kind(
-                    context=ros.context,
-                    parameter_overrides=overrides(by_node[kind.NAME] | own),
-                    cli_args=arguments,
-                )
+        self._trace: list[Sample] = []
+
+        def add(kind: Any, topic: str, **more: Any) -> Any:
+            given = overrides(by_node[kind.NAME] | own)
+            away = ["--ros-args", "-r", f"{topic}:={BEFORE}{topic}"]
+            return ros.add(
+                kind(context=ros.context, parameter_overrides=given, cli_args=away, **more)
             )
-        self._arm: Any = nodes["joint_states"]
-        self._controller: Any = nodes["joint_commands"]
+
+        add(BoundsNode, "acceleration_limits")
+        self._controller = add(ControllerNode, "joint_commands")
+        self._arm = add(WatchedRobot, "joint_states", seen=self._see)
         self._user = ros.talk(JointState, "target_posture", GOAL_QOS)
         self._corners = Corners(self._values, self._rng)
         self._dt = 1.0 / self._values["rate_hz"]
-        self._trace: list[Sample] = []
-        ros.probe.create_subscription(
-            JointState, f"{BEFORE}joint_states", self._on_state, JOINT_STATES.qos
-        )
 
-    def _on_state(self, message: JointState) -> None:
-        mode = self._controller._modes.mode
-        stopped = self._arm._control() in ("stopping", "stopped")
-        braking = stopped or mode is not Mode.TRACKING
-        t = 1e-9 * stamp_to_ns(message.header.stamp)
-        tau = dict(zip(message.name, message.effort, strict=True))
-        tau_of_joints = np.array([tau[joint] for joint in self._values["joints"]])
-        self._trace.append(Sample(t, braking, stopped, tau_of_joints))
+    def _see(self, t: float, stopped: bool, tau: Array) -> None:
+        braking = stopped or self._controller._modes.mode is not Mode.TRACKING
+        self._trace.append(Sample(t, braking, stopped, tau))
 
     def _ask(self) -> None:
         self._user.publish(joint_state(self._values["joints"], 0, self._corners.draw()))

@@ -26,20 +26,21 @@ import numpy as np
 from chain import ROOT, load_node_values
 from figure import Figure, table
 from moments import AGAIN, HEADS, RETURN, ROBOTS, STIFF, Corners, Sample, Seen
+from numpy.typing import NDArray
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
+from watched_robot import STOPS, WatchedRobot
 
-from sim_bridge.nodes.bullet_node import BulletNode
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.safety.modes import Mode
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 from viability_bounds_pkg.parameter import Parameter as Row
 from viability_bounds_pkg.parameter import parameter_table
-from viability_bounds_pkg.ros.runtime import GOAL_QOS, LATCHED_QOS, set_stamp, stamp_to_ns
+from viability_bounds_pkg.ros.runtime import GOAL_QOS, LATCHED_QOS, set_stamp
 from viability_bounds_pkg.ros.topics import JOINT_STATES, ROBOT_DESCRIPTION
 from viability_bounds_pkg.testing.node_program import NodeProgram
 from viability_bounds_pkg.testing.ros_harness import (
@@ -59,6 +60,8 @@ ALONE = {
     ESTIMATOR: "estimated_joint_states",
 }
 """What each node alone publishes."""
+
+Array = NDArray[np.float64]
 
 START = 60.0  # s, in which nodes must start
 STILL = 0.05, 1.0  # s, shortest and longest time in which a node stands still
@@ -188,7 +191,7 @@ class Bench:
         return self._mode == Mode.TRACKING.value and not self._stopped()
 
     def _stopped(self) -> bool:
-        return self.arm is not None and self.arm._control() in ("stopping", "stopped", "brakes")
+        return self.arm is not None and self.arm._control() in STOPS
 
     def _on_mode(self, message: String) -> None:
         self._mode = message.data
@@ -196,15 +199,21 @@ class Bench:
             nothing = np.full(len(self._joints), np.nan)
             self._trace.append(Sample(self.now(), not self.tracking, False, nothing))
 
-    def _on_state(self, message: JointState) -> None:
+    def _see(self, t: float, stopped: bool, tau: Array) -> None:
+        """Take a state of the robot in this process."""
         self.heard = True
-        # In the order of the stamps, whenever they come: the robot is in this process.
-        now = self.now() if self.arm is None else 1e-9 * stamp_to_ns(message.header.stamp)
+        braking = stopped or self._mode != Mode.TRACKING.value
+        self._trace.append(Sample(t, braking, stopped, tau))
+
+    def _on_state(self, message: JointState) -> None:
+        if self.arm is not None:
+            return
+        self.heard = True
         tau = dict(zip(message.name, message.effort, strict=True))
         torques = np.array([tau[joint] for joint in self._joints])
         if not torques.any():  # the first state of a robot that has started: nothing has acted
             torques.fill(np.nan)
-        self._trace.append(Sample(now, not self.tracking, self._stopped(), torques))
+        self._trace.append(Sample(self.now(), not self.tracking, False, torques))
 
     def now(self) -> float:
         """Return robot time, s; that of this computer where the robot is a process."""
@@ -222,7 +231,9 @@ class Bench:
             self.programs[name].start()
             return
         own = {k: v for k, v in self._own[name].items() if v != []}
-        node = BulletNode(context=self.ros.context, parameter_overrides=overrides(own))
+        node = WatchedRobot(
+            self._see, context=self.ros.context, parameter_overrides=overrides(own)
+        )
         self.arm = self.ros.add(node)
 
     def start_all(self) -> None:
