@@ -86,8 +86,14 @@ def test_what_is_doubted_takes_the_share_down_as_fast_as_it_grows():
         watch.ease(DT)
         watch.note(DT)
     assert watch.share == pytest.approx(high - 5 * DT / RETURN_TIME)
-    for _ in range(50):
-        watch.ease(DT)
-        watch.note(DT)
+    for at_rest in (True, False):
+        for _ in range(30):
+            last = watch.share
+            watch.ease(DT)
+            watch.note(DT, at_rest)
+            assert watch.share == pytest.approx(max(0.0, last - DT / RETURN_TIME))
     watch.ease(None)  # the first state
-    assert 0.0 <= watch.share <= 2 * DT / RETURN_TIME
+    assert watch.share == 0.0
+    watch.note(None)
+    watch.note(DT)
+    assert watch.share == pytest.approx(DT / RETURN_TIME), "it does not go on"

@@ -36,6 +36,7 @@ class RateWatch:
         self.too_long = self.longest = 0
         self._why = ""
         self._stopping = 0.0
+        self._eased = False
 
     def slow(self, why: str) -> None:
         """Take the share to zero, because of what had gone wrong until now."""
@@ -44,8 +45,9 @@ class RateWatch:
         self.share, self._why = 0.0, why
 
     def ease(self, elapsed: float | None) -> None:
-        """Let the share go down as fast as it grows, for a state: `note` will count it, too."""
-        self.share = max(0.0, self.share - 2.0 * (elapsed or 0.0) / RETURN_TIME)
+        """Let the share go down as fast as it grows, for a state: `note` does not add to it."""
+        self.share = max(0.0, self.share - (elapsed or 0.0) / RETURN_TIME)
+        self._eased = True
 
     def note(self, elapsed: float | None, at_rest: bool = True) -> str:
         """Take the time since the last answered state; return what to log, mostly nothing.
@@ -54,6 +56,7 @@ class RateWatch:
             elapsed: s; None if there was no such state.
             at_rest: whether the arm has come to rest, where the share is zero.
         """
+        eased, self._eased = self._eased, False
         if elapsed is None:
             return ""
         was_slowed = self.slowed
@@ -66,11 +69,9 @@ class RateWatch:
             return "" if was_slowed else f"{row} {what}: the arm is slowed"
         if self.share == 0.0 and not at_rest and self._stopping < REST_TIME:
             self._stopping += elapsed
-            return ""
-        self.share = min(1.0, self.share + elapsed / RETURN_TIME)
-        if was_slowed and not self.slowed:
-            return "the arm goes on"
-        return ""
+        elif not eased:
+            self.share = min(1.0, self.share + elapsed / RETURN_TIME)
+        return "the arm goes on" if was_slowed and not self.slowed else ""
 
     @property
     def slowed(self) -> bool:
