@@ -139,6 +139,10 @@ class Bench:
             own_ways = {"rate_hz": rate, "command_timeout": hold}
             changes |= {name: value for name, value in own_ways.items() if value is not None}
         found = load_node_values(robot, *more)
+        if "rate_hz" in changes:  # for which an integral gain must not be too high
+            slower = changes["rate_hz"] / found[ROBOT]["rate_hz"]
+            gain = found[CONTROLLER].get("integral_lambda", 30.0)
+            changes["integral_lambda"] = min(1.0, slower) * gain
         if kind.imperfect:  # noise of the torques would count as their steps
             changes["current_noise"] = [0.0] * len(found[ROBOT]["joints"])
         self._own = {name: own | changes for name, own in found.items()}
