@@ -139,10 +139,11 @@ class Bench:
             own_ways = {"rate_hz": rate, "command_timeout": hold}
             changes |= {name: value for name, value in own_ways.items() if value is not None}
         found = load_node_values(robot, *more)
-        if "rate_hz" in changes:  # for which an integral gain must not be too high
-            slower = changes["rate_hz"] / found[ROBOT]["rate_hz"]
-            gain = found[CONTROLLER].get("integral_lambda", 30.0)
-            changes["integral_lambda"] = min(1.0, slower) * gain
+        gain = found[CONTROLLER].get("integral_lambda")
+        if "rate_hz" in changes and gain:  # it would be too high for a lower rate
+            changes["integral_lambda"] = gain * min(
+                1.0, changes["rate_hz"] / found[ROBOT]["rate_hz"]
+            )
         if kind.imperfect:  # noise of the torques would count as their steps
             changes["current_noise"] = [0.0] * len(found[ROBOT]["joints"])
         self._own = {name: own | changes for name, own in found.items()}
@@ -628,7 +629,11 @@ def main() -> int:
     parser.add_argument("--robot", action="append", choices=ROBOTS, help="only this one")
     parser.add_argument("--fault", action="append", choices=tuple(FAULTS), help="only this one")
     parser.add_argument("--moments", type=int, default=10, help="of each fault")
-    parser.add_argument("--rate", type=float, help="of the control loop, Hz; the robot's own")
+    parser.add_argument(
+        "--rate",
+        type=float,
+        help="of the control loop, Hz; the robot's own; a lower one lowers its integral_lambda",
+    )
     parser.add_argument(
         "--hold", type=int, help="periods for which the robot holds a command; the robot's own"
     )

@@ -238,6 +238,14 @@ def test_motors_that_cannot_be_compared_change_nothing(ros, changed):
     assert motors.chain.reported("commands_ignored") == "0"
 
 
+def goes_on_when_it_rests(chain, stamps, why):
+    """Let the arm move on, which keeps it in HOLD, and then rest."""
+    chain.await_mode("HOLD", f"comes to rest: {why}", each=lambda: chain.both(next(stamps)))
+    chain.ros.run_for(0.2, each=lambda: chain.both(next(stamps)))
+    assert chain.reported("mode") == "HOLD"
+    chain.await_mode("TRACKING", each=lambda: chain.both(next(stamps), v=REST))
+
+
 def test_it_holds_while_bounds_are_missing_and_goes_on_by_itself(ros):
     chain = NodeChain(ros, bounds_timeout=0.1)
     stamp = give_goal(chain)
@@ -254,12 +262,7 @@ def test_it_holds_while_bounds_are_missing_and_goes_on_by_itself(ros):
         chain.await_command(stamp + k, lambda k=k: chain.state(stamp + k))
     assert chain.reported("mode") == "HOLD"
     stamps = iter(range(stamp + 30, stamp + 2000))
-    # It goes on when it has come to rest.
-    stops = "comes to rest: acceleration limits are stale"
-    chain.await_mode("HOLD", stops, each=lambda: chain.both(next(stamps)))
-    ros.run_for(0.2, each=lambda: chain.both(next(stamps)))
-    assert chain.reported("mode") == "HOLD"
-    chain.await_mode("TRACKING", each=lambda: chain.both(next(stamps), v=REST))
+    goes_on_when_it_rests(chain, stamps, "acceleration limits are stale")
 
 
 def test_a_controller_that_was_paused_in_motion_lets_the_arm_come_to_rest(ros):
@@ -271,11 +274,7 @@ def test_a_controller_that_was_paused_in_motion_lets_the_arm_come_to_rest(ros):
     assert chain.reported("mode") == "TRACKING"
     stamps = iter(range(stamp + 401, stamp + 2000))
     chain.answer(stamp + 400)
-    paused = "comes to rest: states were not answered"
-    chain.await_mode("HOLD", paused, each=lambda: chain.both(next(stamps)))
-    ros.run_for(0.2, each=lambda: chain.both(next(stamps)))
-    assert chain.reported("mode") == "HOLD"
-    chain.await_mode("TRACKING", each=lambda: chain.both(next(stamps), v=REST))
+    goes_on_when_it_rests(chain, stamps, "states were not answered")
 
 
 def test_slow_robots_are_not_taken_for_missing_bounds(ros):
