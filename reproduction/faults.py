@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from chain import load_node_values, load_values
 from figure import Figure, table
-from moments import HEADS, ROBOTS, STIFF, Corners, Sample, Seen
+from moments import HEADS, ROBOTS, STIFF, Corners, Sample, Seen, at_rate
 from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 from watched_robot import WatchedRobot
@@ -109,19 +109,23 @@ class Bench:
         ros: runs the nodes.
         robot: name of its file.
         seed: of goals and moments.
+        rate: of the control loop, Hz; None for the robot's own.
         own: parameters that differ from the file, by name.
     """
 
-    def __init__(self, ros: RosHarness, robot: str, seed: int, own: dict[str, Any]) -> None:
+    def __init__(
+        self, ros: RosHarness, robot: str, seed: int, rate: float | None, own: dict[str, Any]
+    ) -> None:
         self._ros, self._rng = ros, np.random.default_rng(seed)
         own = STIFF | {"start_paused": False, "clock": "real_time"} | own
         # Of each its own: the bounds of TALOS keep speeds below those that the robot may have.
         by_node = load_node_values(robot)
-        self._values = by_node[BulletNode.NAME] | own
+        by_node = {name: by_node[name] | own | new for name, new in at_rate(by_node, rate).items()}
+        self._values = by_node[BulletNode.NAME]
         self._trace: list[Sample] = []
 
         def add(kind: Any, topic: str, **more: Any) -> Any:
-            given = overrides(by_node[kind.NAME] | own)
+            given = overrides(by_node[kind.NAME])
             away = ["--ros-args", "-r", f"{topic}:={BEFORE}{topic}"]
             return ros.add(
                 kind(context=ros.context, parameter_overrides=given, cli_args=away, **more)
@@ -187,13 +191,13 @@ class Bench:
 
 
 def play(
-    robot: str, names: list[str], moments: int, own: dict[str, Any]
+    robot: str, names: list[str], moments: int, rate: float | None, own: dict[str, Any]
 ) -> list[tuple[str, dict[str, Any]]]:
     """Let a robot suffer these faults; return what each did."""
     with private_domain() as domain, tempfile.TemporaryDirectory() as folder:
         ros = RosHarness(domain)
         try:
-            seen = Bench(ros, robot, 1, own).suffer(names, moments, Path(folder))
+            seen = Bench(ros, robot, 1, rate, own).suffer(names, moments, Path(folder))
             return [(name, vars(each)) for name, each in zip(names, seen, strict=True)]
         finally:
             ros.close()
@@ -208,14 +212,20 @@ def main() -> int:
     parser.add_argument(
         "--hold", type=int, help="periods for which the robot holds a command; the robot's own"
     )
-    parser.add_argument("--rate", type=float, help="of the control loop, Hz; the robot's own")
+    parser.add_argument(
+        "--rate",
+        type=float,
+        help="of the control loop, Hz; the robot's own; at a lower one its file is changed for it",
+    )
     given = parser.parse_args()
-    own = {"rate_hz": given.rate, "command_timeout": given.hold}
-    own = {name: value for name, value in own.items() if value is not None}
+    own = {} if given.hold is None else {"command_timeout": given.hold}
     robots, names = given.robot or ROBOTS, given.fault or list(FAULTS)
     figure = Figure("faults")
     with ProcessPoolExecutor(len(robots), get_context("spawn")) as pool:
-        runs = [(robot, pool.submit(play, robot, names, given.moments, own)) for robot in robots]
+        runs = [
+            (robot, pool.submit(play, robot, names, given.moments, given.rate, own))
+            for robot in robots
+        ]
         for robot, run in runs:
             dt = 1.0 / (given.rate or load_values(robot)["rate_hz"])
             for name, seen in run.result():

@@ -26,6 +26,32 @@ HEADS = (
 """Of a table whose rows have a robot, a fault, and `Seen.cells`."""
 
 
+def at_rate(by_node: Mapping[str, Mapping[str, Any]], rate: float | None) -> dict[str, Any]:
+    """Return what differs for each node at a lower rate than a robot's file is made for.
+
+    The integral gain would be too high, and what the bounds keep back is for what friction does in
+    a period, which is longer.
+
+    Args:
+        by_node: parameters of each node, by its name, as its file has them.
+        rate: of the control loop, Hz; None for the file's own.
+    """
+    changes: dict[str, Any] = {name: {} for name in by_node}
+    own = by_node["bullet_node"]
+    if rate is None:
+        return changes
+    for name in changes:
+        changes[name]["rate_hz"] = rate
+    share = min(1.0, rate / own["rate_hz"])
+    if gain := by_node["controller_node"].get("integral_lambda"):
+        changes["controller_node"]["integral_lambda"] = share * gain
+    bounds = by_node["bounds_node"]
+    v_max, slower = np.array(own["velocity_max"]), np.array(bounds["velocity_max"])
+    changes["bounds_node"]["velocity_max"] = (v_max - (v_max - slower) / share).tolist()
+    changes["bounds_node"]["position_margin"] = bounds["position_margin"] / share
+    return changes
+
+
 class Sample(NamedTuple):
     """What an arm does in a control period.
 

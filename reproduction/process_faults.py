@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from chain import ROOT, load_node_values
 from figure import Figure, table
-from moments import AGAIN, HEADS, RETURN, ROBOTS, STIFF, Corners, Sample, Seen
+from moments import AGAIN, HEADS, RETURN, ROBOTS, STIFF, Corners, Sample, Seen, at_rate
 from numpy.typing import NDArray
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.node import Node
@@ -135,18 +135,15 @@ class Bench:
         self.ros, self.rng, self._kind = ros, rng, kind
         more = [f"imperfect/{robot}"] * kind.imperfect
         changes = STIFF | {"start_paused": False, "clock": "real_time"} | dict(kind.values)
-        if not kind.imperfect:  # what is declared is for the robot's own
-            own_ways = {"rate_hz": rate, "command_timeout": hold}
-            changes |= {name: value for name, value in own_ways.items() if value is not None}
         found = load_node_values(robot, *more)
-        gain = found[CONTROLLER].get("integral_lambda")
-        if "rate_hz" in changes and gain:  # it would be too high for a lower rate
-            changes["integral_lambda"] = gain * min(
-                1.0, changes["rate_hz"] / found[ROBOT]["rate_hz"]
-            )
-        if kind.imperfect:  # noise of the torques would count as their steps
+        if kind.imperfect:  # what is declared is for the robot's own rate
+            rate = None
+            # Noise of the torques would count as their steps.
             changes["current_noise"] = [0.0] * len(found[ROBOT]["joints"])
-        self._own = {name: own | changes for name, own in found.items()}
+        elif hold is not None:
+            changes["command_timeout"] = hold
+        by_node = {name: changes | own for name, own in at_rate(found, rate).items()}
+        self._own = {name: own | by_node[name] for name, own in found.items()}
         values = self._own[ROBOT]
         if "robot_description" in kind.values:  # the robot itself cannot take it from the topic
             values["robot_description"] = load_node_values(robot)[ROBOT]["robot_description"]
@@ -161,7 +158,7 @@ class Bench:
             name: NodeProgram(
                 name,
                 ros.domain,
-                [*words, *_given(values if name == ROBOT else changes, changes)],
+                [*words, *_given(values if name == ROBOT else by_node[name], by_node[name])],
                 subprocess.DEVNULL,
             )
             for name in kind.programs
@@ -632,7 +629,7 @@ def main() -> int:
     parser.add_argument(
         "--rate",
         type=float,
-        help="of the control loop, Hz; the robot's own; a lower one lowers its integral_lambda",
+        help="of the control loop, Hz; the robot's own; at a lower one its file is changed for it",
     )
     parser.add_argument(
         "--hold", type=int, help="periods for which the robot holds a command; the robot's own"
