@@ -5,7 +5,11 @@ from typing import Any
 
 import pytest
 
-SPREAD = {"test/test_demo.py", "test/test_readme.py", "test/test_startup.py"}
+SPREAD = {
+    "test/motions/test_demo.py",
+    "test/project/test_readme.py",
+    "test/installation/test_startup.py",
+}
 """Files of tests that share nothing and take long, for any process that has time."""
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plants faults in copies of the tree and tells which of them the tests notice.
 
-    python scripts/plant_faults.py                     all of `test/faults.yaml`
+    python scripts/plant_faults.py                     all of `test/planted_faults.yaml`
     python scripts/plant_faults.py -k integral         those whose line contains a word
     python scripts/plant_faults.py --tree DIRECTORY    in another checkout, set up
 
@@ -27,7 +27,7 @@ from typing import Any
 import yaml
 
 ROOT = Path(__file__).resolve().parent.parent
-TABLE = ROOT / "test" / "faults.yaml"
+TABLE = ROOT / "test" / "planted_faults.yaml"
 PACKAGES = ("viability_bounds_pkg", "torque_safety_controller", "sim_bridge")
 COPIED = ("src", "test", "config", "reproduction", "conftest.py", "pyproject.toml", "README.md")
 MOST_CPU = 180  # s, for each fault; a test that takes it up has noticed the fault
@@ -67,7 +67,7 @@ def places(tree: Path, fault: dict[str, Any]) -> list[Path]:
 def tests(tree: Path, fault: dict[str, Any]) -> list[str]:
     """Return the test files of a fault, relative to the tree."""
     names = set(fault["tests"].split())
-    found = [*tree.glob("src/*/test/**/*.py"), *tree.glob("test/*.py")]
+    found = [*tree.glob("src/*/test/**/*.py"), *tree.glob("test/**/*.py")]
     return sorted(str(path.relative_to(tree)) for path in found if path.name in names)
 
 

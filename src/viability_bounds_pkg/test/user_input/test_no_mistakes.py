@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is unusual, but no mistake: it must not be refused. test/test_mistakes.py has the rest."""
+"""What is unusual, but no mistake: it must not be refused.
+
+test/project/test_mistakes.py has the rest.
+"""
 
 import math
 

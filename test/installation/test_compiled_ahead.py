@@ -12,7 +12,7 @@ from viability_bounds_pkg.testing.executables import run_to_end
 
 pytestmark = pytest.mark.long
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 CONFIG = ROOT / "config"
 PACKAGES = ("viability_bounds_pkg", "torque_safety_controller", "sim_bridge")
 OBSTACLES = yaml.safe_load((CONFIG / "obstacles" / "panda_wall.yaml").read_text())

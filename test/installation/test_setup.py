@@ -18,7 +18,7 @@ import pytest
 from viability_bounds_pkg.testing.executables import run_to_end
 
 pytestmark = pytest.mark.packaging
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 PYTHON = sys._base_executable
 PYBULLET = "pybullet-3.2.7"
 

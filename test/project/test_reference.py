@@ -19,7 +19,7 @@ from viability_bounds_pkg.parameter import REQUIRED, read
 from viability_bounds_pkg.ros.parameters import describe
 from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 _SPEC = importlib.util.spec_from_file_location(
     "make_reference", ROOT / "scripts" / "make_reference.py"
 )

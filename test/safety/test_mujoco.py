@@ -6,9 +6,7 @@ from pathlib import Path
 
 import pytest
 
-EXAMPLE = runpy.run_path(
-    str(Path(__file__).resolve().parent.parent / "examples" / "mujoco_panda.py")
-)
+EXAMPLE = runpy.run_path(str(Path(__file__).resolve().parents[2] / "examples" / "mujoco_panda.py"))
 drive = EXAMPLE["drive"]
 
 

@@ -14,7 +14,7 @@ from torque_safety_controller.node import controller_node
 from viability_bounds_pkg.node import bounds_node, estimator_node
 from viability_bounds_pkg.testing.executables import as_child
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 DEADLINE = 30.0  # s
 
 BOUNDS = ("viability_bounds_pkg", "bounds_node")

@@ -34,7 +34,7 @@ from viability_bounds_pkg.parameter import parameter_table
 from viability_bounds_pkg.ros.runtime import set_stamp
 from viability_bounds_pkg.testing.ros_harness import joint_state, overrides
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 
 VALUES = load_values("panda") | {
     "scenario": str(ROOT / "config" / "scenarios" / "panda_demo.yaml"),

@@ -20,7 +20,7 @@ from viability_bounds_pkg.testing.executables import run_to_end
 
 pytestmark = pytest.mark.packaging
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 OWN = ("viability_bounds_pkg", "torque_safety_controller")
 CODE = """
 import importlib.util

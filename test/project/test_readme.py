@@ -11,7 +11,7 @@ import yaml
 
 from viability_bounds_pkg.testing.executables import run_to_end
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text()
 
 # Shorter than by default: here it is only shown that they run.

@@ -15,7 +15,7 @@ from sim_bridge.faults.timeline import load_timeline
 from sim_bridge.nodes.fault_node import STREAMS
 from viability_bounds_pkg.testing.executables import as_child, run_to_end
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 SOAK = ["bash", ROOT / "scripts" / "soak.sh", "--rate", "100", "--every", "2"]
 
 

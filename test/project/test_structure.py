@@ -11,7 +11,7 @@ import rclpy
 import yaml
 from rclpy.node import Node
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = {
     "viability_bounds_pkg": set(),
     "torque_safety_controller": {"viability_bounds_pkg"},
@@ -139,6 +139,12 @@ def test_no_folder_is_crowded_and_each_says_what_it_is():
             assert len(files) <= 14, f"{folder}: {len(files)} modules"
             text = ast.get_docstring(ast.parse((folder / "__init__.py").read_text()))
             assert text, f"{folder} has no docstring"
+
+
+def test_no_folder_of_tests_is_crowded():
+    tests = [*ROOT.glob("test/**/test_*.py"), *ROOT.glob("src/*/test/**/test_*.py")]
+    for folder in {path.parent for path in tests}:
+        assert len(list(folder.glob("*.py"))) <= 14, folder
 
 
 @pytest.mark.parametrize(
@@ -275,8 +281,8 @@ def test_every_source_names_its_licence():
 
 def test_each_planted_fault_has_one_place_and_tests():
     sources = [path.read_text() for path in modules()]
-    tests = {path.name for path in (*ROOT.glob("src/*/test/**/*.py"), *ROOT.glob("test/*.py"))}
-    faults = yaml.safe_load((ROOT / "test" / "faults.yaml").read_text())
+    tests = {path.name for path in (*ROOT.glob("src/*/test/**/*.py"), *ROOT.glob("test/**/*.py"))}
+    faults = yaml.safe_load((ROOT / "test" / "planted_faults.yaml").read_text())
     assert len({fault["what"] for fault in faults}) == len(faults)
     for fault in faults:
         assert sum(source.count(fault["old"]) for source in sources) == 1, fault["what"]

@@ -18,7 +18,7 @@ from viability_bounds_pkg.parameter import parameter_table
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.viability import BoundsSolver
 
-TEXT = (Path(__file__).resolve().parent.parent / "CONTRIBUTING.md").read_text()
+TEXT = (Path(__file__).resolve().parents[2] / "CONTRIBUTING.md").read_text()
 STIFF = replace(GAINS, pose_kp=100.0, pose_kd=20.0)
 FLOOR = 0.4  # m
 

@@ -40,7 +40,7 @@ from viability_bounds_pkg.testing.ros_harness import (
     read_config,
 )
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 PANDA = read_config("panda", "bounds_node")
 JOINTS = PANDA["joints"]
 N = len(JOINTS)

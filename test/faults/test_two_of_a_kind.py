@@ -28,7 +28,7 @@ from viability_bounds_pkg.ros.topics import (
 )
 from viability_bounds_pkg.testing.ros_harness import acceleration_limits, joint_state, overrides
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 
 VALUES = load_values("panda") | {"clock": "lockstep", "start_paused": True}
 VALUES["scenario"] = str(ROOT / "config" / "scenarios" / "panda_demo.yaml")

@@ -19,7 +19,7 @@ from sim_bridge.scenario.scenario import load_scenario
 from viability_bounds_pkg.node.bounds_parameters import METHODS
 from viability_bounds_pkg.testing.executables import as_child, run_to_end
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 DEMO = ROOT / "scripts" / "demo.sh"
 SCENARIOS = ROOT / "config" / "scenarios"
 

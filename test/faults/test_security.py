@@ -17,7 +17,7 @@ from viability_bounds_pkg.ros.topics import USER
 from viability_bounds_pkg.testing.executables import run_to_end
 from viability_bounds_pkg.testing.ros_harness import read_config
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 POLICY = ROOT / "config" / "security" / "policy.xml"
 SCRIPT = ROOT / "scripts" / "security.sh"
 STACKS = {

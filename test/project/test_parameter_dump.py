@@ -20,7 +20,7 @@ from viability_bounds_pkg.parameter import parameter_table
 from viability_bounds_pkg.ros.given_parameters import note_arguments
 from viability_bounds_pkg.testing.ros_harness import overrides, private_domain, read_config
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 CONFIG = ROOT / "config"
 
 NODES = {node.NAME: node for node in (BoundsNode, ControllerNode, BulletNode, ScenarioNode)}

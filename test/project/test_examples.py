@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 SAYS = {
     "bounds_alone": r"exact bounds 0\.0e\+00, naive bounds [1-9]",
     "chain_of_nodes": r"positions at most 0 rad beyond their\nlimits, speeds 0 rad/s",

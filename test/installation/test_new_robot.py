@@ -10,7 +10,7 @@ import yaml
 from torque_safety_controller.tools.new_robot import main
 from viability_bounds_pkg.testing.executables import run_to_end
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 UR5 = "package://example-robot-data/robots/ur_description/urdf/ur5_robot.urdf"
 
 

@@ -10,7 +10,7 @@ import pytest
 from viability_bounds_pkg.testing.executables import run_to_end
 
 pytestmark = pytest.mark.packaging
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def colcon(workspace, *arguments):

@@ -24,7 +24,7 @@ from viability_bounds_pkg.testing.ros_harness import read_config
 
 pytestmark = pytest.mark.long
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 KINDS = {"bounds_node": BoundsNode, "controller_node": ControllerNode, "bullet_node": BulletNode}
 PATIENT = {"clock": "lockstep", "bounds_timeout": 5.0, "state_timeout": 10.0}
 VALUES = read_config("panda", *KINDS) | PATIENT
