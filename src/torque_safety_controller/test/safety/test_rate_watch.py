@@ -1,9 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The watch over rows of states without an answer."""
 
+import numpy as np
 import pytest
 
-from torque_safety_controller.safety.rate_watch import REST_TIME, RETURN_TIME, RateWatch
+from torque_safety_controller.safety.rate_watch import (
+    FALLING,
+    REST_TIME,
+    RETURN_TIME,
+    RateWatch,
+)
 
 DT = 0.002  # s
 
@@ -18,8 +24,8 @@ def test_rows_that_the_bounds_cover_change_nothing():
 
 def test_a_longer_row_stops_the_arm_and_it_goes_on_by_itself():
     watch = RateWatch(DT, 2)
-    said = watch.note(4 * DT)
-    assert said.startswith("3 states in a row")
+    said = watch.note(7 * DT)
+    assert said.startswith("6 states in a row")
     assert "cover 2" in said
     assert watch.share == 0.0
     assert watch.trouble.startswith("slowed to 0%")
@@ -32,6 +38,27 @@ def test_a_longer_row_stops_the_arm_and_it_goes_on_by_itself():
     assert steps == pytest.approx(RETURN_TIME / DT, abs=1)
     assert said == "the arm goes on"
     assert watch.note(DT) == ""
+
+
+def test_after_a_row_in_which_the_robot_may_have_held_its_command_the_share_falls_without_a_step():
+    watch, shares = RateWatch(DT, 2), []
+    assert watch.note(4 * DT).startswith("3 states in a row")
+    while watch.share:
+        shares.append(watch.share)
+        assert watch.note(DT) == ""
+    np.testing.assert_allclose(shares, FALLING ** np.arange(1, len(shares) + 1))
+    assert 0.01 < shares[-1] < 0.015
+    assert watch.note(DT) == ""
+    assert watch.share == pytest.approx(DT / RETURN_TIME)
+
+
+def test_a_row_that_was_shorter_does_not_stop_what_falls_already():
+    watch = RateWatch(DT, 2)
+    watch.note(4 * DT)
+    watch.note(2 * DT)
+    assert watch.share == pytest.approx(FALLING**2)
+    watch.note(9 * DT)
+    assert watch.share == 0.0
 
 
 def test_rows_one_after_the_other_are_told_once():

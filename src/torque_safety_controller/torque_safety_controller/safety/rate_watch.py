@@ -9,6 +9,15 @@ RETURN_TIME = 0.5
 REST_TIME = 1.0
 """In which the arm is to come to rest before it goes on, s: one that is shaken never does."""
 
+HELD = 5
+"""Unanswered states in a row in which robots may hold the last command, as they do by default."""
+
+FALLING = 0.7
+"""What is left of the share at each state, after a row that was too long."""
+
+_NOTHING = 0.01
+"""Share that counts as none."""
+
 _ROUNDING = 0.5
 """Of the time between two states, control periods."""
 
@@ -16,9 +25,11 @@ _ROUNDING = 0.5
 class RateWatch:
     """Share of the goals by which the arm may move, from the times of the states answered.
 
-    Each row of unanswered states that is longer than the bounds cover takes the share to zero, and
-    so does `slow`; when the arm rests it grows to one within `RETURN_TIME`. All times are those of
-    the states' stamps, so that in lockstep nothing depends on the machine.
+    A row of unanswered states that is longer than the bounds cover takes the share to zero: by
+    `FALLING`, so that torques do not step, if the robot may have held the last command; at once if
+    it must have stopped itself. `slow` does so at once, too. When the arm rests the share grows to
+    one within `RETURN_TIME`. All times are those of the states' stamps: in lockstep nothing
+    depends on the machine.
 
     Args:
         dt: control period, s.
@@ -36,13 +47,13 @@ class RateWatch:
         self.too_long = self.longest = 0
         self._why = ""
         self._stopping = 0.0
-        self._eased = False
+        self._eased = self._falls = False
 
     def slow(self, why: str) -> None:
         """Take the share to zero, because of what had gone wrong until now."""
         if self.share > 0.0:
             self._stopping = 0.0
-        self.share, self._why = 0.0, why
+        self.share, self._why, self._falls = 0.0, why, False
 
     def ease(self, elapsed: float | None) -> None:
         """Let the share go down as fast as it grows, for a state: `note` does not add to it."""
@@ -64,14 +75,25 @@ class RateWatch:
         self.longest = max(self.longest, row)
         if row > self._covered:
             what = f"states in a row without an answer, the bounds cover {self._covered}"
+            share = self.share
             self.slow(f"too many {what}")
+            if row <= HELD:
+                self._fall(share)
             self.too_long += 1
             return "" if was_slowed else f"{row} {what}: the arm is slowed"
+        if self._falls:
+            self._fall(self.share)
+            return ""
         if self.share == 0.0 and not at_rest and self._stopping < REST_TIME:
             self._stopping += elapsed
         elif not eased:
             self.share = min(1.0, self.share + elapsed / RETURN_TIME)
         return "the arm goes on" if was_slowed and not self.slowed else ""
+
+    def _fall(self, share: float) -> None:
+        share *= FALLING
+        self._falls = share > _NOTHING
+        self.share = share if self._falls else 0.0
 
     @property
     def slowed(self) -> bool:

@@ -19,9 +19,9 @@ FAST = np.full(N, 2.0)
 STILL = np.array([0.1, -0.6, 0.2, -1.9, 0.3, 1.2, 0.4])
 
 
-def estimator(delay=0, dt=DT, lag=0.0, observers=None, longest_gap=1):
-    lags = np.full(N, lag)
-    return StateEstimator(model(), dt, delay, lags, observers, FAST, MAX, np.zeros(N), longest_gap)
+def estimator(delay=0, dt=DT, lag=0.0, observers=None, longest_gap=1, lasting=0.0):
+    lags, learned = np.full(N, lag), np.full(N, lasting)
+    return StateEstimator(model(), dt, delay, lags, observers, FAST, MAX, learned, longest_gap)
 
 
 def gravity(state):
@@ -289,6 +289,29 @@ def test_brakes_that_no_effort_tells_of_hold_before_the_first_command():
     ours.answer(k * PERIOD_NS, gravity(State(STILL, np.zeros(N))))
     answer = ours.step((k + 1) * PERIOD_NS, State(STILL, np.zeros(N)), np.zeros(N))
     np.testing.assert_allclose(answer, State(STILL, np.zeros(N)), atol=1e-9)
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.0016])
+@pytest.mark.parametrize("stood", [1, 200])
+def test_an_arm_that_friction_holds_does_not_move_as_commands_take_effect_little_by_little(
+    lag, stood
+):
+    ours = estimator(delay=2, lag=lag, observers=OBSERVERS, lasting=200.0)
+    still = State(STILL, np.zeros(N))
+    command = gravity(still)
+    stopped = command + [12.0, -15.0, 9.0, 12.0, 2.0, -1.0, 0.1]  # as the robot stopped itself
+    for k in range(1, stood + 150):
+        share = max(0.0, 1.0 - max(0, k - stood) / 100.0)
+        answer = ours.step(k * PERIOD_NS, still, command + share * (stopped - command))
+        # More than twice as much where commands are taken to act at once.
+        assert np.abs(answer.v).max() < 0.09, k
+        if k > stood:
+            ours.answer(k * PERIOD_NS, command)
+    # From then on commands that are sent act.
+    for more in range(4):
+        ours.answer((k + more) * PERIOD_NS, command + PUSH)
+        answer = ours.step((k + more + 1) * PERIOD_NS, still, command + PUSH * (more > 1))
+    assert answer.v[0] > 0.02
 
 
 def test_without_torques_velocities_are_taken_to_stay():

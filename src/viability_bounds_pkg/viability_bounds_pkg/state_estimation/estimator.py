@@ -42,6 +42,12 @@ LEAST = 0.03
 
 NOISE_PERIODS = 100
 
+FADING = 0.98
+"""Of torques beyond the commanded ones, what is left after a period in which those were obeyed."""
+
+STILL = 0.02
+"""Speed of an arm that stands, in speed limits."""
+
 
 class StateEstimator:
     """Estimates the velocity, and predicts the state at the instant when a command will act.
@@ -94,8 +100,11 @@ class StateEstimator:
         self._stamp = -1
         self._tau = zero  # of the motors at the instant of the last state
         self._acting: Array | None = None  # the command that acts then
+        # What the motors give beyond it, as far as it was not obeyed; None before it is known.
+        self._beyond: Array | None = None
         self._noise = (DISAGREES / BEYOND_NOISE) ** 2  # mean square of `_distance`
         self._torque_share = 1.0 / torque_max
+        self._still = STILL * velocity_max
         self.resets: Counter[str] = Counter()
         self.innovation = zero.copy()
         self.expected: Expected | None = None
@@ -116,14 +125,15 @@ class StateEstimator:
         periods = self._periods_since_last(stamp)
         self._stamp = stamp
         if not periods:
-            return self._start(stamp, reported)
+            return self._start(stamp, reported, effort)
         self._commands.open(stamp, periods)
         acted, *coming = self._commands.acting()
         if effort is not None and acted is not None and self._commands.silent:
-            # What the robot does by itself then, the effort tells.
-            acted, coming = Command(None), [Command(None)] * len(coming)
+            acted = Command(None)  # what the robot does by itself then, the effort tells
         before = self._tau
         self._tau = self._torque(before, acted, reported, effort)
+        if effort is not None and self._beyond is None:
+            coming = [Command(None)] * len(coming)  # it goes on little by little
         state, mean = reported, self._lag.mean(before, self._tau)
         if self._observer is None:
             self.expected = Expected(self._model.acceleration_at(reported, mean), STICTION)
@@ -136,13 +146,13 @@ class StateEstimator:
             innovation = observer.innovation(reported.q)
             size = np.abs(innovation)
             if not (size <= self._jump).all():
-                return self._restart("the state jumped", stamp, reported)
+                return self._restart("the state jumped", stamp, reported, effort)
             np.maximum(self.innovation, size, out=self.innovation)
             observer.correct(innovation)
             state = observer.state
         answer = self._predict(state, coming)
         if not np.isfinite(answer).all():
-            return self._restart("the model diverged", stamp, reported)
+            return self._restart("the model diverged", stamp, reported, effort)
         return answer
 
     def _torque(
@@ -151,29 +161,45 @@ class StateEstimator:
         """Return the motors' torque now, one period after `before`, shape (n,), N m.
 
         A command is without the noise of what is reported, which only tells whether it came.
-        Before the first command the joints are taken to keep their velocity: the torque of brakes
-        is in no effort.
         """
         kept, self._acting = self._acting, None if command is None else command.tau
-        if command is None:
-            return self._model.torque_at(reported)
-        if command.tau is None:
-            return self._model.torque_at(reported) if effort is None else effort
-        expected = self._lag.end(before, command.tau)
+        if command is None or command.tau is None:
+            self._beyond = None
+            return self._without_commands(reported, effort)
+        acting, beyond = command.tau, self._beyond
         if effort is None:
-            return expected
-        if kept is None:  # the torque before is not that of a command
-            return effort
-        off = self._distance(effort, expected)
-        if kept is not command.tau:
-            unchanged = self._lag.end(before, kept)
-            if (off_unchanged := self._distance(effort, unchanged)) < off:
-                expected, off, self._acting = unchanged, off_unchanged, kept
-        limit = min(DISAGREES**2, max(LEAST**2, BEYOND_NOISE**2 * self._noise))
+            return self._lag.end(before, acting)
+        off = self._distance(effort, self._lag.end(before, acting))
+        if kept is not None and kept is not acting:
+            unchanged = self._distance(effort, self._lag.end(before, kept))
+            if unchanged < off:
+                off, acting = unchanged, kept
+                self._acting = kept
+        more, limit = effort - acting, LEAST**2
+        if beyond is not None:
+            limit = min(DISAGREES**2, max(limit, BEYOND_NOISE**2 * self._noise))
         if off >= limit:
+            self._beyond = more
+            return effort
+        if beyond is None:  # the torque before is not that of a command
+            self._beyond = np.zeros_like(effort)
             return effort
         self._noise += (off - self._noise) / NOISE_PERIODS
-        return expected
+        # A robot that has stopped itself comes back little by little, and what friction holds
+        # meanwhile was learned with its torques.
+        least, most = np.minimum(more, 0.0), np.maximum(more, 0.0)
+        self._beyond = np.minimum(np.maximum(FADING * beyond, least), most)
+        return self._lag.end(before, acting + self._beyond)
+
+    def _without_commands(self, reported: State, effort: Array | None) -> Array:
+        """Return the torque of a robot that moves or holds itself, shape (n,), N m.
+
+        Where its motors give hardly any, brakes hold it, whose torque is in no effort: then the
+        joints are taken to keep their velocity.
+        """
+        if effort is None or self._distance(effort, np.zeros(len(effort))) < LEAST**2:
+            return self._model.torque_at(reported)
+        return effort
 
     def _distance(self, effort: Array, expected: Array) -> float:
         share = self._torque_share * (effort - expected)
@@ -189,20 +215,23 @@ class StateEstimator:
         self.resets["stamps jumped"] += 1
         return 0
 
-    def _restart(self, why: str, stamp: int, reported: State) -> State:
+    def _restart(self, why: str, stamp: int, reported: State, effort: Array | None) -> State:
         self.resets[why] += 1
-        return self._start(stamp, reported)
+        return self._start(stamp, reported, effort)
 
-    def _start(self, stamp: int, reported: State) -> State:
+    def _start(self, stamp: int, reported: State, effort: Array | None) -> State:
         """Start anew from a reported state; nothing is known to be under way."""
         self.expected = None
         self._commands.clear()
         self._commands.open(stamp)
         self._model.a = np.zeros(len(self._tau))
-        self._acting = None
-        self._tau = self._model.torque_at(reported)
+        self._acting = self._beyond = None
+        self._tau = self._without_commands(reported, effort)
         if self._observer is not None:
-            self._observer.start(reported)
+            still = (np.abs(reported.v) <= self._still).all()
+            # The joints of an arm that stands do not accelerate: friction is in the way.
+            held = -self._model.acceleration_at(reported, self._tau) if still else None
+            self._observer.start(reported, held)
         answer = self._predict(reported, self._commands.acting()[1:])
         return answer if np.isfinite(answer).all() else reported
 
@@ -210,10 +239,11 @@ class StateEstimator:
         """Return a state after the commands under way, those without torques for that of now."""
         model, lag, tau = self._model, self._lag, self._tau
         learned = 0.0 if self._observer is None else self._observer.disturbance
+        beyond = 0.0 if self._beyond is None else self._beyond
         accelerations = [model.a]
         for command in coming:
             sent = None if command is None else command.tau
-            after = tau if sent is None else lag.end(tau, sent)
+            after = tau if sent is None else lag.end(tau, sent + beyond)
             accelerations.append(model.acceleration(state, lag.mean(tau, after)))
             state = state.after(model.a + learned, self._dt)
             tau = after

@@ -137,10 +137,16 @@ class Observer:
         self._learns = bool(lasting.any())
         self.start(State(np.zeros_like(lasting), np.zeros_like(lasting)))
 
-    def start(self, state: State) -> None:
-        """Start anew from a state, without a disturbance."""
+    def start(self, state: State, disturbance: Array | None = None) -> None:
+        """Start anew.
+
+        Args:
+            state: to start from.
+            disturbance: that is known, shape (n,), rad/s^2; as far as one may be learned.
+        """
         self.state = state
-        self.disturbance = np.zeros_like(self._lasting)
+        disturbance = np.zeros_like(self._lasting) if disturbance is None else disturbance
+        self.disturbance = np.minimum(np.maximum(disturbance, -self._lasting), self._lasting)
 
     def predict(self, a: Array) -> None:
         """Go on by a period with mean acceleration `a` of the model, shape (n,), rad/s^2."""
