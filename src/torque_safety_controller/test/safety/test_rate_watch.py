@@ -61,6 +61,26 @@ def test_a_row_that_was_shorter_does_not_stop_what_falls_already():
     assert watch.share == 0.0
 
 
+def test_the_share_does_not_grow_while_it_is_to_wait():
+    watch = RateWatch(DT, 2)
+    watch.slow("no limits")
+    for _ in range(3):
+        watch.wait()
+        watch.note(DT)
+    assert watch.share == 0.0
+    watch.note(DT)
+    assert watch.share == pytest.approx(DT / RETURN_TIME)
+
+
+def test_what_had_gone_wrong_takes_the_share_down_gently_where_it_is_to():
+    watch = RateWatch(DT, 2)
+    watch.slow("motors", gently=True)
+    assert watch.share == FALLING
+    assert watch.trouble == "slowed to 70%: motors"
+    watch.slow("motors")
+    assert watch.share == 0.0
+
+
 def test_rows_one_after_the_other_are_told_once():
     watch = RateWatch(DT, 0)
     said = [watch.note(2 * DT if step % 10 == 0 else DT) for step in range(100)]

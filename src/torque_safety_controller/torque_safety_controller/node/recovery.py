@@ -16,6 +16,9 @@ _PAUSED = "states were not answered for longer than bounds_timeout"
 _IGNORED = "the motors do not give the torques that were sent"
 STUCK = f"{_IGNORED}, and theirs stay the same to the last bit"
 
+_LITTLE = 0.1
+"""Share of its goals with which an arm has hardly gone on: to nothing at once would be a jolt."""
+
 
 class Recovery:
     """Sets the share of the goals by which the controller may move the arm.
@@ -65,6 +68,8 @@ class Recovery:
         doubted, elapsed = motors.doubted, states.elapsed()
         controller.obeyed = motors.look(self.rate.slowed, elapsed or 0.0)
         if not motors.ignored:
+            if motors.in_row:
+                self.rate.wait()  # until it is known whether commands act again
             return True
         controller.forget_disturbance()
         if motors.stuck:
@@ -72,7 +77,7 @@ class Recovery:
         elif doubted:  # perhaps commands act again: no jolt
             self.rate.ease(elapsed)
         else:
-            self.rate.slow(_IGNORED)
+            self.rate.slow(_IGNORED, gently=self.rate.share < _LITTLE)
             self._warn(f"{_IGNORED}: the arm is slowed")
         return not motors.stuck
 

@@ -47,18 +47,30 @@ class RateWatch:
         self.too_long = self.longest = 0
         self._why = ""
         self._stopping = 0.0
-        self._eased = self._falls = False
+        self._waits = self._falls = False
 
-    def slow(self, why: str) -> None:
-        """Take the share to zero, because of what had gone wrong until now."""
-        if self.share > 0.0:
+    def slow(self, why: str, gently: bool = False) -> None:
+        """Take the share to zero.
+
+        Args:
+            why: what had gone wrong until now.
+            gently: by `FALLING` at each state, and not at once.
+        """
+        share = self.share
+        if share > 0.0:
             self._stopping = 0.0
         self.share, self._why, self._falls = 0.0, why, False
+        if gently:
+            self._fall(share)
 
     def ease(self, elapsed: float | None) -> None:
         """Let the share go down as fast as it grows, for a state: `note` does not add to it."""
         self.share = max(0.0, self.share - (elapsed or 0.0) / RETURN_TIME)
-        self._eased = True
+        self.wait()
+
+    def wait(self) -> None:
+        """Let the share not grow for a state."""
+        self._waits = True
 
     def note(self, elapsed: float | None, at_rest: bool = True) -> str:
         """Take the time since the last answered state; return what to log, mostly nothing.
@@ -67,7 +79,7 @@ class RateWatch:
             elapsed: s; None if there was no such state.
             at_rest: whether the arm has come to rest, where the share is zero.
         """
-        eased, self._eased = self._eased, False
+        waits, self._waits = self._waits, False
         if elapsed is None:
             return ""
         was_slowed = self.slowed
@@ -75,10 +87,7 @@ class RateWatch:
         self.longest = max(self.longest, row)
         if row > self._covered:
             what = f"states in a row without an answer, the bounds cover {self._covered}"
-            share = self.share
-            self.slow(f"too many {what}")
-            if row <= HELD:
-                self._fall(share)
+            self.slow(f"too many {what}", gently=row <= HELD)
             self.too_long += 1
             return "" if was_slowed else f"{row} {what}: the arm is slowed"
         if self._falls:
@@ -86,7 +95,7 @@ class RateWatch:
             return ""
         if self.share == 0.0 and not at_rest and self._stopping < REST_TIME:
             self._stopping += elapsed
-        elif not eased:
+        elif not waits:
             self.share = min(1.0, self.share + elapsed / RETURN_TIME)
         return "the arm goes on" if was_slowed and not self.slowed else ""
 

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Processes that tests start end with them."""
 
+import os
+import select
 import signal
 import subprocess
 import sys
 
 import pytest
 
-from viability_bounds_pkg.testing.executables import as_child, environment
+from viability_bounds_pkg.testing.executables import as_child, environment, run_to_end
 
 STARTS_ANOTHER = """
 import subprocess, sys
@@ -34,3 +36,15 @@ def test_what_a_test_starts_ends_with_it_when_it_is_killed(by):
         test.send_signal(signal.SIGKILL)
         # The pipe ends when the other one has ended, too.
         assert test.communicate(timeout=30.0) == ("", None)
+
+
+def test_a_program_that_takes_too_long_ends_with_what_it_has_started(tmp_path):
+    child = tmp_path / "child"
+    with pytest.raises(subprocess.TimeoutExpired):
+        run_to_end("bash", "-c", f"sleep 100 & echo $! > {child}; wait", timeout=1.0)
+    try:
+        handle = os.pidfd_open(int(child.read_text()))
+    except ProcessLookupError:
+        return
+    assert select.select([handle], [], [], 5.0)[0], "it goes on"
+    os.close(handle)

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import pytest
@@ -58,12 +58,24 @@ def run_to_end(
     Args:
         command: its words.
         timeout: the longest that it may take, s.
-        options: others of `subprocess.run`.
+        options: others of `subprocess.Popen`.
     """
     words = list(map(str, command))
-    return subprocess.run(
-        words, capture_output=True, text=True, timeout=timeout, check=False, **options
-    )
+    with subprocess.Popen(
+        words,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        **options,
+    ) as program:
+        try:
+            said = program.communicate(timeout=timeout)
+        except BaseException:
+            with suppress(ProcessLookupError):
+                os.killpg(program.pid, signal.SIGKILL)  # with what it has started
+            raise
+    return subprocess.CompletedProcess(words, program.returncode, *said)
 
 
 def started(*arguments: Any) -> subprocess.CompletedProcess[str]:
