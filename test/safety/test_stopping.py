@@ -129,7 +129,7 @@ def test_the_chain_of_nodes_goes_on_when_commands_return(ros, robot):
         ros.wait_until(lambda: arm._periods >= end, "control periods", timeout=60.0)
 
     for _ in range(2):
-        reach_for(next(postures), round(rng.uniform(0.2, 0.4) * values["rate_hz"]))
+        reach_for(next(postures), round(rng.uniform(0.4, 0.6) * values["rate_hz"]))
         assert np.abs(arm._robot.state().v).max() > 0.5
         speed = arm._stop.time_to_rest(arm._robot.state().v)
         for _ in range(round((speed + 0.02) * values["rate_hz"])):  # the controller is not heard
@@ -251,7 +251,7 @@ def test_the_arm_is_slowed_after_a_row_of_states_that_is_too_long_and_goes_on(ro
         arm._advance()
         arm._next_state()
     ros.wait_until(lambda: controller._recovery.rate.too_long, "a row that is too long")
-    play(0.2)
+    play(0.4)
     assert "the bounds cover 1: the arm is slowed" in capfd.readouterr().err
     assert 0.0 < controller._recovery.rate.share < 1.0
     assert "slowed to" in controller._report()[1]

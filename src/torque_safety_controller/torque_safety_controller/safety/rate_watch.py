@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+
 RETURN_TIME = 0.5
 """Until goals have all of their effect again, s of robot time."""
 
@@ -12,8 +14,8 @@ REST_TIME = 1.0
 HELD = 5
 """Unanswered states in a row in which robots may hold the last command, as they do by default."""
 
-FALLING = 0.7
-"""What is left of the share at each state, after a row that was too long."""
+FALL_TIME = 0.02
+"""Time constant by which the share falls after a row that was just too long, s."""
 
 _NOTHING = 0.01
 """Share that counts as none."""
@@ -25,25 +27,26 @@ _ROUNDING = 0.5
 class RateWatch:
     """Share of the goals by which the arm may move, from the times of the states answered.
 
-    A row of unanswered states that is longer than the bounds cover takes the share to zero: by
-    `FALLING`, so that torques do not step, if the robot may have held the last command; at once if
-    it must have stopped itself. `slow` does so at once, too. When the arm rests the share grows to
-    one within `RETURN_TIME`. All times are those of the states' stamps: in lockstep nothing
-    depends on the machine.
+    A row of unanswered states that is longer than the bounds cover takes the share to zero: within
+    a few `FALL_TIME`, so that torques do not step, if the robot may have held the last command; at
+    once if it must have stopped itself. `slow` does so at once, too. When the arm rests the share
+    grows to one within `RETURN_TIME`, as the square of the time, because goals far away ask for
+    so much that already a small share is a large torque. A state adds a period to it, however many
+    were missed. All times are those of the states' stamps: in lockstep nothing depends on the
+    machine.
 
     Args:
         dt: control period, s.
         covered: longest row of unanswered states that the bounds hold for.
 
     Attributes:
-        share: from 0, the arm is brought to rest, to 1.
         too_long: number of rows that were longer than covered.
         longest: row of unanswered states so far.
     """
 
     def __init__(self, dt: float, covered: int) -> None:
         self._dt, self._covered = dt, covered
-        self.share = 1.0
+        self._way = 1.0  # of `RETURN_TIME` that has gone by
         self.too_long = self.longest = 0
         self._why = ""
         self._stopping = 0.0
@@ -54,18 +57,19 @@ class RateWatch:
 
         Args:
             why: what had gone wrong until now.
-            gently: by `FALLING` at each state, and not at once.
+            gently: within a few `FALL_TIME`, and not at once.
         """
-        share = self.share
-        if share > 0.0:
+        if self._way > 0.0:
             self._stopping = 0.0
-        self.share, self._why, self._falls = 0.0, why, False
+        self._why, self._falls = why, gently
         if gently:
-            self._fall(share)
+            self._fall()
+        else:
+            self._way = 0.0
 
     def ease(self, elapsed: float | None) -> None:
         """Let the share go down as fast as it grows, for a state: `note` does not add to it."""
-        self.share = max(0.0, self.share - (elapsed or 0.0) / RETURN_TIME)
+        self._way = max(0.0, self._way - (elapsed or 0.0) / RETURN_TIME)
         self.wait()
 
     def wait(self) -> None:
@@ -91,23 +95,28 @@ class RateWatch:
             self.too_long += 1
             return "" if was_slowed else f"{row} {what}: the arm is slowed"
         if self._falls:
-            self._fall(self.share)
+            self._fall()
             return ""
-        if self.share == 0.0 and not at_rest and self._stopping < REST_TIME:
+        if self._way == 0.0 and not at_rest and self._stopping < REST_TIME:
             self._stopping += elapsed
         elif not waits:
-            self.share = min(1.0, self.share + elapsed / RETURN_TIME)
+            self._way = min(1.0, self._way + min(elapsed, self._dt) / RETURN_TIME)
         return "the arm goes on" if was_slowed and not self.slowed else ""
 
-    def _fall(self, share: float) -> None:
-        share *= FALLING
-        self._falls = share > _NOTHING
-        self.share = share if self._falls else 0.0
+    def _fall(self) -> None:
+        self._way *= math.exp(-0.5 * self._dt / FALL_TIME)
+        if self.share < _NOTHING:
+            self._way, self._falls = 0.0, False
+
+    @property
+    def share(self) -> float:
+        """From 0, the arm is brought to rest, to 1."""
+        return self._way**2
 
     @property
     def slowed(self) -> bool:
         """Whether the arm is slowed."""
-        return self.share < 1.0
+        return self._way < 1.0
 
     @property
     def trouble(self) -> str:
