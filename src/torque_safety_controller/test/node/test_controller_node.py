@@ -277,6 +277,15 @@ def test_a_controller_that_was_paused_in_motion_lets_the_arm_come_to_rest(ros):
     goes_on_when_it_rests(chain, stamps, "states were not answered")
 
 
+def test_so_does_one_of_a_slow_robot_that_may_have_held_its_command_meanwhile(ros):
+    chain = NodeChain(ros, bounds_timeout=0.2, rate_hz=20.0)
+    stamp = give_goal(chain)
+    stamps = iter(range(stamp + 251, stamp + 2000))
+    chain.answer(stamp + 250)  # five periods
+    chain.await_mode("HOLD", "comes to rest: states were not answered")
+    goes_on_when_it_rests(chain, stamps, "states were not answered")
+
+
 def test_slow_robots_are_not_taken_for_missing_bounds(ros):
     """The time-out counts from the state, not from the last answer."""
     chain = NodeChain(ros, bounds_timeout=0.8)

@@ -91,6 +91,7 @@ class Recovery:
             controller.forget_disturbance()
             if elapsed > self._pause:
                 self.why = _PAUSED
+                self.slow()  # also where a row of so few states takes it down gently
         controller.share = rate.share
 
     def slow(self) -> None:

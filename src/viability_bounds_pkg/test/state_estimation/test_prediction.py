@@ -256,6 +256,17 @@ def test_the_effort_is_believed_where_no_command_explains_it():
     assert speed_after(0.0 * PUSH, 2.0 * PUSH) == speed_after(2.0 * PUSH, 2.0 * PUSH)
 
 
+def test_where_efforts_cease_the_last_one_has_no_effect_on_what_is_predicted():
+    ours, tau, k = moving(delay=2, observers=OBSERVERS)
+    still = State(STILL, np.zeros(N))
+    for more in range(50):
+        answer = ours.step((k + more) * PERIOD_NS, still, tau + PUSH if more < 3 else None)
+        ours.answer((k + more) * PERIOD_NS, tau)
+        if more == 2:
+            assert answer.v[0] > 0.01
+    assert np.abs(answer.v).max() < 1e-6
+
+
 @pytest.mark.parametrize(("quiet", "believed"), [(2, False), (300, True)])
 def test_the_quieter_the_effort_the_less_it_must_differ_to_be_believed(quiet, believed):
     ours, tau, k = moving(observers=OBSERVERS)

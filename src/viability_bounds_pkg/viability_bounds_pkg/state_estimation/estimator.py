@@ -168,6 +168,7 @@ class StateEstimator:
             return self._without_commands(reported, effort)
         acting, beyond = command.tau, self._beyond
         if effort is None:
+            self._beyond = None
             return self._lag.end(before, acting)
         off = self._distance(effort, self._lag.end(before, acting))
         if kept is not None and kept is not acting:
