@@ -167,6 +167,7 @@ class MoveitNode(ArmNode):
         self._jogs = _Outlet(self, JOG_JOINTS)
         self._jogged = -math.inf
         self._mode = ""
+        self._server: ActionServer | None = None
         action = f"{self.get_fully_qualified_name()}/follow_joint_trajectory"
         with self.starting():
             self.claim("serves", action)
@@ -193,6 +194,8 @@ class MoveitNode(ArmNode):
             self._end(self._run, Result.INVALID_GOAL, "moveit_node ends")
         for outlet in (self._trajectories, self._jogs):
             outlet.close()
+        if self._server is not None:
+            self._server.destroy()  # else it would stay in the ROS graph
         super().destroy_node()
 
     # Goals
