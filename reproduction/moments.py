@@ -19,6 +19,7 @@ RETURN = 0.1  # s after the arm goes on in which torque steps count: later ones 
 HOLD_IN_TIME = 0.1  # s, where the controller brakes
 STEP = 0.02  # of tau_max, when the arm goes on
 AGAIN = 2.0  # s
+BEFORE = 0.1  # s before a fault in which the arm has to be under way
 HEADS = (
     *("robot", "fault", "moments", "position, rad", "speed, rad/s", "torque"),
     *("periods to braking", "by", "again, s", "torque step", ""),
@@ -76,6 +77,7 @@ class Seen:
         position, speed, torque: worst beyond limits, rad, rad/s, and share of torque_max.
         braking: periods until the arm braked, one for each moment; NaN where it did not.
         by_robot: whether it was the robot's own stop that braked first.
+        under_way: whether nothing had braked the arm just before; empty where not looked at.
         again: time until it went on, s.
         steps: largest change of torque in a period as it went on, share of torque_max.
         lasted: how long the faults were there, s.
@@ -89,6 +91,7 @@ class Seen:
     torque: float = 0.0
     braking: list[float] = field(default_factory=list)
     by_robot: list[bool] = field(default_factory=list)
+    under_way: list[bool] = field(default_factory=list)
     again: list[float] = field(default_factory=list)
     steps: list[float] = field(default_factory=list)
     lasted: list[float] = field(default_factory=list)
@@ -121,6 +124,9 @@ class Seen:
         """
         t = np.array([each.t for each in trace])
         braking, stopped = (np.array([each[k] for each in trace], dtype=bool) for k in (1, 2))
+        before = (t < begin) & (t >= begin - BEFORE)
+        if before.any():
+            self.under_way.append(not braking[before].any())
         first = np.flatnonzero((t >= begin) & (t < end) & braking)
         if first.size:
             by_robot = bool(stopped[first[0]])
@@ -154,6 +160,8 @@ class Seen:
         wrong = []
         if self.position > 0.0 or self.speed > 0.0 or self.torque > 1.0 + 1e-9:
             wrong.append("a limit was passed")
+        if self.under_way and np.mean(self.under_way) < 0.5:
+            wrong.append("mostly at rest before")  # what it shows of limits and steps is little
         stop = self.believed + self.timeout + 1
         in_time = np.where(np.array(self.by_robot), stop, HOLD_IN_TIME / dt)
         if self.brakes and not (np.array(self.braking) <= in_time).all():  # nor where it did not

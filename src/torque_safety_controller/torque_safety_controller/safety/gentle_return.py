@@ -57,8 +57,10 @@ def return_gently(
     and for more within `_RESERVE` of the limit itself; at most for its share of the bounds.
 
     One that moves towards its limit brakes as its bounds ask, or so that it comes to rest in T and
-    in a part of the room to the reserve, if that is less. Where its speed may be noise, it need
-    not do more than stand: the noise would choose between a push and none.
+    in a part of the room to the reserve, if that is less. It need not do more than stand at the
+    end of the period, if that leaves it a half of the room to the limit itself: what stiction lets
+    slip would choose between a push and none. Where its speed may be noise, the reserve is half as
+    wide, and it need never do more than stand.
 
     Args:
         bounds: of the joints, shape (n,) each, rad/s^2.
@@ -74,10 +76,14 @@ def return_gently(
     # Where the bounds leave no choice the joint is beyond what they keep.
     slow = np.inf if rough else np.where(lower == upper, _CREEPS, _STANDS)
     to_reserve = room[0] - _RESERVE, room[1] - _RESERVE
-    way = _PART * np.where(v > 0.0, to_reserve[1], to_reserve[0]) - _LATE * period * speed
+    room_ahead, late = np.where(v > 0.0, room[1], room[0]), _LATE * period * speed
+    way = _PART * (room_ahead - (0.5 if rough else 1.0) * _RESERVE) - late
+    rest = 0.5 * room_ahead - late
     with np.errstate(divide="ignore", invalid="ignore"):
         brake = np.where(way > 0.0, np.maximum(speed / _TIME, 0.5 * v * v / way), np.inf)
-    brake = np.where(speed < slow, np.minimum(brake, speed / period), brake)
+        stand = np.where(rest > 0.0, np.maximum(speed / period, 0.5 * v * v / rest), np.inf)
+    stand = np.where(speed < slow, speed / period, stand)
+    brake = np.minimum(brake, stand)
 
     grown = share / (1.0 - share) if share < 1.0 else np.inf
     per_way = 2.0 * (period / _TIME) ** 2
