@@ -158,6 +158,11 @@ class AdditionalTorque:
         self.last = torque + self.friction.torque(robot.M, v, a_last, time, robot.dt)
         return self.last
 
+    def forget(self) -> None:
+        """Let the integral action begin anew: what it gives now fades."""
+        self._started = False
+        self._resuming = True
+
     def initialise(self, robot: RobotModel, v: Array, torque: Array) -> Array:
         """Begin so that the torque is `torque` now; return that. Friction's fades in.
 
@@ -214,6 +219,7 @@ class AdditionalTorque:
             self._fade(self.integral - torque)
         if not self._faded:
             gap = min(elapsed, LONGEST_GAP * robot.dt) if elapsed > 0.0 else 0.0
+            gap = robot.dt if math.isinf(elapsed) else gap
             self._fade(self._fading * math.exp(-gap / _FADING_TIME))
             torque = torque + self._fading
         changed = self._mode != self._settings.mode or action is not self._chosen()

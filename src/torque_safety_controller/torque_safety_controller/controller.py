@@ -180,6 +180,11 @@ class Controller:
         """Forget what was learned of disturbances: it was of something else."""
         self._observer.reset()
 
+    def forget_integral(self) -> None:
+        """Let what the integral action adds fade: it was of another motion."""
+        if self.additional is not None:
+            self.additional.forget()
+
     def _forget(self) -> None:
         self._a_last = np.zeros(self.robot.n)
         self.at_rest = False

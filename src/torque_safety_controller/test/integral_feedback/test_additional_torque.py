@@ -56,6 +56,20 @@ def test_a_mode_that_is_left_fades_and_then_costs_nothing():
     assert relative(loop.additional.last) > 0.03
 
 
+@pytest.mark.parametrize("mode", MODES[1:])
+def test_what_is_forgotten_again_and_again_fades_from_what_it_was(mode):
+    """As while the motors do not do as they are told: no time counts then."""
+    loop = settled(mode)
+    torques = [loop.additional.last.copy()]
+    for _ in range(500):
+        loop.additional.forget()
+        loop.robot.update(State(loop.robot.q, loop.robot.v), np.zeros(N))
+        torques.append(loop.additional.torque(loop.robot, loop.robot.v, np.zeros(N), math.inf))
+    assert relative(torques[0]) > 0.03
+    assert relative(np.diff(torques, axis=0)) < 0.02 * relative(torques[0])
+    np.testing.assert_allclose(torques[-1], torques[0] * math.exp(-500 * DT / 0.2), rtol=0.05)
+
+
 def test_changing_one_s_mind_within_a_step_is_no_change():
     loop, other = settled("joints"), settled("joints")
     for mode in ("task", "none", "joints"):

@@ -191,6 +191,20 @@ def test_what_was_learned_until_the_motors_were_told_is_forgotten(ros):
     assert not observer.estimate.any()
 
 
+def test_integral_action_fades_where_the_motors_give_other_torques_for_long(ros):
+    """It would push against a robot that keeps its own limits, and so go on not to be obeyed."""
+    motors = Motors(ros, integral_action="joints")
+    motors.answer(150)
+    added = motors.chain.node._controller.additional
+    before = np.abs(added.integral).max()
+    assert before > 0.1
+    others = -motors.tau
+    motors.answer(45, others)
+    assert np.abs(added.integral).max() == pytest.approx(before, rel=0.1)
+    motors.answer(80, others)
+    assert np.abs(added.integral).max() < 0.1 * before
+
+
 def test_where_torques_are_not_reported_any_more_commands_count_as_obeyed(ros):
     motors = Motors(ros)
     motors.answer(150)

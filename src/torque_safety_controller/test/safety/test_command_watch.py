@@ -65,8 +65,10 @@ def test_they_are_ignored_after_some_states_and_act_again_at_once(off):
         assert not loop.look(off=np.array([0.0, off]))
         assert loop.watch.in_row == row
         assert loop.watch.ignored == (row >= IGNORED)
+        assert loop.watch.ignored_for == pytest.approx(row * DT)
     loop.agree(1)
     assert not loop.watch.ignored
+    assert loop.watch.ignored_for == 0.0
     assert loop.watch.times == 1
 
 

@@ -54,6 +54,7 @@ class CommandWatch:
         in_row: states that do not agree, since the last one that does.
         doubted: whether commands were ignored, and the arm has not gone on yet.
         times: how often that began.
+        ignored_for: for how long torques have not agreed, s.
         stuck: whether torques do not agree and stay the same to the last bit.
         seen: largest difference lately while the commands acted, as a share of the tolerance.
     """
@@ -69,7 +70,7 @@ class CommandWatch:
 
     def reset(self) -> None:
         """Forget all commands."""
-        self._agreed = 0
+        self._agreed, self.ignored_for = 0, 0.0
         self.doubted = self._known = False
         self.retry()
 
@@ -100,6 +101,7 @@ class CommandWatch:
             if not self.doubted:
                 self.seen = max((1.0 - _FORGETS) * self.seen, off)
             self._agreed += 1
+            self.ignored_for = 0.0
             self.retry()
             return True
         if self._agreed < ENOUGH:
@@ -107,6 +109,7 @@ class CommandWatch:
             return True
         self.seen += _LEARNS * max(0.0, min(off, 1.0) - self.seen)
         self.in_row += 1
+        self.ignored_for += elapsed
         self._same = self._same + 1 if same else 0
         self.stuck = self._same >= IGNORED
         self._stuck_for = self._stuck_for + elapsed if self.stuck else 0.0
