@@ -18,6 +18,7 @@ import argparse
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cache
 from multiprocessing import get_context
@@ -38,6 +39,7 @@ from imperfect_page import (
 )
 
 from viability_bounds_pkg.robot_description import build_model, read_urdf
+from viability_bounds_pkg.testing.ros_harness import private_domain
 
 ROBOTS = ("panda", "talos_left_arm", "baxter_left_arm")
 MINUTE = 60.0  # s
@@ -66,6 +68,8 @@ PUSHED = {
 
 Values = dict[str, dict[str, Any]]
 """Parameters by node."""
+
+_held = ExitStack()
 
 
 @dataclass(frozen=True)
@@ -361,6 +365,11 @@ def times_to_goal(robot: str, name: str) -> dict[str, Any]:
     return {"times": times, "left": left}
 
 
+def _own_domain() -> None:
+    """Let the nodes of this process see no others, until it ends."""
+    os.environ["ROS_DOMAIN_ID"] = str(_held.enter_context(private_domain()))
+
+
 def seeds(name: str, minutes: int) -> range:
     """Return the seeds of a case's minutes: one minute alone is one with a stiff posture task."""
     return range(minutes) if name in AT_LENGTH else range(1, minutes + 1)
@@ -375,7 +384,9 @@ def play_all(
     """
     lengths = {name: minutes_declared if name in AT_LENGTH else minutes_others for name in names}
     fine = True
-    with ProcessPoolExecutor(max(1, os.cpu_count() or 1), get_context("spawn")) as pool:
+    with ProcessPoolExecutor(
+        max(1, os.cpu_count() or 1), get_context("spawn"), initializer=_own_domain
+    ) as pool:
         runs = {
             (robot, name): (
                 [pool.submit(play, robot, name, seed) for seed in seeds(name, minutes)],

@@ -23,7 +23,7 @@ from torque_safety_controller.node import safety_stack
 from viability_bounds_pkg.ros.direct_delivery import DirectDelivery
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS
 from viability_bounds_pkg.testing.executables import as_child
-from viability_bounds_pkg.testing.ros_harness import RosHarness, joint_state
+from viability_bounds_pkg.testing.ros_harness import joint_state, private_domain
 
 ROOT = Path(__file__).resolve().parents[2]
 DEADLINE = 30.0  # s
@@ -32,17 +32,14 @@ SIMULATED = ("sim_bridge", "simulated_stack")
 
 
 @pytest.fixture
-def another_robot():
-    """Somebody else publishes states in the domain that this process was given."""
-    ros = RosHarness(int(os.environ["ROS_DOMAIN_ID"]))
-    try:
-        ros.probe.create_publisher(JointState, "joint_states", CONTROL_QOS)
+def own_domain(monkeypatch):
+    """A program that was killed stays in the graph of its domain for some seconds."""
+    with private_domain() as domain:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
         yield
-    finally:
-        ros.close()
 
 
-@pytest.mark.usefixtures("another_robot")
+@pytest.mark.usefixtures("own_domain")
 @pytest.mark.parametrize(
     ("robot", "overlays", "left_out"),
     [
