@@ -16,9 +16,9 @@ _PAUSED = "states were not answered for longer than bounds_timeout"
 _IGNORED = "the motors do not give the torques that were sent"
 STUCK = f"{_IGNORED}, and theirs stay the same to the last bit"
 
-_LATEST = 0.5
-"""For how long what the integral action adds is kept while commands do not act, s: in motion it
-balances friction, and pushes an arm that stands, against the robot's own stop, too."""
+_INTEGRAL_KEPT = 0.5
+"""For how long the integral action's torque is kept while commands do not act, s. It balances the
+friction of a motion; the arm that has stopped since then would be pushed by it."""
 
 _LITTLE = 0.1
 """Share of its goals with which an arm has hardly gone on: to nothing at once would be a jolt."""
@@ -76,7 +76,7 @@ class Recovery:
                 self.rate.wait()  # until it is known whether commands act again
             return True
         controller.forget_disturbance()
-        if motors.ignored_for > _LATEST:
+        if motors.ignored_for > _INTEGRAL_KEPT:
             controller.forget_integral()
         if motors.stuck:
             self.why = STUCK
