@@ -268,6 +268,7 @@ def test_it_holds_while_bounds_are_missing_and_goes_on_by_itself(ros):
     tau = chain.await_command(stamp + 10, lambda: chain.state(stamp + 10))
     assert time.monotonic() - begin >= 0.1
     chain.await_mode("HOLD", "acceleration limits are stale")
+    assert float(chain.reported("goal_share")) == 0.0  # within margins it returns gently, too
     hold = expected(GOAL).hold(State(Q, V))
     np.testing.assert_allclose(tau, hold.tau, atol=0.5)  # the node's last acceleration differs
     # The next ones are held at once.

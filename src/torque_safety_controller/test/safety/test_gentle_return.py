@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.safety.disturbance_observer import DisturbanceObserver
 from torque_safety_controller.safety.gentle_return import return_gently
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.viability import BoundsSolver
@@ -90,14 +91,17 @@ def test_noise_of_a_velocity_does_not_choose_between_a_push_and_none(side):
     eased, demanded = least(0.1, True)
     np.testing.assert_allclose(eased, demanded)  # as it must
     assert (demanded >= 2.9).all()
-    # 1 mrad before its limit it may stop on the way, as farther away; nearer it has to stand.
+    # One count of an encoder of 16 bits just before a limit is a little braking, not a jolt.
     bounds = AccelerationRange(-side * demanded, -side * demanded)
-    noise = 6.6e-3  # of one count of an encoder of 16 bits
+    noise = 6.6e-3
     v = np.full(2, side * noise)
-    for left, expected in ((1e-3, noise / 0.02), (0.5e-3, noise / 1e-3)):
+    for left, expected in ((1e-3, noise / 0.04), (0.4e-3, noise / 0.04), (2e-5, noise / 1e-3)):
         room = np.full(2, left), np.full(2, left)
         low, high = return_gently(bounds, v, room, 0.0, 1e-3, True)
         np.testing.assert_allclose(-side * np.clip(0.0, low, high), np.minimum(expected, demanded))
+        back = [return_gently(bounds, w, room, 0.1, 1e-3, True) for w in (0.0 * v, -v)]
+        back = [np.clip(0.0, *each) for each in back]
+        assert (np.abs(back[1] - back[0]) <= noise / 0.04 + 1e-9).all()
 
 
 MARGIN = 2e-3  # rad
@@ -170,6 +174,26 @@ def test_a_push_within_the_margins_that_is_not_known_passes_no_limit(
                 acting = np.clip(0.0, low, high)
             a = acting + side * push * DISTURBANCE
             q, v = q + v * 1e-3 + 0.5e-6 * a, v + 1e-3 * a
+            assert (side * (edge - q) > 0.0).all()
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_nor_does_it_where_velocities_are_estimates_and_it_is_observed(within_margins, side):
+    """Noise is braked little. Of a push, the observer learns in time from 0.1 mrad on."""
+    rng = np.random.default_rng(11)
+    edge = LIMITS.q_max if side > 0.0 else LIMITS.q_min
+    for _ in range(40):
+        observer = DisturbanceObserver(2, 0.012)
+        q, v, a = edge - side * MARGIN * rng.uniform(0.05, 0.5, 2), np.zeros(2), np.zeros(2)
+        for _ in range(300):
+            seen = v + 3e-3 * rng.uniform(-1.0, 1.0, 2)
+            observer.observe(seen, a, 1e-3, np.full(2, 1e3), np.eye(2))
+            found = within_margins.bounds(q, seen)
+            bounds = AccelerationRange(found.lower, found.upper)
+            ways = q - LIMITS.q_min, LIMITS.q_max - q
+            a = np.clip(0.0, *observer.shift(*return_gently(bounds, seen, ways, 0.0, 1e-3, True)))
+            given = a + side * DISTURBANCE
+            q, v = q + v * 1e-3 + 0.5e-6 * given, v + 1e-3 * given
             assert (side * (edge - q) > 0.0).all()
 
 

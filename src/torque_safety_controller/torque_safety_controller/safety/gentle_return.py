@@ -69,7 +69,7 @@ def return_gently(
             each, rad.
         share: of what the bounds demand, from 0 to 1.
         period: of control, s.
-        rough: whether `v` has noise, for which the bounds have margins.
+        rough: whether `v` has noise, for which the bounds have margins; pushes are observed.
     """
     lower, upper = bounds
     speed, stop = np.abs(v), -v / period
@@ -77,10 +77,11 @@ def return_gently(
     slow = np.inf if rough else np.where(lower == upper, _CREEPS, _STANDS)
     to_reserve = room[0] - _RESERVE, room[1] - _RESERVE
     room_ahead, late = np.where(v > 0.0, room[1], room[0]), _LATE * period * speed
-    way = _PART * (room_ahead - (0.5 if rough else 1.0) * _RESERVE) - late
     rest = 0.5 * room_ahead - late
+    way = rest if rough else _PART * (room_ahead - _RESERVE) - late
+    time = 2.0 * _TIME if rough else _TIME
     with np.errstate(divide="ignore", invalid="ignore"):
-        brake = np.where(way > 0.0, np.maximum(speed / _TIME, 0.5 * v * v / way), np.inf)
+        brake = np.where(way > 0.0, np.maximum(speed / time, 0.5 * v * v / way), np.inf)
         stand = np.where(rest > 0.0, np.maximum(speed / period, 0.5 * v * v / rest), np.inf)
     stand = np.where(speed < slow, speed / period, stand)
     brake = np.minimum(brake, stand)
@@ -90,8 +91,8 @@ def return_gently(
     per_missing = _HASTE / _TIME**2
     up = np.maximum(np.maximum(per_way * lower, _LEAST), -per_missing * to_reserve[0])
     down = np.minimum(np.minimum(per_way * upper, -_LEAST), per_missing * to_reserve[1])
-    up = np.minimum(share * lower, grown * up - v / _TIME)
-    down = np.maximum(share * upper, grown * down - v / _TIME)
+    up = np.minimum(share * lower, grown * up - v / time)
+    down = np.maximum(share * upper, grown * down - v / time)
     up = np.maximum(up, np.where(v < 0.0, brake, stop))
     down = np.minimum(down, np.where(v > 0.0, -brake, stop))
     return AccelerationRange(
