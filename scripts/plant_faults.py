@@ -99,6 +99,7 @@ def run(
         text = path.read_text()
         path.write_text(text.replace(fault["old"], fault["new"]))
         paths = [copy, *(copy / "src" / name for name in PACKAGES), copy / "reproduction"]
+        paths += [each for each in (copy / "reproduction").iterdir() if each.is_dir()]
         environment = os.environ | {
             "PYTHONPATH": os.pathsep.join([*map(str, paths), os.environ.get("PYTHONPATH", "")]),
             "PLANTED_DIGESTS": json.dumps(digests),

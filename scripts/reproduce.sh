@@ -54,4 +54,8 @@ paper0 | paper1_integral | paper1_compliance | two_hands | departures | friction
 esac
 # shellcheck source=scripts/environment.sh
 source "$root/scripts/environment.sh"
-exec python "$root/reproduction/$what.py" "$@"
+for room in "$root/reproduction" "$root"/reproduction/*/; do
+    PYTHONPATH="$room:${PYTHONPATH:-}"
+done
+export PYTHONPATH
+exec python "$root"/reproduction/*/"$what.py" "$@"

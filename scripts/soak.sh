@@ -25,4 +25,5 @@ case "${1:-}" in -h | --help) usage; exit 0 ;; esac
 root="$(cd "$(dirname "$0")/.." && pwd)"
 # shellcheck source=scripts/environment.sh
 source "$root/scripts/environment.sh"
-exec python "$root/reproduction/soak.py" "$@"
+export PYTHONPATH="$root/reproduction:${PYTHONPATH:-}"
+exec python "$root/reproduction/bad_days/soak.py" "$@"

@@ -6,7 +6,7 @@ Shorter runs of what `scripts/reproduce.sh paper1-integral` plays.
 
 import numpy as np
 import pytest
-from direct import DirectLoop, column
+from direct import DirectLoop, column, posture_at_limits
 from paper1_integral import (
     PAPER,
     PUSHES,
@@ -86,3 +86,23 @@ def test_the_handover_does_not_jolt():
     # The drives' last step is 1200, counted from the beginning.
     assert jumps[200].max() < np.delete(jumps, 200, axis=0).max() + 0.01
     assert np.ptp(column(samples, "q")[200:], axis=0).max() < 1e-3
+
+
+def test_no_limit_is_passed_whatever_the_gain_and_however_often_it_changes():
+    """Panda with K = lambda diag(M) passed all limits but those of its torques."""
+    loop = DirectLoop(
+        "panda",
+        {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
+        | {"integral_action": "joints", "integral_lambda": 50.0},
+    )
+    rng, monitor = np.random.default_rng(4), loop.robot.monitor
+    low, high = loop.config.position_min, loop.config.position_max
+    for k in range(6):
+        loop.controller.goals.set_posture(posture_at_limits(rng, low, high))
+        for _ in range(20 if k > 2 else 1):
+            loop.run(0.05 if k > 2 else 1.0)
+            if k > 2:
+                mode = str(rng.choice(["none", "joints", "task", "position"]))
+                loop.change(integral_action=mode, integral_lambda=10.0 ** rng.uniform(0.0, 3.0))
+        assert monitor.max_velocity_violation.max() == 0.0
+        assert monitor.max_position_violation.max() == 0.0

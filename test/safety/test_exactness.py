@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The long comparison of `reproduction/exactness.py`, in short, and that it can fail."""
+"""The long comparison of `exactness.py` (reproduction), in short, and that it can fail."""
 
 import json
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `reproduction/imperfect.py` does beside playing: scaling, courses, rows, the page."""
+"""What `imperfect.py` (reproduction) does beside playing: scaling, courses, rows, the page."""
 
 from dataclasses import replace
 

@@ -39,7 +39,7 @@ def in_one_process(monkeypatch):
 
 
 def play(robot, case, duration, seed=1):
-    """Play the begin of a minute of reproduction/imperfect.py; return what came of it."""
+    """Play the begin of a minute of `imperfect.py`; return what came of it."""
     values = node_values(robot, CASES[case], seed)
     course = Course(values["controller_node"], robot, seed)
     values["controller_node"] |= STIFF

@@ -21,6 +21,7 @@ from torque_safety_controller.friction.settings import FrictionSettings, no_fric
 from torque_safety_controller.integral_feedback.action import ArmTerms, IntegralAction
 from torque_safety_controller.integral_feedback.feedback import IntegralFeedback
 from torque_safety_controller.integral_feedback.settings import IntegralSettings
+from torque_safety_controller.integral_feedback.stable_gain import StableGain
 from torque_safety_controller.nullspace.compliance import NullspaceCompliance, PrintedCompliance
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.compiled import compiled
@@ -37,6 +38,11 @@ PRINTED = "{} as printed"
 
 LONGEST_GAP = 2.5
 """Periods that a step may take, a missed deadline being 2; a longer gap is not integrated over."""
+
+_MOST = {"joints": 1.0} | dict.fromkeys(TASKS, 0.5)
+"""Share of the gain that is stable for one joint alone, in each mode: `StableGain`.
+
+Those with a null space are left with K and P K P, which bear less in some postures."""
 
 _POSITION_JUMP = 0.05  # rad or m; beyond what the velocities account for
 _FADING_TIME = 0.2  # s; of what a mode cannot take over
@@ -89,6 +95,7 @@ class AdditionalTorque:
         self.friction = FrictionCompensation(settings.friction or self._no_friction)
         self.skipped = 0
         self._zero = np.zeros(n)
+        self._stable = StableGain(n)
         self._settings = settings
         self.reset()
         # Compiled now, not in a control loop.
@@ -103,8 +110,8 @@ class AdditionalTorque:
     @settings.setter
     def settings(self, settings: AdditionalSettings) -> None:
         settings.integral.check_joints(len(self._zero))
-        if settings.integral.same_as(self._integral_settings):
-            settings = replace(settings, integral=self._integral_settings)
+        if settings.integral.same_as(self._asked):
+            settings = replace(settings, integral=self._asked)
         self._settings = settings
         self.friction.settings = settings.friction or self._no_friction
 
@@ -115,6 +122,11 @@ class AdditionalTorque:
         return not integrating and self.friction.idle
 
     @property
+    def gain(self) -> float:
+        """Gain lambda of the integral action, 1/s: what is set, or what is stable."""
+        return self._integral_settings.gain
+
+    @property
     def saturated(self) -> NDArray[np.bool_]:
         """Which joints are at their budget, shape (n,)."""
         if self._action is None:
@@ -123,7 +135,8 @@ class AdditionalTorque:
 
     def reset(self) -> None:
         """Forget the past: the next step begins with nothing added."""
-        self._select_action()
+        self._stable.reset()
+        self._select_action(self._settings.integral)
         self._started = False
         self._lost = self._resuming = False
         self._q_last = self._v_last = self._zero
@@ -175,7 +188,7 @@ class AdditionalTorque:
             torque: shape (n,), N m, finite.
         """
         self.friction.reset()
-        self._select_action()
+        self._select_action(self._borne(robot))
         self._take_over(robot, v, torque, reset=True)
         self.last = self.integral = torque
         return torque
@@ -223,8 +236,9 @@ class AdditionalTorque:
             self._fade(self._fading * math.exp(-gap / _FADING_TIME))
             torque = torque + self._fading
         changed = self._mode != self._settings.mode or action is not self._chosen()
-        if changed or self._integral_settings is not self._settings.integral:
-            self._select_action()
+        integral = self._borne(robot)
+        if changed or self._integral_settings is not integral:
+            self._select_action(integral)
             self._take_over(robot, v, torque, reset=changed)
         return torque
 
@@ -235,9 +249,22 @@ class AdditionalTorque:
             mode = PRINTED.format(mode)
         return self.actions.get(mode)
 
-    def _select_action(self) -> None:
-        """Let the mode and the settings that are set hold from now on."""
-        self._mode, self._integral_settings = self._settings.mode, self._settings.integral
+    def _borne(self, robot: RobotModel) -> IntegralSettings:
+        """Return the settings of the integral action with a gain that is stable here."""
+        asked, mode = self._settings.integral, self._settings.mode
+        if mode == "none" or asked.anti_windup == "paper_mass":
+            return asked  # K = lambda M does not depend on the posture
+        gain = self._stable.of(asked.gain, robot.M, robot.dt, _MOST[mode])
+        if gain == asked.gain:
+            return asked
+        if asked is self._asked and gain == self._integral_settings.gain:
+            return self._integral_settings
+        return replace(asked, gain=gain)
+
+    def _select_action(self, integral: IntegralSettings) -> None:
+        """Let the mode that is set, and these settings, hold from now on."""
+        self._mode, self._asked = self._settings.mode, self._settings.integral
+        self._integral_settings = integral
         self._action = self._chosen()
         for action in self.actions.values():
             action.settings = self._integral_settings

@@ -180,6 +180,11 @@ class Controller:
         """Forget what was learned of disturbances: it was of something else."""
         self._observer.reset()
 
+    @property
+    def integral_gain(self) -> float:
+        """Gain of the integral action that is used here, 1/s; 0 without one."""
+        return 0.0 if self.additional is None else self.additional.gain
+
     def forget_integral(self) -> None:
         """Let what the integral action adds fade: it was of another motion."""
         if self.additional is not None:

@@ -400,6 +400,7 @@ class ControllerNode(ArmNode):
                 "mode_changes": self._modes.changes,
                 "control": self._handover.control.value,
                 "integral_action": self._config.integral.integral_action,
+                "integral_lambda": self._controller.integral_gain,
                 "goals_pending": len(self._goals),
                 "goals_refused": self._goals.refused,
                 "states_refused": self._states.refused,

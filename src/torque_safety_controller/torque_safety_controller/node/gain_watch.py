@@ -14,9 +14,14 @@ from torque_safety_controller.parameters.controller_parameters import Controller
 from torque_safety_controller.parameters.loop_parameters import gain_check, limits_gains
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 
+_QUIET = 0.5
+"""Time without a change of parameters after which gains are judged, s."""
+
 
 class GainWatch:
     """Judges gains beside the control loop, in a thread: it takes some tenths of a second.
+
+    They are judged when they have been the same for `_QUIET`: several threads would slow the loop.
 
     Where nothing is declared, nothing is judged as long as there is no integral action: with one
     whose gain is too high for the rate an arm passes all limits but those of its torques.
@@ -33,20 +38,25 @@ class GainWatch:
         self._robot, self._model = declared_robot(node), model
         self._inertia: ArmInertia | None = None
         self._judged: ControllerConfiguration | None = None
+        self._timer: threading.Timer | None = None
         self.look(config)
 
     def look(self, config: ControllerConfiguration) -> None:
         """Judge the gains, at start and when they have changed."""
-        self._judged = None
+        self.close()
         if self._robot is None:
             return
         if limits_gains(self._robot.declared) or config.integral.integral_action != "none":
             self._judged = config
-            threading.Thread(target=self._judge, args=(self._robot, config), daemon=True).start()
+            self._timer = threading.Timer(_QUIET, self._judge, (self._robot, config))
+            self._timer.daemon = True
+            self._timer.start()
 
     def close(self) -> None:
         """Log no more warnings."""
         self._judged = None
+        if self._timer is not None:
+            self._timer.cancel()
 
     def _judge(self, robot: BoundsConfiguration, config: ControllerConfiguration) -> None:
         if self._inertia is None:

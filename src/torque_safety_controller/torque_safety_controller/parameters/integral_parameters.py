@@ -13,7 +13,7 @@ from torque_safety_controller.integral_feedback.settings import METHODS, Integra
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import (
     NOT_NEGATIVE,
-    above,
+    Range,
     joint_numbers,
     number,
     numbers,
@@ -45,7 +45,10 @@ class IntegralConfiguration:
         note="at most torque_max",
     )
     integral_lambda: float = number(
-        "gain, K = lambda diag(M), 1/s", above(0.0, 1e3), default=2.0, live=True
+        "gain, K = lambda diag(M), 1/s; less is used in postures where it would be unstable",
+        Range(1.0, 1e3),
+        default=2.0,
+        live=True,
     )
     integral_leak: Array = numbers(
         "leak rates theta_s and theta_f of the slow and the fast integrator, 1/s, the share mu of "

@@ -24,7 +24,7 @@ from viability_bounds_pkg.acceleration_limits import estimate_acceleration_limit
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 
-sys.path.insert(0, f"{Path(__file__).resolve().parents[1]}/src/viability_bounds_pkg/test/support")
+sys.path.insert(0, f"{Path(__file__).resolve().parents[2]}/src/viability_bounds_pkg/test/support")
 
 import paper_algorithms
 

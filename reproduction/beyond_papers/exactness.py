@@ -25,7 +25,7 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 import numpy as np
 from tqdm import tqdm
 
-sys.path.insert(0, f"{Path(__file__).resolve().parents[1]}/src/viability_bounds_pkg/test/support")
+sys.path.insert(0, f"{Path(__file__).resolve().parents[2]}/src/viability_bounds_pkg/test/support")
 
 from adversary import (
     POLICIES,
@@ -51,7 +51,7 @@ from joint_cases import (
 
 from viability_bounds_pkg.viability import BoundsSolver
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 
 STATES_OF_A_CASE = 480
 STATES_OF_A_JOINT = 120

@@ -45,7 +45,7 @@ from viability_bounds_pkg.testing.node_program import NodeProgram
 from viability_bounds_pkg.testing.ros_harness import RosHarness, joint_state, private_domain
 
 ROBOTS = ("panda", "talos_left_arm", "baxter_left_arm")
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 ONE, PROCESSES = ("simulated_stack",), ("bullet_node", "bounds_node", "controller_node")
 PAUSED, RESTARTED, KILLED = "stands still", "started again", "killed"
 START = 60.0  # s, in which programs must start
