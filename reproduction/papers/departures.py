@@ -209,8 +209,9 @@ derivation: J^+ has shape (n, m), not (m, n); u^r after (21) has C dq, not C dq^
 is dq^a and (19) its derivative; the second condition of (11) has a for s where (26) is limited.
 How integral(J's) is computed from samples the paper does not say: by the product rule, which makes
 (25) exact. Near singularities J^+ is damped, where the paper assumes full rank. K is lambda
-diag(M), or lambda M with `integral_anti_windup: paper_mass`; where the posture makes lambda too large for the period
-it is lowered, which the paper's lambda of 2 1/s at 1 kHz never is ([gains.md](gains.md#a-stable-integral-gain)).
+diag(M), or lambda M with `integral_anti_windup: paper_mass`; where the posture makes lambda too
+large for the period it is lowered, which the paper's 2 1/s at 1 kHz never is
+([gains.md](gains.md#a-stable-integral-gain)).
 
 The improvement of (27) for internal forces, which the paper names and does not describe, is
 derived in [forces.md](forces.md#two-hands-on-one-object), for the force between two hands.

@@ -52,6 +52,7 @@ def test_it_follows_an_arm_that_moves(arm):
         M = mass(arm, q + (goal - q) * (k % 500) / 500)
         used.append(stable.of(1000.0, M, DT, 1.0))
         assert radius(used[-1], M) <= 1.0
+        assert used[-1] >= 0.99 * StableGain(arm.n).of(1000.0, M, DT, 1.0) / np.sqrt(2.0)
     assert 3 < np.count_nonzero(np.diff(used)) < 40
     assert len(set(np.round(np.log2(1000.0 / np.array(used)) * 2.0, 6) % 1.0)) == 1
 

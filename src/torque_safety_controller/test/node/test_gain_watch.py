@@ -7,6 +7,7 @@ import pytest
 from controller_chain import NODE
 from rcl_interfaces.msg import Log
 
+from torque_safety_controller.node import gain_watch
 from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.tools.gain_limits import main
 from viability_bounds_pkg.ros.given_parameters import note_arguments
@@ -58,13 +59,22 @@ def test_each_gain_that_is_beyond_gets_one_line_and_again_when_it_changes(ros, d
     assert sum("bounds_dt_factor" in text for text in said()) == 1
 
 
-def test_gains_that_change_often_are_judged_when_they_stay(ros, declared):
+def test_gains_that_change_often_are_judged_when_they_stay(ros, declared, monkeypatch):
     """Each judgement takes time from the control loop."""
+    judged, judge = [], gain_watch.gain_check
+
+    def gain_check(config, *others):
+        judged.append(config.gains.pose_kd)
+        return judge(config, *others)
+
+    monkeypatch.setattr(gain_watch, "gain_check", gain_check)
     said = warnings(ros, declared("delay: 2"))
-    for gain in (2000.0, 3000.0, 4000.0):
+    ros.wait_until(lambda: len(said()) == 2, "what is told at the start")
+    for gain in (2000.0, 3000.0, 4000.0, 5000.0):
         ros.accepts(NODE, pose_kd=gain)
-    ros.wait_until(lambda: any("'pose_kd' is 4000" in text for text in said()), "a warning")
-    assert sum("'pose_kd'" in text for text in said()) == 1
+    ros.wait_until(lambda: any("'pose_kd' is 5000" in text for text in said()), "a warning")
+    assert judged[-1] == 5000.0
+    assert len(judged) <= 3  # where accepting takes long, one in between
 
 
 @pytest.mark.parametrize("text", ["delay: 0", "bounds_dt_factor: 3.0"])

@@ -95,7 +95,7 @@ def test_noise_of_a_velocity_does_not_choose_between_a_push_and_none(side):
     bounds = AccelerationRange(-side * demanded, -side * demanded)
     noise = 6.6e-3
     v = np.full(2, side * noise)
-    for left, expected in ((1e-3, noise / 0.04), (0.4e-3, noise / 0.04), (2e-5, noise / 1e-3)):
+    for left, expected in ((1.2e-3, noise / 0.04), (0.4e-3, noise / 0.012), (2e-5, noise / 1e-3)):
         room = np.full(2, left), np.full(2, left)
         low, high = return_gently(bounds, v, room, 0.0, 1e-3, True)
         np.testing.assert_allclose(-side * np.clip(0.0, low, high), np.minimum(expected, demanded))

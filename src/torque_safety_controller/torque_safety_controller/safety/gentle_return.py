@@ -28,6 +28,9 @@ _PART = 0.25
 _RESERVE = 1e-3
 """Distance from the limit itself within which a joint brakes as its bounds ask, rad."""
 
+_STANDING = 0.012
+"""Time in which a joint comes to stand whose speed may be noise, s; or a period."""
+
 _LATE = 3
 """Periods that a command may come late."""
 
@@ -60,7 +63,9 @@ def return_gently(
     in a part of the room to the reserve, if that is less. It need not do more than stand at the
     end of the period, if that leaves it a half of the room to the limit itself: what stiction lets
     slip would choose between a push and none. Where its speed may be noise, the reserve is half as
-    wide, and it need never do more than stand.
+    wide, 2 T take the place of T, on the way back too, and it need only stand after `_STANDING` or
+    within a half of the room, and never earlier than at the end of the period: one count of an
+    encoder is no jolt, and an observer sees what pushes.
 
     Args:
         bounds: of the joints, shape (n,) each, rad/s^2.
@@ -73,17 +78,20 @@ def return_gently(
     """
     lower, upper = bounds
     speed, stop = np.abs(v), -v / period
-    # Where the bounds leave no choice the joint is beyond what they keep.
-    slow = np.inf if rough else np.where(lower == upper, _CREEPS, _STANDS)
     to_reserve = room[0] - _RESERVE, room[1] - _RESERVE
     room_ahead, late = np.where(v > 0.0, room[1], room[0]), _LATE * period * speed
     rest = 0.5 * room_ahead - late
-    way = rest if rough else _PART * (room_ahead - _RESERVE) - late
+    way = _PART * (room_ahead - (0.5 if rough else 1.0) * _RESERVE) - late
     time = 2.0 * _TIME if rough else _TIME
     with np.errstate(divide="ignore", invalid="ignore"):
         brake = np.where(way > 0.0, np.maximum(speed / time, 0.5 * v * v / way), np.inf)
-        stand = np.where(rest > 0.0, np.maximum(speed / period, 0.5 * v * v / rest), np.inf)
-    stand = np.where(speed < slow, speed / period, stand)
+        in_rest = np.where(rest > 0.0, 0.5 * v * v / rest, np.inf)
+    if rough:
+        stand = np.minimum(np.maximum(speed / _STANDING, in_rest), speed / period)
+    else:
+        # Where the bounds leave no choice the joint is beyond what they keep.
+        slow = np.where(lower == upper, _CREEPS, _STANDS)
+        stand = np.maximum(speed / period, np.where(speed < slow, 0.0, in_rest))
     brake = np.minimum(brake, stand)
 
     grown = share / (1.0 - share) if share < 1.0 else np.inf

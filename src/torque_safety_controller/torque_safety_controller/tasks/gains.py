@@ -69,7 +69,7 @@ class Gains:
     disturbance_time: float | None = number(
         "time constant with which the error of the accelerations is estimated, to tighten the "
         "bounds by it, s; -1: not at all",
-        Range(0.0, 10.0, special=OFF),
+        Range(0.0, 0.1, special=OFF),
         default=OFF,
         live=True,
     )
