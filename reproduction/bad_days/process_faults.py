@@ -69,7 +69,6 @@ APART = 1.0  # s between starts of nodes
 GOAL_PERIOD, SENT_AGAIN = 1.0, 0.2  # s
 CALM = 1.0, 2.0  # s, shortest and longest time of motion before a fault
 WILD = 1.0  # s, in which parameters change, or the clock jumps
-BETWEEN = 0.02  # s, between two changes
 NOT_WILD = "method", "friction_", "closed_contacts", "integral_anti_windup", "integral_lambda"
 """Live parameters that choose what keeps no limits, for comparison, or say what is so; and a gain
 that is tried by itself."""
@@ -463,7 +462,6 @@ def _wild(bench: Bench, chosen: Callable[[str], bool]) -> Course:
         row = rows[node][bench.rng.integers(len(rows[node]))]
         value = wild_value(row, bench.limits["joints"], bench.rng)
         yield from bench.set(node, {row.name: value})
-        yield from bench.wait(BETWEEN)
     for node, values in before.items():
         # Twice: one that must agree with another may be refused until that is back.
         for _ in range(2):

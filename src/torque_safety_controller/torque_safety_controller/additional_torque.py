@@ -40,9 +40,9 @@ LONGEST_GAP = 2.5
 """Periods that a step may take, a missed deadline being 2; a longer gap is not integrated over."""
 
 _MOST = {"joints": 1.0} | dict.fromkeys(TASKS, 0.5)
-"""Share of the gain that is stable for one joint alone, in each mode: `StableGain`.
+"""Product lambda h f that `StableGain` allows in each mode.
 
-Those with a null space are left with K and P K P, which bear less in some postures."""
+It is less with a null space: loops of P K P are unstable earlier in some postures."""
 
 _POSITION_JUMP = 0.05  # rad or m; beyond what the velocities account for
 _FADING_TIME = 0.2  # s; of what a mode cannot take over

@@ -335,7 +335,7 @@ class ControllerNode(ArmNode):
         if not self._sees_motors():
             return
         self._recovery.why = _STALE
-        self._recovery.slow()  # also of an arm within margins: it does not return at once
+        self._recovery.slow()  # an arm within margins returns gently here, too
         self._recovery.look()
         state = State(self._states.q, self._states.v)
         self._answer(self._controller.hold(state, self._states.elapsed()), stamp)
