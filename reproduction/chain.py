@@ -22,6 +22,7 @@ from sim_bridge.scenario.recording import RecordedRun
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.node.estimator_node import EstimatorNode
+from viability_bounds_pkg.testing.ros_harness import private_domain
 
 ROOT = Path(__file__).resolve().parent.parent
 NODES = {
@@ -80,11 +81,13 @@ def load_node_values(robot: str, *overlays: str) -> dict[str, dict[str, Any]]:
 def _context():
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     gc.collect()  # a run that failed leaves its participants to the garbage collector
-    rclpy.init(args=["--ros-args", "--log-level", "error"])
-    try:
-        yield
-    finally:
-        rclpy.try_shutdown()
+    # In a domain of its own: what is left of a run before would be a rival of this one.
+    with private_domain() as domain:
+        rclpy.init(args=["--ros-args", "--log-level", "error"], domain_id=domain)
+        try:
+            yield
+        finally:
+            rclpy.try_shutdown()
 
 
 def run_chain(
@@ -112,16 +115,16 @@ def run_chain(
         path = Path(directory) / "scenario.yaml"
         path.write_text(yaml.safe_dump(scenario))
         nodes: dict[str, Any] = {}
-        for name, kind in NODES.items():
-            if name == "estimator_node" and name not in per_node:
-                continue
-            own = values | lockstep | {"scenario": str(path)} | per_node.get(name, {})
-            overrides = [Parameter(key, value=value) for key, value in own.items() if value != []]
-            nodes[name] = kind(parameter_overrides=overrides)
-        for each in list(nodes["scenario_node"].subscriptions):
-            if each.topic_name.removeprefix("/") in not_recorded:
-                nodes["scenario_node"].destroy_subscription(each)
         try:
+            for name, kind in NODES.items():
+                if name == "estimator_node" and name not in per_node:
+                    continue
+                own = values | lockstep | {"scenario": str(path)} | per_node.get(name, {})
+                given = [Parameter(key, value=value) for key, value in own.items() if value != []]
+                nodes[name] = kind(parameter_overrides=given)
+            for each in list(nodes["scenario_node"].subscriptions):
+                if each.topic_name.removeprefix("/") in not_recorded:
+                    nodes["scenario_node"].destroy_subscription(each)
             player = nodes["scenario_node"]
             play(
                 player, others=[each for each in nodes.values() if each is not player], quiet=True

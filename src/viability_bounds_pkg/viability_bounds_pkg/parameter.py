@@ -10,7 +10,7 @@ hand, in its ``__post_init__``.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar
 
@@ -270,6 +270,10 @@ def _field(**row: Any) -> Any:
     return field(metadata=metadata, default=parameter.default)
 
 
+_TABLES: dict[tuple[type, str], tuple[Parameter, ...]] = {}
+"""Made so far: a running node needs its own for each parameter that is set."""
+
+
 def parameter_table(kind: type, prefix: str = "") -> tuple[Parameter, ...]:
     """Return the parameters that a dataclass and its groups declare, in their order.
 
@@ -277,13 +281,16 @@ def parameter_table(kind: type, prefix: str = "") -> tuple[Parameter, ...]:
         kind: the dataclass.
         prefix: of the names, as in `group`.
     """
+    if (kind, prefix) in _TABLES:
+        return _TABLES[kind, prefix]
     rows: list[Parameter] = []
     for each in fields(kind):
         if _PARAMETER in each.metadata:
             rows.append(replace(each.metadata[_PARAMETER], name=prefix + each.name))
         elif _GROUP in each.metadata:
             rows += parameter_table(*each.metadata[_GROUP])
-    return tuple(rows)
+    _TABLES[kind, prefix] = table = tuple(rows)
+    return table
 
 
 def redeclared(kind: type, name: str, **changes: Any) -> Any:
@@ -302,30 +309,74 @@ def read(kind: type[Configuration], given: Mapping[str, Any]) -> Configuration:
     Raises:
         SettingError: a value is missing, of another type, or not allowed.
     """
+    return make(kind, checked_values(kind, given))
+
+
+def checked_values(
+    kind: type, given: Mapping[str, Any], before: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
+    """Return the values of all parameters of a dataclass by name, each checked by itself.
+
+    Args:
+        kind: the dataclass.
+        given: values by name; None is the default.
+        before: what this returned for values of which only the given ones have changed; without
+            it, those that are missing have their default.
+
+    Raises:
+        SettingError: a value is missing, of another type, or not allowed.
+    """
     table = parameter_table(kind)
+    if before is not None and "joints" not in given:
+        table = tuple(row for row in table if row.name in given)
+    else:
+        before = {}
     values = {row.name: row.coerce(given.get(row.name)) for row in table}
-    if any(row.per_joint for row in table):
-        joints = values["joints"]
-        if not joints or len(set(joints)) != len(joints) or "" in joints:
-            raise SettingError("joints", list(joints), "at least one joint name, each once")
+    joints = values.get("joints", before.get("joints", ()))
+    if any(row.per_joint for row in table) and (
+        not joints or len(set(joints)) != len(joints) or "" in joints
+    ):
+        raise SettingError("joints", list(joints), "at least one joint name, each once")
     for row in table:
-        length = len(values["joints"]) if row.per_joint else row.length
+        length = len(joints) if row.per_joint else row.length
         if row.optional and not len(values[row.name]):
             if row.if_empty is not None and length is not None:
                 values[row.name] = np.full(length, row.if_empty)
         elif row.per_joint:
-            check_per_joint(row.name, values[row.name], values["joints"])
-    return _make(kind, "", values)
+            check_per_joint(row.name, values[row.name], joints)
+    return {**before, **values}
 
 
-def _make(kind: type[Configuration], prefix: str, values: Mapping[str, Any]) -> Configuration:
+def make(
+    kind: type[Configuration],
+    values: Mapping[str, Any],
+    before: Configuration | None = None,
+    changed: Collection[str] = (),
+    prefix: str = "",
+) -> Configuration:
+    """Return a dataclass of parameters.
+
+    Args:
+        kind: the dataclass.
+        values: of `checked_values`.
+        before: what this returned before the values of `changed` changed: its groups without any
+            of them are kept. None makes all anew.
+        changed: names.
+        prefix: of the names, as in `group`.
+
+    Raises:
+        SettingError: values that do not fit each other.
+    """
     made: dict[str, Any] = {}
     for each in fields(kind):  # type: ignore[arg-type]
         if _PARAMETER in each.metadata:
             made[each.name] = values[prefix + each.name]
         elif _GROUP in each.metadata:
             of, its_prefix = each.metadata[_GROUP]
-            made[each.name] = _make(of, its_prefix, values)
+            kept = None if before is None else getattr(before, each.name)
+            if kept is None or any(row.name in changed for row in parameter_table(of, its_prefix)):
+                kept = make(of, values, kept, changed, its_prefix)
+            made[each.name] = kept
     return kind(**made)
 
 

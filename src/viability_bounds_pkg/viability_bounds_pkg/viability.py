@@ -30,6 +30,7 @@ from viability_bounds_pkg.kernel.discrete_time_condition import (
     checked_step,
     discrete_time_condition,
     kernel_braking,
+    longest_steps,
     without_position_error,
 )
 from viability_bounds_pkg.kernel.one_sided_limit import JointTable, highest_speeds, make_table
@@ -61,6 +62,10 @@ class BoundsSolver:
         position_error: shape (n,), rad, or None for zeros. The bounds then hold although the
             true position differs from the one that they are asked for by up to this much.
         velocity_error: shape (n,), rad/s, or None for zeros; the same for the velocity.
+        held: longest time for which an acceleration may act, s, at most `dt`; None means `dt`.
+            Where (11) fails for `dt`, a state may allow no acceleration that could be
+            held for so long; its bounds are then those of a shorter step, at least `held`, for
+            which (11) holds.
 
     Attributes:
         limits: as given.
@@ -82,12 +87,15 @@ class BoundsSolver:
         *,
         position_error: ArrayLike | None = None,
         velocity_error: ArrayLike | None = None,
+        held: float | None = None,
     ):
         self.limits = limits
         self.dt = checked_step(dt)
         period = self.dt if period is None else checked_step(period, "period")
-        if period > self.dt * (1.0 + ROUNDING):
-            raise JointLimitsError("period", None, period, f"must be at most dt = {self.dt:g} s")
+        held = self.dt if held is None else checked_step(held, "held")
+        for name, value in (("period", period), ("held", held)):
+            if value > self.dt * (1.0 + ROUNDING):
+                raise JointLimitsError(name, None, value, f"must be at most dt = {self.dt:g} s")
         same = period >= self.dt * (1.0 - ROUNDING)
         margins = checked_margin(margin, limits)
         off = checked_errors("position_error", position_error, limits)
@@ -97,9 +105,18 @@ class BoundsSolver:
         braking = kernel_braking(inner, self.dt, margins, errors, exact=same & certain)
         self.exact = braking.holds | (same & certain)
         curved = self.exact & ~braking.holds
-        self.table = _make_table(inner, self.dt, margins, errors, braking.deceleration, curved)
+        steps = np.full(len(limits), self.dt)
+        self.table = _make_table(inner, steps, margins, errors, braking.deceleration, curved)
         # A joint counts as inside if it may be.
         self.table.limits["tolerance"] += 2.0 * off[:, None]
+        steps = longest_steps(inner, self.dt, held, margins, errors)
+        changed = steps < self.dt
+        if changed.any():
+            full = np.stack([-limits.a_min, limits.a_max], axis=1) - margins[:, None]
+            none = np.zeros_like(changed)
+            made = _make_table(inner, steps, margins, errors, full, none)
+            shorter = np.where(changed[:, None], made.limits, self.table.limits)
+            self.table = self.table._replace(shorter=shorter)
         # The first call compiles; let it be this one and not one in a control loop.
         self.bounds(np.zeros(len(limits)), np.zeros(len(limits)))
 
@@ -217,7 +234,7 @@ def viable_velocity_range(
 
 def _make_table(
     limits: JointLimits,
-    dt: float,
+    steps: Array,
     margins: Array,
     velocity_errors: Array,
     braking: Array,
@@ -225,8 +242,8 @@ def _make_table(
 ) -> JointTable:
     """Return the kernel's table.
 
-    `braking` is of shape (n, 2), towards the upper and the lower limit, rad/s^2; `curved`, shape
-    (n,), tells which kernels are those of discrete time.
+    `steps` is of shape (n,), s; `braking` of shape (n, 2), towards the upper and the lower limit,
+    rad/s^2; `curved`, shape (n,), tells which kernels are those of discrete time.
     """
     ranges = np.stack([limits.q_max, -limits.q_min], axis=1)
     length = ranges.sum(axis=1, keepdims=True)
@@ -234,10 +251,11 @@ def _make_table(
     largest = np.abs(np.where(np.isfinite(ranges), ranges, 0.0)).max(axis=1, keepdims=True)
     curves: list[tuple[StoppingCurve | None, StoppingCurve | None]] = [(None, None)] * len(limits)
     for j in np.flatnonzero(curved):
+        dt = float(steps[j])
         up, lo = (b * dt * dt for b in braking[j].tolist())
         curves[j] = stopping_curves(float(length[j, 0]), float(limits.v_max[j]) * dt, (up, lo))
     return make_table(
-        dt=dt,
+        dt=steps[:, None],
         position=ranges,
         braking=braking,
         v_max=v_max,

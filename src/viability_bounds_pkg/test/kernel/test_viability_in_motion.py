@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bounds keep the limits: in motion, under disturbances, and on the way back from outside."""
 
+from contextlib import suppress
+
 import numpy as np
 import paper_algorithms
 import pytest
@@ -101,6 +103,58 @@ def test_the_exact_kernel_is_for_one_period_where_the_discrete_time_condition_fa
         q, v, low, high = advance(q, v, solver.bounds(q, v).upper, 0.5 * dt)
         seen.see(low, high, v)
     assert seen.worst > 1e-3
+
+
+def solvers(case, margin, factors):
+    """Return the bounds of a joint for steps of several times its period; some steps have none."""
+    limits, dt = one_joint(*case[:5]), case[5]
+    for factor in factors:
+        with suppress(JointLimitsError):
+            yield BoundsSolver(limits, factor * dt, [margin], period=dt, held=dt)
+
+
+JUST = "condition (11) just holds"  # and with a margin it does not
+
+
+@pytest.mark.parametrize(
+    ("name", "share"),
+    [(name, w) for name in (*HOLDING, "1 kHz") for w in (0.0, 0.02) if w == 0.0 or name != JUST],
+)
+def test_limits_hold_while_the_step_changes(name, share):
+    """A state that suits a short step may allow nothing that can be held for a long one."""
+    case = CASES[name]
+    limits, dt = one_joint(*case[:5]), case[5]
+    w = share * min(-case[3], case[4])
+    found = list(solvers(case, w, (1.0, 1.5, 4.0, 30.0, 300.0)))
+    assert len(found) >= 2
+    for policy in POLICIES.values():
+        rng = np.random.default_rng(10)
+        q, v = states_in_kernel(found[0], case, 100, rng)
+        seen = Violations(limits)
+        for _ in range(100):
+            lower, upper, _ = found[rng.integers(len(found))].bounds(q, v)
+            assert found[0].bounds(q, v).viable.all()
+            a = policy(q, v, lower, upper, limits, rng) + rng.choice([-w, w], v.shape)
+            q, v, low, high = advance(q, v, a, dt)
+            seen.see(low, high, v)
+        assert seen.worst <= VIOLATION
+
+
+def test_a_step_longer_than_accelerations_are_held_gives_way_where_it_must():
+    """It was obeyed as if it were held: the joint braked too little, for its other limits."""
+    limits, dt = one_joint(-2.9, 2.9, 2.6, -15.0, 15.0), 0.004
+    q, v = np.array([2.9 - 4e-4]), np.array([0.1])
+    needed = -v * v / (2.0 * 4e-4)
+    assert BoundsSolver(limits, dt).bounds(q, v).viable
+    longest = BoundsSolver(limits, 105.0 * dt, period=dt)
+    assert longest.bounds(q, v).upper > 0.6 * needed
+    assert BoundsSolver(limits, 105.0 * dt, period=dt, held=dt).bounds(q, v).upper <= needed + 1e-9
+    wide = BoundsSolver(limits, 2.0 * dt, period=dt, held=dt)
+    assert wide.table.shorter is wide.table.limits  # it suits all states
+    case = CASES[JUST]
+    limits, dt = one_joint(*case[:5]), case[5]
+    just = BoundsSolver(limits, 1.5 * dt, period=0.5 * dt, held=dt)
+    assert (just.table.shorter["dt"] == dt).all()  # no shorter than what is held
 
 
 DISTURBANCES = {

@@ -67,6 +67,18 @@ def test_rows_of_missed_deadlines_and_late_commands_lengthen_the_horizon():
     assert configured(missed_deadlines=4, delay_jitter=2).horizon == pytest.approx(7.0 * 0.002)
 
 
+@pytest.mark.parametrize("missed", [0, 2])
+def test_bounds_that_look_far_ahead_give_way_to_what_commands_act_for(missed):
+    """But no further: a command may act for as long as a row of missed deadlines."""
+    config = configured(missed_deadlines=missed, bounds_dt_factor=100.0)
+    table = config.loop.bounds(config.declared).table
+    held = (1 + missed) * config.dt
+    assert (table.limits["dt"] == config.horizon).all()
+    assert (table.shorter["dt"] >= held).all()
+    assert (table.shorter["dt"] < config.horizon).any()
+    assert config.uncertainty.held == pytest.approx(held)
+
+
 @pytest.mark.parametrize("more", [{}, ESTIMATED])
 def test_joints_rest_and_keep_a_speed_where_the_tool_says(more):
     config = configured(**DECLARED, **more)

@@ -42,9 +42,9 @@ def solve(q: Array, v: Array, table: JointTable) -> AccelerationBounds:
     lower, upper = np.empty(q.size), np.empty(q.size)
     viable = np.empty(q.size, dtype=np.bool_)
     if q.ndim == 1:  # to reshape takes longer than to find the bounds of one arm
-        _solve(q, v, table.limits, table.curves, lower, upper, viable)
+        _solve(q, v, table.limits, table.shorter, table.curves, lower, upper, viable)
         return AccelerationBounds(lower, upper, viable)
-    _solve(q.ravel(), v.ravel(), table.limits, table.curves, lower, upper, viable)
+    _solve(q.ravel(), v.ravel(), table.limits, table.shorter, table.curves, lower, upper, viable)
     shape = q.shape
     return AccelerationBounds(lower.reshape(shape), upper.reshape(shape), viable.reshape(shape))
 
@@ -54,6 +54,7 @@ def _solve(
     q: Array,
     v: Array,
     limits: NDArray[np.void],
+    shorter: NDArray[np.void],
     curves: NDArray[np.void],
     lower: Array,
     upper: Array,
@@ -64,9 +65,11 @@ def _solve(
     for first in range(0, len(q), n):
         for j in range(n):
             i = first + j
-            lower[i], upper[i], viable[i] = joint_bounds(
-                q[i], v[i], limits[j, 0], limits[j, 1], curves
-            )
+            low, high, viable[i] = _interval(q[i], v[i], limits[j, 0], limits[j, 1], curves)
+            if low > high:  # nothing can be held for the step
+                above, below = shorter[j, 0], shorter[j, 1]
+                low, high, _ = joint_bounds(q[i], v[i], above, below, curves)
+            lower[i], upper[i] = low, high
 
 
 @compiled(error_model="numpy")
@@ -85,17 +88,21 @@ def joint_bounds(
     Returns:
         Lower and upper bound, rad/s^2, and whether the state is viable.
     """
-    room_above, room_below = above.position - q, below.position + q
-    high, keeps_high = _bound_towards(room_above, v, above, curves)
-    low, keeps_low = _bound_towards(room_below, -v, below, curves)
-    low = -low
+    low, high, viable = _interval(q, v, above, below, curves)
     if low > high:
-        low = high = _resolve_conflict(room_above, room_below, v, low, high, above)
-    return (
-        low,
-        high,
-        keeps_high and keeps_low and abs(v) - above.velocity_error <= above.v_max * _WITHIN,
-    )
+        low = high = _resolve_conflict(above.position - q, below.position + q, v, low, high, above)
+    return low, high, viable
+
+
+@compiled(error_model="numpy")
+def _interval(
+    q: float, v: float, above: np.record, below: np.record, curves: NDArray[np.void]
+) -> tuple[float, float, bool]:
+    """Return what each limit allows by itself; see `joint_bounds`. It may be no interval."""
+    high, keeps_high = _bound_towards(above.position - q, v, above, curves)
+    low, keeps_low = _bound_towards(below.position + q, -v, below, curves)
+    slow = abs(v) - above.velocity_error <= above.v_max * _WITHIN
+    return -low, high, keeps_high and keeps_low and slow
 
 
 @compiled(error_model="numpy")

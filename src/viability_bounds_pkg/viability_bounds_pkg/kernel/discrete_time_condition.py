@@ -113,6 +113,32 @@ def kernel_braking(
     return KernelBraking(deceleration, holds)
 
 
+def longest_steps(
+    limits: JointLimits, dt: float, held: float, margins: Array, velocity_errors: Array
+) -> Array:
+    """Return, to half of it, the longest step of each joint for which (11) holds.
+
+    Args:
+        limits: of n joints, those of position without the errors of position.
+        dt: longest step, s.
+        held: shortest step, s.
+        margins: shape (n,), rad/s^2, checked.
+        velocity_errors: shape (n,), rad/s, checked.
+
+    Returns:
+        shape (n,), s, from `held` to `dt`; `dt` where (11) fails for all of them.
+    """
+    steps = np.full(len(limits), dt)
+    found = _holds(limits, dt, margins, velocity_errors)
+    step = dt
+    while step > held and not found.all():
+        step = max(0.5 * step, held)
+        now = ~found & _holds(limits, step, margins, velocity_errors)
+        steps[now] = step
+        found |= now
+    return steps
+
+
 def checked_step(dt: float, field: str = "dt") -> float:
     """Return `dt` as a float.
 

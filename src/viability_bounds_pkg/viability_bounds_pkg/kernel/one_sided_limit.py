@@ -70,16 +70,18 @@ class JointTable(NamedTuple):
 
     Attributes:
         limits: `ONE_SIDED_LIMIT`, shape (n, 2): the upper and the lower limit.
+        shorter: the same for states in which they contradict; of a shorter step, or as `limits`.
         curves: `CURVE_POINT`, the inverse stopping curves of all limits, one after the other.
     """
 
     limits: NDArray[np.void]
+    shorter: NDArray[np.void]
     curves: NDArray[np.void]
 
 
 def make_table(
     *,
-    dt: float,
+    dt: ArrayLike,
     position: ArrayLike,
     braking: ArrayLike,
     v_max: ArrayLike,
@@ -108,12 +110,13 @@ def make_table(
     position = np.array(position, dtype=float, ndmin=2)
     limits = np.zeros(position.shape, dtype=ONE_SIDED_LIMIT)
     limits["position"] = position
-    limits["dt"], limits["half_dt"] = dt, 0.5 * dt
+    limits["dt"] = dt
+    limits["half_dt"] = 0.5 * limits["dt"]
     limits["v_max"], limits["margin"], limits["tolerance"] = v_max, margin, tolerance
     limits["velocity_error"] = velocity_error
     limits["low"], limits["high"] = low, high
     b, speed = np.asarray(braking), limits["v_max"]
-    k = 0.5 * b * dt
+    k = b * limits["half_dt"]
     limits["twice_braking"], limits["k"] = 2.0 * b, k
     # Not zero even if dt is tiny, so that no room at all does not make 0 / 0.
     limits["k_squared"] = np.maximum(k * k, _TINY)
@@ -124,12 +127,15 @@ def make_table(
         for limit, curve in zip(limits[j], pair, strict=True):
             if curve is None or len(curve.speed) < 2 or not math.isfinite(limit["position"]):
                 continue
-            points.append(_inverse_stopping_curve(curve, float(limit["v_max"]) * dt, length, dt))
+            step = float(limit["dt"])
+            points.append(
+                _inverse_stopping_curve(curve, float(limit["v_max"]) * step, length, step)
+            )
             limit["first"], limit["points"] = sum(map(len, points[:-1])), len(points[-1])
-            limit["period"], limit["peak"] = curve.braking / dt, curve.peak / dt
+            limit["period"], limit["peak"] = curve.braking / step, curve.peak / step
             room = _room_at_full_speed(limit, curve, float(points[-1]["speed"][-1]))
-            limit["free"] = 0.5 * dt * limit["v_max"] + room
-    return JointTable(limits, np.concatenate(points))
+            limit["free"] = 0.5 * step * limit["v_max"] + room
+    return JointTable(limits, limits, np.concatenate(points))
 
 
 def _inverse_stopping_curve(

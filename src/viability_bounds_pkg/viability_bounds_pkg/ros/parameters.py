@@ -21,7 +21,13 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError, did_you_mean
-from viability_bounds_pkg.parameter import REQUIRED, Parameter, parameter_table, read
+from viability_bounds_pkg.parameter import (
+    REQUIRED,
+    Parameter,
+    checked_values,
+    make,
+    parameter_table,
+)
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.given_parameters import (
     UnknownParameterError,
@@ -78,7 +84,8 @@ class NodeParameters(Generic[Configuration]):
         _settle(node, given_parameters(arguments, name), [row.name for row in table])
         self._values = {row.name: _declare(node, row) for row in table}
         try:
-            self.configuration = read(kind, self._values)
+            self._checked = checked_values(kind, self._values)
+            self.configuration = make(kind, self._checked)
         except SettingError as error:
             if error.value is not None:
                 raise
@@ -87,7 +94,7 @@ class NodeParameters(Generic[Configuration]):
             ) from error
         for row in table:
             node.set_descriptor(row.name, describe(row))
-        self._node = node
+        self._node, self._judged = node, (self._checked, self.configuration)
         node.add_pre_set_parameters_callback(self._refuse_undeclared)
         node.add_on_set_parameters_callback(self._judge)
         node.add_post_set_parameters_callback(self._apply)
@@ -106,25 +113,34 @@ class NodeParameters(Generic[Configuration]):
         return parameters
 
     def _judge(self, parameters: Sequence[Any]) -> SetParametersResult:
+        changed = self._changed(parameters)
+        self._judged = self._checked, self.configuration
+        if not any(_differs(self._values[name], value) for name, value in changed.items()):
+            return SetParametersResult(successful=True)
         try:
-            configuration = read(self._kind, self._values | self._changed(parameters))
+            # What has not changed is not read again: it would keep a control loop waiting.
+            values = checked_values(self._kind, changed, self._checked)
+            configuration = make(self._kind, values, self.configuration, changed)
             if self._check is not None:
                 self._check(configuration)
         except ArmSafetyError as error:  # settings that contradict each other raise others
             return SetParametersResult(successful=False, reason=str(error))
+        self._judged = values, configuration
         return SetParametersResult(successful=True)
 
     def _apply(self, parameters: Sequence[Any]) -> None:
         changed = self._changed(parameters)
         if not changed:
             return
+        before = self.configuration
         self._values |= changed
+        self._checked, self.configuration = self._judged
         for row in parameter_table(self._kind):
-            if not self._node.has_parameter(row.name):  # `ros2 param delete` undeclares it
+            if row.name in changed and not self._node.has_parameter(row.name):
+                # `ros2 param delete` undeclares it.
                 self._values[row.name] = _declare(self._node, row, ignore_override=True)
                 self._node.set_descriptor(row.name, describe(row))
-        self.configuration = read(self._kind, self._values)
-        if self._on_change is not None:
+        if self._on_change is not None and self.configuration is not before:
             self._on_change(self.configuration)
 
 

@@ -45,7 +45,7 @@ def reach_of(loop: Loop, declared: DeclaredUncertainty) -> Reach:
     Raises:
         JointLimitsError: there are no bounds.
     """
-    horizon, position_error, velocity_error = loop.margins(declared)
+    horizon, position_error, velocity_error, _ = loop.margins(declared)
     table = loop.bounds(declared).table.limits
     w = loop.torque_margins.acceleration + declared.acceleration_disturbance
     braking = 0.5 * table["twice_braking"]

@@ -27,14 +27,16 @@ class UncertaintyMargins(NamedTuple):
     """What the bounds must hold for.
 
     Attributes:
-        horizon: longest time for which a command may act, s.
+        horizon: step of the bounds, s, at least `held`.
         position_error: E_q, largest error of the state's position, shape (n,), rad.
         velocity_error: E_v, largest error of its velocity, shape (n,), rad/s.
+        held: longest time for which a command may act, s.
     """
 
     horizon: float
     position_error: Array
     velocity_error: Array
+    held: float
 
 
 def uncertainty_margins(
@@ -72,7 +74,7 @@ def uncertainty_margins(
         velocity = errors.v + fastest * (late + lag) + spread * later
         position = errors.q + limits.v_max * (late + lag) + 0.5 * spread * later**2
     longest = 1 + declared.delay_jitter + declared.missed_deadlines
-    return UncertaintyMargins(longest * dt, position, velocity)
+    return UncertaintyMargins(longest * dt, position, velocity, longest * dt)
 
 
 def wrong_periods(declared: DeclaredUncertainty) -> int:
@@ -121,7 +123,7 @@ class Loop(NamedTuple):
         Raises:
             JointLimitsError: there are none.
         """
-        horizon, position_error, velocity_error = self.margins(declared)
+        horizon, position_error, velocity_error, held = self.margins(declared)
         return BoundsSolver(
             tightened(self.limits, self.torque_margins),
             horizon,
@@ -129,6 +131,7 @@ class Loop(NamedTuple):
             self.dt,
             position_error=position_error,
             velocity_error=velocity_error,
+            held=held,
         )
 
     def of_joint(self, j: int) -> Loop:
