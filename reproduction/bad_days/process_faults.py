@@ -521,7 +521,6 @@ def another_user(bench: Bench) -> Course:
     publisher = node.create_publisher(JointState, "target_posture", GOAL_QOS)
     while not publisher.get_subscription_count():
         yield
-    yield from bench.wait(0.2)  # until all know of it
     bench.mark()
     end = time.monotonic() + WILD
     while time.monotonic() < end:
