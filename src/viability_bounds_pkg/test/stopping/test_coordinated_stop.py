@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The stop of an arm, against adversaries and the motion of the model under held torques."""
 
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -12,10 +14,12 @@ from viability_bounds_pkg.stopping import CoordinatedStop
 from viability_bounds_pkg.stopping.coordinated_stop import (
     GIVE_WAY,
     HARDER,
+    HOLD_CLEARANCE,
     HOLD_GAIN,
     MARGIN,
     RETURN_SPEED,
 )
+from viability_bounds_pkg.viability import BoundsSolver
 
 ROUNDING = 1e-9
 FEW_STEPS = 6 * H
@@ -67,6 +71,25 @@ def test_no_limit_is_passed_from_the_edge_of_the_kernel(arm):
             allowed = np.maximum(fastest, -H * np.minimum(arm.limits.a_min, -arm.limits.a_max))
             assert (np.abs(v) <= allowed).all()
         assert stop.at_rest
+
+
+def test_joints_come_to_rest_clear_of_their_limits_where_they_can(arm):
+    """Where friction holds them they stay there, and what lets them slip takes them no further."""
+    stop, limits = arm.stop(), arm.limits
+    lowest, highest = limits.q_min + HOLD_CLEARANCE, limits.q_max - HOLD_CLEARANCE
+    inner = replace(limits, q_min=lowest, q_max=highest)
+    rng, nearest = np.random.default_rng(0), 0
+    for _ in range(10):
+        q, _ = arm.edge(rng)
+        q = np.clip(q, lowest, highest)
+        low, high = BoundsSolver(inner, H, arm.margin).velocity_range(q)
+        v = rng.uniform(0.7, 1.0, arm.n) * np.where(rng.random(arm.n) < 0.5, low, high)
+        stop.begin(q, v)
+        while not stop.at_rest:
+            q, v = arm.move(q, v, stop.torque(q, v))
+            assert (np.minimum(highest - q, q - lowest) >= -2e-5).all()
+        nearest += (np.minimum(highest - q, q - lowest) < 1e-4).sum()
+    assert nearest >= 3  # the limits did matter
 
 
 @pytest.mark.parametrize("adversary", ["out", "back", "random", "alternating"])

@@ -292,7 +292,15 @@ class CoordinatedStop:
             if float(np.abs(off).max()) <= GIVE_WAY:
                 return HOLD_GAIN * (HOLD_GAIN * off - 2.0 * v)
             self.at_rest = False
-        return -v / max(self.time_to_rest(v), self._dt)
+        return -v * np.maximum(self._clearing(q, v), 1.0 / max(self.time_to_rest(v), self._dt))
+
+    def _clearing(self, q: Array, v: Array) -> Array:
+        """Return braking by which joints come to rest before `HOLD_CLEARANCE`, per speed, 1/s."""
+        speed = np.abs(v)
+        room = np.where(v > 0.0, self._highest - q, q - self._lowest)
+        at_once = np.where(speed > self._rest_speed, 1.0 / self._dt, 0.0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.minimum(np.where(room > 0.0, 0.5 * speed / room, np.inf), at_once)
 
     def _commanded(self, q: Array, v: Array, command: Array) -> Array:
         """Return the accelerations that a command gives; after a stop less of the difference."""
