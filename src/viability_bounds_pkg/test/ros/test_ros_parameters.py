@@ -166,11 +166,21 @@ def test_a_bad_change_is_refused_and_the_old_value_stays(ros, name, value, expec
     assert node.changes == []
 
 
-def test_changes_are_judged_one_by_one_unless_asked_for_together(ros):
+def test_changes_are_judged_together_and_one_by_one_if_that_fails(ros):
     node = start(ros)
-    first, second = ros.set_parameters("tunable", offset=3.0, gain=4.0)
-    assert (first.successful, second.successful) == (False, True)
+    first, second = ros.set_parameters("tunable", offset=3.0, gain=5.0)
+    assert first.successful
+    assert second.successful
+    assert node.changes == [(5.0, 3.0, "round")]
+    ros.accepts("tunable", offset=1.0)
+    node.changes.clear()
+    results = ros.set_parameters("tunable", offset=7.0, gain=4.0, shape="oval")
+    assert [each.successful for each in results] == [False, True, False]
+    assert results[0].reason == "parameter 'offset' is 7; allowed: less than gain"
     assert node.parameters.configuration.changing == (4.0, 1.0, "round")
+    results = ros.set_parameters("tunable", gain=4.0, nothing=1.0)
+    assert [each.successful for each in results] == [True, False]
+    assert "unknown parameter 'nothing'" in results[1].reason
     result = node.set_parameters_atomically(overrides({"offset": 5.0, "gain": 8.0}))
     assert result.successful
     assert node.changes == [(4.0, 1.0, "round"), (8.0, 5.0, "round")]

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import InvalidParameterTypeException
+from rclpy.exceptions import InvalidParameterTypeException, ParameterNotDeclaredException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -88,7 +88,9 @@ class ArmNode(Node):
         types = {kind.value for kind in Parameter.Type}
         strange = [each for each in request.parameters if each.value.type not in types]
         if not strange:
-            return take(request, response)
+            if not self._set_together(request, response):
+                take(request, response)
+            return response
         refused = SetParametersResult(
             reason=f"parameter '{strange[0].name}' has a type of number {strange[0].value.type}; "
             f"allowed: 0 to {max(types)}"
@@ -98,6 +100,25 @@ class ArmNode(Node):
         else:
             response.results = [refused] * len(request.parameters)
         return response
+
+    def _set_together(self, request: Any, response: Any) -> bool:
+        """Set several parameters at once where that is allowed, as of a file; else set none.
+
+        One by one each is judged with what was there before it, which keeps a control loop waiting
+        for longer, and may refuse what fits only together.
+        """
+        parameters = [Parameter.from_parameter_msg(each) for each in request.parameters]
+        names = {each.name for each in parameters}
+        if not isinstance(response, SetParameters.Response) or not 1 < len(names) == len(
+            parameters
+        ):
+            return False
+        try:
+            result = self.set_parameters_atomically(parameters)
+        except ParameterNotDeclaredException:
+            return False
+        response.results = [result] * len(parameters) if result.successful else []
+        return bool(result.successful)
 
     @contextmanager
     def starting(self, *topics: Topic) -> Iterator[None]:
