@@ -205,6 +205,24 @@ def test_integral_action_fades_where_the_motors_give_other_torques_for_long(ros)
     assert np.abs(added.integral).max() < 0.1 * before
 
 
+def test_integral_action_fades_after_a_pause_in_which_the_robot_stopped_itself(ros):
+    """It balanced the friction of a motion; an arm that stands would be pushed by it."""
+    motors = Motors(ros, integral_action="joints", bounds_timeout=0.2)
+    motors.answer(150)
+    added = motors.chain.node._controller.additional
+    before = np.abs(added.integral).max()
+    assert before > 0.1
+    motors.stamp += 150  # shorter
+    motors.answer(1)
+    assert np.abs(added.integral).max() > 0.9 * before
+    motors.stamp += 300
+    motors.answer(1)
+    after = np.abs(added.integral).max()
+    assert after > 0.8 * before  # no kick
+    motors.answer(30)
+    assert np.abs(added.integral).max() < 0.5 * before
+
+
 def test_where_torques_are_not_reported_any_more_commands_count_as_obeyed(ros):
     motors = Motors(ros)
     motors.answer(150)

@@ -96,6 +96,7 @@ class Recovery:
         if rate.too_long > before:  # the robot may have stopped itself, and much has changed
             controller.forget_disturbance()
             if elapsed > self._pause:
+                controller.forget_integral()  # the robot has stopped: it was of its motion
                 self.why = _PAUSED
                 self.slow()  # also where a row of so few states takes it down gently
         controller.share = rate.share
