@@ -17,7 +17,7 @@ SAYS = {
     "chain_of_nodes": r"positions at most 0 rad beyond their\nlimits, speeds 0 rad/s",
     "client": r"joints moved by \[0\.(2|19) .*\nhand moved by .*\none metre higher: it stands \d",
     "controller_without_ros": r"rad, .* rad/s, .* N m inside\njoints at rest on a limit: \['",
-    "driver_that_stops": r"at rest after 0\.5\d\d s.*\nnearest to a limit: \d.*e-0[67] rad, \d",
+    "driver_that_stops": r"at rest after 0\.5\d\d s.*\nnearest to a limit: [34]\.\de-04 rad, \d",
     "mujoco_panda": r"largest speed 99\.\d% of its limit.*\n.*\n-\S+ rad, -\S+ rad/s, -",
     "limits_from_urdf": r"torque does not suffice: 0 of 5000",
 }
