@@ -22,7 +22,6 @@ from sim_bridge.scenario.recording import RecordedRun
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.node.estimator_node import EstimatorNode
-from viability_bounds_pkg.testing.ros_harness import private_domain
 
 ROOT = Path(__file__).resolve().parent.parent
 NODES = {
@@ -81,13 +80,11 @@ def load_node_values(robot: str, *overlays: str) -> dict[str, dict[str, Any]]:
 def _context():
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     gc.collect()  # a run that failed leaves its participants to the garbage collector
-    # In a domain of its own: what is left of a run before would be a rival of this one.
-    with private_domain() as domain:
-        rclpy.init(args=["--ros-args", "--log-level", "error"], domain_id=domain)
-        try:
-            yield
-        finally:
-            rclpy.try_shutdown()
+    rclpy.init(args=["--ros-args", "--log-level", "error"])
+    try:
+        yield
+    finally:
+        rclpy.try_shutdown()
 
 
 def run_chain(
