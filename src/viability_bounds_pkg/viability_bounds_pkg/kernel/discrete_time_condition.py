@@ -116,7 +116,7 @@ def kernel_braking(
 def longest_steps(
     limits: JointLimits, dt: float, held: float, margins: Array, velocity_errors: Array
 ) -> Array:
-    """Return, to half of it, the longest step of each joint for which (11) holds.
+    """Return a step of each joint for which (11) holds: `dt`, half of it, half of that, and so on.
 
     Args:
         limits: of n joints, those of position without the errors of position.

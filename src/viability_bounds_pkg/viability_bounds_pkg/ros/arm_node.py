@@ -107,12 +107,11 @@ class ArmNode(Node):
         One by one each is judged with what was there before it, which keeps a control loop waiting
         for longer, and may refuse what fits only together.
         """
-        parameters = [Parameter.from_parameter_msg(each) for each in request.parameters]
-        names = {each.name for each in parameters}
-        if not isinstance(response, SetParameters.Response) or not 1 < len(names) == len(
-            parameters
-        ):
+        if not isinstance(response, SetParameters.Response) or len(request.parameters) < 2:
             return False
+        parameters = [Parameter.from_parameter_msg(each) for each in request.parameters]
+        if len({each.name for each in parameters}) < len(parameters):
+            return False  # the last of one name counts
         try:
             result = self.set_parameters_atomically(parameters)
         except ParameterNotDeclaredException:
