@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,12 +50,18 @@ class AdmittanceGains:
             error_rate: its time derivative, shape (6,).
             damping: that it acts against, 1/s.
         """
-        g = np.empty(6)
-        for part, kp, kd, speed_max in zip(_PARTS, self.kp, self.kd, self.speed_max, strict=True):
-            a = -kp * error[part] - kd * error_rate[part]
-            size, most = math.sqrt(a @ a), damping * speed_max
-            g[part] = a * (most / size) if size > most else a
+        kp, kd = self._by_axis
+        g: Array = -kp * error - kd * error_rate
+        for part, speed_max in zip(_PARTS, self.speed_max, strict=True):
+            if speed_max < math.inf:
+                most, size = damping * speed_max, math.hypot(*g[part].tolist())
+                if size > most:
+                    g[part] *= most / size
         return g
+
+    @cached_property
+    def _by_axis(self) -> tuple[Array, Array]:
+        return np.repeat(self.kp, 3), np.repeat(self.kd, 3)
 
 
 @dataclass(slots=True)

@@ -74,6 +74,7 @@ class FrictionContact:
         normal: direction in which the environment pushes, shape (3,), any length.
         friction: coefficient of friction, >= 0.
         facets: of each point's friction pyramid, at least 3.
+        lever: distance of the farthest point from the frame's origin, m.
         W: wrench of the environment on the link by coefficient, shape (6, p * facets), forces
             first, moments about the frame's origin.
 
@@ -86,6 +87,7 @@ class FrictionContact:
     normal: Array
     friction: float
     facets: int = FACETS
+    lever: float = field(init=False)
     W: Array = field(init=False)
 
     def __post_init__(self) -> None:
@@ -103,6 +105,7 @@ class FrictionContact:
         normal = np.asarray(self.normal, dtype=float)
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "normal", normal / np.linalg.norm(normal))
+        object.__setattr__(self, "lever", float(np.linalg.norm(points, axis=1).max()))
         object.__setattr__(self, "W", np.ascontiguousarray(W))
 
 

@@ -28,6 +28,7 @@ from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.goals import Goals
 from torque_safety_controller.tasks.task import Task
+from viability_bounds_pkg.compiled import compiled
 
 Array = NDArray[np.float64]
 
@@ -111,12 +112,15 @@ class Interaction:
         self._hand = hand
         placement = pin.SE3.Identity() if placement is None else placement
         self._to_hand = placement.toDualActionMatrix()  # from the contact's frame
-        self._to_contact = placement.inverse().toDualActionMatrix()
+        self._to_contact = np.ascontiguousarray(placement.inverse().toDualActionMatrix())
         self._target: tuple[Array, Array | None] | None = None
         self._turned = False
         self._settings = self.settings = settings or InteractionSettings()
         self.state, self.reason, self.changes = Compliance.OFF, "at start", 0
         self.start()
+        # Compiled now, not in a control loop.
+        zero = np.zeros(6)
+        _counted(zero, zero, self._to_contact, np.zeros(3), 0.0, 0.0, 0.0)
 
     @property
     def settings(self) -> InteractionSettings:
@@ -243,17 +247,15 @@ class Interaction:
         if self._hand is None or self.contacts is None:
             return
         contact = self.contacts.contacts[self._hand]
-        normal = contact.normal
-        goal = self._to_contact @ self._goal
-        wanted = normal @ goal[:3]
-        most = max(normal @ (self._to_contact @ measured)[:3], 0.0) + FORCE_STEP
-        counted = goal * min(1.0, most / wanted) if wanted > 0.0 else np.zeros(6)
-        pressing = float(normal @ counted[:3])
-        along = pressing * normal
-        across = _shortened(counted[:3] - along, contact.friction * pressing)
-        lever = float(np.linalg.norm(contact.points, axis=1).max())
-        moment = _shortened(counted[3:], lever * float(np.linalg.norm(along + across)))
-        self._counted = np.concatenate([along + across, moment])
+        self._counted = _counted(
+            self._goal,
+            measured,
+            self._to_contact,
+            contact.normal,
+            contact.friction,
+            contact.lever,
+            FORCE_STEP,
+        )
 
     @property
     def stiffness(self) -> Array | None:
@@ -333,7 +335,50 @@ class Interaction:
             self.changes += 1
 
 
-def _shortened(vector: Array, longest: float) -> Array:
-    """Return a vector, no longer than that."""
-    length = float(np.linalg.norm(vector))
-    return vector * (longest / length) if length > longest else vector
+@compiled
+def _counted(
+    goal: Array,
+    measured: Array,
+    to_contact: Array,
+    normal: Array,
+    friction: float,
+    lever: float,
+    force_step: float,
+) -> Array:
+    """Return the wrench that the QP may count on at a contact, in its axes, shape (6,).
+
+    Args:
+        goal: wrench on the arm that is wanted, in the end effector's axes, shape (6,).
+        measured: wrench on the arm, likewise.
+        to_contact: takes wrenches to the contact's axes and origin, shape (6, 6).
+        normal: direction in which the environment pushes, in these axes, shape (3,), length 1.
+        friction: coefficient of friction.
+        lever: farthest point of the contact from its origin, m.
+        force_step: by how much it may exceed what is felt along the normal, N.
+    """
+    wanted = felt = 0.0
+    counted = np.zeros(6)
+    for i in range(6):
+        for j in range(6):
+            counted[i] += to_contact[i, j] * goal[j]
+            if i < 3:
+                felt += normal[i] * to_contact[i, j] * measured[j]
+        if i < 3:
+            wanted += normal[i] * counted[i]
+    most = max(felt, 0.0) + force_step
+    share = min(1.0, most / wanted) if wanted > 0.0 else 0.0
+    pressing = share * wanted
+    counted *= share
+    counted[:3] -= pressing * normal
+    _shorten(counted[:3], friction * pressing)
+    counted[:3] += pressing * normal
+    _shorten(counted[3:], lever * math.sqrt((counted[:3] * counted[:3]).sum()))
+    return counted
+
+
+@compiled
+def _shorten(vector: Array, longest: float) -> None:
+    """Shorten a vector, in place, to a length of at most `longest`."""
+    length = math.sqrt((vector * vector).sum())
+    if length > longest:
+        vector *= longest / length
