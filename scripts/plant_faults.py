@@ -3,10 +3,12 @@
 
     python scripts/plant_faults.py                     all of `test/planted_faults.yaml`
     python scripts/plant_faults.py -k integral         those whose line contains a word
+    python scripts/plant_faults.py -n 2                so many at a time
     python scripts/plant_faults.py --tree DIRECTORY    in another checkout, set up
 
 Run `source scripts/setup.sh` before. Ends with 1 when a fault is missed, or when its place is not
-found exactly once: then the table has to follow the sources.
+found exactly once: then the table has to follow the sources. A test that fails has noticed a fault
+only if it passes without it.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +33,7 @@ ROOT = Path(__file__).resolve().parent.parent
 TABLE = ROOT / "test" / "planted_faults.yaml"
 PACKAGES = ("viability_bounds_pkg", "torque_safety_controller", "sim_bridge")
 COPIED = ("src", "test", "config", "reproduction", "conftest.py", "pyproject.toml", "README.md")
+ENDED_BY = "ended by"
 MOST_CPU = 180  # s, for each fault; a test that takes it up has noticed the fault
 
 PLUGIN = '''"""What was compiled stays: the fault is in no compiled function."""
@@ -78,7 +82,11 @@ def in_compiled(tree: Path, fault: dict[str, Any]) -> bool:
 
 
 def run(
-    tree: Path, fault: dict[str, Any], digests: dict[str, str], plain: bool = False
+    tree: Path,
+    fault: dict[str, Any],
+    digests: dict[str, str],
+    plain: bool = False,
+    only: str = "",
 ) -> tuple[str, str]:
     """Return "caught", "missed" or what went wrong, and by which test.
 
@@ -87,6 +95,7 @@ def run(
         fault: row of the table.
         digests: by which compiled code is known; none: it is compiled anew.
         plain: compile nothing.
+        only: the one test to run; none for all that the row names.
     """
     with tempfile.TemporaryDirectory(prefix="fault_") as directory:
         copy = Path(directory)
@@ -111,30 +120,49 @@ def run(
         elif digests and "@compiled" not in text:
             (copy / "planted.py").write_text(PLUGIN)
             options += ["-p", "planted"]
-        command = [sys.executable, "-m", "pytest", *options, *tests(tree, fault)]
-        result = subprocess.run(
-            command,
+        chosen = [only] if only else tests(tree, fault)
+        process = subprocess.Popen(
+            [sys.executable, "-m", "pytest", *options, *chosen],
             cwd=copy,
             env=environment,
-            capture_output=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
             text=True,
-            check=False,
-            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (MOST_CPU, MOST_CPU)),
         )
-        if result.returncode < 0:
-            return "caught", f"ended by {signal.Signals(-result.returncode).name}"
-        if result.returncode == 0:
+        resource.prlimit(process.pid, resource.RLIMIT_CPU, (MOST_CPU, MOST_CPU))
+        printed, _ = process.communicate()
+        if process.returncode < 0:
+            return "caught", f"{ENDED_BY} {signal.Signals(-process.returncode).name}"
+        if process.returncode == 0:
             return "missed", ""
-        by = re.search(r"^FAILED (?:\S*/)?(\S+)", result.stdout, re.MULTILINE)
+        by = re.search(r"^FAILED (\S+::\w+)", printed, re.MULTILINE)
         if by is None:
-            return "not run", (result.stdout + result.stderr)[-300:]
+            return "not run", printed[-300:]
         return "caught", by[1]
+
+
+def judge(tree: Path, fault: dict[str, Any], digests: dict[str, str]) -> tuple[str, str]:
+    """Return what becomes of a fault, as `run` does, or "not told": its test fails without it."""
+    sound = fault | {"new": fault["old"]}
+    for plain in (True, False) if in_compiled(tree, fault) else (False,):
+        outcome, by = run(tree, fault, digests, plain)
+        if outcome != "caught":
+            continue
+        if by.startswith(ENDED_BY):
+            if plain:  # which takes long without a fault, too
+                continue
+            return outcome, by
+        if run(tree, sound, digests, plain, by)[0] == "missed":
+            return outcome, by.rpartition("/")[2]
+        outcome, by = "not told", f"{by} fails without it"
+    return outcome, by
 
 
 def main() -> int:
     """Plant faults, print a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-k", default="", help="only faults that contain this word")
+    parser.add_argument("-n", type=int, default=1, help="faults at a time")
     parser.add_argument("--tree", type=Path, default=ROOT, help="checkout to plant them in")
     options = parser.parse_args()
     tree = options.tree.resolve()
@@ -148,27 +176,13 @@ def main() -> int:
 
         digests = {name: _digest(name) for name in PACKAGES}
     outcomes: list[str] = []
-    healthy: dict[tuple[str, bool], bool] = {}
-
-    def passes(fault: dict[str, Any], plain: bool) -> bool:
-        """Return whether the tests of a fault pass without it."""
-        key = fault["tests"], plain
-        if key not in healthy:
-            sound = fault | {"new": fault["old"]}
-            healthy[key] = run(tree, sound, digests, plain)[0] == "missed"
-        return healthy[key]
-
-    for fault in faults:
-        if fault in lost:
-            continue
-        plain = in_compiled(tree, fault) and passes(fault, plain=True)
-        if plain or passes(fault, plain=False):
-            outcome, by = run(tree, fault, digests, plain)
-        else:
-            outcome, by = "not told", "its tests fail without it"
-        outcomes.append(outcome)
-        (path,) = places(tree, fault)
-        print(f"{outcome:8}{path.stem:26}{fault['what']:62}{by}", flush=True)
+    found = [fault for fault in faults if fault not in lost]
+    with ThreadPoolExecutor(options.n) as pool:
+        results = pool.map(lambda fault: judge(tree, fault, digests), found)
+        for fault, (outcome, by) in zip(found, results, strict=True):
+            outcomes.append(outcome)
+            (path,) = places(tree, fault)
+            print(f"{outcome:8}{path.stem:26}{fault['what']:62}{by}", flush=True)
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     caught = outcomes.count("caught")
     minutes = (used.ru_utime + used.ru_stime) / 60.0
