@@ -2,6 +2,7 @@
 """A scenario with everything in it, played by the nodes and without them: the same numbers."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -109,6 +110,14 @@ def test_a_hand_presses_on_a_table_as_hard_as_it_is_told():
     assert float(result.robot["contact_force_max_n"]) < 13.0
 
 
+def dds_threads():
+    """Return the numbers of the threads that send and receive for the nodes of this process."""
+    names = {each.parent.name: each.read_text() for each in Path("/proc/self/task").glob("*/comm")}
+    return {  # that of the watchdog of shared memory stays as long as the process
+        number for number, name in names.items() if name.startswith("dds.") and "wdog" not in name
+    }
+
+
 def rest():
     values = load_values(ROBOT)
     return dict(zip(values["joints"], values["start_positions"], strict=True))
@@ -177,6 +186,7 @@ def test_what_is_refused_ends_the_scenario_and_says_why(tmp_path, event, names):
     urdf = read_urdf(load_values(ROBOT)["robot_description"])
     other = tmp_path / "other.urdf"
     other.write_text(urdf.replace("</robot>", '<link name="no_link"/></robot>'))
+    before = dds_threads()
     with pytest.raises((ScenarioRefused, TimeoutError)) as error:
         run_chain(
             load_values(ROBOT),
@@ -185,6 +195,8 @@ def test_what_is_refused_ends_the_scenario_and_says_why(tmp_path, event, names):
         )
     for name in names:
         assert name in str(error.value)
+    # The error is still there, and keeps all that its frames hold; the nodes have gone.
+    assert dds_threads() <= before
 
 
 def test_a_push_lasts_as_long_as_it_is_meant_to():

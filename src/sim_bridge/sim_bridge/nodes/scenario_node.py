@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import rclpy
 from rclpy.clock import Clock, ClockType
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.task import Future
 
 from sim_bridge.nodes.progress import Progress
@@ -272,8 +272,22 @@ def play(
         ExternalShutdownException: shut down, or a signal received, before the end.
     """
     executor = make_executor(node.context)
-    for each in (node, *others):
-        executor.add_node(each)
+    try:
+        for each in (node, *others):
+            executor.add_node(each)
+        _run(executor, node, signals, quiet)
+    finally:
+        # An error that is kept keeps this frame, and so the executor. One that is not shut down
+        # holds the nodes in C++: destroyed, they would stay in the graph and go on publishing.
+        executor.shutdown()
+    if node.failure is not None:
+        raise node.failure
+    if not node.ended.done():
+        raise ExternalShutdownException
+
+
+def _run(executor: Executor, node: ScenarioNode, signals: Sequence[int], quiet: bool) -> None:
+    """Run callbacks until the scenario has ended, one is to end it, or nothing moves any more."""
     seen, moved_at, shown_at = None, time.monotonic(), -math.inf
     with nullcontext() if quiet else closing(Progress(node.config.plan.duration)) as progress:
         while not (node.ended.done() or signals) and rclpy.ok(context=node.context):
@@ -290,10 +304,6 @@ def play(
             if progress and (node.ended.done() or now - shown_at > _SHOW_PERIOD):
                 shown_at = now
                 node.show(progress)
-    if node.failure is not None:
-        raise node.failure
-    if not node.ended.done():
-        raise ExternalShutdownException
 
 
 def main(args: list[str] | None = None) -> int:
