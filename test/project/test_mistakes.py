@@ -249,6 +249,18 @@ def same_stamp(running):
     return lambda: running.publish("joint_states", states.pop())
 
 
+def leaping_position(running):
+    running.start(ControllerNode)
+    stamps = itertools.count(1000 * MS, 2 * MS)
+    leaps = itertools.cycle([0.0, 0.1])  # again, because a busy machine may lose the first
+
+    def send():
+        q = [REST[0] + next(leaps), *REST[1:]]
+        running.publish("joint_states", joint_state(JOINTS, next(stamps), q, ZERO))
+
+    return send
+
+
 def other_rate(running):
     running.start(BoundsNode)
     answers = running.ros.listen(JointTrajectory, "acceleration_limits")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""States that lie at any moment: all frozen, also where the arm stands, or a part of them."""
+"""States that lie at any moment: frozen, also where the arm stands, a part of them, exchanged."""
 
 from collections.abc import Callable
 from contextlib import closing
@@ -49,6 +49,7 @@ def play(
     seconds: float = 12.5,
     apart: float = 3.5,
     goals: float = 2.0,
+    first_at: float = 2.0,
 ) -> Played:
     """Let faults begin `apart` s from each other, as a node's states would be treated.
 
@@ -61,7 +62,7 @@ def play(
     check = make_state_check(loop._controller_configuration(), loop.model, None)
     watch, low, high = RateWatch(config.dt, 1), config.position_min, config.position_max
     tau, in_row, answered = np.zeros(low.size), 0, 0.0
-    begins = 2.0 + apart * np.arange(int((seconds - 2.0) / apart))
+    begins = first_at + apart * np.arange(int((seconds - first_at) / apart))
     begins += rng.uniform(0.0, 0.5, begins.size)
     first, after, again = None, {}, {}
     with closing(arm):
@@ -142,3 +143,30 @@ def test_positions_that_contradict_velocities_are_told_by_the_second(robot, lie)
     assert len(played.after) == played.faults == 10
     assert max(played.after) <= 2 + (lie == "positions frozen")
     assert max(played.again) < 1.0
+
+
+def nearest_exchanged(state: State, first: State) -> State:
+    """Exchange the two joints that are nearest to each other, of those that can be told apart."""
+    apart = np.abs(first.q[:, None] - first.q[None, :])
+    apart[apart < 1e-3] = np.inf
+    i, j = np.unravel_index(np.argmin(apart), apart.shape)
+    order = np.arange(first.q.size)
+    order[[i, j]] = j, i
+    return State(state.q[order], state.v[order])
+
+
+@pytest.mark.parametrize(
+    "robot",
+    [
+        pytest.param("panda", marks=pytest.mark.long),
+        pytest.param("talos_left_arm", marks=pytest.mark.long),
+        "baxter_left_arm",
+    ],
+)
+def test_joints_that_are_exchanged_are_told_and_never_believed(robot):
+    """In motion, mrad apart; what leapt once has to leap back."""
+    played = play(robot, 4, nearest_exchanged, seconds=36.0, apart=3.1, goals=0.7, first_at=4.0)
+    assert played.position == 0.0 and played.speed == 0.0
+    assert len(played.after) == played.faults == 10
+    assert max(played.after) <= 2
+    assert len(played.again) == 10 and max(played.again) < 1.0

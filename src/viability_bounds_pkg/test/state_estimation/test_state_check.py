@@ -4,13 +4,14 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from sample_arm import MODEL, NONE, TAU_MAX, N
 
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.state_estimation.state_check import (
     CONTRADICTION,
+    EXCHANGED,
     GAP,
     JUMP,
     ONCE_MORE,
@@ -38,23 +39,23 @@ def sine(t, size=0.75, w=2.0):
     return State(size * np.sin(w * t + k), size * w * np.cos(w * t + k))
 
 
-def play(check, spoil, begin=1.0, end=1.6, last=3.0):
+def play(check, spoil, begin=1.0, end=1.6, last=3.0, h=H, motion=sine):
     """Return the times at which states were refused, with what was wrong.
 
     The arm stops within 0.25 s where states are refused, and goes on when they are believed.
     """
     refused, along, pace = [], 0.0, 1.0
-    for k in range(round(last / H)):
-        t = k * H
-        state = sine(along)
+    for k in range(round(last / h)):
+        t = k * h
+        state = motion(along)
         state = state._replace(v=pace * state.v)
         if begin <= t < end:
             state = spoil(state, t)
         wrong = check.look(state, 5.0 + t)
         if wrong:
             refused.append((t, wrong))
-        faster = min(max(pace + (-4.0 if wrong else 4.0) * H, 0.0), 1.0)
-        along += 0.5 * (pace + faster) * H
+        faster = min(max(pace + (-4.0 if wrong else 4.0) * h, 0.0), 1.0)
+        along += 0.5 * (pace + faster) * h
         pace = faster
     return refused
 
@@ -117,6 +118,12 @@ def test_positions_that_freeze_are_told_by_the_second_state():
     refused = play(make_check(), lambda state, t: state._replace(q=sine(1.0).q), begin=1.002)
     assert [wrong for _, wrong in refused[:2]] == [UNDECIDED, CONTRADICTION]
     assert refused[1][0] == pytest.approx(1.004)
+
+
+def test_positions_that_froze_before_sensors_are_known_are_believed_when_they_go_on():
+    """They are told late, and leap as they go on."""
+    refused = play(make_check(), SPOILT["frozen positions"][0], 1.0, 1.6, 3.0, 0.01)
+    assert refused[0][0] > 1.02 and 1.6 < refused[-1][0] < 1.6 + 2.0 * WINDOW + 0.02
 
 
 def test_velocities_that_freeze_are_told_when_the_arm_is_faster_by_some_percent():
@@ -247,6 +254,83 @@ def test_what_motors_and_impacts_can_do_is_believed(seed, h, lag):
         wrong = check.look(read, 7.0 + k * h)
         assert wrong in ("", UNDECIDED) and not (wrong and undecided)
         undecided = wrong == UNDECIDED
+
+
+def leap(size):
+    """Return what adds to the position of one joint, rad."""
+    return lambda state, t: state._replace(q=state.q + size * np.eye(N)[2])
+
+
+def refused_at(refused):
+    """Return when states were refused, undecided ones left out, s."""
+    return np.array([t for t, wrong in refused if wrong != UNDECIDED])
+
+
+@pytest.mark.parametrize("size", [0.001, 0.02, -0.3])
+def test_what_leapt_is_believed_when_it_has_leapt_back(size):
+    times = refused_at(play(make_check(), leap(size), 2.0, 2.6, 4.0))
+    assert times[0] == pytest.approx(2.0, abs=1.1 * H)
+    assert 2.6 + 0.5 * WINDOW < times[-1] < 2.6 + 2.0 * WINDOW + 0.01
+    assert times.size == round((times[-1] - times[0]) / H) + 1  # none in between is believed
+
+
+@pytest.mark.parametrize("size", [0.02, -0.3])
+def test_a_leap_that_stays_is_believed_after_a_gap_only(size):
+    check, last = make_check(), 3.0 + STUCK
+    times = refused_at(play(check, leap(size), 2.0, np.inf, last))
+    assert times.size >= round((last - 2.0) / H) - 1
+    assert not check.look(sine(3.0), 5.0 + last + 1.1 * GAP)
+
+
+def test_a_leap_that_only_good_sensors_tell_is_believed_late():
+    times = refused_at(play(make_check(), leap(0.001), 2.0, np.inf, 4.0 + STUCK))
+    assert 1.9 + STUCK < times[-1] < 2.5 + STUCK
+    assert times.size == round((times[-1] - times[0]) / H) + 1
+
+
+def test_a_second_leap_that_is_not_back_does_not_count():
+    """Where the arm stands: in motion it may have come as far."""
+
+    def stops(t):
+        return sine(t) if t < 2.5 else State(sine(2.5).q, NONE)
+
+    def twice(state, t):
+        return leap(0.02 if t < 3.3 else 0.12)(state, t)
+
+    times = refused_at(play(make_check(), twice, 3.0, np.inf, 5.0, motion=stops))
+    assert times.size >= round(2.0 / H) - 1
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    joints=st.permutations(range(N)).map(lambda order: order[:2]),
+    first=st.integers(600, 800),
+    phase=st.floats(0.0, 1.0),
+    h=st.sampled_from([0.002, 0.01]),
+)
+def test_joints_that_are_exchanged_where_they_meet_are_told_at_once(joints, first, phase, h):
+    """Somewhere in the period before the state that is the `first`: positions leap nowhere."""
+    i, j = joints
+    there = sine((first - phase) * h)
+    assume(abs(there.v[i] - there.v[j]) > 0.1)
+    shift = (there.q[i] - there.q[j]) * np.eye(N)[j]
+
+    def meeting(t):
+        return sine(t)._replace(q=sine(t).q + shift)
+
+    order = np.arange(N)
+    order[[i, j]] = j, i
+
+    def exchanged(state, t):
+        return State(state.q[order], state.v[order])
+
+    begin, end = (first - 0.5) * h, (first - 0.5) * h + 0.4
+    check = make_check(limit=np.full(N, 5.0))
+    refused = play(check, exchanged, begin, end, end + 0.9, h, meeting)
+    assert refused[0] == (pytest.approx(first * h), EXCHANGED)
+    assert len([t for t, _ in refused if t < end]) == round(0.4 / h)
+    # They have come apart while the arm stopped, so that they are seen to leap back.
+    assert refused[-1][0] < end + 2.0 * WINDOW + 2.0 * h
 
 
 def test_a_gap_is_a_new_beginning():

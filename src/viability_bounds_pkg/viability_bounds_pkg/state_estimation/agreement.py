@@ -21,6 +21,15 @@ next one decides: over both periods the sum of e must be within what impacts and
 explain. At the onset of a bias b of the velocities e is -h b / 2, which an impact at the very end
 of the period gives as well: one state cannot tell them apart. Then the sum is -3 h b / 2, and
 h b / 2 may be an impact; after positions have frozen it is -2 h v.
+
+Where two joints meet and their numbers are *exchanged*, i for j, positions leap nowhere, and
+velocities change as in an impact. This is told at once: both velocities change by more than ever
+within a period, except that v_i follows v_j0 and v_j follows v_i0 as closely as always, and so do
+the positions,
+
+    |q_i - q_j0 - h (v_j0 + v_i) / 2| within the tolerance of j, and closer than e of i.
+
+So is an exchange of joints that stand apart, where e of both is more than an impact explains.
 """
 
 from __future__ import annotations
@@ -55,6 +64,14 @@ LONGER = 1.5
 CALM = 0.2
 """Time after an impact in which another one is believed at once: hands rattle on tables, s."""
 
+USUAL = 1.5
+"""A change of velocity within a period that is more than usual, as a multiple of the largest that
+was seen twice in a row: impacts are not."""
+
+CLOSER = 0.25
+"""How closely velocities of joints that are exchanged follow those of each other: a share of how
+they change otherwise."""
+
 
 class _Seen(NamedTuple):
     """What was seen of e; shapes (n,).
@@ -65,6 +82,9 @@ class _Seen(NamedTuple):
         moved: number of good states in motion.
         e: of the last period, rad.
         room: what an impact and the tolerance explain of it, rad.
+        tolerance: as a share of what may be; infinite as long as nothing is relied on.
+        last: acceleration in the last period, rad/s^2.
+        usual: the largest one that good states had twice in a row, rad/s^2.
     """
 
     share: Array
@@ -72,6 +92,9 @@ class _Seen(NamedTuple):
     moved: Array
     e: Array
     room: Array
+    tolerance: Array
+    last: Array
+    usual: Array
 
 
 class Agreement:
@@ -84,6 +107,8 @@ class Agreement:
 
     Attributes:
         undecided: whether the last state is.
+        exchanged: joints that have exchanged their places with it; None for none.
+        room: what an impact and the tolerance explain of its e, shape (n,), rad; None if unknown.
     """
 
     def __init__(self, before: State, now: State, error: Array) -> None:
@@ -96,6 +121,8 @@ class Agreement:
         for each in self._seen:
             each.fill(0.0)
         self.undecided = False
+        self.exchanged: tuple[int, int] | None = None
+        self.room: Array | None = None
         self._shortest = math.inf  # time between states, about, s
         self._impact = -math.inf  # time of the last, s
 
@@ -108,11 +135,16 @@ class Agreement:
             doubted: whether states are not believed now: these are not learned from.
         """
         second, self.undecided = self.undecided, False
+        self.exchanged = self.room = None
         if h > 0.0:
             self._shortest = min(h, 1.01 * self._shortest)
         if not 0.0 < h <= LONGER * self._shortest:
             return False
-        odd, apart = self._judge(h, float(second), float(not doubted))
+        odd, apart, i, j = self._judge(h, float(second), float(not doubted))
+        self.room = self._seen.room
+        if j > 0:
+            self.exchanged = i, j
+            return True
         if doubted or second or not odd:
             return apart
         self.undecided = apart or stamp > self._impact + CALM
@@ -129,8 +161,10 @@ def _judge(
     h: float,
     second: float,
     learns: float,
-) -> tuple[bool, bool]:
+) -> tuple[bool, bool, int, int]:
     """Return whether e is beyond the tolerance, and whether beyond what an impact explains, too.
+
+    And the joints i < j that have exchanged their places; 0, 0 for none.
 
     Args:
         before: a state.
@@ -141,7 +175,8 @@ def _judge(
         second: whether the period before counts as well.
         learns: whether what is within the tolerance is learned from.
     """
-    odd = apart = False
+    odd = apart = off = False
+    unusual = 0
     for i in range(error.size):
         v0, v = before.v[i], now.v[i]
         e = now.q[i] - before.q[i] - 0.5 * h * (v0 + v)
@@ -149,11 +184,12 @@ def _judge(
         lag = LAG if e * (v - v0) > 0.0 else 0.0
         possible = h * error[i] + lag * change
         begins = seen.moved[i] < ENOUGH
-        tolerance = math.inf
+        tolerance = seen.tolerance[i] = math.inf
         if not begins:
+            seen.tolerance[i] = max(LEAST, FACTOR * seen.share[i])
             # Of an acceleration that was not seen yet a filter may make more.
             unseen = lag * max(0.0, change - 2.0 * seen.change[i])
-            tolerance = max(LEAST, FACTOR * seen.share[i]) * possible + unseen
+            tolerance = seen.tolerance[i] * possible + unseen
         room = 0.5 * h * change + tolerance
         if abs(e) > tolerance:
             odd = True
@@ -163,9 +199,39 @@ def _judge(
             seen.share[i] += more if new else SLOWLY * more
             seen.change[i] = max(seen.change[i], change)
             seen.moved[i] += abs(v) > error[i]
+            seen.usual[i] = max(seen.usual[i], min(change / h, seen.last[i]))
+        seen.last[i] = change / h
+        off = off or abs(e) > room
+        unusual += (not begins) and change > USUAL * h * seen.usual[i]
         if second:
             apart = apart or abs(seen.e[i] + e) > seen.room[i] + room
         else:
             apart = apart or abs(e) > room
         seen.e[i], seen.room[i] = e, room
-    return odd, apart
+    if off or unusual > 1:
+        for j in range(1, error.size):
+            for i in range(j):
+                if _exchanged(before, now, error, seen, h, i, j):
+                    return odd, apart, i, j
+    return odd, apart, 0, 0
+
+
+@compiled
+def _exchanged(
+    before: State, now: State, error: Array, seen: _Seen, h: float, i: int, j: int
+) -> bool:
+    """Return whether two states are those of an arm of which two joints are exchanged."""
+    # Good sensors tell it; others have shown more than what may be, or nothing yet.
+    fits = seen.tolerance[i] <= 1.0 and seen.tolerance[j] <= 1.0
+    unusual = off = True
+    closer = 0.0
+    for k, other in ((i, j), (j, i)):
+        own, change = abs(now.v[k] - before.v[k]), now.v[k] - before.v[other]
+        r = now.q[k] - before.q[other] - 0.5 * h * (before.v[other] + now.v[k])
+        lag = LAG * abs(change) if r * change > 0.0 else 0.0
+        fits = fits and abs(r) <= seen.tolerance[other] * (h * error[other] + lag)
+        fits = fits and abs(change) <= USUAL * h * seen.usual[other]
+        unusual = unusual and own > max(USUAL * h * seen.usual[k], abs(change) / CLOSER)
+        off = off and abs(seen.e[k]) > seen.room[k]
+        closer += abs(seen.e[k]) - abs(r)
+    return fits and (unusual or off) and closer > 0.0

@@ -15,13 +15,12 @@ trapezoidal rule is far closer, because its errors hardly add up. So
 stays within errors of positions and `WINDOW` times those of speeds, one impact allowed; where it
 does not, positions and velocities *contradict* each other: one of them has frozen, or has a bias.
 
-With good sensors `agreement.py` tells it within two states.
+With good sensors `agreement.py` tells it within two states. `leaps.py` remembers what leapt.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -31,6 +30,7 @@ from viability_bounds_pkg.compiled import bound, compiled
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.state_estimation.agreement import Agreement
 from viability_bounds_pkg.state_estimation.freeze_check import FROZEN, Expected, FreezeCheck
+from viability_bounds_pkg.state_estimation.leaps import STOPS, UNSURE, Errors, Leaps, free
 
 Array = NDArray[np.float64]
 
@@ -62,14 +62,8 @@ SPIKE = 0.03
 IMPOSSIBLE = 10.0
 """How many times faster than its limit no joint ever moves."""
 
-STOPS = 0.35
-"""How far an arm that is not believed may have moved on, as a multiple of its speed, s."""
-
 STAYS = 0.05
-"""And how far besides, rad."""
-
-UNSURE = 1.0
-"""Error of that speed where positions and velocities contradict each other, rad/s."""
+"""How far an arm that is not believed may have moved besides, rad."""
 
 STUCK = 10.0
 """How long states must agree where the position of a joint that moved is still the same, s."""
@@ -81,7 +75,9 @@ waits for its answer, as in lockstep, sends no other."""
 UNDECIDED = "undecided: an impact, or wrong"
 """Said of a state that the next one decides about."""
 
-JUMP = "no motion leads there from the last"
+UNTIL = f"believed when they leap back, or after a gap of {GAP:g} s in their stamps"
+JUMP = f"no motion leads there from the last; {UNTIL}"
+EXCHANGED = f"two joints have exchanged their places; {UNTIL}"
 CONTRADICTION = "positions contradict velocities"
 OUTSIDE = "beyond a limit by more than the range of the joint"
 TOO_FAST = f"more than {IMPOSSIBLE:g} times faster than the speed limit"
@@ -91,24 +87,6 @@ SAMPLES = 200
 """Postures in which the largest accelerations are looked for."""
 
 
-class _Errors(NamedTuple):
-    """What states may differ by from the truth, and how fast joints may be; shapes (n,).
-
-    Attributes:
-        position: rad.
-        velocity: rad/s.
-        quarter_a: a quarter of the largest acceleration, rad/s^2.
-        limit: of the speed, rad/s.
-        fast: speed for which no velocity is known, rad/s.
-    """
-
-    position: Array
-    velocity: Array
-    quarter_a: Array
-    limit: Array
-    fast: Array
-
-
 class StateCheck:
     """Looks at the joint states of one arm, one after the other.
 
@@ -116,7 +94,9 @@ class StateCheck:
 
     After a jump states are believed again at once if they go on within `SPIKE` where the last one
     that was believed leads to. Otherwise, and after a contradiction, they must agree with each
-    other for `WINDOW` and show the arm where it can be after a stop. What froze agrees with an arm
+    other for `WINDOW` and show the arm where it can be after a stop. What leapt must have leapt
+    back, as joints that are exchanged agree with each other, too; a leap of less than errors of
+    positions is believed after `STUCK`. What froze agrees with an arm
     that stands: after each contradiction it takes twice as long, except for states that were the
     same and change again; and `STUCK` while the position of a joint that moved stays the same. A
     gap of `GAP` in the stamps, as the restart of a robot makes one, is a new beginning.
@@ -147,7 +127,7 @@ class StateCheck:
         error = np.zeros_like(limit) if velocity_error is None else velocity_error
         position, velocity = SPREAD + 2.0 * position_error, SHARE * limit + error
         quarter_a = 0.25 * largest_accelerations(model, tau_max)
-        self._errors = _Errors(position, velocity, quarter_a, limit, FAST * limit)
+        self._errors = Errors(position, velocity, quarter_a, limit, FAST * limit)
         self._with_velocities = known
         # The last state that came, and the one that is looked at, where compiled code reads them.
         self._both = np.zeros((2, 2, model.nv))
@@ -159,6 +139,7 @@ class StateCheck:
             _compare, self._before, self._now, self._errors, self._drift, known, numbers=2
         )
         self._agreement = Agreement(self._before, self._now, velocity)
+        self._leaps = Leaps(self._before, self._now, self._errors, known)
         self._freeze = FreezeCheck(model, tau_max, position, self._before, self._now, known)
         self.reset()
 
@@ -176,6 +157,7 @@ class StateCheck:
         self._again = 0  # how often the last state has come once more
         self._contradiction = False  # whether it is more than a jump
         self._freeze.reset()
+        self._leaps.clear()
 
     def expect(self, expected: Expected) -> None:
         """Say how the arm moves from the last state on."""
@@ -206,6 +188,7 @@ class StateCheck:
         goes, self._goes, self._time = self._goes, not nonsense, stamp
         if nonsense:
             self._doubt, self._agreed = nonsense, 0.0
+            self._leaps.forget()
             return nonsense
         if not goes:  # at the beginning, or after nonsense
             self._agreed = 0.0
@@ -215,7 +198,8 @@ class StateCheck:
             self._both[0], h = self._both[1], 0.0
         frozen = self._freeze.look(h)
         awakes = self._doubt == FROZEN and self._freeze.changing <= h
-        jumps, contradicts = self._compare(h, float(awakes))
+        jumps, slowly = self._compare(h, float(awakes))
+        contradicts = slowly
         if self._with_velocities:
             apart = self._agreement.contradicts(h, stamp, bool(self._doubt))
             contradicts = contradicts or (apart and not jumps)
@@ -224,16 +208,26 @@ class StateCheck:
         if contradicts:
             if not self._contradiction:
                 self._patience *= 2.0
-            self._contradiction, self._doubt = True, FROZEN if frozen else CONTRADICTION
+            self._contradiction = True
+            exchanged = self._agreement.exchanged is not None
+            self._doubt = FROZEN if frozen else EXCHANGED if exchanged else CONTRADICTION
         elif jumps and not self._doubt:
             self._doubt = JUMP
-        elif self._agreement.undecided:
+        undecided = self._agreement.undecided and not self._doubt
+        if (self._doubt or undecided) and self._believed is not None:
+            still = self._doubt == FROZEN
+            agreement, v = self._agreement, self._believed[0].v
+            self._leaps.look(h, v, agreement.room, agreement.exchanged, still, slowly)
+        elif self._leaps.follows:
+            self._leaps.clear()
+        if undecided:
             return UNDECIDED
         if self._doubt:
             self._agreement.undecided = False
         if self._doubt and self._goes_on(state, stamp):
             self._doubt, self._contradiction = "", False
             self._freeze.believe()
+            self._leaps.clear()
         self._trusted = 0.0 if self._doubt else self._trusted + h
         if self._trusted > FORGIVEN:
             self._patience = WINDOW
@@ -245,24 +239,27 @@ class StateCheck:
         """Return whether a state may follow that which was believed last."""
         if self._believed is None:
             return self._agreed >= self._patience
+        if self._leaps.far:
+            return False
         (before, then), errors = self._believed, self._errors
         h, moved = stamp - then, state.q - before.q
-        if not self._contradiction and h <= SPIKE:
-            free = errors.position + STAYS + h * errors.velocity
+        away = self._leaps.away
+        if not self._contradiction and h <= SPIKE and not away:
+            off = free(errors, h)
             if self._with_velocities:
                 low, high = np.minimum(before.v, state.v), np.maximum(before.v, state.v)
             else:
                 low, high = -errors.fast, errors.fast
-            if ((h * low - free <= moved) & (moved <= h * high + free)).all():
+            if ((h * low - off <= moved) & (moved <= h * high + off)).all():
                 return True
-        free = errors.position + STAYS
-        if self._patience > WINDOW or not self._with_velocities:
-            free = free + STOPS * UNSURE
+        off = errors.position + STAYS
+        if self._patience > WINDOW or self._leaps.back or not self._with_velocities:
+            off = off + STOPS * UNSURE
         on = STOPS * before.v
-        near = (np.minimum(on, 0.0) - free <= moved) & (moved <= np.maximum(on, 0.0) + free)
-        if self._doubt == FROZEN and self._freeze.changing >= WINDOW:
+        near = (np.minimum(on, 0.0) - off <= moved) & (moved <= np.maximum(on, 0.0) + off)
+        if self._doubt == FROZEN and self._freeze.changing >= WINDOW and not away:
             patience = WINDOW
-        elif ((state.q == before.q) & (np.abs(before.v) > errors.velocity)).any():
+        elif away or ((state.q == before.q) & (np.abs(before.v) > errors.velocity)).any():
             patience = max(self._patience, STUCK)
         else:
             patience = self._patience
@@ -285,7 +282,7 @@ def _nonsense(
 def _compare(
     before: State,
     now: State,
-    errors: _Errors,
+    errors: Errors,
     drift: Array,
     with_velocities: bool,
     h: float,
