@@ -126,6 +126,24 @@ def test_positions_that_froze_before_sensors_are_known_are_believed_when_they_go
     assert refused[0][0] > 1.02 and 1.6 < refused[-1][0] < 1.6 + 2.0 * WINDOW + 0.02
 
 
+@pytest.mark.parametrize("time", [0.6, 2.0])
+def test_what_froze_untold_as_the_arm_crept_is_believed_when_it_goes_on(time):
+    """Positions leap then, by 3 and 10 mrad, and do not leap back."""
+
+    def creeps(t):
+        return sine(t) if t < 2.5 else State(sine(2.5).q + 0.005 * (t - 2.5), NONE + 0.005)
+
+    frozen = []
+
+    def freezes(state, t):
+        frozen.append(state)
+        return frozen[0]
+
+    refused = play(make_check(), freezes, 3.0, 3.0 + time, 6.0, motion=creeps)
+    assert refused[0][0] == pytest.approx(3.0 + time, abs=1.1 * H)
+    assert refused[-1][0] < 3.0 + time + 3.0 * WINDOW
+
+
 def test_velocities_that_freeze_are_told_when_the_arm_is_faster_by_some_percent():
     refused = play(make_check(), lambda state, t: state._replace(v=sine(1.0).v), begin=1.002)
     change = np.abs(sine(refused[1][0]).v - sine(1.0).v)
@@ -289,10 +307,10 @@ def test_a_leap_that_only_good_sensors_tell_is_believed_late():
 
 
 def test_a_second_leap_that_is_not_back_does_not_count():
-    """Where the arm stands: in motion it may have come as far."""
+    """Where the arm stands: in motion it may have come as far. The last bits are noise."""
 
     def stops(t):
-        return sine(t) if t < 2.5 else State(sine(2.5).q, NONE)
+        return sine(t) if t < 2.5 else State(sine(2.5).q + 1e-9 * np.sin(1e4 * t), NONE)
 
     def twice(state, t):
         return leap(0.02 if t < 3.3 else 0.12)(state, t)

@@ -88,11 +88,15 @@ class _Changes(NamedTuple):
         number: how many.
         turns: how many had another direction than the one before.
         last: the last one, rad/s.
+        still: number of states in a row with the position of the one before.
+        stood: that number at the state before.
     """
 
     number: Array
     turns: Array
     last: Array
+    still: Array
+    stood: Array
 
 
 class FreezeCheck:
@@ -126,6 +130,11 @@ class FreezeCheck:
         self._changes = _Changes(*(np.zeros_like(tau_max) for _ in _Changes._fields))
         self._note_changes = bound(_note_changes, before, now, self._changes, with_velocities)
         self.reset()
+
+    @property
+    def stood(self) -> NDArray[np.bool_]:
+        """Whether positions were the same to the last bit until the last state, shape (n,)."""
+        return self._changes.stood >= ROW
 
     def reset(self) -> None:
         """Begin anew: any state may come next."""
@@ -210,6 +219,8 @@ def _note_changes(
     for i in range(n):
         change = now.v[i] - before.v[i] if with_velocities else now.q[i] - before.q[i]
         same = same and change == 0.0
+        changes.stood[i] = changes.still[i]
+        changes.still[i] = changes.still[i] + 1.0 if now.q[i] == before.q[i] else 0.0
     for i in range(n):
         change = now.v[i] - before.v[i]
         if same:

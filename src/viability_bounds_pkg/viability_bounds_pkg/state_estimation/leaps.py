@@ -120,6 +120,7 @@ class Leaps:
         exchanged: tuple[int, int] | None,
         frozen: bool,
         lies: bool,
+        stood: NDArray[np.bool_],
     ) -> None:
         """Look at the next state.
 
@@ -130,6 +131,8 @@ class Leaps:
             exchanged: joints that have exchanged their places; None for none.
             frozen: whether states have frozen.
             lies: whether positions have contradicted velocities for longer than a state or two.
+            stood: whether good sensors gave the same position to the last bit until now, shape
+                (n,).
         """
         (q0, v0), (q1, v1), errors = self._before, self._now, self._errors
         moved = q1 - q0
@@ -159,7 +162,8 @@ class Leaps:
         # are as they were to the last bit, which is no leap.
         thaw = self._still & (frozen or bool((self._is == _Is.LYING).any()))
         self._still &= moved == 0.0
-        thaw |= moved == 0.0
+        # They may have frozen untold, as the arm crept. Good sensors tell an exchange from it.
+        thaw |= (moved == 0.0) | stood
         if lies:  # what has not leapt before leaps where it ends
             self._is[self._is == _Is.CALM] = _Is.LYING
         calm, pending = self._is == _Is.CALM, self._is == _Is.PENDING
