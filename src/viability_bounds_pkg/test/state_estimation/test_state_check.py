@@ -212,10 +212,10 @@ def test_a_share_that_was_learned_hardly_grows_afterwards():
     check = make_check()
 
     def grows(state, t):
-        return state._replace(v=state.v + 0.005 * (t - 1.0) / H)
+        return state._replace(v=state.v + 0.003 * (t - 1.0) / H)
 
     (first, _), (second, wrong) = play(check, grows)[:2]
-    assert 0.005 * (second - 1.0) / H < 0.08 and wrong == CONTRADICTION and first < second
+    assert 0.003 * (second - 1.0) / H < 0.05 and wrong == CONTRADICTION and first < second
 
 
 def test_reasons():
