@@ -144,6 +144,30 @@ def test_what_froze_untold_as_the_arm_crept_is_believed_when_it_goes_on(time):
     assert refused[-1][0] < 3.0 + time + 3.0 * WINDOW
 
 
+def test_standing_joints_that_are_exchanged_are_not_taken_for_frozen_ones():
+    """Sensors are not known yet, and positions are the same to the last bit before."""
+    stands = State(np.linspace(-0.5, 0.5, N), NONE)
+    times = refused_at(play(make_check(), swapped, 0.5, 1.5, 3.0, motion=lambda t: stands))
+    assert times[0] == pytest.approx(0.5, abs=1.1 * H)
+    assert 1.5 < times[-1] < 1.5 + 2.0 * WINDOW
+    assert times.size == round((times[-1] - times[0]) / H) + 1
+
+
+@pytest.mark.parametrize("time", [0.6, 4.0])
+def test_what_froze_before_sensors_are_known_is_believed_when_it_goes_on(time):
+    def creeps(t):
+        return State(np.linspace(-0.5, 0.5, N) + 0.005 * t, NONE + 0.005)
+
+    frozen = []
+
+    def freezes(state, t):
+        frozen.append(state)
+        return frozen[0]
+
+    refused = play(make_check(), freezes, 0.3, 0.3 + time, 6.0, motion=creeps)
+    assert not refused or refused[-1][0] < 0.3 + time + 3.0 * WINDOW
+
+
 def test_velocities_that_freeze_are_told_when_the_arm_is_faster_by_some_percent():
     refused = play(make_check(), lambda state, t: state._replace(v=sine(1.0).v), begin=1.002)
     change = np.abs(sine(refused[1][0]).v - sine(1.0).v)

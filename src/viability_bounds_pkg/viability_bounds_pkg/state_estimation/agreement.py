@@ -126,11 +126,6 @@ class Agreement:
         self._shortest = math.inf  # time between states, about, s
         self._impact = -math.inf  # time of the last, s
 
-    @property
-    def good(self) -> NDArray[np.bool_]:
-        """Of which joints the last state would have told an exchange, shape (n,)."""
-        return (self._seen.tolerance <= 1.0) & (self.room is not None)
-
     def contradicts(self, h: float, stamp: float, doubted: bool) -> bool:
         """Return whether positions contradict velocities after all; note what is undecided.
 

@@ -131,8 +131,7 @@ class Leaps:
             exchanged: joints that have exchanged their places; None for none.
             frozen: whether states have frozen.
             lies: whether positions have contradicted velocities for longer than a state or two.
-            stood: whether good sensors gave the same position to the last bit until now, shape
-                (n,).
+            stood: whether positions were the same to the last bit until now, shape (n,).
         """
         (q0, v0), (q1, v1), errors = self._before, self._now, self._errors
         moved = q1 - q0
@@ -162,8 +161,11 @@ class Leaps:
         # are as they were to the last bit, which is no leap.
         thaw = self._still & (frozen or bool((self._is == _Is.LYING).any()))
         self._still &= moved == 0.0
-        # They may have frozen untold, as the arm crept. Good sensors tell an exchange from it.
-        thaw |= (moved == 0.0) | stood
+        # They may have frozen untold, as the arm crept, if each does not take another one's place.
+        places = np.abs(q1[:, None] - q0 - h * v0) <= allowed
+        np.fill_diagonal(places, False)
+        exchange = places & places.T & leaps & leaps[:, None]
+        thaw |= (moved == 0.0) | (stood & ~exchange.any(axis=1))
         if lies:  # what has not leapt before leaps where it ends
             self._is[self._is == _Is.CALM] = _Is.LYING
         calm, pending = self._is == _Is.CALM, self._is == _Is.PENDING

@@ -217,7 +217,7 @@ class StateCheck:
         if (self._doubt or undecided) and self._believed is not None:
             still = self._doubt == FROZEN
             agreement, v = self._agreement, self._believed[0].v
-            stood = self._freeze.stood & agreement.good
+            stood = self._freeze.stood
             self._leaps.look(h, v, agreement.room, agreement.exchanged, still, slowly, stood)
         elif self._leaps.follows:
             self._leaps.clear()
