@@ -13,7 +13,9 @@ which the sum of all e is that of errors and of the way that the arm may have co
     |sum e| <= errors + max |moved| + `STOPS` |v|.
 
 While joints are exchanged, one has moved and the number of another has been reported. Where e is
-large in the next state, too, it is no leap: velocities lie, or positions have frozen.
+large in the next state, too, it is no leap: velocities lie, or positions have frozen. Nor is it
+one where a position was the same to the last bit before, unless two joints take each other's
+places: it had frozen, as the arm crept.
 """
 
 from __future__ import annotations
