@@ -4,9 +4,11 @@
 bash scripts/reproduce.sh faults [--robot NAME] [--fault NAME] [--moments N] [--rate HZ]
     [--hold PERIODS]
 
-Robot, bounds and controller in one process, the fault node between them. Goals are random corners
-of the position limits, one a second, with stiff gains; from the start of a fault until the arm
-goes on the goal stays what it was.
+Bounds and controller are a process, `safety_stack`; the robot is in this one, so that its limits
+are judged at its physics steps, and so is the fault node, by which one kind of messages goes at a
+time: each message that it passes takes a part of the period. Goals are random corners of the
+position limits, one a second, with stiff gains; from the start of a fault until the arm goes on
+the goal stays what it was.
 """
 
 from __future__ import annotations
@@ -14,16 +16,18 @@ from __future__ import annotations
 import argparse
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from chain import load_node_values, load_values
+from chain import ROOT, load_node_values, load_values
 from figure import Figure, table
-from moments import HEADS, ROBOTS, STIFF, Corners, Sample, Seen, at_rate
+from moments import HEADS, ROBOTS, STIFF, Corners, Sample, Seen, at_rate, parameter_words
 from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 from watched_robot import WatchedRobot
 
 from sim_bridge.nodes.bullet_node import BulletNode
@@ -31,7 +35,8 @@ from sim_bridge.nodes.fault_node import BEFORE, FaultNode
 from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.safety.modes import Mode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
-from viability_bounds_pkg.ros.runtime import GOAL_QOS
+from viability_bounds_pkg.ros.runtime import GOAL_QOS, LATCHED_QOS
+from viability_bounds_pkg.testing.node_program import NodeProgram
 from viability_bounds_pkg.testing.ros_harness import (
     RosHarness,
     joint_state,
@@ -103,50 +108,77 @@ FAULTS = {
 
 
 class Bench:
-    """A robot under control, its messages by way of a fault node.
+    """A robot under control, some messages by way of a fault node.
 
     Args:
         ros: runs the nodes.
         robot: name of its file.
+        topic: of the messages that go by way of the fault node.
         seed: of goals and moments.
         rate: of the control loop, Hz; None for the robot's own.
         own: parameters that differ from the file, by name.
     """
 
     def __init__(
-        self, ros: RosHarness, robot: str, seed: int, rate: float | None, own: dict[str, Any]
+        self,
+        ros: RosHarness,
+        robot: str,
+        topic: str,
+        seed: int,
+        rate: float | None,
+        own: dict[str, Any],
     ) -> None:
-        self._ros, self._rng = ros, np.random.default_rng(seed)
+        self._ros, self._topic, self._rng = ros, topic, np.random.default_rng(seed)
         own = STIFF | {"start_paused": False, "clock": "real_time"} | own
         # Of each its own: the bounds of TALOS keep speeds below those that the robot may have.
-        by_node = load_node_values(robot)
-        by_node = {name: by_node[name] | own | new for name, new in at_rate(by_node, rate).items()}
-        self._values = by_node[BulletNode.NAME]
+        found = load_node_values(robot)
+        changes = {name: own | new for name, new in at_rate(found, rate).items()}
+        self._values = found[BulletNode.NAME] | changes[BulletNode.NAME]
         self._trace: list[Sample] = []
-
-        def add(kind: Any, topic: str, **more: Any) -> Any:
-            given = overrides(by_node[kind.NAME])
-            away = ["--ros-args", "-r", f"{topic}:={BEFORE}{topic}"]
-            return ros.add(
-                kind(context=ros.context, parameter_overrides=given, cli_args=away, **more)
+        self._mode = ""
+        away = ["-r", f"{SENDERS[topic].NAME}:{topic}:={BEFORE}{topic}"]
+        words = ["--ros-args", "--params-file", str(ROOT / "config" / f"{robot}.yaml")]
+        for name in (BoundsNode.NAME, ControllerNode.NAME):
+            words += parameter_words(name, changes[name])
+        # What renames no topic of the stack would be warned of.
+        words += away if SENDERS[topic] is not BulletNode else []
+        self._stack = NodeProgram("safety_stack", ros.domain, words)
+        self._stack.start()
+        self._arm = ros.add(
+            WatchedRobot(
+                self._see,
+                context=ros.context,
+                parameter_overrides=overrides(self._values),
+                cli_args=["--ros-args", *away],
             )
-
-        add(BoundsNode, "acceleration_limits")
-        self._controller = add(ControllerNode, "joint_commands")
-        self._arm = add(WatchedRobot, "joint_states", seen=self._see)
+        )
+        ros.probe.create_subscription(String, "controller_mode", self._on_mode, LATCHED_QOS)
         self._user = ros.talk(JointState, "target_posture", GOAL_QOS)
         self._corners = Corners(self._values, self._rng)
         self._dt = 1.0 / self._values["rate_hz"]
 
+    def close(self) -> None:
+        """End the program."""
+        self._stack.end()
+
+    def _on_mode(self, message: String) -> None:
+        self._mode = message.data
+
     def _see(self, t: float, stopped: bool, tau: Array) -> None:
-        braking = stopped or self._controller._modes.mode is not Mode.TRACKING
+        braking = stopped or self._mode != Mode.TRACKING.value
         self._trace.append(Sample(t, braking, stopped, tau))
 
     def _ask(self) -> None:
         self._user.publish(joint_state(self._values["joints"], 0, self._corners.draw()))
 
     def suffer(self, names: list[str], moments: int, folder: Path) -> list[Seen]:
-        """Let faults happen at random moments, one kind after the other; return what each did."""
+        """Let faults happen at random moments, one kind after the other; return what each did.
+
+        Args:
+            names: kinds, all of the messages that go by way of the fault node.
+            moments: of each.
+            folder: for the file of faults.
+        """
         count = len(names) * moments
         begins = 2.0 + EPISODE * np.arange(count) + self._rng.uniform(0.0, 1.0, count)
         entries = "\n".join(
@@ -160,7 +192,8 @@ class Bench:
         joints = self._values["joints"]
         entries = entries.replace(TWO_JOINTS, f"[{joints[1]}, {joints[3]}]")
         path = folder / "faults.yaml"
-        path.write_text(f"topics: [{', '.join(SENDERS)}]\nfaults:\n{entries}\n")
+        path.write_text(f"topics: [{self._topic}]\nfaults:\n{entries}\n")
+        self._ros.wait_until(lambda: self._mode, "the controller")
         faults: Any = self._ros.start(FaultNode, {"faults": str(path)})
         self._ros.wait_until(lambda: faults._begin >= 0, "the first state")
         start = 1e-9 * faults._begin
@@ -176,10 +209,11 @@ class Bench:
         trace.clear()
         while not trace or trace[-1].t < begins[-1] + EPISODE - 1.5:
             now = trace[-1].t if trace else -np.inf
-            calm = (now < begins) | (now > begins + DURATION + RECOVERY)
-            if trace and calm.all() and now - asked > 1.0:
-                self._ask()
-                asked = now
+            if trace and now - asked > 1.0:
+                calm = (now < begins) | (now > begins + DURATION + RECOVERY)
+                if calm.all():
+                    self._ask()
+                    asked = now
             self._ros.spin(0.05)
         timeout = self._arm.get_parameter("command_timeout").value
         seen = Seen(timeout=timeout, brakes=kind.brakes, believed=kind.believed)
@@ -194,13 +228,19 @@ def play(
     robot: str, names: list[str], moments: int, rate: float | None, own: dict[str, Any]
 ) -> list[tuple[str, dict[str, Any]]]:
     """Let a robot suffer these faults; return what each did."""
-    with private_domain() as domain, tempfile.TemporaryDirectory() as folder:
-        ros = RosHarness(domain)
-        try:
-            seen = Bench(ros, robot, 1, rate, own).suffer(names, moments, Path(folder))
-            return [(name, vars(each)) for name, each in zip(names, seen, strict=True)]
-        finally:
-            ros.close()
+    seen: dict[str, dict[str, Any]] = {}
+    for topic in SENDERS:
+        some = [name for name in names if FAULTS[name].topic == topic]
+        if not some:
+            continue
+        with ExitStack() as stack:
+            ros = RosHarness(stack.enter_context(private_domain()))
+            stack.callback(ros.close)
+            bench = Bench(ros, robot, topic, 1, rate, own)
+            stack.callback(bench.close)
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+            seen |= zip(some, map(vars, bench.suffer(some, moments, folder)), strict=True)
+    return [(name, seen[name]) for name in names]
 
 
 def main() -> int:

@@ -53,6 +53,15 @@ def at_rate(by_node: Mapping[str, Mapping[str, Any]], rate: float | None) -> dic
     return changes
 
 
+def parameter_words(node: str, values: Mapping[str, Any]) -> list[str]:
+    """Return parameters of a node as words of a command line."""
+    pairs = [
+        f"{node}:{name}:={str(value).lower() if isinstance(value, bool) else value}"
+        for name, value in values.items()
+    ]
+    return [word for pair in pairs for word in ("-p", pair)]
+
+
 class Sample(NamedTuple):
     """What an arm does in a control period.
 

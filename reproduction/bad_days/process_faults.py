@@ -4,10 +4,11 @@
 bash scripts/reproduce.sh process-faults [--robot NAME] [--fault NAME] [--moments N] [--rate HZ]
     [--hold PERIODS]
 
-Bounds and controller are processes, the robot is in this one, so that its limits are judged at
-its physics steps; where the fault is the robot's own, it is a process, too, and its diagnostics
-count. Goals are random corners of the position limits, one a second, with stiff gains; the user
-sends them again five times a second, as a controller that was started anew knows of none.
+Bounds and controller are processes, or one where there is an estimator, too. The robot is in
+this one, so that its limits are judged at its physics steps; where the fault is the robot's own,
+it is a process, and its diagnostics count. Goals are random corners of the position limits, one a
+second, with stiff gains; the user sends them again five times a second, as a controller that was
+started anew knows of none.
 """
 
 from __future__ import annotations
@@ -16,16 +17,29 @@ import argparse
 import math
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from chain import ROOT, load_node_values
 from figure import Figure, table
-from moments import AGAIN, HEADS, RETURN, ROBOTS, STIFF, Corners, Sample, Seen, at_rate
+from moments import (
+    AGAIN,
+    HEADS,
+    RETURN,
+    ROBOTS,
+    STIFF,
+    Corners,
+    Sample,
+    Seen,
+    at_rate,
+    parameter_words,
+)
 from numpy.typing import NDArray
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.node import Node
@@ -53,13 +67,18 @@ from viability_bounds_pkg.testing.ros_harness import (
 BOUNDS, CONTROLLER = "bounds_node", "controller_node"
 ROBOT, ESTIMATOR = "bullet_node", "estimator_node"
 CONTROL = BOUNDS, CONTROLLER
+TOGETHER = "bounds_and_controller"
+"""Both as one process: two processors do not keep 1 kHz with a process for each node."""
 ALONE = {
     BOUNDS: "acceleration_limits",
     CONTROLLER: "joint_commands",
     ROBOT: "joint_states",
     ESTIMATOR: "estimated_joint_states",
+    TOGETHER: "joint_commands",
 }
-"""What each node alone publishes."""
+"""What each program alone publishes."""
+
+_TOGETHER = [sys.executable, str(Path(__file__).with_name(f"{TOGETHER}.py"))]
 
 Array = NDArray[np.float64]
 
@@ -153,16 +172,15 @@ class Bench:
         words = ["--ros-args", "--log-level", "error"]
         for each in (robot, *more):
             words += ["--params-file", str(ROOT / "config" / f"{each}.yaml")]
-        self._words = words
-        self.programs = {
-            name: NodeProgram(
-                name,
-                ros.domain,
-                [*words, *_given(values if name == ROBOT else by_node[name], by_node[name])],
-                subprocess.DEVNULL,
+        by_node[ROBOT] = {name: values[name] for name in by_node[ROBOT]}
+        self.programs = {}
+        for name in kind.programs:
+            nodes = CONTROL if name == TOGETHER else (name,)
+            own = [word for node in nodes for word in parameter_words(node, by_node[node])]
+            start = _TOGETHER if name == TOGETHER else None
+            self.programs[name] = NodeProgram(
+                name, ros.domain, [*words, *own], subprocess.DEVNULL, start
             )
-            for name in kind.programs
-        }
         self.arm: Any = None
         self.heard = False
         self._mode = ""
@@ -378,15 +396,6 @@ class Bench:
         seen.torque = max(seen.torque, worst("torque_ratio"))
 
 
-def _given(values: Mapping[str, Any], changes: Mapping[str, Any]) -> list[str]:
-    """Return parameters as words of a command line."""
-    pairs = [
-        f"{name}:={str(values[name]).lower() if isinstance(value, bool) else values[name]}"
-        for name, value in changes.items()
-    ]
-    return [word for pair in pairs for word in ("-p", pair)]
-
-
 # What happens
 
 
@@ -546,7 +555,7 @@ def late(name: str) -> Callable[[Bench], Course]:
 
 
 WITH_ROBOT = (ROBOT, *CONTROL)
-WITH_ESTIMATOR = (ESTIMATOR, *CONTROL)
+WITH_ESTIMATOR = ESTIMATOR, TOGETHER
 FAULTS = {
     "nothing": Kind(nothing, brakes=False),
     "nothing, imperfect robot": Kind(nothing, WITH_ESTIMATOR, imperfect=True, brakes=False),

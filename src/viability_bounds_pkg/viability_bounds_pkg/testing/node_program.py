@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Installed programs as processes that are killed, stopped and started again."""
+"""Programs of nodes as processes that are killed, stopped and started again."""
 
 from __future__ import annotations
 
@@ -30,13 +30,14 @@ _END = 15.0  # s, after which a program that was told to end is killed
 
 
 class NodeProgram:
-    """An installed program, each time it is started in a process of its own.
+    """A program, each time it is started in a process of its own.
 
     Args:
-        name: of the executable, one of `PACKAGES`.
+        name: of the executable, one of `PACKAGES` unless `start` is given.
         domain: ROS domain.
         words: arguments, those for ROS with their ``--ros-args``.
         errors: where its stderr goes, as for `subprocess`.
+        start: words that start it, before its arguments; None for the installed executable.
 
     Attributes:
         name: as given.
@@ -44,11 +45,18 @@ class NodeProgram:
     """
 
     def __init__(
-        self, name: str, domain: int, words: Sequence[Any], errors: int | IO[Any] | None = None
+        self,
+        name: str,
+        domain: int,
+        words: Sequence[Any],
+        errors: int | IO[Any] | None = None,
+        start: Sequence[str] | None = None,
     ) -> None:
-        folder = Path(get_package_prefix(PACKAGES[name])) / "lib" / PACKAGES[name]
+        if start is None:
+            folder = Path(get_package_prefix(PACKAGES[name])) / "lib" / PACKAGES[name]
+            start = [str(folder / name)]
         self.name = name
-        self._words = [str(folder / name), *map(str, words)]
+        self._words = [*start, *map(str, words)]
         self._environment = os.environ | {"ROS_DOMAIN_ID": str(domain)}
         self._errors = errors
         self.process: subprocess.Popen[str] | None = None
