@@ -153,6 +153,29 @@ def test_standing_joints_that_are_exchanged_are_not_taken_for_frozen_ones():
     assert times.size == round((times[-1] - times[0]) / H) + 1
 
 
+@pytest.mark.parametrize("size", [0.02, -0.3])
+@pytest.mark.parametrize("joints", [slice(2, 3), slice(None)], ids=["one", "all"])
+@pytest.mark.parametrize("velocity_error", [NONE, None], ids=["with velocities", "without"])
+def test_positions_that_get_a_bias_as_the_arm_stands_are_not_taken_for_frozen_ones(
+    size, joints, velocity_error
+):
+    """Where all is the same to the last bit, too: velocities lead nowhere."""
+
+    def stops(t):
+        return sine(min(t, 2.5)) if t < 2.5 else State(sine(2.5).q, NONE)
+
+    def biased(state, t):
+        q = state.q.copy()
+        q[joints] += size
+        return state._replace(q=q)
+
+    check = make_check(velocity_error=velocity_error)
+    times = refused_at(play(check, biased, 3.0, 5.0, 6.0, motion=stops))
+    assert times[0] == pytest.approx(3.0, abs=1.1 * H)
+    assert 5.0 < times[-1] < 5.0 + 2.0 * WINDOW
+    assert times.size == round((times[-1] - times[0]) / H) + 1
+
+
 @pytest.mark.parametrize("time", [0.6, 4.0])
 def test_what_froze_before_sensors_are_known_is_believed_when_it_goes_on(time):
     def creeps(t):

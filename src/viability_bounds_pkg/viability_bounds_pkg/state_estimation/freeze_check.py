@@ -90,6 +90,8 @@ class _Changes(NamedTuple):
         last: the last one, rad/s.
         still: number of states in a row with the position of the one before.
         stood: that number at the state before.
+        way: by the velocities of the states in that row, rad.
+        crept: that way at the state before, rad.
     """
 
     number: Array
@@ -97,6 +99,8 @@ class _Changes(NamedTuple):
     last: Array
     still: Array
     stood: Array
+    way: Array
+    crept: Array
 
 
 class FreezeCheck:
@@ -128,13 +132,20 @@ class FreezeCheck:
         self._tau_max, self._allowed = tau_max, allowed
         self._before, self._now = before, now
         self._changes = _Changes(*(np.zeros_like(tau_max) for _ in _Changes._fields))
-        self._note_changes = bound(_note_changes, before, now, self._changes, with_velocities)
+        self._note_changes = bound(
+            _note_changes, before, now, self._changes, with_velocities, numbers=1
+        )
         self.reset()
 
-    @property
-    def stood(self) -> NDArray[np.bool_]:
-        """Whether positions were the same to the last bit until the last state, shape (n,)."""
-        return self._changes.stood >= ROW
+    def went_on(self) -> NDArray[np.bool_]:
+        """Return which positions froze untold, and go on with the last state, shape (n,).
+
+        They were the same to the last bit until then, and are now where velocities led meanwhile,
+        as far as errors explain, and a joint that became twice as fast.
+        """
+        changes, moved = self._changes, self._now.q - self._before.q
+        off = np.abs(moved - changes.crept)
+        return (changes.stood >= ROW) & (off <= self._allowed + np.abs(changes.crept))
 
     def reset(self) -> None:
         """Begin anew: any state may come next."""
@@ -167,7 +178,7 @@ class FreezeCheck:
             h: time between both, s.
         """
         expected, self.expected = self.expected, None
-        same, most = self._note_changes()
+        same, most = self._note_changes(h)
         if not same:
             if self._alive:
                 self._alive = self._row <= 1 or self._told
@@ -208,7 +219,7 @@ class FreezeCheck:
 
 @compiled
 def _note_changes(
-    before: State, now: State, changes: _Changes, with_velocities: bool
+    before: State, now: State, changes: _Changes, with_velocities: bool, h: float
 ) -> tuple[bool, float]:
     """Count how often in a row velocities of joints at rest have changed by noise.
 
@@ -220,7 +231,12 @@ def _note_changes(
         change = now.v[i] - before.v[i] if with_velocities else now.q[i] - before.q[i]
         same = same and change == 0.0
         changes.stood[i] = changes.still[i]
-        changes.still[i] = changes.still[i] + 1.0 if now.q[i] == before.q[i] else 0.0
+        changes.crept[i] = changes.way[i]
+        if now.q[i] == before.q[i]:
+            changes.still[i] += 1.0
+            changes.way[i] += 0.5 * h * (before.v[i] + now.v[i])
+        else:
+            changes.still[i] = changes.way[i] = 0.0
     for i in range(n):
         change = now.v[i] - before.v[i]
         if same:

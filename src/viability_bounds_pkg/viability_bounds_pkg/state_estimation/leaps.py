@@ -14,8 +14,8 @@ which the sum of all e is that of errors and of the way that the arm may have co
 
 While joints are exchanged, one has moved and the number of another has been reported. Where e is
 large in the next state, too, it is no leap: velocities lie, or positions have frozen. Nor is it
-one where a position was the same to the last bit before, unless two joints take each other's
-places: it had frozen, as the arm crept.
+one where a position was the same to the last bit before and goes on where velocities led
+meanwhile: it had frozen, as the arm crept.
 """
 
 from __future__ import annotations
@@ -108,6 +108,7 @@ class Leaps:
         for each in (self._sum, self._error, self._way, self._size):
             each.fill(0.0)
         self._pair: list[int] = []  # joints that are exchanged
+        self._returned = False  # whether a joint has leapt back
 
     def forget(self) -> None:
         """Take what leaps for explained by a state that was nonsense, except an exchange."""
@@ -122,7 +123,7 @@ class Leaps:
         exchanged: tuple[int, int] | None,
         frozen: bool,
         lies: bool,
-        stood: NDArray[np.bool_],
+        went_on: NDArray[np.bool_],
     ) -> None:
         """Look at the next state.
 
@@ -133,7 +134,7 @@ class Leaps:
             exchanged: joints that have exchanged their places; None for none.
             frozen: whether states have frozen.
             lies: whether positions have contradicted velocities for longer than a state or two.
-            stood: whether positions were the same to the last bit until now, shape (n,).
+            went_on: positions that froze untold and go on now, as far as can be seen, shape (n,).
         """
         (q0, v0), (q1, v1), errors = self._before, self._now, self._errors
         moved = q1 - q0
@@ -163,11 +164,7 @@ class Leaps:
         # are as they were to the last bit, which is no leap.
         thaw = self._still & (frozen or bool((self._is == _Is.LYING).any()))
         self._still &= moved == 0.0
-        # They may have frozen untold, as the arm crept, if each does not take another one's place.
-        places = np.abs(q1[:, None] - q0 - h * v0) <= allowed
-        np.fill_diagonal(places, False)
-        exchange = places & places.T & leaps & leaps[:, None]
-        thaw |= (moved == 0.0) | (stood & ~exchange.any(axis=1))
+        thaw |= (moved == 0.0) | went_on
         if lies:  # what has not leapt before leaps where it ends
             self._is[self._is == _Is.CALM] = _Is.LYING
         calm, pending = self._is == _Is.CALM, self._is == _Is.PENDING
@@ -178,11 +175,14 @@ class Leaps:
         self._is[pending & leaps & alike] = _Is.LYING
         self._is[pending & leaps & (left <= 0.0)] = _Is.CALM
         self._is[away & back] = _Is.CALM
+        self._returned |= bool((away & back).any() or (pending & leaps & (left <= 0.0)).any())
         self._size = np.where(calm, np.abs(self._sum), self._size)
         if exchanged is not None:
             joints = list(exchanged)
-            self._is[joints] = _Is.CALM if joints == self._pair else _Is.AWAY
-            self._pair = [] if joints == self._pair else joints
+            again = joints == self._pair
+            self._is[joints] = _Is.CALM if again else _Is.AWAY
+            self._pair = [] if again else joints
+            self._returned |= again
         elif self._pair and (self._is[self._pair] == _Is.CALM).any():
             self._is[self._pair] = _Is.CALM  # both, where one alone can be told
             self._pair = []
@@ -200,7 +200,7 @@ class Leaps:
     @property
     def back(self) -> bool:
         """Whether joints have leapt, and all of them back."""
-        return bool(self._size.any()) and not self.away
+        return self._returned and not self.away
 
     @property
     def far(self) -> bool:

@@ -217,8 +217,8 @@ class StateCheck:
         if (self._doubt or undecided) and self._believed is not None:
             still = self._doubt == FROZEN
             agreement, v = self._agreement, self._believed[0].v
-            stood = self._freeze.stood
-            self._leaps.look(h, v, agreement.room, agreement.exchanged, still, slowly, stood)
+            went_on = self._freeze.went_on()
+            self._leaps.look(h, v, agreement.room, agreement.exchanged, still, slowly, went_on)
         elif self._leaps.follows:
             self._leaps.clear()
         if undecided:
