@@ -66,7 +66,8 @@ class Kind(NamedTuple):
         brakes: whether the arm has to brake: none of the messages can be used. Where it leaves
             some that can, limits have to be kept, and the goal to be followed again afterwards.
         believed: states at its begin that are answered before it can be told: the first one of
-            what freezes is right; velocities that are the same must be so for 10 ms.
+            what freezes is right; velocities that are the same must be so for 10 ms; a sender is
+            known a moment after it has begun.
     """
 
     topic: str
@@ -101,8 +102,9 @@ FAULTS = {
     ),
     "stamps of the past": Kind("joint_states", "stamp: {offset: -0.3}"),
     "stamps of the future": Kind("joint_states", "stamp: {offset: 0.3}"),
-    "another robot": Kind("joint_states", "rival: {offset: 0.5}"),
-    "other limits": Kind("acceleration_limits", "rival: {offset: 50}"),
+    # A sender that is not in the graph yet is not obeyed; the right one is, until then.
+    "another robot": Kind("joint_states", "rival: {offset: 0.5}", believed=1),
+    "other limits": Kind("acceleration_limits", "rival: {offset: 50}", believed=1),
     "another controller": Kind("joint_commands", "rival: {offset: 5}"),
 }
 

@@ -398,6 +398,20 @@ def test_joints_that_are_exchanged_where_they_meet_are_told_at_once(joints, firs
     assert refused[-1][0] < end + 2.0 * WINDOW + 2.0 * h
 
 
+def test_joints_that_are_exchanged_and_leave_their_range_are_seen_to_leap_back():
+    size = np.r_[0.2, np.ones(N - 1)]
+
+    def motion(t):
+        return State(size * sine(t).q, size * sine(t).v)
+
+    check = make_check(limit=np.r_[0.15, LIMIT[1:]])
+    refused = play(check, swapped, 2.386, 3.0, 4.0, motion=motion)
+    assert refused[0][0] == pytest.approx(2.386, abs=1.1 * H)
+    assert [wrong for t, wrong in refused if t < 3.0][-1] == OUTSIDE
+    assert 3.0 < refused[-1][0] < 3.0 + 2.0 * WINDOW
+    assert len(refused) == round((refused[-1][0] - refused[0][0]) / H) + 1
+
+
 def test_a_gap_is_a_new_beginning():
     check = make_check()
     assert not check.look(sine(0.0), 1.0)

@@ -112,7 +112,7 @@ class Leaps:
 
     def forget(self) -> None:
         """Take what leaps for explained by a state that was nonsense, except an exchange."""
-        if not self._pair:
+        if not self.exchanged:
             self.clear()
 
     def look(
@@ -193,6 +193,11 @@ class Leaps:
         return self._states > 0
 
     @property
+    def exchanged(self) -> bool:
+        """Whether two joints have exchanged their places, and not back."""
+        return bool(self._pair)
+
+    @property
     def away(self) -> bool:
         """Whether a joint has leapt, or may have, and not back."""
         return bool(((self._is == _Is.PENDING) | (self._is == _Is.AWAY)).any())
@@ -206,4 +211,4 @@ class Leaps:
     def far(self) -> bool:
         """Whether one of these leaps is more than errors of positions, or an exchange."""
         more = np.abs(self._sum) > self._errors.position
-        return bool(self._pair) or bool((more & (self._is == _Is.AWAY)).any())
+        return self.exchanged or bool((more & (self._is == _Is.AWAY)).any())

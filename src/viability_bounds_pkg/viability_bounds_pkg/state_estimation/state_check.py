@@ -185,8 +185,10 @@ class StateCheck:
         nonsense = OUTSIDE if outside else TOO_FAST if too_fast else ""
         if not 0.0 < h <= GAP:
             self.reset()
-        goes, self._goes, self._time = self._goes, not nonsense, stamp
-        if nonsense:
+        # Joints that are exchanged may leave each other's range, and must be seen to leap back.
+        follows = not nonsense or (self._leaps.exchanged and not too_fast)
+        goes, self._goes, self._time = self._goes, follows, stamp
+        if not follows:
             self._doubt, self._agreed = nonsense, 0.0
             self._leaps.forget()
             return nonsense
@@ -221,6 +223,9 @@ class StateCheck:
             self._leaps.look(h, v, agreement.room, agreement.exchanged, still, slowly, went_on)
         elif self._leaps.follows:
             self._leaps.clear()
+        if nonsense:
+            self._doubt, self._agreed = nonsense, 0.0
+            return nonsense
         if undecided:
             return UNDECIDED
         if self._doubt:
