@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from sample_arm import MODEL, NONE, TAU_MAX, N
 from std_msgs.msg import Float64MultiArray
 
 from viability_bounds_pkg.ros.messages import (
@@ -16,6 +17,7 @@ from viability_bounds_pkg.ros.messages import (
     Verdict,
 )
 from viability_bounds_pkg.ros.runtime import STATUS_QOS, set_stamp, stamp_to_ns
+from viability_bounds_pkg.state_estimation.state_check import StateCheck
 from viability_bounds_pkg.testing.ros_harness import joint_state
 
 JOINTS = ("a", "b", "c")
@@ -155,6 +157,53 @@ def test_one_corrupt_stamp_in_the_future_does_not_lock_the_robot_out():
         now, stamp = now + 0.01, stamp + 10_000_000
         assert now < 10.6
     assert now == pytest.approx(10.51, abs=0.011)
+
+
+PERIOD, MANY, LATER = 0.004, 1500, 700
+TIMES = PERIOD * np.arange(MANY)
+
+
+def refused_in_motion(stamps, late, joints, w=2.0):
+    """Return which states of a moving arm are refused, in the order in which they come.
+
+    Args:
+        stamps: of the states, s.
+        late: by how much they come after `TIMES`, in which they were, s.
+        joints: that move.
+        w: how fast they move to and fro, up to 2 rad/s, rad/s.
+    """
+    k, limit, moves = np.arange(N), np.full(N, 2.5), np.isin(np.arange(N), joints)
+    check = StateCheck(MODEL, -limit, limit, TAU_MAX, NONE, NONE)
+    names = [str(i) for i in k]
+    reader, heard, refused = JointStateReader(names, check=check), 50.0 + TIMES + late, []
+    for i in np.argsort(heard, kind="stable"):
+        q, v = np.sin(w * TIMES[i] + k) * 2.0 / w, moves * 2.0 * np.cos(w * TIMES[i] + k)
+        q = np.where(moves, q, 0.3)
+        message = joint_state(names, round(1e9 * (50.0 + stamps[i])), q, v)
+        if reader.read(message, heard[i]) is Verdict.REFUSED:
+            refused.append(i)
+    return np.array(refused), reader.refused
+
+
+@pytest.mark.parametrize("joints", [[2], range(N)], ids=["one", "all"])
+@pytest.mark.parametrize("back", [-0.05, -0.001, 5e-4, 0.003, 0.006, 0.011, 0.05, 0.3, 0.9, 20.0])
+@pytest.mark.parametrize("late", [0.0, 3e-4])
+@pytest.mark.parametrize("w", [2.0, 20.0])
+def test_a_clock_that_is_set_in_motion_costs_not_much_more_than_that(back, late, joints, w):
+    """The arm goes on while stamps are old: later ones lead on, and positions have not leapt."""
+    stamps = TIMES - back * (np.arange(MANY) >= LATER)
+    late = late * np.random.default_rng(2).random(MANY)
+    refused, why = refused_in_motion(stamps, late, joints, w)
+    takes = np.clip(back, 0.0, 1.0)  # after which any stamp is taken
+    assert why["old stamp"] == pytest.approx(takes / PERIOD, abs=1.0)
+    assert ((refused >= LATER) & (refused < LATER + (takes + 0.25) / PERIOD)).all()
+
+
+def test_states_that_come_late_and_in_another_order_cost_hardly_more_than_old_ones():
+    late = np.random.default_rng(1).uniform(0.0, 0.02, MANY)
+    _, why = refused_in_motion(TIMES, late, range(N))
+    assert why["old stamp"] > 0.3 * MANY
+    assert why["cannot be"] < 0.01 * MANY
 
 
 def test_what_is_not_taken_does_not_count_as_heard():

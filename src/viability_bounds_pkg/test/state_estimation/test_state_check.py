@@ -412,6 +412,72 @@ def test_joints_that_are_exchanged_and_leave_their_range_are_seen_to_leap_back()
     assert len(refused) == round((refused[-1][0] - refused[0][0]) / H) + 1
 
 
+@pytest.mark.parametrize("begin", [3.15, 3.3])
+def test_exchanged_joints_that_are_out_of_range_at_first_are_never_believed(begin):
+    """They come back into it while the arm stops, and are as wrong there."""
+    size, shift = np.r_[0.1, np.full(N - 1, 0.6)], 0.4 * np.eye(N)[1]
+
+    def motion(t):
+        return State(size * sine(t).q + shift, size * sine(t).v)
+
+    limit = np.r_[motion(begin).q[1] / 3.0 - 0.002, LIMIT[1:]]
+    assert motion(begin + 0.1).q[1] < 3.0 * limit[0]  # where it is at least as it has stopped
+    refused = play(make_check(limit=limit), swapped, begin, 4.0, 5.0, motion=motion)
+    assert refused[0] == (pytest.approx(begin, abs=1.1 * H), OUTSIDE)
+    assert 4.0 < refused[-1][0] < 4.0 + 2.0 * WINDOW
+    assert len(refused) == round((refused[-1][0] - refused[0][0]) / H) + 1
+
+
+@pytest.mark.parametrize("size", [1e3, 1e17, -1e308])
+def test_nonsense_is_undone_by_the_next_state(size):
+    def to_and_fro(state, t):
+        return leap(size * (1.0 if t < 1.0 + 0.5 * H else -1.0))(state, t)
+
+    with np.errstate(all="raise"):
+        refused = play(make_check(), to_and_fro, 1.0, 1.0 + 1.5 * H)
+    assert [wrong for _, wrong in refused] == [OUTSIDE, OUTSIDE]
+
+
+@pytest.mark.parametrize("size", [-0.6 * H, 0.1 * H, 0.6 * H, 0.01, 0.09])
+def test_stamps_that_leap_in_motion_cost_a_moment(size):
+    """Positions seem to leap where it is the clock, which does not leap back."""
+    check = make_check()
+    stamps = 5.0 + H * np.arange(2000)
+    stamps[1000:] += size
+    said = looks(check, [sine(k * H) for k in range(2000)], stamps)
+    assert not any(said[round(1000 + 2.5 * WINDOW / H) :])
+
+
+def test_a_leap_in_the_way_of_the_only_joint_that_moves_is_no_clock_that_was_set():
+    """In another time it would have come as far, but that time was not heard."""
+    check = make_check()
+    for k in range(1000):
+        q, v = sine(k * H)
+        state = State(np.where(np.arange(N) == 2, q, 0.1), np.where(np.arange(N) == 2, v, 0.0))
+        late = 0.6 * H * (k % 2)
+        wrong = check.look(
+            (leap(0.02) if k >= 700 else lambda s, t: s)(state, 0), k * H, k * H + late
+        )
+        assert (wrong not in ("", UNDECIDED)) == (k >= 700), k
+
+
+@pytest.mark.parametrize("times", [0.8, 1.3, 57.3])
+@pytest.mark.parametrize("joints", [slice(2, 3), slice(None)], ids=["one", "all"])
+def test_velocities_in_other_units_are_not_taken_for_a_clock_that_was_set(times, joints):
+    """In each period anew positions move as in another time."""
+    moves = np.zeros(N)
+    moves[joints] = 1.0
+
+    def motion(t):
+        return State(moves * sine(t).q, moves * sine(t).v)
+
+    def other(state, t):
+        return state._replace(v=times * state.v)
+
+    refused = play(make_check(), other, motion=motion)
+    assert refused_at(refused)[0] <= 1.0 + 1.1 * H
+
+
 def test_a_gap_is_a_new_beginning():
     check = make_check()
     assert not check.look(sine(0.0), 1.0)

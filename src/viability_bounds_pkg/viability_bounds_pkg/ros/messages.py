@@ -33,6 +33,9 @@ Report = Callable[[], tuple[bytes, str, dict[str, Any]]]
 """Returns level, message and values of a status."""
 
 
+_SET_BACK = 20_000_000
+"""Time by which stamps are set back after which states are a beginning, ns."""
+
 _PERIODS_SEEN = 20
 """Fewer states do not tell their period."""
 
@@ -95,6 +98,8 @@ class JointStateReader:
         self._joints = tuple(joints)
         self._reset_after = reset_after
         self._accepted_at = -math.inf
+        # The first of old stamps that grow, one after the other, and the last, ns; 0 for none.
+        self._first_old = self._last_old = 0
         self._names: list[str] | None = None
         self._index: NDArray[np.intp] | None = None
         self._accepted: tuple[JointState, NDArray[np.intp] | None] | None = None
@@ -109,6 +114,7 @@ class JointStateReader:
             return self._refuse("no stamp", f"header.stamp is {what}")
         restarted = now - self._accepted_at >= self._reset_after
         if stamp < self.stamp and not restarted:
+            self._note_old(stamp)
             ago = 1e-9 * (self.stamp - stamp)
             return self._refuse("old stamp", f"{ago:.3g} s before that of the last one")
         if message.name != self._names and (missing := self._match(message.name)):
@@ -134,7 +140,7 @@ class JointStateReader:
                 return Verdict.REPEAT
             if not restarted:
                 return self._refuse("other values under the same stamp")
-        if self._check is not None and (wrong := self._check.look(State(q, v), 1e-9 * stamp)):
+        if self._check is not None and (wrong := self._look(self._check, State(q, v), stamp, now)):
             if wrong != UNDECIDED:
                 return self._refuse("cannot be", wrong)
             if self.LEAVES_UNDECIDED:
@@ -194,6 +200,22 @@ class JointStateReader:
             velocity=array("d", v.tobytes()),
             effort=message.effort,
         )
+
+    def _note_old(self, stamp: int) -> None:
+        """Note an old stamp, before that of the last accepted message."""
+        if not self._first_old or stamp < self._last_old:
+            self._first_old = stamp
+        self._last_old = stamp
+
+    def _look(self, check: StateCheck, state: State, stamp: int, now: float) -> str:
+        """Return what is wrong with a state."""
+        if self._first_old:
+            # The arm went on meanwhile, unless they have only come late.
+            heard = int(1e9 * (now - self._accepted_at)) - (stamp - self.stamp)
+            if min(self.stamp - self._first_old, heard) > _SET_BACK:
+                check.reset()
+            self._first_old = 0
+        return check.look(state, 1e-9 * stamp, now)
 
     def _match(self, names: Sequence[str]) -> str:
         """Take the order of joints from `names`; return the first that is missing, or nothing."""

@@ -20,7 +20,8 @@ Where e is beyond it the state is *undecided*: an impact, a stamp that came late
 next one decides: over both periods the sum of e must be within what impacts and tolerances
 explain. At the onset of a bias b of the velocities e is -h b / 2, which an impact at the very end
 of the period gives as well: one state cannot tell them apart. Then the sum is -3 h b / 2, and
-h b / 2 may be an impact; after positions have frozen it is -2 h v.
+h b / 2 may be an impact; after positions have frozen it is -2 h v. Where a clock is set by d the
+e of all joints are -d v, once: the next one is within its tolerance.
 
 Where two joints meet and their numbers are *exchanged*, i for j, positions leap nowhere, and
 velocities change as in an impact. This is told at once: both velocities change by more than ever
@@ -67,6 +68,9 @@ CALM = 0.2
 USUAL = 1.5
 """A change of velocity within a period that is more than usual, as a multiple of the largest that
 was seen twice in a row: impacts are not."""
+
+ALIKE = 0.25
+"""Share of the largest e that may be left where a clock was set."""
 
 CLOSER = 0.25
 """How closely velocities of joints that are exchanged follow those of each other: a share of how
@@ -125,6 +129,7 @@ class Agreement:
         self.room: Array | None = None
         self._shortest = math.inf  # time between states, about, s
         self._impact = -math.inf  # time of the last, s
+        self._clock = False  # whether it may be that a clock was set
 
     def contradicts(self, h: float, stamp: float, doubted: bool) -> bool:
         """Return whether positions contradict velocities after all; note what is undecided.
@@ -140,13 +145,14 @@ class Agreement:
             self._shortest = min(h, 1.01 * self._shortest)
         if not 0.0 < h <= LONGER * self._shortest:
             return False
-        odd, apart, i, j = self._judge(h, float(second), float(not doubted))
+        odd, apart, clock, i, j = self._judge(h, float(second), float(not doubted))
         self.room = self._seen.room
         if j > 0:
             self.exchanged = i, j
             return True
         if doubted or second or not odd:
-            return apart
+            return apart and not (second and self._clock and not odd)
+        self._clock = clock
         self.undecided = apart or stamp > self._impact + CALM
         self._impact = stamp
         return False
@@ -161,10 +167,11 @@ def _judge(
     h: float,
     second: float,
     learns: float,
-) -> tuple[bool, bool, int, int]:
+) -> tuple[bool, bool, bool, int, int]:
     """Return whether e is beyond the tolerance, and whether beyond what an impact explains, too.
 
-    And the joints i < j that have exchanged their places; 0, 0 for none.
+    And whether a clock that was set within the period explains it; and the joints i < j that have
+    exchanged their places; 0, 0 for none.
 
     Args:
         before: a state.
@@ -212,8 +219,26 @@ def _judge(
         for j in range(1, error.size):
             for i in range(j):
                 if _exchanged(before, now, error, seen, h, i, j):
-                    return odd, apart, i, j
-    return odd, apart, 0, 0
+                    return odd, apart, False, i, j
+    return odd, apart, odd and _clock_was_set(before, now, seen, h), 0, 0
+
+
+@compiled
+def _clock_was_set(before: State, now: State, seen: _Seen, h: float) -> bool:
+    """Return whether e is -d v for all joints, with |d| < h."""
+    e_v = v_v = most = 0.0
+    for i in range(seen.e.size):
+        v = 0.5 * (before.v[i] + now.v[i])
+        e_v += seen.e[i] * v
+        v_v += v * v
+        most = max(most, abs(seen.e[i]))
+    if abs(e_v) >= h * v_v:
+        return False
+    fits = True
+    for i in range(seen.e.size):
+        off = seen.e[i] - e_v / v_v * 0.5 * (before.v[i] + now.v[i])
+        fits = fits and abs(off) <= ALIKE * most
+    return fits
 
 
 @compiled

@@ -110,20 +110,15 @@ class Leaps:
         self._pair: list[int] = []  # joints that are exchanged
         self._returned = False  # whether a joint has leapt back
 
-    def forget(self) -> None:
-        """Take what leaps for explained by a state that was nonsense, except an exchange."""
-        if not self.exchanged:
-            self.clear()
-
     def look(
         self,
         h: float,
         v: Array,
-        room: Array | None,
-        exchanged: tuple[int, int] | None,
-        frozen: bool,
-        lies: bool,
-        went_on: NDArray[np.bool_],
+        room: Array | None = None,
+        exchanged: tuple[int, int] | None = None,
+        frozen: bool = False,
+        lies: bool = False,
+        went_on: NDArray[np.bool_] | None = None,
     ) -> None:
         """Look at the next state.
 
@@ -134,7 +129,8 @@ class Leaps:
             exchanged: joints that have exchanged their places; None for none.
             frozen: whether states have frozen.
             lies: whether positions have contradicted velocities for longer than a state or two.
-            went_on: positions that froze untold and go on now, as far as can be seen, shape (n,).
+            went_on: positions that froze untold and go on now, as far as can be seen, shape (n,);
+                None for none.
         """
         (q0, v0), (q1, v1), errors = self._before, self._now, self._errors
         moved = q1 - q0
@@ -164,7 +160,9 @@ class Leaps:
         # are as they were to the last bit, which is no leap.
         thaw = self._still & (frozen or bool((self._is == _Is.LYING).any()))
         self._still &= moved == 0.0
-        thaw |= (moved == 0.0) | went_on
+        thaw |= moved == 0.0
+        if went_on is not None:
+            thaw |= went_on
         if lies:  # what has not leapt before leaps where it ends
             self._is[self._is == _Is.CALM] = _Is.LYING
         calm, pending = self._is == _Is.CALM, self._is == _Is.PENDING
@@ -179,7 +177,10 @@ class Leaps:
         self._size = np.where(calm, np.abs(self._sum), self._size)
         if exchanged is not None:
             joints = list(exchanged)
-            again = joints == self._pair
+            # At first they may have been out of range, which told no exchange.
+            again = joints == self._pair or bool(
+                away[joints].any() and (self._is[joints] == _Is.CALM).all()
+            )
             self._is[joints] = _Is.CALM if again else _Is.AWAY
             self._pair = [] if again else joints
             self._returned |= again
@@ -191,11 +192,6 @@ class Leaps:
     def follows(self) -> bool:
         """Whether there was a doubtful state."""
         return self._states > 0
-
-    @property
-    def exchanged(self) -> bool:
-        """Whether two joints have exchanged their places, and not back."""
-        return bool(self._pair)
 
     @property
     def away(self) -> bool:
@@ -211,4 +207,4 @@ class Leaps:
     def far(self) -> bool:
         """Whether one of these leaps is more than errors of positions, or an exchange."""
         more = np.abs(self._sum) > self._errors.position
-        return self.exchanged or bool((more & (self._is == _Is.AWAY)).any())
+        return bool(self._pair) or bool((more & (self._is == _Is.AWAY)).any())

@@ -62,11 +62,21 @@ SPIKE = 0.03
 IMPOSSIBLE = 10.0
 """How many times faster than its limit no joint ever moves."""
 
+FAR = 1e6
+"""Position that no joint has, also where it has no limits, rad."""
+
 STAYS = 0.05
 """How far an arm that is not believed may have moved besides, rad."""
 
 STUCK = 10.0
 """How long states must agree where the position of a joint that moved is still the same, s."""
+
+LEAP = 0.5
+"""Part of the time between states by which stamps leap at least, and error of the leap that is
+heard, as a part of it."""
+
+ALIKE = 0.25
+"""Part of what positions moved too far that may remain where stamps have leapt instead."""
 
 ONCE_MORE = 4
 """How often a state that is not believed comes again, with its stamp, until it is: a robot that
@@ -133,8 +143,9 @@ class StateCheck:
         self._both = np.zeros((2, 2, model.nv))
         self._before, self._now = (State(q, v) for q, v in self._both)
         self._drift: Array = np.zeros_like(limit)
-        low, high = position_min - width, position_max + width
+        low, high = np.maximum(position_min - width, -FAR), np.minimum(position_max + width, FAR)
         self._nonsense = bound(_nonsense, self._now, low, high, IMPOSSIBLE * limit, known)
+        self._passed = bound(_passed, self._before, self._now, known, numbers=2)
         self._compare = bound(
             _compare, self._before, self._now, self._errors, self._drift, known, numbers=2
         )
@@ -145,8 +156,8 @@ class StateCheck:
 
     def reset(self) -> None:
         """Begin anew: any state may come next."""
-        self._goes = False  # whether one came before, and was no nonsense
-        self._time = -np.inf  # its time, s
+        self._first, self._sense = True, True  # whether none came before; whether that made sense
+        self._time = self._heard = -np.inf  # its time, and when it came, s
         self._believed: tuple[State, float] | None = None
         self._drift.fill(0.0)
         self._agreement.reset()
@@ -163,12 +174,13 @@ class StateCheck:
         """Say how the arm moves from the last state on."""
         self._freeze.expected = expected
 
-    def look(self, state: State, stamp: float) -> str:
+    def look(self, state: State, stamp: float, now: float = np.inf) -> str:
         """Look at the next state; return what is wrong, `UNDECIDED`, or nothing.
 
         Args:
             state: finite, shapes (n,).
             stamp: its time, s.
+            now: when it came, on a clock of its own, s; inf if that is not known.
         """
         h = stamp - self._time
         if (self._doubt or self._agreement.undecided) and -GAP <= h <= 0.0:
@@ -185,14 +197,20 @@ class StateCheck:
         nonsense = OUTSIDE if outside else TOO_FAST if too_fast else ""
         if not 0.0 < h <= GAP:
             self.reset()
-        # Joints that are exchanged may leave each other's range, and must be seen to leap back.
-        follows = not nonsense or (self._leaps.exchanged and not too_fast)
-        goes, self._goes, self._time = self._goes, follows, stamp
-        if not follows:
+        first, sense = self._first, self._sense
+        heard, self._heard = now - self._heard, now
+        self._first, self._sense, self._time = False, not nonsense, stamp
+        if not (first or nonsense) and heard < np.inf:
+            h = self._passed(h, heard)
+        if nonsense:
+            np.clip(self._now.q, -FAR, FAR, out=self._now.q)
+        if (nonsense or not sense) and not first and self._believed is not None:
+            # It leaps, too: exchanged joints, out of each other's range at first, come back to it.
+            self._leaps.look(h, self._believed[0].v)
+        if nonsense:
             self._doubt, self._agreed = nonsense, 0.0
-            self._leaps.forget()
             return nonsense
-        if not goes:  # at the beginning, or after nonsense
+        if first or not sense:
             self._agreed = 0.0
             if not self._doubt:
                 self._believed = state, stamp
@@ -216,16 +234,20 @@ class StateCheck:
         elif jumps and not self._doubt:
             self._doubt = JUMP
         undecided = self._agreement.undecided and not self._doubt
-        if (self._doubt or undecided) and self._believed is not None:
-            still = self._doubt == FROZEN
-            agreement, v = self._agreement, self._believed[0].v
-            went_on = self._freeze.went_on()
-            self._leaps.look(h, v, agreement.room, agreement.exchanged, still, slowly, went_on)
-        elif self._leaps.follows:
-            self._leaps.clear()
-        if nonsense:
-            self._doubt, self._agreed = nonsense, 0.0
-            return nonsense
+        if not (self._doubt or undecided):
+            if self._leaps.follows:
+                self._leaps.clear()
+        elif self._believed is not None and sense:
+            agreement, still = self._agreement, self._doubt == FROZEN
+            self._leaps.look(
+                h,
+                self._believed[0].v,
+                agreement.room,
+                agreement.exchanged,
+                still,
+                slowly,
+                self._freeze.went_on(),
+            )
         if undecided:
             return UNDECIDED
         if self._doubt:
@@ -282,6 +304,33 @@ def _nonsense(
         outside = outside or not low[i] <= now.q[i] <= high[i]
         too_fast = too_fast or (with_velocities and abs(now.v[i]) > fastest[i])
     return outside, too_fast
+
+
+@compiled
+def _passed(before: State, now: State, with_velocities: bool, h: float, heard: float) -> float:
+    """Return the time between two states: not h where stamps have leapt.
+
+    That is where the time between the messages that were `heard`, and how far all joints moved at
+    their velocities, tell the same other time.
+    """
+    leap = heard - h
+    if not with_velocities or abs(leap) < LEAP * min(h, heard):
+        return h
+    way = square = 0.0
+    for i in range(now.q.size):
+        v = 0.5 * (before.v[i] + now.v[i])
+        way += v * (now.q[i] - before.q[i])
+        square += v * v
+    if square == 0.0:
+        return h
+    passed = way / square
+    if passed <= 0.0 or abs(passed - heard) > LEAP * abs(leap):
+        return h
+    e = left = 0.0
+    for i in range(now.q.size):
+        v, moved = 0.5 * (before.v[i] + now.v[i]), now.q[i] - before.q[i]
+        e, left = max(e, abs(moved - h * v)), max(left, abs(moved - passed * v))
+    return passed if left <= ALIKE * e else h
 
 
 @compiled
