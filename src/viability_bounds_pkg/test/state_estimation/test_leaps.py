@@ -188,3 +188,22 @@ def test_nonsense_is_undone_by_the_next_state(size):
     with np.errstate(all="raise"):
         refused = play(make_check(), to_and_fro, 1.0, 1.0 + 1.5 * H)
     assert [wrong for _, wrong in refused] == [OUTSIDE, OUTSIDE]
+
+
+@pytest.mark.parametrize("begin", [1.5, (2.0 * np.pi - 3.0) / 2.0])
+def test_units_that_change_are_undone_for_all_joints_at_once(begin):
+    """What is at zero as they change, or change back, leaps too little then to be seen."""
+
+    def motion(t):
+        q, v = sine(t)
+        if begin == 1.5:  # and is at zero as the arm has stopped
+            left = max(begin + 0.06 - t, 0.0)
+            q[2], v[2] = left, -1.0 if left else 0.0
+        return State(q, v)
+
+    def degrees(state, t):
+        return State(57.3 * state.q, 57.3 * state.v)
+
+    refused = play(make_check(), degrees, begin, begin + 0.6, begin + 2.0, motion=motion)
+    assert refused[-1][0] < begin + 0.6 + 2.0 * WINDOW
+    assert len(refused) == round((refused[-1][0] - refused[0][0]) / H) + 1

@@ -109,6 +109,7 @@ class Leaps:
             each.fill(0.0)
         self._pair: list[int] = []  # joints that are exchanged
         self._returned = False  # whether a joint has leapt back
+        self._nonsense = False  # whether a state was
 
     def look(
         self,
@@ -119,6 +120,7 @@ class Leaps:
         frozen: bool = False,
         lies: bool = False,
         went_on: NDArray[np.bool_] | None = None,
+        nonsense: bool = False,
     ) -> None:
         """Look at the next state.
 
@@ -131,6 +133,7 @@ class Leaps:
             lies: whether positions have contradicted velocities for longer than a state or two.
             went_on: positions that froze untold and go on now, as far as can be seen, shape (n,);
                 None for none.
+            nonsense: whether the next state is beyond all limits.
         """
         (q0, v0), (q1, v1), errors = self._before, self._now, self._errors
         moved = q1 - q0
@@ -167,13 +170,18 @@ class Leaps:
             self._is[self._is == _Is.CALM] = _Is.LYING
         calm, pending = self._is == _Is.CALM, self._is == _Is.PENDING
         away = self._is == _Is.AWAY
-        self._is[calm & leaps] = _Is.PENDING
+        returns = bool((away & back).any())
+        if not returns:  # else it was too small to be seen at first, and ends with the others
+            self._is[calm & leaps] = _Is.PENDING
         self._is[calm & leaps & thaw] = _Is.LYING
         self._is[pending] = _Is.AWAY
         self._is[pending & leaps & alike] = _Is.LYING
         self._is[pending & leaps & (left <= 0.0)] = _Is.CALM
         self._is[away & back] = _Is.CALM
-        self._returned |= bool((away & back).any() or (pending & leaps & (left <= 0.0)).any())
+        self._nonsense |= nonsense
+        if returns and self._nonsense:  # of all joints, where they are as in other units
+            self._is[away] = _Is.CALM
+        self._returned |= returns or bool((pending & leaps & (left <= 0.0)).any())
         self._size = np.where(calm, np.abs(self._sum), self._size)
         if exchanged is not None:
             joints = list(exchanged)

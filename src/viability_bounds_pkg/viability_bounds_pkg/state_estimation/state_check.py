@@ -206,7 +206,7 @@ class StateCheck:
             np.clip(self._now.q, -FAR, FAR, out=self._now.q)
         if (nonsense or not sense) and not first and self._believed is not None:
             # It leaps, too: exchanged joints, out of each other's range at first, come back to it.
-            self._leaps.look(h, self._believed[0].v)
+            self._leaps.look(h, self._believed[0].v, nonsense=bool(nonsense))
         if nonsense:
             self._doubt, self._agreed = nonsense, 0.0
             return nonsense
