@@ -207,3 +207,21 @@ def test_units_that_change_are_undone_for_all_joints_at_once(begin):
     refused = play(make_check(), degrees, begin, begin + 0.6, begin + 2.0, motion=motion)
     assert refused[-1][0] < begin + 0.6 + 2.0 * WINDOW
     assert len(refused) == round((refused[-1][0] - refused[0][0]) / H) + 1
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_a_bias_of_velocities_that_begins_as_a_joint_comes_to_rest_is_not_one_that_froze(known):
+    """Its position is the same afterwards, though it seemed to move: its velocity says why."""
+    begin = 2.0 if known else 0.4
+
+    def comes_to_rest(t):
+        q, v = sine(t)
+        rest = sine(begin).q
+        q[2], v[2] = (q[2], v[2]) if t < begin else (rest[2], 0.0)
+        return State(q, v)
+
+    def biased(state, t):
+        return state._replace(v=state.v + (0.6 if t > begin + 0.5 * H else 0.0))
+
+    times = refused_at(play(make_check(), biased, begin, begin + 0.6, 6.0, motion=comes_to_rest))
+    assert begin + 0.6 < times[-1] < begin + 0.6 + 3.0 * WINDOW

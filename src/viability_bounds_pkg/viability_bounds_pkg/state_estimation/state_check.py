@@ -142,7 +142,7 @@ class StateCheck:
         # The last state that came, and the one that is looked at, where compiled code reads them.
         self._both = np.zeros((2, 2, model.nv))
         self._before, self._now = (State(q, v) for q, v in self._both)
-        self._drift: Array = np.zeros_like(limit)
+        self._drift, self._steps = np.zeros((2, model.nv))
         low, high = np.maximum(position_min - width, -FAR), np.minimum(position_max + width, FAR)
         self._nonsense = bound(_nonsense, self._now, low, high, IMPOSSIBLE * limit, known)
         self._passed = bound(_passed, self._before, self._now, known, numbers=2)
@@ -167,6 +167,7 @@ class StateCheck:
         self._doubt = ""
         self._again = 0  # how often the last state has come once more
         self._contradiction = False  # whether it is more than a jump
+        self._steps.fill(0.0)  # largest change of each velocity between two states in doubt, rad/s
         self._freeze.reset()
         self._leaps.clear()
 
@@ -252,8 +253,11 @@ class StateCheck:
             return UNDECIDED
         if self._doubt:
             self._agreement.undecided = False
+            (_, v0), (_, v1) = self._both
+            np.maximum(self._steps, np.abs(v1 - v0), out=self._steps)
         if self._doubt and self._goes_on(state, stamp):
             self._doubt, self._contradiction = "", False
+            self._steps.fill(0.0)
             self._freeze.believe()
             self._leaps.clear()
         self._trusted = 0.0 if self._doubt else self._trusted + h
@@ -285,9 +289,11 @@ class StateCheck:
             off = off + STOPS * UNSURE
         on = STOPS * before.v
         near = (np.minimum(on, 0.0) - off <= moved) & (moved <= np.maximum(on, 0.0) + off)
+        # One whose velocity is half less at once stood, and its velocity lied.
+        froze = (state.q == before.q) & (self._steps < 0.5 * np.abs(before.v))
         if self._doubt == FROZEN and self._freeze.changing >= WINDOW and not away:
             patience = WINDOW
-        elif away or ((state.q == before.q) & (np.abs(before.v) > errors.velocity)).any():
+        elif away or (froze & (np.abs(before.v) > errors.velocity)).any():
             patience = max(self._patience, STUCK)
         else:
             patience = self._patience
