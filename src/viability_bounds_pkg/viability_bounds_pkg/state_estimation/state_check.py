@@ -167,7 +167,7 @@ class StateCheck:
         self._doubt = ""
         self._again = 0  # how often the last state has come once more
         self._contradiction = False  # whether it is more than a jump
-        self._steps.fill(0.0)  # largest change of each velocity between two states in doubt, rad/s
+        self._steps.fill(0.0)  # changes of velocities of an arm that has stopped in doubt, rad/s
         self._freeze.reset()
         self._leaps.clear()
 
@@ -253,8 +253,9 @@ class StateCheck:
             return UNDECIDED
         if self._doubt:
             self._agreement.undecided = False
-            (_, v0), (_, v1) = self._both
-            np.maximum(self._steps, np.abs(v1 - v0), out=self._steps)
+            if self._believed is not None and stamp - self._believed[1] > STOPS:
+                (_, v0), (_, v1) = self._both
+                np.maximum(self._steps, np.abs(v1 - v0), out=self._steps)
         if self._doubt and self._goes_on(state, stamp):
             self._doubt, self._contradiction = "", False
             self._steps.fill(0.0)
@@ -289,7 +290,8 @@ class StateCheck:
             off = off + STOPS * UNSURE
         on = STOPS * before.v
         near = (np.minimum(on, 0.0) - off <= moved) & (moved <= np.maximum(on, 0.0) + off)
-        # One whose velocity is half less at once stood, and its velocity lied.
+        # One that still seemed to move after the stop, and does not from one state to the next,
+        # stood, and its velocity lied.
         froze = (state.q == before.q) & (self._steps < 0.5 * np.abs(before.v))
         if self._doubt == FROZEN and self._freeze.changing >= WINDOW and not away:
             patience = WINDOW
