@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -50,6 +51,21 @@ def at_rate(by_node: Mapping[str, Mapping[str, Any]], rate: float | None) -> dic
     v_max, slower = np.array(own["velocity_max"]), np.array(bounds["velocity_max"])
     changes["bounds_node"]["velocity_max"] = (v_max - (v_max - slower) / share).tolist()
     changes["bounds_node"]["position_margin"] = bounds["position_margin"] / share
+    if row := own.get("missed_in_row"):  # an imperfect robot: what lasts is as long as it was, in s
+        delays = math.floor(share * own["state_delay"]), math.ceil(share * own["command_delay"])
+        row = math.ceil(share * row)
+        finer = share * share  # encoders, so that estimates of accelerations are as good
+        error = [finer * each for each in own["position_error"]]
+        for each in changes.values():
+            each |= {"delay": sum(delays), "missed_deadlines": row, "position_error": error}
+        changes["bounds_node"]["bounds_dt_factor"] = share * bounds["bounds_dt_factor"]
+        changes["bullet_node"] |= {
+            "encoder_resolution": [finer * each for each in own["encoder_resolution"]],
+            "state_delay": delays[0],
+            "command_delay": delays[1],
+            "missed_in_row": row,
+            "command_timeout": row,
+        }
     return changes
 
 

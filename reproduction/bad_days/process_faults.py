@@ -82,6 +82,7 @@ _TOGETHER = [sys.executable, str(Path(__file__).with_name(f"{TOGETHER}.py"))]
 
 Array = NDArray[np.float64]
 
+IMPERFECT_RATE = 500.0  # Hz, least: estimates are worse at a lower rate
 START = 60.0  # s, in which nodes must start
 STILL = 0.05, 1.0  # s, shortest and longest time in which a node stands still
 APART = 1.0  # s between starts of nodes
@@ -155,8 +156,8 @@ class Bench:
         more = [f"imperfect/{robot}"] * kind.imperfect
         changes = STIFF | {"start_paused": False, "clock": "real_time"} | dict(kind.values)
         found = load_node_values(robot, *more)
-        if kind.imperfect:  # what is declared is for the robot's own rate
-            rate = None
+        if kind.imperfect:
+            rate = rate and max(rate, IMPERFECT_RATE)
             # Noise of the torques would count as their steps.
             changes["current_noise"] = [0.0] * len(found[ROBOT]["joints"])
         elif hold is not None:
