@@ -51,7 +51,7 @@ def at_rate(by_node: Mapping[str, Mapping[str, Any]], rate: float | None) -> dic
     v_max, slower = np.array(own["velocity_max"]), np.array(bounds["velocity_max"])
     changes["bounds_node"]["velocity_max"] = (v_max - (v_max - slower) / share).tolist()
     changes["bounds_node"]["position_margin"] = bounds["position_margin"] / share
-    if row := own.get("missed_in_row"):  # an imperfect robot: what lasts is as long as it was, in s
+    if row := own.get("missed_in_row"):  # imperfect: what lasts is as long as it was, in s
         delays = math.floor(share * own["state_delay"]), math.ceil(share * own["command_delay"])
         row = math.ceil(share * row)
         finer = share * share  # encoders, so that estimates of accelerations are as good

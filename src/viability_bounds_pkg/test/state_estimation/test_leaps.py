@@ -209,6 +209,18 @@ def test_units_that_change_are_undone_for_all_joints_at_once(begin):
     assert len(refused) == round((refused[-1][0] - refused[0][0]) / H) + 1
 
 
+@pytest.mark.parametrize("size", [0.03, 0.3, -0.3])
+def test_a_leap_that_stays_as_nonsense_of_another_joint_ends_is_not_believed(size):
+    def two(state, t):
+        q = state.q + size * np.eye(N)[2]
+        return state._replace(q=q + (10.0 * np.eye(N)[0] if t < 1.6 else 0.0))
+
+    refused = play(make_check(), two, end=2.2, last=4.0)
+    assert [wrong for t, wrong in refused if t < 1.6][-1] == OUTSIDE
+    assert 2.2 < refused[-1][0] < 2.2 + 2.0 * WINDOW
+    assert len(refused) == round((refused[-1][0] - refused[0][0]) / H) + 1
+
+
 @pytest.mark.parametrize("known", [False, True])
 def test_a_bias_of_velocities_that_begins_as_a_joint_comes_to_rest_is_not_one_that_froze(known):
     """Its position is the same afterwards, though it seemed to move: its velocity says why."""

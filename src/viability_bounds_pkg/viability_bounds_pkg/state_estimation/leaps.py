@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from viability_bounds_pkg.state import State
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 STOPS = 0.35
 """How far an arm that is not believed may have moved on, as a multiple of its speed, s."""
@@ -119,7 +120,7 @@ class Leaps:
         exchanged: tuple[int, int] | None = None,
         frozen: bool = False,
         lies: bool = False,
-        went_on: NDArray[np.bool_] | None = None,
+        went_on: Mask | None = None,
         nonsense: bool = False,
     ) -> None:
         """Look at the next state.
@@ -179,8 +180,9 @@ class Leaps:
         self._is[pending & leaps & (left <= 0.0)] = _Is.CALM
         self._is[away & back] = _Is.CALM
         self._nonsense |= nonsense
-        if returns and self._nonsense:  # of all joints, where they are as in other units
-            self._is[away] = _Is.CALM
+        if returns and self._nonsense:
+            units = _other_units(self._before, self._now, away & back, errors, h)
+            self._is[away & units] = _Is.CALM
         self._returned |= returns or bool((pending & leaps & (left <= 0.0)).any())
         self._size = np.where(calm, np.abs(self._sum), self._size)
         if exchanged is not None:
@@ -216,3 +218,25 @@ class Leaps:
         """Whether one of these leaps is more than errors of positions, or an exchange."""
         more = np.abs(self._sum) > self._errors.position
         return bool(self._pair) or bool((more & (self._is == _Is.AWAY)).any())
+
+
+def _other_units(before: State, now: State, known: Mask, errors: Errors, h: float) -> Mask:
+    """Return which joints were in other units, as those are `known` to be; shape (n,).
+
+    A joint near zero leaps little as units change, or as they change back, and so is not seen to
+    leap back.
+
+    Args:
+        before: the last state in other units.
+        now: the one after it.
+        known: joints that leapt back now, shape (n,).
+        errors: of states.
+        h: time between both, s.
+    """
+    q0, (q, v) = before.q, now
+    square = float(q[known] @ q[known])
+    if square == 0.0:
+        return np.zeros_like(known)
+    factor = float(q0[known] @ q[known]) / square
+    off = np.abs(factor) * (errors.position + h * np.abs(v))
+    return np.asarray(np.abs(q0 - factor * q) <= off)
