@@ -234,6 +234,38 @@ def test_a_leap_in_the_way_of_the_only_joint_that_moves_is_no_clock_that_was_set
         assert (wrong not in ("", UNDECIDED)) == (k >= 700), k
 
 
+@pytest.mark.parametrize("speed", [0.0, 0.02, -0.02])
+@pytest.mark.parametrize("b", [-2.0, 0.6])
+@pytest.mark.parametrize("early", [0.5, 0.8, 0.99])
+def test_a_bias_of_velocities_of_an_arm_that_hardly_moves_is_no_clock_that_was_set(
+    speed, b, early
+):
+    """As if hardly any time had passed; and the message came that soon after one that was late."""
+    check = make_check()
+    rest = sine(3.0).q
+    said = []
+    for k in range(2000):
+        t = k * H
+        state = sine(t) if t < 3.0 else State(rest + speed * (t - 3.0), np.full(N, speed))
+        if k >= 1900:
+            state = state._replace(v=state.v + b)
+        said.append(check.look(state, t, t + (early * H if k == 1899 else 0.0)))
+    assert set(said[1600:1900]) == {""}
+    assert said[1900:1902] == [UNDECIDED, CONTRADICTION]
+
+
+def test_a_stamp_that_is_hardly_newer_blinds_for_no_lie_afterwards():
+    check = make_check()
+    stamps = H * np.arange(1000)
+    stamps[700] = stamps[699] + 0.01 * H
+    said = []
+    for k, t in enumerate(stamps):
+        q, v = sine(k * H)
+        said.append(check.look(State(q, v + (0.6 if k >= 703 else 0.0)), t))
+    assert set(said[600:700]) == {""} and set(said[700:703]) <= {"", UNDECIDED}
+    assert CONTRADICTION in said[703:706]
+
+
 @pytest.mark.parametrize("times", [0.8, 1.3, 57.3])
 @pytest.mark.parametrize("joints", [slice(2, 3), slice(None)], ids=["one", "all"])
 def test_velocities_in_other_units_are_not_taken_for_a_clock_that_was_set(times, joints):

@@ -62,6 +62,12 @@ SLOWLY = 0.02
 LONGER = 1.5
 """A period so many times the shortest is not compared: torques may have changed within it."""
 
+SHORTER = 0.9
+"""By how much the shortest one gets less at a state: one odd stamp blinds for none."""
+
+APART = 0.75
+"""Part of a period by which two states are apart at least, where a clock was set."""
+
 CALM = 0.2
 """Time after an impact in which another one is believed at once: hands rattle on tables, s."""
 
@@ -113,11 +119,12 @@ class Agreement:
         undecided: whether the last state is.
         exchanged: joints that have exchanged their places with it; None for none.
         room: what an impact and the tolerance explain of its e, shape (n,), rad; None if unknown.
+        period: the shortest time between states, about, s; inf if unknown.
     """
 
     def __init__(self, before: State, now: State, error: Array) -> None:
         self._seen = _Seen(*(np.zeros_like(error) for _ in _Seen._fields))
-        self._judge = bound(_judge, before, now, error, self._seen, numbers=3)
+        self._judge = bound(_judge, before, now, error, self._seen, numbers=4)
         self.reset()
 
     def reset(self) -> None:
@@ -127,7 +134,7 @@ class Agreement:
         self.undecided = False
         self.exchanged: tuple[int, int] | None = None
         self.room: Array | None = None
-        self._shortest = math.inf  # time between states, about, s
+        self.period = math.inf
         self._impact = -math.inf  # time of the last, s
         self._clock = False  # whether it may be that a clock was set
 
@@ -142,10 +149,13 @@ class Agreement:
         second, self.undecided = self.undecided, False
         self.exchanged = self.room = None
         if h > 0.0:
-            self._shortest = min(h, 1.01 * self._shortest)
-        if not 0.0 < h <= LONGER * self._shortest:
+            known = math.isfinite(self.period)
+            self.period = min(max(h, SHORTER * self.period), 1.01 * self.period) if known else h
+        if not 0.0 < h <= LONGER * self.period:
             return False
-        odd, apart, clock, i, j = self._judge(h, float(second), float(not doubted))
+        odd, apart, clock, i, j = self._judge(
+            h, self.period, float(second), float(not doubted)
+        )
         self.room = self._seen.room
         if j > 0:
             self.exchanged = i, j
@@ -165,6 +175,7 @@ def _judge(
     error: Array,
     seen: _Seen,
     h: float,
+    period: float,
     second: float,
     learns: float,
 ) -> tuple[bool, bool, bool, int, int]:
@@ -179,6 +190,7 @@ def _judge(
         error: of velocities.
         seen: is kept.
         h: time between both, s.
+        period: the shortest such time, about.
         second: whether the period before counts as well.
         learns: whether what is within the tolerance is learned from.
     """
@@ -220,19 +232,22 @@ def _judge(
             for i in range(j):
                 if _exchanged(before, now, error, seen, h, i, j):
                     return odd, apart, False, i, j
-    return odd, apart, odd and _clock_was_set(before, now, seen, h), 0, 0
+    return odd, apart, odd and _clock_was_set(before, now, seen, h, period), 0, 0
 
 
 @compiled
-def _clock_was_set(before: State, now: State, seen: _Seen, h: float) -> bool:
-    """Return whether e is -d v for all joints, with |d| < h."""
+def _clock_was_set(before: State, now: State, seen: _Seen, h: float, period: float) -> bool:
+    """Return whether e is -d v for all joints, with h - d about a period.
+
+    A bias of the velocities of an arm that stands gives d = h.
+    """
     e_v = v_v = most = 0.0
     for i in range(seen.e.size):
         v = 0.5 * (before.v[i] + now.v[i])
         e_v += seen.e[i] * v
         v_v += v * v
         most = max(most, abs(seen.e[i]))
-    if abs(e_v) >= h * v_v:
+    if v_v == 0.0 or not APART * period <= h + e_v / v_v <= LONGER * period:
         return False
     fits = True
     for i in range(seen.e.size):

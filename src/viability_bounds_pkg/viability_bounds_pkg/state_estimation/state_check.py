@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from viability_bounds_pkg.compiled import bound, compiled
 from viability_bounds_pkg.state import State
-from viability_bounds_pkg.state_estimation.agreement import Agreement
+from viability_bounds_pkg.state_estimation.agreement import APART, Agreement
 from viability_bounds_pkg.state_estimation.freeze_check import FROZEN, Expected, FreezeCheck
 from viability_bounds_pkg.state_estimation.leaps import STOPS, UNSURE, Errors, Leaps, free
 
@@ -145,7 +145,7 @@ class StateCheck:
         self._drift, self._steps = np.zeros((2, model.nv))
         low, high = np.maximum(position_min - width, -FAR), np.minimum(position_max + width, FAR)
         self._nonsense = bound(_nonsense, self._now, low, high, IMPOSSIBLE * limit, known)
-        self._passed = bound(_passed, self._before, self._now, known, numbers=2)
+        self._passed = bound(_passed, self._before, self._now, known, numbers=3)
         self._compare = bound(
             _compare, self._before, self._now, self._errors, self._drift, known, numbers=2
         )
@@ -202,7 +202,7 @@ class StateCheck:
         heard, self._heard = now - self._heard, now
         self._first, self._sense, self._time = False, not nonsense, stamp
         if not (first or nonsense) and heard < np.inf:
-            h = self._passed(h, heard)
+            h = self._passed(h, heard, APART * self._agreement.period)
         if nonsense:
             np.clip(self._now.q, -FAR, FAR, out=self._now.q)
         if (nonsense or not sense) and not first and self._believed is not None:
@@ -315,11 +315,14 @@ def _nonsense(
 
 
 @compiled
-def _passed(before: State, now: State, with_velocities: bool, h: float, heard: float) -> float:
+def _passed(
+    before: State, now: State, with_velocities: bool, h: float, heard: float, least: float
+) -> float:
     """Return the time between two states: not h where stamps have leapt.
 
     That is where the time between the messages that were `heard`, and how far all joints moved at
-    their velocities, tell the same other time.
+    their velocities, tell the same other time. It is at `least` about a period: velocities with a
+    bias, of an arm that hardly moves, tell hardly any time.
     """
     leap = heard - h
     if not with_velocities or abs(leap) < LEAP * min(h, heard):
@@ -332,7 +335,7 @@ def _passed(before: State, now: State, with_velocities: bool, h: float, heard: f
     if square == 0.0:
         return h
     passed = way / square
-    if passed <= 0.0 or abs(passed - heard) > LEAP * abs(leap):
+    if passed < least or abs(passed - heard) > LEAP * abs(leap):
         return h
     e = left = 0.0
     for i in range(now.q.size):
