@@ -153,9 +153,7 @@ class Agreement:
             self.period = min(max(h, SHORTER * self.period), 1.01 * self.period) if known else h
         if not 0.0 < h <= LONGER * self.period:
             return False
-        odd, apart, clock, i, j = self._judge(
-            h, self.period, float(second), float(not doubted)
-        )
+        odd, apart, clock, i, j = self._judge(h, self.period, float(second), float(not doubted))
         self.room = self._seen.room
         if j > 0:
             self.exchanged = i, j
