@@ -22,11 +22,12 @@ from direct import DirectLoop
 
 from sim_bridge.bullet.obstacles import Obstacle
 from torque_safety_controller.anti_windup import project_to_limits
-from torque_safety_controller.node.streams.limits import LimitsReader
+from torque_safety_controller.node.assembly import make_state_check
+from torque_safety_controller.qp.constraints import fault_of
+from torque_safety_controller.safety.command_watch import CommandWatch
 from viability_bounds_pkg.cli.command_line import INTERRUPTED
 from viability_bounds_pkg.compiled import compilations, compiled_functions, is_kept
 from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError
-from viability_bounds_pkg.ros.messages import JointStateReader
 from viability_bounds_pkg.stopping.coordinated_stop import CoordinatedStop
 
 CONFIG = Path(__file__).resolve().parent.parent / "config"
@@ -58,8 +59,7 @@ def compile_all() -> None:
         play("panda", wall["ros__parameters"])
         touch()
         stop()
-        LimitsReader(["joint"])
-        JointStateReader(["joint"])
+        watch()
         project_to_limits(np.zeros(1), np.zeros(1), np.ones(1))
 
 
@@ -89,6 +89,15 @@ def stop() -> None:
     law = CoordinatedStop(loop.model, loop.limits, np.full(len(q), 0.1), loop.dt)
     law.begin(q, v)
     law.torque(q, v)
+
+
+def watch() -> None:
+    """Make what looks at states, limits and torques."""
+    loop = DirectLoop("panda")
+    none = np.zeros(loop.model.nv)
+    make_state_check(loop._controller_configuration(), loop.model, None)
+    CommandWatch(none, 1)
+    fault_of(none, none)
 
 
 @contextmanager

@@ -34,14 +34,17 @@ for function in compiled_functions():
 """
 
 COMPILED_BY_NODES = """
-import sys, yaml
+import runpy, sys, yaml
 from chain import load_values, run_chain
 from viability_bounds_pkg.compiled import compiled_functions
 
+runpy.run_path("scripts/compile.py")["compile_all"]()
+# What other programs have left does not count.
+ahead = {function: set(function.overloads) for function in compiled_functions()}
 for robot, changes in yaml.safe_load(sys.argv[1]):
     run_chain(load_values(robot) | changes, {"duration": 0.02, "events": []}, {})
 for function in compiled_functions():
-    for types in function.stats.cache_misses:
+    for types in set(function.overloads) - ahead.get(function, set()):
         print(function, *types)
 """
 
@@ -76,7 +79,6 @@ def test_every_compiled_function_is_kept(not_kept):
     assert not_kept == ""
 
 
-@pytest.mark.usefixtures("not_kept")
 def test_nodes_compile_nothing():
     assert run("-c", COMPILED_BY_NODES, yaml.safe_dump(PLAYED)) == ""
 
