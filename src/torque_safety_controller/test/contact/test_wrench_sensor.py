@@ -107,7 +107,9 @@ def test_a_silent_sensor_says_so_and_comes_back_without_a_kick():
     assert not here.rate.any()
 
 
-@pytest.mark.parametrize("raw", [np.full(6, np.nan), [1, 2, 3, 4, 5, np.inf], np.zeros(5)])
+@pytest.mark.parametrize(
+    "raw", [np.full(6, np.nan), [1, 2, 3, 4, 5, np.inf], np.zeros(5), [0, 0, 0, -1e300, 0, 0]]
+)
 def test_a_measurement_that_is_none_changes_nothing(raw):
     here = sensor()
     step(here, np.ones(6))

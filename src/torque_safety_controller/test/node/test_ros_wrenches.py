@@ -13,6 +13,7 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from std_srvs.srv import Trigger
 
 from torque_safety_controller.contact import interaction
+from torque_safety_controller.contact.wrench_sensor import STRONGEST
 from torque_safety_controller.node.assembly import make_controller
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from viability_bounds_pkg.exceptions import SettingError
@@ -120,6 +121,8 @@ def test_measurements_that_are_none_are_dropped_counted_and_named(ros):
     assert hand.reported("compliance") == "sensor silent"
     hand.feels = wrench(force=(0.0, 30.0, 0.0), frame="moon")
     hand.until("wrenches_refused", "another frame_id")
+    hand.feels = wrench(force=(0.0, 1e300, 0.0))
+    hand.until("wrenches_refused", "beyond 100000 N or N m")
     assert hand.reported("compliance") == "sensor silent"
 
 
@@ -147,6 +150,7 @@ def test_a_target_is_exerted_and_torques_say_so(ros, monkeypatch):
     ("message", "changed"),
     [
         (wrench(force=(0.0, 0.0, math.inf)), {}),
+        (wrench(force=(0.0, 0.0, 1e300)), {}),
         (wrench(frame="moon"), {}),
         (wrench(force=(0.0, 0.0, 10.0)), {"force_directions": [0.0] * 6}),
         (
@@ -163,6 +167,21 @@ def test_targets_that_cannot_be_exerted_are_refused(ros, message, changed):
     hand.targets.publish(message)
     hand.until("goals_refused", "target_wrench")
     assert hand.reported("compliance") != "force"
+
+
+def test_after_the_strongest_wrenches_that_are_taken_the_arm_goes_on(ros):
+    """Sums, squares and filters of larger ones would not be finite for ever."""
+    hand = WrenchChain(ros)
+    hand.feels = wrench(force=(STRONGEST, -STRONGEST, STRONGEST), frame="panda_link8")
+    hand.give_pose()
+    hand.targets.publish(wrench(force=(STRONGEST, STRONGEST, -STRONGEST), frame="panda_hand"))
+    hand.until("compliance", "force")
+    hand.feels = wrench()
+    hand.targets.publish(wrench(force=(0.0, 0.0, 1.0), frame="panda_hand"))
+    hand.until("target_wrench", "1")
+    for _ in range(1000):  # 2 s
+        hand.step()
+    assert hand.reported("mode") == "TRACKING"
 
 
 def test_a_tare_takes_what_is_felt_for_the_bias_but_not_from_a_hand_that_is_led(ros):

@@ -26,6 +26,9 @@ from viability_bounds_pkg.parameter import above, number
 
 Array = NDArray[np.float64]
 
+STRONGEST = 1e5
+"""Largest force or moment that is taken for one, N or N m: no arm bears more."""
+
 _TARE_TIME = 0.2  # s, of the mean that becomes the bias
 
 
@@ -103,6 +106,8 @@ class WrenchSensor:
         raw = np.array(raw, dtype=np.float64)
         if raw.shape != (6,) or not np.isfinite(raw).all():
             raise WrenchError("not six finite numbers")
+        if np.abs(raw).max() > STRONGEST:
+            raise WrenchError(f"beyond {STRONGEST:g} N or N m")
         self._raw = raw
 
     def update(self, rotation: Array, elapsed: float) -> None:

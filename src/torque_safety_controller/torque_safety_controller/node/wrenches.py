@@ -15,7 +15,7 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from torque_safety_controller.contact.interaction import Compliance, Interaction
-from torque_safety_controller.contact.wrench_sensor import WrenchError, WrenchSensor
+from torque_safety_controller.contact.wrench_sensor import STRONGEST, WrenchError, WrenchSensor
 from torque_safety_controller.node.goals import GoalRefused, GoalSubscriber
 from torque_safety_controller.node.topics import TARE_FT_SENSOR, TARGET_WRENCH
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
@@ -94,6 +94,8 @@ class WrenchSubscriber:
         wrench = wrench_of(message)
         if not np.isfinite(wrench).all():
             raise GoalRefused("wrench is not finite")
+        if (strong := np.abs(wrench).max()) > STRONGEST:
+            raise GoalRefused(f"wrench has {strong:g}; allowed: up to {STRONGEST:g} N or N m")
         frame = message.header.frame_id
         hand, base = config.end_effectors[0], config.base_frame
         if frame not in ("", hand, base):
