@@ -504,12 +504,13 @@ class Stack:
     def reset(self) -> None:
         """Put the robot at its start."""
         robot, controller = self.nodes["bullet_node"], self.nodes.get("controller_node")
-        for _ in range(3):
+        for _ in range(4):
             self.wire.call(robot, "reset", Trigger.Request())
             ahead = -np.inf
             if controller is not None:
                 ahead = 1e-9 * (controller._states.stamp - robot._stamp)
-            # Where a stamp ahead was believed, the gap in time that tells of a reset is missing.
+            # Where a stamp ahead was believed, the gap in time that tells of a reset is missing: of
+            # less than 2 s, three more make one.
             if not -GAP <= ahead < _AHEAD:
                 break
         # Then the controller does not see it, and drives go back to where they held the arm, at
