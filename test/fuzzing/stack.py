@@ -509,8 +509,8 @@ class Stack:
             ahead = -np.inf
             if controller is not None:
                 ahead = 1e-9 * (controller._states.stamp - robot._stamp)
-            # Where a stamp ahead was believed, the gap in time that tells of a reset is missing: of
-            # less than 2 s, three more make one.
+            # Where a stamp ahead was believed, the gap in time that tells of a reset is missing;
+            # where it is less than 2 s ahead, three more resets make one.
             if not -GAP <= ahead < _AHEAD:
                 break
         # Then the controller does not see it, and drives go back to where they held the arm, at
