@@ -30,7 +30,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Measure no coverage of the long ones: it takes a third more time, and shows little more."""
+    """Measure no coverage of the long ones: it takes a third more time."""
     if config.pluginmanager.hasplugin("_cov"):
         for item in items:
             if item.get_closest_marker("long"):
