@@ -69,10 +69,11 @@ def test_a_recording_has_goals_pushes_and_the_robot(recorded):
     assert [m.wrench.force.y for _, m in messages["/external_wrench"]] == [20.0, 0.0]
     assert "<robot" in messages["/robot_description"][0][1].data
     assert messages["/diagnostics"] and messages["/hand_pose"] and messages["/limit_distances"]
-    # All on one clock, that of the robot.
+    # All on one clock, that of the robot. At the end of a recording answers to the last states may
+    # have been heard before these.
     times = [time for topic in messages.values() for time, _ in topic]
     states = [time for time, _ in messages["/joint_states"]]
-    assert min(states) - 1e9 < min(times) <= max(times) <= max(states)
+    assert min(states) - 1e9 < min(times) <= max(times) <= max(states) + 2e7
 
 
 def test_the_layout_of_foxglove_shows_what_is_recorded(recorded):

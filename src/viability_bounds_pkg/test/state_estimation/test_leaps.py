@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from sample_arm import NONE, N
 from spoilt_states import LIMIT, H, leap, make_check, play, refused_at, sine, swapped
@@ -81,6 +81,40 @@ def test_what_froze_before_sensors_are_known_is_believed_when_it_goes_on(time):
 
     refused = play(make_check(), freezes, 0.3, 0.3 + time, 6.0, motion=creeps)
     assert not refused or refused[-1][0] < 0.3 + time + 3.0 * WINDOW
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    h=st.sampled_from([H, 0.01]),
+    size=st.floats(0.0, 0.3),
+    duration=st.floats(0.15, 1.0),
+    begin=st.floats(-0.2, 1.0),
+    time=st.floats(0.02, 1.2),
+)
+@example(0, 0.01, 0.1, 0.4, -0.2, 0.7)
+@example(0, 0.01, 0.3, 0.25, -0.2, 0.6)
+def test_however_far_the_arm_moved_as_its_positions_froze_untold_they_are_believed(
+    seed, h, size, duration, begin, time
+):
+    """It moves once, and sensors are not known: it may come to rest before anything is told."""
+    rng = np.random.default_rng(seed)
+    ways = size * rng.uniform(-1.0, 1.0, N) * (rng.uniform(size=N) < rng.choice([0.3, 1.0]))
+
+    def moves(t):
+        s = min(max((t - 0.5) / duration, 0.0), 1.0)
+        q = np.linspace(-0.5, 0.5, N) + ways * (s - np.sin(2.0 * np.pi * s) / (2.0 * np.pi))
+        return State(q, ways / duration * (1.0 - np.cos(2.0 * np.pi * s)))
+
+    frozen = []
+
+    def freezes(state, t):
+        frozen.append(state.q)
+        return state._replace(q=frozen[0])
+
+    end = 0.5 + begin * duration + time
+    refused = play(make_check(), freezes, end - time, end, end + 2.0, h, moves)
+    assert not refused or refused[-1][0] < end + 5.0 * WINDOW
 
 
 @pytest.mark.parametrize("size", [0.001, 0.02, -0.3])

@@ -89,6 +89,10 @@ class Leaps:
         now: that after it.
         errors: of states.
         with_velocities: whether the velocities of states tell anything.
+
+    Attributes:
+        thawed: how far positions that froze untold went at once with the first doubtful state,
+            shape (n,), rad.
     """
 
     def __init__(self, before: State, now: State, errors: Errors, with_velocities: bool) -> None:
@@ -98,7 +102,7 @@ class Leaps:
         self._is = np.zeros(n, dtype=int)
         self._still = np.ones(n, dtype=bool)  # the same to the last bit since the first one
         # Sum of all e that are leaps, of the errors of these, and of the way besides, rad.
-        self._sum, self._error, self._way, self._size = np.zeros((4, n))
+        self._sum, self._error, self._way, self._size, self.thawed = np.zeros((5, n))
         self.clear()
 
     def clear(self) -> None:
@@ -106,7 +110,7 @@ class Leaps:
         self._states = 0
         self._is[:] = _Is.CALM
         self._still[:] = True
-        for each in (self._sum, self._error, self._way, self._size):
+        for each in (self._sum, self._error, self._way, self._size, self.thawed):
             each.fill(0.0)
         self._pair: list[int] = []  # joints that are exchanged
         self._returned = False  # whether a joint has leapt back
@@ -167,6 +171,8 @@ class Leaps:
         thaw |= moved == 0.0
         if went_on is not None:
             thaw |= went_on
+            if self._states == 1:
+                self.thawed = np.where(went_on, moved, 0.0)
         if lies:  # what has not leapt before leaps where it ends
             self._is[self._is == _Is.CALM] = _Is.LYING
         calm, pending = self._is == _Is.CALM, self._is == _Is.PENDING

@@ -288,7 +288,7 @@ class StateCheck:
         off = errors.position + STAYS
         if self._patience > WINDOW or self._leaps.back or not self._with_velocities:
             off = off + STOPS * UNSURE
-        on = STOPS * before.v
+        on, moved = STOPS * before.v, moved - self._leaps.thawed
         near = (np.minimum(on, 0.0) - off <= moved) & (moved <= np.maximum(on, 0.0) + off)
         # One that still seemed to move after the stop, and does not from one state to the next,
         # stood, and its velocity lied.
