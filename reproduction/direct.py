@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import pinocchio as pin
-from chain import ROOT
+from chain import load_node_values
 
 from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.nodes.bullet_parameters import BulletConfiguration, make_robot
@@ -27,7 +27,6 @@ from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.robot_configuration import load_model
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.stopping.coordinated_stop import CoordinatedStop
-from viability_bounds_pkg.user_input.yaml_file import read_yaml
 
 Configuration = TypeVar("Configuration")
 
@@ -49,6 +48,7 @@ class DirectLoop:
     Args:
         robot: name of a file in ``config/``.
         changed: parameters that differ from it, by name; and `FRICTION`.
+        overlays: further files in ``config/``, whose values count more than the first one's.
 
     Attributes:
         robot: in PyBullet.
@@ -58,8 +58,13 @@ class DirectLoop:
         sensing: whether the force/torque sensor says anything.
     """
 
-    def __init__(self, robot: str, changed: Mapping[str, Any] | None = None) -> None:
-        self._file = read_yaml(ROOT / "config" / f"{robot}.yaml")
+    def __init__(
+        self,
+        robot: str,
+        changed: Mapping[str, Any] | None = None,
+        overlays: Sequence[str] = (),
+    ) -> None:
+        self._values = load_node_values(robot, *overlays)
         self._changed = dict(changed or {})
         config = self._configuration("bullet_node", BulletConfiguration)
         self.robot = make_robot(config)
@@ -86,11 +91,7 @@ class DirectLoop:
 
     def _configuration(self, node: str, kind: type[Configuration]) -> Configuration:
         """Return a node's configuration as it would get it from the file."""
-        given: dict[str, Any] = {}
-        for section in ("/**", f"/**/{node}"):
-            given |= self._file.get(section, {}).get("ros__parameters", {})
-        given |= self._changed
-        return read(kind, given)
+        return read(kind, self._values[node] | self._changed)
 
     def _controller_configuration(self) -> ControllerConfiguration:
         """Return what the controller node would be made of."""

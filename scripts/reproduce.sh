@@ -28,8 +28,9 @@ Writes figures to results/, and prints a table with the paper's numbers and ours
                      real time (30 min)
   false-alarms       ten minutes of random motions of each robot, ideal and imperfect: right states
                      must not be refused (20 min)
+  network            robot and control on two hosts, a bad network and a busy machine (12 min)
   exactness          the bounds compared with brute force (30 min)
-  all                all of the above but time_to_goal, adversary, imperfect, faults, process-faults, false-alarms, exactness (default)
+  all                all of the above but time_to_goal, adversary, imperfect, faults, process-faults, false-alarms, network, exactness (default)
 USAGE
 }
 
@@ -46,7 +47,7 @@ fi
 what="${what//-/_}"
 [ "$what" != adversary ] || what=search_adversary
 case "$what" in
-paper0 | paper1_integral | paper1_compliance | two_hands | departures | friction | out_of_reach | stopping | whole_arm | time_to_goal | search_adversary | imperfect | faults | process_faults | false_alarms | exactness) ;;
+paper0 | paper1_integral | paper1_compliance | two_hands | departures | friction | out_of_reach | stopping | whole_arm | time_to_goal | search_adversary | imperfect | faults | process_faults | false_alarms | network | exactness) ;;
 *)
     echo "error: unknown '$what'; --help lists what there is" >&2
     exit 2

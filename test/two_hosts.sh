@@ -70,7 +70,7 @@ while [ $# -gt 1 ]; do
 done
 pids=()
 start() { # host package program arguments
-    ip netns exec "$1" "$root/install/$2/lib/$2/$3" --priority 40 --ros-args --log-level warn \
+    ip netns exec "$1" "$root/install/$2/lib/$2/$3" --ros-args --log-level warn \
         "${@:4}" &
     pids+=($!)
 }

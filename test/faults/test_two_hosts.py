@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
+from network import BUSIER, BUSY, FAST, FREE, play
 
 from viability_bounds_pkg.testing.executables import run_to_end
 
@@ -28,6 +29,23 @@ def test_limits_are_kept_across_hosts_and_the_arm_goes_on_after_cuts(tmp_path):
     assert found["goal_error_rad"] < 0.02
     assert found["deadline_misses"] > 100, "the network is bad"
     assert {"drop", "delay"} <= {*re.findall(r"(\w+):", found["faults"]["touched_joint_commands"])}
+
+
+@pytest.mark.parametrize("network", [FREE, BUSY, BUSIER], ids=["free", "busy", "busier"])
+def test_no_joint_comes_to_its_speed_limit_where_the_control_is_late(network):
+    found = play(1, network, 10.0)
+    assert found.position == found.speed == 0.0
+    assert found.fastest < 0.8 < FAST
+    assert found.nearest > 0.01
+    assert found.torque < 1.0
+    assert found.held > 300
+    assert (found.stops > 5) == (network.stalls > 0.0)
+
+
+def test_it_would_with_disturbances_that_are_estimated_faster_than_commands_act():
+    found = play(1, BUSY, 10.0, {"disturbance_time": 0.005})
+    assert found.fastest > 0.95
+    assert found.moments > 5
 
 
 def test_where_there_are_no_namespaces_it_says_so_in_one_line(tmp_path):

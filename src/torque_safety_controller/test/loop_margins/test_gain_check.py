@@ -13,6 +13,7 @@ from torque_safety_controller.loop_margins.gain_check import (
     GainSettings,
     RobotTiming,
 )
+from torque_safety_controller.safety.disturbance_observer import DisturbanceObserver
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.robot_configuration import load_model
@@ -140,6 +141,26 @@ def test_resolution_limits_each_gain_to_its_share_of_the_torque():
     velocity = timing(**changed).steps.velocity
     torque = INERTIA.diagonal * share * velocity / 1e-3 / ARM.torque_max
     assert torque.max() == pytest.approx(TORQUE_STEP)
+
+
+def test_disturbances_are_not_estimated_faster_than_predicted_commands_act():
+    # As the observer sees them: predicted velocities, all of whose commands under way did not act.
+    delay, wanted, acted = 5, 6.0, -6.0
+    late = limits(delay=delay, predicted=True)["disturbance_time"]
+    assert late.exceeded
+    assert "'disturbance_time' is 0.003, " in str(late)
+    assert "0.005 is the least allowed" in str(late)
+    for time, within in ((1.0 * late.limit, True), (0.5 * late.limit, False)):
+        observer = DisturbanceObserver(1, time)
+        v = np.zeros(1)
+        for change in (wanted * 1e-3, wanted * 1e-3 + delay * (acted - wanted) * 1e-3):
+            mass, most = np.eye(1), np.full(1, 1e3)
+            observer.observe(v, np.full(1, wanted), 1e-3, most, mass)
+            v = v + change
+        observer.observe(v, np.full(1, wanted), 1e-3, most, mass)
+        assert (abs(observer.known[0]) <= abs(acted - wanted)) == within
+    assert not limits(delay=3, predicted=True)["disturbance_time"].exceeded
+    assert not limits(delay=5)["disturbance_time"].exceeded
 
 
 def test_what_is_exceeded_says_so_in_one_line():

@@ -124,7 +124,8 @@ class GainLimit(NamedTuple):
     Attributes:
         name: of the parameter.
         value: as given.
-        by_margin: largest value with which the loop has its margin, or smallest.
+        by_margin: largest value with which the loop has its margin, or smallest; of
+            `disturbance_time`, the delay.
         by_resolution: largest value with which the resolution leaves the torque calm, or
             smallest.
     """
@@ -231,7 +232,7 @@ class GainCheck:
             resolution = _largest_scale(lambda s: _calm(self._step(0.0, 0.0, gain * s)))
             yield GainLimit("integral_lambda", gain, gain * margin, gain * resolution)
         if (time := self._gains.disturbance_time) is not None:
-            yield GainLimit(OBSERVER, time, 0.0, self._fastest_observer())
+            yield GainLimit(OBSERVER, time, self._way(), self._fastest_observer())
         margin, resolution = (
             1.0 / scale if (scale := _last_good(good, 1.0 / _LONGEST, 1.0)) else math.inf
             for good in (
@@ -304,6 +305,16 @@ class GainCheck:
     def _step_of_bounds(self, factor: float) -> Array:
         slopes, steps = self._slopes(factor), self._timing.steps
         return self._own(slopes.kp * steps.position + slopes.kd * steps.velocity)
+
+    def _way(self) -> float:
+        """Return how long commands are under way that are predicted, s.
+
+        Where they did not act, as the robot stopped itself, the predicted velocity changes at once
+        by what they would have done in all that time: a so many times larger acceleration of one
+        period. With at least this time constant the estimate is not larger than the change.
+        """
+        timing = self._timing
+        return timing.declared.delay * timing.dt if timing.predicted else 0.0
 
     def _fastest_observer(self) -> float:
         """Return the least time constant of the disturbance observer that leaves joints calm."""
