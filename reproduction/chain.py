@@ -22,6 +22,7 @@ from sim_bridge.scenario.recording import RecordedRun
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.node.estimator_node import EstimatorNode
+from viability_bounds_pkg.user_input.yaml_file import read_yaml
 
 ROOT = Path(__file__).resolve().parent.parent
 NODES = {
@@ -66,10 +67,13 @@ def load_node_values(robot: str, *overlays: str) -> dict[str, dict[str, Any]]:
     Args:
         robot: name of a file in ``config/``.
         overlays: of further files there, whose values count more.
+
+    Raises:
+        YamlError: a file that is missing or wrong.
     """
     values: dict[str, dict[str, Any]] = {name: {} for name in NODES}
     for each in (robot, *overlays):
-        content = yaml.safe_load((ROOT / "config" / f"{each}.yaml").read_text())
+        content = read_yaml(ROOT / "config" / f"{each}.yaml")
         for name, own in values.items():
             for section in ("/**", f"/**/{name}"):
                 own |= content.get(section, {}).get("ros__parameters", {})
