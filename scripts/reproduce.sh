@@ -28,7 +28,7 @@ Writes figures to results/, and prints a table with the paper's numbers and ours
                      real time (30 min)
   false-alarms       ten minutes of random motions of each robot, ideal and imperfect: right states
                      must not be refused (20 min)
-  network            robot and control on two hosts, a bad network and a busy machine (12 min)
+  network            robot and control on two hosts, a bad network and a busy machine (8 min)
   exactness          the bounds compared with brute force (30 min)
   all                all of the above but time_to_goal, adversary, imperfect, faults, process-faults, false-alarms, network, exactness (default)
 USAGE

@@ -70,8 +70,7 @@ while [ $# -gt 1 ]; do
 done
 pids=()
 start() { # host package program arguments
-    ip netns exec "$1" "$root/install/$2/lib/$2/$3" --ros-args --log-level warn \
-        "${@:4}" &
+    ip netns exec "$1" "$root/install/$2/lib/$2/$3" --ros-args --log-level warn "${@:4}" &
     pids+=($!)
 }
 stop() {

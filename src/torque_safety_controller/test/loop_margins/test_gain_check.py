@@ -150,7 +150,7 @@ def test_disturbances_are_not_estimated_faster_than_predicted_commands_act():
     assert late.exceeded
     assert "'disturbance_time' is 0.003, " in str(late)
     assert "0.005 is the least allowed" in str(late)
-    for time, within in ((1.0 * late.limit, True), (0.5 * late.limit, False)):
+    for time, within in ((late.limit, True), (0.5 * late.limit, False)):
         observer = DisturbanceObserver(1, time)
         v = np.zeros(1)
         for change in (wanted * 1e-3, wanted * 1e-3 + delay * (acted - wanted) * 1e-3):
