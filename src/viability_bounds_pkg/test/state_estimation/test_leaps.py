@@ -184,6 +184,34 @@ def test_joints_that_are_exchanged_where_they_meet_are_told_at_once(joints, firs
     assert refused[-1][0] < end + 2.0 * WINDOW + 2.0 * h
 
 
+def test_joints_that_are_exchanged_where_they_meet_are_told_after_torques_braked_hard():
+    """By more in a period than their velocities differ: e stays small then."""
+    h, first = 0.01, 703
+    there = sine((first - 0.2) * h)
+    apart = abs(there.v[0] - there.v[1])
+    ramps = np.arange(5) * h + 3.0
+    speeds = np.array([0.0, 1.0, 2.0, 1.0, 0.0]) * apart
+
+    def meeting(t):
+        """Both go on by a triangle of the speed."""
+        q, v = sine(t)
+        more = np.interp(t, ramps, speeds)
+        along = np.interp(t, ramps, np.r_[0.0, 0.5, 2.0, 3.5, 4.0] * h * apart)
+        shift = (there.q[0] - there.q[1]) * np.eye(N)[1]
+        return State(q + shift + along, v + more)
+
+    order = np.r_[1, 0, 2:N]
+
+    def exchanged(state, t):
+        return State(state.q[order], state.v[order])
+
+    begin = (first - 0.5) * h
+    refused = play(
+        make_check(limit=np.full(N, 5.0)), exchanged, begin, begin + 0.4, begin + 1.3, h, meeting
+    )
+    assert 0.1 < apart < 1.5 and refused[0] == (pytest.approx(first * h), EXCHANGED)
+
+
 def test_joints_that_are_exchanged_and_leave_their_range_are_seen_to_leap_back():
     size = np.r_[0.2, np.ones(N - 1)]
 

@@ -75,6 +75,46 @@ def test_a_bias_of_good_velocities_is_undecided_at_first_and_told_by_the_second(
     assert len([t for t, _ in refused if t < 1.6]) == round(0.6 / H)
 
 
+def test_an_arm_that_is_farther_than_a_stop_leads_is_believed_late():
+    """Weak motors take their time, or someone moved it; no position has leapt."""
+    v = np.full(N, 0.5)
+    rest = State(np.full(N, -0.8), np.zeros(N))
+    moved = [State(rest.q + 1.5 * k / 300, 1e3 * v) for k in range(1, 301)]
+    check = make_check()
+    assert not any(looks(check, [rest] * 600))
+    stands = State(moved[-1].q, np.zeros(N))
+    later = round((STUCK + 1.0) / H)
+    wrong = looks(check, moved + [stands] * later, 5.0 + H * np.arange(600, 900 + later))
+    believed = wrong.index("")
+    assert not any(wrong[believed:]) and STUCK <= H * (believed - 300) < STUCK + 0.1
+
+
+def test_a_joint_that_stood_is_moved_by_the_stop_of_the_others():
+    """As far as it may, of what its limit is, it goes back where it leapt to at once."""
+    stops = State(np.zeros(N), np.r_[0.0, np.full(N - 1, 1.0)])
+    way = np.linspace(0.0, 0.3, 300)
+    moving = [State(stops.q + H * k * stops.v, stops.v) for k in range(-100, 1)]
+    # All report zeros, as the first joint is moved by 0.1 rad and the others by 0.3 rad.
+    zero = State(np.zeros(N) + 0.5, np.zeros(N))
+    stands = State(np.r_[0.1, np.full(N - 1, way[-1])], np.zeros(N))
+    wrong = looks(make_check(), moving + [zero] * 300 + [stands] * 300)
+    assert not any(wrong[:101]) and all(wrong[101:401])
+    assert wrong.index("", 401) - 401 <= round(WINDOW / H) + 2
+
+
+def test_what_was_learned_from_a_lie_is_forgotten_when_it_is_told():
+    """It began before sensors were known, and seemed to be their error at first."""
+
+    def biased(state, t):
+        return state._replace(v=state.v + (1.5 if t < 0.7 else 0.1 if t > 2.999 else 0.0))
+
+    times = np.array([t for t, _ in play(make_check(), biased, 0.1, 3.6, 4.0)])
+    assert 0.11 < times[0] < 0.2
+    # Known again after 200 states in motion, and told by the second.
+    again = times[(times > 2.0) & (times < 3.6)]
+    assert again[0] == pytest.approx(3.0) and again.size == round(0.6 / H)
+
+
 def test_positions_that_freeze_are_told_by_the_second_state():
     refused = play(make_check(), lambda state, t: state._replace(q=sine(1.0).q), begin=1.002)
     assert [wrong for _, wrong in refused[:2]] == [UNDECIDED, CONTRADICTION]

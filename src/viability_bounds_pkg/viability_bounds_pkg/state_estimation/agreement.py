@@ -25,8 +25,8 @@ e of all joints are -d v, once: the next one is within its tolerance.
 
 Where two joints meet and their numbers are *exchanged*, i for j, positions leap nowhere, and
 velocities change as in an impact. This is told at once: both velocities change by more than ever
-within a period, except that v_i follows v_j0 and v_j follows v_i0 as closely as always, and so do
-the positions,
+within a period, or both e are beyond their tolerances, except that v_i follows v_j0 and v_j
+follows v_i0 as closely as always, and so do the positions,
 
     |q_i - q_j0 - h (v_j0 + v_i) / 2| within the tolerance of j, and closer than e of i.
 
@@ -138,6 +138,17 @@ class Agreement:
         self._impact = -math.inf  # time of the last, s
         self._clock = False  # whether it may be that a clock was set
 
+    def forget_lies(self) -> None:
+        """Learn anew of joints that may have learned from lies, as states are doubted now.
+
+        Of joints that are not known yet the states before have taught; others have shown more than
+        what may be.
+        """
+        seen = self._seen
+        again = (seen.moved < ENOUGH) | (seen.share > 1.0)
+        for each in (seen.share, seen.change, seen.moved, seen.usual):
+            each[again] = 0.0
+
     def contradicts(self, h: float, stamp: float, doubted: bool) -> bool:
         """Return whether positions contradict velocities after all; note what is undecided.
 
@@ -208,7 +219,8 @@ def _judge(
             unseen = lag * max(0.0, change - 2.0 * seen.change[i])
             tolerance = seen.tolerance[i] * possible + unseen
         room = 0.5 * h * change + tolerance
-        if abs(e) > tolerance:
+        strange = abs(e) > tolerance
+        if strange:
             odd = True
         elif learns:
             more = max(0.0, abs(e) / possible - seen.share[i])
@@ -219,7 +231,7 @@ def _judge(
             seen.usual[i] = max(seen.usual[i], min(change / h, seen.last[i]))
         seen.last[i] = change / h
         off = off or abs(e) > room
-        unusual += (not begins) and change > USUAL * h * seen.usual[i]
+        unusual += strange or ((not begins) and change > USUAL * h * seen.usual[i])
         if second:
             apart = apart or abs(seen.e[i] + e) > seen.room[i] + room
         else:
@@ -269,7 +281,10 @@ def _exchanged(
         lag = LAG * abs(change) if r * change > 0.0 else 0.0
         fits = fits and abs(r) <= seen.tolerance[other] * (h * error[other] + lag)
         fits = fits and abs(change) <= USUAL * h * seen.usual[other]
-        unusual = unusual and own > max(USUAL * h * seen.usual[k], abs(change) / CLOSER)
+        # Torques brake hard, too, but all through the period: e stays small.
+        strange = abs(seen.e[k]) > seen.room[k] - 0.5 * h * own
+        unusual = unusual and (strange or own > USUAL * h * seen.usual[k])
+        unusual = unusual and own > abs(change) / CLOSER
         off = off and abs(seen.e[k]) > seen.room[k]
         closer += abs(seen.e[k]) - abs(r)
     return fits and (unusual or off) and closer > 0.0

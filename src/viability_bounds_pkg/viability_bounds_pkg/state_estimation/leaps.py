@@ -10,7 +10,7 @@ numbers of two joints are exchanged. What agrees with itself afterwards is as wr
 state. So a leap that stays, because the next e is small, has to be undone: by another one, after
 which the sum of all e is that of errors and of the way that the arm may have come meanwhile,
 
-    |sum e| <= errors + max |moved| + `STOPS` |v|.
+    |sum e| <= errors + max |moved| + the way to rest (`way_to_rest`).
 
 While joints are exchanged, one has moved and the number of another has been reported. Where e is
 large in the next state, too, it is no leap: velocities lie, or positions have frozen. Nor is it
@@ -67,6 +67,19 @@ def free(errors: Errors, h: float) -> Array:
     """
     between = np.minimum(h * h * errors.quarter_a, h * errors.limit)
     return errors.position + h * errors.velocity + between
+
+
+def way_to_rest(errors: Errors, v: Array) -> Array:
+    """Return how far joints may turn until an arm has stopped itself, shape (n,), rad.
+
+    Each as far as if it were as fast, of what its limit is, as the fastest: where motors are weak
+    a joint that stood is moved by the others, and one may go on for a while.
+
+    Args:
+        errors: of states.
+        v: velocity as it begins to stop, shape (n,), rad/s.
+    """
+    return STOPS * np.maximum((np.abs(v) / errors.limit).max() * errors.limit, np.abs(v))
 
 
 class _Is(IntEnum):
@@ -155,7 +168,7 @@ class Leaps:
         self._sum += np.where(leaps, e, 0.0)
         self._error += np.where(leaps, allowed, 0.0)
         self._way += np.where(leaps, 0.0, moved)
-        came = np.abs(self._way).max() + STOPS * np.abs(v)
+        came = np.abs(self._way).max() + way_to_rest(errors, v)
         if not self._with_velocities:
             came += STOPS * UNSURE
         left = np.abs(self._sum) - self._error

@@ -30,7 +30,14 @@ from viability_bounds_pkg.compiled import bound, compiled
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.state_estimation.agreement import APART, Agreement
 from viability_bounds_pkg.state_estimation.freeze_check import FROZEN, Expected, FreezeCheck
-from viability_bounds_pkg.state_estimation.leaps import STOPS, UNSURE, Errors, Leaps, free
+from viability_bounds_pkg.state_estimation.leaps import (
+    STOPS,
+    UNSURE,
+    Errors,
+    Leaps,
+    free,
+    way_to_rest,
+)
 
 Array = NDArray[np.float64]
 
@@ -69,7 +76,8 @@ STAYS = 0.05
 """How far an arm that is not believed may have moved besides, rad."""
 
 STUCK = 10.0
-"""How long states must agree where the position of a joint that moved is still the same, s."""
+"""How long states must agree that are hard to believe, s: where the position of a joint that moved
+is still the same, or is farther away than a stop leads."""
 
 LEAP = 0.5
 """Part of the time between states by which stamps leap at least, and error of the leap that is
@@ -106,10 +114,11 @@ class StateCheck:
     that was believed leads to. Otherwise, and after a contradiction, they must agree with each
     other for `WINDOW` and show the arm where it can be after a stop. What leapt must have leapt
     back, as joints that are exchanged agree with each other, too; a leap of less than errors of
-    positions is believed after `STUCK`. What froze agrees with an arm
-    that stands: after each contradiction it takes twice as long, except for states that were the
-    same and change again; and `STUCK` while the position of a joint that moved stays the same. A
-    gap of `GAP` in the stamps, as the restart of a robot makes one, is a new beginning.
+    positions is believed after `STUCK`. What froze agrees with an arm that stands: after each
+    contradiction it takes twice as long, except for states that were the same and change again;
+    and `STUCK` while the position of a joint that moved stays the same, or the arm is where no
+    stop leads: someone moved it, or weak motors took long. A gap of `GAP` in the stamps, as the
+    restart of a robot makes one, is a new beginning.
 
     Args:
         model: the arm, n joints with one coordinate each.
@@ -225,6 +234,8 @@ class StateCheck:
             apart = self._agreement.contradicts(h, stamp, bool(self._doubt))
             contradicts = contradicts or (apart and not jumps)
         contradicts = contradicts or frozen
+        if (jumps or contradicts) and not self._doubt:
+            self._agreement.forget_lies()
         self._agreed = 0.0 if jumps or contradicts else self._agreed + h
         if contradicts:
             if not self._contradiction:
@@ -288,18 +299,18 @@ class StateCheck:
         off = errors.position + STAYS
         if self._patience > WINDOW or self._leaps.back or not self._with_velocities:
             off = off + STOPS * UNSURE
-        on, moved = STOPS * before.v, moved - self._leaps.thawed
-        near = (np.minimum(on, 0.0) - off <= moved) & (moved <= np.maximum(on, 0.0) + off)
+        moved = moved - self._leaps.thawed
+        near = (np.abs(moved) <= way_to_rest(errors, before.v) + off).all()
         # One that still seemed to move after the stop, and does not from one state to the next,
         # stood, and its velocity lied.
         froze = (state.q == before.q) & (self._steps < 0.5 * np.abs(before.v))
-        if self._doubt == FROZEN and self._freeze.changing >= WINDOW and not away:
+        if self._doubt == FROZEN and self._freeze.changing >= WINDOW and near and not away:
             patience = WINDOW
-        elif away or (froze & (np.abs(before.v) > errors.velocity)).any():
+        elif away or not near or (froze & (np.abs(before.v) > errors.velocity)).any():
             patience = max(self._patience, STUCK)
         else:
             patience = self._patience
-        return bool(near.all()) and self._agreed >= patience
+        return self._agreed >= patience
 
 
 @compiled
