@@ -22,7 +22,7 @@ from sim_bridge.scenario.recording import RecordedRun
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.node.estimator_node import EstimatorNode
-from viability_bounds_pkg.user_input.yaml_file import read_yaml
+from viability_bounds_pkg.user_input.yaml_file import YamlError, read_yaml
 
 ROOT = Path(__file__).resolve().parent.parent
 NODES = {
@@ -73,7 +73,10 @@ def load_node_values(robot: str, *overlays: str) -> dict[str, dict[str, Any]]:
     """
     values: dict[str, dict[str, Any]] = {name: {} for name in NODES}
     for each in (robot, *overlays):
-        content = read_yaml(ROOT / "config" / f"{each}.yaml")
+        path = ROOT / "config" / f"{each}.yaml"
+        content = read_yaml(path)
+        if not isinstance(content, dict):
+            raise YamlError(f"{path}: it has no parameters of nodes")
         for name, own in values.items():
             for section in ("/**", f"/**/{name}"):
                 own |= content.get(section, {}).get("ros__parameters", {})

@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 # Set-up, node tests and a demo on a system like Ubuntu 24.04 with ROS 2 Jazzy sourced:
 #
-#     bash test/ubuntu_jazzy.sh             all of it
-#     bash test/ubuntu_jazzy.sh --system    makes the system only
+#     bash test/ubuntu_jazzy.sh                    all of it
+#     bash test/ubuntu_jazzy.sh --set-up FOLDER    the set-up only, of a copy in an empty folder
+#     bash test/ubuntu_jazzy.sh FOLDER             the rest of it there
 #
 # The system is a copy of a Python 3.12 with NumPy 1.26.4 and PyBullet, as apt has them, and with
 # ROS' wheels in a folder of their own, found by the variables that sourcing sets. It is kept in the
@@ -106,9 +107,16 @@ key="$(cat "$root"/requirements/{wheels,constraints}.txt <(declare -f make_syste
     sha256sum)"
 system="${XDG_CACHE_HOME:-$HOME/.cache}/viability_bounds/ubuntu_jazzy"
 ros="$system/opt/ros/jazzy"
-work="$(mktemp -d)"
+parts="set-up tests" # of all of it
+if [ "${1:-}" = --set-up ]; then
+    parts=set-up work="$(realpath "$2")"
+elif [ $# -gt 0 ]; then
+    parts=tests work="$(realpath "$1")"
+else
+    work="$(mktemp -d)"
+    trap 'rm -rf "$work"' EXIT
+fi
 log="$work/log"
-trap 'rm -rf "$work"' EXIT
 trap 'exit 130' INT TERM
 # Nobody makes it anew while another run uses it.
 mkdir -p "$(dirname "$system")"
@@ -120,15 +128,18 @@ else
     stage "system (Python, NumPy $numpy, ROS' wheels, PyBullet from source)" make_system
 fi
 flock --shared "$lock"
-[ "${1:-}" != --system ] || exit 0
 
 source_ros
 export PYTHON="$system/bin/python3.12"
-mkdir "$work/copy"
-git -C "$root" ls-files -z | tar -C "$root" --null -T - -c | tar -C "$work/copy" -x
+if [[ "$parts" == *set-up* ]]; then
+    mkdir "$work/copy"
+    git -C "$root" ls-files -z | tar -C "$root" --null -T - -c | tar -C "$work/copy" -x
+    cd "$work/copy"
+    stage "set-up" set_up
+    grep -v compiling "$log"
+fi
+[[ "$parts" == *tests* ]] || exit 0
 cd "$work/copy"
-stage "set-up" set_up
-grep -v compiling "$log"
 stage "set-up again" set_up
 stage "NumPy and consistency" check_environment
 cat "$log"

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bounds, controller and robot node together, over real DDS, in lockstep."""
 
+import chain
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -9,6 +10,7 @@ from chain import load_values, run_chain
 
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 from viability_bounds_pkg.testing.ros_harness import config_folder
+from viability_bounds_pkg.user_input.yaml_file import YamlError
 
 ROBOTS = ("baxter_left_arm", "panda")
 
@@ -134,3 +136,11 @@ def test_torque_limits_hold_where_gravity_beats_the_motor():
     assert result.vector("torque_ratio").max() <= 1.0 + 1e-9
     assert result.run.v[-1, 1] > 0.05, "it should sink"
     assert np.isfinite(result.run.tau).all()
+
+
+def test_a_file_without_parameters_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(chain, "ROOT", tmp_path)
+    (tmp_path / "config").mkdir()
+    (tmp_path / "config" / "arm.yaml").write_text("")
+    with pytest.raises(YamlError, match="no parameters"):
+        chain.load_node_values("arm")
