@@ -198,7 +198,7 @@ IMPOSSIBLE = {
 @pytest.mark.parametrize("lie", IMPOSSIBLE)
 @pytest.mark.parametrize("seed", [3, 4])
 def test_an_arm_of_weak_motors_that_stopped_meanwhile_goes_on(lie, seed):
-    """Its stop moves joints that stood, and takes up to 2 s."""
+    """Its stop moves joints that stood."""
     played = play("baxter_left_arm", seed, IMPOSSIBLE[lie], **IN_MOTION)
     assert played.position == 0.0 and played.speed == 0.0
     assert len(played.after) == len(played.again) == played.faults == 10

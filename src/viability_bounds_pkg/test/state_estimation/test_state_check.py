@@ -90,7 +90,7 @@ def test_an_arm_that_is_farther_than_a_stop_leads_is_believed_late():
 
 
 def test_a_joint_that_stood_is_moved_by_the_stop_of_the_others():
-    """As far as it may, of what its limit is, it goes back where it leapt to at once."""
+    """It is believed where it is after that, without the 10 s of an arm that is far away."""
     stops = State(np.zeros(N), np.r_[0.0, np.full(N - 1, 1.0)])
     way = np.linspace(0.0, 0.3, 300)
     moving = [State(stops.q + H * k * stops.v, stops.v) for k in range(-100, 1)]

@@ -72,14 +72,14 @@ def free(errors: Errors, h: float) -> Array:
 def way_to_rest(errors: Errors, v: Array) -> Array:
     """Return how far joints may turn until an arm has stopped itself, shape (n,), rad.
 
-    Each as far as if it were as fast, of what its limit is, as the fastest: where motors are weak
-    a joint that stood is moved by the others, and one may go on for a while.
+    Each as if it had the same share of its speed limit as the fastest joint: where motors are
+    weak, a joint that stood is moved by the others, and one may go on for a while.
 
     Args:
         errors: of states.
         v: velocity as it begins to stop, shape (n,), rad/s.
     """
-    return STOPS * np.maximum((np.abs(v) / errors.limit).max() * errors.limit, np.abs(v))
+    return STOPS * (np.abs(v) / errors.limit).max() * errors.limit
 
 
 class _Is(IntEnum):
