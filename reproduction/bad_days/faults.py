@@ -24,7 +24,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from chain import ROOT, load_node_values, load_values
 from figure import Figure, table
-from moments import HEADS, ROBOTS, STIFF, Corners, Sample, Seen, at_rate, parameter_words
+from moments import (
+    EVERY,
+    HEADS,
+    ROBOTS,
+    STIFF,
+    Corners,
+    Sample,
+    Seen,
+    at_rate,
+    parameter_words,
+)
 from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -248,7 +258,12 @@ def play(
 def main() -> int:
     """Play, print the table; return whether all is as it should be."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--robot", action="append", choices=ROBOTS, help="only this one")
+    parser.add_argument(
+        "--robot",
+        action="append",
+        choices=EVERY,
+        help=f"repeatable; default: {' and '.join(ROBOTS)}",
+    )
     parser.add_argument("--fault", action="append", choices=tuple(FAULTS), help="only this one")
     parser.add_argument("--moments", type=int, default=10, help="of each fault")
     parser.add_argument(

@@ -14,6 +14,7 @@ from figure import verdict
 from sim_bridge.bullet.limit_monitor import LimitMonitor
 
 ROBOTS = ("panda", "talos_left_arm")
+EVERY = (*ROBOTS, "baxter_left_arm")
 STIFF = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
 """Gains by which joint goals drive the joints at their limits."""
 RETURN = 0.1  # s after the arm goes on in which torque steps count: later ones are of the motion
