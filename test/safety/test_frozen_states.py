@@ -3,7 +3,7 @@
 
 from collections.abc import Callable
 from contextlib import closing
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -51,15 +51,17 @@ def play(
     wander: float = 0.5,
     goals: float = 2.0,
     first_at: float = 2.0,
+    **changed: Any,
 ) -> Played:
     """Let faults begin `apart` s from each other, as a node's states would be treated.
 
     Each is up to `wander` s late. Fewer than 2.5 s from one to the next are taken for one fault.
     With goals 2 s apart the arm stands in about half of the faults when they begin. States that
     are refused are not answered, and the robot stops itself; one that is undecided costs a period.
+    `changed` are parameters that differ from the robot's file.
     """
     rng = np.random.default_rng(seed)
-    loop = DirectLoop(robot, HASTE)
+    loop = DirectLoop(robot, HASTE | changed)
     config, arm, law = loop.config, loop.robot, make_stop(loop.config)
     check = make_state_check(loop._controller_configuration(), loop.model, None)
     watch, low, high = RateWatch(config.dt, 1), config.position_min, config.position_max
@@ -82,7 +84,7 @@ def play(
                 first = None
             wrong = check.look(state, 1.0 + t) if told else ""
             if wrong == UNDECIDED:
-                pass
+                tau = loop.controller.go_on()
             elif wrong:
                 watch.slow(wrong)
                 in_row += 1
@@ -129,6 +131,13 @@ LIES = {
 # When sensors are known, and as near to each other as they may be: 2 s are most of what is played.
 IN_MOTION = {"seconds": 29.0, "apart": 2.6, "wander": 0.1, "goals": 0.7, "first_at": 3.0}
 LIES["positions frozen"] = lambda state, first: state._replace(q=first.q)
+
+
+def test_the_period_of_a_state_that_is_undecided_passes_no_limit():
+    """A torque that was held, at 250 Hz and a speed limit, passed it by 4 mrad/s."""
+    played = play("panda", 17, LIES["positions frozen"], **IN_MOTION, rate_hz=250.0)
+    assert played.position == 0.0 and played.speed == 0.0
+    assert len(played.after) == played.faults
 
 
 @pytest.mark.parametrize("lie", LIES)

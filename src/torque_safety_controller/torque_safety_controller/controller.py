@@ -324,6 +324,21 @@ class Controller:
             return self.brake(state, AccelerationRange(lower, upper), elapsed)
         return self._hold(self._begin(state, elapsed), "")
 
+    def go_on(self) -> Array:
+        """Return the torque, shape (n,), N m, that goes on with the last step's accelerations.
+
+        For a period of which the state is not known. Bounds that look two periods ahead cover it;
+        not so a torque that is held: its accelerations change as the arm moves. What is not of
+        the model, as the integral action and forces of contacts, stays what it was.
+        """
+        robot, a, last = self.robot, self._a_last, self._limiter.last
+        if last is None:
+            return self._limiter.limited(robot.torque(a))
+        disturbance, h = self._observer.known, robot.dt
+        moves = a if disturbance is None else a + disturbance
+        state = State(robot.q + h * (robot.v + 0.5 * h * moves), robot.v + h * moves)
+        return self._limiter.limited(last + robot.torque(a, state) - robot.torque(a))
+
     def _begin(self, state: State, elapsed: float | None) -> Array | None:
         """Update the model and return the additional torque of a step, or None."""
         robot, additional = self.robot, self.additional

@@ -132,8 +132,12 @@ class RobotModel(HandModel):
             hand.v, hand.a_last = v, a_last
             hand.read(model, data)
 
-    def torque(self, a: Array) -> Array:
-        """Return the torque that, held for dt, gives mean acceleration `a`, shape (n,), N m."""
-        q_mid, v_mid = middle_of_step(self.q, self.v, a, self.dt)
+    def torque(self, a: Array, state: State | None = None) -> Array:
+        """Return the torque that, held for dt, gives mean acceleration `a`, shape (n,), N m.
+
+        From `state` on; None for the current one.
+        """
+        q, v = state or (self.q, self.v)
+        q_mid, v_mid = middle_of_step(q, v, a, self.dt)
         tau: Array = pin.rnea(self.model, self.data, q_mid, v_mid, a)
         return tau

@@ -50,6 +50,7 @@ from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.robot_urdf import DescriptionWatch
+from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import (
     ACCELERATION_LIMITS,
     FT_WRENCH,
@@ -226,12 +227,17 @@ class ControllerNode(ArmNode):
             self._enter(Mode.STOPPED, states.why_refused)
 
     def _wait(self, stamp: Any) -> None:
-        """Let the last command act for a period more: the next state decides about this one."""
+        """Let the arm go on for a period more: the next state decides about this one."""
         states = self._states
         if self._handover.by_drives:
             self._drives.hold(stamp)
         elif states.answered_stamp == states.stamp and not states.refused_in_row:
-            self._commands.again(stamp)
+            if stamp_to_ns(stamp) <= self._commands.stamp:  # once more
+                self._commands.again(stamp)
+                return
+            tau = self._controller.go_on()
+            self._commands.torque(tau, stamp)
+            self._recovery.motors.note(tau)
 
     def _begin(self, arrival: Arrival) -> None:
         """Start anew: the robot was silent, or restarted."""

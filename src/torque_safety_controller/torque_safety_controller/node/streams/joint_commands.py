@@ -13,6 +13,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from torque_safety_controller.node.topics import ROS2_CONTROL_EFFORTS
+from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import JOINT_COMMANDS
 
 
@@ -35,6 +36,11 @@ class JointCommands:
         self._efforts = None
         if ros2_control_topic:
             self._efforts = ROS2_CONTROL_EFFORTS.publisher(node, ros2_control_topic)
+
+    @property
+    def stamp(self) -> int:
+        """Stamp of the state answered last, ns."""
+        return stamp_to_ns(self._last.header.stamp)
 
     def torque(self, tau: np.ndarray, stamp: Any) -> None:
         """Send torques, shape (n,), N m, for the state with `stamp`."""
