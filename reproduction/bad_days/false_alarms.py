@@ -18,8 +18,8 @@ import numpy as np
 import yaml
 from chain import ROOT, load_node_values
 from figure import RESULTS, Figure, table, verdict
+from moments import EVERY
 
-ROBOTS = ("panda", "talos_left_arm", "baxter_left_arm")
 HEADS = ("robot", "", "robot time, s", "joint states", "refused or doubted", "limits", "")
 ALARMS = "joint_states refused", "the motors do not give the torques that were sent"
 
@@ -66,12 +66,12 @@ def play(robot: str, kind: str, minutes: float) -> tuple[str, ...]:
 def main() -> int:
     """Play all; return 1 when there was a false alarm or a limit was passed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--robot", action="append", choices=ROBOTS, help="repeatable")
+    parser.add_argument("--robot", action="append", choices=EVERY, help="repeatable")
     parser.add_argument("--minutes", type=float, default=10.0, help="of robot time (default: 10)")
     options = parser.parse_args()
     rows = [
         play(robot, kind, options.minutes)
-        for robot in options.robot or ROBOTS
+        for robot in options.robot or EVERY
         for kind in ("ideal", "imperfect")
     ]
     print(table([Figure("false_alarms", rows=rows)], HEADS))

@@ -28,7 +28,7 @@ import pinocchio as pin
 from faults import SENDERS
 from figure import RESULTS
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from moments import STIFF
+from moments import EVERY, STIFF
 from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -44,7 +44,6 @@ from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS, LATCHED_QOS,
 from viability_bounds_pkg.testing.node_program import NodeProgram
 from viability_bounds_pkg.testing.ros_harness import RosHarness, joint_state, private_domain
 
-ROBOTS = ("panda", "talos_left_arm", "baxter_left_arm")
 ROOT = Path(__file__).resolve().parents[2]
 ONE, PROCESSES = ("simulated_stack",), ("bullet_node", "bounds_node", "controller_node")
 PAUSED, RESTARTED, KILLED = "stands still", "started again", "killed"
@@ -372,7 +371,7 @@ def main() -> int:
     """Run, print and write the report; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--minutes", type=float, default=60.0, help="how long (default: 60)")
-    parser.add_argument("--robot", choices=ROBOTS, default="panda")
+    parser.add_argument("--robot", choices=EVERY, default="panda")
     parser.add_argument("--seed", type=int, default=0, help="of goals, pushes and faults")
     parser.add_argument("--processes", action="store_true", help="each node is a process")
     parser.add_argument("--every", type=float, default=8.0, help="s between faults")
