@@ -21,10 +21,10 @@ RETURN = 0.1  # s after the arm goes on in which torque steps count: later ones 
 HOLD_IN_TIME = 0.1  # s, where the controller brakes
 STEP = 0.02  # of tau_max, when the arm goes on
 AGAIN = 2.0  # s
-BEFORE = 0.1  # s before a fault in which the arm has to be under way
+BEFORE = RETURN  # s before a fault in which the arm has to be under way
 HEADS = (
     *("robot", "fault", "moments", "position, rad", "speed, rad/s", "torque"),
-    *("periods to braking", "by", "again, s", "torque step", ""),
+    *("periods to braking", "by", "again, s", "torque step", "before", ""),
 )
 """Of a table whose rows have a robot, a fault, and `Seen.cells`."""
 
@@ -106,6 +106,8 @@ class Seen:
         under_way: whether nothing had braked the arm just before; empty where not looked at.
         again: time until it went on, s.
         steps: largest change of torque in a period as it went on, share of torque_max.
+        steps_before: the same in as long a time before the fault, if nothing braked the arm:
+            what the motion does by itself.
         lasted: how long the faults were there, s.
         brakes: whether the arm has to brake; where not, it may for other reasons.
         believed: wrong states that are answered at most before they are told.
@@ -120,6 +122,7 @@ class Seen:
     under_way: list[bool] = field(default_factory=list)
     again: list[float] = field(default_factory=list)
     steps: list[float] = field(default_factory=list)
+    steps_before: list[float] = field(default_factory=list)
     lasted: list[float] = field(default_factory=list)
     timeout: int = 0
     brakes: bool = True
@@ -151,8 +154,11 @@ class Seen:
         t = np.array([each.t for each in trace])
         braking, stopped = (np.array([each[k] for each in trace], dtype=bool) for k in (1, 2))
         before = (t < begin) & (t >= begin - BEFORE)
+        tau = np.array([each.tau for each in trace])
         if before.any():
             self.under_way.append(not braking[before].any())
+            if self.under_way[-1]:
+                self.steps_before += _largest_step(tau[before], tau_max)
         first = np.flatnonzero((t >= begin) & (t < end) & braking)
         if first.size:
             by_robot = bool(stopped[first[0]])
@@ -172,10 +178,7 @@ class Seen:
             return  # it had not been brought to rest, or had gone on before
         last = np.flatnonzero((t > t[back] + RETURN) | ((t > t[back]) & braking))
         stop = last[0] if last.size else len(trace)
-        tau = np.array([each.tau for each in trace[max(back - 1, 0) : stop]])
-        tau = tau[np.isfinite(tau).all(axis=1)]
-        if len(tau) > 1:
-            self.steps.append(float((np.abs(np.diff(tau, axis=0)) / tau_max).max()))
+        self.steps += _largest_step(tau[max(back - 1, 0) : stop], tau_max)
 
     def wrong(self, dt: float) -> list[str]:
         """Return what is not as it should be, in words.
@@ -210,9 +213,15 @@ class Seen:
             f"{np.nanmedian(braked):.0f} to {np.nanmax(braked):.0f}" if some else "-",
             "robot" if robots.any() else "controller" if some else "-",
             f"{max(self.again):.2f}" if self.again else "-",
-            f"{max(self.steps):.3f}" if self.steps else "-",
+            *(f"{max(each):.3f}" if each else "-" for each in (self.steps, self.steps_before)),
             verdict(not wrong, "kept") + (f": {', '.join(wrong)}" if wrong else ""),
         )
+
+
+def _largest_step(tau: np.ndarray, tau_max: np.ndarray) -> list[float]:
+    """Return the largest change of torques, shape (k, n), between periods; empty without one."""
+    tau = tau[np.isfinite(tau).all(axis=1)]
+    return [float((np.abs(np.diff(tau, axis=0)) / tau_max).max())] if len(tau) > 1 else []
 
 
 class Corners:

@@ -299,3 +299,13 @@ def test_nothing_that_is_not_finite_goes_on():
     controller.step(State(arm.q_start, np.full(arm.n, 1e200)), wide(arm))
     tau = controller.go_on()
     assert np.isfinite(tau).all() and (np.abs(tau) <= arm.tau_max).all()
+
+
+def test_without_a_torque_before_the_arm_is_carried_on():
+    """As after a restart: no acceleration was asked for."""
+    arm = load_arm("panda")
+    controller = make(arm)
+    controller.set_posture_goal(arm.q_start + 0.3)
+    controller.step(State(arm.q_start, np.zeros(arm.n)), wide(arm))
+    controller.reset(arm.q_start)
+    np.testing.assert_allclose(controller.go_on(), gravity(arm, arm.q_start), rtol=1e-9)
