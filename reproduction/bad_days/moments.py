@@ -107,7 +107,7 @@ class Seen:
         again: time until it went on, s.
         steps: largest change of torque in a period as it went on, share of torque_max.
         steps_before: the same in as long a time before the fault, if nothing braked the arm:
-            what the motion does by itself.
+            what motion and new goals do by themselves.
         lasted: how long the faults were there, s.
         brakes: whether the arm has to brake; where not, it may for other reasons.
         believed: wrong states that are answered at most before they are told.
