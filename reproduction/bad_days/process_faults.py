@@ -89,7 +89,7 @@ APART = 1.0  # s between starts of nodes
 GOAL_PERIOD, SENT_AGAIN = 1.0, 0.2  # s
 CALM = 1.0, 2.0  # s, shortest and longest time of motion before a fault
 WILD = 1.0  # s, in which parameters change, or the clock jumps
-NOT_WILD = "method", "friction_", "closed_contacts", "integral_anti_windup", "integral_lambda"
+NOT_WILD = "method", "friction_", "integral_anti_windup", "integral_lambda"
 """Live parameters that choose what keeps no limits, for comparison, or say what is so; and a gain
 that is tried by itself."""
 

@@ -213,11 +213,8 @@ diag(M), or lambda M with `integral_anti_windup: paper_mass`; where the posture 
 large for the period it is lowered, which the paper's 2 1/s at 1 kHz never is
 ([gains.md](gains.md#a-stable-integral-gain)).
 
-The improvement of (27) for internal forces, which the paper names and does not describe, is
-derived in [forces.md](forces.md#two-hands-on-one-object), for the force between two hands.
-
-Not there: internal moments, more than two end effectors in the node, and the unactuated joints of
-III-E: bases are fixed.
+Not there: the improvement of (27) for internal forces, which the paper names and does not
+describe, more than two end effectors in the node, and the unactuated joints of III-E: bases are fixed.
 
 [Benallegue2021]: references.md
 """

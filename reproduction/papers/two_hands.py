@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One integral for two hands at once: (15) to (26) of [Benallegue2021] with 12 rows.
 
-bash scripts/reproduce.sh two-hands            all, and docs/reproduction_two_hands.md
-bash scripts/reproduce.sh two-hands pushes     one part
+bash scripts/reproduce.sh two-hands
 
 TALOS' torso and both arms, 16 joints at 1 kHz, with friction of 10% of the torque limits (stiction
 13%), rotors, and links 10% heavier than the controller knows:
@@ -11,25 +10,13 @@ TALOS' torso and both arms, 16 joints at 1 kHz, with friction of 10% of the torq
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
 from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pinocchio as pin
-from chain import ROOT
 from direct import DirectLoop, column, within_limits
 from figure import Figure, reproduce, table, verdict
-
-from torque_safety_controller.contact.admittance import AdmittanceGains
-from torque_safety_controller.contact.squeeze import Squeeze, SqueezeTask, closing_direction
-from torque_safety_controller.contact.wrench_sensor import WrenchSensor
-from torque_safety_controller.qp.terms import TaskTerm
-from torque_safety_controller.robot_model import RobotModel
-from torque_safety_controller.tasks.gains import Gains
-from torque_safety_controller.tasks.goals import Goals
-from torque_safety_controller.tasks.task import Task
 
 ROBOT = "two_hands/talos_arms"
 HANDS = {"left": "wrist_left_ft_tool_link", "right": "wrist_right_ft_tool_link"}
@@ -38,20 +25,6 @@ MODES = {"without": "joints", "with": "task"}
 RAMP = 0.3  # s, in which a push grows
 HAND_FORCE, ELBOW_FORCE = 50.0, 120.0  # N
 HELD, PAUSE = 2.0, 0.5  # s
-
-# An object between the hands
-TARGET, LOAD = 40.0, 30.0  # N
-PRESSED, PUSHED = 0.5, 3.0  # s
-GAIN, SPEED_MAX = 0.1, 0.02  # m/s^2 per N, m/s
-STIFFNESS = np.repeat([2e4, 100.0], 3)  # N/m, N m/rad
-DAMPING = np.repeat([100.0, 0.5], 3)  # N s/m, N m s/rad
-NOISE = np.repeat([0.1, 0.005], 3)  # N, N m, in each control period
-ARMS: dict[str, dict[str, list[float]]] = {
-    "no friction": dict.fromkeys(
-        ("friction_coulomb", "friction_static", "friction_viscous", "stribeck_velocity"), []
-    ),
-    "friction of the file": {},
-}
 
 
 class Push(NamedTuple):
@@ -242,192 +215,11 @@ def pushes() -> Figure:
     return figure
 
 
-class ForceByHand(SqueezeTask):
-    """(27) as printed at each hand for itself, to compare with: no stiffness along the line."""
-
-    squeeze: Squeeze
-
-    def term(self, robot: RobotModel) -> TaskTerm:
-        """Return the term for both hands: 12 rows."""
-        hands = (self.first, robot), (self.second, robot.others[0])
-        terms = [task.term(hand) for task, hand in hands]
-        free = [replace(task, kp=0.0).term(hand) for task, hand in hands]
-        b = [each.b for each in terms]
-        direction = np.split(closing_direction(robot), 2)
-        kp, most = GAIN, SPEED_MAX * self.first.kd
-        for k, (d, sensor) in enumerate(zip(direction, self.squeeze.sensors, strict=True)):
-            g = kp * (self.squeeze.reference + d @ sensor.wrench)
-            b[k] = b[k] + d * (min(max(g, -most), most) - d @ (terms[k].b - free[k].b))
-        A = np.vstack([each.A for each in terms])
-        return TaskTerm(A, np.concatenate(b), self.first.weight)
-
-
-class SqueezeByHand(Squeeze):
-    """`Squeeze` with `ForceByHand`."""
-
-    def tasks(self, goals: Goals, gains: Gains) -> list[Task]:
-        """See `Squeeze`."""
-        both, *rest = super().tasks(goals, gains)
-        assert isinstance(both, SqueezeTask)
-        task = ForceByHand(both.first, both.second, 0.0)
-        task.squeeze = self
-        return [task, *rest]
-
-
-class Held(NamedTuple):
-    """What two hands did that hold an object.
-
-    Attributes:
-        t: s, shape (N,).
-        squeeze: true internal force, N, shape (N,).
-        away: of the object from where it was, m, shape (N, 3).
-        budgets: additional torque in budgets, shape (N, n).
-        kept: whether all limits were kept.
-    """
-
-    t: np.ndarray
-    squeeze: np.ndarray
-    away: np.ndarray
-    budgets: np.ndarray
-    kept: bool
-
-
-def hold(kind: type[Squeeze], changed: dict[str, list[float]]) -> Held:
-    """Let both hands press an object with `TARGET`, which is then pushed along their line.
-
-    The object is a light block that is glued to the hands, a spring and damper in all directions.
-    """
-    loop = DirectLoop(ROBOT, {"integral_action": "task"} | changed)
-    rest = pin.SE3.Identity(), pin.Inertia.Zero(), np.zeros(3)
-    squeeze = kind(
-        (WrenchSensor(*rest), WrenchSensor(*rest)),
-        AdmittanceGains((GAIN, 0.0), (0.0, 0.0), (SPEED_MAX, 1.0)),
-    )
-    loop.controller.squeeze = squeeze
-    noise = np.random.default_rng(0)
-    start = [loop.pose(frame) for frame in HANDS.values()]
-    between = start[0].actInv(start[1])
-    last = np.zeros(6)
-    forces, away = [], []
-
-    def each(t: float) -> None:
-        nonlocal last
-        poses = [loop.pose(frame) for frame in HANDS.values()]
-        axes, seen = poses[0].rotation, poses[0].actInv(poses[1])
-        bent = np.r_[
-            axes @ (seen.translation - between.translation),
-            axes @ pin.log3(seen.rotation @ between.rotation.T),
-        ]
-        rate, last = (bent - last) / loop.dt, bent
-        wrench = -STIFFNESS * bent - DAMPING * rate
-        load = np.zeros(6)
-        if PUSHED <= t < PUSHED + HELD:
-            load[1] = 0.5 * LOAD * min(1.0, (t - PUSHED) / RAMP)
-        loop.robot.clear_wrenches()
-        for frame, pose, sensor, sign in zip(
-            HANDS.values(), poses, squeeze.sensors, (-1.0, 1.0), strict=True
-        ):
-            felt = sign * wrench + load
-            loop.robot.apply_wrench(frame, felt[:3], felt[3:])
-            raw = (felt.reshape(2, 3) @ pose.rotation).ravel()
-            sensor.receive(raw + NOISE * noise.normal(size=6))
-        x = poses[1].translation - poses[0].translation
-        forces.append(float(x @ wrench[:3] / np.linalg.norm(x)))
-        ways = [p.translation - s.translation for p, s in zip(poses, start, strict=True)]
-        away.append(0.5 * (ways[0] + ways[1]))
-        if t >= PRESSED and squeeze.target is None:
-            squeeze.target = TARGET
-
-    samples = loop.run(PUSHED + HELD + 1.5, each)
-    budget = loop.controller.additional.settings.integral.budget
-    return Held(
-        column(samples, "t"),
-        np.array(forces),
-        np.array(away),
-        np.abs(column(samples, "additional")) / budget,
-        within_limits(loop),
-    )
-
-
-def holding() -> Figure:
-    """An object between the hands, pressed with 40 N, and pushed: (27) for both, or for each."""
-    figure = Figure("two-hands-hold")
-    kinds = {"each": SqueezeByHand, "both": Squeeze}
-    picture, axes = plt.subplots(2, 2, figsize=(12, 7), sharex=True, layout="constrained")
-    for (arm, changed), (upper, lower) in zip(ARMS.items(), axes.T, strict=True):
-        cells, found = [], {}
-        for name, kind in kinds.items():
-            run = hold(kind, changed)
-            judged = run.t > PUSHED - 0.5
-            off = np.abs(run.squeeze[judged] - TARGET).max()
-            moved = np.linalg.norm(run.away[judged] - run.away[judged][0], axis=1).max()
-            found[name] = off, moved, run.budgets.max(), run.kept
-            cells.append(
-                f"squeeze off by at most {off:.1f} N; object moved by {1e3 * moved:.1f} mm; "
-                f"{run.budgets.max():.2f} budgets"
-            )
-            figure.metrics |= {
-                f"{arm}, {name}: squeeze_off_n": float(off),
-                f"{arm}, {name}: object_moved_m": float(moved),
-                f"{arm}, {name}: limits_kept": float(run.kept),
-            }
-            figure.data[f"{arm}, {name}"] = np.column_stack([run.t, run.squeeze, run.away])
-            upper.plot(run.t, run.squeeze, label=f"(27) for {name}")
-            lower.plot(run.t, 1e3 * run.away[:, 1], label=f"(27) for {name}")
-        upper.set(title=arm, ylabel="squeeze [N]")
-        lower.set(xlabel="time [s]; orange: object pushed", ylabel="object along the line [mm]")
-        for axis in (upper, lower):
-            axis.axvspan(PUSHED, PUSHED + HELD, color="orange", alpha=0.15)
-            axis.grid(alpha=0.3)
-            axis.legend(fontsize="small")
-        off, moved, most, kept = found["both"]
-        fine = kept and most <= 1.0 + 1e-9 and moved < 2e-3 and off < 0.25 * TARGET
-        figure.rows.append(
-            (
-                f"an object pressed with {TARGET:.0f} N, pushed with {LOAD:.0f} N along the line "
-                f"of the hands for {HELD:.0f} s; {arm}",
-                *cells,
-                verdict(bool(fine), "held, limits kept"),
-            )
-        )
-    figure.save(picture)
-    return figure
-
-
 HEADS = "", "`integral_action: joints`", "`integral_action: task`", ""
-HOLD_HEADS = "", "(27) at each hand for itself", "(27) for the squeeze", ""
-PARTS: dict[str, Callable[[], Figure]] = {"pushes": pushes, "hold": holding}
-PAGE = """# Results: two hands, one integral
-
-Written by `bash scripts/reproduce.sh two-hands`; do not edit.
-TALOS' torso and both arms, 16 joints at 1 kHz, `config/two_hands/talos_arms.yaml`: both hands
-hold their poses, 12 rows, with one integral action
-([nullspace_compliance.md](nullspace_compliance.md#several-end-effectors)). Friction is 10% of the
-torque limits (stiction 13%), links are 10% heavier than the controller knows.
-
-{table}
-
-Both hands hold a light block, a spring of 20 kN/m and 100 N m/rad that is glued to them, with
-`task`; sensors at both hands have noise. Both numbers count from 0.5 s before the push to 1.5 s
-after it; it ends at once. What the node does not offer:
-[forces.md](forces.md#two-hands-on-one-object).
-
-{hold}
-"""
-
-
-def show(figures: list[Figure]) -> str:
-    """Return the tables."""
-    heads = {"two-hands-pushes": HEADS, "two-hands-hold": HOLD_HEADS}
-    return "\n\n".join(table([figure], heads[figure.name]) for figure in figures)
-
-
-def write_document(figures: list[Figure]) -> None:
-    """Write docs/reproduction_two_hands.md."""
-    first, second = (show([figure]) for figure in figures)
-    page = PAGE.format(table=first, hold=second)
-    (ROOT / "docs" / "reproduction_two_hands.md").write_text(page)
 
 
 if __name__ == "__main__":
-    raise SystemExit(reproduce(__doc__, PARTS, write_document, show))
+    parts = {"pushes": pushes}
+    raise SystemExit(
+        reproduce(__doc__, parts, lambda _: None, lambda figures: table(figures, HEADS))
+    )

@@ -19,7 +19,6 @@ from torque_safety_controller.additional_torque import (
     AdditionalTorque,
 )
 from torque_safety_controller.contact.interaction import Interaction
-from torque_safety_controller.contact.squeeze import Squeeze
 from torque_safety_controller.qp.constraints import (
     AccelerationRange,
     Constraint,
@@ -37,14 +36,13 @@ from torque_safety_controller.safety.disturbance_observer import DisturbanceObse
 from torque_safety_controller.safety.gentle_return import return_gently
 from torque_safety_controller.safety.torque_limiter import TorqueLimiter
 from torque_safety_controller.tasks.damping_task import DampingTask
-from torque_safety_controller.tasks.detour import Detour, Progress
 from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.goals import Goals
 from torque_safety_controller.tasks.task import Task
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.state_estimation.freeze_check import FRICTION, STICTION, Expected
 from viability_bounds_pkg.viability import AccelerationBounds
-from viability_bounds_pkg.whole_arm.safety_filter import UNHURRIED, USUAL, SafetyFilter
+from viability_bounds_pkg.whole_arm.safety_filter import SafetyFilter
 
 __all__ = ["ControlOutput", "Controller", "Gains"]
 
@@ -92,16 +90,14 @@ class Controller:
         constraints: on the accelerations, besides bounds and torque limits.
         interaction: forces at the hand and other contacts; None for nothing.
         safety_filter: keeps a plan in hand that keeps all limits; None for nothing.
-        detour: leads the arm where it would stand short of its goal; None for nothing.
         own_bounds: within which it brakes while it is given no acceleration bounds; None brakes
             regardless of positions and speeds.
         position_limits: without margins, lower and upper, shape (n,), rad; while it is slowed it
             brakes gently within the margins, which None forbids.
-        squeeze: of an object between two hands; while they press, `interaction` does nothing.
 
     Attributes:
         goals: of the end effector and the joints.
-        additional, constraints, interaction, safety_filter, detour, squeeze: as given.
+        additional, constraints, interaction, safety_filter: as given.
         iterations: of the last QP.
         share: of the accelerations that the tasks want; the rest brings the arm to rest.
         at_rest: whether the share is zero and hardly any torque is left that brakes the arm.
@@ -121,10 +117,8 @@ class Controller:
         constraints: Sequence[Constraint] = (),
         interaction: Interaction | None = None,
         safety_filter: SafetyFilter | None = None,
-        detour: Detour | None = None,
         own_bounds: Callable[[Array, Array], AccelerationBounds] | None = None,
         position_limits: tuple[Array, Array] | None = None,
-        squeeze: Squeeze | None = None,
     ) -> None:
         n = robot.n
         self.robot = robot
@@ -134,8 +128,6 @@ class Controller:
         self.constraints = constraints
         self.interaction = interaction
         self.safety_filter = safety_filter
-        self.detour = detour
-        self.squeeze = squeeze
         self.iterations = 0
         self.share = 1.0
         self.at_rest = False
@@ -199,12 +191,8 @@ class Controller:
             self.additional.reset()
         if self.interaction is not None:
             self.interaction.start()
-        if self.squeeze is not None:
-            self.squeeze.start()
         if self.safety_filter is not None:
             self.safety_filter.reset()
-        if self.detour is not None:
-            self.detour.reset()
 
     def set_pose_goal(
         self,
@@ -351,8 +339,6 @@ class Controller:
         observer.observe(robot.v, self._a_last, known, self.tau_max, robot.M)
         if self.interaction is not None:
             self.interaction.observe(robot, self.goals, elapsed)
-        if self.squeeze is not None:
-            self.squeeze.observe(robot, self.goals, elapsed)
         if additional is None or not robot.rates:
             return None
         before = additional.integral
@@ -364,26 +350,10 @@ class Controller:
     def _tasks(self) -> tuple[list[Task], ContactForces | None]:
         """Return the tasks of a step, and the forces that contacts may exert."""
         gains, interaction = self.gains, self.interaction
-        if self.squeeze is not None and self.squeeze.presses(self.goals):
-            return self.squeeze.tasks(self.goals, gains), self.squeeze.forces(self.robot)
         if interaction is None:
-            return self._by_detour(self.goals.tasks(gains)), None
+            return self.goals.tasks(gains), None
         tasks, forced = self.goals.tasks(gains, interaction.stiffness), interaction.tasks(gains)
-        forces = interaction.forces(self.robot)
-        if forced or forces is not None:
-            if self.detour is not None:
-                self.detour.reset()
-            return tasks + forced, forces
-        return self._by_detour(tasks), None
-
-    def _by_detour(self, tasks: list[Task]) -> list[Task]:
-        """Return the tasks that lead the arm where those of its goals would leave it standing."""
-        detour, keeper = self.detour, self.safety_filter
-        if detour is None or keeper is None:
-            return tasks
-        tasks = detour.tasks(tasks, self.robot, AccelerationRange(keeper.lower, keeper.upper))
-        keeper.usual = UNHURRIED if detour.progress is Progress.LED else USUAL
-        return tasks
+        return tasks + forced, interaction.forces(self.robot)
 
     def _solve(
         self,
@@ -446,9 +416,7 @@ class Controller:
             tau = tau + additional
         if contacts is not None:
             tau = tau - contacts.B @ solution.rho
-            if self.squeeze is not None and self.squeeze.presses(self.goals):
-                self.squeeze.note_forces(solution.rho)
-            elif self.interaction is not None:
+            if self.interaction is not None:
                 self.interaction.note_forces(solution.rho)
         a = self._remember(a)
         tau = self._limiter.limited(tau)

@@ -48,9 +48,7 @@ class SimulatedHand:
         contacts = None
         if contact:
             contacts = Contacts(ARM.model, [FrictionContact(ARM.frame, np.zeros(3), NORMAL, 0.5)])
-        self.interaction = Interaction(
-            sensor, contacts, 0 if contact else None, None, InteractionSettings(**settings)
-        )
+        self.interaction = Interaction(sensor, contacts, settings=InteractionSettings(**settings))
         self.controller = Controller(ARM.robot(DT), tau_max, gains, interaction=self.interaction)
         self.controller.warm_up()
         self.controller.reset(Q)
@@ -162,7 +160,7 @@ def test_the_motors_give_what_the_contact_takes():
     np.testing.assert_allclose(free.tau, exact.torque(free.a), atol=1e-9)
     for _ in range(2000):
         pressing = hand.step(force(z=-10.0))
-    assert hand.interaction.contacts.closed[0]
+    assert hand.interaction.forces(hand.controller.robot) is not None
     # The wrench task has a hundred thousandth of the others' weight, and gamma acts on it, too.
     np.testing.assert_allclose(hand.interaction.reference, force(z=-10.0), atol=2.5)
     model, data = ARM.model, ARM.model.createData()
@@ -191,13 +189,11 @@ def test_what_is_counted_on_exceeds_what_is_felt_by_a_step_at_most(monkeypatch):
     monkeypatch.setattr(interaction, "WRENCH_TIME", 1e-6)
     hand = SimulatedHand(contact=True, directions=Z)
     hand.interaction.set_target(-force(x=5.0, z=-10.0))
-    contacts = hand.interaction.contacts
     for measured, counted in ((0.0, 2.0), (3.0, 5.0), (-7.0, 2.0), (9.0, 10.0), (40.0, 10.0)):
         hand.step(force(z=-measured))
         task = hand.interaction.forces(hand.controller.robot).tasks[0]
         # Smaller, and in the same direction.
         np.testing.assert_allclose(task.F_des, [0.5 * counted, 0.0, -counted], rtol=1e-9)
-    assert contacts.closed[0]
 
 
 @pytest.mark.parametrize(
@@ -292,7 +288,7 @@ def test_a_sensor_that_falls_silent_ends_it_where_the_hand_is(pressing):
         step = hand.step(None, elsewhere)
     assert hand.state is Compliance.SILENT
     assert hand.controller.goals.pose_des.isApprox(hand.controller.robot.pose)
-    assert not hand.interaction.contacts.closed.any()
+    assert hand.interaction.forces(hand.controller.robot) is None
     np.testing.assert_allclose(hand.hand_acceleration(step), 0.0, atol=1e-4)
     assert not hand.interaction.target.any()
     # Back again, nothing is pressed unasked.
@@ -346,21 +342,3 @@ def test_starting_anew_presses_nothing():
     hand.controller.reset(Q)
     hand.step(force())
     assert hand.state is Compliance.OFF
-
-
-def test_other_contacts_are_closed_by_name_only_and_carry_no_more_than_they_must():
-    contacts = Contacts(
-        ARM.model,
-        [
-            FrictionContact(ARM.frame, np.zeros(3), NORMAL, 0.5),
-            FrictionContact("panda_link4", np.zeros(3), [0.0, 1.0, 0.0], 0.3),
-        ],
-    )
-    interaction = Interaction(None, contacts, None, None, InteractionSettings(closed=(1,)))
-    robot = ARM.robot(DT)
-    robot.update(State(Q, REST), REST)
-    forces = interaction.forces(robot)
-    assert contacts.closed.tolist() == [False, True]
-    assert [task.F_des.tolist() for task in forces.tasks] == [[0.0, 0.0, 0.0]]
-    interaction.settings = InteractionSettings()
-    assert interaction.forces(robot) is None

@@ -139,7 +139,6 @@ def test_a_target_is_exerted_and_torques_say_so(ros, monkeypatch):
     hand.until("compliance", "force")
     for _ in range(300):  # until the target is reached
         after = hand.step()
-    hand.until("contacts_closed", "panda_hand")
     robot = ARM.robot(0.0)
     robot.update(State(ARM.q_start, np.zeros(ARM.n)), np.zeros(ARM.n))
     pressed = robot.J.T @ np.array([0.0, 0.0, 10.0, 0.0, 0.0, 0.0])
@@ -242,7 +241,7 @@ def contact(**changed):
         ({"contacts": [contact(), contact(normal=[0.0, 0.0, 1.0])]}, "contacts[1].normal"),
         ({"contacts": [contact(), contact(stiffness=1.0)]}, "contacts[1]"),
         ({"contacts": ["panda_hand"]}, "contacts[0]"),
-        ({"closed_contacts": ["panda_link4"]}, "closed_contacts"),
+        ({"contacts": [contact(frame="panda_link4")]}, "contacts"),
     ],
 )
 def test_a_wrong_parameter_is_named(changed, named):
@@ -291,20 +290,13 @@ def test_what_a_tool_weighs_is_that_of_the_parameter_or_of_the_urdf():
 def test_points_of_one_link_are_one_contact():
     corners = [[x, y, 0.1] for x in (-0.02, 0.02) for y in (-0.01, 0.01)]
     controller = build(
-        contacts=[
-            *(contact(point=corner) for corner in corners),
-            contact(frame="panda_link4", normal=[0.0, 1.0, 0.0], friction=0.2),
-        ],
-        closed_contacts=["panda_link4"],
+        contacts=[contact(point=corner) for corner in corners],
     )
-    hand, elbow = controller.interaction.contacts.contacts
+    (hand,) = controller.interaction.contacts.contacts
     np.testing.assert_array_equal(hand.points, corners)
-    np.testing.assert_array_equal(elbow.points, [[0.0, 0.0, 0.0]])
-    np.testing.assert_array_equal(elbow.normal, [0.0, 1.0, 0.0])
-    assert (hand.friction, elbow.friction) == (0.5, 0.2)
-    assert controller.interaction.settings.closed == (1,)
+    assert hand.friction == 0.5
 
 
-def test_without_sensor_and_contacts_there_is_nothing_to_do():
-    controller = build(contacts=[], ft_frame="", force_directions=[], yield_threshold=[])
+def test_without_a_sensor_there_is_nothing_to_do():
+    controller = build(ft_frame="", force_directions=[], yield_threshold=[])
     assert controller.interaction is None

@@ -118,7 +118,6 @@ class Contacts:
 
     Attributes:
         contacts: as given.
-        closed: which of them there are at present, shape (c,); open ones exert nothing.
         r: number of force coefficients of all contacts.
 
     Raises:
@@ -133,7 +132,6 @@ class Contacts:
                 known = ", ".join(f.name for f in model.frames)
                 raise SettingError("frame of a contact", contact.frame, f"one of: {known}")
         self.contacts = tuple(contacts)
-        self.closed = np.ones(len(contacts), dtype=bool)
         ends = np.cumsum([contact.W.shape[1] for contact in contacts])
         self.r = int(ends[-1])
         self._model = model
@@ -144,7 +142,7 @@ class Contacts:
         ]
         self._exerted = [c.W[:3] if len(c.points) == 1 else c.W for c in contacts]
         self._B = np.zeros((model.nv, self.r))
-        self._rho_max = np.zeros(self.r)
+        self._rho_max = np.full(self.r, np.inf)
 
     def update(self, data: pin.Data) -> None:
         """Compute what depends on the state.
@@ -158,8 +156,6 @@ class Contacts:
 
     def forces(self, tasks: Sequence[WrenchTerm] = ()) -> ContactForces:
         """Return the forces for the QP, with what they should be; the next update changes them."""
-        for closed, part in zip(self.closed, self._slices, strict=True):
-            self._rho_max[part] = np.inf if closed else 0.0
         return ContactForces(self._B, self._rho_max, tasks)
 
     def wrench_task(self, index: int, F_des: Array, weight: float) -> WrenchTerm:

@@ -69,14 +69,12 @@ class InteractionSettings:
         directions: of the end effector's axes, those in which force is controlled, shape (6,),
             bool.
         gains: of the admittance task when a wrench is exerted.
-        closed: indices of other contacts that there are at present.
         yield_threshold: force and moment above which the hand yields, N and N m; None never.
         yielding_gains: of the admittance task when it does.
     """
 
     directions: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(6, dtype=bool))
     gains: AdmittanceGains = AdmittanceGains()
-    closed: tuple[int, ...] = ()
     yield_threshold: tuple[float, float] | None = None
     yielding_gains: AdmittanceGains = AdmittanceGains((0.1, 1.0), (0.0, 0.0), (0.25, 1.0))
 
@@ -85,10 +83,9 @@ class Interaction:
     """What an arm does about forces.
 
     Args:
-        sensor: at the hand; None for none: then nothing is done but what `contacts` want.
-        contacts: that the QP may use forces of; None for none.
-        hand: index of the contact at the hand, with which a wrench is exerted; None for none.
-        placement: of that contact's frame in the end effector's.
+        sensor: at the hand.
+        contacts: the hand's, with which a wrench is exerted; None for none.
+        placement: of the contact's frame in the end effector's.
         settings: may be replaced between steps.
 
     Attributes:
@@ -101,15 +98,13 @@ class Interaction:
 
     def __init__(
         self,
-        sensor: WrenchSensor | None,
+        sensor: WrenchSensor,
         contacts: Contacts | None = None,
-        hand: int | None = None,
         placement: pin.SE3 | None = None,
         settings: InteractionSettings | None = None,
     ) -> None:
         self.sensor = sensor
         self.contacts = contacts
-        self._hand = hand
         placement = pin.SE3.Identity() if placement is None else placement
         self._to_hand = placement.toDualActionMatrix()  # from the contact's frame
         self._to_contact = np.ascontiguousarray(placement.inverse().toDualActionMatrix())
@@ -142,10 +137,7 @@ class Interaction:
         self._counted = np.zeros(6)  # on, at the contact of the hand, in its axes
         self._missing = np.zeros(6)  # of that, in the QP, in the end effector's axes
         self._enter(Compliance.OFF, "at start")
-        if self.contacts is not None:
-            self.contacts.closed[:] = False
-        if self.sensor is not None:
-            self.sensor.start()
+        self.sensor.start()
 
     def set_target(self, wrench: Array, rotation: Array | None = None) -> None:
         """Exert a wrench in the directions set for it.
@@ -173,8 +165,6 @@ class Interaction:
             goals: of the arm.
             elapsed: time since the last step, s.
         """
-        if self.sensor is None:
-            return
         sensor = self.sensor
         sensor.update(robot.pose.rotation, elapsed)
         active = self.state in (Compliance.FORCE, Compliance.YIELDING)
@@ -244,9 +234,9 @@ class Interaction:
         Along the normal hardly more than is felt; across it, and as a moment, what a contact that
         presses so can give: the QP would press harder for the sake of it, on nothing perhaps.
         """
-        if self._hand is None or self.contacts is None:
+        if self.contacts is None:
             return
-        contact = self.contacts.contacts[self._hand]
+        (contact,) = self.contacts.contacts
         self._counted = _counted(
             self._goal,
             measured,
@@ -269,7 +259,7 @@ class Interaction:
             gains: of the tasks.
         """
         settings, sensor, weight = self._settings, self.sensor, gains.pose_weight
-        if sensor is None or weight == 0.0:
+        if weight == 0.0:
             return []
         if self.state not in (Compliance.FORCE, Compliance.YIELDING):
             return []
@@ -283,27 +273,16 @@ class Interaction:
         return [AdmittanceTask(a, weight, self._rows)]
 
     def forces(self, robot: RobotModel) -> ContactForces | None:
-        """Return what contacts may exert in this step, with their wrench tasks; None if nothing.
+        """Return what the contact may exert in this step, with its wrench task; None if nothing.
 
         Args:
             robot: updated to the current state.
         """
         contacts = self.contacts
-        if contacts is None:
-            return None
-        closed = contacts.closed
-        for index in range(len(closed)):
-            closed[index] = index in self._settings.closed
-        if self._hand is not None:
-            closed[self._hand] = self.state is Compliance.FORCE
-        if not closed.any():
+        if contacts is None or self.state is not Compliance.FORCE:
             return None
         contacts.update(robot.data)
-        tasks = []
-        for index in np.flatnonzero(closed).tolist():
-            wanted = self._counted if index == self._hand else np.zeros(6)
-            tasks.append(contacts.wrench_task(index, wanted, WRENCH_WEIGHT))
-        return contacts.forces(tasks)
+        return contacts.forces([contacts.wrench_task(0, self._counted, WRENCH_WEIGHT)])
 
     def rehearsal(
         self, robot: RobotModel, gains: Gains
@@ -315,17 +294,15 @@ class Interaction:
         if contacts is None:
             return tasks, None
         contacts.update(robot.data)
-        contacts.closed[:] = True
-        wrench_tasks = [contacts.wrench_task(i, zero, 1.0) for i in range(len(contacts.closed))]
-        return tasks, contacts.forces(wrench_tasks)
+        return tasks, contacts.forces([contacts.wrench_task(0, zero, 1.0)])
 
     def note_forces(self, rho: Array) -> None:
         """Take note of the forces that the QP counts on, shape (r,), N."""
-        contacts, hand = self.contacts, self._hand
-        if contacts is None or hand is None or not contacts.closed[hand]:
+        contacts = self.contacts
+        if contacts is None or self.state is not Compliance.FORCE:
             return
-        missing = self._counted - contacts.wrench(hand, rho)
-        if len(contacts.contacts[hand].points) == 1:
+        missing = self._counted - contacts.wrench(0, rho)
+        if len(contacts.contacts[0].points) == 1:
             missing[3:] = 0.0  # a point exerts no moment; none was asked of it
         self._missing = self._to_hand @ missing
 

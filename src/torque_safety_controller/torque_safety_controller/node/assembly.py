@@ -20,8 +20,6 @@ from torque_safety_controller.controller import Controller
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parameters.interaction_parameters import ContactPoint
 from torque_safety_controller.robot_model import RobotModel
-from torque_safety_controller.tasks.detour import Detour
-from torque_safety_controller.tasks.detour_search import DetourSearch
 from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError, did_you_mean
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.node.bounds_parameters import (
@@ -39,7 +37,7 @@ from viability_bounds_pkg.ros.robot_urdf import robot_urdf, warn_of_unusual
 from viability_bounds_pkg.state_estimation.state_check import StateCheck
 from viability_bounds_pkg.stopping.coordinated_stop import MARGIN
 from viability_bounds_pkg.viability import BoundsSolver
-from viability_bounds_pkg.whole_arm.safety_filter import CLEARANCE, SafetyFilter
+from viability_bounds_pkg.whole_arm.safety_filter import SafetyFilter
 
 if TYPE_CHECKING:
     from rclpy.node import Node
@@ -79,7 +77,6 @@ def make_controller(
         [] if collision is None else [collision],
         make_interaction(config, robot, urdf),
         safety_filter,
-        make_detour(config, robot, safety_filter),
         make_own_bounds(config, declared),
         (config.position_min, config.position_max),
     )
@@ -163,33 +160,6 @@ def make_own_bounds(
     return BoundsSolver(limits, HORIZON * config.dt, margin, period=config.dt).bounds
 
 
-def make_detour(
-    config: ControllerConfiguration, robot: RobotModel, safety_filter: SafetyFilter | None
-) -> Detour | None:
-    """Return what leads the arm where it would stand short of its goal; None where nothing does.
-
-    It searches for ways of one end effector, not of two, and by what the safety filter knows.
-
-    Args:
-        config: checked parameters.
-        robot: model of the arm.
-        safety_filter: knows what can be held.
-    """
-    if safety_filter is None or robot.others:
-        return None
-    limits = config.collision
-    rates = np.minimum(-limits.acceleration_min, limits.acceleration_max)
-    clearance = CLEARANCE * config.dt**2 * rates
-    search = DetourSearch(
-        robot,
-        config.position_min + clearance,
-        config.position_max - clearance,
-        safety_filter.usable,
-        safety_filter.can_hold,
-    )
-    return Detour(search, config.dt)
-
-
 def configure(controller: Controller, config: ControllerConfiguration) -> None:
     """Apply the live parameters to a running controller."""
     controller.gains = config.gains
@@ -197,8 +167,7 @@ def configure(controller: Controller, config: ControllerConfiguration) -> None:
         controller.additional.settings = config.additional
     if controller.interaction is not None:
         controller.interaction.settings = config.interaction.settings
-        if controller.interaction.sensor is not None:
-            controller.interaction.sensor.settings = config.interaction.sensor
+        controller.interaction.sensor.settings = config.interaction.sensor
 
 
 class LoadedRobot(NamedTuple):
@@ -300,7 +269,7 @@ def load_collision(
 def make_interaction(
     config: ControllerConfiguration, robot: RobotModel, urdf: str
 ) -> Interaction | None:
-    """Return what handles forces; None where there is neither a sensor nor a contact.
+    """Return what handles forces; None without a sensor.
 
     Args:
         config: checked parameters.
@@ -311,23 +280,14 @@ def make_interaction(
         SettingError: a frame that the URDF does not have or that is not where it must be.
     """
     sensor = _sensor(config, robot, urdf)
-    contacts = _contacts(config.interaction.points, robot.model)
-    if sensor is None and contacts is None:
+    contact = _contact(config.interaction.points, robot)
+    if sensor is None:
         return None
-    hand, placement = None, None
-    if contacts is not None and sensor is not None:
-        on_hand = [
-            index
-            for index, contact in enumerate(contacts.contacts)
-            if _joint_of(robot.model, contact.frame) == _joint_of(robot.model, robot.frame)
-        ]
-        if len(on_hand) > 1:
-            frames = [contacts.contacts[index].frame for index in on_hand]
-            raise SettingError("contacts", frames, "one link that is fixed to the hand")
-        if on_hand:
-            hand = on_hand[0]
-            placement = _between(robot.model, robot.frame, contacts.contacts[hand].frame)
-    return Interaction(sensor, contacts, hand, placement, config.interaction.settings)
+    if contact is None:
+        return Interaction(sensor, settings=config.interaction.settings)
+    placement = _between(robot.model, robot.frame, contact.frame)
+    contacts = Contacts(robot.model, [contact])
+    return Interaction(sensor, contacts, placement, config.interaction.settings)
 
 
 def _sensor(config: ControllerConfiguration, robot: RobotModel, urdf: str) -> WrenchSensor | None:
@@ -352,18 +312,23 @@ def _sensor(config: ControllerConfiguration, robot: RobotModel, urdf: str) -> Wr
     return WrenchSensor(placement, inertia, model.gravity.linear, settings.sensor)
 
 
-def _contacts(points: Sequence[ContactPoint], model: pin.Model) -> Contacts | None:
-    contacts = []
-    for frame in dict.fromkeys(each.frame for each in points):
-        its = [each for each in points if each.frame == frame]
-        first = its[0]
-        if not model.existFrame(frame):
-            label = f"contacts[{points.index(first)}].frame"
-            hint = did_you_mean(frame, (each.name for each in model.frames))
-            raise SettingError(label, frame, f"a frame of the URDF{hint}")
-        places = np.array([each.point for each in its])
-        contacts.append(FrictionContact(frame, places, first.normal, first.friction))
-    return Contacts(model, contacts) if contacts else None
+def _contact(points: Sequence[ContactPoint], robot: RobotModel) -> FrictionContact | None:
+    """Return the contact of the hand; None without points."""
+    if not points:
+        return None
+    for index, point in enumerate(points):
+        if not robot.model.existFrame(point.frame):
+            hint = did_you_mean(point.frame, (each.name for each in robot.model.frames))
+            allowed = f"a frame of the URDF{hint}"
+            raise SettingError(f"contacts[{index}].frame", point.frame, allowed)
+    first = points[0]
+    frames = list(dict.fromkeys(each.frame for each in points))
+    if len(frames) > 1 or _joint_of(robot.model, first.frame) != _joint_of(
+        robot.model, robot.frame
+    ):
+        raise SettingError("contacts", frames, f"one link, fixed to {robot.frame!r}")
+    places = np.array([each.point for each in points])
+    return FrictionContact(first.frame, places, first.normal, first.friction)
 
 
 def _joint_of(model: pin.Model, frame: str) -> int:

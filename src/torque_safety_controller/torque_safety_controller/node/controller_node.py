@@ -31,7 +31,7 @@ from torque_safety_controller.node.reports.controller_report import (
     LEVELS,
     Shortfall,
     StepRecord,
-    about_detour,
+    goal_too_heavy,
     too_weak,
 )
 from torque_safety_controller.node.reports.state_publisher import StatePublisher
@@ -417,17 +417,17 @@ class ControllerNode(ArmNode):
         level, text = LEVELS[self._modes.mode], f"{self._modes.mode.value}: {self._modes.reason}"
         weak = too_weak(self._config.joints, self._controller)
         weak = weak and f"the arm cannot be held where it would come to rest: {weak}"
+        heavy = goal_too_heavy(self._config.joints, self._controller)
+        heavy = heavy and f"the goal cannot be held: {heavy}"
         troubles = (
             self._recovery.rate.trouble,
             self._collision.too_near,
             self._wrenches.trouble,
             weak,
+            heavy,
         )
         for trouble in filter(None, troubles):
             level, text = max(level, DiagnosticStatus.WARN), f"{text}; {trouble}"
-        detour = about_detour(self._config.joints, self._controller)
-        if detour.text:
-            level, text = max(level, detour.level), f"{text}; {detour.text}"
         short = self._shortfall.look(self._controller, 1e-9 * self._states.stamp)
         short = short if self._modes.mode is Mode.TRACKING else ""
         values["short_of_goal"] = short or "none"

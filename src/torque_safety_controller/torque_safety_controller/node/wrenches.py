@@ -61,7 +61,7 @@ class WrenchSubscriber:
         self.refused: Counter[str] = Counter()
         self._changes = 0
         goals.listen(TARGET_WRENCH, self._on_target)
-        if interaction is None or interaction.sensor is None:
+        if interaction is None:
             return
         sensor = interaction.sensor
         measured = FT_WRENCH.subscription(node, partial(self._on_measured, sensor))
@@ -89,7 +89,7 @@ class WrenchSubscriber:
 
     def _on_target(self, message: WrenchStamped) -> None:
         config, interaction = self._config, self._interaction
-        if interaction is None or interaction.sensor is None:
+        if interaction is None:
             raise GoalRefused("there is no force/torque sensor, 'ft_frame'")
         wrench = wrench_of(message)
         if not np.isfinite(wrench).all():
@@ -154,20 +154,12 @@ class WrenchSubscriber:
         interaction = self._interaction
         if interaction is None:
             return {"compliance": Compliance.OFF.value}
-        values: dict[str, Any] = {
+        return {
             "compliance": interaction.state.value,
             "compliance_reason": interaction.reason,
             "compliance_changes": interaction.changes,
+            "hand_wrench": interaction.sensor.wrench,
+            "target_wrench": interaction.target,
+            "ft_bias": interaction.sensor.bias,
+            "wrenches_refused": self.refused,
         }
-        if interaction.sensor is not None:
-            values |= {
-                "hand_wrench": interaction.sensor.wrench,
-                "target_wrench": interaction.target,
-                "ft_bias": interaction.sensor.bias,
-                "wrenches_refused": self.refused,
-            }
-        if interaction.contacts is not None:
-            closed = zip(interaction.contacts.contacts, interaction.contacts.closed, strict=True)
-            names = [contact.frame for contact, flag in closed if flag]
-            values["contacts_closed"] = ", ".join(names) or "none"
-        return values

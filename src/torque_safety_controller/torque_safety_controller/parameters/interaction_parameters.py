@@ -90,18 +90,12 @@ class InteractionConfiguration:
         live=True,
     )
     contacts: tuple[str, ...] = texts(
-        "points at which the QP may use contact forces, in the axes of the link frame: point, m, "
-        "its origin if left out; normal, direction in which the environment pushes; friction, "
-        "Coulomb's coefficient, 0 if left out; points of one link are one contact",
+        "points at which the hand touches while it exerts target_wrench, on one link fixed to it "
+        "and in its axes: point, m, its origin if left out; normal, direction in which the "
+        "environment pushes; friction, Coulomb's coefficient, 0 if left out",
         default=(),
         note="each a YAML mapping '{frame: link, point: [x, y, z], normal: [x, y, z], "
-        "friction: 0.3}'; normal and friction are the same at all points of a link",
-    )
-    closed_contacts: tuple[str, ...] = texts(
-        "links but the hand that are in contact at present",
-        default=(),
-        live=True,
-        note="frames of 'contacts'",
+        "friction: 0.3}'; all have the same frame, normal and friction",
     )
     points: tuple[ContactPoint, ...] = field(init=False)
     settings: InteractionSettings = field(init=False)
@@ -121,10 +115,6 @@ class InteractionConfiguration:
         object.__setattr__(self, "settings", self._settings())
 
     def _settings(self) -> InteractionSettings:
-        frames = list(dict.fromkeys(point.frame for point in self.points))
-        if not set(self.closed_contacts) <= set(frames):
-            allowed = f"frames of 'contacts': {', '.join(frames) or 'none'}"
-            raise SettingError("closed_contacts", self.closed_contacts, allowed)
         threshold = tuple(self.yield_threshold.tolist()) or None
         return InteractionSettings(
             directions=self.force_directions == 1.0,
@@ -133,21 +123,18 @@ class InteractionConfiguration:
                 kp=tuple(self.admittance_kp.tolist()),
                 speed_max=tuple(self.admittance_speed_max.tolist()),
             ),
-            closed=tuple(map(frames.index, self.closed_contacts)),
             yield_threshold=threshold,
         )
 
 
 def _contact_points(entries: Sequence[str]) -> tuple[ContactPoint, ...]:
     points = read_entries(ContactPoint, "contacts", entries)
-    first: dict[str, ContactPoint] = {}
     for index, point in enumerate(points):
-        other = first.setdefault(point.frame, point)
-        allowed = f"the same at all points of {point.frame!r}"
+        allowed = "the same at all points"
         if np.abs(point.normal).max() <= 1e-9:
             raise SettingError(f"contacts[{index}].normal", point.normal, "a direction, not zero")
-        if not np.array_equal(other.normal, point.normal):
+        if not np.array_equal(points[0].normal, point.normal):
             raise SettingError(f"contacts[{index}].normal", point.normal, allowed)
-        if other.friction != point.friction:
+        if points[0].friction != point.friction:
             raise SettingError(f"contacts[{index}].friction", point.friction, allowed)
     return points

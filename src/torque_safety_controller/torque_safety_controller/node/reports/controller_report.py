@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -11,7 +11,6 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from torque_safety_controller.controller import Controller, ControlOutput
 from torque_safety_controller.safety.modes import Mode
-from torque_safety_controller.tasks.detour import Progress
 from viability_bounds_pkg.recent_values import RecentValues
 
 LEVELS = {
@@ -97,8 +96,6 @@ class StepRecord:
                 "joints_at_integral_budget": _named(joints, controller.additional.saturated),
                 "integral_skipped_steps": controller.additional.skipped,
             }
-        if controller.detour is not None:
-            values["detour"] = controller.detour.progress.value
         if controller.safety_filter is not None:
             values |= {
                 "steps_by_plan": controller.safety_filter.outcomes,
@@ -112,37 +109,25 @@ def too_weak(joints: tuple[str, ...], controller: Controller) -> str:
     """Return which joints cannot hold the arm where it would come to rest; empty for none."""
     if controller.safety_filter is None:
         return ""
-    torque, most = controller.safety_filter.rest_torque, controller.tau_max
+    return _beyond(joints, controller.safety_filter.rest_torque, controller.tau_max)
+
+
+def goal_too_heavy(joints: tuple[str, ...], controller: Controller) -> str:
+    """Return which joints cannot hold the arm at the joints' goal; empty for none."""
+    goals, robot = controller.goals, controller.robot
+    if goals.q_des is None or goals.pose_des is not None:
+        return ""
+    torque = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), goals.q_des)
+    return _beyond(joints, torque, controller.tau_max)
+
+
+def _beyond(joints: tuple[str, ...], torque: np.ndarray, most: np.ndarray) -> str:
+    """Return which joints need more torque than they have; empty for none."""
     return ", ".join(
         f"{name} needs {needed:.1f} of {limit:.1f} N m"
         for name, needed, limit in zip(joints, np.abs(torque), most, strict=True)
         if needed > limit
     )
-
-
-class About(NamedTuple):
-    """What to report, and at which level."""
-
-    level: bytes
-    text: str
-
-
-def about_detour(joints: tuple[str, ...], controller: Controller) -> About:
-    """Return what is done about an arm that stands short of its goal; no text for nothing."""
-    detour = controller.detour
-    if detour is None or detour.progress is Progress.NONE:
-        return About(DiagnosticStatus.OK, "")
-    text = detour.progress.value
-    if detour.progress in (Progress.SEARCHING, Progress.LED):
-        return About(DiagnosticStatus.OK, text)
-    if detour.progress is Progress.NOT_HELD and controller.safety_filter is not None:
-        joint = int(detour.load.argmax())
-        limit = float(controller.safety_filter.usable[joint])
-        text += f": {joints[joint]} needs {detour.load[joint] * limit:.1f} of {limit:.1f} N m"
-    if detour.progress is Progress.AT_LIMIT:
-        joint = int(detour.short.argmax())
-        text += f": {joints[joint]} stops {1e3 * detour.short[joint]:.1f} mrad before it"
-    return About(DiagnosticStatus.WARN, text)
 
 
 class Shortfall:
