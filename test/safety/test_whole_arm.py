@@ -1,17 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arms with motors that are too weak for their own weight or haste, with the safety filter."""
 
-import re
-
 import numpy as np
 import pinocchio as pin
 import pytest
 from direct import DirectLoop, column
 from time_to_goal import SHORT, near_goal
-from whole_arm import CASES, CLEAR, POSE, arrive, make_loop, random_goal
-
-from torque_safety_controller.node.reports.controller_report import about_detour
-from torque_safety_controller.tasks.detour import Progress
+from whole_arm import CLEAR, arrive, random_goal
 
 STIFF = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
 """A posture task that drives each joint to its limits, whatever the hand does."""
@@ -19,8 +14,6 @@ FILTERED = {"safety_filter": True}
 SHOULDER = 1
 STRETCHED = np.array([0.0, -0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
 """Where Baxter's shoulder needs more than it has."""
-AT_LIMITS = np.array([1.7, -2.146, -3.051, 2.613, -2.671, -0.831, 3.054])
-"""Baxter with five joints at their limits."""
 
 
 def load_at(loop, q):
@@ -107,7 +100,7 @@ def test_an_arm_that_starts_where_it_cannot_be_held_comes_down_slowly():
     assert beyond(loop)[:2] == (0.0, 0.0)
 
 
-def test_a_goal_behind_what_cannot_be_held_is_reached_by_a_detour():
+def test_before_what_cannot_be_held_the_arm_stops_short_of_its_goal():
     """From one side of the horizontal to the other, the elbow straight at both ends."""
     loop = DirectLoop("baxter_left_arm", STIFF | {"safety_filter": True})
     above = np.array([0.0, -1.3, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -116,103 +109,9 @@ def test_a_goal_behind_what_cannot_be_held_is_reached_by_a_detour():
     loop.begin()
     loop.controller.set_posture_goal(below)
     samples = loop.run(14.0)
-    assert np.abs(samples[-1].q - below).max() < 0.01
-    assert column(samples, "q")[:, 3].max() > 0.3, "the elbow did not bend"
+    assert np.abs(samples[-1].q - below).max() > 0.01
+    assert np.abs(samples[-1].v).max() < 0.05
     assert beyond(loop)[:2] == (0.0, 0.0)
-
-
-def test_a_pose_behind_limits_of_joints_is_reached_by_a_detour():
-    """Where five joints of the goal's posture are at limits, limits are in the way."""
-    errors = []
-    for led in (False, True):
-        loop = DirectLoop(
-            "baxter_left_arm", {"pose_kp": 100.0, "pose_kd": 20.0, "safety_filter": True}
-        )
-        if not led:
-            loop.controller.detour = None
-        data = loop.model.createData()
-        pin.framesForwardKinematics(loop.model, data, AT_LIMITS)
-        frame = loop.model.getFrameId(loop.controller.robot.frame)
-        loop.controller.set_pose_goal(data.oMf[frame].copy())
-        errors.append(np.linalg.norm(loop.run(10.0)[-1].error))
-        assert beyond(loop)[:2] == (0.0, 0.0)
-    assert errors[0] > 0.05
-    assert errors[1] < 1e-3
-
-
-@pytest.mark.parametrize(
-    ("arm", "goals", "start", "goal"),
-    [
-        # The hand is at a limit of its joint and shakes at 2 rad/s, 0.1 m off.
-        (
-            "Baxter",
-            "pose",
-            [1.697, -2.142, 1.517, 2.613, 1.379, -1.566, -3.054],
-            [0.649, 0.765, 1.969, 0.431, 1.516, -1.249, -0.453],
-        ),
-        # On the edge of what the shoulder can hold, with two joints at limits: from there a plan
-        # of 0.3 s would brake too hard in whatever direction.
-        (
-            "Baxter",
-            "pose",
-            [-1.697, 1.042, 1.545, -0.045, -3.054, -0.152, -3.054],
-            [1.145, -1.964, -0.698, 1.445, 0.735, -0.652, -0.615],
-        ),
-        # The straight way to the goal can be held, but goes along that edge.
-        (
-            "Baxter",
-            "posture",
-            [1.564, -1.007, 0.045, 2.215, -0.885, 1.057, 0.49],
-            [1.697, 0.925, -1.634, -0.045, 2.025, 2.089, 1.256],
-        ),
-        # Near the goal, on that edge: only exactly on the straight way torque becomes free.
-        (
-            "Panda, 60% of its torque",
-            "posture",
-            [1.964, -1.336, 2.716, -1.275, 1.0, 3.006, 2.694],
-            [1.957, -1.394, 2.739, -1.281, 0.998, 3.0, 2.694],
-        ),
-    ],
-)
-def test_goals_where_an_arm_has_been_stuck_are_reached(arm, goals, start, goal):
-    loop = make_loop(CASES[arm])
-    loop.change(**(STIFF if goals == "posture" else POSE))
-    loop.robot.reset(np.array(start), np.zeros(7))
-    loop.begin()
-    loop.controller.set_posture_goal(np.array(start))
-    _, at = arrive(loop, goals, np.array(goal), 15.0)
-    assert at < 12.0
-    assert beyond(loop)[:2] == (0.0, 0.0)
-    assert loop.controller.safety_filter.outcomes["outside"] == 0
-
-
-def test_a_goal_beyond_a_position_limit_is_told_and_not_searched_for():
-    loop = DirectLoop("baxter_left_arm", STIFF | FILTERED)
-    goal = loop.robot.state().q
-    goal[5] = loop.limits.q_max[5] + 0.01
-    loop.controller.set_posture_goal(goal)
-    loop.run(3.0)
-    assert loop.controller.detour.progress is Progress.AT_LIMIT
-    told = about_detour(loop.limits.names, loop.controller).text
-    off = 1e3 * (goal[5] - loop.robot.state().q[5])
-    assert re.search(rf"left_w1 stops {off:.1f} mrad before it", told)
-
-
-def test_motions_that_need_no_detour_are_bit_for_bit_what_they_are_without():
-    samples = []
-    for led in (False, True):
-        loop = DirectLoop("baxter_left_arm", STIFF | {"safety_filter": True})
-        if not led:
-            loop.controller.detour = None
-        loop.controller.set_posture_goal(loop.robot.state().q + 0.4)
-        samples.append(loop.run(3.0))
-    for name in ("q", "v", "tau"):
-        np.testing.assert_array_equal(column(samples[0], name), column(samples[1], name))
-
-
-def test_without_the_filter_there_are_no_detours():
-    loop = DirectLoop("baxter_left_arm", {"safety_filter": False})
-    assert loop.controller.detour is None
 
 
 def test_an_arm_goes_on_to_the_next_goal_when_it_is_at_rest():

@@ -329,15 +329,10 @@ def test_joints_that_cannot_hold_the_arm_are_named(ros):
 
 
 def test_a_goal_that_cannot_be_held_is_named(ros):
-    chain = NodeChain(ros, safety_filter=True, pose_weight=0.0)
+    chain = NodeChain(ros, pose_weight=0.0)
     chain.answer(10, v=REST)
-    ros.wait_until(lambda: chain.reported("detour") == "none")
     stretched = [0.0, -0.2, 0.0, 0.0, 0.0, 0.0, 0.0]
     chain.postures.publish(joint_state(JOINTS, 0, stretched))
     stamps = iter(range(20, 2000, 10))
     chain.await_mode("TRACKING", each=lambda: chain.both(next(stamps), v=REST))
-    still = np.full(ARM.n, 1e-9)  # bounds that let it stand
-    for stamp in range(2000, 2400, 10):
-        chain.answer(stamp, v=REST, lower=-still, upper=still)
-    ros.wait_until(lambda: chain.reported("detour") == "goal cannot be held")
-    assert "goal cannot be held: left_s1 needs 5" in chain.reported("message")
+    ros.wait_until(lambda: "goal cannot be held: left_s1 needs 5" in chain.reported("message"))

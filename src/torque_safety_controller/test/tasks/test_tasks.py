@@ -10,7 +10,6 @@ from torque_safety_controller.tasks.damping_task import DampingTask
 from torque_safety_controller.tasks.gains import Gains, critical_damping
 from torque_safety_controller.tasks.pose_task import PoseMotion, PoseTask, pose_error
 from torque_safety_controller.tasks.posture_task import PostureTask
-from torque_safety_controller.tasks.way_task import ALONG, WayTask
 from viability_bounds_pkg.state import State
 
 KP, KD, WEIGHT = 30.0, 7.0, 2.5
@@ -222,21 +221,6 @@ def test_posture_and_damping_terms():
     A, b, _ = DampingTask(KD).term(robot)
     assert A is None
     np.testing.assert_allclose(b, -KD * v, rtol=1e-15)
-
-
-def test_on_a_way_errors_along_the_line_count_less():
-    q_des, q, v = np.array([1.0, 2.0, 0.0]), np.array([0.5, 3.0, 0.1]), np.array([0.1, -0.2, 0.0])
-    robot = SimpleNamespace(q=q, v=v)
-    A, b, weight = WayTask(q_des, KP, KD, WEIGHT).term(robot)
-    asked = KP * (q_des - q) - KD * v
-    along = (q_des - q) / np.linalg.norm(q_des - q)
-    across = np.cross(along, [0.0, 0.0, 1.0])
-    across /= np.linalg.norm(across)
-    for error, size in ((along, ALONG), (across, 1.0), (along + across, np.hypot(1.0, ALONG))):
-        np.testing.assert_allclose(np.linalg.norm(A @ (asked + error) - b), size, rtol=1e-6)
-    assert weight == WEIGHT
-    A, b, _ = WayTask(q, KP, KD, WEIGHT).term(robot)  # at its end there is no line
-    np.testing.assert_allclose(np.linalg.solve(A, b), -KD * v)
 
 
 @pytest.mark.parametrize("kp", [0.25, 10.0, 1000.0])
