@@ -214,7 +214,8 @@ large for the period it is lowered, which the paper's 2 1/s at 1 kHz never is
 ([gains.md](gains.md#a-stable-integral-gain)).
 
 Not there: the improvement of (27) for internal forces, which the paper names and does not
-describe, more than two end effectors in the node, and the unactuated joints of III-E: bases are fixed.
+describe, more than two end effectors in the node, and the unactuated joints of III-E: bases are
+fixed.
 
 [Benallegue2021]: references.md
 """
