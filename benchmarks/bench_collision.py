@@ -30,7 +30,7 @@ from torque_safety_controller.collision.geometry import link_shapes
 from torque_safety_controller.collision.model import CollisionModel, build_collision_model
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
 from viability_bounds_pkg.parameter import read

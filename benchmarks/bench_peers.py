@@ -22,11 +22,15 @@ from live_robot import load
 from other_environment import TSID, Arrays, worker
 
 from torque_safety_controller.controller import Controller, Gains
-from torque_safety_controller.qp.constraints import AccelerationRange
-from torque_safety_controller.qp.daqp_solver import DaqpSolver
-from torque_safety_controller.qp.inverse_dynamics_qp import InverseDynamicsQP
-from torque_safety_controller.qp.proxqp_solver import ProxqpSolver
-from torque_safety_controller.qp.quadratic_program import QuadraticProgram, Solver, Status
+from torque_safety_controller.qp import (
+    AccelerationRange,
+    DaqpSolver,
+    InverseDynamicsQP,
+    ProxqpSolver,
+    QuadraticProgram,
+    Solver,
+    Status,
+)
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks.goals import Goals
 from torque_safety_controller.tasks.pose_task import PoseTask

@@ -50,7 +50,7 @@ from torque_safety_controller.controller import Controller
 from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.node.safety_stack import make_nodes
 from torque_safety_controller.node.streams.limits import LimitsReader
-from torque_safety_controller.qp.inverse_dynamics_qp import InverseDynamicsQP
+from torque_safety_controller.qp import InverseDynamicsQP
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.cli.scheduling import add_scheduling
 from viability_bounds_pkg.node.bounds_node import BoundsNode

@@ -25,9 +25,12 @@ from sensor_msgs.msg import JointState
 
 from torque_safety_controller.contact.contacts import Contacts, FrictionContact
 from torque_safety_controller.node.controller_node import ControllerNode
-from torque_safety_controller.qp.constraints import AccelerationRange, LinearConstraints
-from torque_safety_controller.qp.inverse_dynamics_qp import InverseDynamicsQP
-from torque_safety_controller.qp.terms import TaskTerm
+from torque_safety_controller.qp import (
+    AccelerationRange,
+    InverseDynamicsQP,
+    LinearConstraints,
+    TaskTerm,
+)
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 from viability_bounds_pkg.ros.direct_delivery import DirectDelivery

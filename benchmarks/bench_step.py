@@ -18,8 +18,12 @@ import yaml
 
 from torque_safety_controller.contact.contacts import Contacts, FrictionContact
 from torque_safety_controller.controller import Controller, Gains
-from torque_safety_controller.qp.constraints import AccelerationRange, LinearConstraints
-from torque_safety_controller.qp.inverse_dynamics_qp import SOLVERS, InverseDynamicsQP
+from torque_safety_controller.qp import (
+    SOLVERS,
+    AccelerationRange,
+    InverseDynamicsQP,
+    LinearConstraints,
+)
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 from viability_bounds_pkg.state import State

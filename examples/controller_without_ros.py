@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from torque_safety_controller.controller import Controller, Gains
-from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.acceleration_limits import estimate_acceleration_limits
 from viability_bounds_pkg.estimation.discretisation_margin import discretisation_margin

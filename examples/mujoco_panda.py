@@ -18,7 +18,7 @@ import numpy as np
 import pinocchio as pin
 
 from torque_safety_controller.controller import Controller, Gains
-from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
 from viability_bounds_pkg.parameter import read

@@ -21,7 +21,7 @@ from sim_bridge.nodes.ft_sensor import ForceTorqueReading
 from torque_safety_controller.controller import ControlOutput
 from torque_safety_controller.node import assembly
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.robot_configuration import load_model

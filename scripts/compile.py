@@ -23,7 +23,6 @@ from direct import DirectLoop
 from sim_bridge.bullet.obstacles import Obstacle
 from torque_safety_controller.anti_windup import project_to_limits
 from torque_safety_controller.node.assembly import make_state_check
-from torque_safety_controller.qp.constraints import fault_of
 from torque_safety_controller.safety.command_watch import CommandWatch
 from viability_bounds_pkg.cli.command_line import INTERRUPTED
 from viability_bounds_pkg.compiled import compilations, compiled_functions, is_kept
@@ -97,7 +96,6 @@ def watch() -> None:
     none = np.zeros(loop.model.nv)
     make_state_check(loop._controller_configuration(), loop.model, None)
     CommandWatch(none, 1)
-    fault_of(none, none)
 
 
 @contextmanager

@@ -32,7 +32,7 @@ from sim_bridge.nodes.bullet_parameters import make_stop
 from sim_bridge.nodes.command_stream import CommandStream
 from torque_safety_controller.node.recovery import Recovery
 from torque_safety_controller.node.streams.states import Arrival, StateStream
-from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.node.estimator_parameters import EstimatorConfiguration, make_estimator
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import joint_state

@@ -18,7 +18,7 @@ from paper1_integral import (
     push,
 )
 
-from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.state import State
 
 pytestmark = pytest.mark.long

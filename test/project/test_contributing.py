@@ -12,7 +12,7 @@ from arms import load_arm
 from controllers import GAINS
 
 from torque_safety_controller.controller import Controller, Gains
-from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.parameter import parameter_table
 from viability_bounds_pkg.state import State

@@ -11,7 +11,7 @@ from direct import DirectLoop, posture_at_limits
 
 from sim_bridge.nodes.bullet_parameters import make_stop
 from torque_safety_controller.node.assembly import make_state_check
-from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.safety.rate_watch import RateWatch
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.state_estimation.state_check import UNDECIDED

@@ -8,7 +8,7 @@ import pytest
 from direct import DirectLoop, posture_at_limits
 
 from sim_bridge.nodes.bullet_parameters import make_stop
-from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.state import State
 
 RATE = 100.0  # Hz; in a row a joint moves far

@@ -19,18 +19,16 @@ from torque_safety_controller.additional_torque import (
     AdditionalTorque,
 )
 from torque_safety_controller.contact.interaction import Interaction
-from torque_safety_controller.qp.constraints import (
+from torque_safety_controller.qp import (
     AccelerationRange,
     Constraint,
-    LinearConstraints,
-    stack_constraints,
-)
-from torque_safety_controller.qp.inverse_dynamics_qp import (
     ContactForces,
     InverseDynamicsQP,
+    LinearConstraints,
+    NoSolutionFound,
     Solution,
+    stack_constraints,
 )
-from torque_safety_controller.qp.quadratic_program import NoSolutionFound
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.safety.disturbance_observer import DisturbanceObserver
 from torque_safety_controller.safety.gentle_return import return_gently

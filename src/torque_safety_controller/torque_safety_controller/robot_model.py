@@ -9,7 +9,6 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from torque_safety_controller.linalg.dense_kernels import middle_of_step
 from viability_bounds_pkg.robot_description import unknown_name
 from viability_bounds_pkg.state import State
 
@@ -113,7 +112,7 @@ class RobotModel(HandModel):
         model, data = self.model, self.data
         q, v = self.q, self.v = state
         self.a_last = a_last
-        q_mid, v_mid = middle_of_step(q, v, a_last, self.dt)
+        q_mid, v_mid = _middle_of_step(q, v, a_last, self.dt)
         self.M = pin.crba(model, data, q_mid)
         self.h = pin.nonLinearEffects(model, data, q_mid, v_mid)
         if self.rates:
@@ -138,6 +137,13 @@ class RobotModel(HandModel):
         From `state` on; None for the current one.
         """
         q, v = state or (self.q, self.v)
-        q_mid, v_mid = middle_of_step(q, v, a, self.dt)
+        q_mid, v_mid = _middle_of_step(q, v, a, self.dt)
         tau: Array = pin.rnea(self.model, self.data, q_mid, v_mid, a)
         return tau
+
+
+def _middle_of_step(q: Array, v: Array, a: Array, dt: float) -> tuple[Array, Array]:
+    """Return position and velocity after dt / 2 at acceleration `a`, shape (n,) each."""
+    half = 0.5 * dt
+    change = half * a
+    return q + half * (v + 0.5 * change), v + change

@@ -21,7 +21,7 @@ from torque_safety_controller.collision.avoidance import (
     CollisionSettings,
 )
 from torque_safety_controller.collision.bodies import box, half_space
-from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.viability import BoundsSolver

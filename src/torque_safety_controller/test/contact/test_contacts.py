@@ -12,13 +12,13 @@ from torque_safety_controller.contact.contacts import (
     FrictionContact,
     friction_pyramid,
 )
-from torque_safety_controller.qp.constraints import (
+from torque_safety_controller.qp import (
     AccelerationRange,
+    InverseDynamicsQP,
     LinearConstraints,
+    TaskTerm,
     stack_constraints,
 )
-from torque_safety_controller.qp.inverse_dynamics_qp import InverseDynamicsQP
-from torque_safety_controller.qp.terms import TaskTerm
 from viability_bounds_pkg.exceptions import SettingError
 
 SOLE = np.array([[0.05, 0.03, 0.1], [0.05, -0.03, 0.1], [-0.05, -0.03, 0.1], [-0.05, 0.03, 0.1]])

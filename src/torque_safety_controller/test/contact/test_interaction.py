@@ -21,7 +21,7 @@ from torque_safety_controller.contact.interaction import (
 )
 from torque_safety_controller.contact.wrench_sensor import SensorSettings, WrenchSensor
 from torque_safety_controller.controller import Controller
-from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.state import State
 
 GAINS = replace(PLAIN, posture_weight=1e-6)  # so little that the hand does what its tasks want

@@ -21,7 +21,7 @@ from torque_safety_controller.controller import Controller
 from torque_safety_controller.friction.settings import FrictionModel, FrictionSettings
 from torque_safety_controller.integral_feedback import IntegralSettings
 from torque_safety_controller.parameters.friction_parameters import FrictionConfiguration
-from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import group, read
 from viability_bounds_pkg.robot_configuration import RobotConfiguration

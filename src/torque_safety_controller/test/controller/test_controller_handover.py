@@ -10,7 +10,7 @@ from controllers import EXACT, KHZ, assert_may_be_sent, gravity, pose_at, wide, 
 from torque_safety_controller.additional_torque import (
     MODES,
 )
-from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.state import State
 
 

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from torque_safety_controller.additional_torque import (
     MODES,
 )
-from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.tasks.pose_task import pose_error
 from viability_bounds_pkg.state import State
 

@@ -7,7 +7,7 @@ from arms import load_arm
 from controllers import posture_only
 
 from torque_safety_controller.controller import Controller
-from torque_safety_controller.qp.constraints import AccelerationRange, LinearConstraints
+from torque_safety_controller.qp import AccelerationRange, LinearConstraints
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import read_config
 from viability_bounds_pkg.whole_arm.safety_filter import KEPT, SafetyFilter

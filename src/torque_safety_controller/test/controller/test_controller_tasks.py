@@ -19,7 +19,7 @@ from controllers import (
 )
 from scipy.optimize import nnls
 
-from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.tasks.pose_task import pose_error
 from viability_bounds_pkg.state import State
 

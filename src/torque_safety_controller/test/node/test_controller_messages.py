@@ -34,7 +34,7 @@ from torque_safety_controller.node.topics import (
     TARGET_TRAJECTORY,
     TARGET_WRENCH,
 )
-from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import acceleration_limits, joint_state

@@ -29,7 +29,7 @@ from node_chain import (
     torque_for,
 )
 
-from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.safety.modes import Mode
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.state import State

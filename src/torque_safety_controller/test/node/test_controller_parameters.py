@@ -12,7 +12,7 @@ from std_msgs.msg import String
 
 from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.tasks.gains import critical_damping
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import checked_values, make, parameter_table, read

@@ -17,7 +17,7 @@ from torque_safety_controller.additional_torque import (
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.integral_feedback import IntegralSettings
 from torque_safety_controller.node.controller_node import ControllerNode
-from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import names_parameter, read_config

@@ -15,7 +15,7 @@ from torque_safety_controller.additional_torque import AdditionalSettings, Addit
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.integral_feedback import IntegralSettings
 from torque_safety_controller.nullspace.compliance import NullspaceCompliance
-from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks.gains import Gains
 from viability_bounds_pkg.robot_description import build_model, read_urdf

@@ -7,8 +7,7 @@ import scipy.sparse as sparse
 from proxsuite import proxqp
 from scipy.optimize import linprog, nnls
 
-from torque_safety_controller.qp.daqp_solver import DaqpSolver
-from torque_safety_controller.qp.quadratic_program import QuadraticProgram, Status
+from torque_safety_controller.qp import DaqpSolver, QuadraticProgram, Status
 
 SAME = 1e-6  # of solutions that only rounding keeps apart
 

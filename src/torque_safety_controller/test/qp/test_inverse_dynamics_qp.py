@@ -18,7 +18,7 @@ from qp_problems import (
     solution_of,
 )
 
-from torque_safety_controller.qp.inverse_dynamics_qp import InverseDynamicsQP
+from torque_safety_controller.qp import InverseDynamicsQP
 
 
 @pytest.mark.parametrize(("room", "scale"), [(1.0, 0.1), (1.0, 1.0), (1.0, 100.0), (0.6, 1.0)])

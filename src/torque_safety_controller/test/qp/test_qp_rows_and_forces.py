@@ -8,10 +8,14 @@ from proxsuite import proxqp
 from qp_problems import Problem, solution_of
 from scipy.optimize import lsq_linear, nnls
 
-from torque_safety_controller.qp.constraints import LinearConstraints
-from torque_safety_controller.qp.inverse_dynamics_qp import ContactForces, InverseDynamicsQP
-from torque_safety_controller.qp.quadratic_program import NoSolutionFound
-from torque_safety_controller.qp.terms import TaskTerm, WrenchTerm
+from torque_safety_controller.qp import (
+    ContactForces,
+    InverseDynamicsQP,
+    LinearConstraints,
+    NoSolutionFound,
+    TaskTerm,
+    WrenchTerm,
+)
 
 N = 9
 GAMMA = 1e-4
@@ -267,9 +271,7 @@ def test_without_rows_and_forces_nothing_changes():
 def test_any_layout_of_rows_will_do():
     problem = random_problem(np.random.default_rng(6))
     expected = solution_of(InverseDynamicsQP(N, GAMMA), problem)
-    rows = LinearConstraints(
-        np.asfortranarray(problem.rows.G), problem.rows.lower.tolist(), problem.rows.upper[::1]
-    )
+    rows = problem.rows._replace(G=np.asfortranarray(problem.rows.G))
     contacts = problem.contacts._replace(B=np.asfortranarray(problem.contacts.B))
     a = solution_of(InverseDynamicsQP(N, GAMMA), problem._replace(rows=rows, contacts=contacts)).a
     np.testing.assert_array_equal(a, expected.a)

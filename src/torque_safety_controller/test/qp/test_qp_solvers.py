@@ -6,11 +6,12 @@ import pytest
 from qp_problems import GAMMA, LITTLE_ROOM, N, built, random_problem, solution_of
 from scipy.optimize import Bounds, minimize
 
-from torque_safety_controller.qp.daqp_solver import DaqpSolver
-from torque_safety_controller.qp.inverse_dynamics_qp import SOLVERS, InverseDynamicsQP
-from torque_safety_controller.qp.proxqp_solver import ProxqpSolver
-from torque_safety_controller.qp.quadratic_program import (
+from torque_safety_controller.qp import (
+    SOLVERS,
+    DaqpSolver,
+    InverseDynamicsQP,
     NoSolutionFound,
+    ProxqpSolver,
     QuadraticProgram,
     SolverResult,
     Status,

@@ -15,8 +15,8 @@ from qp_problems import (
     solution_of,
 )
 
-from torque_safety_controller.qp.inverse_dynamics_qp import InverseDynamicsQP
-from torque_safety_controller.qp.quadratic_program import (
+from torque_safety_controller.qp import (
+    InverseDynamicsQP,
     NoSolutionFound,
 )
 

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.safety.disturbance_observer import DisturbanceObserver
 from torque_safety_controller.safety.gentle_return import return_gently
 from viability_bounds_pkg.joint_limits import JointLimits

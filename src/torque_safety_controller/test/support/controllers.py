@@ -14,7 +14,7 @@ from torque_safety_controller.additional_torque import (
 )
 from torque_safety_controller.controller import Controller, Gains
 from torque_safety_controller.integral_feedback import IntegralSettings
-from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.state import State
 
 GAINS = Gains(

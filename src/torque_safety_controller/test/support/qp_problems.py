@@ -7,9 +7,12 @@ import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import lsq_linear, nnls
 
-from torque_safety_controller.qp.constraints import AccelerationRange, LinearConstraints
-from torque_safety_controller.qp.inverse_dynamics_qp import ContactForces
-from torque_safety_controller.qp.terms import TaskTerm
+from torque_safety_controller.qp import (
+    AccelerationRange,
+    ContactForces,
+    LinearConstraints,
+    TaskTerm,
+)
 
 N = 7
 GAMMA = 1e-6

@@ -20,7 +20,7 @@ from torque_safety_controller.collision.rows import (
     Workspace,
     collision_rows,
 )
-from torque_safety_controller.qp.constraints import AccelerationRange, LinearConstraints
+from torque_safety_controller.qp import AccelerationRange, LinearConstraints
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.compiled import bound
 from viability_bounds_pkg.exceptions import SettingError

@@ -20,7 +20,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from torque_safety_controller.qp.terms import TaskTerm
+from torque_safety_controller.qp import TaskTerm
 from torque_safety_controller.robot_model import RobotModel
 
 Array = NDArray[np.float64]

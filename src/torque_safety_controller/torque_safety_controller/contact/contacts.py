@@ -23,8 +23,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from torque_safety_controller.qp.inverse_dynamics_qp import ContactForces
-from torque_safety_controller.qp.terms import WrenchTerm
+from torque_safety_controller.qp import ContactForces, WrenchTerm
 from viability_bounds_pkg.exceptions import SettingError
 
 Array = NDArray[np.float64]

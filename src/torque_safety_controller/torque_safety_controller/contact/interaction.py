@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from torque_safety_controller.contact.admittance import AdmittanceGains, AdmittanceTask
 from torque_safety_controller.contact.contacts import Contacts
 from torque_safety_controller.contact.wrench_sensor import WrenchSensor
-from torque_safety_controller.qp.inverse_dynamics_qp import ContactForces
+from torque_safety_controller.qp import ContactForces
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.goals import Goals

@@ -2,13 +2,10 @@
 """Small dense linear algebra for the control step."""
 
 from torque_safety_controller.linalg.cholesky import factorise, solve
-from torque_safety_controller.linalg.dense_kernels import middle_of_step, null_space_spring_damper
 from torque_safety_controller.linalg.generalized_inverse import dynamically_consistent_inverse
 
 __all__ = [
     "dynamically_consistent_inverse",
     "factorise",
-    "middle_of_step",
-    "null_space_spring_damper",
     "solve",
 ]

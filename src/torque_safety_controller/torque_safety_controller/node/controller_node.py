@@ -41,7 +41,7 @@ from torque_safety_controller.node.streams.states import UNSEEN, Arrival, StateS
 from torque_safety_controller.node.topics import GOALS
 from torque_safety_controller.node.wrenches import WrenchSubscriber
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.safety.handover import Control, Handover
 from torque_safety_controller.safety.modes import Mode, ModeKeeper
 from viability_bounds_pkg.ros.arm_node import ArmNode

@@ -17,7 +17,7 @@ from torque_safety_controller.node.streams.limits import LimitsReader
 from torque_safety_controller.node.streams.states import StateStream
 from torque_safety_controller.node.topics import ENABLE_TORQUE
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.qp.constraints import AccelerationRange
+from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.safety.handover import Control, Handover, HandoverRefused
 from torque_safety_controller.safety.modes import Mode
 from viability_bounds_pkg.state import State

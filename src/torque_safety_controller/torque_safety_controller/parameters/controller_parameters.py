@@ -13,7 +13,7 @@ from torque_safety_controller.parameters.collision_parameters import CollisionCo
 from torque_safety_controller.parameters.friction_parameters import FrictionConfiguration
 from torque_safety_controller.parameters.integral_parameters import IntegralConfiguration
 from torque_safety_controller.parameters.interaction_parameters import InteractionConfiguration
-from torque_safety_controller.qp.inverse_dynamics_qp import SOLVERS
+from torque_safety_controller.qp import SOLVERS
 from torque_safety_controller.safety.modes import CONTROLS
 from torque_safety_controller.tasks.gains import Gains
 from viability_bounds_pkg.exceptions import SettingError

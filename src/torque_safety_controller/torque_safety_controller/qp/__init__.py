@@ -1,28 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
 """The inverse-dynamics quadratic program, its constraints, and the solvers for it."""
 
-from torque_safety_controller.qp.constraints import (
+from torque_safety_controller.qp.inverse_dynamics_qp import InverseDynamicsQP, Solution
+from torque_safety_controller.qp.program import (
     AccelerationRange,
     Constraint,
-    LinearConstraints,
-)
-from torque_safety_controller.qp.daqp_solver import DaqpSolver
-from torque_safety_controller.qp.inverse_dynamics_qp import (
     ContactForces,
-    InverseDynamicsQP,
-    Solution,
-)
-from torque_safety_controller.qp.proxqp_solver import ProxqpSolver
-from torque_safety_controller.qp.quadratic_program import (
+    LinearConstraints,
     NoSolutionFound,
     QuadraticProgram,
+    TaskTerm,
+    WrenchTerm,
+    build_program,
+    stack_constraints,
+)
+from torque_safety_controller.qp.solvers import (
+    SOLVERS,
+    DaqpSolver,
+    ProxqpSolver,
     Solver,
     SolverResult,
     Status,
 )
-from torque_safety_controller.qp.terms import TaskTerm, WrenchTerm
 
 __all__ = [
+    "SOLVERS",
     "AccelerationRange",
     "Constraint",
     "ContactForces",
@@ -38,4 +40,6 @@ __all__ = [
     "Status",
     "TaskTerm",
     "WrenchTerm",
+    "build_program",
+    "stack_constraints",
 ]

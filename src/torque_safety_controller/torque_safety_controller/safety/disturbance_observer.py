@@ -24,9 +24,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from torque_safety_controller.linalg import cholesky
-from viability_bounds_pkg.compiled import compiled
-
 Array = NDArray[np.float64]
 
 
@@ -39,27 +36,22 @@ class DisturbanceObserver:
 
     Attributes:
         time_constant: may be changed between steps.
-        estimate: e, filtered, shape (n,), rad/s^2.
+        estimate: e, filtered, shape (n,), rad/s^2; not to be changed.
     """
 
     def __init__(self, n: int, time_constant: float | None) -> None:
         self.time_constant = time_constant
-        self.estimate = np.zeros(n)
-        self._v_last = np.zeros(n)
-        self._begun = False
-        ones = np.ones(n)  # compiled now, not in a control loop
-        _observe(np.zeros(n), ones, ones, ones, 1.0, 1.0, ones, np.eye(n))
-        _expect(np.zeros(n), ones, ones, np.eye(n))
-        _shift(ones, -ones, ones)
+        self._n = n
+        self.reset()
 
     def reset(self) -> None:
         """Forget the past."""
-        self.estimate.fill(0.0)
+        self.estimate = np.zeros(self._n)
         self.pause()
 
     def pause(self) -> None:
         """Keep the estimate, and learn nothing from the time until the next step."""
-        self._begun = False
+        self._v_last: Array | None = None
 
     def observe(self, v: Array, a_last: Array, elapsed: float, tau_max: Array, M: Array) -> None:
         """Update the estimate with the step that has just passed.
@@ -76,11 +68,11 @@ class DisturbanceObserver:
         """
         if self.time_constant is None:
             return
-        if elapsed > 0.0 and self._begun:
+        if elapsed > 0.0 and self._v_last is not None:
             gain = -math.expm1(-elapsed / self.time_constant) if self.time_constant > 0.0 else 1.0
-            _observe(self.estimate, v, self._v_last, a_last, elapsed, gain, tau_max, M)
-        self._v_last[:] = v
-        self._begun = True
+            error = (v - self._v_last) / elapsed - a_last
+            self._set(self.estimate + gain * (error - self.estimate), tau_max, M)
+        self._v_last = v.copy()
 
     def expect(self, torque: Array, tau_max: Array, M: Array) -> None:
         """Count a change of the additional torque before it can be seen.
@@ -91,8 +83,20 @@ class DisturbanceObserver:
             tau_max: torque limits, shape (n,), N m.
             M: mass matrix, shape (n, n), kg m^2.
         """
-        if self.time_constant is not None:
-            _expect(self.estimate, torque, tau_max, M)
+        if self.time_constant is None or not torque.any():
+            return
+        try:
+            change = np.linalg.solve(M, torque)
+        except np.linalg.LinAlgError:
+            return
+        if np.isfinite(change).all():
+            self._set(self.estimate + change, tau_max, M)
+
+    def _set(self, estimate: Array, tau_max: Array, M: Array) -> None:
+        """Set the estimate, within what motors can give; joints with a NaN begin anew."""
+        largest = tau_max / np.diagonal(M)
+        usable = (estimate == estimate) & (largest > 0.0)
+        self.estimate = np.where(usable, np.clip(estimate, -largest, largest), 0.0)
 
     @property
     def known(self) -> Array | None:
@@ -106,55 +110,11 @@ class DisturbanceObserver:
             lower: bound of the real accelerations, shape (n,), rad/s^2.
             upper: shape (n,), rad/s^2, not below `lower`.
         """
-        known = self.known
-        return (lower, upper) if known is None else _shift(known, lower, upper)
-
-
-@compiled
-def _observe(
-    estimate: Array,
-    v: Array,
-    v_last: Array,
-    a_last: Array,
-    elapsed: float,
-    gain: float,
-    tau_max: Array,
-    M: Array,
-) -> None:
-    """Filter the error of the last step with `gain`, in place."""
-    for j in range(v.size):
-        e = (v[j] - v_last[j]) / elapsed - a_last[j]
-        e = estimate[j] + gain * (e - estimate[j])
-        largest = tau_max[j] / M[j, j]
-        # A NaN resets the estimate.
-        estimate[j] = min(max(e, -largest), largest) if e == e and largest > 0.0 else 0.0
-
-
-@compiled
-def _expect(estimate: Array, torque: Array, tau_max: Array, M: Array) -> None:
-    """Add M^-1 torque to the estimate, in place; nothing where that is not finite."""
-    n, L = torque.size, M.copy()
-    if not torque.any() or not cholesky.factorise(L):
-        return
-    change = torque.copy().reshape(n, 1)
-    cholesky.solve(L, change)
-    if not np.isfinite(change).all():
-        return
-    for j in range(n):
-        largest = tau_max[j] / M[j, j]
-        estimate[j] = min(max(estimate[j] + change[j, 0], -largest), largest)
-
-
-@compiled
-def _shift(estimate: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
-    """Return the bounds tightened by the estimate: the upper one, or the lower one."""
-    low, high = lower.copy(), upper.copy()
-    for j in range(low.size):
-        e = estimate[j]
-        if e > 0.0:
-            high[j] -= e
-            low[j] = min(low[j], high[j])
-        else:
-            low[j] -= e
-            high[j] = max(low[j], high[j])
-    return low, high
+        if self.time_constant is None:
+            return lower, upper
+        pushed_up = self.estimate > 0.0
+        low, high = lower - np.minimum(self.estimate, 0.0), upper - np.maximum(self.estimate, 0.0)
+        return (
+            np.where(pushed_up, np.minimum(low, high), low),
+            np.where(pushed_up, high, np.maximum(low, high)),
+        )

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torque_safety_controller.qp.terms import TaskTerm
+from torque_safety_controller.qp import TaskTerm
 from torque_safety_controller.robot_model import RobotModel
 
 

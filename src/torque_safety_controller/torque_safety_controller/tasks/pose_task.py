@@ -21,7 +21,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from torque_safety_controller.qp.terms import TaskTerm
+from torque_safety_controller.qp import TaskTerm
 from torque_safety_controller.robot_model import HandModel, RobotModel
 from viability_bounds_pkg.compiled import compiled
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from torque_safety_controller.linalg.dense_kernels import null_space_spring_damper
-from torque_safety_controller.qp.terms import TaskTerm
+from torque_safety_controller.qp import TaskTerm
 from torque_safety_controller.robot_model import RobotModel
 
 Array = NDArray[np.float64]
@@ -47,16 +46,18 @@ class PostureTask:
 
     def term(self, robot: RobotModel) -> TaskTerm:
         """Return ``a = kp (q_des - q) - kd v + feedforward`` as a term of the cost."""
+        pull = self.kp * (self.q_des - robot.q)
         hands = [robot.J] if self.in_null_space else []
         hands += [robot.others[hand].J for hand in self.others]
         if hands:
             # Regularised where J has lost rank; there it leaves in what the pose cannot feel.
             J = hands[0] if len(hands) == 1 else np.vstack(hands)
-            b = null_space_spring_damper(
-                J, self.q_des, robot.q, robot.v, self.kp, self.kd, _RANK_REGULARISATION
-            )
-        else:
-            b = self.kp * (self.q_des - robot.q) - self.kd * robot.v
+            inner = J @ J.T
+            inner.reshape(-1)[:: len(J) + 1] += _RANK_REGULARISATION
+            moving = J.T @ np.linalg.solve(inner, J @ pull)
+            if np.isfinite(moving).all():
+                pull = pull - moving
+        b = pull - self.kd * robot.v
         if self.feedforward is not None:
             b = b + self.feedforward
         return TaskTerm(None, b, self.weight)

@@ -28,7 +28,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from torque_safety_controller.qp.terms import TaskTerm
+from torque_safety_controller.qp import TaskTerm
 from torque_safety_controller.robot_model import HandModel
 from torque_safety_controller.tasks.pose_task import PoseTask
 from viability_bounds_pkg.compiled import compiled

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from torque_safety_controller.qp.terms import TaskTerm
+from torque_safety_controller.qp import TaskTerm
 from torque_safety_controller.robot_model import RobotModel
 
 

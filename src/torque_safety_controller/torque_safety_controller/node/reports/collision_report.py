@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from torque_safety_controller.collision.avoidance import CollisionAvoidance
 from torque_safety_controller.controller import ControlOutput
-from torque_safety_controller.qp.constraints import Constraint
+from torque_safety_controller.qp import Constraint
 
 if TYPE_CHECKING:
     from rclpy.impl.rcutils_logger import RcutilsLogger

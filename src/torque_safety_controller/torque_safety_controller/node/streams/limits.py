@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from trajectory_msgs.msg import JointTrajectory
 
-from torque_safety_controller.qp.constraints import fault_of
+from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 
 
@@ -50,7 +50,7 @@ class LimitsReader:
                 return self._refuse("missing joint", f": there is no '{missing}'")
             index = [where[joint] for joint in self._joints]
             lower, upper = lower[index], upper[index]
-        if fault := fault_of(lower, upper):
+        if fault := AccelerationRange(lower, upper).fault:
             return self._refuse(fault)
         self.lower, self.upper = lower, upper
         self.stamp = stamp_to_ns(message.header.stamp)
