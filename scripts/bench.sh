@@ -12,19 +12,11 @@ Ratios compare programs that run in turns in one process. NAME --help lists opti
               also with estimator, prediction and margins
   realtime    all nodes by the wall clock: one process, with a recorder, separate ones, relays, and
               what the machine itself can do; where the time of a period goes
-  scaling     how bounds, step and chain grow with joints; the QP with tasks, contacts and rows
   peers       the step beside TSID's, the QPs by solvers of qpsolvers; both are installed into
               .venv-tsid and .venv-qpsolvers
-  recorder    what a recorder costs the control, and one that stands still; speed in lockstep
   step        one controller step, part by part
   bounds      acceleration bounds: one arm, and batches; with --tsid also TSID's, which is
               installed into .venv-tsid
-  robot       physics steps of the simulated robot, and their accuracy
-  collision   pairs of shapes, and controller steps with and without them
-  antiwindup  limits on the integral torque, in closed form and by a solver
-  compliance  controller steps with integral action, sensor and contacts
-  filter      the safety filter in a step, against the number of joints
-  nullspace   a step of null-space compliance; with --motion also how far the hand gives way
 USAGE
 }
 root="$(cd "$(dirname "$0")/.." && pwd)"

@@ -20,7 +20,6 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
 from sim_bridge.nodes import topics as bullet_topics
 from sim_bridge.nodes.bullet_parameters import BulletConfiguration
-from sim_bridge.nodes.fault_node import FaultConfiguration
 from sim_bridge.scenario.scenario import ScenarioConfiguration
 from sim_bridge.viewer.node.viewer_parameters import ViewerConfiguration
 from torque_safety_controller.node import topics as controller_topics
@@ -40,7 +39,6 @@ CONFIGURATIONS = {
     "bullet_node": BulletConfiguration,
     "scenario_node": ScenarioConfiguration,
     "viewer_node": ViewerConfiguration,
-    "fault_node": FaultConfiguration,
     "moveit_node": MoveitConfiguration,
 }
 TABLES = {node: parameter_table(kind) for node, kind in CONFIGURATIONS.items()}

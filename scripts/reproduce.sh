@@ -12,23 +12,12 @@ Writes figures to results/, and prints a table with the paper's numbers and ours
   paper0 fig5        one of them
   paper1-integral    the second paper: handover, anti-windup, endurance
   paper1-compliance  pushes, poles, yielding and pressing hand
-  two-hands          two hands with one integral action (1 min)
-  departures         where the controller departs from the second paper, and docs/departures.md
-  friction           TALOS with friction compensation
-  stopping           commands fail: the drives' own stop beside the brakes, and its cost (2 min)
   whole_arm          weak motors, with and without the safety filter (10 min)
-  time_to_goal       Panda with larger accelerations and the safety filter (10 min)
   imperfect          late, coarse and noisy robots, with and without each remedy, and
                      docs/reproduction_imperfect.md (40 min on two cores)
   imperfect panda    one of the robots; its rows replace those of before
-  faults             messages lost, late or wrong between the nodes, in real time (20 min)
-  process-faults     nodes killed, stopped, started again or late, and other faults of processes, in
-                     real time (30 min)
-  false-alarms       ten minutes of random motions of each robot, ideal and imperfect: right states
-                     must not be refused (20 min)
-  network            robot and control on two hosts, a bad network and a busy machine (8 min)
   exactness          the bounds compared with brute force (30 min)
-  all                all of the above but time_to_goal, imperfect, faults, process-faults, false-alarms, network, exactness (default)
+  all                all of the above but imperfect and exactness (default)
 USAGE
 }
 
@@ -37,14 +26,14 @@ what="${1:-all}"
 [ $# -eq 0 ] || shift
 case "$what" in -h | --help) usage; exit 0 ;; esac
 if [ "$what" = all ]; then
-    for part in paper0 paper1-integral paper1-compliance two-hands departures friction stopping whole_arm; do
+    for part in paper0 paper1-integral paper1-compliance whole_arm; do
         bash "$root/scripts/reproduce.sh" "$part"
     done
     exit 0
 fi
 what="${what//-/_}"
 case "$what" in
-paper0 | paper1_integral | paper1_compliance | two_hands | departures | friction | stopping | whole_arm | time_to_goal | imperfect | faults | process_faults | false_alarms | network | exactness) ;;
+paper0 | paper1_integral | paper1_compliance | whole_arm | imperfect | exactness) ;;
 *)
     echo "error: unknown '$what'; --help lists what there is" >&2
     exit 2

@@ -7,14 +7,11 @@ from setuptools import find_packages, setup
 
 PACKAGE = "sim_bridge"
 FOLDERS = (
-    "faults",
     "imperfect",
     "layouts",
     "obstacles",
     "scenarios",
-    "security",
     "two_hands",
-    "two_hosts",
 )
 CONFIG = ("config", *(f"config/{folder}" for folder in FOLDERS))
 
@@ -47,7 +44,6 @@ setup(
     entry_points={
         "console_scripts": [
             "bullet_node = sim_bridge.cli.ros_program:bullet_node",
-            "fault_node = sim_bridge.cli.ros_program:fault_node",
             "record_excitation = sim_bridge.cli.ros_program:record_excitation",
             "viewer_node = sim_bridge.cli.ros_program:viewer_node",
             "simulated_stack = sim_bridge.cli.ros_program:simulated_stack",

@@ -18,7 +18,6 @@ README = (ROOT / "README.md").read_text()
 SHORTER = {
     "bash scripts/bench.sh chain": "bash scripts/bench.sh chain --cycles 200",
     "bash scripts/bench.sh step": "bash scripts/bench.sh step --rounds 2",
-    "bash scripts/bench.sh compliance": "bash scripts/bench.sh compliance --steps 20",
 }
 DEMO = "bash scripts/demo.sh"
 """The command that is played in full."""

@@ -277,13 +277,3 @@ def test_every_source_names_its_licence():
         if path.stat().st_size:
             start = path.read_text()[:200]
             assert "SPDX-License-Identifier: Apache-2.0" in start, path
-
-
-def test_each_planted_fault_has_one_place_and_tests():
-    sources = [path.read_text() for path in modules()]
-    tests = {path.name for path in (*ROOT.glob("src/*/test/**/*.py"), *ROOT.glob("test/**/*.py"))}
-    faults = yaml.safe_load((ROOT / "test" / "planted_faults.yaml").read_text())
-    assert len({fault["what"] for fault in faults}) == len(faults)
-    for fault in faults:
-        assert sum(source.count(fault["old"]) for source in sources) == 1, fault["what"]
-        assert tests.issuperset(fault["tests"].split()), fault["what"]

@@ -5,8 +5,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from direct import DirectLoop, column
-from time_to_goal import SHORT, near_goal
-from whole_arm import CLEAR, arrive, random_goal
+from whole_arm import CLEAR, KEPT_FREE, arrive, random_goal
 
 STIFF = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
 """A posture task that drives each joint to its limits, whatever the hand does."""
@@ -14,6 +13,18 @@ FILTERED = {"safety_filter": True}
 SHOULDER = 1
 STRETCHED = np.array([0.0, -0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
 """Where Baxter's shoulder needs more than it has."""
+SHORT = 0.3  # rad
+
+
+def near_goal(loop, rng):
+    """Return a posture within a short move that can be held."""
+    data, q = loop.model.createData(), loop.robot.state().q
+    low, high = loop.limits.q_min + CLEAR, loop.limits.q_max - CLEAR
+    while True:
+        goal = np.clip(q + rng.uniform(-SHORT, SHORT, q.size), low, high)
+        held = np.abs(pin.computeGeneralizedGravity(loop.model, data, goal))
+        if (held <= (1.0 - KEPT_FREE) * loop.config.torque_max).all():
+            return goal
 
 
 def load_at(loop, q):

@@ -12,7 +12,6 @@ from control_msgs_build import CompilerMissingError, import_control_msgs
 from rclpy.action import ActionClient
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
-from test_security import expressions
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint, MultiDOFJointTrajectoryPoint
 
 from sim_bridge.nodes.bullet_node import BulletNode
@@ -332,18 +331,3 @@ def test_a_second_one_of_its_name_does_not_start(ros, moveit):
     start_node(ros, moveit)
     with pytest.raises(TakenError, match="serves '/moveit_node/follow_joint_trajectory'"):
         start_node(ros, moveit)
-
-
-def test_the_policy_of_security_has_its_topics(ros, moveit):
-    node = start_node(ros, moveit)
-    heard = {name for name, _ in node.get_subscriber_names_and_types_by_node("moveit_node", "/")}
-    policy = ROOT / "config" / "security" / "moveit_node.xml"
-    granted = {
-        (right, each.text.replace("~", "/moveit_node") if "~" in each.text else f"/{each.text}")
-        for element in expressions(policy)
-        for right in element.attrib
-        for each in element
-    }
-    assert {name for right, name in granted if right == "subscribe"} >= heard
-    assert ("execute", "/moveit_node/follow_joint_trajectory") in granted
-    assert {("publish", f"/{TARGET}"), ("publish", "/jog_joints")} <= granted

@@ -11,11 +11,6 @@ def bullet_node() -> int:
     return run_with_ros("bullet_node", "sim_bridge.nodes.bullet_node")
 
 
-def fault_node() -> int:
-    """Run the node that spoils messages between the others."""
-    return run_with_ros("fault_node", "sim_bridge.nodes.fault_node")
-
-
 def record_excitation() -> int:
     """Run the recording of a motion that excites joint friction."""
     return run_with_ros("record_excitation", "sim_bridge.tools.record_excitation")

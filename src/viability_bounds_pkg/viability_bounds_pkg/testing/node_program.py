@@ -22,7 +22,6 @@ PACKAGES = {
     "controller_node": "torque_safety_controller",
     "safety_stack": "torque_safety_controller",
     "bullet_node": "sim_bridge",
-    "fault_node": "sim_bridge",
     "scenario_node": "sim_bridge",
     "simulated_stack": "sim_bridge",
 }
