@@ -69,8 +69,6 @@ def play(robot: str, changes: dict[str, Any]) -> None:
         with suppress(SettingError):  # six joints have no null space left of the task
             loop.change(integral_action=mode)
             loop.run(2.0 * loop.dt)
-    loop.change(pose_speed_max=[1.0, 1.0])
-    loop.run(2.0 * loop.dt)
 
 
 def touch() -> None:

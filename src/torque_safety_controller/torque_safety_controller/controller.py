@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from copy import copy
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -223,14 +222,10 @@ class Controller:
         zero = np.zeros(self.robot.n)
         state = State(zero, zero)
         wide = AccelerationRange(zero - 1e3, zero + 1e3)
-        gains = self.gains
         for bounds in (wide, AccelerationRange(zero, zero)):
             self.robot.update(state, zero)
             self.set_pose_goal(self.robot.pose.copy())
-            for speed_max in ([], [1.0, 1.0]):
-                self.gains = replace(gains, pose_speed_max=np.array(speed_max))
-                self.step(state, bounds)
-        self.gains = gains
+            self.step(state, bounds)
         if self.interaction is not None:
             tasks, contacts = self.interaction.rehearsal(self.robot, self.gains)
             self._solve(tasks, wide, None, contacts)

@@ -22,7 +22,6 @@ from torque_safety_controller.node.assembly import (
 )
 from torque_safety_controller.node.declared import covered_row, declared_robot, longest_way
 from torque_safety_controller.node.driving import Driving
-from torque_safety_controller.node.gain_watch import GainWatch
 from torque_safety_controller.node.goals import GoalSubscriber
 from torque_safety_controller.node.position_control import PositionControl
 from torque_safety_controller.node.recovery import STUCK, Recovery
@@ -79,7 +78,6 @@ class ControllerNode(ArmNode):
     PARAMETERS = ControllerConfiguration
 
     def __init__(self, **node_arguments: Any) -> None:
-        self._gains: GainWatch | None = None
         super().__init__(**node_arguments)
         with self.starting(JOINT_COMMANDS):
             self._node_parameters = NodeParameters(self, ControllerConfiguration, self._configure)
@@ -137,7 +135,6 @@ class ControllerNode(ArmNode):
             self._commands,
             self._enter,
         )
-        self._gains = GainWatch(self, self._controller.robot.model, config)
         self._published = StatePublisher(self, self._controller, config, base, self._states)
         self._states_topic = states.subscription(self, self._on_state).topic_name
         limits = ACCELERATION_LIMITS.subscription(self, self._on_limits)
@@ -164,17 +161,9 @@ class ControllerNode(ArmNode):
             f"{avoiding} collision avoidance",
         )
 
-    def destroy_node(self) -> None:
-        """End what runs beside the callbacks, too."""
-        if self._gains is not None:  # else the start failed
-            self._gains.close()
-        super().destroy_node()
-
     def _configure(self, config: ControllerConfiguration) -> None:
         self._config = config
         configure(self._controller, config)
-        if self._gains is not None:
-            self._gains.look(config)
 
     # Streams
 

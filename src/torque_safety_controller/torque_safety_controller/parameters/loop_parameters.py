@@ -9,16 +9,6 @@ from torque_safety_controller.loop_margins.arm_inertia import ArmInertia
 from torque_safety_controller.loop_margins.gain_check import GainCheck, GainSettings, RobotTiming
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
-from viability_bounds_pkg.uncertainty.declared import DeclaredUncertainty
-from viability_bounds_pkg.uncertainty.feasible import declared_names
-
-LIMITING = {"position_error", "velocity_error", "delay", "delay_jitter", "motor_bandwidth"}
-"""Declarations that limit gains."""
-
-
-def limits_gains(declared: DeclaredUncertainty) -> bool:
-    """Return whether any delay, lag or error of the state is declared."""
-    return not LIMITING.isdisjoint(declared_names(declared))
 
 
 def gain_check(

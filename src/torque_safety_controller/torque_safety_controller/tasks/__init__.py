@@ -6,7 +6,6 @@ from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.goals import Goals
 from torque_safety_controller.tasks.pose_task import PoseMotion, PoseTask
 from torque_safety_controller.tasks.posture_task import PostureTask
-from torque_safety_controller.tasks.settling_pose_task import SettlingPoseTask
 from torque_safety_controller.tasks.task import Task
 
 __all__ = [
@@ -16,6 +15,5 @@ __all__ = [
     "PoseMotion",
     "PoseTask",
     "PostureTask",
-    "SettlingPoseTask",
     "Task",
 ]

@@ -19,7 +19,6 @@ from torque_safety_controller.tasks.pose_task import (
     pose_error,
 )
 from torque_safety_controller.tasks.posture_task import PostureTask
-from torque_safety_controller.tasks.settling_pose_task import SettlingPoseTask
 from torque_safety_controller.tasks.task import Task
 
 Array = NDArray[np.float64]
@@ -175,9 +174,7 @@ def _pose_task(
     motion: PoseMotion | None = None,
     stiffness: Array | None = None,
 ) -> PoseTask:
-    # With errors of any size its curvature would slow the arm down on its way.
-    kind = PoseTask if gains.pose_error_max is None else SettlingPoseTask
-    return kind(
+    return PoseTask(
         pose_des,
         gains.pose_kp,
         gains.pose_kd,
