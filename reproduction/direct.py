@@ -22,6 +22,7 @@ from torque_safety_controller.controller import ControlOutput
 from torque_safety_controller.node import assembly
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.qp import AccelerationRange
+from torque_safety_controller.supervisor import Order
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.robot_configuration import load_model
@@ -144,13 +145,14 @@ class DirectLoop:
             self.step()
         return tuple(self.samples[first:])
 
-    def step(self) -> ControlOutput:
-        """Play one control step under torque control."""
+    def step(self, order: Order | None = None) -> ControlOutput:
+        """Play one control step under torque control, by an order of the supervisor."""
         q, v, _ = self.robot.state()
         if self._sensor is not None and self.sensing:
             self.controller.interaction.sensor.receive(self._sensor.read())
         bounds = self.bounds(q, v)
-        step = self.controller.step(State(q, v), AccelerationRange(bounds.lower, bounds.upper))
+        limits = AccelerationRange(bounds.lower, bounds.upper)
+        step = self.controller.step(State(q, v), limits, order)
         self._record(q, v, step.tau)
         self.robot.step(step.tau, self.config.substeps)
         return step

@@ -13,6 +13,7 @@ from sim_bridge.nodes.bullet_parameters import make_stop
 from torque_safety_controller.node.assembly import make_state_check
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.safety.rate_watch import RateWatch
+from torque_safety_controller.supervisor import Order
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.state_estimation.state_check import UNDECIDED
 
@@ -91,9 +92,9 @@ def play(
             else:
                 in_row = 0
                 watch.note(t - answered)
-                answered, loop.controller.share = t, watch.share
+                answered, order = t, Order(watch.share)
                 bounds = AccelerationRange(*loop.bounds(*state)[:2])
-                tau = loop.controller.step(state, bounds, config.dt).tau
+                tau = loop.controller.step(state, bounds, order, config.dt).tau
                 check.expect(loop.controller.expected())
             if first and wrong and wrong != UNDECIDED:
                 after.setdefault(last, int((t - begins[last]) / config.dt) + 1)

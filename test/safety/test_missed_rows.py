@@ -38,7 +38,7 @@ def play(mode: str, seed: int) -> tuple[float, float, int]:
             if not lost or rng.random() < 0.5:
                 q, v, _ = robot.state()
                 bounds = AccelerationRange(*loop.bounds(q, v)[:2])
-                step = loop.controller.step(State(q, v), bounds, unanswered * config.dt)
+                step = loop.controller.step(State(q, v), bounds, None, unanswered * config.dt)
                 unanswered = 0
             if not lost:
                 tau, in_row = step.tau, 0

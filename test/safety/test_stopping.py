@@ -14,6 +14,7 @@ from sim_bridge.nodes.bullet_node import BulletNode
 from sim_bridge.nodes.bullet_parameters import make_robot, make_stop
 from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.safety.rate_watch import RateWatch
+from torque_safety_controller.supervisor import REST, Order
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.ros.runtime import GOAL_QOS
 from viability_bounds_pkg.state import State
@@ -199,7 +200,7 @@ def test_no_limit_is_passed_in_hold_without_acceleration_limits(robot):
             fastest = max(fastest, float((np.abs(arm.state().v) / loop.config.velocity_max).max()))
             for _ in range(round(0.6 / loop.dt)):
                 q, v, _ = arm.state()
-                arm.step(loop.controller.hold(State(q, v)).tau, loop.config.substeps)
+                arm.step(loop.controller.step(State(q, v), None, REST).tau, loop.config.substeps)
             assert not arm.monitor.violated
     assert fastest > 0.5, "the arm was hardly driven"
 
@@ -216,17 +217,15 @@ def test_after_hold_an_arm_goes_on_without_a_jolt_wherever_it_stopped():
             loop.run(rng.uniform(0.3, 1.2))
             for _ in range(round(0.4 / loop.dt)):
                 q, v, _ = arm.state()
-                arm.step(controller.hold(State(q, v)).tau, loop.config.substeps)
+                arm.step(controller.step(State(q, v), None, REST).tau, loop.config.substeps)
             rate.slow("it was in HOLD")
             last = arm.believed_torque
             for _ in range(round(0.1 / loop.dt)):
                 rate.note(loop.dt)
-                controller.share = rate.share
-                loop.step()
+                loop.step(Order(rate.share))
                 tau = arm.believed_torque
                 steps.append(np.abs((tau - last) / loop.config.torque_max).max())
                 last = tau
-            controller.share = 1.0
         assert not arm.monitor.violated
     assert max(steps) < 0.02
 

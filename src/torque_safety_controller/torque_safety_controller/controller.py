@@ -30,8 +30,9 @@ from torque_safety_controller.qp import (
 )
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.safety.disturbance_observer import DisturbanceObserver
-from torque_safety_controller.safety.gentle_return import return_gently
 from torque_safety_controller.safety.torque_limiter import TorqueLimiter
+from torque_safety_controller.slow_down import SlowDown
+from torque_safety_controller.supervisor import Order
 from torque_safety_controller.tasks.damping_task import DampingTask
 from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.goals import Goals
@@ -44,12 +45,6 @@ from viability_bounds_pkg.whole_arm.safety_filter import SafetyFilter
 __all__ = ["ControlOutput", "Controller", "Gains"]
 
 Array = NDArray[np.float64]
-
-_REST = 0.02
-"""Torque of braking with which an arm nearly rests, share of the torque limits."""
-
-_UNBOUNDED = 1e6
-"""Stands for the width of bounds that are not there, rad/s^2."""
 
 
 class ControlOutput(NamedTuple):
@@ -96,11 +91,6 @@ class Controller:
         goals: of the end effector and the joints.
         additional, constraints, interaction, safety_filter: as given.
         iterations: of the last QP.
-        share: of the accelerations that the tasks want; the rest brings the arm to rest.
-        at_rest: whether the share is zero and hardly any torque is left that brakes the arm.
-        rough: whether velocities are estimates, with noise also of an arm that stands.
-        obeyed: whether the last commands act, as far as is known; while they do not, nothing is
-            learned from how the arm moves.
     """
 
     def __init__(
@@ -126,12 +116,9 @@ class Controller:
         self.interaction = interaction
         self.safety_filter = safety_filter
         self.iterations = 0
-        self.share = 1.0
-        self.at_rest = False
-        self.rough = False
-        self.obeyed = True
         self._own_bounds = own_bounds
-        self._position_limits = position_limits
+        self._slow_down = SlowDown(position_limits, robot.dt)
+        self._order = Order()
         self._limiter = TorqueLimiter(tau_max, torque_rate_max, robot.dt)
         self._qp = InverseDynamicsQP(n, solver=solver)
         self._observer = DisturbanceObserver(n, gains.disturbance_time)
@@ -165,23 +152,13 @@ class Controller:
         self._forget()
         self.goals.posture = q.copy()
 
-    def forget_disturbance(self) -> None:
-        """Forget what was learned of disturbances: it was of something else."""
-        self._observer.reset()
-
     @property
     def integral_gain(self) -> float:
         """Gain of the integral action that is used here, 1/s; 0 without one."""
         return 0.0 if self.additional is None else self.additional.gain
 
-    def forget_integral(self) -> None:
-        """Let what the integral action adds fade: it was of another motion."""
-        if self.additional is not None:
-            self.additional.forget()
-
     def _forget(self) -> None:
         self._a_last = np.zeros(self.robot.n)
-        self.at_rest = False
         self._limiter.reset()
         self._observer.reset()
         if self.additional is not None:
@@ -237,29 +214,38 @@ class Controller:
             self.safety_filter.outcomes.clear()
 
     def step(
-        self, state: State, bounds: AccelerationRange, elapsed: float | None = None
+        self,
+        state: State,
+        limits: AccelerationRange | None,
+        order: Order | None = None,
+        elapsed: float | None = None,
     ) -> ControlOutput:
-        """Return the torque for one control step towards the goals.
+        """Return the torque for one control step.
 
-        Without a goal it is that of `brake`; when the QP fails, that of `hold`.
+        Without a goal the arm is brought to rest; when the QP fails, too: by gravity
+        compensation and damping.
 
         Args:
             state: of the arm now.
-            bounds: of the accelerations.
+            limits: of the accelerations; None for the controller's own.
+            order: of the supervisor; None to serve the goals.
             elapsed: time since the last step, s; None for a control period.
         """
-        if not self.goals.any:
-            return self.brake(state, bounds, elapsed)
+        self._order = order = order or Order()
+        if order.forget_disturbance:
+            self._observer.reset()
+        if order.forget_integral and self.additional is not None:
+            self.additional.forget()
         additional = self._begin(state, elapsed)
-        tasks, contacts = self._tasks()
-        return self._solve(tasks, bounds, additional, contacts)
-
-    def brake(
-        self, state: State, bounds: AccelerationRange, elapsed: float | None = None
-    ) -> ControlOutput:
-        """Return the torque that brings the arm to rest inside its bounds; see `step`."""
-        additional = self._begin(state, elapsed)
-        output = self._solve([DampingTask(self.gains.hold_kd)], bounds, additional)
+        if limits is None:
+            if self._own_bounds is None:
+                return self._hold(additional, "")
+            lower, upper, _ = self._own_bounds(state.q, state.v)
+            limits = AccelerationRange(lower, upper)
+        if order.track and self.goals.any:
+            tasks, contacts = self._tasks()
+            return self._solve(tasks, limits, additional, contacts)
+        output = self._solve([DampingTask(self.gains.hold_kd)], limits, additional)
         return output._replace(tracking=False)
 
     def bumpless_transfer(
@@ -277,6 +263,7 @@ class Controller:
             tau: torque of the motors now, shape (n,), N m.
         """
         self._forget()
+        self._order = Order()
         self.robot.rates = self.additional is not None
         self.robot.update(state, self._a_last)
         here = copy(self.goals)
@@ -294,16 +281,6 @@ class Controller:
         if self.additional is not None:
             self.additional.initialise(self.robot, state.v, last - output.tau)
         return output
-
-    def hold(self, state: State, elapsed: float | None = None) -> ControlOutput:
-        """Return a torque that needs to be given no acceleration bounds: gravity and damping.
-
-        Joints brake with `hold_kd`, within bounds of its own, or else as hard as motors allow.
-        """
-        if self._own_bounds is not None:
-            lower, upper, _ = self._own_bounds(state.q, state.v)
-            return self.brake(state, AccelerationRange(lower, upper), elapsed)
-        return self._hold(self._begin(state, elapsed), "")
 
     def go_on(self) -> Array:
         """Return the torque, shape (n,), N m, that goes on with the last step's accelerations.
@@ -328,14 +305,14 @@ class Controller:
         elapsed = robot.dt if elapsed is None else elapsed
         observer = self._observer
         observer.time_constant = self.gains.disturbance_time
-        known = elapsed if self.obeyed and elapsed <= LONGEST_GAP * robot.dt else 0.0
+        known = elapsed if self._order.obeyed and elapsed <= LONGEST_GAP * robot.dt else 0.0
         observer.observe(robot.v, self._a_last, known, self.tau_max, robot.M)
         if self.interaction is not None:
             self.interaction.observe(robot, self.goals, elapsed)
         if additional is None or not robot.rates:
             return None
         before = additional.integral
-        time = elapsed if self.obeyed else math.inf
+        time = elapsed if self._order.obeyed else math.inf
         torque = additional.torque(robot, robot.v, self._a_last, time)
         observer.expect(additional.integral - before, self.tau_max, robot.M)
         return torque
@@ -355,7 +332,7 @@ class Controller:
         additional: Array | None,
         contacts: ContactForces | None = None,
     ) -> ControlOutput:
-        robot, qp = self.robot, self._qp
+        robot, qp, share = self.robot, self._qp, self._order.share
         bias = robot.h if additional is None else robot.h + additional
         lower, upper = self._limiter.range()
         disturbance = self._observer.known
@@ -364,17 +341,17 @@ class Controller:
             bounds = AccelerationRange(self.safety_filter.lower, self.safety_filter.upper)
             if self.lost:
                 tasks = [DampingTask(self.gains.hold_kd)]
-        elif self.share < 1.0:
-            bounds = return_gently(bounds, robot.v, self._room(), self.share, robot.dt, self.rough)
+        else:
+            bounds = self._slow_down.return_bounds(bounds, robot.q, robot.v, share)
         if disturbance is not None:
             bounds = AccelerationRange(*self._observer.shift(*bounds))
         parts = [each.constraint(robot, bounds, disturbance) for each in self.constraints]
         terms = [task.term(robot) for task in tasks]
         eased = bounds
-        if self.share < 1.0:
+        if share < 1.0:
             rest = -self.gains.hold_kd * robot.v
-            terms = [each.mixed(rest, self.share) for each in terms]
-            eased = _around(rest, bounds, self.share)
+            terms = self._slow_down.tasks(terms, rest, share)
+            eased = self._slow_down.bounds(bounds, rest, share)
 
         def solve(bounds: AccelerationRange, rows: LinearConstraints | None) -> Solution:
             constraints = stack_constraints([*parts, rows])
@@ -418,13 +395,6 @@ class Controller:
             relaxed = relaxed[: -len(rows.G)] if len(relaxed) > len(rows.G) else None
         return ControlOutput(tau, a, not self.lost, solution.relaxation, "", relaxed)
 
-    def _room(self) -> tuple[Array, Array]:
-        """Return the room to the lower and the upper position limit, as far as they are known."""
-        if self._position_limits is None:
-            return self._no_torque, self._no_torque
-        (low, high), q = self._position_limits, self.robot.q
-        return q - low, high - q
-
     def _look_ahead(
         self, bounds: AccelerationRange, additional: Array | None, disturbance: Array | None
     ) -> LinearConstraints | None:
@@ -464,22 +434,7 @@ class Controller:
 
     def _remember(self, a: Array) -> Array:
         self._a_last = a if math.isfinite(a.dot(a)) else np.zeros(self.robot.n)
-        self.at_rest = self.share == 0.0 and bool(
-            (np.abs(self.robot.M @ self._a_last) <= _REST * self.tau_max).all()
-        )
         return self._a_last
-
-
-def _around(rest: Array, bounds: AccelerationRange, share: float) -> AccelerationRange:
-    """Return the share of the bounds that is nearest to `rest`, shape (n,), rad/s^2.
-
-    A goal that is far away asks for far more than the bounds allow: a small share of it, too.
-    """
-    near = np.minimum(np.maximum(rest, bounds.lower), bounds.upper)
-    reach = share * np.minimum(bounds.upper - bounds.lower, _UNBOUNDED)
-    return AccelerationRange(
-        np.maximum(bounds.lower, near - reach), np.minimum(bounds.upper, near + reach)
-    )
 
 
 def _chosen(safety_filter: SafetyFilter, a: Array, disturbance: Array | None) -> Array:

@@ -125,7 +125,7 @@ def test_what_comes_after_a_gap_or_a_jump_does_not_kick():
     before = steps(made, 500)
     for elapsed in (0.4, 0.0, -1.0, math.nan):
         w = made.additional.friction.reference_velocity.copy()
-        tau = made.step(State(ARM.q_start, V), AccelerationRange(-WIDE, WIDE), elapsed).tau
+        tau = made.step(State(ARM.q_start, V), AccelerationRange(-WIDE, WIDE), None, elapsed).tau
         np.testing.assert_array_equal(made.additional.friction.reference_velocity, w)
         assert np.abs((tau - before.tau) / ARM.tau_max).max() < 2e-3
     w = made.additional.friction.last.copy()

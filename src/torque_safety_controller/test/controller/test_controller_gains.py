@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from controllers import GAINS, SOLVED, make, pose_at, strong, wide
 
+from torque_safety_controller.supervisor import REST
 from viability_bounds_pkg.state import State
 
 
@@ -48,9 +49,9 @@ def test_the_damping_in_hold_reaches_the_acceleration(arm, way):
     for kd in (5.0, 40.0):
         controller = strong(arm, gains=replace(GAINS, hold_kd=kd))
         step = (
-            controller.hold(State(arm.q_start, v))
+            controller.step(State(arm.q_start, v), None, REST)
             if way == "hold"
-            else controller.brake(State(arm.q_start, v), wide(arm))
+            else controller.step(State(arm.q_start, v), wide(arm), REST)
         )
         np.testing.assert_allclose(step.a, -kd * v, rtol=1e-4, atol=SOLVED)
 

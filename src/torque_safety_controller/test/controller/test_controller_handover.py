@@ -11,6 +11,7 @@ from torque_safety_controller.additional_torque import (
     MODES,
 )
 from torque_safety_controller.qp import AccelerationRange
+from torque_safety_controller.supervisor import REST
 from viability_bounds_pkg.state import State
 
 
@@ -65,6 +66,6 @@ def test_a_handover_that_fails_leaves_everything_as_it_was(arm, bad):
     assert not controller.additional.last.any()
     assert controller.goals.pose_des is goal
     assert controller.goals.q_des is None
-    step = controller.hold(State(arm.q_start, np.zeros(arm.n)))
+    step = controller.step(State(arm.q_start, np.zeros(arm.n)), None, REST)
     np.testing.assert_allclose(step.tau, gravity(arm, arm.q_start), atol=EXACT)
     assert not controller.step(State(arm.q_start, np.zeros(arm.n)), wide(arm)).failure

@@ -24,6 +24,7 @@ from torque_safety_controller.additional_torque import (
     MODES,
 )
 from torque_safety_controller.qp import AccelerationRange
+from torque_safety_controller.supervisor import REST
 from torque_safety_controller.tasks.pose_task import pose_error
 from viability_bounds_pkg.state import State
 
@@ -132,7 +133,7 @@ def test_in_hold_nothing_grows_on_what_the_motors_cannot_give(arm):
     v[0] = 1.8 * arm.tau_max[0] / (100.0 * robot.M[0, 0])
     saturated = 0
     for _ in range(8):
-        step = controller.hold(State(q, v), KHZ)
+        step = controller.step(State(q, v), None, REST, KHZ)
         saturated += abs(step.tau[0]) == arm.tau_max[0]
         q, v = arm.move(q, v, step.tau, KHZ, steps=2)
     assert saturated > 4

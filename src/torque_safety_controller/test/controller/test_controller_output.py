@@ -25,6 +25,7 @@ from hypothesis import strategies as st
 
 from torque_safety_controller.additional_torque import AdditionalTorque
 from torque_safety_controller.qp import AccelerationRange
+from torque_safety_controller.supervisor import REST, Order
 from viability_bounds_pkg.state import State
 
 
@@ -72,8 +73,8 @@ def test_torques_are_finite_and_within_their_limits_whatever_comes(
         state = State(arm.q_start, np.zeros(arm.n))
         step = {
             "step": lambda: controller.step(state, bounds),
-            "brake": lambda: controller.brake(state, bounds),
-            "hold": lambda: controller.hold(state),
+            "brake": lambda: controller.step(state, bounds, REST),
+            "hold": lambda: controller.step(state, None, REST),
         }[after]()
         assert_may_be_sent(step, arm)
         if additional is None:
@@ -123,7 +124,10 @@ def test_an_additional_torque_that_is_not_finite_leaves_the_arm_held(arm):
     controller = make(arm, additional=Fixed(np.full(arm.n, math.nan)))
     controller.set_pose_goal(pose_at(arm, arm.q_start))
     q, v = arm.q_start, np.zeros(arm.n)
-    for step in (controller.step(State(q, v), wide(arm)), controller.hold(State(q, v))):
+    for step in (
+        controller.step(State(q, v), wide(arm)),
+        controller.step(State(q, v), None, REST),
+    ):
         assert not step.tracking
         np.testing.assert_allclose(step.tau, gravity(arm, q), atol=EXACT)
     assert controller.step(State(q, v), wide(arm)).failure
@@ -162,7 +166,7 @@ def test_the_rate_of_torque_is_limited_whatever_comes(arm):
         lower = rng.uniform(-30.0, 20.0, arm.n)
         with np.errstate(all="ignore"):
             step = (
-                controller.hold(State(q, v))
+                controller.step(State(q, v), None, REST)
                 if k % 5 == 0
                 else controller.step(
                     State(q, v), AccelerationRange(lower, lower + rng.uniform(0.0, 10.0, arm.n))
@@ -178,8 +182,8 @@ def test_the_rate_of_torque_is_limited_whatever_comes(arm):
     # A robot that was away begins anew.
     controller.reset(arm.q_start)
     q, v = arm.random_state(rng)
-    free = make(arm).hold(State(q, v)).tau
-    np.testing.assert_allclose(controller.hold(State(q, v)).tau, free, atol=EXACT)
+    free = make(arm).step(State(q, v), None, REST).tau
+    np.testing.assert_allclose(controller.step(State(q, v), None, REST).tau, free, atol=EXACT)
 
 
 def test_a_share_of_the_goals_mixes_their_accelerations_with_those_of_braking():
@@ -189,29 +193,12 @@ def test_a_share_of_the_goals_mixes_their_accelerations_with_those_of_braking():
     controller.set_pose_goal(pose_at(arm, arm.q_start + 0.01))
     state = State(arm.q_start, np.full(arm.n, 0.02))
     found = {}
-    for controller.share in (0.0, 0.25, 1.0):
-        found[controller.share] = controller.step(state, wide(arm)).a
+    for share in (0.0, 0.25, 1.0):
+        found[share] = controller.step(state, wide(arm), Order(share)).a
     rest = -controller.gains.hold_kd * state.v
     np.testing.assert_allclose(found[0.0], rest, atol=1e-3)
     np.testing.assert_allclose(found[0.25], 0.25 * found[1.0] + 0.75 * rest, atol=1e-3)
     assert np.abs(found[1.0] - rest).max() > 0.1
-
-
-def test_it_tells_when_an_arm_that_is_to_rest_does(arm):
-    controller = strong(arm, gains=posture_only(100.0, 20.0))
-    controller.set_posture_goal(arm.q_start + 1.0)
-    robot, kd = arm.robot(), controller.gains.hold_kd
-    for share, speed in ((0.0, 1.0), (0.0, 1e-4), (0.1, 1e-4), (0.0, 0.0)):
-        controller.share = share
-        v = np.full(arm.n, speed)
-        for act in (controller.step, controller.brake):
-            act(State(arm.q_start, v), wide(arm))
-            robot.update(State(arm.q_start, v), v)
-            rests = (np.abs(robot.M @ (kd * v)) < 0.02 * controller.tau_max).all()
-            assert controller.at_rest == (rests and share == 0.0)
-    assert controller.at_rest
-    controller.reset(arm.q_start)
-    assert not controller.at_rest, "it is not known"
 
 
 def test_a_far_goal_gets_its_effect_back_without_a_jolt(arm):
@@ -221,8 +208,8 @@ def test_a_far_goal_gets_its_effect_back_without_a_jolt(arm):
     controller.set_posture_goal(arm.q_start + 3.0)
     state = State(arm.q_start, np.zeros(arm.n))
     last, increment = np.zeros(arm.n), 0.01
-    for controller.share in np.arange(0.0, 1.0, increment):
-        a = controller.step(state, bounds).a
+    for share in np.arange(0.0, 1.0, increment):
+        a = controller.step(state, bounds, Order(share)).a
         assert np.abs(a - last).max() <= 2.0 * increment * 30.0 + SOLVED
         last = a
     assert last.max() > 14.0, "the goal has no effect"
@@ -234,8 +221,7 @@ def test_where_the_motors_cannot_let_it_rest_the_bounds_count_alone(arm):
     weak = np.where(weight > 1.0, 0.9 * weight, arm.tau_max)
     controller = make(arm, tau_max=weak, gains=posture_only(100.0, 20.0))
     controller.set_posture_goal(arm.q_start + 1.0)
-    controller.share = 0.0
-    step = controller.step(state, wide(arm))
+    step = controller.step(state, wide(arm), Order(share=0.0))
     assert step.relaxation is None
     assert np.abs(step.a).max() > 0.01, "it rests"
 
@@ -252,13 +238,12 @@ def test_nothing_is_learned_from_a_motion_that_was_not_commanded():
         controller.step(at_rest, wide(arm))
     learned, torque = controller._observer.estimate.copy(), controller.additional.integral
     assert learned.any() and torque.any()
-    controller.obeyed = False
     for k in range(20):
-        controller.step(State(arm.q_start, np.full(arm.n, 0.01 * k)), wide(arm))
+        state = State(arm.q_start, np.full(arm.n, 0.01 * k))
+        controller.step(state, wide(arm), Order(obeyed=False))
     # What the additional torque changes by as it goes on counts.
     np.testing.assert_allclose(controller._observer.estimate, learned, rtol=0.05)
     np.testing.assert_allclose(controller.additional.integral, torque, rtol=0.05)
-    controller.obeyed = True
     controller.step(State(arm.q_start, np.full(arm.n, 0.5)), wide(arm))
     assert np.abs(controller._observer.estimate - learned).max() > 10.0
 

@@ -8,6 +8,7 @@ from controllers import posture_only
 
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.qp import AccelerationRange, LinearConstraints
+from torque_safety_controller.supervisor import REST
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import read_config
 from viability_bounds_pkg.whole_arm.safety_filter import KEPT, SafetyFilter
@@ -126,10 +127,10 @@ def test_without_a_qp_the_arm_brakes_as_the_filter_allows():
     controller = make()
     v = np.array([0.1, 0.4, 0.0, 0.0, 0.0, 0.0, 0.0])
     controller.reset(FOLDED)
-    output = controller.hold(State(FOLDED, v))
+    output = controller.step(State(FOLDED, v), None, REST)
     assert controller.safety_filter.outcomes == {"as wanted": 1}
     np.testing.assert_allclose(output.a, -GAINS.hold_kd * v)
-    output = controller.hold(State(EDGE, v))
+    output = controller.step(State(EDGE, v), None, REST)
     assert controller.safety_filter.outcomes.total() == 2
     assert (np.abs(output.tau) <= ARM.tau_max).all()
 

@@ -20,6 +20,7 @@ from controllers import (
 from scipy.optimize import nnls
 
 from torque_safety_controller.qp import AccelerationRange
+from torque_safety_controller.supervisor import REST
 from torque_safety_controller.tasks.pose_task import pose_error
 from viability_bounds_pkg.state import State
 
@@ -109,8 +110,8 @@ def test_hold_and_brake_damp_and_carry_the_arm(arm, way):
     q, v = arm.q_start, 0.3 * arm.v_max * np.array([1, -1, 1, -1, 1, -1, 1])
     bounds = AccelerationRange(np.full(arm.n, -8.0), np.full(arm.n, 8.0))
     act = {
-        "hold": lambda q, v: controller.hold(State(q, v)),
-        "brake": lambda q, v: controller.brake(State(q, v), bounds),
+        "hold": lambda q, v: controller.step(State(q, v), None, REST),
+        "brake": lambda q, v: controller.step(State(q, v), bounds, REST),
     }[way]
     speeds = []
     for q_now, v_now, step in simulate(arm, controller, q, v, 1.0, act):

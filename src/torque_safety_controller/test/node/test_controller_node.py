@@ -31,6 +31,7 @@ from node_chain import (
 
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.safety.modes import Mode
+from torque_safety_controller.supervisor import REST as HELD
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import joint_state
@@ -52,7 +53,9 @@ def test_without_a_goal_it_brings_the_arm_to_rest(ros):
     chain = NodeChain(ros)
     tau = chain.answer(10)
     np.testing.assert_allclose(
-        tau, expected().brake(State(Q, V), AccelerationRange(LOWER, UPPER)).tau, atol=SAME_TORQUE
+        tau,
+        expected().step(State(Q, V), AccelerationRange(LOWER, UPPER), HELD).tau,
+        atol=SAME_TORQUE,
     )
     chain.await_mode("HOLD", "no goal")
     assert ros.diagnostics[NODE]["level"] == DiagnosticStatus.WARN
@@ -67,7 +70,7 @@ def test_with_a_pose_goal_it_tracks(ros, frame):
     step = expected(GOAL).step(State(Q, V), AccelerationRange(LOWER, UPPER))
     np.testing.assert_allclose(tau, step.tau, atol=SAME_TORQUE)
     assert (
-        np.abs(tau - expected().brake(State(Q, V), AccelerationRange(LOWER, UPPER)).tau).max()
+        np.abs(tau - expected().step(State(Q, V), AccelerationRange(LOWER, UPPER), HELD).tau).max()
         > 0.1
     )
     chain.await_mode("TRACKING", "goal")
@@ -120,7 +123,7 @@ def test_where_motors_hold_the_arm_before_it_starts_goals_fade_in(ros, held, bef
 
         return chain.await_command(stamp, send)
 
-    rest = expected().brake(State(Q, at_rest), AccelerationRange(LOWER, UPPER)).tau
+    rest = expected().step(State(Q, at_rest), AccelerationRange(LOWER, UPPER), HELD).tau
     goal = expected(posture=GOAL_Q).step(State(Q, at_rest), AccelerationRange(LOWER, UPPER)).tau
     for k in range(before):
         answer(10 + 10 * k)
@@ -155,7 +158,7 @@ class Motors:
 
             self.tau = self.chain.await_command(self.stamp, send)
         bounds = AccelerationRange(LOWER, UPPER)
-        rest = expected().brake(State(Q, at_rest), bounds).tau
+        rest = expected().step(State(Q, at_rest), bounds, HELD).tau
         goal = expected(posture=GOAL_Q).step(State(Q, at_rest), bounds).tau
         return np.abs(self.tau - rest).max() / np.abs(goal - rest).max()
 
@@ -227,7 +230,7 @@ def test_where_torques_are_not_reported_any_more_commands_count_as_obeyed(ros):
     motors = Motors(ros)
     motors.answer(150)
     motors.answer(5, -motors.tau)
-    assert not motors.chain.node._controller.obeyed
+    assert not motors.chain.node._recovery.order.obeyed
     motors.stamp += 10
 
     def send():
@@ -235,7 +238,7 @@ def test_where_torques_are_not_reported_any_more_commands_count_as_obeyed(ros):
         motors.chain.send_state(motors.stamp, Q, np.zeros(ARM.n), [])
 
     motors.chain.await_command(motors.stamp, send)
-    assert motors.chain.node._controller.obeyed
+    assert motors.chain.node._recovery.order.obeyed
 
 
 def test_motors_whose_other_torques_have_frozen_are_sent_nothing_for_a_while(ros):
@@ -287,7 +290,7 @@ def test_it_holds_while_bounds_are_missing_and_goes_on_by_itself(ros):
     assert time.monotonic() - begin >= 0.1
     chain.await_mode("HOLD", "acceleration limits are stale")
     assert float(chain.reported("goal_share")) == 0.0  # within margins it returns gently, too
-    hold = expected(GOAL).hold(State(Q, V))
+    hold = expected(GOAL).step(State(Q, V), None, HELD)
     np.testing.assert_allclose(tau, hold.tau, atol=0.5)  # the node's last acceleration differs
     # The next ones are held at once.
     begin = time.monotonic()

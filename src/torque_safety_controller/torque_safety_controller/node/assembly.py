@@ -80,7 +80,6 @@ def make_controller(
         make_own_bounds(config, declared),
         (config.position_min, config.position_max),
     )
-    controller.rough = config.use_estimated_states
     controller.warm_up()
     return controller, base
 

@@ -112,7 +112,6 @@ class ControllerNode(ArmNode):
         self._modes = ModeKeeper()
         self._before = self._modes.mode, self._modes.reason  # what they were before silence
         self._recovery = Recovery(
-            self._controller,
             self._states,
             config,
             covered_row(self),
@@ -272,12 +271,11 @@ class ControllerNode(ArmNode):
         else:
             self._recovery.slow()
         self._recovery.look()
-        now = state, AccelerationRange(self._limits.lower, self._limits.upper)
+        limits = AccelerationRange(self._limits.lower, self._limits.upper)
         lost = contested or self._goals.lost
-        if lost or self._handover.control is Control.GIVING_BACK:
-            step = self._controller.brake(*now, self._states.elapsed())
-        else:
-            step = self._controller.step(*now, self._states.elapsed())
+        track = not lost and self._handover.control is not Control.GIVING_BACK
+        order = self._recovery.order._replace(track=track)
+        step = self._controller.step(state, limits, order, self._states.elapsed())
         self._recovery.note(step)
         self._answer(step, stamp)
 
@@ -333,7 +331,8 @@ class ControllerNode(ArmNode):
         self._recovery.slow()  # an arm within margins returns gently here, too
         self._recovery.look()
         state = State(self._states.q, self._states.v)
-        self._answer(self._controller.hold(state, self._states.elapsed()), stamp)
+        order = self._recovery.order._replace(track=False)
+        self._answer(self._controller.step(state, None, order, self._states.elapsed()), stamp)
 
     # Watchdogs
 

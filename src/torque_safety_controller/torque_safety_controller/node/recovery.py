@@ -6,11 +6,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from torque_safety_controller.controller import Controller, ControlOutput
+import numpy as np
+
+from torque_safety_controller.controller import ControlOutput
 from torque_safety_controller.node.streams.states import StateStream
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.safety.command_watch import CommandWatch
+from torque_safety_controller.safety.handover import REST_SPEED
 from torque_safety_controller.safety.rate_watch import RateWatch
+from torque_safety_controller.supervisor import Order
 
 _PAUSED = "states were not answered for longer than bounds_timeout"
 _IGNORED = "the motors do not give the torques that were sent"
@@ -30,7 +34,6 @@ class Recovery:
     `docs/stopping.md`, "The controller's part", says why.
 
     Args:
-        controller: of the arm.
         states: of the robot.
         config: of the controller.
         covered: longest row of unanswered states that the bounds hold for.
@@ -39,20 +42,21 @@ class Recovery:
 
     Attributes:
         why: the arm was braked, until it goes on; empty when it does.
+        order: what the controller is to do with the newest state.
         rate: share of the goals.
         motors: whether they do as they are told.
     """
 
     def __init__(
         self,
-        controller: Controller,
         states: StateStream,
         config: ControllerConfiguration,
         covered: int,
         on_way: int,
         warn: Callable[[str], None],
     ) -> None:
-        self._controller, self._states, self._warn = controller, states, warn
+        self._states, self._warn = states, warn
+        self.order = Order()
         self._pause = config.bounds_timeout
         self._tolerance = config.effort_tolerance
         self.why = ""
@@ -65,19 +69,22 @@ class Recovery:
         Returns:
             Whether the newest state is to be answered: what it says of the motors has not frozen.
         """
-        motors, states, controller = self.motors, self._states, self._controller
+        motors, states = self.motors, self._states
+        self.order = Order()
         if self._tolerance <= 0.0 or not states.copy_effort(motors.effort):
-            controller.obeyed = True  # as far as is known
-            return True
+            return True  # as far as is known
         doubted, elapsed = motors.doubted, states.elapsed()
-        controller.obeyed = motors.look(self.rate.slowed, elapsed or 0.0)
+        obeyed = motors.look(self.rate.slowed, elapsed or 0.0)
+        self.order = Order(obeyed=obeyed)
         if not motors.ignored:
             if motors.in_row:
                 self.rate.wait()  # until it is known whether commands act again
             return True
-        controller.forget_disturbance()
-        if motors.ignored_for > _INTEGRAL_KEPT:
-            controller.forget_integral()
+        self.order = Order(
+            obeyed=obeyed,
+            forget_disturbance=True,
+            forget_integral=motors.ignored_for > _INTEGRAL_KEPT,
+        )
         if motors.stuck:
             self.why = STUCK
         elif doubted:  # perhaps commands act again: no jolt
@@ -89,17 +96,22 @@ class Recovery:
 
     def look(self) -> None:
         """Slow the arm if too many states were not answered; else let it go on."""
-        rate, controller = self.rate, self._controller
+        rate, order = self.rate, self.order
         before, elapsed = rate.too_long, self._states.elapsed() or 0.0
-        if news := rate.note(elapsed, controller.at_rest):
+        if news := rate.note(elapsed, self._at_rest):
             self._warn(news)
         if rate.too_long > before:  # the robot may have stopped itself, and much has changed
-            controller.forget_disturbance()
+            order = order._replace(forget_disturbance=True)
             if elapsed > self._pause:
-                controller.forget_integral()  # the robot has stopped: it was of its motion
+                # The robot has stopped: what it balanced was of a motion.
+                order = order._replace(forget_integral=True)
                 self.why = _PAUSED
                 self.slow()  # also where a row of so few states takes it down gently
-        controller.share = rate.share
+        self.order = order._replace(share=rate.share)
+
+    @property
+    def _at_rest(self) -> bool:
+        return bool(np.abs(self._states.v).max() <= REST_SPEED)
 
     def slow(self) -> None:
         """Let the goals have no effect, after something went wrong."""
@@ -108,7 +120,7 @@ class Recovery:
 
     def note(self, step: ControlOutput) -> None:
         """Take a step of the controller towards its goals: the arm goes on if it rests."""
-        if step.tracking and (self.rate.share > 0.0 or self._controller.at_rest):
+        if step.tracking and (self.rate.share > 0.0 or self._at_rest):
             self.why = ""
 
     def values(self) -> dict[str, Any]:

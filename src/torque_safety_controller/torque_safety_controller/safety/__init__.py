@@ -3,7 +3,6 @@
 
 from torque_safety_controller.safety.command_watch import CommandWatch
 from torque_safety_controller.safety.disturbance_observer import DisturbanceObserver
-from torque_safety_controller.safety.gentle_return import return_gently
 from torque_safety_controller.safety.handover import Control, Handover, HandoverRefused
 from torque_safety_controller.safety.modes import Mode, ModeKeeper
 from torque_safety_controller.safety.rate_watch import RateWatch
@@ -19,5 +18,4 @@ __all__ = [
     "ModeKeeper",
     "RateWatch",
     "TorqueLimiter",
-    "return_gently",
 ]
