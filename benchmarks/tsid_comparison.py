@@ -70,7 +70,7 @@ def _states(limits: list[float], dt: float, count: int, rng: np.random.Generator
 
 def _compare_where_it_holds(name, case, states, theirs) -> None:
     solver, a_max = _solver(case), case[3]
-    assert discrete_time_condition(solver.limits, solver.dt).all()
+    assert discrete_time_condition(solver.limits, solver.steps[0]).all()
     lower, upper, viable = solver.bounds(*states)
     error = np.maximum(np.abs(lower - theirs[0]), np.abs(upper - theirs[1])) / (2.0 * a_max)
     outside = ~viable
@@ -86,7 +86,7 @@ def _compare_where_it_holds(name, case, states, theirs) -> None:
 
 def _compare_where_it_fails(name, case, given, found) -> None:
     solver = _solver(case)
-    assert not discrete_time_condition(solver.limits, solver.dt).any()
+    assert not discrete_time_condition(solver.limits, solver.steps[0]).any()
     states, theirs = given[f"states:{name}"], found[f"states:{name}"]
     lower, upper, viable = solver.bounds(*states)
     tolerance = 1e-6 * 2.0 * case[3]
@@ -98,7 +98,7 @@ def _compare_where_it_fails(name, case, given, found) -> None:
         low, high, _ = solver.bounds(q, v)
         a = np.where(v >= 0.0, high, low)
         path[:, i] = q, v, a
-        q, v = q + solver.dt * v + 0.5 * solver.dt**2 * a, v + solver.dt * a
+        q, v = q + solver.steps[0] * v + 0.5 * solver.steps[0] ** 2 * a, v + solver.steps[0] * a
     print(
         f"{name}, (11) fails: TSID allows more than is safe in "
         f"{100.0 * wider[viable].mean():.0f} % of {viable.sum():,} viable states; from rest, "

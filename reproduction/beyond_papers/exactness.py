@@ -36,14 +36,14 @@ from adversary import (
     states_in_kernel,
     states_outside,
 )
-from against_brute_force import EXACT, NO_DETOUR, Comparison, Detour, compare, detour, merged
+from against_brute_force import EXACT, Comparison, compare, merged
+from discrete_kernel import exact_bounds
 from joint_cases import (
     CASES,
     FAST_LOOP,
     ODD_STEPS,
     Case,
     condition_holds,
-    horizon,
     one_joint,
     random_joint,
     states_of,
@@ -55,8 +55,14 @@ ROOT = Path(__file__).resolve().parents[2]
 
 STATES_OF_A_CASE = 480
 STATES_OF_A_JOINT = 120
+FAILING_JOINTS = 200
+"""Random joints for which the exact kernel of discrete time is compared."""
+
 JOINTS_IN_MOTION = 60
 """Random joints that move, for each of (11) holding and failing."""
+
+COMPARED = ["states", "viable", "misjudged", "unsafe", "undecided", "difference", "excess"]
+"""Columns of `Comparison`."""
 
 STEPS = 100
 """Length of a motion within the kernel."""
@@ -64,11 +70,8 @@ STEPS = 100
 MOST_STEPS = 10**6
 """Of a motion back into the kernel: none takes nearly as many."""
 
-LONGEST_HORIZON = 60
-"""Of a linear program that is still quickly solved."""
-
-MOTIONS_OUTSIDE, DETOURS = 300, 30
-"""For each joint and policy; and for each joint."""
+MOTIONS_OUTSIDE = 300
+"""For each joint and policy."""
 
 
 class Joint(NamedTuple):
@@ -101,6 +104,11 @@ def against_brute_force(count: int, joint: Joint) -> Comparison:
     return compare(joint.case, *states_of(joint.case, count, joint.seed))
 
 
+def discrete_kernel(count: int, joint: Joint) -> Comparison:
+    """Compare those of the exact kernel of discrete time."""
+    return compare(joint.case, *states_of(joint.case, count, joint.seed), bounds=exact_bounds)
+
+
 def in_motion(motions: int, joint: Joint) -> Kept:
     """Drive a joint from within its kernel, with every policy."""
     solver = BoundsSolver(one_joint(*joint.case[:5]), joint.case[5])
@@ -131,24 +139,17 @@ class Outside(NamedTuple):
     beyond: float
 
 
-def from_outside(joint: Joint) -> tuple[Outside, Detour]:
-    """Bring a joint back, with every policy; see how far it goes, and how far it must."""
+def from_outside(joint: Joint) -> Outside:
+    """Bring a joint back, with every policy; see how far it goes."""
     case = joint.case
     solver = BoundsSolver(one_joint(*case[:5]), case[5])
     rng = np.random.default_rng(joint.seed)
     q, v = states_outside(solver, case, MOTIONS_OUTSIDE, rng)
     runs = [bring_back(solver, q, v, policy, MOST_STEPS, rng) for policy in POLICIES]
-    result = merged(
+    return merged(
         Outside(q.size, run.joint_steps, run.stray, run.again, run.speed, run.position)
         for run in runs
     )
-    if horizon(case) > LONGEST_HORIZON or not np.isfinite(case[1]):
-        return result, NO_DETOUR
-    # Brute force has an answer where all other limits are kept.
-    (rows,) = np.nonzero(((v >= 0.0) & (v <= case[2]) & (q >= case[0]))[:, 0])
-    rows = rows[:DETOURS]
-    highest = np.max([run.highest for run in runs], axis=0)
-    return result, detour(case, q[rows, 0], v[rows, 0], highest[rows, 0])
 
 
 Work = Callable[[Joint], tuple]
@@ -211,12 +212,16 @@ def as_metrics(rows: dict[tuple[str, bool], Outside]) -> dict[str, dict]:
     return found
 
 
-def failures(compared, moved, outside) -> list[str]:
+def failures(compared, kernel, moved, outside) -> list[str]:
     """Return which claims did not come true."""
     wrong = []
-    for (name, _), c in compared.items():
-        if c.difference > EXACT or c.misjudged or c.undecided > 1e-3 * c.states:
-            wrong.append(f"{name}: {c}")
+    for rows, exact in ((compared, False), (kernel, True)):
+        for (name, holds), c in rows.items():
+            off = c.excess > EXACT or c.unsafe
+            if holds or exact:
+                off = c.difference > EXACT or c.misjudged
+            if off or c.undecided > 1e-3 * c.states:
+                wrong.append(f"{name}: {c}")
     for (name, _), k in moved.items():
         if max(k.position, k.speed) > VIOLATION or k.lost:
             wrong.append(f"{name}: {k}")
@@ -242,15 +247,18 @@ def main() -> None:
     # Not forked: numba and the solver may have threads.
     with multiprocessing.get_context("spawn").Pool(len(os.sched_getaffinity(0))) as pool:
         moved = rows_of(list(examine(pool, "in motion", partial(in_motion, motions), movers)))
-        back = list(examine(pool, "from outside", from_outside, movers))
+        outside = rows_of(list(examine(pool, "from outside", from_outside, movers)))
         compared = rows_of(compare_all(pool, options.states, options.seed))
-    outside = rows_of([(joint, outcome) for joint, (outcome, _) in back])
-    detours = rows_of([(joint, outcome) for joint, (_, outcome) in back])
+        failing = [j for j in named_joints(CASES, options.seed) if not j.holds]
+        failing += random_joints(False, FAILING_JOINTS, rng)
+        work = partial(discrete_kernel, STATES_OF_A_JOINT)
+        kernel = rows_of(list(examine(pool, "discrete kernel", work, failing)))
     table(
         "Against brute force: difference of a bound as a part of the acceleration range",
-        ["states", "viable", "misjudged", "undecided", "difference"],
+        COMPARED,
         compared,
     )
+    table("The same for the exact kernel of discrete time", COMPARED, kernel)
     table(
         "In motion from within the kernel: violations in continuous time",
         ["joint-steps", "lost", "position rad", "speed rad/s"],
@@ -261,21 +269,16 @@ def main() -> None:
         ["motions", "joint-steps", "stray", "out again", "speed rad/s", "position rad"],
         outside,
     )
-    table(
-        "From outside: further out than the other limits make necessary, by brute force",
-        ["motions", "undecided", "position rad", "part of a dt^2"],
-        detours,
-    )
-    wrong = failures(compared, moved, outside)
+    wrong = failures(compared, kernel, moved, outside)
     print(f"\n{(time.monotonic() - start) / 60:.1f} min", *wrong, sep="\n")
     directory = ROOT / "results" / "exactness"
     directory.mkdir(parents=True, exist_ok=True)
     metrics = {
         "seed": options.seed,
         "against_brute_force": as_metrics(compared),
+        "discrete_kernel_against_brute_force": as_metrics(kernel),
         "in_motion": as_metrics(moved),
         "from_outside": as_metrics(outside),
-        "further_than_it_must": as_metrics(detours),
         "claims_hold": not wrong,
     }
     (directory / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")

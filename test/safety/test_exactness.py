@@ -17,18 +17,20 @@ def outcomes():
     assert [joint.holds for joint in joints] == [True, False]
     works = (
         lambda joint: exactness.against_brute_force(30, joint),
+        lambda joint: exactness.discrete_kernel(30, joint),
         lambda joint: exactness.in_motion(5, joint),
-        lambda joint: exactness.from_outside(joint)[0],
+        exactness.from_outside,
     )
     return [exactness.rows_of([(joint, work(joint)) for joint in joints]) for work in works]
 
 
 def test_claims_hold(outcomes):
     assert exactness.failures(*outcomes) == []
-    compared, moved, outside = outcomes
+    compared, kernel, moved, outside = outcomes
     for name in NAMES:
         row = (name, name == "figure 3")
         assert compared[row].compared > 5
+        assert kernel[row].compared > 5
         assert moved[row].joint_steps == 5 * exactness.STEPS * len(exactness.POLICIES)
         assert outside[row].motions == exactness.MOTIONS_OUTSIDE * len(exactness.POLICIES)
 
@@ -39,13 +41,14 @@ def test_claims_hold(outcomes):
         (0, {"difference": 1.1e-6}),
         (0, {"misjudged": 1}),
         (0, {"undecided": 1}),
-        (1, {"position": 1.1e-9}),
-        (1, {"speed": 1.1e-9}),
-        (1, {"lost": 1}),
-        (2, {"stray": 1}),
-        (2, {"again": 1.1e-9}),
+        (1, {"difference": 1.1e-6}),
+        (2, {"position": 1.1e-9}),
         (2, {"speed": 1.1e-9}),
-        (2, {"beyond": 1.1e-9}),
+        (2, {"lost": 1}),
+        (3, {"stray": 1}),
+        (3, {"again": 1.1e-9}),
+        (3, {"speed": 1.1e-9}),
+        (3, {"beyond": 1.1e-9}),
     ],
 )
 def test_a_claim_that_does_not_hold_is_named(outcomes, which, wrong):
@@ -54,6 +57,14 @@ def test_a_claim_that_does_not_hold_is_named(outcomes, which, wrong):
     changed[which][row] = changed[which][row]._replace(**wrong)
     (message,) = exactness.failures(*changed)
     assert message.startswith("figure 3: ") and next(iter(wrong)) in message
+
+
+@pytest.mark.parametrize("wrong", [{"excess": 1.1e-6}, {"unsafe": 1}])
+def test_bounds_that_allow_too_much_are_named_where_the_condition_fails(outcomes, wrong):
+    row = ("narrow", False)
+    changed = outcomes[0] | {row: outcomes[0][row]._replace(**wrong)}
+    (message,) = exactness.failures(changed, *outcomes[1:])
+    assert message.startswith("narrow: ")
 
 
 def test_random_joints_are_of_the_kind_asked_for():

@@ -21,19 +21,15 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from viability_bounds_pkg.joint_limits import ROUNDING, JointLimits, JointLimitsError
-from viability_bounds_pkg.kernel.bounds_kernel import AccelerationBounds, solve
-from viability_bounds_pkg.kernel.discrete_kernel import StoppingCurve, stopping_curves
-from viability_bounds_pkg.kernel.discrete_time_condition import (
-    checked_errors,
-    checked_margin,
+from viability_bounds_pkg.discrete_time import (
+    Margins,
     checked_step,
+    discrete_time,
     discrete_time_condition,
-    kernel_braking,
-    longest_steps,
     without_position_error,
 )
-from viability_bounds_pkg.kernel.one_sided_limit import JointTable, highest_speeds, make_table
+from viability_bounds_pkg.joint_limits import ROUNDING, JointLimits, JointLimitsError, joint_array
+from viability_bounds_pkg.kernel import AccelerationBounds, make_table, solve
 
 Array = NDArray[np.float64]
 
@@ -51,27 +47,24 @@ class BoundsSolver:
 
     Args:
         limits: of n joints.
-        dt: step, s: how long an acceleration is held. A larger value than the control period
-            gives gentler bounds; see `period`.
+        dt: step, s: how long an acceleration is assumed to last. A larger value than the control
+            period gives gentler bounds; see `period`.
         margin: shape (n,), rad/s^2, or None for zeros. The bounds then hold although the true
             acceleration strays from the commanded one by up to this much within a step.
-        period: control period, s, at most `dt`; None means `dt`. The bounds hold for every
-            period up to `dt` where condition (11) holds. Where it does not, the kernel of
-            discrete time belongs to one period only: with a shorter one, the bounds fall back
-            to a smaller kernel that suits them all.
+        period: longest time for which an acceleration acts, s, at most `dt`; None means `dt`.
+            Joints for which condition (11) fails with `dt` get a shorter step, at least `period`,
+            for which it holds. If it fails with `period`, too, their braking is reduced.
         position_error: shape (n,), rad, or None for zeros. The bounds then hold although the
             true position differs from the one that they are asked for by up to this much.
         velocity_error: shape (n,), rad/s, or None for zeros; the same for the velocity.
-        held: longest time for which an acceleration may act, s, at most `dt`; None means `dt`.
-            Where (11) fails for `dt`, a state may allow no acceleration that could be
-            held for so long; its bounds are then those of a shorter step, at least `held`, for
-            which (11) holds.
 
     Attributes:
         limits: as given.
-        dt: as given, s.
-        exact: shape (n,), bool; False where the kernel is an inner approximation, because
-            (11) fails and a margin, an error or a shorter period is asked for.
+        steps: the step of each joint, shape (n,), s.
+        braking: deceleration that the kernel counts on, towards the upper and the lower limit,
+            shape (n, 2), rad/s^2.
+        exact: shape (n,), bool; False where the braking was reduced, so that the kernel is an
+            inner approximation.
         table: the constants that `solve` takes.
 
     Raises:
@@ -87,36 +80,15 @@ class BoundsSolver:
         *,
         position_error: ArrayLike | None = None,
         velocity_error: ArrayLike | None = None,
-        held: float | None = None,
     ):
         self.limits = limits
-        self.dt = checked_step(dt)
-        period = self.dt if period is None else checked_step(period, "period")
-        held = self.dt if held is None else checked_step(held, "held")
-        for name, value in (("period", period), ("held", held)):
-            if value > self.dt * (1.0 + ROUNDING):
-                raise JointLimitsError(name, None, value, f"must be at most dt = {self.dt:g} s")
-        same = period >= self.dt * (1.0 - ROUNDING)
-        margins = checked_margin(margin, limits)
-        off = checked_errors("position_error", position_error, limits)
-        errors = checked_errors("velocity_error", velocity_error, limits)
-        inner = without_position_error(limits, off)
-        certain = (margins == 0.0) & (errors == 0.0) & (off == 0.0)
-        braking = kernel_braking(inner, self.dt, margins, errors, exact=same & certain)
-        self.exact = braking.holds | (same & certain)
-        curved = self.exact & ~braking.holds
-        steps = np.full(len(limits), self.dt)
-        self.table = _make_table(inner, steps, margins, errors, braking.deceleration, curved)
-        # A joint counts as inside if it may be.
-        self.table.limits["tolerance"] += 2.0 * off[:, None]
-        steps = longest_steps(inner, self.dt, held, margins, errors)
-        changed = steps < self.dt
-        if changed.any():
-            full = np.stack([-limits.a_min, limits.a_max], axis=1) - margins[:, None]
-            none = np.zeros_like(changed)
-            made = _make_table(inner, steps, margins, errors, full, none)
-            shorter = np.where(changed[:, None], made.limits, self.table.limits)
-            self.table = self.table._replace(shorter=shorter)
+        dt = checked_step(dt)
+        period = dt if period is None else checked_step(period, "period")
+        if period > dt * (1.0 + ROUNDING):
+            raise JointLimitsError("period", None, period, f"must be at most dt = {dt:g} s")
+        margins = Margins.of(limits, margin, position_error, velocity_error)
+        self.steps, self.braking, self.exact = discrete_time(limits, dt, period, margins)
+        self.table = _make_table(limits, self.steps, self.braking, margins)
         # The first call compiles; let it be this one and not one in a control loop.
         self.bounds(np.zeros(len(limits)), np.zeros(len(limits)))
 
@@ -151,15 +123,7 @@ class BoundsSolver:
         Returns:
             Two arrays of the shape of `q`, rad/s; nan where `q` is outside its limits.
         """
-        q = np.asarray(q, dtype=np.float64)
-        lower, upper = np.empty_like(q), np.empty_like(q)
-        above, below = self.limits.q_max - q, q - self.limits.q_min
-        for j, (up, lo) in enumerate(self.table.limits):
-            upper[..., j] = highest_speeds(above[..., j], up, self.table.curves)
-            lower[..., j] = -highest_speeds(below[..., j], lo, self.table.curves)
-        outside = (above < 0.0) | (below < 0.0)
-        lower[outside] = upper[outside] = np.nan
-        return lower, upper
+        return _velocity_range(np.asarray(q, dtype=np.float64), self.limits, self.braking)
 
 
 def acceleration_bounds(
@@ -178,15 +142,12 @@ def acceleration_bounds(
     A function for `BoundsSolver(limits, dt, ...).bounds(q, v)`, which documents arguments and
     errors; the solver is kept for the next call with the same settings.
     """
-    if margin is not None:
-        margin = tuple(checked_margin(margin, limits).tolist())
-    if position_error is not None:
-        errors = checked_errors("position_error", position_error, limits)
-        position_error = tuple(errors.tolist())
-    if velocity_error is not None:
-        errors = checked_errors("velocity_error", velocity_error, limits)
-        velocity_error = tuple(errors.tolist())
-    return _solver(limits, dt, margin, period, position_error, velocity_error).bounds(q, v)
+
+    def key(field: str, values: ArrayLike | None) -> _Numbers:
+        return None if values is None else tuple(joint_array(field, values, limits.names).tolist())
+
+    errors = key("position_error", position_error), key("velocity_error", velocity_error)
+    return _solver(limits, dt, key("margin", margin), period, *errors).bounds(q, v)
 
 
 _Numbers = tuple[float, ...] | None
@@ -211,8 +172,8 @@ def viable_velocity_range(
 ) -> tuple[Array, Array]:
     """Return the velocities from which the limits can be kept in continuous time: eq. (8)-(10).
 
-    Where condition (11) holds this is also the kernel of discrete time; where it does not, ask
-    `BoundsSolver.velocity_range`.
+    Where condition (11) holds this is also the kernel of discrete time; where it does not, the
+    bounds keep to the smaller one of `BoundsSolver.velocity_range`.
 
     Args:
         q: shape (n,) or (batch, n), rad.
@@ -222,38 +183,30 @@ def viable_velocity_range(
     Returns:
         Lowest and highest velocity, each of the shape of `q`, rad/s; nan outside the limits.
     """
-    q = np.asarray(q, dtype=np.float64)
-    margins = checked_margin(margin, limits)
+    kept = Margins.of(limits, margin, None, None).acceleration[:, None]
+    braking = np.stack([-limits.a_min, limits.a_max], axis=1) - kept
+    return _velocity_range(np.asarray(q, dtype=np.float64), limits, braking)
+
+
+def _velocity_range(q: Array, limits: JointLimits, braking: Array) -> tuple[Array, Array]:
+    """Return the velocities from which the limits are kept with `braking`, shape (n, 2)."""
     above, below = limits.q_max - q, q - limits.q_min
     with np.errstate(invalid="ignore"):
-        upper = np.minimum(np.sqrt(2.0 * (-limits.a_min - margins) * above), limits.v_max)
-        lower = -np.minimum(np.sqrt(2.0 * (limits.a_max - margins) * below), limits.v_max)
+        upper = np.minimum(np.sqrt(2.0 * braking[:, 0] * above), limits.v_max)
+        lower = -np.minimum(np.sqrt(2.0 * braking[:, 1] * below), limits.v_max)
     outside = (above < 0.0) | (below < 0.0)
     return np.where(outside, np.nan, lower), np.where(outside, np.nan, upper)
 
 
 def _make_table(
-    limits: JointLimits,
-    steps: Array,
-    margins: Array,
-    velocity_errors: Array,
-    braking: Array,
-    curved: NDArray[np.bool_],
-) -> JointTable:
-    """Return the kernel's table.
-
-    `steps` is of shape (n,), s; `braking` of shape (n, 2), towards the upper and the lower limit,
-    rad/s^2; `curved`, shape (n,), tells which kernels are those of discrete time.
-    """
-    ranges = np.stack([limits.q_max, -limits.q_min], axis=1)
+    limits: JointLimits, steps: Array, braking: Array, margins: Margins
+) -> NDArray[np.void]:
+    inner = without_position_error(limits, margins.position)
+    ranges = np.stack([inner.q_max, -inner.q_min], axis=1)
     length = ranges.sum(axis=1, keepdims=True)
     v_max = limits.v_max[:, None]
     largest = np.abs(np.where(np.isfinite(ranges), ranges, 0.0)).max(axis=1, keepdims=True)
-    curves: list[tuple[StoppingCurve | None, StoppingCurve | None]] = [(None, None)] * len(limits)
-    for j in np.flatnonzero(curved):
-        dt = float(steps[j])
-        up, lo = (b * dt * dt for b in braking[j].tolist())
-        curves[j] = stopping_curves(float(length[j, 0]), float(limits.v_max[j]) * dt, (up, lo))
+    rounding = ROUNDING * (largest + np.minimum(v_max * v_max / (2.0 * braking), length))
     return make_table(
         dt=steps[:, None],
         position=ranges,
@@ -261,8 +214,8 @@ def _make_table(
         v_max=v_max,
         low=np.stack([limits.a_min, -limits.a_max], axis=1),
         high=np.stack([limits.a_max, -limits.a_min], axis=1),
-        margin=margins[:, None],
-        velocity_error=velocity_errors[:, None],
-        tolerance=ROUNDING * (largest + np.minimum(v_max * v_max / (2.0 * braking), length)),
-        curves=curves,
+        margin=margins.acceleration[:, None],
+        velocity_error=margins.velocity[:, None],
+        # A joint counts as inside if it may be.
+        tolerance=rounding + 2.0 * margins.position[:, None],
     )

@@ -18,7 +18,6 @@ from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.robot_configuration import load_model
 from viability_bounds_pkg.testing.ros_harness import read_config
-from viability_bounds_pkg.uncertainty.feasible import none_of
 
 ARM = read(BoundsConfiguration, read_config("talos_left_arm", "bounds_node"))
 MODEL = load_model(ARM, ARM.read_urdf())
@@ -29,7 +28,9 @@ GAINS = GainSettings(
 )
 TIMING = RobotTiming(
     dt=1e-3,
-    declared=replace(none_of(ARM.declared), acceleration_disturbance=np.full(N, 5.0)),
+    declared=replace(
+        ARM.declared.without(*ARM.declared.names), acceleration_disturbance=np.full(N, 5.0)
+    ),
     braking=np.full(N, 20.0),
     horizon=2.0,
 )

@@ -24,7 +24,7 @@ from torque_safety_controller.qp import AccelerationRange, LinearConstraints
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.compiled import bound
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.kernel.one_sided_limit import make_table
+from viability_bounds_pkg.kernel import make_table
 from viability_bounds_pkg.parameter import Range, check, number
 
 Array = NDArray[np.float64]

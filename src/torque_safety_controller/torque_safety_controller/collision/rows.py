@@ -37,8 +37,7 @@ from torque_safety_controller.collision.vectors3 import (
     sub,
     times,
 )
-from viability_bounds_pkg.kernel.bounds_kernel import joint_bounds
-from viability_bounds_pkg.kernel.one_sided_limit import JointTable
+from viability_bounds_pkg.kernel import joint_bounds
 
 Array = NDArray[np.float64]
 
@@ -116,7 +115,7 @@ class Workspace(NamedTuple):
     speed_max: float
     influence: float
     dt: float
-    table: JointTable
+    table: NDArray[np.void]
     braking: Array
     v: Array
     a_lower: Array
@@ -247,8 +246,8 @@ def _write_row(
     braking = max(min(counted, share + bias), _LEAST_SHARE * counted, _LEAST_BRAKING)
     room = d - work.kept
     # As a joint's lower limit, in units in which its braking is 1, so that one table serves.
-    above, below = table.limits[0, 0], table.limits[0, 1]
-    lowest, _, _ = joint_bounds(room / braking, rate / braking, above, below, table.curves)
+    above, below = table[0, 0], table[0, 1]
+    lowest, _, _ = joint_bounds(room / braking, rate / braking, above, below)
     wanted = max(braking * lowest, (-work.speed_max - rate) / dt)
     # With which the distance is at its limit after a step. More is never asked for where it
     # approaches its limit or is beyond it, but to end the approach: the last micrometres would be

@@ -21,7 +21,7 @@ from torque_safety_controller.loop_margins.joint_loop import (
     filter_share,
     open_loop,
 )
-from viability_bounds_pkg.uncertainty.declared import DeclaredUncertainty
+from viability_bounds_pkg.uncertainty import DeclaredUncertainty
 
 Array = NDArray[np.float64]
 

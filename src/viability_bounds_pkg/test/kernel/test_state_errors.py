@@ -130,7 +130,7 @@ def test_where_the_condition_fails_the_braking_is_the_largest_for_which_it_holds
     (off,), (error,) = errors_of(case).values()
     solver = robust(case, 0.03, 0.02)
     (w,) = margin_of(case, 0.02)
-    up, lo = 0.5 * solver.table.limits[0]["twice_braking"]
+    up, lo = solver.braking[0]
 
     def fits(up, lo):
         length = q_max - q_min - 2.0 * off - dt * error
@@ -195,10 +195,10 @@ def test_every_joint_returns_although_its_state_is_unsure(name, policy):
     ("errors", "field", "said"),
     [
         ({"position_error": [-0.1]}, "position_error", "at least 0"),
-        ({"position_error": [np.inf]}, "position_error", "finite"),
+        ({"position_error": [np.inf]}, "position_error", "half the range"),
         ({"velocity_error": [np.inf]}, "velocity_error", "finite"),
         ({"velocity_error": [0.1, 0.1]}, "velocity_error", "one value for each of the 1 joints"),
-        ({"position_error": [0.5]}, "position_error", "below half of the range, 0.5 rad"),
+        ({"position_error": [0.5]}, "position_error", "below half the range, 0.5 rad"),
         ({"velocity_error": [1.01]}, "velocity_error", "must be smaller"),
     ],
 )

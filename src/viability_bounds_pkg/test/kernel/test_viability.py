@@ -3,7 +3,6 @@
 
 import math
 
-import against_brute_force
 import numpy as np
 import paper_algorithms
 import pytest
@@ -21,7 +20,6 @@ from joint_cases import (
 )
 
 from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
-from viability_bounds_pkg.kernel.discrete_kernel import stopping_curves
 from viability_bounds_pkg.viability import (
     BoundsSolver,
     acceleration_bounds,
@@ -41,7 +39,11 @@ def test_discrete_time_condition_holds(name):
 @pytest.mark.parametrize("name", FAILING)
 def test_discrete_time_condition_fails(name):
     case = FAILING[name]
-    assert not discrete_time_condition(one_joint(*case[:5]), case[5]).any()
+    limits = one_joint(*case[:5])
+    assert not discrete_time_condition(limits, case[5]).any()
+    solver = BoundsSolver(limits, case[5])
+    assert not solver.exact.any()
+    assert (solver.braking < [[-limits.a_min[0], limits.a_max[0]]]).any()
 
 
 def test_discrete_time_condition_of_the_paper():
@@ -90,11 +92,11 @@ def assert_exact(outcome):
     assert outcome.difference <= EXACT
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", HOLDING)
 def test_agrees_with_brute_force(name):
     """`bash scripts/reproduce.sh exactness` compares far more states.
 
-    Where (11) holds, the paper's algorithm is compared in 20,000 states more, above.
+    The paper's algorithm is compared in 20,000 states more, above.
     """
     count = 30
     outcome = compare(CASES[name], *states_of(CASES[name], count, seed=2))
@@ -102,16 +104,25 @@ def test_agrees_with_brute_force(name):
     assert outcome.compared > 0.2 * count
 
 
-@pytest.mark.parametrize("holds", [True, False])
-def test_agrees_with_brute_force_for_random_joints(holds):
+def test_agrees_with_brute_force_for_random_joints():
     rng = np.random.default_rng(3)
-    cases = [random_joint(rng, holds) for _ in range(4)]
+    cases = [random_joint(rng, True) for _ in range(4)]
     outcome = merged(compare(case, *states_of(case, 30, seed=4)) for case in cases)
     assert_exact(outcome)
     assert outcome.compared > 40
 
 
-def test_brute_force_sees_bounds_that_are_a_little_too_wide(monkeypatch):
+def test_allows_no_more_than_brute_force_where_the_discrete_time_condition_fails():
+    rng = np.random.default_rng(3)
+    cases = [*FAILING.values(), *(random_joint(rng, False) for _ in range(4))]
+    outcome = merged(compare(case, *states_of(case, 30, seed=4)) for case in cases)
+    assert outcome.unsafe == 0
+    assert outcome.undecided <= 0.02 * outcome.states
+    assert outcome.excess <= EXACT
+    assert outcome.compared > 100
+
+
+def test_brute_force_sees_bounds_that_are_a_little_too_wide():
     """The comparison can fail: a braking that is off by 1e-5 is noticed."""
     case = HOLDING["figure 3"]
 
@@ -119,76 +130,9 @@ def test_brute_force_sees_bounds_that_are_a_little_too_wide(monkeypatch):
         stronger = one_joint(*case[:3], *(1.00001 * a for a in case[3:5]))
         return acceleration_bounds(q, v, stronger, dt)
 
-    monkeypatch.setattr(against_brute_force, "acceleration_bounds", optimistic)
-    assert compare(case, *states_of(case, 60, seed=2)).difference > EXACT
-
-
-def test_kernel_when_only_the_speed_is_short():
-    # A step that stops at the limit may end at -v_max: U(v) = v^2 / (2 (v + v_max)).
-    curve, _ = stopping_curves(np.inf, 1.5, (4.0, 4.0))
-    v = np.linspace(0.0, 1.5, 200)
-    expected = np.maximum(v**2 / 8.0, v**2 / (2.0 * (v + 1.5)))
-    assert np.abs(curve.room_and_slope(v)[0] - expected).max() < 1e-6
-
-
-def test_kernel_when_only_the_range_is_short():
-    # At speed 2 L, braking with 4 L, the joint swings from limit to limit for ever.
-    for curve in stopping_curves(0.7, 100.0, (50.0, 60.0)):
-        assert curve.room_at(1.4) == pytest.approx(0.35, abs=1e-7)
-
-
-SHORT = [
-    (1.0, 9.0, (3.0, 3.0)),
-    (1.0, 9.0, (30.0, 20.0)),
-    (1.0, 1.5, (3.0, 2.0)),
-    (1.0, 0.5, (3.0, 2.0)),
-    (1.0, 9.0, (3.0, 0.1)),
-    (0.366, 1.63, (1.185, 0.5525)),
-    (np.inf, 1.5, (3.0, 3.0)),
-]
-"""Range, speed limit and braking in units of the step, where condition (11) fails."""
-
-
-@pytest.mark.parametrize(("length", "v_max", "braking"), SHORT)
-def test_interpolation_costs_less_than_the_accuracy_claimed(length, v_max, braking, monkeypatch):
-    """Also at the kinks, which random states hardly meet."""
-    curves = stopping_curves(length, v_max, braking)
-    monkeypatch.setattr("viability_bounds_pkg.kernel.discrete_kernel.PIECES", (256, 1024, 8192))
-    for curve, finer in zip(curves, stopping_curves(length, v_max, braking), strict=True):
-        # Evenly, and as closely as it gets around where the parabola begins.
-        v = np.linspace(0.0, min(finer.braking, 4.0 * length, v_max), 10_001)
-        peak = finer.peak if np.isfinite(finer.peak) else v[-1]
-        v = np.concatenate([v, peak * np.linspace(0.99, 1.01, 2001)])
-        v = v[v <= v[10_000]]
-        excess = curve.room_and_slope(v)[0] - finer.room_and_slope(v)[0]
-        # An end-of-step speed is off by at most twice the room.
-        assert 2.0 * np.abs(excess).max() <= 0.5 * EXACT * sum(braking)
-
-
-@pytest.mark.parametrize(("length", "v_max", "braking"), SHORT)
-def test_interpolated_kernel_is_invariant(length, v_max, braking):
-    """From its edge, one step leads back into it: what makes the bounds safe, not just close."""
-    curves = stopping_curves(length, v_max, braking)
-    for curve, opposite, b in zip(curves, curves[::-1], braking, strict=True):
-        v = np.linspace(1e-6, min(b, 4.0 * length, v_max), 20_001)
-        room = curve.room_and_slope(v)[0]
-        v, room = v[room <= length], room[room <= length]
-        # Stop on the limit, with as little braking as the room allows; then thrown back.
-        needed = v**2 / (2.0 * room)
-        back = needed - v
-        left = length - back**2 / (2.0 * needed)
-        assert (needed <= b * (1.0 + 1e-12)).all()
-        assert (back >= -1e-12).all()
-        assert (back <= v_max * (1.0 + 1e-12)).all()
-        excess = opposite.room_and_slope(np.maximum(back, 0.0))[0] - left
-        assert excess.max() <= 1e-12 * min(1.0, v_max)
-
-
-def test_a_joint_that_is_far_stronger_one_way():
-    """Its braking divides its speed limit in thousands, and not quite evenly in floating point."""
-    limits = one_joint(-np.inf, 1.0, 3.25, -2.0, 0.001)
-    lower, upper, viable = acceleration_bounds([1.0], [0.0], limits, 3.25)
-    assert (lower[0], upper[0], viable[0]) == (-1.0, 0.0, True)
+    outcome = compare(case, *states_of(case, 60, seed=2), bounds=optimistic)
+    assert outcome.difference > EXACT
+    assert outcome.excess > EXACT
 
 
 def test_velocity_range_is_the_paper_s_kernel():
@@ -238,7 +182,7 @@ def joints(draw):
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(
     limits=joints(),
-    dt=st.one_of(st.floats(1e-4, 1.0), st.sampled_from([5e-324, 1e-300, 1e-12, 1e3, 1e300])),
+    dt=st.one_of(st.floats(1e-4, 1.0), st.sampled_from([5e-324, 1e-300, 1e-12, 1e3, 1e100])),
     q=NEAR,
     v=NEAR,
     on_limit=st.sampled_from([None, "q_min", "q_max"]),
@@ -353,7 +297,7 @@ def test_refuses_states_of_the_wrong_shape(q, v):
         acceleration_bounds(q, v, one_joint(-1.0, 1.0, 2.0, -10.0, 8.0), 0.1)
 
 
-@pytest.mark.parametrize("dt", [0.0, -0.1, math.nan, math.inf, "soon"])
+@pytest.mark.parametrize("dt", [0.0, -0.1, math.nan, math.inf, "soon", 1e300])
 def test_refuses_steps(dt):
     with pytest.raises(JointLimitsError, match="dt"):
         BoundsSolver(one_joint(-1.0, 1.0, 2.0, -10.0, 8.0), dt)

@@ -119,7 +119,7 @@ def drive(solver: BoundsSolver, q, v, policy: str, steps: int, rng) -> Kept:
         lower, upper, viable = solver.bounds(q, v)
         lost += int((~viable).sum())
         a = POLICIES[policy](q, v, lower, upper, limits, rng)
-        q, v, low, high = advance(q, v, a, solver.dt)
+        q, v, low, high = advance(q, v, a, solver.steps)
         seen.see(low, high, v)
     return Kept(steps * q.size, lost, float(seen.position), float(seen.speed))
 
@@ -133,7 +133,6 @@ class Returned(NamedTuple):
         again: largest violation of a limit by a joint that had been back, rad and rad/s.
         position: the furthest that any went beyond where braking at its limit takes it, rad.
         speed: the most that any was faster than at the start or than its limit, rad/s.
-        highest: the furthest position of each motion, shape (m, n), rad.
     """
 
     joint_steps: int
@@ -141,7 +140,6 @@ class Returned(NamedTuple):
     again: float
     position: float
     speed: float
-    highest: np.ndarray
 
 
 def bring_back(solver: BoundsSolver, q, v, policy: str, most_steps: int, rng) -> Returned:
@@ -153,7 +151,6 @@ def bring_back(solver: BoundsSolver, q, v, policy: str, most_steps: int, rng) ->
     stop_above = np.maximum(limits.q_max, stop_above)
     stop_below = np.minimum(limits.q_min, stop_below)
     fastest = np.maximum(limits.v_max, np.abs(v))
-    highest = q.copy()
     back = np.zeros(q.shape, dtype=bool)
     position = speed = again = -np.inf
     steps = 0
@@ -163,12 +160,11 @@ def bring_back(solver: BoundsSolver, q, v, policy: str, most_steps: int, rng) ->
         if back.all() or steps == most_steps:
             break
         a = POLICIES[policy](q, v, lower, upper, limits, rng)
-        q, v, low, high = advance(q, v, a, solver.dt)
-        highest = np.maximum(highest, high)
+        q, v, low, high = advance(q, v, a, solver.steps)
         position = max(position, float(np.maximum(high - stop_above, stop_below - low).max()))
         speed = max(speed, float((np.abs(v) - fastest).max()))
         outside = np.maximum(high - limits.q_max, limits.q_min - low)
         outside = np.maximum(outside, np.abs(v) - limits.v_max)
         again = max(again, float(outside.max(where=back, initial=-np.inf)))
         steps += 1
-    return Returned(steps * q.size, int((~back).sum()), again, position, speed, highest)
+    return Returned(steps * q.size, int((~back).sum()), again, position, speed)

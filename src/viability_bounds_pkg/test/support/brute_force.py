@@ -79,25 +79,6 @@ def extreme_accelerations(
     return Extremes(lower, upper, margin)
 
 
-def least_excess(
-    joint: BruteForceJoint, q: np.ndarray, v: np.ndarray, steps: int, end_at_rest: bool
-) -> np.ndarray:
-    """Return how far joints must pass the upper limit to keep all others for ever, rad.
-
-    Args:
-        joint: its limits.
-        q: shape (m,), rad, not below `joint.q_min`.
-        v: shape (m,), rad/s, at least zero and at most `joint.v_max`.
-        steps: horizon N.
-        end_at_rest: True for an upper bound on the answer, False for a lower one.
-
-    Returns:
-        shape (m,); negative where the upper limit can be kept, nan where the solver fails.
-    """
-    motions = _Motions(joint, q, v, steps, end_at_rest, eased=(1.0, 0.0, 0.0))
-    return -motions.margin(least=-np.inf) * motions.unit * joint.dt**2
-
-
 class _Motions:
     """m motions side by side; variables of each: N accelerations, a margin, N margins of steps.
 
@@ -105,14 +86,13 @@ class _Motions:
     To look for the extreme first acceleration they are zero; but of the motions that reach the
     extreme, one that keeps clear of the limits where it can is examined for times at which it
     leaves the range. Without that, the exchange would waste its rounds on corners that the
-    motion need not touch. `eased` is the share of the margin that the upper limit, the lower one
-    and that of the speed have.
+    motion need not touch.
     """
 
-    def __init__(self, joint, q, v, steps, end_at_rest, eased=(1.0, 1.0, 1.0)):
+    def __init__(self, joint, q, v, steps, end_at_rest):
         self.unit = max(-joint.a_min, joint.a_max)
         scale = self.unit * joint.dt**2
-        self.m, self.steps, self.end_at_rest, self.eased = len(q), steps, end_at_rest, eased
+        self.m, self.steps, self.end_at_rest = len(q), steps, end_at_rest
         self.low, self.high = joint.q_min / scale, joint.q_max / scale
         self.v_max = joint.v_max * joint.dt / scale
         self.bounds = np.array([joint.a_min, joint.a_max]) / self.unit
@@ -120,10 +100,10 @@ class _Motions:
         grid = np.meshgrid(np.arange(self.m), np.arange(steps), FIRST_PHASES, indexing="ij")
         self.cuts = [part.ravel() for part in grid]
 
-    def margin(self, least: float = -VIABLE) -> np.ndarray:
+    def margin(self) -> np.ndarray:
         """Return the margin that can be kept for ever; negative if the limits cannot.
 
-        Below `least` it is only a bound on itself: it is not followed further.
+        Below -`VIABLE` it is only a bound on itself: it is not followed further.
         """
         margin = np.full(self.m, np.nan)
         active = np.arange(self.m)
@@ -131,7 +111,7 @@ class _Motions:
             x = self._solve(active, "margin")
             margin[active] = x[:, self.steps]
             # What some of the times already rule out, all of them rule out.
-            finished = self._add_cuts(x, active) | (margin[active] < least)
+            finished = self._add_cuts(x, active) | (margin[active] < -VIABLE)
             active = active[~finished]
             if active.size == 0:
                 return margin
@@ -211,8 +191,7 @@ class _Motions:
         inside = (phase > 0.0) & (phase < 1.0)
         phase = np.where(inside, phase, 1.0)
         peak = q_start + phase * v_start + 0.5 * phase**2 * a
-        above, below, _ = self.eased
-        over = np.maximum(peak - self.high - above * slack, self.low - peak - below * slack)
+        over = np.maximum(peak - self.high, self.low - peak) - slack
         motion, step = np.nonzero(inside & (over > 3.0 * TOLERANCE))
         new = (active[motion], step, phase[motion, step])
         self.cuts = [np.concatenate(pair) for pair in zip(self.cuts, new, strict=True)]
@@ -230,22 +209,18 @@ class _Motions:
         weight = np.where(j < step[:, None], time - j - 0.5, 0.0)
         weight[np.arange(len(step)), step] = 0.5 * phase**2
         free = self.q[motion] + time[:, 0] * self.v[motion]
-        above, below, fast = self.eased
         blocks = [
-            (sign * weight, limit - sign * free, motion, step, np.full(len(step), eased))
-            for sign, limit, eased in ((1.0, self.high, above), (-1.0, -self.low, below))
+            (sign * weight, limit - sign * free, motion, step)
+            for sign, limit in ((1.0, self.high), (-1.0, -self.low))
             if np.isfinite(limit)
         ]
         owner, ends = np.repeat(active, self.steps), np.tile(j, active.size)
         sums = np.tile(np.tri(self.steps), (active.size, 1))
         blocks += [
-            (sign * sums, self.v_max - sign * self.v[owner], owner, ends, np.full(len(ends), fast))
-            for sign in (1.0, -1.0)
+            (sign * sums, self.v_max - sign * self.v[owner], owner, ends) for sign in (1.0, -1.0)
         ]
-        weights, rhs, owners, at, eased = (
-            np.concatenate(part) for part in zip(*blocks, strict=True)
-        )
-        margins = np.hstack([eased[:, None], at[:, None] == j])
+        weights, rhs, owners, at = (np.concatenate(part) for part in zip(*blocks, strict=True))
+        margins = np.hstack([np.ones((len(at), 1)), at[:, None] == j])
         return self._sparse(np.hstack([weights, margins]), owners, active), rhs
 
     def _rest(self, active: np.ndarray):

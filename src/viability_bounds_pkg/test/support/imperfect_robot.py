@@ -14,12 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from adversary import Violations, advance
 
-from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
+from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.torque_margin import TorqueMargins
-from viability_bounds_pkg.uncertainty.declared import DeclaredUncertainty
-from viability_bounds_pkg.uncertainty.feasible import joint_of
-from viability_bounds_pkg.uncertainty.margins import Loop, uncertainty_margins
+from viability_bounds_pkg.uncertainty import DeclaredUncertainty, Loop, uncertainty_margins
 from viability_bounds_pkg.viability import BoundsSolver
 
 SAMPLES = np.linspace(0.0, 1.0, 9)[1:]
@@ -62,7 +60,6 @@ def plan(limits, dt, declared, predicted=True, shares=(1.0, 1.0)):
         limits,
         margins.horizon,
         w,
-        dt,
         position_error=shares[0] * margins.position_error,
         velocity_error=shares[1] * margins.velocity_error,
     )
@@ -214,7 +211,7 @@ def random_plan(rng, joints, shortest=1e-3, shares=(1.0, 1.0), predicted=True, *
     limits = JointLimits(names, -half, half, v_max, a_min, a_max)
     margins = TorqueMargins(*np.zeros((3, joints)))
     loop = Loop(limits, margins, dt, 0.0, predicted)
-    good = [j for j in range(joints) if _has_bounds(loop.of_joint(j), joint_of(declared, j))]
+    good = [j for j in range(joints) if loop.of_joint(j).has_bounds(declared.of_joint(j))]
     if not good:
         return random_plan(rng, joints, shortest, shares, predicted, **kinds)
     chosen = {
@@ -224,11 +221,3 @@ def random_plan(rng, joints, shortest=1e-3, shares=(1.0, 1.0), predicted=True, *
     names = tuple(names[j] for j in good)
     limits = JointLimits(names, -half[good], half[good], v_max[good], a_min[good], a_max[good])
     return plan(limits, dt, DeclaredUncertainty(**chosen), predicted, shares)
-
-
-def _has_bounds(loop, declared):
-    try:
-        loop.bounds(declared)
-    except JointLimitsError:
-        return False
-    return True

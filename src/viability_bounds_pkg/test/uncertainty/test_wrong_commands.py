@@ -5,8 +5,7 @@ from itertools import product
 
 import pytest
 
-from viability_bounds_pkg.uncertainty.declared import DeclaredUncertainty
-from viability_bounds_pkg.uncertainty.margins import wrong_periods
+from viability_bounds_pkg.uncertainty import DeclaredUncertainty, wrong_periods
 
 
 def acting_commands(delay, jitter, missed):

@@ -13,10 +13,10 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from viability_bounds_pkg import viability
 from viability_bounds_pkg.node.bounds_parameters import (
     BoundsConfiguration,
     make_bounds,
+    make_solver,
 )
 from viability_bounds_pkg.node.slow_topics import SlowTopics
 from viability_bounds_pkg.robot_configuration import TOPIC
@@ -72,28 +72,26 @@ class BoundsNode(ArmNode):
         self._diagnostics = Diagnostics(
             self, self._report, self.publisher_watch, DescriptionWatch(self)
         )
-        self._warn_of_affected_joints(config)
+        self._warn_of_reduced_braking(config)
         self.announce(joints, config.rate_hz, f"method {config.method}")
 
     def _configure(self, config: BoundsConfiguration) -> None:
         self._bounds = make_bounds(config)
-        self._warn_of_affected_joints(config)
+        self._warn_of_reduced_braking(config)
 
-    def _warn_of_affected_joints(self, config: BoundsConfiguration) -> None:
+    def _warn_of_reduced_braking(self, config: BoundsConfiguration) -> None:
         if config.method != "exact":
             self._warn(f"method '{config.method}' does not keep the limits; it is for comparison")
             return
-        holds = viability.discrete_time_condition(
-            config.limits,
-            config.horizon,
-            position_error=config.uncertainty.position_error,
-            velocity_error=config.uncertainty.velocity_error,
-        )
-        for name, fine in zip(config.joints, holds, strict=True):
-            if not fine:
+        solver = make_solver(config)
+        for name, full, (up, low) in zip(
+            config.joints, solver.exact, solver.braking.tolist(), strict=True
+        ):
+            if not full:
                 self.get_logger().warning(
                     f"joint '{name}' can cross its range or exceed its speed within one braking "
-                    f"step of {config.horizon:g} s (condition (11)); its bounds are stricter"
+                    f"step (condition (11)); its bounds count on {up:.3g} rad/s^2 before the "
+                    f"upper limit and {low:.3g} rad/s^2 before the lower one"
                 )
 
     def _on_state(self, message: JointState) -> None:

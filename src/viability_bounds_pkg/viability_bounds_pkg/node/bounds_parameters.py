@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viability_bounds_pkg import baselines, viability
-from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError
+from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
 from viability_bounds_pkg.parameter import (
     NEGATIVE,
@@ -34,9 +34,12 @@ from viability_bounds_pkg.robot_configuration import (
     StateSource,
 )
 from viability_bounds_pkg.torque_margin import TorqueMargins, torque_margins
-from viability_bounds_pkg.uncertainty.declared import DeclaredUncertainty, VelocityEstimation
-from viability_bounds_pkg.uncertainty.feasible import refusal
-from viability_bounds_pkg.uncertainty.margins import Loop, UncertaintyMargins
+from viability_bounds_pkg.uncertainty import (
+    DeclaredUncertainty,
+    Loop,
+    UncertaintyMargins,
+    VelocityEstimation,
+)
 
 Array = NDArray[np.float64]
 
@@ -175,25 +178,29 @@ Bounds = Callable[[Array, Array], viability.AccelerationBounds]
 """Computes the bounds from positions and velocities."""
 
 
+def make_solver(config: BoundsConfiguration) -> viability.BoundsSolver:
+    """Return the exact bounds.
+
+    Raises:
+        SettingError: declarations, or a control rate, that leave no bounds.
+    """
+    try:
+        return config.loop.bounds(config.declared)
+    except JointLimitsError as error:
+        found = config.loop.refusal(config.declared, error)
+        if not isinstance(found, SettingError):
+            found = SettingError("rate_hz", config.rate_hz, f"what leaves bounds: {found}")
+        raise found from error
+
+
 def make_bounds(config: BoundsConfiguration) -> Bounds:
     """Return how the bounds are computed.
 
     Raises:
         SettingError: declarations that leave no bounds.
     """
-    limits, horizon = config.limits, config.horizon
     if config.method == "exact":
-        try:
-            return config.loop.bounds(config.declared).bounds
-        except JointLimitsError as error:
-            found = refusal(config.loop, config.declared, error)
-            raise found if isinstance(found, SettingError) else _too_long(config, found) from error
+        return make_solver(config).bounds
     own = {"influence": config.damper_influence, "gain": config.damper_gain}
     settings = own if config.method == "damper" else {}
-    return partial(BASELINES[config.method], limits=limits, dt=horizon, **settings)
-
-
-def _too_long(config: BoundsConfiguration, error: ArmSafetyError) -> SettingError:
-    """Return the error for a horizon that leaves a joint no bounds, whatever is declared."""
-    value, allowed = config.bounds_dt_factor, f"what leaves each joint bounds: {error}"
-    return SettingError("bounds_dt_factor", value, allowed)
+    return partial(BASELINES[config.method], limits=config.limits, dt=config.horizon, **settings)

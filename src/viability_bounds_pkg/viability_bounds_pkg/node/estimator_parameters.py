@@ -12,7 +12,7 @@ from viability_bounds_pkg.robot_configuration import ControlRate, LimitedRobotCo
 from viability_bounds_pkg.state_estimation.estimator import StateEstimator
 from viability_bounds_pkg.state_estimation.observer import ObserverDesign
 from viability_bounds_pkg.state_estimation.state_check import StateCheck
-from viability_bounds_pkg.uncertainty.declared import DeclaredUncertainty, VelocityEstimation
+from viability_bounds_pkg.uncertainty import DeclaredUncertainty, VelocityEstimation
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

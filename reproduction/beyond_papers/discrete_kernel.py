@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The viability kernel when condition (11) of [DelPrete2018] fails.
+"""The exact viability kernel, and bounds from it, when condition (11) of [DelPrete2018] fails.
+
+A result beside the product, whose bounds reduce the braking there, as the paper advises, and so
+allow less than this.
 
 Braking lasts whole steps: a joint that stops in front of one limit early in a step is thrown
 back until the step ends, and may then be too fast, or too close to the other limit. Where (11)
@@ -23,6 +26,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from viability_bounds_pkg.joint_limits import ROUNDING, JointLimits
+from viability_bounds_pkg.viability import AccelerationBounds
 
 Array = NDArray[np.float64]
 
@@ -229,3 +235,83 @@ def _spread(end: float, pieces: int) -> Array:
 def _stopping_room(v: Array, u: Array) -> Array:
     """Return v^2 / (2 (u + v)): the way to rest if one step takes speed v to -u."""
     return v * np.divide(v, 2.0 * (u + v), out=np.zeros_like(v), where=v > 0.0)
+
+
+def exact_bounds(q: Array, v: Array, limits: JointLimits, dt: float) -> AccelerationBounds:
+    """Return the largest interval of accelerations that keeps one joint's limits for ever.
+
+    Args:
+        q: shape (m, 1), rad.
+        v: shape (m, 1), rad/s.
+        limits: of one joint.
+        dt: step, s.
+
+    Returns:
+        Bounds as of `viability.acceleration_bounds`; of states that are not viable they mean
+        nothing.
+    """
+    (q_min,), (q_max,), (v_max,) = limits.q_min, limits.q_max, limits.v_max
+    up, lo = float(-limits.a_min[0]), float(limits.a_max[0])
+    curves = stopping_curves(q_max - q_min, v_max * dt, (up * dt * dt, lo * dt * dt))
+    sides = ((q_max - q, v, up, lo, curves[0]), (q - q_min, -v, lo, up, curves[1]))
+    found = [_towards(*side, v_max, q_max - q_min, dt) for side in sides]
+    (upper, below), (lower, above) = found
+    viable = below & above & (np.abs(v) <= v_max * (1.0 + ROUNDING))
+    return AccelerationBounds(-lower, upper, viable)
+
+
+def _towards(
+    room: Array,
+    v: Array,
+    braking: float,
+    most: float,
+    curve: StoppingCurve,
+    v_max: float,
+    length: float,
+    dt: float,
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the largest acceleration towards a limit, and whether the state is viable."""
+    table = _inverse(curve, v_max, length, dt)
+    budget = room - 0.5 * dt * v
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a = (_end_speed(budget, table, curve, braking, v_max, dt) - v) / dt
+        a = np.where((budget < 0.0) & (v > 0.0), -v * v / (2.0 * room), a)
+    fastest = _end_speed(room + 0.5 * dt * v + 1e-12, table, curve, braking, v_max, dt)
+    viable = (room >= -1e-12) & ((v <= 0.0) | (v <= fastest * (1.0 + ROUNDING) + 1e-12))
+    return np.clip(a, -braking, most), viable
+
+
+def _inverse(
+    curve: StoppingCurve, v_max: float, length: float, dt: float
+) -> tuple[Array, Array] | None:
+    """Return budgets ``dt w / 2 + U(w)``, rad, and their end-of-step speeds w, rad/s."""
+    if len(curve.speed) < 2:
+        return None
+    budgets, speeds, base = [], [], 0.0
+    while base <= v_max * dt and (base == 0.0 or curve.room_at(base) <= length):
+        whole = round(base / curve.braking)
+        speed = base + curve.speed
+        room = whole * curve.speed + 0.5 * whole * base + curve.room
+        speeds.append(speed / dt)
+        budgets.append(0.5 * speed + room)
+        base += curve.braking
+    return np.concatenate(budgets), np.concatenate(speeds)
+
+
+def _end_speed(
+    budget: Array,
+    table: tuple[Array, Array] | None,
+    curve: StoppingCurve,
+    braking: float,
+    v_max: float,
+    dt: float,
+) -> Array:
+    """Return the largest end-of-step speed w <= v_max with ``dt w / 2 + U(w) <= budget``."""
+    free = 0.5 * dt * v_max + curve.room_at(v_max * dt)
+    budget = np.clip(budget, 0.0, free)
+    k, c = 0.5 * braking * dt, 2.0 * braking * budget
+    speed = c / (k + np.sqrt(k * k + c))
+    if table is not None:
+        curved = np.fmod(speed, curve.braking / dt) < curve.peak / dt
+        speed = np.where(curved, np.interp(budget, *table), speed)
+    return np.where(budget < free, np.minimum(speed, v_max), v_max)

@@ -1,24 +1,59 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compiled evaluation of the acceleration bounds, joint by joint.
 
-One loop serves a single arm and a batch of a million states.
+One loop serves a single arm and a batch of a million states. Each position limit is seen in the
+direction of motion towards it, so that the lower one is the mirror image of the upper: position
+and velocity change sign, `a_min` and `-a_max` change places.
 """
 
 from __future__ import annotations
 
-from math import floor, sqrt
+from math import sqrt
+from sys import float_info
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
 
-from viability_bounds_pkg.compiled import compiled
 from viability_bounds_pkg.joint_limits import ROUNDING
-from viability_bounds_pkg.kernel.one_sided_limit import JointTable
 
 Array = NDArray[np.float64]
 
+_TINY = float_info.min
 _WITHIN = 1.0 + ROUNDING
+
+ONE_SIDED_LIMIT = np.dtype(
+    [
+        ("position", np.float64),
+        ("dt", np.float64),
+        ("half_dt", np.float64),
+        ("twice_braking", np.float64),
+        ("k", np.float64),
+        ("k_squared", np.float64),
+        ("free", np.float64),
+        ("v_max", np.float64),
+        ("low", np.float64),
+        ("high", np.float64),
+        ("margin", np.float64),
+        ("velocity_error", np.float64),
+        ("tolerance", np.float64),
+    ],
+    align=True,
+)
+"""One position limit of one joint, as compiled code reads it by name.
+
+- position: of the limit, rad; the room is ``position - q``, for the lower limit ``position + q``.
+- dt, half_dt: step and its half, s.
+- twice_braking: 2 B, rad/s^2, where B is the deceleration that the kernel counts on.
+- k, k_squared: B dt / 2, rad/s, and its square.
+- free: budget ``room - dt v / 2`` from which on only the speed limit counts, rad.
+- v_max: speed limit, rad/s.
+- low, high: hardest accelerations away from the limit and towards it, rad/s^2.
+- margin: acceleration kept back for disturbances, rad/s^2.
+- velocity_error: by which a velocity may be higher or lower than it is said to be, rad/s.
+- tolerance: room that a state may lack and still count as viable, rad.
+"""
 
 
 class AccelerationBounds(NamedTuple):
@@ -37,44 +72,70 @@ class AccelerationBounds(NamedTuple):
     viable: NDArray[np.bool_]
 
 
-def solve(q: Array, v: Array, table: JointTable) -> AccelerationBounds:
+def make_table(
+    *,
+    dt: ArrayLike,
+    position: ArrayLike,
+    braking: ArrayLike,
+    v_max: ArrayLike,
+    low: ArrayLike,
+    high: ArrayLike,
+    margin: ArrayLike = 0.0,
+    velocity_error: ArrayLike = 0.0,
+    tolerance: ArrayLike = 0.0,
+) -> NDArray[np.void]:
+    """Return the limits of n joints, `ONE_SIDED_LIMIT` of shape (n, 2): upper and lower.
+
+    Arguments are as documented there, and `braking` is B, rad/s^2; all of shape (n, 2), or
+    broadcast to it.
+    """
+    position = np.array(position, dtype=float, ndmin=2)
+    table = np.zeros(position.shape, dtype=ONE_SIDED_LIMIT)
+    table["position"], table["dt"], table["v_max"] = position, dt, v_max
+    table["low"], table["high"] = low, high
+    table["margin"], table["velocity_error"] = margin, velocity_error
+    table["tolerance"] = tolerance
+    half_dt, speed, b = 0.5 * table["dt"], table["v_max"], np.asarray(braking)
+    k = b * half_dt
+    table["half_dt"], table["twice_braking"], table["k"] = half_dt, 2.0 * b, k
+    # Not zero even if dt is tiny, so that no room at all does not make 0 / 0.
+    table["k_squared"] = np.maximum(k * k, _TINY)
+    table["free"] = half_dt * speed + 0.5 * speed * speed / b
+    return table
+
+
+def solve(q: Array, v: Array, table: NDArray[np.void]) -> AccelerationBounds:
     """Return the bounds of states of shape (n,) or (batch, n), rad and rad/s."""
     lower, upper = np.empty(q.size), np.empty(q.size)
     viable = np.empty(q.size, dtype=np.bool_)
     if q.ndim == 1:  # to reshape takes longer than to find the bounds of one arm
-        _solve(q, v, table.limits, table.shorter, table.curves, lower, upper, viable)
+        _solve(q, v, table, lower, upper, viable)
         return AccelerationBounds(lower, upper, viable)
-    _solve(q.ravel(), v.ravel(), table.limits, table.shorter, table.curves, lower, upper, viable)
+    _solve(q.ravel(), v.ravel(), table, lower, upper, viable)
     shape = q.shape
     return AccelerationBounds(lower.reshape(shape), upper.reshape(shape), viable.reshape(shape))
 
 
-@compiled(error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _solve(
     q: Array,
     v: Array,
-    limits: NDArray[np.void],
-    shorter: NDArray[np.void],
-    curves: NDArray[np.void],
+    table: NDArray[np.void],
     lower: Array,
     upper: Array,
     viable: NDArray[np.bool_],
 ) -> None:
-    """Write the bounds of states one after the other, each of as many joints as `limits`."""
-    n = len(limits)
+    """Write the bounds of states one after the other, each of as many joints as the table."""
+    n = len(table)
     for first in range(0, len(q), n):
         for j in range(n):
             i = first + j
-            low, high, viable[i] = _interval(q[i], v[i], limits[j, 0], limits[j, 1], curves)
-            if low > high:  # nothing can be held for the step
-                above, below = shorter[j, 0], shorter[j, 1]
-                low, high, _ = joint_bounds(q[i], v[i], above, below, curves)
-            lower[i], upper[i] = low, high
+            lower[i], upper[i], viable[i] = joint_bounds(q[i], v[i], table[j, 0], table[j, 1])
 
 
-@compiled(error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def joint_bounds(
-    q: float, v: float, above: np.record, below: np.record, curves: NDArray[np.void]
+    q: float, v: float, above: np.record, below: np.record
 ) -> tuple[float, float, bool]:
     """Return the bounds of one joint state and whether it is in the kernel.
 
@@ -83,32 +144,21 @@ def joint_bounds(
         v: rad/s.
         above: upper limit, a `ONE_SIDED_LIMIT`.
         below: lower limit.
-        curves: of `JointTable`.
 
     Returns:
         Lower and upper bound, rad/s^2, and whether the state is viable.
     """
-    low, high, viable = _interval(q, v, above, below, curves)
+    high, keeps_high = _bound_towards(above.position - q, v, above)
+    low, keeps_low = _bound_towards(below.position + q, -v, below)
+    low = -low
+    slow = abs(v) - above.velocity_error <= above.v_max * _WITHIN
     if low > high:
         low = high = _resolve_conflict(above.position - q, below.position + q, v, low, high, above)
-    return low, high, viable
+    return low, high, keeps_high and keeps_low and slow
 
 
-@compiled(error_model="numpy")
-def _interval(
-    q: float, v: float, above: np.record, below: np.record, curves: NDArray[np.void]
-) -> tuple[float, float, bool]:
-    """Return what each limit allows by itself; see `joint_bounds`. It may be no interval."""
-    high, keeps_high = _bound_towards(above.position - q, v, above, curves)
-    low, keeps_low = _bound_towards(below.position + q, -v, below, curves)
-    slow = abs(v) - above.velocity_error <= above.v_max * _WITHIN
-    return -low, high, keeps_high and keeps_low and slow
-
-
-@compiled(error_model="numpy")
-def _bound_towards(
-    room: float, v: float, limit: np.record, curves: NDArray[np.void]
-) -> tuple[float, bool]:
+@njit(cache=True, error_model="numpy")
+def _bound_towards(room: float, v: float, limit: np.record) -> tuple[float, bool]:
     """Return the largest acceleration towards a limit that keeps it, and whether it can be kept.
 
     Args:
@@ -116,7 +166,6 @@ def _bound_towards(
         v: velocity towards it, rad/s; the acceleration is for the highest within its error, what
             is kept for the lowest.
         limit: a `ONE_SIDED_LIMIT`.
-        curves: of `JointTable`.
 
     Returns:
         Acceleration, rad/s^2, within those of the limit whatever the state; and whether the
@@ -129,7 +178,9 @@ def _bound_towards(
     if budget >= limit.free:
         a = (limit.v_max - v) / dt
     elif budget >= 0.0:
-        a = (min(_end_speed(budget, limit, curves), limit.v_max) - v) / dt
+        # The largest end-of-step speed w with dt w / 2 + w^2 / (2 B) <= budget.
+        c = limit.twice_braking * budget
+        a = (min(c / (limit.k + sqrt(limit.k_squared + c)), limit.v_max) - v) / dt
     elif v > 0.0:
         # Stop within the step: eq. (19). Outside, and still leaving: brake.
         a = -v * (v / (2.0 * room)) if room > 0.0 else limit.low
@@ -144,46 +195,10 @@ def _bound_towards(
         a = limit.low
     room += limit.tolerance
     v -= 2.0 * limit.velocity_error
-    if v <= 0.0:
-        return a, room >= 0.0
-    viable = v * v <= limit.twice_braking * room
-    if viable and limit.points > 0:
-        budget = min(room + limit.half_dt * v, limit.free)
-        viable = v <= _end_speed(budget, limit, curves) * _WITHIN
-    return a, viable
+    return a, room >= 0.0 if v <= 0.0 else v * v <= limit.twice_braking * room
 
 
-@compiled(error_model="numpy")
-def _end_speed(budget: float, limit: np.record, curves: NDArray[np.void]) -> float:
-    """Return the largest end-of-step speed w with ``dt w / 2 + U(w) <= budget``."""
-    c = limit.twice_braking * budget
-    parabola: float = c / (limit.k + sqrt(limit.k_squared + c))
-    if limit.points == 0 or parabola % limit.period >= limit.peak:
-        return parabola
-    low, end = limit.first, limit.first + limit.points
-    high = end
-    while low < high:
-        middle = (low + high) // 2
-        if budget < curves[middle].budget:
-            high = middle
-        else:
-            low = middle + 1
-    before = curves[low - 1]
-    if low == end:
-        # Only from outside: so fast a joint would need more room than there is in the range. To
-        # come to rest as a step ends it needs chords of the parabola, one for each step.
-        length, per_step = budget / limit.dt, 2.0 * limit.k
-        steps = floor(0.5 * (sqrt(1.0 + 8.0 * length / per_step) - 1.0))
-        rest = length - 0.5 * per_step * steps * (steps + 1.0)
-        braked: float = max(before.speed, per_step * steps + rest / (steps + 1.0))
-        return braked
-    after = curves[low]
-    share = (budget - before.budget) / (after.budget - before.budget)
-    speed: float = before.speed + (after.speed - before.speed) * share
-    return speed
-
-
-@compiled(error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _resolve_conflict(
     room_above: float, room_below: float, v: float, lower: float, upper: float, limit: np.record
 ) -> float:

@@ -1,0 +1,250 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Declared uncertainty of a robot, and the horizon and errors that its bounds must hold for.
+
+All declarations zero: states are exact, commands act at once. `docs/uncertainty.md` derives the
+rest. The bounds are asked for a state that belongs to the instant when the command begins to act
+if it is not late; its error is that of the state for its own instant, what the acceleration may be
+off until then, and what other commands than those expected may do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError
+from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
+from viability_bounds_pkg.parameter import joint_amounts, periods, switch
+from viability_bounds_pkg.state import State
+from viability_bounds_pkg.state_estimation.observer import ObserverDesign, design_observer
+from viability_bounds_pkg.torque_margin import TorqueMargins, tightened
+from viability_bounds_pkg.viability import BoundsSolver
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class VelocityEstimation:
+    """Where the velocities in estimated joint states come from."""
+
+    velocity_estimation: bool = switch(
+        "whether velocities are estimated from positions and torques; false takes those that the "
+        "robot reports",
+        default=True,
+    )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DeclaredUncertainty:
+    """Largest errors of states, times and accelerations; arrays of shape (n,)."""
+
+    position_error: Array = joint_amounts(
+        "largest error of a reported position, rad: resolution and noise of the encoder; 0 if "
+        "empty"
+    )
+    velocity_error: Array = joint_amounts(
+        "largest error of a reported velocity, rad/s; 0 if empty",
+        note="not used with use_estimated_states, where the observer's own error counts",
+    )
+    acceleration_disturbance: Array = joint_amounts(
+        "how much more than commanded the joints may accelerate by what the model does not know, "
+        "friction, payloads, pushes, rad/s^2; the bounds are tightened by it; 0 if empty"
+    )
+    lasting_disturbance: Array = joint_amounts(
+        "up to which the estimator learns what the model does not know and lasts, friction, "
+        "payloads, wrong masses, rad/s^2, so that velocities of joints at rest have no bias; its "
+        "errors are guaranteed where acceleration_disturbance covers the rest; 0 if empty"
+    )
+    delay: int = periods(
+        "control periods from the instant of a reported state to the one when the command that "
+        "answers it begins to act"
+    )
+    delay_jitter: int = periods("control periods by which the delay may be longer at times")
+    missed_deadlines: int = periods(
+        "longest row of control periods in which no new command arrives and the robot keeps the "
+        "last one"
+    )
+    motor_bandwidth: Array = joint_amounts(
+        "bandwidth of the motors' torque as a first-order lag, Hz; 0 or empty: no lag"
+    )
+
+    @property
+    def motor_lag(self) -> Array:
+        """Time constant of the motors' torque, shape (n,), s; 0 without a lag."""
+        bandwidth = 2.0 * np.pi * self.motor_bandwidth
+        return np.divide(1.0, bandwidth, out=np.zeros_like(bandwidth), where=bandwidth > 0.0)
+
+    def observers(self, dt: float) -> ObserverDesign:
+        """Return the observers that estimate velocities.
+
+        Args:
+            dt: control period, s.
+        """
+        return design_observer(dt, self.position_error, self.acceleration_disturbance)
+
+    @property
+    def names(self) -> list[str]:
+        """Which declarations are not zero."""
+        return [each.name for each in fields(self) if np.any(getattr(self, each.name))]
+
+    def without(self, *names: str) -> DeclaredUncertainty:
+        """Return the same with some of the declarations left out."""
+        nothing: dict[str, Any] = {name: 0 * getattr(self, name) for name in names}
+        return replace(self, **nothing)
+
+    def of_joint(self, j: int) -> DeclaredUncertainty:
+        """Return what is declared of joint j alone, arrays of shape (1,)."""
+        arrays = {k: v for k, v in vars(self).items() if isinstance(v, np.ndarray)}
+        own: dict[str, Any] = {name: value[j : j + 1] for name, value in arrays.items()}
+        return replace(self, **own)
+
+
+class UncertaintyMargins(NamedTuple):
+    """What the bounds must hold for.
+
+    Attributes:
+        horizon: step of the bounds, s, at least `held`.
+        position_error: E_q, largest error of the state's position, shape (n,), rad.
+        velocity_error: E_v, largest error of its velocity, shape (n,), rad/s.
+        held: longest time for which a command may act, s.
+    """
+
+    horizon: float
+    position_error: Array
+    velocity_error: Array
+    held: float
+
+
+def uncertainty_margins(
+    declared: DeclaredUncertainty,
+    dt: float,
+    limits: JointLimits,
+    acceleration_error: Array,
+    errors: State,
+    predicted: bool,
+) -> UncertaintyMargins:
+    """Return what the bounds must hold for.
+
+    Args:
+        declared: delay and its jitter, rows of missed deadlines, lag of the motors.
+        dt: control period, s.
+        limits: of n joints; of the accelerations commanded.
+        acceleration_error: W, how far the acceleration may be from the one commanded, shape (n,),
+            rad/s^2.
+        errors: largest errors of position and velocity of a state for its own instant.
+        predicted: whether the state is predicted to the instant when the command begins to act,
+            lag of the motors included; otherwise the bounds take it as it is.
+    """
+    late, later = declared.delay * dt, declared.delay_jitter * dt
+    lag = declared.motor_lag
+    spread = limits.a_max - limits.a_min
+    if predicted:
+        wrong = wrong_periods(declared)
+        velocity = errors.v + acceleration_error * (late + lag) + wrong * dt * spread
+        position = errors.q + errors.v * (late + lag)
+        position += acceleration_error * late * (0.5 * late + lag)
+        if wrong:
+            position += 0.5 * spread * (late**2 + later**2)
+    else:
+        fastest = np.maximum(-limits.a_min, limits.a_max) + acceleration_error
+        velocity = errors.v + fastest * (late + lag) + spread * later
+        position = errors.q + limits.v_max * (late + lag) + 0.5 * spread * later**2
+    longest = 1 + declared.delay_jitter + declared.missed_deadlines
+    return UncertaintyMargins(longest * dt, position, velocity, longest * dt)
+
+
+def wrong_periods(declared: DeclaredUncertainty) -> int:
+    """Return in how many periods, at most, other commands act than the prediction expects.
+
+    From the instant of a state to the one when the command that answers it begins to act. Where
+    that is late, the prediction expects it to act already. Of any row of periods that is one
+    longer than a command may be old, one period has a command that is expected in that row, so
+    that only the order differs.
+    """
+    uncertain = declared.delay + declared.delay_jitter
+    oldest = declared.delay_jitter + declared.missed_deadlines
+    return uncertain - uncertain // (1 + oldest)
+
+
+class Loop(NamedTuple):
+    """A control loop, without what is uncertain in it.
+
+    Attributes:
+        limits: of n joints.
+        torque_margins: off these limits, for the torque held in a control period.
+        dt: control period, s.
+        least_horizon: of the bounds, s.
+        predicted: as in `uncertainty_margins`.
+        observed: whether velocities are observed, not reported.
+    """
+
+    limits: JointLimits
+    torque_margins: TorqueMargins
+    dt: float
+    least_horizon: float
+    predicted: bool = False
+    observed: bool = False
+
+    def margins(self, declared: DeclaredUncertainty) -> UncertaintyMargins:
+        """Return what the bounds must hold for; the horizon is that of the bounds."""
+        source = declared.observers(self.dt) if self.observed else declared
+        errors = State(source.position_error, source.velocity_error)
+        w = self.torque_margins.acceleration + declared.acceleration_disturbance
+        margins = uncertainty_margins(declared, self.dt, self.limits, w, errors, self.predicted)
+        return margins._replace(horizon=max(self.least_horizon, margins.horizon))
+
+    def bounds(self, declared: DeclaredUncertainty) -> BoundsSolver:
+        """Return the bounds that hold for what is declared.
+
+        Raises:
+            JointLimitsError: there are none.
+        """
+        horizon, position_error, velocity_error, held = self.margins(declared)
+        return BoundsSolver(
+            tightened(self.limits, self.torque_margins),
+            horizon,
+            self.torque_margins.acceleration + declared.acceleration_disturbance,
+            held,
+            position_error=position_error,
+            velocity_error=velocity_error,
+        )
+
+    def of_joint(self, j: int) -> Loop:
+        """Return the loop of joint j alone."""
+        own = TorqueMargins(*(each[j : j + 1] for each in self.torque_margins))
+        return self._replace(limits=self.limits.of_joint(j), torque_margins=own)
+
+    def refusal(self, declared: DeclaredUncertainty, error: JointLimitsError) -> ArmSafetyError:
+        """Return the error for declarations that leave a joint no bounds.
+
+        It names the first declaration without which there were some.
+
+        Args:
+            declared: of n joints.
+            error: what the bounds say; returned where nothing declared is the cause.
+        """
+        if error.joint is None:
+            return error
+        j = self.limits.names.index(error.joint)
+        loop, own = self.of_joint(j), declared.of_joint(j)
+        if not own.names or not loop.has_bounds(own.without(*own.names)):
+            return error
+        too_large = [name for name in own.names if loop.has_bounds(own.without(name))]
+        numbers = {each: float(np.squeeze(getattr(own, each))) for each in own.names}
+        name = (too_large or own.names)[0]
+        value = numbers.pop(name)
+        others = ", ".join(f"{other} {number:g}" for other, number in numbers.items())
+        allowed = f"{'more' if name == 'motor_bandwidth' else 'less'} for '{error.joint}' at "
+        allowed += f"{1.0 / self.dt:g} Hz" + (f", with {others}" if others else "")
+        return SettingError(name, value, allowed)
+
+    def has_bounds(self, declared: DeclaredUncertainty) -> bool:
+        """Return whether there are bounds for what is declared."""
+        try:
+            self.bounds(declared)
+        except JointLimitsError:
+            return False
+        return True
