@@ -22,7 +22,6 @@ from direct import DirectLoop
 
 from sim_bridge.bullet.obstacles import Obstacle
 from torque_safety_controller.anti_windup import project_to_limits
-from torque_safety_controller.node.assembly import make_state_check
 from torque_safety_controller.safety.command_watch import CommandWatch
 from viability_bounds_pkg.cli.command_line import INTERRUPTED
 from viability_bounds_pkg.compiled import compilations, compiled_functions, is_kept
@@ -92,7 +91,6 @@ def watch() -> None:
     """Make what looks at states, limits and torques."""
     loop = DirectLoop("panda")
     none = np.zeros(loop.model.nv)
-    make_state_check(loop._controller_configuration(), loop.model, None)
     CommandWatch(none, 1)
 
 

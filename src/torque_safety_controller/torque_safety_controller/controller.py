@@ -38,7 +38,6 @@ from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.goals import Goals
 from torque_safety_controller.tasks.task import Task
 from viability_bounds_pkg.state import State
-from viability_bounds_pkg.state_estimation.freeze_check import FRICTION, STICTION, Expected
 from viability_bounds_pkg.viability import AccelerationBounds
 from viability_bounds_pkg.whole_arm.safety_filter import SafetyFilter
 
@@ -136,11 +135,6 @@ class Controller:
     def acceleration(self) -> Array:
         """Acceleration commanded last, shape (n,), rad/s^2."""
         return self._a_last
-
-    def expected(self) -> Expected:
-        """Return how the arm moves after the last step."""
-        idle = self.additional is None or self.additional.idle
-        return Expected(self._a_last, FRICTION if idle else STICTION, self._observer.known)
 
     @property
     def lost(self) -> bool:
@@ -281,21 +275,6 @@ class Controller:
         if self.additional is not None:
             self.additional.initialise(self.robot, state.v, last - output.tau)
         return output
-
-    def go_on(self) -> Array:
-        """Return the torque, shape (n,), N m, that goes on with the last step's accelerations.
-
-        For a period of which the state is not known. Bounds that look two periods ahead cover it;
-        not so a torque that is held: its accelerations change as the arm moves. What is not of
-        the model, as the integral action and forces of contacts, stays what it was.
-        """
-        robot, a, last = self.robot, self._a_last, self._limiter.last
-        if last is None:
-            return self._limiter.limited(robot.torque(a))
-        disturbance, h = self._observer.known, robot.dt
-        moves = a if disturbance is None else a + disturbance
-        state = State(robot.q + h * (robot.v + 0.5 * h * moves), robot.v + h * moves)
-        return self._limiter.limited(last + robot.torque(a, state) - robot.torque(a))
 
     def _begin(self, state: State, elapsed: float | None) -> Array | None:
         """Update the model and return the additional torque of a step, or None."""

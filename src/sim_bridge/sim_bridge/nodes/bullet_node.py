@@ -28,6 +28,7 @@ from sim_bridge.nodes.command_stream import CommandStream
 from sim_bridge.nodes.ft_sensor import ForceTorqueReading
 from sim_bridge.nodes.topics import CLOCK, PAUSE, RESET
 from sim_bridge.nodes.world_subscriber import WorldSubscriber
+from viability_bounds_pkg.plausible import RESTART_GAP
 from viability_bounds_pkg.recent_values import RecentValues
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.joint_command import PositionCommand, TorqueCommand
@@ -43,7 +44,6 @@ from viability_bounds_pkg.ros.topics import (
     JOINT_STATES,
     ROBOT_DESCRIPTION,
 )
-from viability_bounds_pkg.state_estimation.state_check import RESTART
 
 Array = NDArray[np.float64]
 
@@ -283,7 +283,7 @@ class BulletNode(ArmNode):
         if self._has_moved:
             # As robots that start again: else the leap is taken for a state that cannot be. Also
             # where it is at its start already: the controller may not have seen the last reset.
-            self._stamp += round(1e9 * RESTART)
+            self._stamp += round(1e9 * RESTART_GAP)
         self._restart()
         self._next_state()
         response.success = True

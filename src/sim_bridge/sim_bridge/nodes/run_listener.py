@@ -21,7 +21,7 @@ from trajectory_msgs.msg import JointTrajectory, MultiDOFJointTrajectory
 from sim_bridge.nodes.topics import EXTERNAL_WRENCH, OBSTACLES
 from sim_bridge.recording.mcap_file import McapFile
 from sim_bridge.scenario.recording import Array, RecordedRun
-from viability_bounds_pkg.ros.messages import JointStateReader, Verdict
+from viability_bounds_pkg.ros.messages import Arrival, JointStateReader
 from viability_bounds_pkg.ros.runtime import LATCHED_QOS, stamp_to_ns
 from viability_bounds_pkg.ros.topics import (
     ACCELERATION_LIMITS,
@@ -156,7 +156,7 @@ class RunListener:
         )
 
     def _on_state(self, message: JointState) -> None:
-        if self._reader.read(message, time.monotonic()) is Verdict.NEW:
+        if self._reader.read(message, time.monotonic()) is Arrival.NEW:
             self.stamp, self.q = self._reader.stamp, self._reader.q
             self._states[self.stamp] = self.q, self._reader.v
 

@@ -5,7 +5,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from arms import load_arm
 from controllers import (
     EXACT,
@@ -246,51 +245,3 @@ def test_nothing_is_learned_from_a_motion_that_was_not_commanded():
     np.testing.assert_allclose(controller.additional.integral, torque, rtol=0.05)
     controller.step(State(arm.q_start, np.full(arm.n, 0.5)), wide(arm))
     assert np.abs(controller._observer.estimate - learned).max() > 10.0
-
-
-@pytest.mark.parametrize("disturbed", [False, True])
-@pytest.mark.parametrize("robot", ["baxter_left_arm", "panda"])
-def test_accelerations_go_on_in_a_period_without_a_state(robot, disturbed):
-    """Under a torque that is held they change, as the arm moves."""
-    arm = load_arm(robot)
-    rng = np.random.default_rng(6)
-    gains = posture_only(50.0, 10.0)
-    gains = replace(gains, disturbance_time=0.0) if disturbed else gains
-    load = gravity(arm, arm.q_start) * (0.2 if disturbed else 0.0)
-    gone_on, held = [], []
-    for _ in range(30):
-        controller = strong(arm, gains=gains)
-        (q0, v0), dt = arm.random_state(rng), controller.robot.dt
-        bounds = AccelerationRange(np.full(arm.n, -5.0), np.full(arm.n, 5.0))
-        controller.set_posture_goal(rng.uniform(arm.q_min, arm.q_max))
-        before = controller.step(State(q0, v0), bounds).tau
-        q1, v1 = arm.move(q0, v0, before - load, dt, 4)
-        tau = controller.step(State(q1, v1), bounds).tau
-        assert (controller.expected().disturbance is not None) == disturbed
-        q2, v2 = arm.move(q1, v1, tau - load, dt, 4)
-        other = controller.go_on()
-        for changes, torque in ((gone_on, other), (held, tau)):
-            _, v3 = arm.move(q2, v2, torque - load, dt, 4)
-            changes.append(np.abs((v3 - v2) - (v2 - v1)).max() / dt)
-    # A load of one torque gives other accelerations, too, as the arm moves.
-    share = 0.5 if disturbed else 0.01
-    assert max(gone_on) < share * max(held) and np.median(gone_on) < share * np.median(held)
-
-
-def test_nothing_that_is_not_finite_goes_on():
-    arm = load_arm("panda")
-    controller = make(arm)
-    controller.set_posture_goal(arm.q_start)
-    controller.step(State(arm.q_start, np.full(arm.n, 1e200)), wide(arm))
-    tau = controller.go_on()
-    assert np.isfinite(tau).all() and (np.abs(tau) <= arm.tau_max).all()
-
-
-def test_without_a_torque_before_the_arm_is_carried_on():
-    """As after a restart: no acceleration was asked for."""
-    arm = load_arm("panda")
-    controller = make(arm)
-    controller.set_posture_goal(arm.q_start + 0.3)
-    controller.step(State(arm.q_start, np.zeros(arm.n)), wide(arm))
-    controller.reset(arm.q_start)
-    np.testing.assert_allclose(controller.go_on(), gravity(arm, arm.q_start), rtol=1e-9)

@@ -27,6 +27,7 @@ from viability_bounds_pkg.node.bounds_parameters import (
     BoundsConfiguration,
     make_bounds,
 )
+from viability_bounds_pkg.plausible import PlausibilityCheck
 from viability_bounds_pkg.robot_configuration import load_model
 from viability_bounds_pkg.robot_description import (
     RobotDescriptionError,
@@ -34,7 +35,6 @@ from viability_bounds_pkg.robot_description import (
     load_geometry,
 )
 from viability_bounds_pkg.ros.robot_urdf import robot_urdf, warn_of_unusual
-from viability_bounds_pkg.state_estimation.state_check import StateCheck
 from viability_bounds_pkg.stopping.coordinated_stop import MARGIN
 from viability_bounds_pkg.viability import BoundsSolver
 from viability_bounds_pkg.whole_arm.safety_filter import SafetyFilter
@@ -84,24 +84,23 @@ def make_controller(
     return controller, base
 
 
-def make_state_check(
-    config: ControllerConfiguration, model: pin.Model, declared: BoundsConfiguration | None
-) -> StateCheck | None:
-    """Return what tells joint states that cannot be; None where the estimator does it.
+def make_plausibility_check(
+    config: ControllerConfiguration, declared: BoundsConfiguration | None
+) -> PlausibilityCheck | None:
+    """Return the check of the states that the robot reports; None where the estimator has it.
 
     Args:
         config: checked parameters.
-        model: of the arm.
         declared: of the robot, for the bounds node.
     """
     if config.use_estimated_states:
         return None
-    none = np.zeros(model.nv)
-    return StateCheck(
-        model,
+    none = np.zeros(len(config.joints))
+    return PlausibilityCheck(
         config.position_min,
         config.position_max,
-        config.torque_max,
+        config.velocity_max,
+        config.dt,
         none if declared is None else declared.declared.position_error,
         none if declared is None else declared.declared.velocity_error,
     )

@@ -18,7 +18,7 @@ from torque_safety_controller.controller import ControlOutput
 from torque_safety_controller.node.assembly import (
     configure,
     make_controller,
-    make_state_check,
+    make_plausibility_check,
 )
 from torque_safety_controller.node.declared import covered_row, declared_robot, longest_way
 from torque_safety_controller.node.driving import Driving
@@ -36,7 +36,7 @@ from torque_safety_controller.node.reports.controller_report import (
 from torque_safety_controller.node.reports.state_publisher import StatePublisher
 from torque_safety_controller.node.streams.joint_commands import JointCommands
 from torque_safety_controller.node.streams.limits import LimitsReader
-from torque_safety_controller.node.streams.states import UNSEEN, Arrival, StateStream
+from torque_safety_controller.node.streams.states import UNSEEN, StateStream
 from torque_safety_controller.node.topics import GOALS
 from torque_safety_controller.node.wrenches import WrenchSubscriber
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
@@ -44,12 +44,11 @@ from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.safety.handover import Control, Handover
 from torque_safety_controller.safety.modes import Mode, ModeKeeper
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.messages import Diagnostics, PeriodCheck
+from viability_bounds_pkg.ros.messages import Arrival, Diagnostics, PeriodCheck
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.robot_urdf import DescriptionWatch
-from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import (
     ACCELERATION_LIMITS,
     FT_WRENCH,
@@ -92,7 +91,7 @@ class ControllerNode(ArmNode):
             config.torque_max,
             config.dt,
         )
-        check = make_state_check(config, self._controller.robot.model, declared_robot(self))
+        check = make_plausibility_check(config, declared_robot(self))
         self._states = StateStream(config.joints, config.state_timeout, self._warn, check)
         self._period = PeriodCheck(config.dt, self._warn)
         self._limits = LimitsReader(config.joints, self._warn)
@@ -170,8 +169,8 @@ class ControllerNode(ArmNode):
         if not self.publisher_watch.admits(self._states_topic):
             return
         states, stamp = self._states, message.header.stamp
-        arrival = states.take(message, time.monotonic())
-        if arrival is not Arrival.NEXT and not self._begins(arrival, stamp):
+        arrival = states.read(message, time.monotonic())
+        if arrival is not Arrival.NEW and not self._begins(arrival, stamp):
             return
         if states.unseen and self._handover.by_drives:
             # They would jump to where the arm was held before, from where it has been put.
@@ -189,9 +188,7 @@ class ControllerNode(ArmNode):
         states = self._states
         if arrival is Arrival.REFUSED:
             self._on_refused(stamp)
-        elif arrival is Arrival.UNDECIDED:
-            self._wait(stamp)
-        elif arrival is not Arrival.REPEAT:
+        elif arrival is not Arrival.REPEATED:
             self._begin(arrival)
             return True
         elif states.answered_stamp == states.stamp:
@@ -214,25 +211,12 @@ class ControllerNode(ArmNode):
             self._recovery.why = states.why_refused
             self._enter(Mode.STOPPED, states.why_refused)
 
-    def _wait(self, stamp: Any) -> None:
-        """Let the arm go on for a period more: the next state decides about this one."""
-        states = self._states
-        if self._handover.by_drives:
-            self._drives.hold(stamp)
-        elif states.answered_stamp == states.stamp and not states.refused_in_row:
-            if stamp_to_ns(stamp) <= self._commands.stamp:  # once more
-                self._commands.again(stamp)
-                return
-            tau = self._controller.go_on()
-            self._commands.torque(tau, stamp)
-            self._recovery.motors.note(tau)
-
     def _begin(self, arrival: Arrival) -> None:
         """Start anew: the robot was silent, or restarted."""
         states = self._states
         if states.missed:
             self._recovery.why = "joint states were missing"
-        if arrival is Arrival.ANEW and self._limits.stamp == states.answered_stamp:
+        if arrival is Arrival.RESTARTED and self._limits.stamp == states.answered_stamp:
             self._limits.stamp = -1  # from before the restart; its stamps may come again
         if self._by_others():
             self._recovery.why = "the motors held the arm before"
@@ -294,7 +278,6 @@ class ControllerNode(ArmNode):
         self._commands.torque(step.tau, stamp)
         self._recovery.motors.note(step.tau)
         states.answered()
-        states.expect(self._controller.expected())
         self._record.note(step, now - states.message_at)
         self._wrenches.note()
         self._collision.note(step)
@@ -398,7 +381,6 @@ class ControllerNode(ArmNode):
                 "goals_pending": len(self._goals),
                 "goals_refused": self._goals.refused,
                 "states_refused": self._states.refused,
-                "states_undecided": self._states.undecided,
                 "limits_refused": self._limits.refused,
             }
         )

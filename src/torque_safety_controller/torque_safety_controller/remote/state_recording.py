@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 
-from viability_bounds_pkg.ros.messages import JointStateReader, Verdict
+from viability_bounds_pkg.ros.messages import Arrival, JointStateReader
 
 Array = NDArray[np.float64]
 
@@ -31,7 +31,7 @@ class StateRecording:
 
     def add(self, message: JointState, now: float) -> None:
         """Keep the state in a message that came at `now`, s, if it can be used."""
-        if self._reader.read(message, now) is Verdict.NEW:
+        if self._reader.read(message, now) is Arrival.NEW:
             tau = self._reader.effort()
             self._stamps.append(self._reader.stamp)
             self._states.append(

@@ -8,26 +8,26 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from sample_arm import MODEL, NONE, TAU_MAX, N
 from std_msgs.msg import Float64MultiArray
 
+from viability_bounds_pkg.plausible import JUMP, PlausibilityCheck
 from viability_bounds_pkg.ros.messages import (
+    Arrival,
     Diagnostics,
     JointStateReader,
-    Verdict,
 )
 from viability_bounds_pkg.ros.runtime import STATUS_QOS, set_stamp, stamp_to_ns
-from viability_bounds_pkg.state_estimation.state_check import StateCheck
 from viability_bounds_pkg.testing.ros_harness import joint_state
 
 JOINTS = ("a", "b", "c")
 Q, V = [0.1, 0.2, 0.3], [1.0, 2.0, 3.0]
 SECOND = 1_000_000_000
+NONE = np.zeros(3)
 
 
 def make_reader():
     reader = JointStateReader(JOINTS, reset_after=0.5)
-    assert reader.read(joint_state(JOINTS, SECOND, Q, V), now=10.0) is Verdict.NEW
+    assert reader.read(joint_state(JOINTS, SECOND, Q, V), now=10.0) is Arrival.NEW
     return reader
 
 
@@ -46,10 +46,10 @@ def test_names_may_come_in_any_order_and_with_others():
     message = joint_state(
         ["x", "c", "a", "y", "b"], 2 * SECOND, [9.0, 3.0, 1.0, 9.0, 2.0], [8, 6, 4, 8, 5]
     )
-    assert reader.read(message, 10.01) is Verdict.NEW
+    assert reader.read(message, 10.01) is Arrival.NEW
     holds(reader, [1.0, 2.0, 3.0], [4.0, 5.0, 6.0], 2 * SECOND)
     # And back: the order may change from message to message.
-    assert reader.read(joint_state(JOINTS, 3 * SECOND, Q, V), 10.02) is Verdict.NEW
+    assert reader.read(joint_state(JOINTS, 3 * SECOND, Q, V), 10.02) is Arrival.NEW
     holds(reader, Q, V, 3 * SECOND)
 
 
@@ -58,7 +58,7 @@ def test_what_other_joints_do_does_not_matter():
     message = joint_state(
         ["x", *JOINTS], 2 * SECOND, [math.nan, 1.0, 2.0, 3.0], [math.inf, 4.0, 5.0, 6.0]
     )
-    assert reader.read(message, 10.01) is Verdict.NEW
+    assert reader.read(message, 10.01) is Arrival.NEW
     holds(reader, [1.0, 2.0, 3.0], [4.0, 5.0, 6.0], 2 * SECOND)
 
 
@@ -66,7 +66,7 @@ def test_what_other_joints_do_does_not_matter():
 def test_a_stamp_of_zero_or_before_is_none(stamp):
     warnings = []
     reader = JointStateReader(JOINTS, warn=warnings.append)
-    assert reader.read(joint_state(JOINTS, stamp, Q, V), 10.0) is Verdict.REFUSED
+    assert reader.read(joint_state(JOINTS, stamp, Q, V), 10.0) is Arrival.REFUSED
     assert reader.refused == {"no stamp": 1}
     what = "zero" if stamp == 0 else "before zero"
     assert warnings == [f"joint_states refused: no stamp: header.stamp is {what}"]
@@ -82,7 +82,7 @@ def test_any_order_of_any_joints(order, data):
     message = joint_state(
         [names[i] for i in order], 5, [q[i] for i in order], [v[i] for i in order]
     )
-    assert reader.read(message, 0.0) is Verdict.NEW
+    assert reader.read(message, 0.0) is Arrival.NEW
     holds(reader, q[:3], v[:3], 5)
 
 
@@ -108,12 +108,12 @@ def test_any_order_of_any_joints(order, data):
 )
 def test_what_is_refused_is_counted_and_changes_nothing(message, reason):
     reader = make_reader()
-    assert reader.read(message, 10.01) is Verdict.REFUSED
+    assert reader.read(message, 10.01) is Arrival.REFUSED
     assert reader.refused == {reason: 1}
     holds(reader, Q, V, SECOND)
-    assert reader.read(message, 10.02) is Verdict.REFUSED
+    assert reader.read(message, 10.02) is Arrival.REFUSED
     assert reader.refused == {reason: 2}
-    assert reader.read(joint_state(JOINTS, 3 * SECOND, V, Q), 10.03) is Verdict.NEW
+    assert reader.read(joint_state(JOINTS, 3 * SECOND, V, Q), 10.03) is Arrival.NEW
     holds(reader, V, Q, 3 * SECOND)
 
 
@@ -121,100 +121,80 @@ def test_what_is_refused_is_counted_and_changes_nothing(message, reason):
 def test_a_first_message_without_the_joints_is_refused(names):
     reader = JointStateReader(JOINTS)
     message = joint_state(names, SECOND, [0.0] * len(names), [0.0] * len(names))
-    assert reader.read(message, 0.0) is Verdict.REFUSED
+    assert reader.read(message, 0.0) is Arrival.REFUSED
     assert reader.q.shape == reader.v.shape == (3,)
 
 
 def test_the_same_message_again_is_a_repeat():
     reader = make_reader()
     for now in (10.1, 10.2, 100.0):
-        assert reader.read(joint_state(JOINTS, SECOND, Q, V), now) is Verdict.REPEAT
+        assert reader.read(joint_state(JOINTS, SECOND, Q, V), now) is Arrival.REPEATED
     assert not reader.refused
 
 
 def test_old_stamps_are_taken_again_after_silence():
     reader = make_reader()
     restarted = joint_state(JOINTS, 5, V, Q)
-    assert reader.read(restarted, 10.0 + 0.49) is Verdict.REFUSED
-    assert reader.read(restarted, 10.0 + 0.51) is Verdict.NEW
+    assert reader.read(restarted, 10.0 + 0.49) is Arrival.REFUSED
+    assert reader.read(restarted, 10.0 + 0.51) is Arrival.NEW
     holds(reader, V, Q, 5)
-    assert reader.read(joint_state(JOINTS, 6, Q, V), 10.52) is Verdict.NEW
+    assert reader.read(joint_state(JOINTS, 6, Q, V), 10.52) is Arrival.NEW
 
 
 def test_a_source_that_starts_over_at_the_same_stamp_is_taken_after_silence():
     reader = make_reader()
     restarted = joint_state(JOINTS, SECOND, V, Q)
-    assert reader.read(restarted, 10.0 + 0.49) is Verdict.REFUSED
-    assert reader.read(restarted, 10.0 + 0.51) is Verdict.NEW
+    assert reader.read(restarted, 10.0 + 0.49) is Arrival.REFUSED
+    assert reader.read(restarted, 10.0 + 0.51) is Arrival.NEW
     holds(reader, V, Q, SECOND)
 
 
 def test_one_corrupt_stamp_in_the_future_does_not_lock_the_robot_out():
     reader = make_reader()
-    assert reader.read(joint_state(JOINTS, 1000 * SECOND, Q, V), 10.01) is Verdict.NEW
+    assert reader.read(joint_state(JOINTS, 1000 * SECOND, Q, V), 10.01) is Arrival.NEW
     now, stamp = 10.02, 2 * SECOND
-    while reader.read(joint_state(JOINTS, stamp, Q, V), now) is Verdict.REFUSED:
+    while reader.read(joint_state(JOINTS, stamp, Q, V), now) is Arrival.REFUSED:
         now, stamp = now + 0.01, stamp + 10_000_000
         assert now < 10.6
     assert now == pytest.approx(10.51, abs=0.011)
 
 
-PERIOD, MANY, LATER = 0.004, 1500, 700
-TIMES = PERIOD * np.arange(MANY)
+def test_impossible_states_are_refused_and_counted_until_they_are_plausible_again():
+    limit = np.full(3, 2.5)
+    check = PlausibilityCheck(-limit, limit, limit, 0.01, NONE, NONE)
+    warnings = []
+    reader = JointStateReader(JOINTS, warn=warnings.append, check=check)
+
+    def arrives(k, q):
+        return reader.read(joint_state(JOINTS, k * SECOND // 100, q, NONE), 0.01 * k)
+
+    assert arrives(1, Q) is Arrival.NEW
+    assert arrives(2, V) is Arrival.REFUSED
+    assert arrives(3, Q) is Arrival.NEW
+    assert reader.refused == {"impossible": 1}
+    assert warnings == [f"joint_states refused: impossible: {JUMP}"]
 
 
-def refused_in_motion(stamps, late, joints, w=2.0):
-    """Return which states of a moving arm are refused, in the order in which they come.
-
-    Args:
-        stamps: of the states, s.
-        late: by how much they come after `TIMES`, in which they were, s.
-        joints: that move.
-        w: how fast they move to and fro, up to 2 rad/s, rad/s.
-    """
-    k, limit, moves = np.arange(N), np.full(N, 2.5), np.isin(np.arange(N), joints)
-    check = StateCheck(MODEL, -limit, limit, TAU_MAX, NONE, NONE)
-    names = [str(i) for i in k]
-    reader, heard, refused = JointStateReader(names, check=check), 50.0 + TIMES + late, []
-    for i in np.argsort(heard, kind="stable"):
-        q, v = np.sin(w * TIMES[i] + k) * 2.0 / w, moves * 2.0 * np.cos(w * TIMES[i] + k)
-        q = np.where(moves, q, 0.3)
-        message = joint_state(names, round(1e9 * (50.0 + stamps[i])), q, v)
-        if reader.read(message, heard[i]) is Verdict.REFUSED:
-            refused.append(i)
-    return np.array(refused), reader.refused
-
-
-@pytest.mark.parametrize("joints", [[2], range(N)], ids=["one", "all"])
-@pytest.mark.parametrize("back", [-0.05, -0.001, 5e-4, 0.003, 0.006, 0.011, 0.05, 0.3, 0.9, 20.0])
-@pytest.mark.parametrize("late", [0.0, 3e-4])
-@pytest.mark.parametrize("w", [2.0, 20.0])
-def test_a_clock_that_is_set_in_motion_costs_not_much_more_than_that(back, late, joints, w):
-    """The arm goes on while stamps are old: later ones lead on, and positions have not leapt."""
-    stamps = TIMES - back * (np.arange(MANY) >= LATER)
-    late = late * np.random.default_rng(2).random(MANY)
-    refused, why = refused_in_motion(stamps, late, joints, w)
-    takes = np.clip(back, 0.0, 1.0)  # after which any stamp is taken
-    assert why["old stamp"] == pytest.approx(takes / PERIOD, abs=1.0)
-    assert ((refused >= LATER) & (refused < LATER + (takes + 0.25) / PERIOD)).all()
-
-
-def test_states_that_come_late_and_in_another_order_cost_hardly_more_than_old_ones():
-    late = np.random.default_rng(1).uniform(0.0, 0.02, MANY)
-    _, why = refused_in_motion(TIMES, late, range(N))
-    assert why["old stamp"] > 0.3 * MANY
-    assert why["cannot be"] < 0.01 * MANY
+def test_a_robot_that_waits_for_the_answer_to_an_impossible_state_is_answered_after_a_while():
+    limit = np.full(3, 2.5)
+    check = PlausibilityCheck(-limit, limit, limit, 0.01, NONE, NONE)
+    reader = JointStateReader(JOINTS, reset_after=0.5, check=check)
+    assert reader.read(joint_state(JOINTS, SECOND, Q, NONE), 10.0) is Arrival.NEW
+    jumped = joint_state(JOINTS, SECOND + 10_000_000, V, NONE)
+    for now in (10.01, 10.05, 10.49):
+        assert reader.read(jumped, now) is Arrival.REFUSED
+    assert reader.read(jumped, 10.52) is Arrival.NEW
 
 
 def test_what_is_not_taken_does_not_count_as_heard():
     reader = JointStateReader(JOINTS, reset_after=1.0)
     late, early = joint_state(JOINTS, 100, Q, V), joint_state(JOINTS, 50, Q, V)
-    assert reader.read(joint_state(JOINTS[:2], 100, Q[:2], V[:2]), 0.0) is Verdict.REFUSED
-    assert reader.read(early, 0.1) is Verdict.NEW
-    assert reader.read(late, 0.2) is Verdict.NEW
-    assert reader.read(early, 0.3) is Verdict.REFUSED
-    assert reader.read(early, 1.1) is Verdict.REFUSED  # a refusal is no sign of life either
-    assert reader.read(early, 1.2) is Verdict.NEW
+    assert reader.read(joint_state(JOINTS[:2], 100, Q[:2], V[:2]), 0.0) is Arrival.REFUSED
+    assert reader.read(early, 0.1) is Arrival.NEW
+    assert reader.read(late, 0.2) is Arrival.NEW
+    assert reader.read(early, 0.3) is Arrival.REFUSED
+    assert reader.read(early, 1.1) is Arrival.REFUSED  # a refusal is no sign of life either
+    assert reader.read(early, 1.2) is Arrival.NEW
 
 
 @pytest.mark.parametrize("nanoseconds", [0, 999_999_999, SECOND, 1_795_235_306_814_914_975])

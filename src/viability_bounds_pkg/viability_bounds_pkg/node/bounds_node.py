@@ -16,12 +16,13 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from viability_bounds_pkg.node.bounds_parameters import (
     BoundsConfiguration,
     make_bounds,
+    make_plausibility_check,
     make_solver,
 )
 from viability_bounds_pkg.node.slow_topics import SlowTopics
 from viability_bounds_pkg.robot_configuration import TOPIC
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, PeriodCheck, Verdict
+from viability_bounds_pkg.ros.messages import Arrival, Diagnostics, JointStateReader, PeriodCheck
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
@@ -52,7 +53,8 @@ class BoundsNode(ArmNode):
                 warn_of_unusual(self, config, config.read_urdf())
             self._bounds = make_bounds(config)
         joints = config.joints
-        self._reader = JointStateReader(joints, config.state_timeout, self._warn)
+        check = make_plausibility_check(config)
+        self._reader = JointStateReader(joints, config.state_timeout, self._warn, check)
         self._period = PeriodCheck(config.dt, self._warn)
         self._answered = 0
         self._outside = np.zeros(len(joints), dtype=int)
@@ -97,10 +99,10 @@ class BoundsNode(ArmNode):
     def _on_state(self, message: JointState) -> None:
         if not self.publisher_watch.admits(self._states_topic):
             return
-        verdict = self._reader.read(message, time.monotonic())
-        if verdict is Verdict.REFUSED:
+        arrival = self._reader.read(message, time.monotonic())
+        if arrival is Arrival.REFUSED:
             return
-        if verdict is Verdict.NEW:
+        if arrival is Arrival.NEW:
             bounds = self._bounds(self._reader.q, self._reader.v)
             points = self._answer.points
             points[0].accelerations = array("d", bounds.lower.tobytes())

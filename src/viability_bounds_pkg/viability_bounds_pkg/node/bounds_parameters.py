@@ -27,6 +27,7 @@ from viability_bounds_pkg.parameter import (
     text,
     timeout,
 )
+from viability_bounds_pkg.plausible import PlausibilityCheck
 from viability_bounds_pkg.robot_configuration import (
     ControlRate,
     LimitedRobotConfiguration,
@@ -204,3 +205,17 @@ def make_bounds(config: BoundsConfiguration) -> Bounds:
     own = {"influence": config.damper_influence, "gain": config.damper_gain}
     settings = own if config.method == "damper" else {}
     return partial(BASELINES[config.method], limits=config.limits, dt=config.horizon, **settings)
+
+
+def make_plausibility_check(config: BoundsConfiguration) -> PlausibilityCheck | None:
+    """Return the check of the states that the robot reports; None where the estimator has it."""
+    if config.use_estimated_states:
+        return None
+    return PlausibilityCheck(
+        config.position_min,
+        config.position_max,
+        config.velocity_max,
+        config.dt,
+        config.declared.position_error,
+        config.declared.velocity_error,
+    )

@@ -15,12 +15,12 @@ from sensor_msgs.msg import JointState
 from viability_bounds_pkg.node.estimator_parameters import (
     EstimatorConfiguration,
     make_estimator,
-    make_state_check,
+    make_plausibility_check,
 )
 from viability_bounds_pkg.robot_configuration import TOPIC, load_model
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.joint_command import TorqueCommand, accept_command
-from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader, PeriodCheck, Verdict
+from viability_bounds_pkg.ros.messages import Arrival, Diagnostics, JointStateReader, PeriodCheck
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
@@ -56,7 +56,7 @@ class EstimatorNode(ArmNode):
         joints = config.joints
         self._joints = list(joints)
         self._observers = config.observers
-        check = make_state_check(config, model)
+        check = make_plausibility_check(config)
         self._reader = JointStateReader(joints, config.state_timeout, self._warn, check)
         self._period = PeriodCheck(config.dt, self._warn)
         self._refused: Counter[str] = Counter()
@@ -84,19 +84,17 @@ class EstimatorNode(ArmNode):
         if not self.publisher_watch.admits(self._states_topic):
             return
         reader = self._reader
-        verdict = reader.read(message, time.monotonic())
-        if verdict is Verdict.REFUSED:
+        arrival = reader.read(message, time.monotonic())
+        if arrival is Arrival.REFUSED:
             return
-        if verdict is Verdict.NEW:
+        if arrival is Arrival.NEW:
             reported = State(reader.q, reader.v)
             estimator = self._estimator
             state = estimator.step(reader.stamp, reported, reader.effort())
-            if estimator.expected is not None:
-                reader.expect(estimator.expected)
             self._answer = reader.with_state(state)
             self._answered += 1
         self._publisher.publish(self._answer)
-        if verdict is Verdict.NEW and self._estimator.resets.total() != self._restarts:
+        if arrival is Arrival.NEW and self._estimator.resets.total() != self._restarts:
             self._tell_restart()
 
     def _tell_restart(self) -> None:

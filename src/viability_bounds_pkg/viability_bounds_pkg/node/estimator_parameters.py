@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import pinocchio as pin
 
 from viability_bounds_pkg.parameter import group, timeout
+from viability_bounds_pkg.plausible import PlausibilityCheck
 from viability_bounds_pkg.robot_configuration import ControlRate, LimitedRobotConfiguration
 from viability_bounds_pkg.state_estimation.estimator import StateEstimator
 from viability_bounds_pkg.state_estimation.observer import ObserverDesign
-from viability_bounds_pkg.state_estimation.state_check import StateCheck
 from viability_bounds_pkg.uncertainty import DeclaredUncertainty, VelocityEstimation
 
 
@@ -46,14 +46,14 @@ def make_estimator(config: EstimatorConfiguration, model: pin.Model) -> StateEst
     )
 
 
-def make_state_check(config: EstimatorConfiguration, model: pin.Model) -> StateCheck:
-    """Return the check of the reported states of an arm."""
+def make_plausibility_check(config: EstimatorConfiguration) -> PlausibilityCheck:
+    """Return the check of the states that the robot reports."""
     declared = config.declared
-    return StateCheck(
-        model,
+    return PlausibilityCheck(
         config.position_min,
         config.position_max,
-        config.torque_max,
+        config.velocity_max,
+        config.dt,
         declared.position_error,
         None if config.velocity_estimation else declared.velocity_error,
     )

@@ -21,36 +21,34 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
 from viability_bounds_pkg.exceptions import did_you_mean
+from viability_bounds_pkg.plausible import PlausibilityCheck
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.robot_urdf import DescriptionWatch
 from viability_bounds_pkg.ros.runtime import set_stamp, stamp_to_ns
 from viability_bounds_pkg.ros.topics import DIAGNOSTICS, VALUES
 from viability_bounds_pkg.state import State
-from viability_bounds_pkg.state_estimation.freeze_check import Expected
-from viability_bounds_pkg.state_estimation.state_check import UNDECIDED, StateCheck
 
 Report = Callable[[], tuple[bytes, str, dict[str, Any]]]
 """Returns level, message and values of a status."""
 
 
-_SET_BACK = 20_000_000
-"""Time by which stamps are set back after which states are a beginning, ns."""
-
 _PERIODS_SEEN = 20
 """Fewer states do not tell their period."""
 
 
-class Verdict(Enum):
-    """Result of reading a message."""
+class Arrival(Enum):
+    """What a joint state is to its reader."""
 
     NEW = 1
     """Accepted: the arrays hold its values."""
-    REPEAT = 2
+    REPEATED = 2
     """The stamp and the values of the last accepted message: the robot repeats its state."""
     REFUSED = 3
     """Dropped and counted; the arrays hold what they held."""
-    UNDECIDED = 4
-    """The next one tells whether it is wrong; the arrays hold what they held."""
+    RESTARTED = 4
+    """Accepted, of a robot that was silent or has restarted; only told by readers that answer."""
+    RESUMED = 5
+    """Repeated by a robot that was silent; only told by readers that answer."""
 
 
 class JointStateReader:
@@ -62,29 +60,24 @@ class JointStateReader:
 
     Args:
         joints: names of the n joints.
-        reset_after: time without an accepted message after which any stamp is accepted, s.
+        reset_after: time without a later stamp after which any is accepted, s.
         warn: told in words when a message is dropped for a reason for the first time.
-        check: tells states that cannot be; None to believe what is finite.
+        check: of what is finite; None to accept it.
 
     Attributes:
-        LEAVES_UNDECIDED: whether a state that may be wrong is left until the next one decides;
-            else it is believed.
         accepted: how many new states were accepted.
         q, v: position and velocity of the last accepted message, shape (n,), rad and rad/s.
         stamp: its stamp, ns.
         heard_at: when it came, or was repeated last, s.
         refused: how many messages were dropped, by reason.
-        undecided: how many states were left until the next one.
     """
-
-    LEAVES_UNDECIDED = False
 
     def __init__(
         self,
         joints: Sequence[str],
         reset_after: float = 1.0,
         warn: Callable[[str], object] | None = None,
-        check: StateCheck | None = None,
+        check: PlausibilityCheck | None = None,
     ) -> None:
         n = len(joints)
         self.accepted = 0
@@ -94,27 +87,23 @@ class JointStateReader:
         self.stamp = -1
         self.heard_at = -math.inf
         self.refused: Counter[str] = Counter()
-        self.undecided, self._left = 0, -1
         self._joints = tuple(joints)
         self._reset_after = reset_after
-        self._accepted_at = -math.inf
-        # The first of old stamps that grow, one after the other, and the last, ns; 0 for none.
-        self._first_old = self._last_old = 0
+        self._newest, self._newest_at = -1, -math.inf  # stamp that came, ns, and when, s
         self._names: list[str] | None = None
         self._index: NDArray[np.intp] | None = None
         self._accepted: tuple[JointState, NDArray[np.intp] | None] | None = None
 
-    def read(self, message: JointState, now: float) -> Verdict:
-        """Take a message that arrived at `now`, in s on the steady clock."""
+    def read(self, message: JointState, now: float) -> Arrival:
+        """Read a message that arrived at `now`, in s on the steady clock."""
         stamp = stamp_to_ns(message.header.stamp)
         if stamp <= 0:
             # Later messages would have the same, and be taken for repeats of the first; below
             # zero there are no times, only stamps that stand for none.
             what = "zero" if stamp == 0 else "before zero"
             return self._refuse("no stamp", f"header.stamp is {what}")
-        restarted = now - self._accepted_at >= self._reset_after
+        restarted = now - self._newest_at >= self._reset_after
         if stamp < self.stamp and not restarted:
-            self._note_old(stamp)
             ago = 1e-9 * (self.stamp - stamp)
             return self._refuse("old stamp", f"{ago:.3g} s before that of the last one")
         if message.name != self._names and (missing := self._match(message.name)):
@@ -137,31 +126,25 @@ class JointStateReader:
         if stamp == self.stamp:
             if np.array_equal(q, self.q) and np.array_equal(v, self.v):
                 self.heard_at = now
-                return Verdict.REPEAT
+                return Arrival.REPEATED
             if not restarted:
                 return self._refuse("other values under the same stamp")
-        if self._check is not None and (wrong := self._look(self._check, State(q, v), stamp, now)):
-            if wrong != UNDECIDED:
-                return self._refuse("cannot be", wrong)
-            if self.LEAVES_UNDECIDED:
-                self.undecided += self._left != stamp
-                self._left = stamp
-                return Verdict.UNDECIDED
+        if self._check is not None and restarted and stamp <= self._newest:
+            self._check.reset()
+        if restarted or stamp > self._newest:
+            self._newest, self._newest_at = stamp, now
+        if self._check is not None and (fault := self._check.fault(State(q, v), 1e-9 * stamp)):
+            return self._refuse("impossible", fault)
         self.q, self.v, self.stamp = q, v, stamp
         self._accepted = message, self._index
-        self._accepted_at = self.heard_at = now
+        self.heard_at = now
         self.accepted += 1
-        return Verdict.NEW
+        return Arrival.NEW
 
     @property
     def message(self) -> JointState | None:
         """The last accepted message; None before the first."""
         return None if self._accepted is None else self._accepted[0]
-
-    def expect(self, expected: Expected) -> None:
-        """Say how the arm moves from the last state on, for what tells states that cannot be."""
-        if self._check is not None:
-            self._check.expect(expected)
 
     def effort(self) -> NDArray[np.float64] | None:
         """Return the torque of the motors in the last accepted message, shape (n,), N m.
@@ -201,22 +184,6 @@ class JointStateReader:
             effort=message.effort,
         )
 
-    def _note_old(self, stamp: int) -> None:
-        """Note an old stamp, before that of the last accepted message."""
-        if not self._first_old or stamp < self._last_old:
-            self._first_old = stamp
-        self._last_old = stamp
-
-    def _look(self, check: StateCheck, state: State, stamp: int, now: float) -> str:
-        """Return what is wrong with a state."""
-        if self._first_old:
-            # The arm went on meanwhile, unless they have only come late.
-            heard = int(1e9 * (now - self._accepted_at)) - (stamp - self.stamp)
-            if min(self.stamp - self._first_old, heard) > _SET_BACK:
-                check.reset()
-            self._first_old = 0
-        return check.look(state, 1e-9 * stamp, now)
-
     def _match(self, names: Sequence[str]) -> str:
         """Take the order of joints from `names`; return the first that is missing, or nothing."""
         where = {name: i for i, name in enumerate(names)}
@@ -228,11 +195,11 @@ class JointStateReader:
         self._index = None if same_order else np.array(index)
         return ""
 
-    def _refuse(self, reason: str, detail: str = "") -> Verdict:
+    def _refuse(self, reason: str, detail: str = "") -> Arrival:
         self.refused[reason] += 1
         if self._warn is not None and self.refused[reason] == 1:
             self._warn(f"joint_states refused: {reason}" + (f": {detail}" if detail else ""))
-        return Verdict.REFUSED
+        return Arrival.REFUSED
 
 
 class PeriodCheck:

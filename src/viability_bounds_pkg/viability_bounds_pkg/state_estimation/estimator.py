@@ -10,7 +10,6 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from viability_bounds_pkg.state import State
-from viability_bounds_pkg.state_estimation.freeze_check import STICTION, Expected
 from viability_bounds_pkg.state_estimation.observer import Observer, ObserverDesign
 from viability_bounds_pkg.state_estimation.prediction import (
     Command,
@@ -71,7 +70,6 @@ class StateEstimator:
     Attributes:
         resets: how often it started anew, by reason.
         innovation: largest one seen since then, shape (n,), rad; not those of jumps.
-        expected: how the arm moved in the last period; None at the beginning.
     """
 
     def __init__(
@@ -107,7 +105,6 @@ class StateEstimator:
         self._still = STILL * velocity_max
         self.resets: Counter[str] = Counter()
         self.innovation = zero.copy()
-        self.expected: Expected | None = None
 
     def answer(self, stamp: int, tau: Array | None) -> None:
         """Take note of a command, see `CommandsUnderWay.answer`."""
@@ -135,14 +132,10 @@ class StateEstimator:
         if effort is not None and self._beyond is None:
             coming = [Command(None)] * len(coming)  # it goes on little by little
         state, mean = reported, self._lag.mean(before, self._tau)
-        if self._observer is None:
-            self.expected = Expected(self._model.acceleration_at(reported, mean), STICTION)
-        else:
+        if self._observer is not None:
             observer = self._observer
             for _ in range(periods):
-                a = self._model.acceleration(observer.state, mean)
-                observer.predict(a)
-            self.expected = Expected(a, STICTION, observer.disturbance, observer.state.v)
+                observer.predict(self._model.acceleration(observer.state, mean))
             innovation = observer.innovation(reported.q)
             size = np.abs(innovation)
             if not (size <= self._jump).all():
@@ -222,7 +215,6 @@ class StateEstimator:
 
     def _start(self, stamp: int, reported: State, effort: Array | None) -> State:
         """Start anew from a reported state; nothing is known to be under way."""
-        self.expected = None
         self._commands.clear()
         self._commands.open(stamp)
         self._model.a = np.zeros(len(self._tau))

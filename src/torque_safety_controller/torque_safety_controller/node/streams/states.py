@@ -1,38 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The stream of joint states: which can be used, which were answered, where it begins anew."""
+"""Joint states as a stream: which can be used, which were answered, where the robot restarted."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from enum import Enum
 from typing import Any
 
 import numpy as np
 from sensor_msgs.msg import JointState
 
-from viability_bounds_pkg.ros.messages import JointStateReader, Verdict
-from viability_bounds_pkg.state_estimation.state_check import RESTART, STAYS, StateCheck
+from viability_bounds_pkg.plausible import RESTART_GAP, PlausibilityCheck
+from viability_bounds_pkg.ros.messages import Arrival, JointStateReader
 
 UNSEEN = 3
-"""States in a row that cannot be used after which nothing is known of the arm."""
+"""Refused states in a row after which nothing is known of the arm."""
 
 
-class Arrival(Enum):
-    """What a joint state is to those who answer it."""
-
-    NEXT = 1
-    """A new state of an arm that goes on."""
-    ANEW = 2
-    """The first state of an arm that was silent, or of a robot that has restarted."""
-    BACK = 3
-    """The last state, repeated by an arm that was silent."""
-    REPEAT = 4
-    """The last state, repeated: this was lost, or its answer."""
-    REFUSED = 5
-    """Dropped and counted."""
-    UNDECIDED = 6
-    """The next state tells whether it is wrong."""
+ELSEWHERE = 0.05
+"""By how much positions differ where an arm has been moved while its stamps leapt, rad."""
 
 
 class StateStream(JointStateReader):
@@ -42,9 +28,7 @@ class StateStream(JointStateReader):
         joints: names of the n joints.
         timeout: how long without a usable state until the arm counts as silent, s.
         warn: told in words when a state is dropped for a reason for the first time.
-        check: tells states that cannot be; None to believe what is finite.
-
-    A state that is undecided counts as one that was lost, until the next one.
+        check: of what is finite; None to accept it.
 
     Attributes:
         message_at: when the last message came, usable or not, s on the steady clock.
@@ -58,14 +42,12 @@ class StateStream(JointStateReader):
             as after a start of the robot, or `UNSEEN` states were dropped.
     """
 
-    LEAVES_UNDECIDED = True
-
     def __init__(
         self,
         joints: Sequence[str],
         timeout: float,
         warn: Callable[[str], object] | None = None,
-        check: StateCheck | None = None,
+        check: PlausibilityCheck | None = None,
     ) -> None:
         super().__init__(joints, timeout, warn, check)
         self._timeout = timeout
@@ -75,30 +57,30 @@ class StateStream(JointStateReader):
         self.refused_in_row = 0
         self.missed = self.unseen = False
 
-    def take(self, message: JointState, now: float) -> Arrival:
-        """Take a message that arrived at `now`, in s on the steady clock."""
+    def read(self, message: JointState, now: float) -> Arrival:
+        """Read a message that arrived at `now`, in s on the steady clock."""
         self.message_at, self.message_stamp = now, message.header.stamp
         last, was_at = self.stamp, self.q
-        verdict = self.read(message, now)
-        if verdict is not Verdict.NEW and verdict is not Verdict.REPEAT:
-            return Arrival.REFUSED if verdict is Verdict.REFUSED else Arrival.UNDECIDED
+        arrival = super().read(message, now)
+        if arrival is Arrival.REFUSED:
+            return arrival
         dropped, self.refused_in_row = self.refused_in_row, 0
         silent = self.silent(now)
         self.usable_at = now
         self.missed = silent and 0 <= self.answered_stamp <= last < self.stamp
-        if verdict is not Verdict.NEW:
-            return Arrival.BACK if silent else Arrival.REPEAT
+        if arrival is Arrival.REPEATED:
+            return Arrival.RESUMED if silent else arrival
         if last >= 0:  # where its time stood still, as of a halted simulation, the arm did, too
             silent = silent and self.stamp - last > 1e9 * self._timeout
         # Where the time alone has leapt, the arm goes on without a jolt.
-        leapt = self.stamp - last >= 1e9 * RESTART
+        leapt = self.stamp - last >= 1e9 * RESTART_GAP
         self.unseen = leapt or dropped >= UNSEEN
-        elsewhere = leapt and bool((np.abs(self.q - was_at) > STAYS).any())
+        elsewhere = leapt and bool((np.abs(self.q - was_at) > ELSEWHERE).any())
         if silent or self.stamp <= last or elsewhere:
-            return Arrival.ANEW
+            return Arrival.RESTARTED
         if self.answered_stamp == last:
             self.waiting_since = now
-        return Arrival.NEXT
+        return Arrival.NEW
 
     def count_refused(self) -> int:
         """Count a dropped state of an arm that is answered; return how many in a row."""

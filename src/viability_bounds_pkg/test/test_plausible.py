@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""States that cannot be are refused, and those that can be are not."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from viability_bounds_pkg.plausible import (
+    CONTRADICTION,
+    FORGETTING,
+    FROZEN,
+    GAP,
+    JUMP,
+    NOT_LATER,
+    OUTSIDE,
+    TOO_FAST,
+    WINDOW,
+    PlausibilityCheck,
+)
+from viability_bounds_pkg.state import State
+
+N, LIMIT = 4, np.full(4, 2.5)
+NONE = np.zeros(N)
+
+
+def make_check(h=0.002, velocity_error=NONE, limit=LIMIT):
+    return PlausibilityCheck(-limit, limit, np.full(N, 2.0), h, NONE, velocity_error)
+
+
+def sine(t, size=0.75, w=2.0):
+    """Return a motion in which all joints differ."""
+    k = np.arange(1, N + 1)
+    return State(size * np.sin(w * t + k), size * w * np.cos(w * t + k))
+
+
+def play(check, spoil, h=0.002, begin=1.0, end=1.6, last=3.0):
+    """Return the times at which states were refused, with the reason.
+
+    The arm stops within 0.25 s where states are refused, and goes on when they are accepted.
+    """
+    refused, along, pace = [], 0.0, 1.0
+    for k in range(round(last / h)):
+        q, v = sine(along)
+        state = State(q, pace * v)
+        if begin <= k * h < end:
+            state = spoil(state)
+        reason = check.fault(state, 5.0 + k * h)
+        if reason:
+            refused.append((k * h, reason))
+        faster = min(max(pace + (-4.0 if reason else 4.0) * h, 0.0), 1.0)
+        along += 0.5 * (pace + faster) * h
+        pace = faster
+    return refused
+
+
+JOINT = np.eye(N)[2]
+
+
+def frozen_joint(state):
+    return state._replace(q=np.where(JOINT == 1.0, sine(1.0).q, state.q))
+
+
+SPOILT = {
+    "degrees": (lambda state: State(57.3 * state.q, 57.3 * state.v), OUTSIDE, 0.0),
+    "far too fast": (lambda state: state._replace(v=1e200 * state.v), TOO_FAST, 0.0),
+    "a position leaps": (lambda state: state._replace(q=state.q + 0.4 * JOINT), JUMP, 0.0),
+    "a biased velocity": (lambda state: state._replace(v=state.v + JOINT), CONTRADICTION, WINDOW),
+    "frozen": (lambda state: sine(1.0), FROZEN, 0.02),
+    "frozen positions": (lambda state: state._replace(q=sine(1.0).q), FROZEN, 0.02),
+    "a frozen position": (frozen_joint, FROZEN, 0.07),  # at 0.4 rad/s
+}
+
+
+@pytest.mark.parametrize("h", [0.002, 0.01])
+@pytest.mark.parametrize("name", SPOILT)
+def test_what_cannot_be_is_refused_and_what_comes_afterwards_is_accepted(name, h):
+    spoil, reason, within = SPOILT[name]
+    # Of an arm that stands to the last bit the position may have frozen, or the velocity lied.
+    longest = FORGETTING if name == "a biased velocity" else 2.0 * WINDOW
+    refused = play(make_check(h), spoil, h, last=2.1 + longest)
+    first, why = refused[0]
+    assert why == reason and 1.0 - 1e-9 <= first <= 1.0 + within + 2.0 * h
+    assert refused[-1][0] <= 1.6 + longest + h
+
+
+@pytest.mark.parametrize("name", ["frozen", "frozen positions", "degrees"])
+def test_what_stays_impossible_stays_refused(name):
+    spoil, _, within = SPOILT[name]
+    refused = play(make_check(), spoil, end=6.0, last=6.0)
+    assert len(refused) >= round((5.0 - within) / 0.002) - 1
+
+
+def test_one_impossible_state_costs_no_other():
+    check = make_check()
+    wrong = [check.fault(sine(k * 0.002), k * 0.002) for k in range(500)]
+    q, v = sine(1.0)
+    assert not any(wrong) and check.fault(State(q + 0.3, v), 1.0) == JUMP
+    assert check.fault(sine(1.002), 1.002) == ""
+
+
+def test_after_a_gap_in_the_stamps_an_arm_may_be_elsewhere():
+    check, elsewhere = make_check(), State(np.full(N, -1.0), NONE)
+    assert check.fault(sine(0.0), 1.0) == ""
+    assert check.fault(elsewhere, 1.0 + GAP + 1e-3) == ""
+    assert check.fault(sine(0.0), 1.0) == NOT_LATER
+    check.reset()
+    assert check.fault(sine(0.0), 1.0) == ""
+
+
+def test_velocities_that_are_not_used_are_not_checked():
+    check = make_check(velocity_error=None)
+    rng = np.random.default_rng(0)
+    assert not play(check, lambda state: State(state.q, 1e200 * rng.standard_normal(N)))
+    check.reset()
+    assert play(check, SPOILT["a position leaps"][0])[0][1] == JUMP
+
+
+def test_joints_without_limits_may_turn_for_ever():
+    check = make_check(limit=np.full(N, np.inf))
+    turns = [State(np.full(N, 200.0 + 0.004 * k), np.full(N, 2.0)) for k in range(1000)]
+    assert not any(check.fault(turn, 0.002 * k) for k, turn in enumerate(turns))
+
+
+@settings(deadline=None, max_examples=15)
+@given(
+    h=st.sampled_from([0.001, 0.002, 0.01]),
+    lag=st.sampled_from([0.0, 0.002, 0.005]),
+    resolution=st.sampled_from([0.0, 1e-4, 1e-3]),
+    lost=st.sampled_from([0.0, 0.3]),
+    seed=st.integers(0, 1000),
+)
+def test_violent_motions_impacts_filters_and_encoders_are_accepted(h, lag, resolution, lost, seed):
+    """Accelerations of up to 60 rad/s^2, hits, and a stop by brakes within one period."""
+    rng, check = np.random.default_rng(seed), make_check(h, limit=np.full(N, np.inf))
+    (q, v, seen), a = np.zeros((3, N)), np.zeros(N)
+    for k in range(round(1.5 / h)):
+        if k % round(0.1 / h) == 0:
+            a = rng.uniform(-60.0, 60.0, N)
+        before, (q, v) = v, State(q, v).after(np.clip(a, (-2.0 - v) / h, (2.0 - v) / h), h)
+        if rng.random() < 0.02:
+            hit = rng.uniform(-2.0, 2.0, N) if rng.random() < 0.7 else NONE
+            q, v = q + rng.random() * h * (hit - v), hit
+        seen = v + np.exp(-h / lag) * (seen - v) if lag else v
+        told = resolution * np.round(q / resolution) if resolution else q
+        if rng.random() >= lost:
+            assert check.fault(State(told, seen.copy()), 7.0 + k * h) == "", (k, before)
