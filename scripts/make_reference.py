@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write docs/parameters.md, docs/topics.md and lists of names from the nodes' tables.
-
-docs/mistakes.md is made of test/mistakes.yaml.
+"""Write docs/parameters.md, docs/topics.md and the list of names from the nodes' tables.
 
 python scripts/make_reference.py
 python scripts/make_reference.py --check    # say which page is stale, write nothing
@@ -15,7 +13,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
-import yaml
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
 from sim_bridge.nodes import topics as bullet_topics
@@ -31,7 +28,6 @@ from viability_bounds_pkg.parameter import REQUIRED, Parameter, parameter_table
 from viability_bounds_pkg.ros.topics import SHARED_TOPICS, OfferedService, Topic
 
 ROOT = Path(__file__).resolve().parent.parent
-MISTAKES = ROOT / "test" / "mistakes.yaml"
 CONFIGURATIONS = {
     "bounds_node": BoundsConfiguration,
     "estimator_node": EstimatorConfiguration,
@@ -114,44 +110,15 @@ A robot of your own takes the place of `bullet_node`.
     return text
 
 
-def mistakes_page() -> str:
-    """Return the text of docs/mistakes.md."""
-    text = """<!-- Made by scripts/make_reference.py from test/mistakes.yaml: change that. -->
-
-# Mistakes, and the lines they get
-
-Nothing that a node is given is ignored: a line says what is wrong, with its value and what is
-allowed. Lines with `error:` at their front end a node before it publishes anything; the others are
-warnings in the log, or answers of a service. Each row is a test. The robot is Panda;
-`second.yaml` and `s.yaml` are a parameter file and a scenario with the mistake.
-"""
-    groups = yaml.safe_load(MISTAKES.read_text(encoding="utf-8"))
-    for group in groups:
-        rows = ((each["did"], f"`{each['line']}`", each["fix"]) for each in group["mistakes"])
-        text += f"\n## {group['topic']}\n\n"
-        text += _table(("what you did", "what you get", "what to do"), rows)
-    return text
-
-
 def parameter_names() -> str:
     """Return what a node reads to know which parameters other nodes have."""
     return "".join(f"{name}\n" for name in sorted({r.name for t in TABLES.values() for r in t}))
 
 
-def graph_names() -> str:
-    """Return what a node reads to know the names of all nodes, topics and services."""
-    names = {f"node {node}" for node in TABLES}
-    names |= {f"topic {topic.name.strip('/')}" for topic in TOPICS if "<" not in topic.name}
-    names |= {f"service {service.name}" for service in SERVICES}
-    return "".join(f"{line}\n" for line in sorted(names))
-
-
 PAGES = {
     "docs/parameters.md": parameters_page,
     "docs/topics.md": topics_page,
-    "docs/mistakes.md": mistakes_page,
     "src/viability_bounds_pkg/viability_bounds_pkg/ros/parameter_names.txt": parameter_names,
-    "src/viability_bounds_pkg/viability_bounds_pkg/ros/graph_names.txt": graph_names,
 }
 
 

@@ -151,4 +151,5 @@ def test_nodes_say_in_one_line_that_they_need_ros(environment, node):
     assert ended.returncode == 1
     assert ended.stdout == ""
     assert ended.stderr.count("\n") == 1
-    assert ended.stderr.startswith(f"{node}: this program needs ROS 2 Jazzy")
+    assert ended.stderr.startswith(f"{node}: no Python module")
+    assert "needs ROS 2 Jazzy" in ended.stderr

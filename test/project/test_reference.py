@@ -18,6 +18,7 @@ from viability_bounds_pkg.node.estimator_node import EstimatorNode
 from viability_bounds_pkg.parameter import REQUIRED, read
 from viability_bounds_pkg.ros.parameters import describe
 from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
+from viability_bounds_pkg.user_input import known_names
 
 ROOT = Path(__file__).resolve().parents[2]
 _SPEC = importlib.util.spec_from_file_location(
@@ -160,6 +161,10 @@ def test_a_node_has_the_parameters_of_its_table_and_describes_them(ros, name):
         assert shown.read_only == (not row.live)
         assert shown.floating_point_range == expected.floating_point_range
         assert shown.integer_range == expected.integer_range
+
+
+def test_the_names_of_all_nodes_are_known():
+    assert set(make_reference.TABLES) == set(known_names.NODES)
 
 
 def test_the_controller_has_at_most_60_parameters():

@@ -10,8 +10,9 @@ hand, in its ``__post_init__``.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import cache, partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -24,9 +25,6 @@ Configuration = TypeVar("Configuration")
 
 LARGEST = 1e12
 """No parameter of a robot has a larger finite number; computing with such numbers overflows."""
-
-MOST_PERIODS = 100
-"""Longest delay and row of missed deadlines, control periods."""
 
 REQUIRED = object()
 """Default of a parameter that has none: the node does not start without a value."""
@@ -105,16 +103,14 @@ class Parameter:
     note: str = ""
 
     def coerce(self, value: Any) -> Any:
-        """Return `value` as `kind`.
+        """Return `value`, or the default for None, as `kind`.
 
         Raises:
             SettingError: the value is missing, of another type, or not allowed.
         """
-        if value is None:
-            if self.default is REQUIRED:
-                raise SettingError(self.name, None, self._kind_name())
-            return np.array(self.default) if self.kind == list[float] else self.default
-        converted = self._convert(value)
+        if value is None and self.default is REQUIRED:
+            raise SettingError(self.name, None, self._type_in_words)
+        converted = self._convert(self.default if value is None else value)
         if self.kind in (float, list[float]) and _is_absurd(converted):
             raise SettingError(self.name, value, f"numbers up to {LARGEST:g} in size")
         if not self._allows(converted):
@@ -149,17 +145,13 @@ class Parameter:
     def _convert(self, value: Any) -> Any:
         if self.kind == list[float] and _is_sequence(value) and all(map(_is_number, value)):
             return np.array(value, dtype=float)
-        if (
-            self.kind == list[str]
-            and _is_sequence(value)
-            and all(isinstance(item, str) for item in value)
-        ):
+        if self.kind == list[str] and _is_sequence(value) and {*map(type, value)} <= {str}:
             return tuple(value)
         if self.kind is float and _is_number(value):
             return float(value)
         if self.kind in (int, bool, str) and type(value) is self.kind:
             return value
-        raise SettingError(self.name, value, self._kind_name())
+        raise SettingError(self.name, value, self._type_in_words)
 
     def _allows(self, value: Any) -> bool:
         if self.choices:
@@ -172,8 +164,9 @@ class Parameter:
             return False
         return self.within is None or all(item in self.within for item in value)
 
-    def _kind_name(self) -> str:
-        if self.kind in (float, int, bool, str):
+    @property
+    def _type_in_words(self) -> str:
+        if self.kind in _SCALARS:
             return _SCALARS[self.kind]
         if self.length is not None:
             return self.constraints
@@ -197,59 +190,30 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def number(description: str, within: Range | None = None, **more: Any) -> Any:
-    """Return the field of a float; `more` as in `Parameter`."""
-    return _field(kind=float, description=description, within=within, **more)
+_PARAMETER, _GROUP = "parameter", "group"
 
 
-def whole_number(description: str, within: Range | None = None, **more: Any) -> Any:
-    """Return the field of an int; `more` as in `Parameter`."""
-    return _field(kind=int, description=description, within=within, **more)
-
-
-def switch(description: str, **more: Any) -> Any:
-    """Return the field of a bool; `more` as in `Parameter`."""
-    return _field(kind=bool, description=description, **more)
-
-
-def text(description: str, **more: Any) -> Any:
-    """Return the field of a string; `more` as in `Parameter`."""
-    return _field(kind=str, description=description, **more)
-
-
-def texts(description: str, **more: Any) -> Any:
-    """Return the field of a list of strings, a tuple; `more` as in `Parameter`."""
-    return _field(kind=list[str], description=description, **more)
-
-
-def numbers(description: str, within: Range | None = None, **more: Any) -> Any:
-    """Return the field of a list of numbers, an array; `more` as in `Parameter`.
-
-    With `if_empty` the list may be left out.
-    """
-    if "if_empty" in more:
+def _field(kind: Any, description: str, within: Range | None = None, **more: Any) -> Any:
+    if more.get("if_empty") is not None:
         more["default"] = ()
-    return _field(kind=list[float], description=description, within=within, **more)
+    parameter = Parameter(kind=kind, description=description, within=within, **more)
+    metadata = {_PARAMETER: parameter}
+    if parameter.default is REQUIRED:
+        return field(metadata=metadata)
+    return field(metadata=metadata, default_factory=lambda: parameter.coerce(None))
 
 
-def joint_numbers(description: str, within: Range | None = None, **more: Any) -> Any:
-    """Return the field of an array with one number a joint; `more` as for `numbers`."""
-    return numbers(description, within, per_joint=True, **more)
-
-
-def joint_amounts(description: str, **more: Any) -> Any:
-    """Return the field of an array of numbers >= 0, one a joint; all 0 if it is left out."""
-    return joint_numbers(description, NOT_NEGATIVE, if_empty=0.0, **more)
-
-
-def periods(description: str) -> Any:
-    """Return the field of a number of control periods, 0 if it is left out."""
-    return whole_number(description, Range(0, MOST_PERIODS), default=0)
-
-
-def timeout(description: str, default: float) -> Any:
-    """Return the field of a time, s, that something is waited for or lasts at most."""
-    return number(description, above(0.0, 3600.0), default=default)
+# Each returns the field of a parameter: its description, its range, and more as in `Parameter`.
+number = partial(_field, float)
+whole_number = partial(_field, int)
+switch = partial(_field, bool)
+text = partial(_field, str)
+texts = partial(_field, list[str])  # a tuple
+numbers = partial(_field, list[float])  # an array
+joint_numbers = partial(numbers, per_joint=True)
+joint_amounts = partial(joint_numbers, within=NOT_NEGATIVE, if_empty=0.0)
+periods = partial(whole_number, within=Range(0, 100), default=0)  # control periods
+timeout = partial(number, within=above(0.0, 3600.0))  # s
 
 
 def group(kind: type, prefix: str = "") -> Any:
@@ -257,23 +221,7 @@ def group(kind: type, prefix: str = "") -> Any:
     return field(metadata={_GROUP: (kind, prefix)})
 
 
-_PARAMETER, _GROUP = "parameter", "group"
-
-
-def _field(**row: Any) -> Any:
-    parameter = Parameter(**row)
-    metadata = {_PARAMETER: parameter}
-    if parameter.default is REQUIRED:
-        return field(metadata=metadata)
-    if parameter.kind == list[float]:
-        return field(metadata=metadata, default_factory=lambda: parameter.coerce(None))
-    return field(metadata=metadata, default=parameter.default)
-
-
-_TABLES: dict[tuple[type, str], tuple[Parameter, ...]] = {}
-"""Made so far: a running node needs its own for each parameter that is set."""
-
-
+@cache
 def parameter_table(kind: type, prefix: str = "") -> tuple[Parameter, ...]:
     """Return the parameters that a dataclass and its groups declare, in their order.
 
@@ -281,22 +229,19 @@ def parameter_table(kind: type, prefix: str = "") -> tuple[Parameter, ...]:
         kind: the dataclass.
         prefix: of the names, as in `group`.
     """
-    if (kind, prefix) in _TABLES:
-        return _TABLES[kind, prefix]
     rows: list[Parameter] = []
     for each in fields(kind):
         if _PARAMETER in each.metadata:
             rows.append(replace(each.metadata[_PARAMETER], name=prefix + each.name))
         elif _GROUP in each.metadata:
             rows += parameter_table(*each.metadata[_GROUP])
-    _TABLES[kind, prefix] = table = tuple(rows)
-    return table
+    return tuple(rows)
 
 
 def redeclared(kind: type, name: str, **changes: Any) -> Any:
     """Return the field of a parameter that the dataclass `kind` declares, with changes."""
     (row,) = (row for row in parameter_table(kind) if row.name == name)
-    return _field(**vars(replace(row, **changes)))
+    return _field(**{**vars(row), **changes})
 
 
 def read(kind: type[Configuration], given: Mapping[str, Any]) -> Configuration:
@@ -307,32 +252,11 @@ def read(kind: type[Configuration], given: Mapping[str, Any]) -> Configuration:
         given: values by name, as from YAML; those that are missing or None have their default.
 
     Raises:
-        SettingError: a value is missing, of another type, or not allowed.
-    """
-    return make(kind, checked_values(kind, given))
-
-
-def checked_values(
-    kind: type, given: Mapping[str, Any], before: Mapping[str, Any] | None = None
-) -> dict[str, Any]:
-    """Return the values of all parameters of a dataclass by name, each checked by itself.
-
-    Args:
-        kind: the dataclass.
-        given: values by name; None is the default.
-        before: what this returned for values of which only the given ones have changed; without
-            it, those that are missing have their default.
-
-    Raises:
-        SettingError: a value is missing, of another type, or not allowed.
+        SettingError: a value is missing, of another type, not allowed, or does not fit others.
     """
     table = parameter_table(kind)
-    if before is not None and "joints" not in given:
-        table = tuple(row for row in table if row.name in given)
-    else:
-        before = {}
     values = {row.name: row.coerce(given.get(row.name)) for row in table}
-    joints = values.get("joints", before.get("joints", ()))
+    joints = values.get("joints", ())
     if any(row.per_joint for row in table) and (
         not joints or len(set(joints)) != len(joints) or "" in joints
     ):
@@ -344,39 +268,17 @@ def checked_values(
                 values[row.name] = np.full(length, row.if_empty)
         elif row.per_joint:
             check_per_joint(row.name, values[row.name], joints)
-    return {**before, **values}
+    return _made(kind, values)
 
 
-def make(
-    kind: type[Configuration],
-    values: Mapping[str, Any],
-    before: Configuration | None = None,
-    changed: Collection[str] = (),
-    prefix: str = "",
-) -> Configuration:
-    """Return a dataclass of parameters.
-
-    Args:
-        kind: the dataclass.
-        values: of `checked_values`.
-        before: what this returned before the values of `changed` changed: its groups without any
-            of them are kept. None makes all anew.
-        changed: names.
-        prefix: of the names, as in `group`.
-
-    Raises:
-        SettingError: values that do not fit each other.
-    """
+def _made(kind: type[Configuration], values: Mapping[str, Any], prefix: str = "") -> Configuration:
     made: dict[str, Any] = {}
     for each in fields(kind):  # type: ignore[arg-type]
         if _PARAMETER in each.metadata:
             made[each.name] = values[prefix + each.name]
         elif _GROUP in each.metadata:
             of, its_prefix = each.metadata[_GROUP]
-            kept = None if before is None else getattr(before, each.name)
-            if kept is None or any(row.name in changed for row in parameter_table(of, its_prefix)):
-                kept = make(of, values, kept, changed, its_prefix)
-            made[each.name] = kept
+            made[each.name] = _made(of, values, its_prefix)
     return kind(**made)
 
 

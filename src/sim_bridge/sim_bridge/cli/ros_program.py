@@ -3,30 +3,14 @@
 
 from __future__ import annotations
 
-from viability_bounds_pkg.cli.ros_program import run_with_ros
+from functools import partial
 
+from viability_bounds_pkg.cli.ros_program import run_program
 
-def bullet_node() -> int:
-    """Run the robot node."""
-    return run_with_ros("bullet_node", "sim_bridge.nodes.bullet_node")
+_VIEWER = {name: f"pip install {name}" for name in ("viser", "trimesh")}
 
-
-def record_excitation() -> int:
-    """Run the recording of a motion that excites joint friction."""
-    return run_with_ros("record_excitation", "sim_bridge.tools.record_excitation")
-
-
-def scenario_node() -> int:
-    """Run the scenario node."""
-    return run_with_ros("scenario_node", "sim_bridge.nodes.scenario_node")
-
-
-def simulated_stack() -> int:
-    """Run the simulated robot and the nodes that control it in one process."""
-    return run_with_ros("simulated_stack", "sim_bridge.nodes.simulated_stack")
-
-
-def viewer_node() -> int:
-    """Run the node that shows the arm in a browser."""
-    libraries = {name: f"pip install {name}" for name in ("viser", "trimesh")}
-    return run_with_ros("viewer_node", "sim_bridge.viewer.node.viewer_node", libraries)
+bullet_node = partial(run_program, "sim_bridge.nodes.bullet_node")
+record_excitation = partial(run_program, "sim_bridge.tools.record_excitation")
+scenario_node = partial(run_program, "sim_bridge.nodes.scenario_node")
+simulated_stack = partial(run_program, "sim_bridge.nodes.simulated_stack")
+viewer_node = partial(run_program, "sim_bridge.viewer.node.viewer_node", _VIEWER)

@@ -23,7 +23,7 @@ from sim_bridge.scenario.trajectory import read_trajectory
 from sim_bridge.urdf.payload import PayloadError, payload_inertia
 from viability_bounds_pkg.exceptions import did_you_mean
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory
-from viability_bounds_pkg.user_input.known_names import graph_names, unknown_parameters
+from viability_bounds_pkg.user_input.known_names import NODES, unknown_parameters
 
 _ZERO = (0.0, 0.0, 0.0)
 
@@ -147,7 +147,7 @@ def read_event(content: Any, where: str) -> Event:
         raise ScenarioError(f"{place} has no force and no torque; allowed: one of them or both")
     if kind == "payload":
         _check_payload(event(time, **fields), place)
-    own_node = kind == "parameters" and fields["node"].rpartition("/")[2] in graph_names("node")
+    own_node = kind == "parameters" and fields["node"].rpartition("/")[2] in NODES
     if own_node and (unknown := unknown_parameters(fields["values"])):
         raise ScenarioError(f"{place}.values: {unknown}")
     return event(time, **fields)
@@ -192,20 +192,10 @@ def _trigger(value: Any, where: str) -> str:
 
 
 def _node(value: Any, where: str) -> str:
-    known, node = graph_names("node"), name(value, where)
-    if hint := did_you_mean(node, known) if node not in known else "":
+    node = name(value, where)
+    if hint := did_you_mean(node, NODES) if node not in NODES else "":
         raise refuse(where, node, f"the name of a node{hint}")
     return node
-
-
-def _service(value: Any, where: str) -> str:
-    node, _, service = name(value, where).rpartition("/")
-    if node:
-        _node(node, where)
-    known = graph_names("service")
-    if service not in known and (hint := did_you_mean(service, known)):
-        raise refuse(where, value, f"a service{hint}")
-    return value
 
 
 def _parameters(content: Any, where: str) -> dict[str, Any]:
@@ -247,6 +237,6 @@ _KINDS: dict[str, tuple[Any, Check | Mapping[str, Check]]] = {
     "remove_obstacle": (RemoveObstacle, {"name": name}),
     "enable_torque": (EnableTorque, _true_or_false),
     "parameters": (ParameterChange, {"node": _node, "values": _parameters}),
-    "call": (TriggerCall, {"service": _service, "type": _trigger}),
+    "call": (TriggerCall, {"service": name, "type": _trigger}),
 }
 """By the entry's name: the event, and its fields or a function that reads its only field."""

@@ -2,7 +2,7 @@
 """Parameters of the controller node, and where the robot's description comes from."""
 
 import math
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,11 +11,9 @@ from node_chain import ARM, GOAL, JOINTS, VALUES, NodeChain, Q, V, expected, pos
 from std_msgs.msg import String
 
 from torque_safety_controller.node.controller_node import ControllerNode
-from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.tasks.gains import critical_damping
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.parameter import checked_values, make, parameter_table, read
 from viability_bounds_pkg.robot_description import read_urdf
 from viability_bounds_pkg.ros.runtime import LATCHED_QOS
 from viability_bounds_pkg.state import State
@@ -55,55 +53,6 @@ def test_gains_change_while_it_runs(ros, changed, gains):
         after, core.step(State(Q, V), AccelerationRange(-wide, wide)).tau, atol=1e-4
     )
     assert np.abs(after - before).max() > 1e-3
-
-
-def same(one, other):
-    """Return whether two values of configurations are equal, to the last bit."""
-    if is_dataclass(one):
-        return all(same(getattr(one, f.name), getattr(other, f.name)) for f in fields(one))
-    if isinstance(one, tuple):
-        return len(one) == len(other) and all(map(same, one, other))
-    return np.array_equal(one, other)
-
-
-def another_value(row, n, rng):
-    """Return a value for a parameter; some are not allowed."""
-    if row.kind == list[str]:
-        return [[], ["panda_hand"], ["nowhere"]][rng.integers(3)]
-    if row.choices:
-        return row.choices[rng.integers(len(row.choices))]
-    count = 1 if row.kind is float else [0, row.length or n, 3][rng.choice(3, p=[0.2, 0.7, 0.1])]
-    values = [float(v) for v in rng.choice([-1.0, 0.0, 1.0, 2.5, 1e4], count)]
-    return values[0] if row.kind is float else values
-
-
-def test_changes_one_after_the_other_give_what_all_give_at_once():
-    """Only what changed is read again, and all that follows from it."""
-    more = {"ft_frame": "panda_hand", "contacts": ["{frame: panda_hand, normal: [0, 0, 1]}"]}
-    values = read_config("panda", "controller_node") | more
-    rows = [row for row in parameter_table(ControllerConfiguration) if row.live]
-    checked = checked_values(ControllerConfiguration, values)
-    config = make(ControllerConfiguration, checked)
-    rng, taken, refused = np.random.default_rng(3), set(), 0
-    for _ in range(600):
-        row = rows[rng.integers(len(rows))]
-        changed, whole, why = {row.name: another_value(row, 7, rng)}, None, ""
-        try:
-            whole = read(ControllerConfiguration, values | changed)
-        except SettingError as error:
-            why = str(error)
-        try:
-            found = checked_values(ControllerConfiguration, changed, checked)
-            after = make(ControllerConfiguration, found, config, changed)
-        except SettingError as error:
-            assert str(error) == why
-            refused += 1
-            continue
-        assert same(after, whole)
-        values, checked, config = values | changed, found, after
-        taken.add(row.name)
-    assert taken == {row.name for row in rows}
-    assert refused > 50
 
 
 def test_the_damping_in_hold_changes_while_it_runs(ros):

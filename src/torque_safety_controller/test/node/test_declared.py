@@ -1,23 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the controller takes from the parameters of the bounds node beside it."""
 
+from types import SimpleNamespace
+
 import pytest
 from rclpy.context import Context
 
-from torque_safety_controller.node.declared import covered_row, longest_way
+from torque_safety_controller.node.declared import covered_row, declared_robot, longest_way
 from viability_bounds_pkg.ros.given_parameters import note_arguments
 from viability_bounds_pkg.testing.ros_harness import config_folder
 
 
-class Beside:
-    """Stands for a node with a command line."""
-
-    def __init__(self, *rules):
-        self.context = Context()
-        note_arguments(self.context, ["--ros-args", *rules])
-
-    def get_namespace(self):
-        return "/"
+def declared(*words):
+    """Return what a node reads of the bounds node beside it, from its own command line."""
+    context = Context()
+    note_arguments(context, ["--ros-args", *words])
+    return declared_robot(SimpleNamespace(context=context, get_namespace=lambda: "/left"))
 
 
 @pytest.mark.parametrize(
@@ -32,9 +30,10 @@ class Beside:
 )
 def test_late_and_missed_commands_are_within_reach(given, row, way):
     rules = [word for rule in given for word in ("-p", rule)]
-    node = Beside("--params-file", str(config_folder() / "panda.yaml"), *rules)
-    assert (covered_row(node), longest_way(node)) == (row, way)
+    robot = declared("--params-file", str(config_folder() / "panda.yaml"), *rules)
+    assert (covered_row(robot), longest_way(robot)) == (row, way)
 
 
 def test_without_a_file_little_is_declared():
-    assert (covered_row(Beside()), longest_way(Beside())) == (1, 4)
+    assert declared() is None
+    assert (covered_row(None), longest_way(None)) == (1, 4)

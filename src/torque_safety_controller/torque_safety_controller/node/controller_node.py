@@ -81,7 +81,8 @@ class ControllerNode(ArmNode):
         with self.starting(JOINT_COMMANDS):
             self._node_parameters = NodeParameters(self, ControllerConfiguration, self._configure)
             config = self._node_parameters.configuration
-            self._controller, base = make_controller(config, self, declared_robot(self))
+            declared = declared_robot(self)
+            self._controller, base = make_controller(config, self, declared)
         self._config = config
         self._handover = Handover(
             config.start_control,
@@ -91,7 +92,7 @@ class ControllerNode(ArmNode):
             config.torque_max,
             config.dt,
         )
-        check = make_plausibility_check(config, declared_robot(self))
+        check = make_plausibility_check(config, declared)
         self._states = StateStream(config.joints, config.state_timeout, self._warn, check)
         self._period = PeriodCheck(config.dt, self._warn)
         self._limits = LimitsReader(config.joints, self._warn)
@@ -113,8 +114,8 @@ class ControllerNode(ArmNode):
         self._recovery = Recovery(
             self._states,
             config,
-            covered_row(self),
-            longest_way(self),
+            covered_row(declared),
+            longest_way(declared),
             partial(self._later, self._warn),
         )
         self._record = StepRecord(len(config.joints))

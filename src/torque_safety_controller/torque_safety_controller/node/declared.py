@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is declared of the robot for the bounds node.
-
-It is in the parameter files that all nodes of a robot get: what this node's command line says of
-it is read, no other node is asked.
-"""
+"""What is declared of the robot for the bounds node, which is in the same parameter files."""
 
 from __future__ import annotations
 
@@ -12,7 +8,7 @@ from rclpy.node import Node
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 from viability_bounds_pkg.parameter import read
-from viability_bounds_pkg.ros.given_parameters import arguments_of, given_parameters
+from viability_bounds_pkg.ros.given_parameters import given_parameters
 
 UNDECLARED = 1
 """Missed periods that the bounds cover by their defaults."""
@@ -20,26 +16,24 @@ UNDECLARED = 1
 
 def declared_robot(node: Node) -> BoundsConfiguration | None:
     """Return the parameters that the bounds node beside a node gets; None if it cannot start."""
-    arguments, place = arguments_of(node.context), node.get_namespace().rstrip("/")
+    beside = f"{node.get_namespace().rstrip('/')}/bounds_node"
     try:
-        return read(BoundsConfiguration, given_parameters(arguments, f"{place}/bounds_node"))
+        return read(BoundsConfiguration, given_parameters(node.context, beside))
     except ArmSafetyError:  # the node that they are for says so
         return None
 
 
-def longest_way(node: Node) -> int:
+def longest_way(robot: BoundsConfiguration | None) -> int:
     """Return how many of the last commands may act at a state, by what is declared.
 
     Late ones and missed periods count; two are added for what nobody declares.
     """
-    robot = declared_robot(node)
     late = 0 if robot is None else robot.declared.delay + robot.declared.delay_jitter
-    return 3 + late + covered_row(node)
+    return 3 + late + covered_row(robot)
 
 
-def covered_row(node: Node) -> int:
-    """Return how many missed periods in a row the bounds beside a node cover."""
-    robot = declared_robot(node)
+def covered_row(robot: BoundsConfiguration | None) -> int:
+    """Return how many missed periods in a row the bounds cover."""
     if robot is None:
         return UNDECLARED
     return robot.declared.missed_deadlines or round(robot.horizon / robot.dt) - 1

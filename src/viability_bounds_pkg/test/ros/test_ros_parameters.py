@@ -6,11 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.msg import ParameterValue
-from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
-from rosgraph_msgs.msg import Clock
 
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import (
@@ -29,7 +25,8 @@ from viability_bounds_pkg.parameter import (
 )
 from viability_bounds_pkg.robot_configuration import RobotConfiguration
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.parameters import NodeParameters
+from viability_bounds_pkg.ros.given_parameters import note_arguments
+from viability_bounds_pkg.ros.parameters import NodeParameters, UnknownParameterError
 from viability_bounds_pkg.testing.ros_harness import overrides
 
 
@@ -166,27 +163,16 @@ def test_a_bad_change_is_refused_and_the_old_value_stays(ros, name, value, expec
     assert node.changes == []
 
 
-def test_changes_are_judged_together_and_one_by_one_if_that_fails(ros):
+def test_changes_that_fit_only_together_are_made_at_once(ros):
     node = start(ros)
-    first, second = ros.set_parameters("tunable", offset=3.0, gain=5.0)
-    assert first.successful
-    assert second.successful
-    assert node.changes == [(5.0, 3.0, "round")]
-    ros.accepts("tunable", offset=1.0)
-    node.changes.clear()
-    results = ros.set_parameters("tunable", offset=7.0, gain=4.0, shape="oval")
-    assert [each.successful for each in results] == [False, True, False]
-    assert results[0].reason == "parameter 'offset' is 7; allowed: less than gain"
-    assert node.parameters.configuration.changing == (4.0, 1.0, "round")
-    results = ros.set_parameters("tunable", gain=4.0, nothing=1.0)
-    assert [each.successful for each in results] == [True, False]
-    assert "unknown parameter 'nothing'" in results[1].reason
-    result = node.set_parameters_atomically(overrides({"offset": 5.0, "gain": 8.0}))
+    assert not ros.set_parameters("tunable", offset=3.0, gain=5.0)[0].successful
+    assert node.parameters.configuration.changing == (5.0, 1.0, "round")
+    result = node.set_parameters_atomically(overrides({"offset": 6.0, "gain": 8.0}))
     assert result.successful
-    assert node.changes == [(4.0, 1.0, "round"), (8.0, 5.0, "round")]
+    assert node.changes == [(5.0, 1.0, "round"), (8.0, 6.0, "round")]
     result = node.set_parameters_atomically(overrides({"shape": "flat", "gain": -1.0}))
     assert not result.successful
-    assert node.parameters.configuration.changing == (8.0, 5.0, "round")
+    assert node.parameters.configuration.changing == (8.0, 6.0, "round")
 
 
 @pytest.mark.parametrize(
@@ -198,46 +184,36 @@ def test_what_is_not_live_is_read_only(ros, name, value):
     assert node.changes == []
 
 
-def test_a_parameter_that_is_deleted_has_its_default_and_can_be_set_again(ros):
+def test_a_parameter_cannot_be_deleted(ros):
     node = start(ros, gain=5.0)
     (result,) = node.set_parameters([Parameter("gain", Parameter.Type.NOT_SET)])
-    assert result.successful
-    assert node.parameters.configuration.gain == 2.0
-    ros.accepts("tunable", gain=6.0)
-    assert node.parameters.configuration.gain == 6.0
-    assert "out of range" in ros.refuses("tunable", gain=-1.0)
+    assert result.reason == "parameters cannot be deleted"
+    assert node.get_parameter("gain").value == 5.0
 
 
-def test_a_parameter_of_no_type_is_refused_and_the_node_goes_on(ros):
-    start(ros)
-    strange = ParameterMessage(name="gain", value=ParameterValue(type=99))
-    request = SetParameters.Request(parameters=[strange])
-    (result,) = ros.call(SetParameters, "tunable/set_parameters", request).results
-    together = SetParametersAtomically.Request(parameters=[strange])
-    result_of_all = ros.call(
-        SetParametersAtomically, "tunable/set_parameters_atomically", together
-    ).result
-    for each in (result, result_of_all):
-        assert not each.successful
-        assert each.reason == "parameter 'gain' has a type of number 99; allowed: 0 to 9"
-    ros.accepts("tunable", gain=5.0)
+@pytest.mark.parametrize(
+    ("rule", "error", "line"),
+    [
+        ("offsset:=1.0", UnknownParameterError, "'offsset'; did you mean 'offset'"),
+        ("gain:=[[1.0]]", SettingError, "'gain' is .*; allowed: a number"),
+        ("rate:=2001-01-01", SettingError, "'rate' is 2001-01-01; allowed: a number"),
+        ("joints:=[]", SettingError, "'joints' is not set; allowed: a list of strings$"),
+    ],
+)
+def test_what_the_command_line_gives_is_checked(ros, rule, error, line):
+    note_arguments(ros.context, ["--ros-args", "-p", rule])
+    with pytest.raises(error, match=line):
+        start(ros)
 
 
-@pytest.mark.parametrize("later", [False, True])
-def test_a_time_before_zero_does_not_end_a_node(ros, later):
-    node = start(ros, use_sim_time=not later)
-    if later:
-        ros.accepts("tunable", use_sim_time=True)
-    clock = ros.talk(Clock, "/clock")
-    for sec in (-5, 7):
-        message = Clock()
-        message.clock.sec = sec
-        ros.wait_until(
-            lambda sec=sec: sec < 0 or node.get_clock().now().nanoseconds == sec * 10**9,
-            each=lambda message=message: clock.publish(message),
-        )
-        ros.run_for(0.1, each=lambda message=message: clock.publish(message))
-    assert node.get_clock().now().nanoseconds == 7 * 10**9
+def test_parameters_of_other_nodes_may_be_given(ros):
+    note_arguments(ros.context, ["--ros-args", "-p", "pose_kp:=1.0"])
+    assert not start(ros).has_parameter("pose_kp")
+
+
+def test_a_node_without_any_values_asks_for_its_file(ros):
+    with pytest.raises(SettingError, match="'joints' is not set.*--params-file FILE$"):
+        ros.start(Tunable, {})
 
 
 def test_parameters_of_others_are_left_alone(ros):

@@ -14,13 +14,16 @@ from viability_bounds_pkg.testing.executables import as_child, run_to_end
 
 PACKAGES = str(Path(viability_bounds_pkg.__file__).resolve().parents[1])
 INTERRUPT = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n"
-CALL = "import sys; from viability_bounds_pkg.cli.ros_program import {0}; sys.exit({0}({1}))"
+CALL = (
+    "import sys; from viability_bounds_pkg.cli.ros_program import run_program; "
+    "sys.exit(run_program('slow_program'))"
+)
 
 
-def call(directory, program, function, arguments):
+def call(directory, program):
     (directory / "slow_program.py").write_text(program)
     return run_to_end(
-        *(sys.executable, "-c", CALL.format(function, arguments)),
+        *(sys.executable, "-c", CALL),
         env=os.environ | {"PYTHONPATH": f"{directory}{os.pathsep}{PACKAGES}"},
         preexec_fn=as_child,
     )
@@ -41,12 +44,8 @@ def call(directory, program, function, arguments):
     ],
     ids=["imports", "main", "undisturbed", "end"],
 )
-@pytest.mark.parametrize(
-    ("function", "arguments"),
-    [("run_program", "'slow_program'"), ("run_with_ros", "'slow', 'slow_program'")],
-)
-def test_an_interrupt_leaves_no_traceback(tmp_path, function, arguments, program, code):
-    result = call(tmp_path, program, function, arguments)
+def test_an_interrupt_leaves_no_traceback(tmp_path, program, code):
+    result = call(tmp_path, program)
     assert (result.returncode, result.stderr) == (code, "")
 
 

@@ -6,35 +6,6 @@ from small_node import SMALL_NODE
 
 from viability_bounds_pkg.testing.executables import started
 
-SCRIPT = f"""{SMALL_NODE}
-import rclpy
-from numba import njit
-
-@njit
-def add(x):
-    return x + 1
-
-class Quick(SmallNode):
-    NAME = "quick"
-
-    def __init__(self):
-        super().__init__()
-        if "compile" in sys.argv:
-            add(1)
-        self.create_timer(0.01, rclpy.try_shutdown)
-
-sys.exit(run(Quick, ["quick"]))
-"""
-
-
-@pytest.mark.parametrize("compiles", [True, False])
-def test_a_node_says_when_its_start_had_to_compile(compiles):
-    done = started("-c", SCRIPT, *(["compile"] if compiles else []))
-    assert done.returncode == 0, done.stderr
-    said = [line for line in done.stderr.splitlines() if "compiling took" in line]
-    assert len(said) == compiles, done.stderr
-    assert not compiles or "scripts/setup.sh" in said[0]
-
 
 def assert_ends_well(done):
     assert done.returncode == 0, done.stderr

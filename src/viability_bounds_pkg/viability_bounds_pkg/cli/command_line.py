@@ -15,9 +15,6 @@ INTERRUPTED = 130
 """Exit code of a program ended by SIGINT, as shells report it."""
 
 
-ROS_FLAGS = ("-p", "--param", "-r", "--remap", "--params-file", "--log-level")
-
-
 class Parser(argparse.ArgumentParser):
     """Reports a usage error in one line."""
 
@@ -35,17 +32,14 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print what is wrong, and exit with 2."""
-        self.exit(2, f"{self.prog}: error: {message}{self._hint(message)}\n")
-
-    def _hint(self, message: str) -> str:
         kind, _, words = message.partition(": ")
-        if kind != "unrecognized arguments":
-            return ""
-        word = words.split()[0]
-        if word in ROS_FLAGS:
-            return "; arguments for ROS follow --ros-args"
-        known = [option for option in self._option_string_actions if option.startswith("--")]
-        return did_you_mean(word.partition("=")[0], known)
+        hint = ""
+        if kind == "unrecognized arguments":
+            word = words.split()[0]
+            known = [each for each in self._option_string_actions if each.startswith("--")]
+            of_ros = word in ("-p", "-r", "--params-file", "--log-level")
+            hint = "; arguments for ROS follow --ros-args" if of_ros else did_you_mean(word, known)
+        self.exit(2, f"{self.prog}: error: {message}{hint}\n")
 
 
 def positive(text: str) -> float:

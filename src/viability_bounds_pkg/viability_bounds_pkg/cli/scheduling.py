@@ -9,24 +9,8 @@ import os
 import resource
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
-
-HIGHEST = 99
-"""Of the priorities of SCHED_FIFO."""
 
 _MCL_CURRENT, _MCL_FUTURE = 1, 2  # sys/mman.h
-
-
-class Outcome(NamedTuple):
-    """What the system made of a request.
-
-    Attributes:
-        text: one line; empty if nothing was asked for.
-        granted: whether it granted all.
-    """
-
-    text: str
-    granted: bool
 
 
 def add_scheduling(parser: argparse.ArgumentParser) -> None:
@@ -35,44 +19,45 @@ def add_scheduling(parser: argparse.ArgumentParser) -> None:
         "--priority",
         type=_priority,
         metavar="N",
-        help=f"real-time priority (SCHED_FIFO) of all threads, 1 to {HIGHEST}",
+        help="real-time priority (SCHED_FIFO) of all threads, 1 to 99",
     )
     parser.add_argument(
-        "--lock-memory",
-        action="store_true",
-        help="keep the memory from being paged out",
+        "--lock-memory", action="store_true", help="keep the memory from being paged out"
     )
     parser.add_argument(
         "--cpus", type=_cpus, metavar="LIST", help="processors to run on, as in 0,2"
     )
 
 
-def schedule(options: argparse.Namespace) -> Outcome:
+def schedule(options: argparse.Namespace) -> tuple[list[str], list[str]]:
     """Ask the system for what the options say, for all threads that there are.
 
     Threads that they start later inherit it.
+
+    Returns:
+        What was granted, and what was refused and why, a line each.
     """
-    asked: list[tuple[str, Callable[[], None], str]] = []
+    granted: list[str] = []
+    refused: list[str] = []
+
+    def ask(what: str, call: Callable[[], None], limit: str) -> None:
+        try:
+            call()
+            granted.append(f"{what} granted")
+        except OSError as error:
+            refused.append(f"{what} refused: {error.strerror}, {limit}")
+
     if options.priority is not None:
         limit = f"ulimit -r is {resource.getrlimit(resource.RLIMIT_RTPRIO)[0]}"
-        asked.append((f"priority {options.priority}", lambda: _prefer(options.priority), limit))
+        ask(f"priority {options.priority}", lambda: _prefer(options.priority), limit)
     if options.lock_memory:
-        most = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
-        limit = f"ulimit -l is {'unlimited' if most < 0 else most // 1024}"
-        asked.append(("locked memory", _lock_memory, limit))
+        size = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
+        limit = f"ulimit -l is {'unlimited' if size < 0 else size // 1024}"
+        ask("locked memory", _lock_memory, limit)
     if options.cpus:
-        there = f"there are {','.join(map(str, range(os.cpu_count() or 1)))}"
         name = f"processors {','.join(map(str, sorted(options.cpus)))}"
-        asked.append((name, lambda: _pin(options.cpus), there))
-    said, granted = [], True
-    for name, ask, limit in asked:
-        try:
-            ask()
-            said.append(f"{name} granted")
-        except OSError as error:
-            granted = False
-            said.append(f"{name} refused: {error.strerror}, {limit}")
-    return Outcome(f"scheduling: {'; '.join(said)}" if said else "", granted)
+        ask(name, lambda: _pin(options.cpus), f"there are {os.cpu_count()}")
+    return granted, refused
 
 
 def _threads() -> list[int]:
@@ -95,9 +80,8 @@ def _pin(cpus: frozenset[int]) -> None:
 
 
 def _priority(text: str) -> int:
-    if not (text.isdecimal() and 1 <= int(text) <= HIGHEST):
-        allowed = f"must be a whole number from 1 to {HIGHEST}, is '{text}'"
-        raise argparse.ArgumentTypeError(allowed)
+    if not (text.isdecimal() and 1 <= int(text) <= 99):
+        raise argparse.ArgumentTypeError(f"must be a whole number from 1 to 99, is '{text}'")
     return int(text)
 
 

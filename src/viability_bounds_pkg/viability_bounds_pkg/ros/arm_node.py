@@ -3,23 +3,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from typing import Any, ClassVar
 
-from rcl_interfaces.msg import SetParametersResult
-from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import InvalidParameterTypeException, ParameterNotDeclaredException
+from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.ros.claim import Claim
 from viability_bounds_pkg.ros.direct_delivery import DirectDelivery
-from viability_bounds_pkg.ros.ros_arguments import RosArgumentError
+from viability_bounds_pkg.ros.given_parameters import given_parameters
 from viability_bounds_pkg.ros.topics import Topic
 
 RCLError = rclpy_implementation.RCLError
@@ -30,6 +26,13 @@ CLOCK_TIMEOUT = 5.0
 _TYPE_PERIOD = 2.0  # s
 
 _TOPICS_OF_ROS = ("/rosout", "/parameter_events", "/clock")
+
+_OF_ROS = ("use_sim_time", "start_type_description_service", "qos_overrides")
+"""Parameters that rclpy declares by itself."""
+
+
+class StartError(ArmSafetyError, RuntimeError):
+    """rclpy cannot start, or not make a node."""
 
 
 class ArmNode(Node):
@@ -42,6 +45,7 @@ class ArmNode(Node):
     Attributes:
         NAME: of the node, unless it is remapped.
         PARAMETERS: the dataclass of its parameters.
+        given: values of parameters that the command line and files give the node.
     """
 
     NAME: ClassVar[str]
@@ -52,72 +56,18 @@ class ArmNode(Node):
     ) -> None:
         self.direct_delivery = direct_delivery
         self._claims: list[Claim] = []
-        self._told_of_clock = False
         try:
             # With the services that `rqt_logger_level` uses.
             super().__init__(self.NAME, enable_logger_service=True, **node_arguments)
-        except InvalidParameterTypeException as error:  # of use_sim_time: rclpy declares it
-            raise RosArgumentError(str(error).rpartition(": ")[0]) from error
-        except RCLError as error:  # of the middleware, such as security that it does not have
-            raise RosArgumentError(" ".join(str(error).split(", at /")[0].split())) from error
-        self._guard()
+        except (RCLError, InvalidParameterTypeException) as error:  # security; use_sim_time
+            raise StartError(str(error)) from error
+        self.given = given_parameters(self.context, self.get_fully_qualified_name())
+        for name in list(self.given):
+            if name.startswith(_OF_ROS):
+                del self.given[name]
 
     def _warn(self, text: str) -> None:
         self.get_logger().warning(text)
-
-    def _guard(self) -> None:
-        """Refuse what ends a node inside of rclpy: times before 0, parameters of no type."""
-        source = self._time_source  # subscribes now, or when use_sim_time becomes true
-        take = source.clock_callback
-        source.clock_callback = partial(self._on_clock, take)
-        for subscription in self.subscriptions:
-            if subscription.callback == take:
-                subscription.callback = source.clock_callback
-        for service in self.services:
-            if service.srv_type in (SetParameters, SetParametersAtomically):
-                service.callback = partial(self._on_set_parameters, service.callback)
-
-    def _on_clock(self, take: Callable[[Any], None], message: Any) -> None:
-        if message.clock.sec >= 0:
-            take(message)
-        elif not self._told_of_clock:
-            self._told_of_clock = True
-            self._warn(f"/clock refused: {message.clock.sec} s, before 0")
-
-    def _on_set_parameters(self, take: Callable[..., Any], request: Any, response: Any) -> Any:
-        types = {kind.value for kind in Parameter.Type}
-        strange = [each for each in request.parameters if each.value.type not in types]
-        if not strange:
-            if not self._set_together(request, response):
-                take(request, response)
-            return response
-        refused = SetParametersResult(
-            reason=f"parameter '{strange[0].name}' has a type of number {strange[0].value.type}; "
-            f"allowed: 0 to {max(types)}"
-        )
-        if isinstance(response, SetParametersAtomically.Response):
-            response.result = refused
-        else:
-            response.results = [refused] * len(request.parameters)
-        return response
-
-    def _set_together(self, request: Any, response: Any) -> bool:
-        """Set several parameters at once where that is allowed, as of a file; else set none.
-
-        One by one each is judged with what was there before it, which keeps a control loop waiting
-        for longer, and may refuse what fits only together.
-        """
-        if not isinstance(response, SetParameters.Response) or len(request.parameters) < 2:
-            return False
-        parameters = [Parameter.from_parameter_msg(each) for each in request.parameters]
-        if len({each.name for each in parameters}) < len(parameters):
-            return False  # the last of one name counts
-        try:
-            result = self.set_parameters_atomically(parameters)
-        except ParameterNotDeclaredException:
-            return False
-        response.results = [result] * len(parameters) if result.successful else []
-        return bool(result.successful)
 
     @contextmanager
     def starting(self, *topics: Topic) -> Iterator[None]:
@@ -148,9 +98,9 @@ class ArmNode(Node):
         """
         published, heard = map(" ".join, self.topics_used())
         # A parameter of the scenario node, which robots' files have for all nodes.
-        name = self._parameter_overrides.get("robot_name")
+        name = self.given.get("robot_name", "robot")
         self.get_logger().info(
-            f"{name.value if name else 'robot'}, {len(joints)} joints ({joints[0]} to "
+            f"{name}, {len(joints)} joints ({joints[0]} to "
             f"{joints[-1]}) at {rate:g} Hz, {what}; subscribes to {heard}; publishes {published}"
         )
         if self.get_parameter("use_sim_time").value:

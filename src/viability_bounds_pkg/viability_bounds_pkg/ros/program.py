@@ -9,9 +9,9 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from itertools import pairwise
 
 import rclpy
-from numba.core.event import TimingListener, install_listener
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.node import Node
@@ -22,16 +22,11 @@ from viability_bounds_pkg.cli.command_line import Parser
 from viability_bounds_pkg.cli.scheduling import add_scheduling, schedule
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.parameter import parameter_table
-from viability_bounds_pkg.ros.arm_node import ArmNode
+from viability_bounds_pkg.ros.arm_node import ArmNode, StartError
 from viability_bounds_pkg.ros.direct_delivery import DirectDelivery
-from viability_bounds_pkg.ros.given_parameters import arguments_of, note_arguments
-from viability_bounds_pkg.ros.ros_arguments import (
-    check_ros_arguments,
-    is_known_remapping,
-    ros_rules,
-)
+from viability_bounds_pkg.ros.given_parameters import note_arguments
 from viability_bounds_pkg.ros.runtime import EventsExecutor, make_executor, settle_dds
-from viability_bounds_pkg.user_input.parameter_files import check_parameter_files
+from viability_bounds_pkg.user_input.parameter_files import read_sections
 
 _SIGNAL_CHECK_PERIOD = 0.2
 
@@ -67,19 +62,21 @@ def spin(executor: Executor, node: Node) -> None:
 
 
 def own_arguments(args: Sequence[str] | None) -> list[str]:
-    """Return those arguments, of the process if None, that are not for ROS; check the others.
+    """Return those arguments, of the process if None, that are not for ROS.
 
     The first is the program's name, as in `sys.argv`.
 
     Raises:
-        ArmSafetyError: a ROS argument or a parameter file that cannot be used.
+        ArmSafetyError: arguments for ROS, or a parameter file, that cannot be used.
     """
     arguments = list(sys.argv if args is None else args)
-    check_ros_arguments(arguments, os.environ)
-    check_parameter_files(
-        [value for flag, value in ros_rules(arguments) if flag == "--params-file"]
-    )
-    own: list[str] = rclpy.utilities.remove_ros_args(args=arguments)
+    for word, path in pairwise(arguments):
+        if word == "--params-file":
+            read_sections(path)  # rcl's own errors do not tell the line
+    try:
+        own: list[str] = rclpy.utilities.remove_ros_args(args=arguments)
+    except Exception as error:  # rclpy's own classes differ between releases
+        raise StartError(f"arguments for ROS cannot be used: {error}") from error
     return own[1:]
 
 
@@ -101,12 +98,19 @@ def node_parser(kind: type[ArmNode]) -> Parser:
 
 
 def initialise(args: Sequence[str] | None) -> None:
-    """Initialise rclpy with the arguments given, of the process if None."""
+    """Initialise rclpy with the arguments given, of the process if None.
+
+    Raises:
+        StartError: arguments for ROS, or the environment, are not what rcl can use.
+    """
     arguments = list(sys.argv if args is None else args)
     settle_dds(os.environ)
-    # Its own signal handlers would shut down the context in the middle of a callback.
-    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-    note_arguments(rclpy.get_default_context(), arguments)
+    try:
+        # Its own signal handlers would shut down the context in the middle of a callback.
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        note_arguments(rclpy.get_default_context(), arguments)
+    except Exception as error:
+        raise StartError(f"arguments for ROS cannot be used: {error}") from error
 
 
 def stack_parser(name: str, description: str, kinds: Sequence[type[ArmNode]]) -> Parser:
@@ -147,7 +151,7 @@ def run_together(
         add_scheduling(parser)
         options = parser.parse_args(own_arguments(args))
         initialise(args)
-    except Exception as error:  # rclpy's own classes differ between releases
+    except ArmSafetyError as error:
         report_refusal(error)
         return 1
     nodes: list[ArmNode] = []
@@ -160,17 +164,9 @@ def run_together(
     # What is raised while a callback of compiled code runs is lost.
     signal.signal(signal.SIGINT, interrupt)
     try:
-        compiling = TimingListener()
-        with install_listener("numba:compile", compiling):
-            for node in make_nodes(DirectDelivery()):
-                nodes.append(node)
+        for node in make_nodes(DirectDelivery()):
+            nodes.append(node)
         logger = nodes[0].get_logger()
-        _warn_of_idle_remappings(nodes)
-        if compiling.done:
-            logger.warning(
-                f"compiling took {compiling.duration:.1f} s of the start, which scripts/setup.sh "
-                "does ahead: no compiled code of these sources was kept"
-            )
         executor = make_executor()
         if EventsExecutor is None:
             logger.warning(
@@ -182,11 +178,11 @@ def run_together(
         # loop.
         gc.collect()
         gc.freeze()
-        outcome = schedule(options)
-        if outcome.text and outcome.granted:
-            logger.info(outcome.text)
-        elif outcome.text:
-            logger.warning(f"{outcome.text}; docs/performance.md tells how to grant it")
+        granted, refused = schedule(options)
+        if granted:
+            logger.info(f"scheduling: {'; '.join(granted)}")
+        if refused:
+            logger.warning(f"scheduling: {'; '.join(refused)}; see docs/performance.md")
         if not told:
             spin(executor, nodes[0])
     except (KeyboardInterrupt, ExternalShutdownException):
@@ -201,18 +197,6 @@ def run_together(
         leave(*nodes)
         gc.unfreeze()
     return 0
-
-
-def _warn_of_idle_remappings(nodes: Sequence[ArmNode]) -> None:
-    """Warn of rules of the command line that rename nothing."""
-    used = {name for node in nodes for names in node.topics_used() for name in names}
-    which = "this node" if len(nodes) == 1 else "these nodes"
-    for flag, rule in ros_rules(arguments_of(nodes[0].context)):
-        if flag != "-r" or is_known_remapping(rule):
-            continue
-        target = rule.partition(":=")[2]
-        if used.isdisjoint(node.resolve_topic_name(target) for node in nodes):
-            nodes[0].get_logger().warning(f"'-r {rule}' changes no topic of {which}")
 
 
 def leave(*nodes: Node) -> None:

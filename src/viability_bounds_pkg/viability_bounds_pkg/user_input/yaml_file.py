@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""YAML that users write: read strictly, and refused in one line that names the place."""
+"""YAML that users write: errors in one line that names the place."""
 
 from __future__ import annotations
 
 import re
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,35 +16,24 @@ class YamlError(ArmSafetyError, ValueError):
     """A file that cannot be read, is no YAML, or has a key twice."""
 
 
-class _Strict(yaml.constructor.SafeConstructor):
-    """Takes each key of a mapping once."""
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    """Takes each key of a mapping once, and 1e-3 for a number, as rcl does."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        first: dict[str, int] = {}
+        keys = set()
         for key, _ in node.value:
-            line = key.start_mark.line + 1
-            if key.value in first and isinstance(key, yaml.ScalarNode):
-                problem = f"'{key.value}' a second time; it is in line {first[key.value]} already"
+            if isinstance(key, yaml.ScalarNode) and key.value in keys:
+                problem = f"'{key.value}' a second time"
                 raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
-            if isinstance(key, yaml.ScalarNode):
-                first[key.value] = line
+            keys.add(key.value)
         return super().construct_mapping(node, deep)
 
 
-class _Loader(_Strict, yaml.SafeLoader):
-    """Says best what is wrong."""
-
-
-class _FastLoader(_Strict, getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """Several times as fast, where PyYAML was built with LibYAML."""
-
-
-for _each in (_Loader, _FastLoader):
-    _each.add_implicit_resolver(  # 1e-3 is a number, as for rcl
-        "tag:yaml.org,2002:float",
-        re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$"),
-        list("-+.0123456789"),
-    )
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$"),
+    list("-+.0123456789"),
+)
 
 
 def load_yaml(text: str, where: str = "") -> Any:
@@ -58,18 +46,13 @@ def load_yaml(text: str, where: str = "") -> Any:
     Raises:
         YamlError: it is no YAML, or a key stands twice in a mapping.
     """
-    with suppress(yaml.YAMLError, ValueError):
-        return yaml.load(text, _FastLoader)
     try:
         return yaml.load(text, _Loader)
-    except yaml.MarkedYAMLError as error:
-        problem, mark = error.problem or error.context or "no YAML", error.problem_mark
-        if r"'\t'" in problem:
-            problem = "a tab; only spaces may indent"
-        place = where if mark is None else f"{where}, line {mark.line + 1}".removeprefix(", ")
-        raise YamlError(f"{place}: {problem}") from error
     except (yaml.YAMLError, ValueError) as error:
-        raise YamlError(f"{where}: {' '.join(str(error).split())}".removeprefix(": ")) from error
+        mark = getattr(error, "problem_mark", None)
+        place = where if mark is None else f"{where}, line {mark.line + 1}"
+        problem = getattr(error, "problem", None) or " ".join(str(error).split())
+        raise YamlError(f"{place}: {problem}".lstrip(",: ")) from error
 
 
 def read_yaml(path: str | Path) -> Any:
@@ -81,11 +64,8 @@ def read_yaml(path: str | Path) -> Any:
     try:
         text = Path(path).read_text(encoding="utf-8")
     except FileNotFoundError as error:
-        folder = Path(path).parent
-        names = [each.name for each in folder.iterdir()] if folder.is_dir() else []
-        hint = did_you_mean(Path(path).name, names)
+        hint = did_you_mean(Path(path).name, (each.name for each in Path(path).parent.glob("*")))
         raise YamlError(f"{path}: there is no such file{hint}") from error
     except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is no text"
-        raise YamlError(f"{path}: {reason}") from error
+        raise YamlError(f"{path}: {getattr(error, 'strerror', 'it is no text')}") from error
     return load_yaml(text, str(path))
