@@ -50,12 +50,6 @@ def test_missed_deadlines_lengthen_the_horizon_of_the_bounds(declared, capsys):
     assert rows["bounds_dt_factor"].split()[1] == "5"
 
 
-def test_a_step_of_all_encoders_is_exceeded_too(declared, capsys):
-    assert main(files(FILE, declared(f"velocity_error: {[0.005] * 9}"))) == 1
-    (line,) = (row for row in capsys.readouterr().out.splitlines() if "at rest" in row)
-    assert line.endswith("exceeded")
-
-
 @pytest.mark.parametrize(
     ("text", "line"),
     [

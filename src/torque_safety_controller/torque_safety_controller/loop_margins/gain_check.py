@@ -5,23 +5,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 
-from torque_safety_controller.loop_margins.arm_inertia import ArmInertia
-from torque_safety_controller.loop_margins.joint_loop import (
-    Feedback,
-    Link,
-    ObserverGains,
-    Sensing,
-    filter_share,
-    open_loop,
-)
-from viability_bounds_pkg.uncertainty import DeclaredUncertainty
+from torque_safety_controller.loop_margins.joint_loop import Feedback, Link, open_loop
+from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
+from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 
 Array = NDArray[np.float64]
 
@@ -36,86 +28,13 @@ inertia may be 30% off, and is assumed to be at most 20% off."""
 TORQUE_STEP = 0.05
 """Share of `torque_max` by which the resolution may change a torque from period to period."""
 
+HORIZON, OBSERVER = "bounds_dt_factor", "disturbance_time"
+"""What must be at least, not at most, as large as its limit."""
+
 _SCALES = 1e-4, 1e3  # of a gain
 _LONGEST = 1e3  # horizon of the bounds, control periods
 _BISECTIONS = 14
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class RobotTiming:
-    """Delay, bandwidth and resolution of a robot with n joints.
-
-    Attributes:
-        dt: control period, s.
-        declared: delay, lag of the motors, errors of states and accelerations.
-        braking: smaller limit of the acceleration, shape (n,), rad/s^2.
-        horizon: of the bounds, in control periods.
-        predicted: whether states are predicted through delay and lag.
-        observed: whether velocities are observed, not reported.
-    """
-
-    dt: float
-    declared: DeclaredUncertainty
-    braking: Array
-    horizon: float
-    predicted: bool = False
-    observed: bool = False
-
-    @cached_property
-    def links(self) -> list[Link]:
-        """With the shortest and with the longest delay, and the slowest motor."""
-        lag, delay = float(self.declared.motor_lag.max()), self.declared.delay
-        delays = sorted({delay, delay + self.declared.delay_jitter})
-        return [Link(self.dt, each, 1.0 / lag if lag > 0.0 else math.inf) for each in delays]
-
-    @cached_property
-    def observers(self) -> ObserverGains:
-        """Gains of the observers, shape (n,) each."""
-        design = self.declared.observers(self.dt)
-        return ObserverGains(design.position_gain, design.velocity_gain)
-
-    @cached_property
-    def sensing(self) -> list[Sensing]:
-        """How the slowest and the fastest observer tell the state."""
-        predicted = self.declared.delay if self.predicted else None
-        if not self.observed:
-            return [Sensing(predicted=predicted)]
-        gains = sorted(set(zip(*self.observers, strict=True)))
-        return [
-            Sensing(ObserverGains(*each), predicted=predicted)
-            for each in dict.fromkeys((gains[0], gains[-1]))
-        ]
-
-    @cached_property
-    def steps(self) -> ObserverGains:
-        """Steps of position and velocity, as the controller knows them, by the resolution.
-
-        Shape (n,) each. A position that is off by up to E changes by 2 E at once.
-        """
-        position, velocity = 2.0 * self.declared.position_error, 2.0 * self.declared.velocity_error
-        if self.observed:
-            velocity = self.observers.velocity * position
-            position = self.observers.position * position
-        if self.predicted:
-            ahead = self.declared.delay * self.dt + self.declared.motor_lag
-            position = position + ahead * velocity
-        return ObserverGains(position, velocity)
-
-
-class GainSettings(NamedTuple):
-    """The gains that are checked.
-
-    Attributes:
-        tasks: kp and kd by the beginning of their names, `pose`, `posture` and `hold`.
-        integral: lambda, 1/s; 0 for no integral action.
-        leak: theta_s, theta_f, mu.
-        disturbance_time: s; None for none.
-    """
-
-    tasks: dict[str, tuple[float, float]]
-    integral: float
-    leak: tuple[float, float, float]
-    disturbance_time: float | None
+_POSTURES, _SEED = 200, 0
 
 
 class GainLimit(NamedTuple):
@@ -151,36 +70,41 @@ class GainLimit(NamedTuple):
         beyond = self.limit - self.value if self.smallest else self.value - self.limit
         return beyond > 1e-3 * abs(self.value)  # as near as the limit is found
 
-    def __str__(self) -> str:
-        """Return what to tell of a gain that is beyond its limit."""
-        if math.isinf(self.limit) or self.limit == 0.0:
-            least = "no value is"
-        else:
-            least = f"{self.limit:.3g} is the {'least' if self.smallest else 'most'}"
-        return (
-            f"parameter '{self.name}' is {self.value:.4g}, but with the delay, motors and "
-            f"encoders declared {least} allowed: see gain_limits and docs/gains.md"
-        )
 
+class ArmInertia:
+    """Mass matrices of an arm at random postures within its position limits.
 
-HORIZON, OBSERVER = "bounds_dt_factor", "disturbance_time"
-"""What must be at least, not at most, as large as its limit."""
+    With M = D^(1/2) Q S^-1 Q' D^(1/2), D = diag(M), the torque M a_ref + lambda D s falls apart
+    into n loops of one joint each, which differ in the gain of the integral action only: lambda
+    times a number of S. The numbers 1 / S are at least 0 and n in the mean over 1: coupled joints
+    have some far above 1.
 
-
-class LimitGains(NamedTuple):
-    """Slopes of the acceleration bound of a joint that rests on its limit.
+    Args:
+        model: n joints with one coordinate each.
+        q_min: lower position limits, shape (n,), rad; perhaps infinite.
+        q_max: upper ones, shape (n,), rad.
 
     Attributes:
-        kp: with the position, 1/s^2.
-        kd: with the velocity, 1/s.
+        matrices: M, shape (N, n, n), kg m^2.
+        factors: smallest and largest number of S anywhere.
+        diagonal: largest inertia of each joint, shape (n,), kg m^2.
     """
 
-    kp: Array
-    kd: Array
+    def __init__(self, model: pin.Model, q_min: Array, q_max: Array) -> None:
+        low, high = np.maximum(q_min, -math.pi), np.minimum(q_max, math.pi)
+        data, random = model.createData(), np.random.default_rng(_SEED)
+        self.matrices = np.array(
+            [pin.crba(model, data, random.uniform(low, high)).copy() for _ in range(_POSTURES)]
+        )
+        diagonals = np.diagonal(self.matrices, axis1=1, axis2=2)
+        self.diagonal: Array = diagonals.max(axis=0)
+        scale = 1.0 / np.sqrt(diagonals)
+        shares = np.linalg.eigvalsh(self.matrices * scale[:, :, None] * scale[:, None, :])
+        self.factors = 1.0 / float(shares.max()), 1.0 / float(shares.min())
 
 
-def limit_gains(horizon: float, disturbance: Array, braking: Array) -> LimitGains:
-    """Return how steep the bounds are where a joint rests on its limit.
+def limit_gains(horizon: float, disturbance: Array, braking: Array) -> tuple[Array, Array]:
+    """Return kp, 1/s^2, and kd, 1/s, of a joint that rests on its limit: slopes of its bound.
 
     The bound ends its step with w that T w / 2 + w^2 / (2 B) = x - T v / 2 allows, x from the
     limit. It is at rest where w = T W; there dw = (2 dx - T dv) / T / (1 + 2 W / B).
@@ -191,56 +115,103 @@ def limit_gains(horizon: float, disturbance: Array, braking: Array) -> LimitGain
         braking: limits of acceleration, of which W is not available, shape (n,), rad/s^2.
     """
     flatter = 1.0 / (1.0 + 2.0 * disturbance / np.maximum(braking - disturbance, 1e-9))
-    return LimitGains(2.0 * flatter / horizon**2, (1.0 + flatter) / horizon)
+    return 2.0 * flatter / horizon**2, (1.0 + flatter) / horizon
 
 
 class GainCheck:
-    """Gains against the margins of the loops and the resolution.
+    """Gains of a controller against the margins of its loops and the resolution of its encoders.
 
     Args:
-        gains: to check.
-        timing: of the robot.
-        inertia: of the arm.
-        tau_max: torque limits, shape (n,), N m.
+        config: of the controller.
+        robot: what is declared of the robot, and the horizon of the bounds.
+        model: of the arm.
+
+    Attributes:
+        tasks: kp and kd by the beginning of their names, `pose`, `posture` and `hold`.
+        integral: lambda, 1/s; 0 for no integral action.
+        steps: of position, rad, and velocity, rad/s, that the resolution makes of what the
+            controller knows, shape (n,) each.
     """
 
     def __init__(
-        self, gains: GainSettings, timing: RobotTiming, inertia: ArmInertia, tau_max: Array
+        self, config: ControllerConfiguration, robot: BoundsConfiguration, model: pin.Model
     ) -> None:
-        self._gains, self._timing = gains, timing
-        self._inertia, self._tau_max = inertia, tau_max
+        gains, declared = config.gains, robot.declared
+        self.inertia = ArmInertia(model, config.position_min, config.position_max)
+        self.tasks = {
+            "pose": (gains.pose_kp, gains.pose_kd if gains.pose_weight > 0.0 else 0.0),
+            "posture": (gains.posture_kp, gains.posture_kd),
+            "hold": (0.0, gains.hold_kd),
+        }
+        self.tasks = {name: pair for name, pair in self.tasks.items() if pair[1] > 0.0}
+        integral = config.additional.integral
+        self.integral = 0.0 if config.additional.mode == "none" else integral.gain
+        self._leak = integral.slow_leak_rate, integral.fast_leak_rate, integral.mu
+        self._disturbance_time = gains.disturbance_time
+        self._robot, self._tau_max = robot, config.torque_max
+        self._predicted = config.use_estimated_states
+        observers = None
+        if config.use_estimated_states and robot.velocity_estimation:
+            design = declared.observers(robot.dt)
+            observers = design.position_gain, design.velocity_gain
+        self._links = self._all_links(observers)
+        # A position that is off by up to E changes by 2 E at once.
+        position, velocity = 2.0 * declared.position_error, 2.0 * declared.velocity_error
+        if observers is not None:
+            position, velocity = observers[0] * position, observers[1] * position
+        if self._predicted:
+            ahead = declared.delay * robot.dt + declared.motor_lag
+            position = position + ahead * velocity
+        self.steps = position, velocity
+
+    def _all_links(self, observers: tuple[Array, Array] | None) -> list[Link]:
+        """Return loops with shortest and longest delay, slowest motor, both ends of observers."""
+        declared = self._robot.declared
+        ends: list[tuple[float, float] | None] = [None]
+        if observers is not None:
+            pairs = sorted(zip(*(each.tolist() for each in observers), strict=True))
+            ends = list(dict.fromkeys((pairs[0], pairs[-1])))
+        return [
+            Link(
+                self._robot.dt,
+                delay,
+                float(declared.motor_lag.max()),
+                observer,
+                declared.delay if self._predicted else None,
+            )
+            for delay in sorted({declared.delay, declared.delay + declared.delay_jitter})
+            for observer in ends
+        ]
 
     def limits(self) -> Iterator[GainLimit]:
         """Yield each gain with its limits: kp and kd of a task grow as its bandwidth does.
 
         Tasks are judged without the integral action; that with the fastest of them.
         """
-        for task, (kp, kd) in self._gains.tasks.items():
-            margin, resolution = (
-                _largest_scale(good)
-                for good in (
-                    lambda s, kp=kp, kd=kd: self.margin(kp * s * s, kd * s, 0.0) >= MARGIN,
-                    lambda s, kp=kp, kd=kd: _calm(self._step(kp * s * s, kd * s, 0.0)),
-                )
+        for task, (kp, kd) in self.tasks.items():
+            margin = _largest_scale(
+                lambda s, kp=kp, kd=kd: self.margin(kp * s * s, kd * s, 0.0) >= MARGIN
             )
+            resolution = _largest_scale(lambda s, kp=kp, kd=kd: self._calm(kp * s * s, kd * s))
             if kp > 0.0:
                 yield GainLimit(f"{task}_kp", kp, kp * margin**2, kp * resolution**2)
             yield GainLimit(f"{task}_kd", kd, kd * margin, kd * resolution)
-        if gain := self._gains.integral:
-            kp, kd = self._stiffest
+        if gain := self.integral:
+            kp, kd = max(self.tasks.values(), key=lambda pair: pair[1])
             margin = _largest_scale(lambda s: self.margin(kp, kd, gain * s) >= MARGIN)
-            resolution = _largest_scale(lambda s: _calm(self._step(0.0, 0.0, gain * s)))
+            step = self._own(gain * self.steps[1])
+            resolution = TORQUE_STEP / step if step > 0.0 else math.inf
             yield GainLimit("integral_lambda", gain, gain * margin, gain * resolution)
-        if (time := self._gains.disturbance_time) is not None:
+        if (time := self._disturbance_time) is not None:
             yield GainLimit(OBSERVER, time, self._way(), self._fastest_observer())
         margin, resolution = (
             1.0 / scale if (scale := _last_good(good, 1.0 / _LONGEST, 1.0)) else math.inf
             for good in (
                 lambda s: self.limit_margin(1.0 / s) >= LIMIT_MARGIN,
-                lambda s: _calm(self._step_of_bounds(1.0 / s)),
+                lambda s: self._calm_on_limits(1.0 / s),
             )
         )
-        yield GainLimit(HORIZON, self._timing.horizon, margin, resolution)
+        yield GainLimit(HORIZON, self._robot.horizon / self._robot.dt, margin, resolution)
 
     def margin(self, kp: float, kd: float, integral: float, observed: bool = False) -> float:
         """Return the least modulus margin, over delays, observers and postures.
@@ -251,23 +222,13 @@ class GainCheck:
             integral: lambda, 1/s.
             observed: whether the disturbance observer acts.
         """
-        time = self._gains.disturbance_time if observed else None
+        time = self._disturbance_time if observed else None
+        factors = self.inertia.factors if integral > 0.0 else (1.0,)
         return min(
-            open_loop(
-                link, sensing, Feedback(kp, kd, integral * factor, self._gains.leak, time)
-            ).modulus_margin()
-            for link in self._timing.links
-            for sensing in self._timing.sensing
-            for factor in (self._inertia.factors if integral > 0.0 else (1.0,))
+            open_loop(link, Feedback(kp, kd, integral * f, self._leak, time)).modulus_margin()
+            for link in self._links
+            for f in factors
         )
-
-    @property
-    def _stiffest(self) -> tuple[float, float]:
-        return max(self._gains.tasks.values(), key=lambda pair: pair[1])
-
-    def stiffest_margin(self) -> float:
-        """Return the modulus margin of the task with the most damping, and integral action."""
-        return self.margin(*self._stiffest, self._gains.integral)
 
     def limit_margin(self, factor: float) -> float:
         """Return the least modulus margin of joints at their limits, all that acts there counted.
@@ -275,36 +236,28 @@ class GainCheck:
         Args:
             factor: horizon of the bounds, in control periods.
         """
-        slopes = self._slopes(factor)
-        steepest = int(np.argmax(slopes.kd))
-        kp, kd = float(slopes.kp[steepest]), float(slopes.kd[steepest])
-        return self.margin(kp, kd, self._gains.integral, observed=True)
+        kp, kd = self._slopes(factor)
+        steepest = int(np.argmax(kd))
+        return self.margin(float(kp[steepest]), float(kd[steepest]), self.integral, observed=True)
 
-    def step_at_rest(self) -> Array:
-        """Return the torque step that the resolution makes at rest, shape (n,), of `tau_max`.
+    def _slopes(self, factor: float) -> tuple[Array, Array]:
+        robot = self._robot
+        braking = np.minimum(-robot.limits.a_min, robot.limits.a_max)
+        return limit_gains(factor * robot.dt, robot.declared.acceleration_disturbance, braking)
 
-        All encoders step at once, the worst way round.
-        """
-        kp, kd = np.max(list(self._gains.tasks.values()), axis=0)
-        return self._step(kp, kd, self._gains.integral)
+    def _calm(self, kp: float, kd: float) -> bool:
+        """Return whether encoders that all step at once, the worst way round, change little."""
+        position, velocity = self.steps
+        torque = np.abs(self.inertia.matrices) @ (kp * position + kd * velocity)
+        return bool((torque.max(axis=0) <= TORQUE_STEP * self._tau_max).all())
 
-    def step_at_limits(self, factor: float) -> Array:
-        """Return that of a joint that rests on its limit, shape (n,), of `tau_max`.
+    def _calm_on_limits(self, factor: float) -> bool:
+        (kp, kd), (position, velocity) = self._slopes(factor), self.steps
+        return self._own(kp * position + kd * velocity) <= TORQUE_STEP
 
-        Bounds, integral action and disturbance observer act there together.
-
-        Args:
-            factor: horizon of the bounds, in control periods.
-        """
-        time, dt = self._gains.disturbance_time, self._timing.dt
-        damping = self._gains.integral
-        if time is not None:
-            damping += filter_share(time, dt) / dt
-        return self._step_of_bounds(factor) + self._own(damping * self._timing.steps.velocity)
-
-    def _step_of_bounds(self, factor: float) -> Array:
-        slopes, steps = self._slopes(factor), self._timing.steps
-        return self._own(slopes.kp * steps.position + slopes.kd * steps.velocity)
+    def _own(self, acceleration: Array) -> float:
+        """Return the largest torque of joints' accelerations one by one, of `torque_max`."""
+        return float((self.inertia.diagonal * acceleration / self._tau_max).max())
 
     def _way(self) -> float:
         """Return how long commands are under way that are predicted, s.
@@ -313,33 +266,13 @@ class GainCheck:
         by what they would have done in all that time: a so many times larger acceleration of one
         period. With at least this time constant the estimate is not larger than the change.
         """
-        timing = self._timing
-        return timing.declared.delay * timing.dt if timing.predicted else 0.0
+        return self._robot.declared.delay * self._robot.dt if self._predicted else 0.0
 
     def _fastest_observer(self) -> float:
         """Return the least time constant of the disturbance observer that leaves joints calm."""
-        dt = self._timing.dt
-        share = TORQUE_STEP / float(self._own(self._timing.steps.velocity / dt).max() or math.inf)
+        dt = self._robot.dt
+        share = TORQUE_STEP / (self._own(self.steps[1] / dt) or math.inf)
         return 0.0 if share >= 1.0 or share == 0.0 else -dt / math.log1p(-share)
-
-    def _own(self, acceleration: Array) -> Array:
-        """Return the torque of joints' accelerations one by one, shape (n,), of `tau_max`."""
-        torque: Array = self._inertia.diagonal * acceleration / self._tau_max
-        return torque
-
-    def _slopes(self, factor: float) -> LimitGains:
-        timing = self._timing
-        horizon = factor * timing.dt
-        return limit_gains(horizon, timing.declared.acceleration_disturbance, timing.braking)
-
-    def _step(self, kp: float, kd: float, integral: float) -> Array:
-        steps = self._timing.steps
-        torque = self._inertia.torque(kp * steps.position + kd * steps.velocity)
-        return self._own(integral * steps.velocity) + torque / self._tau_max
-
-
-def _calm(steps: Array) -> bool:
-    return bool((steps <= TORQUE_STEP).all())
 
 
 def _largest_scale(good: Callable[[float], bool]) -> float:

@@ -26,40 +26,22 @@ _ROUNDING = 1e-6  # of a pole: kp = 0 leaves one at 1
 
 
 class Link(NamedTuple):
-    """What lies between a command and the joint.
+    """What lies between a command and the state that the controller knows.
 
     Attributes:
         dt: control period, s.
         delay: whole periods from the state that a command answers to its effect.
-        bandwidth: of the motor's torque, first order, rad/s.
-    """
-
-    dt: float
-    delay: int = 0
-    bandwidth: float = math.inf
-
-
-class ObserverGains(NamedTuple):
-    """Shares of an error of the position that correct position and velocity, 1 and 1/s."""
-
-    position: Array
-    velocity: Array
-
-
-class Sensing(NamedTuple):
-    """How the controller knows the state.
-
-    Attributes:
-        observer: gains of the observer that estimates the velocity; None for one that is measured,
-            or differenced.
-        filter_rate: low-pass of a velocity by differences of the position, rad/s, perhaps
-            infinite; None for one that is measured, or observed.
+        lag: of the motor's torque, first order, s.
+        observer: shares of an error of the position that correct position and velocity, 1 and
+            1/s; None for a velocity that is measured.
         predicted: periods by which the state is predicted, and the motor lag with it; None for
             no prediction.
     """
 
-    observer: ObserverGains | None = None
-    filter_rate: float | None = None
+    dt: float
+    delay: int = 0
+    lag: float = 0.0
+    observer: tuple[float, float] | None = None
     predicted: int | None = None
 
 
@@ -82,25 +64,15 @@ class Feedback(NamedTuple):
     disturbance_time: float | None = None
 
 
-class Motion(NamedTuple):
-    """One period of position, velocity and acceleration: x' = A x + b command."""
-
-    A: Array
-    b: Array
-
-
 class OpenLoop(NamedTuple):
-    """The loop, opened at the motor: x' = A x + b entering, returning = c x.
-
-    Attributes:
-        A, b, c: of shapes (n, n), (n,) and (n,).
-        dt: control period, s.
-    """
+    """The loop, opened at the motor: x' = A x + b entering, returning = c x."""
 
     A: Array
+    """Shape (n, n)."""
     b: Array
+    """Shape (n,)."""
     c: Array
-    dt: float
+    """Shape (n,)."""
 
     def spectral_radius(self) -> float:
         """Return the largest magnitude of the closed loop's poles."""
@@ -117,14 +89,18 @@ class OpenLoop(NamedTuple):
         return float(np.abs(1.0 - self.c @ states[..., 0].T).min())
 
 
-def motion(link: Link) -> Motion:
-    """Return a period of a joint under a held command, with the motor's lag, exactly."""
-    dt, lag = link.dt, 1.0 / link.bandwidth
+def motion(dt: float, lag: float) -> tuple[Array, Array]:
+    """Return A and b, so that (q, v, a) becomes A (q, v, a) + b command in a period, exactly.
+
+    Args:
+        dt: control period, in which the command is held, s.
+        lag: of the motor, s.
+    """
     left = math.exp(-dt / lag) if lag > 0.0 else 0.0
     moved = lag * (1.0 - left)
     way = lag * (dt - moved)
     A = np.array([[1.0, dt, way], [0.0, 1.0, moved], [0.0, 0.0, left]])
-    return Motion(A, np.array([0.5 * dt**2 - way, dt - moved, 1.0 - left]))
+    return A, np.array([0.5 * dt**2 - way, dt - moved, 1.0 - left])
 
 
 def filter_share(time_constant: float, dt: float) -> float:
@@ -132,76 +108,61 @@ def filter_share(time_constant: float, dt: float) -> float:
     return -math.expm1(-dt / time_constant) if time_constant > 0.0 else 1.0
 
 
-def open_loop(link: Link, sensing: Sensing, gains: Feedback) -> OpenLoop:
+def open_loop(link: Link, gains: Feedback) -> OpenLoop:
     """Return the loop of a joint, opened at the motor.
 
     Args:
-        link: true delay and lag; the prediction knows the lag, and `sensing.predicted` periods.
-        sensing: how the state is known.
+        link: delay, motor and state estimation; a prediction knows the true lag.
         gains: of the feedback.
     """
-    assumed = 0 if sensing.predicted is None else sensing.predicted
-    names = ["q", "v", "a"] + [f"late{i}" for i in range(link.delay)]
-    names += ["q_seen", "v_seen", "a_seen"] + [f"sent{i}" for i in range(assumed)]
-    names += ["q_before", "v_before", "a_ref_before", "fast", "slow", "disturbance"]
+    dt, predicts = link.dt, link.predicted is not None
+    assumed = link.predicted or 0
+    names = ["q", "v", "a", *(f"late{i}" for i in range(link.delay))]
+    names += ["q_seen", "v_seen", "a_seen", *(f"sent{i}" for i in range(assumed))]
+    names += ["v_before", "a_ref_before", "fast", "slow", "disturbance"]
     rows = np.eye(len(names) + 1)
     x = dict(zip(names, rows, strict=False))
     entering = rows[-1]
     new: dict[str, Array] = {}
 
-    # The state as it is known for its own instant: q_seen, v_seen come predicted from the last.
-    q, v, dt = x["q"], x["v"], link.dt
-    seen = [q, v, x["a_seen"]]
-    if sensing.observer is not None:
-        error = q - x["q_seen"]
-        seen[0] = x["q_seen"] + sensing.observer.position * error
-        seen[1] = x["v_seen"] + sensing.observer.velocity * error
-    elif sensing.filter_rate is not None:
-        share = filter_share(1.0 / sensing.filter_rate, dt)
-        seen[1] = x["v_seen"] + share * ((q - x["q_before"]) / dt - x["v_seen"])
-    new["q_before"] = q
+    # The state as it is known for its own instant; q_seen, v_seen were predicted from the last.
+    seen = np.array([x["q"], x["v"], x["a_seen"]])
+    if link.observer is not None:
+        error = x["q"] - x["q_seen"]
+        seen[0] = x["q_seen"] + link.observer[0] * error
+        seen[1] = x["v_seen"] + link.observer[1] * error
     # As it is when the next command acts; with the lag it is where it would coast to.
-    model = motion(link if sensing.predicted is not None else link._replace(bandwidth=math.inf))
-    ahead = list(seen)
+    A, b = motion(dt, link.lag if predicts else 0.0)
+    ahead = seen
     for i in reversed(range(assumed)):
-        ahead = _moved(model, ahead, x[f"sent{i}"])
-    if sensing.predicted is not None and link.bandwidth < math.inf:
-        ahead[:2] = [ahead[0] + ahead[1] / link.bandwidth, ahead[1] + ahead[2] / link.bandwidth]
-    known_q, known_v = ahead[:2]
+        ahead = A @ ahead + np.outer(b, x[f"sent{i}"])
+    if predicts:
+        ahead = ahead + link.lag * np.array([ahead[1], ahead[2], 0.0 * entering])
 
     # Integral action and disturbance observer, then the command.
     theta_slow, theta_fast, mu = gains.leak
-    increment = x["a_ref_before"] * dt - (known_v - x["v_before"])
+    increment = x["a_ref_before"] * dt - (ahead[1] - x["v_before"])
     for name, theta in (("fast", theta_fast), ("slow", theta_slow)):
         decay, share = leak_factors(theta, dt, False)
         new[name] = decay * x[name] + share * increment
-    a_ref = -gains.kp * known_q - gains.kd * known_v
+    a_ref = -gains.kp * ahead[0] - gains.kd * ahead[1]
     new["disturbance"] = x["disturbance"]
     if gains.disturbance_time is not None:
         share = filter_share(gains.disturbance_time, dt)
-        error = -increment / dt - x["disturbance"]
-        new["disturbance"] = x["disturbance"] + share * error
+        new["disturbance"] = (1.0 - share) * x["disturbance"] - share * increment / dt
         a_ref = a_ref - new["disturbance"]
     command = a_ref + gains.integral * (mu * new["fast"] + (1.0 - mu) * new["slow"])
-    new["v_before"], new["a_ref_before"] = known_v, a_ref
+    new["v_before"], new["a_ref_before"] = ahead[1], a_ref
 
     # What the controller believes to act now, and what does.
     queue = [command, *(x[f"sent{i}"] for i in range(assumed))]
     new |= {f"sent{i}": row for i, row in enumerate(queue[:-1])}
-    believed = dict(
-        zip(("q_seen", "v_seen", "a_seen"), _moved(model, seen, queue[-1]), strict=True)
-    )
-    if sensing.observer is None:
-        believed["v_seen"] = seen[1]
-    new |= believed
+    believed = A @ seen + np.outer(b, queue[-1])
+    new |= dict(zip(("q_seen", "v_seen", "a_seen"), believed, strict=True))
     queue = [entering, *(x[f"late{i}"] for i in range(link.delay))]
     new |= {f"late{i}": row for i, row in enumerate(queue[:-1])}
-    new |= dict(zip("qva", _moved(motion(link), [x["q"], x["v"], x["a"]], queue[-1]), strict=True))
+    A, b = motion(dt, link.lag)
+    moved = A @ np.array([x["q"], x["v"], x["a"]]) + np.outer(b, queue[-1])
+    new |= dict(zip("qva", moved, strict=True))
     step = np.array([new[name] for name in names])
-    return OpenLoop(step[:, :-1], step[:, -1], command[:-1], dt)
-
-
-def _moved(motion: Motion, state: list[Array], command: Array) -> list[Array]:
-    """Return position, velocity and acceleration a period later."""
-    after = motion.A @ np.array(state) + np.outer(motion.b, command)
-    return list(after)
+    return OpenLoop(step[:, :-1], step[:, -1], command[:-1])

@@ -18,8 +18,12 @@ from typing import Any
 
 import numpy as np
 
-from torque_safety_controller.loop_margins.arm_inertia import ArmInertia
-from torque_safety_controller.loop_margins.gain_check import HORIZON, OBSERVER, GainLimit
+from torque_safety_controller.loop_margins.gain_check import (
+    HORIZON,
+    OBSERVER,
+    GainCheck,
+    GainLimit,
+)
 from torque_safety_controller.new_robot.chain import Chain, NewRobotError, find_chain
 from torque_safety_controller.new_robot.estimates import Estimates, estimate
 from torque_safety_controller.new_robot.files import (
@@ -34,7 +38,6 @@ from torque_safety_controller.new_robot.hardware import (
 )
 from torque_safety_controller.new_robot.postures import SelfCollisions, find_postures
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.parameters.loop_parameters import gain_check
 from viability_bounds_pkg.cli.command_line import Parser, positive, run_tool
 from viability_bounds_pkg.cli.limits_file import CONTROLLER, NODE, check_writable, write_whole
 from viability_bounds_pkg.exceptions import ArmSafetyError
@@ -188,7 +191,7 @@ def _run(options: argparse.Namespace) -> int:
             break
         gains = _lowered(gains, beyond)
     else:
-        raise NewRobotError(f"no gains suit this rate: {beyond[0]}; a higher --rate")
+        raise NewRobotError(f"no gains suit this rate: {_told(beyond[0])}; a higher --rate")
     write_whole(files["scenario"], scenario_file(chain, estimates, postures))
     _write_imperfect(chain, estimates, gains, files)
     for name, path in files.items():
@@ -226,7 +229,7 @@ def _write_imperfect(
             if not beyond:
                 write_whole(path, text)
                 return
-            reason = str(beyond[0])
+            reason = _told(beyond[0])
             longer = [each for each in beyond if each.name == HORIZON]
             if longer and np.isfinite(longer[0].limit):
                 grade = replace(grade, horizon=float(np.ceil(longer[0].limit / _INSIDE)))
@@ -249,8 +252,11 @@ def _exceeded(paths: Sequence[Path]) -> list[GainLimit]:
     robot = read_files(BoundsConfiguration, paths, NODE)
     model = load_model(config, config.read_urdf())
     make_bounds(robot)
-    inertia = ArmInertia.of(model, config.position_min, config.position_max)
-    return [each for each in gain_check(config, robot, inertia).limits() if each.exceeded]
+    return [each for each in GainCheck(config, robot, model).limits() if each.exceeded]
+
+
+def _told(limit: GainLimit) -> str:
+    return f"'{limit.name}' is {limit.value:.4g}, beyond its limit {limit.limit:.3g}"
 
 
 def _lowered(gains: dict[str, float], beyond: Sequence[GainLimit]) -> dict[str, float]:
