@@ -223,7 +223,7 @@ STAGES = (
     (LimitsReader, "read", "controller: limits from message"),
     (RobotModel, "update", "controller: model"),
     (RobotModel, "torque", "controller: model"),
-    (SafetyFilter, "look", "controller: safety filter"),
+    (SafetyFilter, "prepare", "controller: safety filter"),
     (SafetyFilter, "choose", "controller: safety filter"),
     (InverseDynamicsQP, "build", "controller: QP"),
     (InverseDynamicsQP, "solve", "controller: QP"),

@@ -380,12 +380,11 @@ class Controller:
         """Let the filter look; return its constraints on the commanded accelerations."""
         if self.safety_filter is None:
             return None
-        robot, last = self.robot, self._a_last
+        robot = self.robot
         extra = self._no_torque if additional is None else additional
         if disturbance is not None:
             extra = extra - robot.M @ disturbance
-            last = last + disturbance
-        rows = self.safety_filter.look(robot.q, robot.v, extra, *bounds, last)
+        rows = self.safety_filter.prepare(robot.q, robot.v, extra, *bounds)
         if rows is None:
             return None
         G, upper = rows

@@ -256,7 +256,7 @@ def test_an_estimate_without_a_solution_is_held_and_forgotten(ros):
 
 def test_the_rate_of_torque_is_limited(ros):
     rate = np.full(ARM.n, 100.0)
-    chain = NodeChain(ros, torque_rate_max=rate.tolist(), safety_filter=True)
+    chain = NodeChain(ros, torque_rate_max=rate.tolist())
     tau = [
         chain.answer(10 * k, q=Q + 0.05 * k, lower=a, upper=a)
         for k, a in ((1, -UPPER), (2, UPPER), (3, -UPPER))

@@ -132,18 +132,9 @@ BROKEN_URDF = __file__
         ({"torque_max": None, "robot_description": "topic"}, "torque_max", "not set"),
         ({"torque_rate_max": [100.0]}, "torque_rate_max", "7 numbers"),
         ({"torque_rate_max": [0.0] * 7}, "torque_rate_max", "> 0"),
-        ({"torque_rate_max": [1e3] * 7}, "torque_rate_max", "empty without safety_filter"),
-        ({"jerk_max": [1e3] * 7}, "jerk_max", "empty without safety_filter"),
-        ({"jerk_max": [-1e3] * 7}, "jerk_max", "> 0"),
         ({"torque_reserve": [1.0] * 6}, "torque_reserve", "7 numbers"),
         ({"torque_reserve": [-1.0] * 7}, "torque_reserve", ">= 0"),
         ({"torque_reserve": [1e3] * 7}, "torque_reserve", "less than 0.97 of torque_max"),
-        (
-            {"jerk_max": [1e3] * 7, "safety_filter": True, "velocity_max": []}
-            | {"robot_description": "topic"},
-            "velocity_max",
-            "for jerk_max",
-        ),
         ({"position_min": list(ARM.q_max)}, "position_max", "above position_min"),
         ({"position_max": [1.0]}, "position_max", "7 numbers"),
         ({"rate_hz": 0.0}, "rate_hz", ">= 1"),

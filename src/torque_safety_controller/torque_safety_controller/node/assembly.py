@@ -124,9 +124,6 @@ def make_safety_filter(config: ControllerConfiguration, model: pin.Model) -> Saf
         limits.acceleration_max,
         config.torque_max,
         config.dt,
-        config.velocity_max,
-        config.jerk_max,
-        config.torque_rate_max,
         config.torque_reserve,
     )
 

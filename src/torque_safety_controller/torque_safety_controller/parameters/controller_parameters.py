@@ -53,19 +53,13 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
     NOT_NEEDED = frozenset({"velocity_max"})
 
     velocity_max: Array = joint_numbers(
-        "speed limits, rad/s, for jerk_max, torque_rate_max, and HOLD without bounds; those of "
-        "the URDF if empty, or none",
+        "speed limits, rad/s, of driving and HOLD without bounds; those of the URDF if empty, or none",
         POSITIVE,
         default=(),
     )
     torque_rate_max: Array = joint_numbers(
-        "limits of the rate of torque, N m/s; none if empty; with safety_filter",
-        if_empty=np.inf,
-        note="all > 0",
-    )
-    jerk_max: Array = joint_numbers(
-        "limits of the rate of the commanded accelerations, rad/s^3; none if empty; with "
-        "safety_filter",
+        "limits of the rate of torque, N m/s; torques are clipped to them, and other limits not "
+        "promised then; none if empty",
         if_empty=np.inf,
         note="all > 0",
     )
@@ -124,16 +118,8 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
         super().__post_init__()
         if not len(self.velocity_max):
             object.__setattr__(self, "velocity_max", np.full(len(self.joints), np.inf))
-        for name in ("torque_rate_max", "jerk_max"):
-            rates = getattr(self, name)
-            if not (rates > 0).all():
-                raise SettingError(name, rates, "numbers > 0")
-            if np.isfinite(rates).any() and not self.safety_filter:
-                # The bounds know nothing of rates: near a limit a joint could not stop any more.
-                raise SettingError(name, rates, "empty without safety_filter: true")
-            if np.isfinite(rates).any() and not np.isfinite(self.velocity_max).all():
-                allowed = f"a number for each of 'joints', for {name}"
-                raise SettingError("velocity_max", self.velocity_max, allowed)
+        if not (self.torque_rate_max > 0).all():
+            raise SettingError("torque_rate_max", self.torque_rate_max, "numbers > 0")
         if not (self.torque_reserve < (1.0 - RESERVE) * self.torque_max).all():
             allowed = f"less than {1.0 - RESERVE:g} of torque_max"
             raise SettingError("torque_reserve", self.torque_reserve, allowed)

@@ -1,246 +1,294 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Braking plans: every joint slows down until it stands; compiled.
+"""Braking plans: every joint slows down at a constant rate until it stands, and stays there.
 
-Each joint has a plan of its own (`joint_plan`): for how many periods N it moves, in how many of
-them, m, its deceleration rises, and in how many, w, it falls.
+A joint with position q, rad, and velocity v, rad/s, that stands after N control periods of dt is,
+at time t before,
 
-After a period, what is left of a plan is the plan with N-1, m-1 and w, at most N-1, from the state
-then: the same accelerations. So one plan, once found, is enough for ever.
+    q(t) = q + v t - v t^2 / (2 N dt),   v(t) = v - v t / (N dt),   a(t) = -v / (N dt).
 
-N is chosen from one time T for the whole arm: a joint takes longer where it would have to brake
-harder than A, and less where it would pass its position limit. m and w are as long as it takes for
-the acceleration to change gently, where its changes are limited.
+What is left of a plan after a period is the plan of N - 1 periods from the state then. So a plan
+that keeps all limits, once found, is enough for ever.
 
-Arguments, for n joints, arrays of shape (n,): positions q, rad, and velocities v, rad/s, at the
-beginning of a plan; accelerations a of the period before, rad/s^2; the time T of the plan and the
-control period dt, s; the change of acceleration from period to period that is `gentle`, rad/s^2,
-inf for any. Functions of one joint, j, take its own q, v and a.
+Periods are whole numbers in float arrays of shape (plans, n), n being the number of joints.
 """
 
 from __future__ import annotations
 
+from math import ceil
 from typing import NamedTuple
 
 import numpy as np
+import pinocchio as pin
+from numba import njit
 from numpy.typing import NDArray
 
-from viability_bounds_pkg.compiled import compiled
-from viability_bounds_pkg.whole_arm.joint_plan import (
-    joint_course,
-    joint_excess,
-    passed,
-)
-
 Array = NDArray[np.float64]
-Counts = NDArray[np.int64]
 
-NEGLIGIBLE = 1e-6
-"""Excess of speeds and rates, as a share of their limits."""
+UNIFORM = 20
+"""Samples at equal distances in time, the first at the beginning."""
 
-DRIFTED = 0.2
-"""Share of the tolerance by which a plan that is carried on may pass a limit unrepaired."""
+_ROUNDING = 1e-9
+"""Of numbers of periods."""
 
-HALVINGS = 10
-"""Of the search for the largest acceleration from which a joint can stop."""
-
-
-class Course(NamedTuple):
-    """When each joint does what in a plan, in control periods, shape (n,) each."""
-
-    moving: Counts
-    """N, until it stands."""
-    rising: Counts
-    """m, until it brakes fully."""
-    falling: Counts
-    """w, from full braking to the stop."""
+_FAR = 1e12
+"""Stands for infinite room, in accelerations times period squared."""
 
 
-class JointLimitsOfPlans(NamedTuple):
-    """What plans keep to, shape (n,) each."""
+class PlanLimits(NamedTuple):
+    """What plans of n joints keep to, arrays of shape (n,)."""
 
     q_min: Array
     """Lowest positions at which joints are to stand, rad."""
     q_max: Array
     """Highest, rad."""
     tolerance: Array
-    """By how far they may stand beyond, where only braking harder than A would help, rad."""
-    v_max: Array
-    """Speeds, rad/s; inf for none."""
+    """By how far they may stand beyond, where only braking harder than `braking` helps, rad."""
     braking: Array
-    """A, rad/s^2."""
-    change_max: Array
-    """Change of the acceleration from period to period, rad/s^2; inf for none."""
+    """Deceleration that plans prefer not to exceed, rad/s^2."""
+    dt: float
+    """Control period, s."""
 
 
-def new_course(n: int) -> Course:
-    """Return the course of n joints that stand after one period."""
-    return Course(*(np.ones(n, dtype=np.int64) for _ in range(3)))
-
-
-def copy_course(course: Course, into: Course) -> None:
-    """Copy a course."""
-    into.moving[:] = course.moving
-    into.rising[:] = course.rising
-    into.falling[:] = course.falling
-
-
-@compiled
-def _course_of(
-    j: int,
-    q: float,
-    v: float,
-    a: float,
-    T: float,
-    gentle: Array,
-    limits: JointLimitsOfPlans,
-    dt: float,
-) -> tuple[int, int, int]:
-    """Return N, m and w of joint j; see `joint_course`."""
-    return joint_course(
-        q,
-        v,
-        a,
-        T,
-        limits.q_min[j],
-        limits.q_max[j],
-        limits.tolerance[j],
-        limits.braking[j],
-        gentle[j],
-        dt,
-    )
-
-
-@compiled
-def excess_of(
-    j: int,
-    q: float,
-    v: float,
-    a: float,
-    course: tuple[int, int, int],
-    limits: JointLimitsOfPlans,
-    dt: float,
-) -> tuple[float, float]:
-    """Return by how far the plan of joint j passes its limits; see `joint_excess`."""
-    N, m, w = course
-    return joint_excess(
-        q,
-        v,
-        a,
-        N,
-        m,
-        w,
-        dt,
-        limits.q_min[j],
-        limits.q_max[j],
-        limits.v_max[j],
-        limits.change_max[j],
-    )
-
-
-@compiled
-def make_course(
+@njit(cache=True)
+def braking_periods(
     q: Array,
     v: Array,
-    a: Array,
-    T: float,
-    gentle: Array,
-    limits: JointLimitsOfPlans,
+    times: Array,
+    q_min: Array,
+    q_max: Array,
+    tolerance: Array,
+    braking: Array,
     dt: float,
-    course: Course,
-) -> None:
-    """Fill in the course of the plan of time `T`."""
-    for j in range(q.size):
-        course.moving[j], course.rising[j], course.falling[j] = _course_of(
-            j, q[j], v[j], a[j], T, gentle, limits, dt
-        )
+) -> Array:
+    """Return in how many periods each joint stands in the plans of given times.
 
+    A joint takes longer where it would have to brake harder than `braking`, and less where it would
+    pass a position limit. Arguments are those of `PlanLimits`, and:
 
-def rest_of(course: Course, rest: Course) -> None:
-    """Fill in what is left of a course after a period: at least one."""
-    np.maximum(course.moving - 1, 1, out=rest.moving)
-    np.maximum(course.rising - 1, 1, out=rest.rising)
-    np.minimum(course.falling, rest.moving, out=rest.falling)
+    Args:
+        q: positions, shape (n,), rad.
+        v: velocities, shape (n,), rad/s.
+        times: shape (plans,), s.
 
-
-def repair(
-    q: Array,
-    v: Array,
-    a: Array,
-    T: float,
-    gentle: Array,
-    limits: JointLimitsOfPlans,
-    dt: float,
-    course: Course,
-    repaired: Course,
-) -> bool:
-    """Return whether joints have drifted: their plan ends beyond a limit by more than `DRIFTED`.
-
-    Then `repaired` is filled in: `course`, that of the plan in hand, but for these joints, which
-    stand before their limits again.
+    Returns:
+        Periods, at least 1, shape (plans, n).
     """
-    beyond = np.empty(q.size)
-    for j, (N, m, w) in enumerate(zip(*course, strict=True)):
-        low, high = limits.q_min[j], limits.q_max[j]
-        beyond[j] = passed(q[j], v[j], a[j], (N, m, w), low, high, dt)
-    fine = ~(beyond > DRIFTED * limits.tolerance)
-    if fine.all():
-        return False
-    make_course(q, v, a, T, gentle, limits, dt, repaired)
-    for new, old in zip(repaired, course, strict=True):
-        new[fine] = old[fine]
-    return True
+    periods = np.empty((times.size, q.size))
+    for j in range(q.size):
+        speed = abs(v[j])
+        hardest = ceil(speed / (braking[j] * dt) - _ROUNDING)
+        most = np.inf
+        way = 0.5 * dt * speed  # by which each period takes it further
+        if way > 0.0:
+            room = q_max[j] - q[j] if v[j] > 0.0 else q[j] - q_min[j]
+            inside = np.floor(room / way + _ROUNDING)
+            tolerated = np.floor((room + tolerance[j]) / way + _ROUNDING)
+            most = max(inside, min(hardest, tolerated), 1.0)
+        for i in range(times.size):
+            wanted = ceil(times[i] / dt - _ROUNDING)
+            periods[i, j] = min(max(wanted, hardest, 1.0), most)
+    return periods
 
 
-@compiled
-def viable_range(
+@njit(cache=True)
+def narrow(
     q: Array,
     v: Array,
     plan: Array,
-    last: Array,
-    T: float,
-    gentle: Array,
-    limits: JointLimitsOfPlans,
+    lower: Array,
+    upper: Array,
+    q_min: Array,
+    q_max: Array,
+    braking: Array,
     dt: float,
-    low: Array,
-    high: Array,
-) -> None:
-    """Narrow ranges of accelerations to those after which each joint by itself has a plan.
+) -> tuple[Array, Array]:
+    """Return acceleration bounds, narrowed to those after which each joint by itself can stop.
 
-    `low` and `high`, the ends of the ranges, rad/s^2, change in place; where nothing in a range is
-    possible, to what is nearest to it. `plan` has the accelerations of the plan in hand, `last`
-    those of the period before, rad/s^2.
+    After a period of acceleration a, a joint of speed ``s A dt`` needs ceil(s) more to stop with
+    A, `braking`. It stops before a limit at distance r if
+
+        s (1 + ceil(s)) <= c = (2 r - v dt) / (A dt^2),
+
+    so the largest s is ``min(h, c / (h + 1))``, h being the largest number with h^2 - 1 < c.
+    Arguments are those of `PlanLimits`, and:
+
+    Args:
+        q: positions, shape (n,), rad.
+        v: velocities, shape (n,), rad/s.
+        plan: accelerations of the plan in hand, which are always allowed, shape (n,), rad/s^2.
+        lower: bounds, shape (n,), rad/s^2.
+        upper: shape (n,), rad/s^2.
+
+    Returns:
+        Lower and upper bounds, shape (n,), rad/s^2; where nothing within those given is possible,
+        what is nearest to them.
     """
+    low, high = np.empty_like(lower), np.empty_like(upper)
     for j in range(q.size):
-        change = limits.change_max[j]
-        within = limits.q_min[j] <= q[j] <= limits.q_max[j]
-        already = 0.0 if within else np.inf  # then only leave it for the inside
-        ends = low[j], high[j]
-        for upper in (False, True):
-            good, bad = plan[j], last[j] + change if upper else last[j] - change
-            if abs(bad) == np.inf:
-                bad = max(ends[1], good) if upper else min(ends[0], good)
-            if abs(bad) == np.inf:
-                continue
-            if not within and upper == (q[j] > limits.q_max[j]):
-                bad = good
-            # The end itself first: mostly it is possible.
-            for turn in range(HALVINGS + 1):
-                a = bad if turn == 0 else 0.5 * (good + bad)
-                place, speed = q[j] + dt * v[j] + 0.5 * dt * dt * a, v[j] + dt * a
-                course = _course_of(j, place, speed, a, T, gentle, limits, dt)
-                far, fast = excess_of(j, place, speed, a, course, limits, dt)
-                if far <= already and fast <= NEGLIGIBLE:
-                    good = a
-                    if turn == 0:
-                        break
-                elif turn > 0:
-                    bad = a
-            if upper:
-                high[j] = good
+        A = braking[j]
+        for sign in (-1.0, 1.0):
+            room = q_max[j] - q[j] if sign > 0.0 else q[j] - q_min[j]
+            c = min((2.0 * room - sign * v[j] * dt) / (A * dt * dt), _FAR)
+            h = max(ceil(np.sqrt(max(1.0 + c, 0.0))) - 1.0, 0.0)
+            most = A * min(h, c / (h + 1.0)) - sign * v[j] / dt
+            if sign > 0.0:
+                high[j] = max(most, plan[j])
             else:
-                low[j] = good
-        # Of what is possible what the given range says, or what is nearest to it.
-        if abs(low[j]) < np.inf and abs(high[j]) < np.inf:
-            possible = low[j], high[j]
-            low[j] = min(max(ends[0], possible[0]), possible[1])
-            high[j] = max(min(ends[1], possible[1]), possible[0])
+                low[j] = min(-most, plan[j])
+        possible = low[j], high[j]
+        low[j] = min(max(lower[j], possible[0]), possible[1])
+        high[j] = min(max(upper[j], possible[0]), possible[1])
+    return low, high
+
+
+class Samples(NamedTuple):
+    """States of plans at samples in time: equally spaced, where joints stop, and at rest.
+
+    Arrays of shape (plans, samples, n), but for `clock`; `AT_REST` is the index of the last.
+    """
+
+    clock: Array
+    """Periods since the beginning, shape (plans, samples)."""
+    q: Array
+    """rad."""
+    v: Array
+    """rad/s."""
+    a: Array
+    """rad/s^2."""
+
+
+FIRST, AT_REST = 0, -1
+"""Samples at the beginning of a plan and at its end."""
+
+
+@njit(cache=True)
+def sample(
+    q: Array,
+    v: Array,
+    periods: Array,
+    q_min: Array,
+    q_max: Array,
+    tolerance: Array,
+    dt: float,
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return the states of plans, as in `Samples`, and by how far they pass position limits.
+
+    Arguments are those of `PlanLimits`, and:
+
+    Args:
+        q: positions at the beginning, shape (n,), rad.
+        v: velocities, shape (n,), rad/s.
+        periods: in which each joint stands, shape (plans, n).
+
+    Returns:
+        Samples; and the largest excess of a position beyond the tolerance, 0 for none, rad, shape
+        (plans,).
+    """
+    plans, n = periods.shape
+    clock = np.empty((plans, UNIFORM + 2 * n + 1))
+    positions = np.empty((plans, clock.shape[1], n))
+    velocities, accelerations = np.empty_like(positions), np.empty_like(positions)
+    beyond = np.zeros(plans)
+    for i in range(plans):
+        longest = periods[i].max()
+        for k in range(UNIFORM):
+            clock[i, k] = k * longest / UNIFORM
+        for j in range(n):
+            clock[i, UNIFORM + j] = periods[i, j] - 1.0
+            clock[i, UNIFORM + n + j] = periods[i, j]
+        clock[i, AT_REST] = longest
+        for j in range(n):
+            time = dt * periods[i, j]
+            way = 0.5 * v[j] * time
+            excess = max(max(q[j], q[j] + way) - q_max[j], q_min[j] - min(q[j], q[j] + way))
+            beyond[i] = max(beyond[i], excess - tolerance[j])
+            for k in range(clock.shape[1]):
+                left = max(1.0 - clock[i, k] / periods[i, j], 0.0)  # share of the time
+                positions[i, k, j] = q[j] + way * (1.0 - left * left)
+                velocities[i, k, j] = v[j] * left
+                accelerations[i, k, j] = -v[j] / time if left > 0.0 else 0.0
+    return clock, positions, velocities, accelerations, beyond
+
+
+class BrakingPlans(NamedTuple):
+    """Plans from one state, their torques and what they leave of the limits."""
+
+    periods: Array
+    """In which each joint stands, shape (plans, n)."""
+    samples: Samples
+    """States."""
+    tau: Array
+    """Torques that are needed, shape (plans, samples, n), N m."""
+    loads: Array
+    """The same, as shares of what plans may use, without sign."""
+    peaks: Array
+    """The largest load of each joint, shape (plans, n)."""
+    slack: Array
+    """Least share that each plan leaves; negative beyond the limit; shape (plans,)."""
+    beyond: Array
+    """By how far each passes a position limit, less the tolerance, rad; 0 for none."""
+
+
+class PlanTorques:
+    """Computes braking plans and their torques by inverse dynamics, all at once.
+
+    Args:
+        model: the arm, n joints with one coordinate each.
+        limits: of the plans.
+        usable: torque that plans may use, shape (n,), N m.
+    """
+
+    def __init__(self, model: pin.Model, limits: PlanLimits, usable: Array) -> None:
+        self._pool = pin.ModelPool(model, 1)
+        self._limits, self._usable = limits, usable
+
+    def evaluate(self, q: Array, v: Array, periods: Array, extra: Array) -> BrakingPlans:
+        """Return the plans in which joints stand after `periods`.
+
+        Args:
+            q: positions, shape (n,), rad.
+            v: velocities, shape (n,), rad/s.
+            periods: shape (plans, n).
+            extra: torque that the motors give besides that of the model, shape (n,), N m.
+        """
+        q_min, q_max, tolerance, _, dt = self._limits
+        *states, beyond = sample(q, v, periods, q_min, q_max, tolerance, dt)
+        samples = Samples(*states)
+        n = q.size
+        tau = np.empty_like(samples.q)
+        # Pinocchio takes a column for each sample.
+        columns = [each.reshape(-1, n).T for each in (*samples[1:], tau)]
+        pin.rneaInParallel(1, self._pool, *columns)
+        tau += extra
+        loads = np.abs(tau) / self._usable
+        peaks = loads.max(axis=1)
+        slack = 1.0 - peaks.max(axis=1)
+        return BrakingPlans(periods, samples, tau, loads, peaks, slack, beyond)
+
+
+def torque_change(
+    clock: float, periods: Array, by_q: Array, by_v: Array, M: Array, dt: float
+) -> Array:
+    """Return how the torques at a sample change with the acceleration of this control step.
+
+    With the acceleration of the plan, the rest of the plan stays what it is. With another one the
+    arm is elsewhere after the step, and brakes from there in the periods that are left: the torques
+    at the time of the sample change by ``result @ (a - plan)``, to first order.
+
+    Args:
+        clock: of the sample, periods from the beginning of the step; at least 1 is assumed.
+        periods: of the plan from the state in which the step begins, shape (n,).
+        by_q: derivative of the torque by positions at the sample, shape (n, n).
+        by_v: by velocities, shape (n, n).
+        M: by accelerations, shape (n, n).
+        dt: control period, s.
+
+    Returns:
+        Shape (n, n), N m s^2/rad.
+    """
+    rest = np.maximum(periods - 1.0, 1.0)
+    left = 1.0 - np.minimum(max(clock - 1.0, 0.0), rest) / rest
+    q_a = 0.5 * dt * dt * (1.0 + rest * (1.0 - left * left))
+    a_a = np.where(left > 0.0, -1.0 / rest, 0.0)
+    change: Array = by_q * q_a + by_v * (dt * left) + M * a_a
+    return change
