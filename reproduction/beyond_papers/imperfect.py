@@ -136,27 +136,17 @@ CASES = {
     ),
     "outage_stop": Case("spoilt, all done; commands fail for up to 0.2 s; stop", 1, outages=True),
     "filter": Case("spoilt, all done; safety filter", 1, filtered=True),
-    "filter_rates": Case(
-        "spoilt, all done; safety filter, torque rates of its maker",
-        1,
-        # Of Franka's control interface, N m/s.
-        changed={"controller_node": {"torque_rate_max": [1000.0] * 7}},
-        filtered=True,
-    ),
     "filter_weak": Case(
         "spoilt, all done; safety filter, 60% of its torque", 1, filtered=True, torque=0.6
     ),
 }
-AT_LENGTH = ("all", "filter", "filter_rates", "filter_weak")
+AT_LENGTH = ("all", "filter", "filter_weak")
 """Cases that are played for longer."""
 NOT_PLAYED = {
     ("baxter_left_arm", "filter"),
-    ("baxter_left_arm", "filter_rates"),
     ("baxter_left_arm", "filter_weak"),
-    ("talos_left_arm", "filter_rates"),
 }
-"""Baxter has filter and rates in each case, and cannot hold itself with less torque; of TALOS'
-rates nothing is published."""
+"""Baxter has the filter in each case, and cannot hold itself with less torque."""
 IDEAL = ("ideal", "ideal_remedies")
 DOUBLED = (
     "encoder_resolution",

@@ -28,9 +28,7 @@ from direct import DirectLoop, column
 from figure import Figure, table, verdict
 from pieces import in_pieces
 
-from torque_safety_controller.controller import ControlOutput
-from viability_bounds_pkg.whole_arm.braking_plan import JointLimitsOfPlans
-from viability_bounds_pkg.whole_arm.plan_torques import PlanTorques
+from viability_bounds_pkg.whole_arm.braking_plan import PlanLimits, PlanTorques, braking_periods
 from viability_bounds_pkg.whole_arm.safety_filter import RESERVE
 
 POSTURE = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
@@ -56,8 +54,6 @@ DATA_SHEET = [15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0]
 """Panda's largest accelerations by its maker, rad/s^2."""
 SHORT = 4
 """Minutes of rows without the filter, at most."""
-TRIED = 10
-"""Minutes of rows with limits of rates, at most."""
 CLEAR = 0.005
 """Distance of goals from position limits, rad: the bounds' margins keep Baxter 4 mrad off them."""
 KEPT_FREE = 0.05
@@ -67,9 +63,6 @@ NEAR = {"posture": (0.01,), "pose": (0.01, 0.05)}
 AT = {"posture": (0.001,), "pose": (0.001, 0.005)}
 STILL, REST = 0.01, 0.3
 """Speed below which an arm is at rest, rad/s, and how long it is to be before the next goal, s."""
-JERK = 1.01
-"""Share of a jerk limit that is taken for kept: what the disturbance observer finds changes the
-commands as well."""
 SHOULDER, ELBOW = 1, 3
 
 
@@ -104,22 +97,6 @@ CASES: dict[str, Case] = {}
 for _arm, (_robot, _share) in ARMS.items():
     CASES[_arm] = Case(_robot, _share)
     CASES[f"{_arm}, without"] = Case(_robot, _share, WITHOUT)
-RATES: dict[str, dict[str, Any]] = {
-    # Of the Franka Control Interface, for torques and accelerations that are commanded.
-    "Panda, its rates": {
-        "torque_rate_max": [1000.0] * 7,
-        "jerk_max": [7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0],
-    },
-    "Panda, rates far below": {"torque_rate_max": [300.0] * 7, "jerk_max": [500.0] * 7},
-    # A tenth of the torque limits in a period, and jerks with which a joint needs up to 0.1 s.
-    "Baxter, with rates": {
-        "torque_rate_max": [500.0, 500.0, 500.0, 500.0, 150.0, 150.0, 150.0],
-        "jerk_max": [150.0] * 7,
-    },
-}
-"""Limits of the torques' rates, N m/s, and of jerks, rad/s^3."""
-for _arm, _rates in RATES.items():
-    CASES[_arm] = Case("panda" if "Panda" in _arm else "baxter_left_arm", 1.0, _rates)
 
 
 def make_loop(case: Case) -> DirectLoop:
@@ -169,44 +146,13 @@ class Errors:
         return np.linalg.norm(sample.error.reshape(2, 3), axis=1)
 
 
-class Changes:
-    """The largest changes of commands from step to step, as shares of their limits.
-
-    Attributes:
-        torque: of torques before they are clipped to their rates.
-        acceleration: of accelerations.
-    """
-
-    def __init__(self, loop: DirectLoop, rates: dict[str, Any]) -> None:
-        free = np.full(len(loop.limits), np.inf)
-        self._torque, self._acceleration = (
-            loop.dt * np.asarray(rates.get(name, free)) for name in ("torque_rate_max", "jerk_max")
-        )
-        self._last: tuple[np.ndarray, np.ndarray] | None = None
-        self.torque = self.acceleration = 0.0
-
-    def note(self, output: ControlOutput) -> None:
-        """Note a step."""
-        if self._last is not None:
-            tau, a = self._last
-            change = np.abs(output.tau - tau) / self._torque
-            self.torque = max(self.torque, float(change.max()))
-            change = np.abs(output.a - a) / self._acceleration
-            self.acceleration = max(self.acceleration, float(change.max()))
-        self._last = output.tau.copy(), output.a.copy()
-
-
-def arrive(
-    loop: DirectLoop, goals: str, goal: np.ndarray, limit: float, changes: Changes | None = None
-) -> tuple[float, float]:
+def arrive(loop: DirectLoop, goals: str, goal: np.ndarray, limit: float) -> tuple[float, float]:
     """Go to a goal; return when the arm was near and at it for good, s, NaN where it was not."""
     errors, steps = Errors(loop, goals, goal), round(limit / loop.dt)
     last = {"near": 0, "at": 0}  # steps in which it was not there
     resting = 0
     for k in range(steps):
-        output = loop.step()
-        if changes is not None:
-            changes.note(output)
+        loop.step()
         off = errors.now()
         for name, tolerance in (("near", NEAR[goals]), ("at", AT[goals])):
             if not (off <= tolerance).all():
@@ -228,20 +174,17 @@ def play(name: str, seed: int, limit: float, duration: float = 60.0) -> dict[str
     gains = {"posture": POSTURE, "pose": POSE}
     if case.robot == "talos_left_arm":
         gains = AGAINST_FRICTION
-    changes = Changes(loop, case.changed)
     times: dict[str, list[tuple[float, float]]] = {goals: [] for goals in gains}
     while loop.t < duration:
         for goals, own in gains.items():
             loop.change(**own)
             goal = random_goal(loop, rng, 0.5 if goals == "posture" else 0.0)
-            times[goals].append(arrive(loop, goals, goal, limit, changes))
+            times[goals].append(arrive(loop, goals, goal, limit))
     monitor, keeper = loop.robot.monitor, loop.controller.safety_filter
     return {
         "position": float(monitor.max_position_violation.max()),
         "speed": float(monitor.max_velocity_violation.max()),
         "torque": float(monitor.max_torque_ratio.max()),
-        "rate": changes.torque,
-        "jerk": changes.acceleration,
         "seconds": loop.t,
         "times": times,
         "outcomes": {} if keeper is None else dict(keeper.outcomes),
@@ -253,7 +196,7 @@ def compare(figure: Figure, minutes: int, limit: float, word: str) -> bool:
     kept = True
     names = [name for name in CASES if word in name]
     seeds = {
-        name: range(min(minutes, TRIED if name in RATES else minutes if case.filtered else SHORT))
+        name: range(minutes if case.filtered else min(minutes, SHORT))
         for name, case in CASES.items()
         if name in names
     }
@@ -269,9 +212,8 @@ def compare(figure: Figure, minutes: int, limit: float, word: str) -> bool:
 
 def add_row(figure: Figure, name: str, minutes: list[dict[str, Any]]) -> bool:
     """Add the row of a case; return whether the filter, if it is on, kept all limits."""
-    position, speed, torque, rate, jerk = (
-        max(minute[key] for minute in minutes)
-        for key in ("position", "speed", "torque", "rate", "jerk")
+    position, speed, torque = (
+        max(minute[key] for minute in minutes) for key in ("position", "speed", "torque")
     )
     times = {
         goals: np.array([each for minute in minutes for each in minute["times"][goals]])
@@ -280,8 +222,7 @@ def add_row(figure: Figure, name: str, minutes: list[dict[str, Any]]) -> bool:
     postures, poses = np.isfinite(times["posture"]), np.isfinite(times["pose"])
     median = float(np.nanmedian(times["posture"][:, 0]))
     outcomes: Counter[str] = sum((Counter(minute["outcomes"]) for minute in minutes), Counter())
-    fine = position == 0.0 and speed == 0.0 and max(torque, rate) <= 1.0 + 1e-9
-    fine = fine and jerk <= JERK
+    fine = position == 0.0 and speed == 0.0 and torque <= 1.0 + 1e-9
     filtered = CASES[name].filtered
     share = 1.0 - outcomes["as wanted"] / max(outcomes.total(), 1)
     figure.metrics |= {
@@ -301,7 +242,6 @@ def add_row(figure: Figure, name: str, minutes: list[dict[str, Any]]) -> bool:
             f"{position:.2g}",
             f"{speed:.2g}",
             f"{torque:.3f}",
-            f"{rate:.3f}, {jerk:.3f}" if name in RATES else "-",
             *(f"{near.sum()}, {at.sum()} of {near.size}" for near, at in (postures.T, poses.T)),
             f"{median:.2f} s",
             f"{share:.2%}" if filtered else "-",
@@ -337,12 +277,9 @@ def safe_set(axis: plt.Axes, elbow: float) -> None:
     loop = DirectLoop("baxter_left_arm")
     limits, n = loop.limits, len(loop.limits)
     braking = np.minimum(-limits.a_min, limits.a_max)
-    free = np.full(n, np.inf)
-    kept = JointLimitsOfPlans(
-        limits.q_min, limits.q_max, np.full(n, 1e-6), limits.v_max, braking, free
-    )
+    kept = PlanLimits(limits.q_min, limits.q_max, np.full(n, 1e-6), braking, loop.dt)
     tau_max = (1.0 - RESERVE) * loop.config.torque_max
-    plans = PlanTorques(loop.model, kept, tau_max, free, loop.dt)
+    torques, times = PlanTorques(loop.model, kept, tau_max), np.geomspace(loop.dt, 1.5, 12)
     places = np.linspace(limits.q_min[SHOULDER], limits.q_max[SHOULDER], 161)
     speeds = np.linspace(-limits.v_max[SHOULDER], limits.v_max[SHOULDER], 121)
     q, v, zero = np.zeros(n), np.zeros(n), np.zeros(n)
@@ -351,9 +288,8 @@ def safe_set(axis: plt.Axes, elbow: float) -> None:
     for k, place in enumerate(places):
         for i, speed in enumerate(speeds):
             q[SHOULDER], v[SHOULDER] = place, speed
-            for T in np.geomspace(loop.dt, 1.5, 12).tolist():
-                plans.plan(q, v, zero, T, free, zero)
-                safe[i, k] |= plans.slack >= 0.0 and plans.beyond <= 0.0
+            plans = torques.evaluate(q, v, braking_periods(q, v, times, *kept), zero)
+            safe[i, k] = ((plans.slack >= 0.0) & (plans.beyond <= 0.0)).any()
     axis.contourf(places, speeds, safe, levels=[0.5, 1.5], colors=["tab:green"], alpha=0.4)
     for sign, end in ((1.0, limits.q_max[SHOULDER]), (-1.0, limits.q_min[SHOULDER])):
         curve = np.sqrt(2.0 * braking[SHOULDER] * np.abs(end - places))
@@ -374,7 +310,7 @@ def main() -> int:
     given = parser.parse_args()
     figure = Figure("whole_arm")
     kept = compare(figure, given.minutes, given.limit, given.row)
-    heads = ("arm", "played", "position, rad", "speed, rad/s", "torque", "rate, jerk")
+    heads = ("arm", "played", "position, rad", "speed, rad/s", "torque")
     heads = (*heads, "postures: near, at", "poses: near, at", "median time", "steps changed", "")
     print("\n" + table([figure], heads))
     if given.row:

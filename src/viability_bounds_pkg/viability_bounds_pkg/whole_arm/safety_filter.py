@@ -189,9 +189,7 @@ class SafetyFilter:
         """Forget the plan in hand."""
         self._time, self._periods = USUAL_TIME, None
 
-    def prepare(
-        self, q: Array, v: Array, extra: Array, lower: Array, upper: Array
-    ) -> Rows | None:
+    def prepare(self, q: Array, v: Array, extra: Array, lower: Array, upper: Array) -> Rows | None:
         """Bring the plan to the present state; return the constraints on the step's accelerations.
 
         They are torque limits of the plan to first order, approached with `APPROACH_TIME`; None
@@ -220,9 +218,7 @@ class SafetyFilter:
         self.plan = plans.samples.a[chosen, FIRST]
         self.rest_torque = plans.tau[chosen, AT_REST]
         q_min, q_max, _, braking, dt = self._limits
-        self.lower, self.upper = narrow(
-            q, v, self.plan, lower, upper, q_min, q_max, braking, dt
-        )
+        self.lower, self.upper = narrow(q, v, self.plan, lower, upper, q_min, q_max, braking, dt)
         most = float((plans.peaks[chosen] * self._of_limit).max())
         self.lost = not most <= 1.0 + LOST
         return self._rows(plans, chosen) if most <= 1.0 else None
