@@ -53,7 +53,8 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
     NOT_NEEDED = frozenset({"velocity_max"})
 
     velocity_max: Array = joint_numbers(
-        "speed limits, rad/s, of driving and HOLD without bounds; those of the URDF if empty, or none",
+        "speed limits, rad/s, for driving, and HOLD without bounds; those of the URDF if empty, "
+        "or none",
         POSITIVE,
         default=(),
     )

@@ -62,13 +62,18 @@ def braking_periods(
 ) -> Array:
     """Return in how many periods each joint stands in the plans of given times.
 
-    A joint takes longer where it would have to brake harder than `braking`, and less where it would
-    pass a position limit. Arguments are those of `PlanLimits`, and:
+    A joint takes longer where it would have to brake harder than `braking`, and less where it
+    would pass a position limit.
 
     Args:
         q: positions, shape (n,), rad.
         v: velocities, shape (n,), rad/s.
         times: shape (plans,), s.
+        q_min: lowest positions at which joints are to stand, shape (n,), rad.
+        q_max: highest, shape (n,), rad.
+        tolerance: as in `PlanLimits`, shape (n,), rad.
+        braking: as in `PlanLimits`, shape (n,), rad/s^2.
+        dt: control period, s.
 
     Returns:
         Periods, at least 1, shape (plans, n).
@@ -110,7 +115,6 @@ def narrow(
         s (1 + ceil(s)) <= c = (2 r - v dt) / (A dt^2),
 
     so the largest s is ``min(h, c / (h + 1))``, h being the largest number with h^2 - 1 < c.
-    Arguments are those of `PlanLimits`, and:
 
     Args:
         q: positions, shape (n,), rad.
@@ -118,6 +122,10 @@ def narrow(
         plan: accelerations of the plan in hand, which are always allowed, shape (n,), rad/s^2.
         lower: bounds, shape (n,), rad/s^2.
         upper: shape (n,), rad/s^2.
+        q_min: lowest positions at which joints are to stand, shape (n,), rad.
+        q_max: highest, shape (n,), rad.
+        braking: as in `PlanLimits`, shape (n,), rad/s^2.
+        dt: control period, s.
 
     Returns:
         Lower and upper bounds, shape (n,), rad/s^2; where nothing within those given is possible,
@@ -173,12 +181,14 @@ def sample(
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return the states of plans, as in `Samples`, and by how far they pass position limits.
 
-    Arguments are those of `PlanLimits`, and:
-
     Args:
         q: positions at the beginning, shape (n,), rad.
         v: velocities, shape (n,), rad/s.
         periods: in which each joint stands, shape (plans, n).
+        q_min: lowest positions at which joints are to stand, shape (n,), rad.
+        q_max: highest, shape (n,), rad.
+        tolerance: as in `PlanLimits`, shape (n,), rad.
+        dt: control period, s.
 
     Returns:
         Samples; and the largest excess of a position beyond the tolerance, 0 for none, rad, shape
@@ -272,8 +282,8 @@ def torque_change(
     """Return how the torques at a sample change with the acceleration of this control step.
 
     With the acceleration of the plan, the rest of the plan stays what it is. With another one the
-    arm is elsewhere after the step, and brakes from there in the periods that are left: the torques
-    at the time of the sample change by ``result @ (a - plan)``, to first order.
+    arm is elsewhere after the step, and brakes from there in the periods that are left: the
+    torques at the time of the sample change by ``result @ (a - plan)``, to first order.
 
     Args:
         clock: of the sample, periods from the beginning of the step; at least 1 is assumed.

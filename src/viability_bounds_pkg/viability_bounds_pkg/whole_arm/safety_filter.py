@@ -123,8 +123,8 @@ class SafetyFilter:
 
     Attributes:
         plan: acceleration with which the plan in hand goes on, shape (n,), rad/s^2.
-        lower: bounds of what may be wanted, shape (n,), rad/s^2: those given to `prepare`, narrowed
-            to that from which each joint by itself has a plan.
+        lower: bounds of what may be wanted, shape (n,), rad/s^2: those given to `prepare`,
+            narrowed to that from which each joint by itself has a plan.
         upper: shape (n,), rad/s^2.
         usable: torque that plans may use, shape (n,), N m.
         slack: least share that this plan leaves of it; negative where it needs more.
@@ -283,7 +283,7 @@ class SafetyFilter:
         return plans, int(better)
 
     def _rows(self, plans: BrakingPlans, chosen: int) -> Rows | None:
-        """Return rows for the joints of large torque: at first, when it is largest, and at rest."""
+        """Return rows for joints of large torque: at first, when it is largest, and at rest."""
         loads, dt = plans.loads[chosen], self._dt
         # With fewer samples the largest torque would move to and fro between them.
         busiest = loads[FIRST + 1 :].argmax(axis=0) + FIRST + 1
