@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from viability_bounds_pkg.state import State
-from viability_bounds_pkg.state_estimation.observer import SLOWER, Observer, design_observer
+from viability_bounds_pkg.state_estimation.observer import SLACK, Observer, design_observer
 
 CASES = [
     # dt, largest error of position and acceleration
@@ -128,8 +128,8 @@ def test_no_other_gains_are_much_better(dt, delta, w):
         ]
     )
     ours = design.velocity_error[0]
-    assert ours <= 1.01 * SLOWER * same_poles
-    assert ours <= 1.15 * SLOWER * best
+    assert ours <= 1.01 * SLACK * same_poles
+    assert ours <= 1.15 * SLACK * best
 
 
 def test_larger_errors_of_the_position_make_slower_observers():

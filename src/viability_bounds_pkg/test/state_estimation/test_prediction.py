@@ -39,73 +39,73 @@ def some_torques(rng, state, count):
 def test_commands_are_those_that_act_between_the_state_and_its_answer():
     way = CommandsUnderWay(2)
     for stamp in range(1, 8):
-        way.open(stamp)
+        way.add_state(stamp)
         way.answer(stamp, np.full(2, float(stamp)))
-    way.open(8)
+    way.add_state(8)
     # State 8 is of the instant 8 - sensing; command 8 acts 2 periods later: 6 and 7 until then.
-    assert [command.tau[0] for command in way.acting()] == [5.0, 6.0, 7.0]
+    assert [tau[0] for tau in way.acting()] == [5.0, 6.0, 7.0]
 
 
 def test_without_delay_only_the_command_that_acted_last():
     way = CommandsUnderWay(0)
-    way.open(1)
+    way.add_state(1)
     way.answer(1, np.ones(2))
-    way.open(2)
-    (command,) = way.acting()
-    assert command.tau[0] == 1.0
+    way.add_state(2)
+    (tau,) = way.acting()
+    assert tau[0] == 1.0
 
 
 def test_a_command_that_never_came_holds_the_last():
     way = CommandsUnderWay(2)
     for stamp in (1, 2, 3, 4, 5):
-        way.open(stamp)
+        way.add_state(stamp)
         if stamp in (1, 4):
             way.answer(stamp, np.full(2, float(stamp)))
-    assert [command.tau[0] for command in way.acting()] == [1.0, 1.0, 4.0]
+    assert [tau[0] for tau in way.acting()] == [1.0, 1.0, 4.0]
     for stamp in (6, 7, 8):
         assert not way.silent
-        way.open(stamp)
+        way.add_state(stamp)
     assert way.silent
-    assert [command.tau[0] for command in way.acting()] == [4.0, 4.0, 4.0]
+    assert [tau[0] for tau in way.acting()] == [4.0, 4.0, 4.0]
 
 
 def test_of_several_commands_for_a_state_the_first_acts_and_those_for_no_state_do_not():
     way = CommandsUnderWay(1)
-    way.open(1)
+    way.add_state(1)
     way.answer(1, np.ones(2))
     way.answer(1, np.full(2, 7.0))
     way.answer(9, np.full(2, 8.0))
-    way.open(2)
+    way.add_state(2)
     way.answer(2, np.full(2, 2.0))
-    way.open(3)
-    assert [command.tau[0] for command in way.acting()] == [1.0, 2.0]
+    way.add_state(3)
+    assert [tau[0] for tau in way.acting()] == [1.0, 2.0]
 
 
 def test_lost_states_have_no_commands():
     way = CommandsUnderWay(2)
-    way.open(1)
+    way.add_state(1)
     way.answer(1, np.ones(2))
-    way.open(4, periods=3)
-    assert [command.tau[0] for command in way.acting()] == [1.0, 1.0, 1.0]
+    way.add_state(4, periods=3)
+    assert [tau[0] for tau in way.acting()] == [1.0, 1.0, 1.0]
     way.answer(4, np.full(2, 4.0))
-    way.open(5)
-    assert [command.tau[0] for command in way.acting()] == [1.0, 1.0, 4.0]
+    way.add_state(5)
+    assert [tau[0] for tau in way.acting()] == [1.0, 1.0, 4.0]
 
 
 def test_position_commands_have_no_torque():
     way = CommandsUnderWay(1)
     for stamp, tau in ((1, np.ones(2)), (2, None)):
-        way.open(stamp)
+        way.add_state(stamp)
         way.answer(stamp, tau)
-    way.open(3)
+    way.add_state(3)
     first, second = way.acting()
-    assert first.tau[0] == 1.0
-    assert second.tau is None
+    assert first[0] == 1.0
+    assert second is None
 
 
 def test_before_the_first_command_none_acts():
     way = CommandsUnderWay(1)
-    way.open(1)
+    way.add_state(1)
     assert way.acting() == [None, None]
 
 

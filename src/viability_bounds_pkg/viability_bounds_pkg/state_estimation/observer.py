@@ -31,14 +31,14 @@ from viability_bounds_pkg.state import State
 Array = NDArray[np.float64]
 
 LEAST_ACCELERATION_ERROR = 0.1
-"""What gains are chosen for at least, rad/s^2: with none, an error at the start would stay."""
+"""Least error that gains are chosen for, rad/s^2: with none, an error at the start would stay."""
 
 LEARNING = 0.2
-"""Of the gain that learns lasting disturbances: the slowest of three poles is fastest with it."""
+"""Part of the gain that learns lasting disturbances: makes the slowest of three poles fastest."""
 
-SLOWER = 1.15
-"""How much larger than the least the largest velocity error may be, for a slower observer: what a
-step of the encoder makes of the velocity is then less than half."""
+SLACK = 1.15
+"""How many times the least the largest velocity error may be, for a slower observer: a step of
+the encoder then changes the velocity by less than half as much."""
 
 _POLES = np.concatenate(([0.0], np.exp(-np.geomspace(7.0, 5e-3, 300))))
 """Poles to choose from: 2.5 % between two in frequency: costs less than 1e-4 of the error."""
@@ -73,12 +73,11 @@ class ObserverDesign:
 def design_observer(
     dt: float, position_error: ArrayLike, acceleration_error: ArrayLike
 ) -> ObserverDesign:
-    """Return the slowest observers whose largest error of the velocity is nearly the least.
+    """Return the slowest observers whose largest velocity error is within `SLACK` of the least.
 
-    It is at most `SLOWER` times as large. Where positions are exact, the poles are at zero: the
-    velocity is right after two periods. Gains are chosen for an error of the acceleration of at
-    least `LEAST_ACCELERATION_ERROR`; what is guaranteed is for the errors given, so that it is
-    zero where both are.
+    Where positions are exact, the poles are at zero: the velocity is right after two periods.
+    Gains are chosen for an error of the acceleration of at least `LEAST_ACCELERATION_ERROR`; the
+    guarantees are for the errors given.
 
     Args:
         dt: control period, s.
@@ -87,30 +86,28 @@ def design_observer(
             also within a period, shape (n,), rad/s^2.
     """
     delta, w = np.atleast_1d(*np.broadcast_arrays(position_error, acceleration_error))
-    table = _worst_cases()
-    from_position, from_acceleration = table.velocity
-    # In units of the period: the choice depends on the ratio of the two only.
+    gains = _error_gains()
+    # In units of the period: the choice depends on the ratio of both errors only.
     least = np.maximum(w, LEAST_ACCELERATION_ERROR) * dt**2
-    error = np.outer(delta, from_position) + np.outer(least, from_acceleration)
-    close = error <= SLOWER * error.min(axis=1, keepdims=True)
+    error = np.outer(delta, gains.velocity[:, 0]) + np.outer(least, gains.velocity[:, 1])
+    close = error <= SLACK * error.min(axis=1, keepdims=True)
     slowest = len(_POLES) - 1 - np.argmax(close[:, ::-1], axis=1)
     chosen = np.where(delta > 0.0, slowest, 0)
 
-    def worst(responses: _Norms) -> Array:
-        return (
-            responses.to_position[chosen] * delta + responses.to_acceleration[chosen] * w * dt**2
-        )
+    def worst(gain: Array) -> Array:
+        largest: Array = gain[chosen, 0] * delta + gain[chosen, 1] * w * dt**2
+        return largest
 
     p = _POLES[chosen]
     return ObserverDesign(
         position_gain=1.0 - p**2,
         velocity_gain=(1.0 - p) ** 2 / dt,
         learning_gain=LEARNING * (1.0 - p) ** 3 / dt**2,
-        position_error=worst(table.position),
-        velocity_error=worst(table.velocity) / dt,
-        innovation=worst(table.innovation),
+        position_error=worst(gains.position),
+        velocity_error=worst(gains.velocity) / dt,
+        innovation=worst(gains.innovation),
         lag=dt * (2.0 / (1.0 - p) - 1.5),
-        noise=table.noise[chosen] * delta / (np.sqrt(3.0) * dt),
+        noise=gains.noise[chosen] * delta / (np.sqrt(3.0) * dt),
     )
 
 
@@ -124,32 +121,22 @@ class Observer:
 
     Attributes:
         state: the estimate.
-        disturbance: c^, what was learned, shape (n,), rad/s^2.
+        disturbance: c^, the learned part, shape (n,), rad/s^2.
     """
 
     def __init__(self, design: ObserverDesign, dt: float, lasting: Array) -> None:
-        self._l1, self._l2, self._l3 = (
-            design.position_gain,
-            design.velocity_gain,
-            design.learning_gain,
-        )
-        self._dt, self._lasting = dt, lasting
+        self._design, self._dt, self._lasting = design, dt, lasting
         self._learns = bool(lasting.any())
         self.start(State(np.zeros_like(lasting), np.zeros_like(lasting)))
 
     def start(self, state: State, disturbance: Array | None = None) -> None:
-        """Start anew.
-
-        Args:
-            state: to start from.
-            disturbance: that is known, shape (n,), rad/s^2; as far as one may be learned.
-        """
+        """Restart from a state, with a known disturbance, shape (n,), rad/s^2, clipped to C."""
         self.state = state
-        disturbance = np.zeros_like(self._lasting) if disturbance is None else disturbance
-        self.disturbance = np.minimum(np.maximum(disturbance, -self._lasting), self._lasting)
+        known = np.zeros_like(self._lasting) if disturbance is None else disturbance
+        self.disturbance = self._clipped(known)
 
     def predict(self, a: Array) -> None:
-        """Go on by a period with mean acceleration `a` of the model, shape (n,), rad/s^2."""
+        """Advance by a period with mean acceleration `a` of the model, shape (n,), rad/s^2."""
         self.state = self.state.after(a + self.disturbance, self._dt)
 
     def innovation(self, q: Array) -> Array:
@@ -159,65 +146,62 @@ class Observer:
 
     def correct(self, innovation: Array) -> None:
         """Correct the estimate by what `innovation` returned."""
-        q, v = self.state
-        self.state = State(q + self._l1 * innovation, v + self._l2 * innovation)
+        (q, v), design = self.state, self._design
+        self.state = State(
+            q + design.position_gain * innovation, v + design.velocity_gain * innovation
+        )
         if self._learns:
-            learned = self.disturbance + self._l3 * innovation
-            self.disturbance = np.minimum(np.maximum(learned, -self._lasting), self._lasting)
+            learned = self.disturbance + design.learning_gain * innovation
+            self.disturbance = self._clipped(learned)
+
+    def _clipped(self, disturbance: Array) -> Array:
+        return np.minimum(np.maximum(disturbance, -self._lasting), self._lasting)
 
 
-class _Norms(NamedTuple):
-    """L1 norms of the responses to both errors for each of `_POLES`, with a period of 1."""
+class _ErrorGains(NamedTuple):
+    """Largest errors per error of the position and of the acceleration, period 1, for `_POLES`.
 
-    to_position: Array
-    to_acceleration: Array
+    Those are L1 norms of the responses, shape (poles, 2); `noise`, shape (poles,), is the L2 norm
+    of the response of the velocity to errors of the position.
+    """
 
-
-class _WorstCases(NamedTuple):
-    """Norms for each of `_POLES`; `noise` is the L2 norm from position errors to velocity."""
-
-    position: _Norms
-    velocity: _Norms
-    innovation: _Norms
+    position: Array
+    velocity: Array
+    innovation: Array
     noise: Array
 
 
 @cache
-def _worst_cases() -> _WorstCases:
-    """Return the norms, with a period of 1.
+def _error_gains() -> _ErrorGains:
+    rows = np.array([_norms(p) for p in _POLES])
+    return _ErrorGains(rows[:, 0:2], rows[:, 2:4], rows[:, 4:6], rows[:, 6])
+
+
+def _norms(p: float) -> tuple[float, ...]:
+    """Return the norms for one pole.
 
     The error e = (q - q^, v - v^) follows e+ = A e + B(s) d(s) - L n with A = (I - L C) F,
     B(s) = (I - L C) (1 - s, 1) for d at time s of the period. Powers of a 2 x 2 matrix with a
     double eigenvalue p are A^i = p^i I + i p^(i-1) (A - p I).
     """
-    rows = np.array([_norms(p) for p in _POLES])
-    position, velocity, innovation = (_Norms(*rows[:, i : i + 2].T) for i in (0, 2, 4))
-    return _WorstCases(position, velocity, innovation, rows[:, 6])
-
-
-def _norms(p: float) -> tuple[float, ...]:
     l1, l2 = 1.0 - p * p, (1.0 - p) ** 2
     corrected = np.array([[1.0 - l1, 0.0], [-l2, 1.0]])
     step = np.array([[1.0, 1.0], [0.0, 1.0]])
-    count = 2 if p == 0.0 else 3 + int(35.0 / -np.log(p))
-    i = np.arange(count)
-    power = p**i
+    i = np.arange(2 if p == 0.0 else 3 + int(35.0 / -np.log(p)))
     slope = i * p ** np.maximum(i - 1, 0)
     rest = corrected @ step - p * np.eye(2)
-    powers = power[:, None, None] * np.eye(2) + slope[:, None, None] * rest
+    powers = (p**i)[:, None, None] * np.eye(2) + slope[:, None, None] * rest
     from_noise = powers @ np.array([l1, l2])
     # The response to d(s) is linear in s: its values at both ends of the period.
     ends = powers @ corrected @ np.array([[1.0, 0.0], [1.0, 1.0]])
     before = step[0]  # position before the correction, of the error one period earlier
-    q, v = (_integral(ends[:, k]) for k in (0, 1))
-    innovation = _integral(before @ ends) + 0.5
     return (
         float(np.abs(from_noise[:, 0]).sum()),
-        q,
+        _integral(ends[:, 0]),
         float(np.abs(from_noise[:, 1]).sum()),
-        v,
+        _integral(ends[:, 1]),
         float(np.abs(from_noise @ before).sum()) + 1.0,
-        innovation,
+        _integral(before @ ends) + 0.5,
         float(np.sqrt((from_noise[:, 1] ** 2).sum())),
     )
 
@@ -226,6 +210,6 @@ def _integral(ends: Array) -> float:
     """Return the sum of integrals of |f| over periods, f linear with values `ends`, (count, 2)."""
     first, last = ends.T
     total = np.abs(first) + np.abs(last)
-    crossing = first * last < 0.0
     both = np.where(total > 0.0, total, 1.0)
-    return float(np.sum(np.where(crossing, (first**2 + last**2) / (2.0 * both), 0.5 * total)))
+    crosses = first * last < 0.0
+    return float(np.sum(np.where(crosses, (first**2 + last**2) / (2.0 * both), 0.5 * total)))

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The state in which a command will act: through the torques under way and the motors' lag."""
+"""What predicts a state: forward dynamics, the motors' lag, and the commands under way."""
 
 from __future__ import annotations
 
 from collections import deque
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
@@ -34,20 +34,18 @@ class ForwardModel:
         self.a = np.zeros(model.nv)
 
     def acceleration(self, state: State, tau: Array) -> Array:
-        """Return the mean acceleration of a period, shape (n,), rad/s^2.
+        """Return the mean acceleration of the period from `state` on, shape (n,), rad/s^2.
 
         Args:
-            state: at its beginning.
+            state: at the beginning of the period.
             tau: mean torque, shape (n,), N m.
         """
-        middle = state.after(self.a, self._half)
-        self.a = np.array(pin.aba(self._model, self._data, middle.q, middle.v, tau))
+        self.a = self.acceleration_at(state.after(self.a, self._half), tau)
         return self.a
 
     def acceleration_at(self, state: State, tau: Array) -> Array:
         """Return the acceleration at an instant, shape (n,), rad/s^2."""
-        a: Array = pin.aba(self._model, self._data, state.q, state.v, tau)
-        return a
+        return np.array(pin.aba(self._model, self._data, state.q, state.v, tau))
 
     def torque_at(self, state: State) -> Array:
         """Return the torque under which the joints do not accelerate, shape (n,), N m."""
@@ -91,76 +89,70 @@ class MotorLag:
         return State(state.q + self._lag * state.v, state.v + self._lag * a)
 
 
-class Command(NamedTuple):
-    """A command: torques, shape (n,), N m; None where the drives control positions."""
-
-    tau: Array | None
-
-
 class CommandsUnderWay:
     """The commands that have been sent but do not act yet, and the one that acted last.
 
-    Each joint state opens a slot for the command that answers it. A slot without an answer keeps
-    the command of the one before, as the robot does.
+    A state without an answer keeps the command of the one before, as the robot does.
 
     Args:
         delay: control periods from the instant of a state to that when its command begins to act.
     """
 
     def __init__(self, delay: int) -> None:
-        # That of the state that came last is not under way yet.
-        self._slots: deque[_Slot] = deque(maxlen=delay + 2)
+        # The last state's command is not under way yet.
+        self._answers: deque[_Answer] = deque(maxlen=delay + 2)
         self.clear()
 
     def clear(self) -> None:
         """Forget all commands."""
-        self._held: Command | None = None
-        self._slots.extend(_Slot(-1) for _ in range(self._slots.maxlen or 0))
+        self._held: Array | None = None
+        self._answers.extend(_Answer(-1) for _ in range(self._answers.maxlen or 0))
 
-    def open(self, stamp: int, periods: int = 1) -> None:
-        """Take note of a joint state.
+    def add_state(self, stamp: int, periods: int = 1) -> None:
+        """Add a state, which has no answer yet.
 
         Args:
-            stamp: its stamp, ns.
+            stamp: of the state, ns.
             periods: since the last one; those between were lost, and nothing answers them.
         """
         for each in (*[-1] * (periods - 1), stamp):
-            self._held = self._slots[0].command or self._held
-            self._slots.append(_Slot(each))
+            if self._answers[0].given:
+                self._held = self._answers[0].tau
+            self._answers.append(_Answer(each))
 
     def answer(self, stamp: int, tau: Array | None) -> None:
-        """Take note of a command; of several for one state the first counts, as at the robot.
+        """Add a command; of several for one state the first counts, as at the robot.
 
         Args:
             stamp: of the state that it answers, ns; others are ignored.
-            tau: as of `Command`.
+            tau: torques, shape (n,), N m; None where the drives control positions.
         """
-        for slot in self._slots:
-            if slot.stamp == stamp and slot.command is None:
-                slot.command = Command(tau)
+        for each in self._answers:
+            if each.stamp == stamp and not each.given:
+                each.given, each.tau = True, tau
 
-    def acting(self) -> list[Command | None]:
-        """Return what acted in the period before the last state, and what acts in the next ones.
+    def acting(self) -> list[Array | None]:
+        """Return the torques of the period before the last state, and of the next ones.
 
-        As many as the delay is long, and one; None where no command came yet: brakes may hold.
+        As many as the delay is long, and one; None where no torque is known: before the first
+        command, when brakes may hold, and where the drives control positions.
         """
-        held, commands = self._held, []
-        for slot in self._slots:
-            held = slot.command or held
-            commands.append(held)
-        return commands[:-1]
+        held, torques = self._held, []
+        for each in self._answers:
+            held = each.tau if each.given else held
+            torques.append(held)
+        return torques[:-1]
 
     @property
     def silent(self) -> bool:
         """Whether none of the states whose commands act now or later was answered."""
-        return all(slot.command is None for slot in self._slots)
+        return not any(each.given for each in self._answers)
 
 
-class _Slot:
-    """The command that answers one joint state."""
+@dataclass
+class _Answer:
+    """The command that answers a state with a stamp, in ns, if it was given."""
 
-    __slots__ = ("command", "stamp")
-
-    def __init__(self, stamp: int) -> None:
-        self.stamp = stamp
-        self.command: Command | None = None
+    stamp: int
+    given: bool = False
+    tau: Array | None = None
