@@ -258,7 +258,7 @@ def test_the_rate_of_torque_is_limited(ros):
     rate = np.full(ARM.n, 100.0)
     chain = NodeChain(ros, torque_rate_max=rate.tolist())
     tau = [
-        chain.answer(10 * k, q=Q + 0.05 * k, lower=a, upper=a)
+        chain.answer(10 * k, q=Q + 0.01 * k, lower=a, upper=a)
         for k, a in ((1, -UPPER), (2, UPPER), (3, -UPPER))
     ]
     change = np.abs(np.diff(tau, axis=0))
