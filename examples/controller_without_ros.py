@@ -16,7 +16,7 @@ from torque_safety_controller.controller import Controller, Gains
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.acceleration_limits import estimate_acceleration_limits
-from viability_bounds_pkg.estimation.discretisation_margin import discretisation_margin
+from viability_bounds_pkg.hold_error import discretisation_margin
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.torque_margin import tightened, torque_margins

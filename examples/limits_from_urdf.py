@@ -39,9 +39,9 @@ def main(uri: str = PANDA) -> int:
             break
         except EmptyIntervalError as error:
             print(error)
-            if error.suggestion.scale == 0.0:
+            if error.scale == 0.0:
                 return 1
-            v_max = 0.99 * error.velocity_max
+            v_max = 0.99 * error.scale * v_max
     for name, low, high, speed in zip(found.names, found.a_min, found.a_max, v_max, strict=True):
         print(f"{name}: {low:8.2f} to {high:7.2f} rad/s^2 at up to {speed:.2f} rad/s")
     rng, data, broken = np.random.default_rng(1), model.createData(), 0

@@ -11,38 +11,43 @@ with the smaller deceleration, and a torque that gives the larger one gives the 
 What is lost is speed near the position limits. `cap` does that, and is wise for light joints
 such as wrists, whose torque would allow hundreds of rad/s^2 that neither the gears nor the
 control period are made for: the zero-order hold error of the acceleration grows with it (see
-`discretisation_margin`).
+`hold_error`).
 
 Using larger ones (`overrides`) gives the guarantee up in the states where torque does not suffice.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from viability_bounds_pkg.estimation.state_space import Array, LimitEstimateError, StateSpace
-from viability_bounds_pkg.estimation.velocity_scale import (
-    USEFUL_ACCELERATION,
-    VelocityScale,
-    largest_velocity_scale,
-)
-from viability_bounds_pkg.estimation.worst_case_search import (
+from viability_bounds_pkg.worst_case import (
+    Array,
+    LimitEstimateError,
+    StateSpace,
     WorstCases,
     acceleration_room,
     search_by_sampling,
     search_refined,
+    torque_terms,
 )
 
-SEARCHES: dict[str, Callable[[pin.Model, StateSpace, int, int], Iterator[WorstCases]]] = {
+SEARCHES: dict[str, Callable[..., WorstCases]] = {
     "sampling": search_by_sampling,
     "refined": search_refined,
 }
 DEFAULT_SAMPLES = {"sampling": 1_000_000, "refined": 10_000}
+
+USEFUL_ACCELERATION = 1.0
+"""What a suggested velocity scale leaves each joint at least, either way, rad/s^2."""
+
+SCALE_SAMPLES = 10_000
+"""Random states to begin a velocity scale with, and evaluations of each refined search."""
 
 
 @dataclass(frozen=True)
@@ -67,66 +72,15 @@ class AccelerationLimits:
 class EmptyIntervalError(LimitEstimateError):
     """The torque limits leave a joint no acceleration interval in some state.
 
-    Args:
-        joint: index of the joint.
-        model: the robot.
-        space: what was searched.
-        worst: the outcome of the search.
-        suggestion: the velocity scale that gives every such joint an interval, or the posture
-            whose weight alone is too much.
-
     Attributes:
         joint: its name.
-        a_min: tightest lower limit found, rad/s^2; not negative, or `a_max` is not positive.
-        a_max: tightest upper limit found, rad/s^2.
-        q: the state that empties the interval, shape (n,), rad.
-        v: its velocity, shape (n,), rad/s.
-        torque_max: the torque available, N m.
-        suggestion: as given.
-        velocity_max: the velocity limits so scaled, shape (n,), rad/s.
+        scale: of the velocity limits with which every such joint has an interval; 0 where the
+            weight alone takes too much torque.
     """
 
-    def __init__(
-        self,
-        joint: int,
-        model: pin.Model,
-        space: StateSpace,
-        worst: WorstCases,
-        suggestion: VelocityScale,
-    ) -> None:
-        side = "a_max" if worst.a_max[joint] <= 0 else "a_min"
-        self.joint = model.names[1 + joint]
-        self.a_min, self.a_max = float(worst.a_min[joint]), float(worst.a_max[joint])
-        self.q: Array = getattr(worst, f"q_at_{side}")[joint]
-        self.v: Array = getattr(worst, f"v_at_{side}")[joint]
-        self.torque_max = float(space.tau_max[joint])
-        self.suggestion = suggestion
-        self.velocity_max = suggestion.scale * space.v_max
-        if suggestion.scale == 0.0:
-            remedy = (
-                f"lower velocities do not help: joint {suggestion.joint} takes "
-                f"{abs(suggestion.static_torque):.3g} N m just to hold still at "
-                f"q = {_text(suggestion.q)}, which leaves less than {USEFUL_ACCELERATION:g} "
-                "rad/s^2; narrow the position limits or override "
-            )
-        else:
-            remedy = (
-                f"velocity limits scaled by {suggestion.scale:.3f}, to "
-                f"{_text(self.velocity_max)} rad/s, leave every joint "
-                f"{USEFUL_ACCELERATION:g} rad/s^2 either way; else narrow the position limits or "
-                "override "
-            )
-        super().__init__(
-            f"joint {self.joint}: its torque of {self.torque_max:.4g} N m leaves no acceleration "
-            f"interval: {side} = {getattr(self, side):.3g} rad/s^2 at "
-            f"q = {_text(self.q)}, v = {_text(self.v)}; {remedy}the joint's acceleration limits "
-            f"(--override {self.joint}=MIN,MAX), or take those of most states, with the "
-            "controller's safety_filter (--share)"
-        )
-
-
-def _text(values: Array) -> str:
-    return "[" + ", ".join(f"{value:.3g}" for value in values) + "]"
+    def __init__(self, message: str, joint: str, scale: float) -> None:
+        self.joint, self.scale = joint, scale
+        super().__init__(message)
 
 
 def available_torque(tau_max: ArrayLike, torque_reserve: ArrayLike) -> Array:
@@ -192,7 +146,7 @@ def estimate_acceleration_limits(
         samples = DEFAULT_SAMPLES[method]
     space = StateSpace.of(model, q_min, q_max, v_max, available_torque(tau_max, torque_reserve))
     check_adjustments(model, overrides, cap)
-    *_, worst = SEARCHES[method](model, space, samples, seed)
+    worst = SEARCHES[method](model, space, samples, seed)
     return limits_from_worst_cases(model, space, worst, overrides, cap)
 
 
@@ -234,15 +188,136 @@ def limits_from_worst_cases(
     overrides = dict(overrides or {})
     names = tuple(model.names)[1:]
     for j, joint in enumerate(names):
-        if joint in overrides or worst.a_min[j] < 0 < worst.a_max[j]:
-            continue
-        suggestion = largest_velocity_scale(model, space, ignore=overrides)
-        raise EmptyIntervalError(j, model, space, worst, suggestion)
+        if joint not in overrides and not worst.a_min[j] < 0 < worst.a_max[j]:
+            raise _empty_interval(model, space, worst, j, overrides)
     bound = np.broadcast_to(np.inf if cap is None else np.asarray(cap, dtype=float), len(names))
     a_min, a_max = np.maximum(worst.a_min, -bound), np.minimum(worst.a_max, bound)
     for joint, (low, high) in overrides.items():
         a_min[names.index(joint)], a_max[names.index(joint)] = low, high
     return AccelerationLimits(names, a_min, a_max, worst, frozenset(overrides))
+
+
+def _empty_interval(
+    model: pin.Model, space: StateSpace, worst: WorstCases, j: int, overrides: Container[str]
+) -> EmptyIntervalError:
+    """Return the error for joint j: the state that leaves it no interval, and what would help."""
+    joint = model.names[1 + j]
+    side = 0 if worst.a_max[j] <= 0 else 1
+    suggestion = largest_velocity_scale(model, space, ignore=overrides)
+    if suggestion.scale == 0.0:
+        remedy = (
+            f"lower velocities do not help: joint {suggestion.joint} takes "
+            f"{abs(suggestion.static_torque):.3g} N m just to hold still at "
+            f"q = {_text(suggestion.q)}; narrow the position limits or override "
+        )
+    else:
+        remedy = (
+            f"velocity limits scaled by {suggestion.scale:.3f}, to "
+            f"{_text(suggestion.scale * space.v_max)} rad/s, leave every joint "
+            f"{USEFUL_ACCELERATION:g} rad/s^2 either way; else narrow the position limits or "
+            "override "
+        )
+    limit, value = (("a_max", worst.a_max[j]), ("a_min", worst.a_min[j]))[side]
+    message = (
+        f"joint {joint}: its torque of {space.tau_max[j]:.4g} N m leaves no acceleration "
+        f"interval: {limit} = {value:.3g} rad/s^2 at q = {_text(worst.q[side, j])}, "
+        f"v = {_text(worst.v[side, j])}; {remedy}the joint's acceleration limits (--override "
+        f"{joint}=MIN,MAX), or take those of most states, with the controller's safety_filter "
+        "(--share)"
+    )
+    return EmptyIntervalError(message, joint, suggestion.scale)
+
+
+def _text(values: Array) -> str:
+    return "[" + ", ".join(f"{value:.3g}" for value in values) + "]"
+
+
+class VelocityScale(NamedTuple):
+    """The largest common factor of the velocity limits that leaves every joint an interval.
+
+    Attributes:
+        scale: in [0, 1]; 0 when gravity alone takes too much torque.
+        joint: the joint that limits it; empty when the scale is 1, and the rest is NaN.
+        q: the state that limits it, shape (n,), rad.
+        v: its velocity, scaled, shape (n,), rad/s.
+        static_torque: the torque of that joint that holds the arm at rest in `q`, N m.
+    """
+
+    scale: float
+    joint: str
+    q: Array
+    v: Array
+    static_torque: float
+
+
+def largest_velocity_scale(
+    model: pin.Model,
+    space: StateSpace,
+    required: float = USEFUL_ACCELERATION,
+    *,
+    ignore: Container[str] = (),
+) -> VelocityScale:
+    """Return the largest factor of `space.v_max` that leaves every joint `required` either way.
+
+    No bisection is needed: at scale s, ``h = g(q) + s^2 c(q, v)``, so that each state allows an
+    explicit range of s^2. The least over random states is refined by exchange: a refined search
+    at that scale adds the worst states it finds, until it finds none that allows less.
+
+    Args:
+        model: the robot.
+        space: limits; velocities of the result are multiples of its `v_max`.
+        required: acceleration that each joint must be able to reach up and down, rad/s^2.
+        ignore: names of joints that need not (those overridden).
+
+    Raises:
+        LimitEstimateError: `required` is negative.
+    """
+    if not required >= 0:
+        raise LimitEstimateError(f"required must be at least zero, is {required}")
+    counted = np.array([name not in ignore for name in list(model.names)[1:]])
+    q, v = space.states(np.random.default_rng(0).random((SCALE_SAMPLES, 2 * space.n)))
+    nothing = np.full(space.n, np.nan)
+    found = VelocityScale(1.0, "", nothing, nothing, np.nan)
+    for attempt in range(20):
+        allowed = _scale_allowed(model, space, q, v, required, counted)
+        if allowed and allowed.scale < found.scale:
+            found = allowed
+        if found.scale == 0.0:
+            break
+        # Slightly below, or the states already known would be found once more.
+        scale = found.scale * (1.0 - 1e-4 if attempt else 1.0)
+        scaled = StateSpace(space.q_min, space.q_max, scale * space.v_max, space.tau_max)
+        worst = search_refined(model, scaled, SCALE_SAMPLES, attempt)
+        if not (worst.room[:, counted] < required).any():
+            return found._replace(scale=scale)
+        q = worst.q[:, counted].reshape(-1, space.n)
+        v = worst.v[:, counted].reshape(-1, space.n) / scale
+    return found
+
+
+def _scale_allowed(
+    model: pin.Model, space: StateSpace, q: Array, v: Array, required: float, counted: Array
+) -> VelocityScale | None:
+    """Return the least scale that one of the states, each of shape (batch, n), allows, below 1."""
+    data = model.createData()
+    h, inertia = torque_terms(model, data, q, v)
+    gravity, _ = torque_terms(model, data, q, np.zeros_like(v))
+    sign = np.array([1.0, -1.0])[:, None, None]
+    # Up and down: tau_max - sign (gravity + s^2 (h - gravity)) >= M required.
+    slack = space.tau_max - sign * gravity - inertia * required
+    growth = sign * (h - gravity)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        square = np.where(slack < 0, 0.0, np.where(growth > 0, slack / growth, np.inf))
+    square = np.where(counted, square, np.inf)
+    least = square.min()
+    if not least < 1.0:
+        return None
+    # Where several states allow nothing, name the one whose weight is the most beyond.
+    rank = np.where(square == least, slack / inertia, np.inf)
+    _, row, j = np.unravel_index(np.argmin(rank), rank.shape)
+    scale = float(np.sqrt(least))
+    joint = list(model.names)[1 + j]
+    return VelocityScale(scale, joint, q[row], scale * v[row], float(gravity[row, j]))
 
 
 def unavailable_share(

@@ -17,15 +17,14 @@ from numpy.typing import NDArray
 
 from torque_safety_controller.new_robot.chain import Chain, NewRobotError
 from viability_bounds_pkg.acceleration_limits import (
+    largest_velocity_scale,
     limits_from_worst_cases,
     limits_in_share,
     unavailable_share,
 )
 from viability_bounds_pkg.cli.limits_file import rounded
-from viability_bounds_pkg.estimation.discretisation_margin import discretisation_margin
-from viability_bounds_pkg.estimation.state_space import StateSpace
-from viability_bounds_pkg.estimation.velocity_scale import largest_velocity_scale
-from viability_bounds_pkg.estimation.worst_case_search import WorstCases, search_refined
+from viability_bounds_pkg.hold_error import discretisation_margin
+from viability_bounds_pkg.worst_case import StateSpace, WorstCases, search_refined
 
 Array = NDArray[np.float64]
 
@@ -170,7 +169,7 @@ def _space(chain: Chain, v_max: Array) -> StateSpace:
 
 
 def _search(model: pin.Model, space: StateSpace) -> WorstCases:
-    *_, worst = search_refined(model, space, SEARCH, 0)
+    worst = search_refined(model, space, SEARCH, 0)
     return worst
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from decimal import ROUND_DOWN, ROUND_UP
 from pathlib import Path
 
 import numpy as np
@@ -19,28 +20,27 @@ from viability_bounds_pkg.acceleration_limits import (
     DEFAULT_SAMPLES,
     SEARCHES,
     AccelerationLimits,
-    EmptyIntervalError,
     available_torque,
     check_adjustments,
     limits_from_worst_cases,
     limits_in_share,
     unavailable_share,
 )
-from viability_bounds_pkg.cli.command_line import INTERRUPTED, Parser, number, positive, run_tool
+from viability_bounds_pkg.cli.command_line import Parser, number, positive, run_tool
 from viability_bounds_pkg.cli.limits_file import (
+    CONTROLLER,
     Robot,
     check_writable,
+    overlay,
     read_robot,
+    rounded,
     write_whole,
 )
-from viability_bounds_pkg.cli.report import overlay_text, report_limits, report_search
-from viability_bounds_pkg.estimation.discretisation_margin import (
-    ZeroOrderHoldError,
-    discretisation_margin,
-)
-from viability_bounds_pkg.estimation.state_space import Array, LimitEstimateError, StateSpace
-from viability_bounds_pkg.estimation.worst_case_search import WorstCases
+from viability_bounds_pkg.hold_error import ZeroOrderHoldError, discretisation_margin
 from viability_bounds_pkg.user_input.parameter_files import ParameterFileError
+from viability_bounds_pkg.worst_case import Array, LimitEstimateError, StateSpace, WorstCases
+
+HISTORY_COLUMNS = 9
 
 
 def _count(text: str) -> int:
@@ -151,20 +151,17 @@ def _caps(options: argparse.Namespace, names: Sequence[str]) -> Array:
     return caps
 
 
-def _search(
-    robot: Robot, space: StateSpace, options: argparse.Namespace
-) -> tuple[WorstCases | None, bool]:
-    """Return what the search found, None if nothing, and whether it was interrupted."""
-    worst = None
-    try:
-        # With no terminal to draw on there is no bar.
-        with tqdm(total=options.samples, unit=" evaluations", disable=None) as bar:
-            search = SEARCHES[options.method]
-            for worst in search(robot.model, space, options.samples, options.seed):
-                bar.update(worst.evaluations - bar.n)
-    except KeyboardInterrupt:
-        return worst, True
-    return worst, False
+def _search(robot: Robot, space: StateSpace, options: argparse.Namespace) -> WorstCases:
+    # With no terminal to draw on there is no bar.
+    with tqdm(total=options.samples, unit=" evaluations", disable=None) as bar:
+        search = SEARCHES[options.method]
+        return search(
+            robot.model,
+            space,
+            options.samples,
+            options.seed,
+            lambda done: bar.update(done - bar.n),
+        )
 
 
 def _in_share(
@@ -175,29 +172,6 @@ def _in_share(
     found = (worst.a_min < 0.0) & (worst.a_max > 0.0)
     joints = zip(list(robot.model.names)[1:], found.tolist(), usual, strict=True)
     return {name: (-each, each) for name, any_state, each in joints if not any_state and each > 0}
-
-
-def _margin(
-    robot: Robot, space: StateSpace, limits: AccelerationLimits, options: argparse.Namespace
-) -> tuple[ZeroOrderHoldError | None, bool]:
-    """Return the margin, None if interrupted, and whether it was interrupted."""
-    try:
-        print("searching for the worst drift of a held torque ...", flush=True)
-        margin = discretisation_margin(
-            robot.model,
-            robot.q_min,
-            robot.q_max,
-            robot.v_max,
-            limits.a_min,
-            limits.a_max,
-            space.tau_max,
-            options.margin_dt,
-            seed=options.seed,
-        )
-    except KeyboardInterrupt:
-        print("interrupted: acceleration_drift is left out", file=sys.stderr)
-        return None, True
-    return margin, False
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -214,54 +188,114 @@ def _run(options: argparse.Namespace) -> int:
     check_adjustments(robot.model, overrides, caps)
     torque = available_torque(robot.tau_max, options.torque_reserve * robot.tau_max)
     space = StateSpace.of(robot.model, robot.q_min, robot.q_max, robot.v_max, torque)
-    worst, interrupted = _search(robot, space, options)
-    if worst is None:
-        raise KeyboardInterrupt
-    report_search(names, worst)
+    worst = _search(robot, space, options)
+    _report_search(names, worst)
     if options.share > 0.0:
         overrides = _in_share(robot, space, worst, options.share) | overrides
-    if interrupted:
-        print(
-            f"interrupted after {worst.evaluations} of {options.samples} evaluations: the limits "
-            "are those found so far, too large rather than too small",
-            file=sys.stderr,
-        )
-    try:
-        limits = limits_from_worst_cases(robot.model, space, worst, overrides, caps)
-    except EmptyIntervalError as error:
-        if not interrupted:
-            raise
-        print(error, file=sys.stderr)
-        return INTERRUPTED
-    margin = None
-    if options.margin_dt is not None and not interrupted:
-        margin, interrupted = _margin(robot, space, limits, options)
-    report_limits(limits, unavailable_share(robot.model, space, limits), margin)
-    text = overlay_text(limits, margin, _origin(options, worst, interrupted))
-    if options.output is None:
-        print("\n" + text, end="")
-    else:
-        try:
-            write_whole(options.output, text)
-        except OSError:
-            # The search may have taken long: what it found must not be lost.
-            print("\n" + text, end="", flush=True)
-            raise
-        print(f"\nwritten to {options.output}")
-    return INTERRUPTED if interrupted else 0
-
-
-def _origin(options: argparse.Namespace, worst: WorstCases, interrupted: bool) -> list[str]:
-    """Return the lines that say where the limits come from."""
-    lines = [
+    limits = limits_from_worst_cases(robot.model, space, worst, overrides, caps)
+    held = None
+    if options.margin_dt is not None:
+        print("searching for the worst drift of a held torque ...", flush=True)
+        box = robot.q_min, robot.q_max, robot.v_max, limits.a_min, limits.a_max, torque
+        held = discretisation_margin(robot.model, *box, options.margin_dt, seed=options.seed)
+    _report_limits(limits, unavailable_share(robot.model, space, limits), held)
+    origin = [
         "Limits written by estimate_acceleration_limits, to be passed as a parameter file after "
         f"{options.parameters.name}",
         f"method {options.method}, {worst.evaluations} evaluations, seed {options.seed}, "
         f"torque reserve {options.torque_reserve:g}",
     ]
-    if interrupted:
-        lines.append("INTERRUPTED: not all that was asked for was searched")
-    return lines
+    text = overlay_text(limits, held, origin)
+    if options.output is None:
+        print("\n" + text, end="")
+        return 0
+    try:
+        write_whole(options.output, text)
+    except OSError:
+        # The search may have taken long: what it found must not be lost.
+        print("\n" + text, end="", flush=True)
+        raise
+    print(f"\nwritten to {options.output}")
+    return 0
+
+
+def _report_search(names: Sequence[str], worst: WorstCases) -> None:
+    """Print the worst states of each joint and how the estimate came to be."""
+    count = len(worst.history)
+    picked = np.unique(np.linspace(0, count - 1, min(HISTORY_COLUMNS, count)).round().astype(int))
+    history = [worst.history[i] for i in picked]
+    for j, name in enumerate(names):
+        print(f"{name}: torque leaves [{worst.a_min[j]:.4g}, {worst.a_max[j]:.4g}] rad/s^2")
+        for side, limit in ((1, "a_min"), (0, "a_max")):
+            q, v = worst.q[side, j], worst.v[side, j]
+            print(f"  worst {limit} at q = {_vector(q)}, v = {_vector(v)}")
+        print("  after N " + "".join(f"{entry.evaluations:>10}" for entry in history))
+        for side in ("a_min", "a_max"):
+            row = "".join(f"{getattr(entry, side)[j]:>10.4g}" for entry in history)
+            print(f"  {side}   {row}")
+    print(f"{worst.evaluations} evaluations of the dynamics\n")
+
+
+def _report_limits(
+    limits: AccelerationLimits, unavailable: Array, held: ZeroOrderHoldError | None
+) -> None:
+    """Print the limits to use, where each comes from, and the zero-order hold error.
+
+    Args:
+        limits: what to use.
+        unavailable: share of states in which torque does not allow them, shape (n,).
+        held: the zero-order hold error, if that was searched.
+    """
+    found = limits.worst
+    for j, name in enumerate(limits.names):
+        low, high = limits.a_min[j], limits.a_max[j]
+        if name in limits.overridden:
+            origin = "override"
+            if found.a_min[j] > low or found.a_max[j] < high:
+                origin += f", NOT available in {100.0 * unavailable[j]:.2g} % of random states"
+        else:
+            origin = "found" if (low, high) == (found.a_min[j], found.a_max[j]) else "capped"
+        print(f"{name}: a in [{low:.4g}, {high:.4g}] rad/s^2 ({origin})")
+    if held is None:
+        return
+    print(f"\nwith the torque held for {held.dt:g} s, at most:")
+    for j, name in enumerate(limits.names):
+        print(
+            f"{name}: acceleration off by {held.acceleration[j]:.3g} rad/s^2, "
+            f"its mean by {held.mean_acceleration[j]:.3g}, "
+            f"position by {held.position[j]:.2g} rad"
+        )
+
+
+def _vector(values: Array) -> str:
+    return "[" + ", ".join(f"{value:.3f}" for value in values) + "]"
+
+
+def overlay_text(
+    limits: AccelerationLimits, held: ZeroOrderHoldError | None, origin: Sequence[str]
+) -> str:
+    """Return the parameter file with the limits, rounded to the safe side.
+
+    Args:
+        limits: what to write.
+        held: gives ``acceleration_drift``, rad/s^3, if there is one.
+        origin: lines of comment that say where the limits come from.
+    """
+    notes = [*origin, f"joints: {', '.join(limits.names)}; rad/s^2, drift in rad/s^3"]
+    if limits.overridden:
+        notes.append(f"set by hand: {', '.join(sorted(limits.overridden))}")
+    found = {
+        "acceleration_min": rounded(limits.a_min, ROUND_DOWN),
+        "acceleration_max": rounded(limits.a_max, ROUND_DOWN),
+    }
+    drift = {}
+    if held is not None:
+        notes.append(f"acceleration_drift with the torque held for {held.dt:g} s")
+        # The acceleration is right at the middle of the period: its error grows for half of it.
+        jerk = np.maximum(held.jerk, 2.0 * held.acceleration / held.dt)
+        drift["acceleration_drift"] = rounded(jerk, ROUND_UP)
+    # Not for all nodes at once: a file that names the node would win over that.
+    return overlay(found | drift, notes) + "\n" + overlay(found, [], CONTROLLER)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -14,11 +14,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
-from viability_bounds_pkg.estimation.state_space import Array
 from viability_bounds_pkg.robot_configuration import LimitedRobotConfiguration
 from viability_bounds_pkg.robot_description import build_model
 from viability_bounds_pkg.user_input.parameter_files import ParameterFileError, read_files
+
+Array = NDArray[np.float64]
 
 NODE = "/**/bounds_node"
 """The node whose parameters the limits are."""
