@@ -52,6 +52,7 @@ from torque_safety_controller.node.safety_stack import make_nodes
 from torque_safety_controller.node.streams.limits import LimitsReader
 from torque_safety_controller.qp import InverseDynamicsQP
 from torque_safety_controller.robot_model import RobotModel
+from viability_bounds_pkg.cli.command_line import Parser
 from viability_bounds_pkg.cli.scheduling import add_scheduling
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.node.estimator_node import EstimatorNode
@@ -286,7 +287,8 @@ def stages_of(
         "-p",
         "state_timeout:=10.0",
     ]
-    initialise(["bench_realtime", "--ros-args", *arguments, "--log-level", "error"])
+    parser = Parser(prog="bench_realtime")
+    initialise(parser, ["bench_realtime", "--ros-args", *arguments, "--log-level", "error"])
     watch.periods.clear()
     nodes: list[Node] = [BulletNode(direct_delivery=delivery), *make_nodes(delivery)]
     user = Node("user")

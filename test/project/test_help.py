@@ -72,5 +72,5 @@ def test_help_of_an_executable(name, capsys, monkeypatch):
 @pytest.mark.skipif(bool(importlib.util.find_spec("control_msgs")), reason="it is installed")
 def test_a_program_says_what_it_needs(capsys):
     assert EXECUTABLES["moveit_node"].load()() == 1
-    line = "moveit_node: needs 'control_msgs': apt install ros-jazzy-control-msgs\n"
+    line = "moveit_node: no Python module 'control_msgs': apt install ros-jazzy-control-msgs\n"
     assert capsys.readouterr().err == line

@@ -222,7 +222,7 @@ def group(kind: type, prefix: str = "") -> Any:
 
 
 @cache
-def parameter_table(kind: type, prefix: str = "") -> tuple[Parameter, ...]:
+def parameter_table(kind: Any, prefix: str = "") -> tuple[Parameter, ...]:
     """Return the parameters that a dataclass and its groups declare, in their order.
 
     Args:

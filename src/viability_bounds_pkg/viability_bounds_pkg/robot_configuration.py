@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, ClassVar
@@ -191,18 +191,35 @@ def urdf_limits(source: str, joints: tuple[str, ...]) -> Mapping[str, Mapping[st
         SettingError: there is no such URDF.
     """
     try:
-        root = ElementTree.fromstring(read_urdf(source))
+        elements = urdf_joints(read_urdf(source), joints)
     except RobotDescriptionError as error:
         raise SettingError("robot_description", source, f"a URDF ({error})") from error
-    elements = {each.get("name", ""): each for each in root.findall("joint")}
-    if unknown := [name for name in joints if name not in elements]:
-        movable = [name for name, each in elements.items() if each.get("type") != "fixed"]
-        hint = did_you_mean(unknown[0], movable) or f": {', '.join(movable)}"
-        raise SettingError("joints", unknown[0], f"joints of the URDF{hint}")
     return {
         name: {joint: _limit(elements[joint], key) for joint in joints}
         for name, key in LIMITS_OF_URDF.items()
     }
+
+
+def urdf_joints(urdf: str, joints: Sequence[str]) -> dict[str, ElementTree.Element]:
+    """Return the elements of a URDF's joints by name.
+
+    Args:
+        urdf: its text.
+        joints: names that it must have.
+
+    Raises:
+        SettingError: a joint that the URDF does not have.
+    """
+    # Those of transmissions have the same names, and nothing to compare with.
+    elements = {
+        each.get("name", ""): each for each in ElementTree.fromstring(urdf).findall("joint")
+    }
+    for name in joints:
+        if name not in elements:
+            movable = [each for each, e in elements.items() if e.get("type") != "fixed"]
+            hint = did_you_mean(name, movable) or f": {', '.join(movable)}"
+            raise SettingError("joints", name, f"joints of the URDF{hint}")
+    return elements
 
 
 def _limit(joint: ElementTree.Element, key: str) -> float | None:

@@ -44,7 +44,6 @@ from viability_bounds_pkg.ros.program import (
     initialise,
     leave,
     node_parser,
-    own_arguments,
     report_refusal,
 )
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
@@ -320,8 +319,7 @@ def main(args: list[str] | None = None) -> int:
             parser.add_argument(
                 "--record", type=Path, metavar="FILE", help="all messages, as MCAP"
             )
-            options = parser.parse_args(own_arguments(args))
-            initialise(args)
+            options = initialise(parser, args)
             # An exception in a callback is more than the executor reports in one line.
             signals: list[int] = []
             for each in (signal.SIGINT, signal.SIGTERM):

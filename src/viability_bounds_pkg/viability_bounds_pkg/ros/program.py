@@ -61,10 +61,38 @@ def spin(executor: Executor, node: Node) -> None:
         executor.spin_until_future_complete(told, timeout_sec=_SIGNAL_CHECK_PERIOD)
 
 
-def own_arguments(args: Sequence[str] | None) -> list[str]:
-    """Return those arguments, of the process if None, that are not for ROS.
+def node_parser(kind: type[ArmNode]) -> Parser:
+    """Return the parser of a node's own arguments, whose help lists its parameters."""
+    lines = (
+        f"  {row.name}: {row.description}" + (f" [{row.constraints}]" if row.constraints else "")
+        for row in parameter_table(kind.PARAMETERS)
+    )
+    return _parser(kind.NAME, kind.__doc__, "\n".join(("parameters:", *lines)))
 
-    The first is the program's name, as in `sys.argv`.
+
+def stack_parser(name: str, description: str, kinds: Sequence[type[ArmNode]]) -> Parser:
+    """Return the parser of a program's own arguments that runs nodes of several kinds."""
+    names = ", ".join(kind.NAME for kind in kinds)
+    return _parser(name, description, f"nodes, whose --help lists their parameters: {names}")
+
+
+def _parser(name: str, description: str | None, epilog: str) -> Parser:
+    return Parser(
+        prog=name,
+        description=(description or "").strip().split("\n")[0],
+        usage="%(prog)s [options] [--ros-args [--params-file FILE] [-p [NODE:]NAME:=VALUE] "
+        "[-r [NODE:]FROM:=TO] [--log-level LEVEL]]",
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def initialise(parser: Parser, args: Sequence[str] | None = None) -> argparse.Namespace:
+    """Initialise rclpy with a command line; return what its other arguments say.
+
+    Args:
+        parser: of the arguments that are not for ROS.
+        args: the command line, as `sys.argv`; None for that of the process.
 
     Raises:
         ArmSafetyError: arguments for ROS, or a parameter file, that cannot be used.
@@ -73,57 +101,15 @@ def own_arguments(args: Sequence[str] | None) -> list[str]:
     for word, path in pairwise(arguments):
         if word == "--params-file":
             read_sections(path)  # rcl's own errors do not tell the line
-    try:
-        own: list[str] = rclpy.utilities.remove_ros_args(args=arguments)
-    except Exception as error:  # rclpy's own classes differ between releases
-        raise StartError(f"arguments for ROS cannot be used: {error}") from error
-    return own[1:]
-
-
-def node_parser(kind: type[ArmNode]) -> Parser:
-    """Return the parser of a node's own arguments, whose help lists its parameters."""
-    rows = parameter_table(kind.PARAMETERS)
-    table = "\n".join(
-        f"  {row.name}: {row.description}" + (f" [{row.constraints}]" if row.constraints else "")
-        for row in rows
-    )
-    return Parser(
-        prog=kind.NAME,
-        description=(kind.__doc__ or "").strip().split("\n")[0],
-        usage="%(prog)s [options] [--ros-args [--params-file FILE] [-p NAME:=VALUE] [-r FROM:=TO] "
-        "[--log-level LEVEL]]",
-        epilog=f"parameters:\n{table}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-
-
-def initialise(args: Sequence[str] | None) -> None:
-    """Initialise rclpy with the arguments given, of the process if None.
-
-    Raises:
-        StartError: arguments for ROS, or the environment, are not what rcl can use.
-    """
-    arguments = list(sys.argv if args is None else args)
     settle_dds(os.environ)
     try:
+        options = parser.parse_args(rclpy.utilities.remove_ros_args(args=arguments)[1:])
         # Its own signal handlers would shut down the context in the middle of a callback.
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-        note_arguments(rclpy.get_default_context(), arguments)
-    except Exception as error:
+    except Exception as error:  # rclpy's own classes differ between releases
         raise StartError(f"arguments for ROS cannot be used: {error}") from error
-
-
-def stack_parser(name: str, description: str, kinds: Sequence[type[ArmNode]]) -> Parser:
-    """Return the parser of a program's own arguments that runs nodes of several kinds."""
-    names = ", ".join(kind.NAME for kind in kinds)
-    return Parser(
-        prog=name,
-        description=description,
-        usage="%(prog)s [options] [--ros-args [--params-file FILE] [-p [NODE:]NAME:=VALUE] "
-        "[-r [NODE:]FROM:=TO] [--log-level LEVEL]]",
-        epilog=f"Nodes: {names}. Each has its own name, topics and parameters, as if it ran "
-        "alone; --help of each lists them.",
-    )
+    note_arguments(rclpy.get_default_context(), arguments)
+    return options
 
 
 def run(make_node: type[ArmNode], args: list[str] | None = None) -> int:
@@ -149,8 +135,7 @@ def run_together(
     """
     try:
         add_scheduling(parser)
-        options = parser.parse_args(own_arguments(args))
-        initialise(args)
+        options = initialise(parser, args)
     except ArmSafetyError as error:
         report_refusal(error)
         return 1

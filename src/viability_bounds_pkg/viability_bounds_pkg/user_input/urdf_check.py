@@ -7,8 +7,8 @@ import math
 from collections.abc import Iterator
 from xml.etree import ElementTree
 
-from viability_bounds_pkg.exceptions import SettingError, did_you_mean
-from viability_bounds_pkg.robot_configuration import RobotConfiguration
+from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.robot_configuration import RobotConfiguration, urdf_joints
 
 _TURNS_MAX = 2.0
 """Turns of a joint with limits from which on its angles are surely degrees."""
@@ -29,20 +29,12 @@ def check_with_urdf(config: RobotConfiguration, urdf: str) -> list[str]:
     Raises:
         SettingError: a joint that the URDF does not have, or angles that must be degrees.
     """
-    # Those of transmissions have the same names, and nothing to compare with.
-    joints = ElementTree.fromstring(urdf).findall("joint")
-    elements = {each.get("name", ""): each for each in joints}
-    for name in config.joints:
-        if name not in elements:
-            movable = [k for k, each in elements.items() if each.get("type") != "fixed"]
-            allowed = (
-                f"joints of the URDF{did_you_mean(name, movable) or ': ' + ', '.join(movable)}"
-            )
-            raise SettingError("joints", name, allowed)
-    lines: list[str] = []
-    for index, name in enumerate(config.joints):
-        lines += _unusual(config, index, elements[name])
-    return lines
+    elements = urdf_joints(urdf, config.joints)
+    return [
+        line
+        for index, name in enumerate(config.joints)
+        for line in _unusual(config, index, elements[name])
+    ]
 
 
 def _unusual(config: RobotConfiguration, index: int, joint: ElementTree.Element) -> Iterator[str]:

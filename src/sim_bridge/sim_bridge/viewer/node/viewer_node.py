@@ -40,7 +40,6 @@ from viability_bounds_pkg.ros.program import (
     initialise,
     leave,
     node_parser,
-    own_arguments,
     report_refusal,
 )
 from viability_bounds_pkg.ros.robot_urdf import robot_urdf
@@ -269,8 +268,7 @@ def main(args: list[str] | None = None) -> int:
     """Serve the page until SIGINT or SIGTERM comes; return the exit code."""
     node = None
     try:
-        node_parser(ViewerNode).parse_args(own_arguments(args))
-        initialise(args)
+        initialise(node_parser(ViewerNode), args)
         signals: list[int] = []
         for each in (signal.SIGINT, signal.SIGTERM):
             signal.signal(each, lambda number, _: signals.append(number))
