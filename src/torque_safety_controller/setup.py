@@ -37,6 +37,7 @@ setup(
     entry_points={
         "console_scripts": [
             "controller_node = torque_safety_controller.cli.ros_program:controller_node",
+            "fit_capsules = torque_safety_controller.cli.ros_program:fit_capsules",
             "gain_limits = torque_safety_controller.cli.ros_program:gain_limits",
             "identify_friction = torque_safety_controller.cli.ros_program:identify_friction",
             "moveit_node = torque_safety_controller.cli.ros_program:moveit_node",

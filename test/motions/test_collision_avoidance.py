@@ -11,6 +11,7 @@ from direct import DirectLoop, column
 from sim_bridge.scenario.events import AddObstacle, PoseGoal
 from sim_bridge.scenario.scenario import load_scenario
 from torque_safety_controller.qp import AccelerationRange
+from torque_safety_controller.supervisor import REST
 from viability_bounds_pkg.robot_description import load_geometry, read_urdf
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import config_folder
@@ -193,8 +194,8 @@ def test_every_way_to_solve_has_the_rows_and_none_has_a_nan():
     assert len(lower) > 0
     assert (G @ (-controller.gains.hold_kd * v) < lower).any(), "damping alone would do"
     controller.reset(q)
-    for solve in (controller.brake, controller.step):
-        step = solve(State(q, v), AccelerationRange(-wide, wide))
+    for order in (REST, None):
+        step = controller.step(State(q, v), AccelerationRange(-wide, wide), order)
         assert not step.failure
         assert (G @ step.a >= lower - 1e-6).all()
     step = controller.bumpless_transfer(State(q, v), AccelerationRange(-wide, wide), np.zeros(7))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Collision avoidance as constraints on joint accelerations: distances that can always be kept.
+"""Collision avoidance: constraints on joint accelerations that keep distances for ever.
 
 `docs/collision_avoidance.md` derives the rows, and says what they promise and what not.
 """
@@ -8,23 +8,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from torque_safety_controller.collision.model import CollisionModel
-from torque_safety_controller.collision.motion import Kinematics
-from torque_safety_controller.collision.rows import (
-    RESERVE,
-    CollisionRows,
-    Workspace,
-    collision_rows,
+from torque_safety_controller.collision.distances import (
+    Features,
+    find_features,
+    move_segments,
 )
+from torque_safety_controller.collision.model import CollisionModel
+from torque_safety_controller.collision.rows import BRAKING, RESERVE, SPEED_MAX, write_rows
 from torque_safety_controller.qp import AccelerationRange, LinearConstraints
 from torque_safety_controller.robot_model import RobotModel
-from viability_bounds_pkg.compiled import bound
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.kernel import make_table
 from viability_bounds_pkg.parameter import Range, check, number
 
 Array = NDArray[np.float64]
@@ -34,22 +33,18 @@ ROW_SCALE = 0.01
 distance gives way at a ten thousandth of what joints cost, so that the joints keep theirs."""
 
 INFLUENCE = 0.08
-"""Distance beyond the margin at which pairs are looked at that do not approach fast, m."""
+"""Distance beyond the margin within which pairs matter that do not approach fast, m."""
 
 ROWS_MAX = 40
 """Rows that a step returns at most; of more, those of the least distances. Only arms deep in
 obstacles have more, and a QP needs an end."""
 
-SPEED_MAX = 1.0
-"""Largest speed of approach, m/s."""
-
-# Of a virtual joint whose braking is 1: more than anything has.
-_FAST, _HARD = 1e6, 1e12
+_UNBOUNDED = 1e6  # rad/s^2; more than anything has
 
 
 @dataclass(frozen=True)
 class CollisionSettings:
-    """What distances are kept, and how.
+    """What distances are kept.
 
     Raises:
         SettingError: a value is out of range; named as the node's parameters.
@@ -68,6 +63,30 @@ class CollisionSettings:
         return self.margin + RESERVE
 
 
+class CollisionRows(NamedTuple):
+    """Rows ``G a >= lower``.
+
+    Attributes:
+        G: shape (k, n), m/rad.
+        lower: shape (k,), m/s^2; never more than some `a` within the bounds reaches.
+        pair: index of the pair that a row belongs to, shape (k,), int.
+        distance: shape (k,), m; negative where bodies overlap.
+        rate: rate of change of the distance, shape (k,), m/s.
+        bias: its acceleration at zero joint acceleration, shape (k,), m/s^2, so that its
+            acceleration is ``G a + bias``.
+        viable: shape (k,), bool; False where the margin is broken, or more braking is needed to
+            keep it than is counted on or than the bounds allow.
+    """
+
+    G: Array
+    lower: Array
+    pair: NDArray[np.int64]
+    distance: Array
+    rate: Array
+    bias: Array
+    viable: NDArray[np.bool_]
+
+
 class CollisionAvoidance:
     """Rows that keep the pairs of a collision model apart.
 
@@ -77,11 +96,13 @@ class CollisionAvoidance:
         a_max: shape (n,), rad/s^2, positive.
         dt: how long an acceleration is held, s; more than the control period gives gentler
             rows, as with the joints' bounds.
-        settings: distances and speeds.
+        settings: distances.
 
     Attributes:
         model, settings: as given.
-        count: how many rows the last step had, before those beyond `ROWS_MAX` were dropped.
+        influence, speed_max, rows_max: `INFLUENCE` and the margin, `SPEED_MAX`, `ROWS_MAX`.
+        count: how many rows the last step had, before those beyond `rows_max` were dropped.
+        distances: of all pairs in the last step, shape (p,), m; inf where one is far.
 
     Raises:
         SettingError: limits of the wrong size or sign, or a step that is not positive.
@@ -103,50 +124,36 @@ class CollisionAvoidance:
                 raise SettingError(f"acceleration_{name}", limit, f"{n} finite {kind} numbers")
         if not 0.0 < dt < math.inf:
             raise SettingError("dt", dt, "a finite number > 0")
-        self.model = model
+        self.model, self.dt = model, float(dt)
         self.settings = settings = settings or CollisionSettings()
-        self.count = 0
-        self._rows_max = ROWS_MAX
-        self._kinematics = Kinematics(model.arm, len(model.bodies.joint))
-        parts, pairs = np.diff(model.bodies.first), model.pairs
-        most = int((parts[pairs.first] + parts[pairs.second]).sum())
-        self._no_limit = np.full(most, np.inf)
-        v, a_lower, a_upper, disturbance = np.zeros((4, n))
-        # Of a joint with a lower limit of 0 and none above, whose braking is 1.
-        table = make_table(
-            dt=dt, position=[math.inf, 0.0], braking=1.0, v_max=_FAST, low=-_HARD, high=_HARD
+        self.influence, self.speed_max = settings.margin + INFLUENCE, SPEED_MAX
+        self.rows_max, self.count = ROWS_MAX, 0
+        self.distances = np.full(len(model.names), np.inf)
+        self._data = data = model.arm.createData()
+        joints = model.arm.njoints
+        self._parent = np.array(list(model.arm.parents), dtype=np.int64)
+        self._J, self._dJ = data.J.T, data.dJ.T  # views of Pinocchio's memory, like those below
+        self._placements = np.zeros((joints, 4, 3))
+        # To read each placement anew takes ten times as long.
+        self._views = [
+            view
+            for placement in data.oMi
+            for view in (placement.rotation, placement.translation[None])
+        ]
+        self._twists = np.zeros((joints, 2, 6))
+        self._points = np.zeros((len(model.segments.joint), 2, 3, 3))
+        self._limits = np.zeros((4, n))
+        self._limits[0] = np.minimum(-lower, upper)
+        most = len(model.candidates.bodies)
+        # A row more than there are distances: what is not kept is written, too.
+        self._features = Features(
+            pair=np.zeros(most + 1, dtype=np.int64),
+            line=np.zeros((most + 1, 6)),
+            motion=np.zeros((most + 1, 3)),
         )
-        self._use(
-            Workspace(
-                model.bodies,
-                pairs,
-                self._kinematics.motion,
-                kept=settings.kept,
-                speed_max=SPEED_MAX,
-                influence=settings.margin + INFLUENCE,
-                dt=float(dt),
-                table=table,
-                braking=np.minimum(-lower, upper),
-                v=v,
-                a_lower=a_lower,
-                a_upper=a_upper,
-                disturbance=disturbance,
-                rows=CollisionRows(
-                    G=np.zeros((most + 1, n)),
-                    lower=np.zeros(most),
-                    pair=np.zeros(most, dtype=np.int64),
-                    distance=np.zeros(most),
-                    rate=np.zeros(most),
-                    bias=np.zeros(most),
-                    viable=np.zeros(most, dtype=bool),
-                ),
-                distances=np.full(len(model.names), np.inf),
-                seen=np.zeros((16, 2, 3)),
-            )
-        )
-
-    def _use(self, work: Workspace) -> None:
-        self._work, self._find_rows = work, bound(collision_rows, work)
+        self._G, self._lower = np.zeros((most + 1, n)), np.zeros(most + 1)
+        self._source = np.zeros(most + 1, dtype=np.int64)
+        self._viable = np.zeros(most + 1, dtype=bool)
 
     def rows(
         self,
@@ -156,7 +163,7 @@ class CollisionAvoidance:
         a_upper: Array,
         disturbance: Array | None = None,
     ) -> CollisionRows:
-        """Return the rows of one step, overwritten by the next; those that bounds imply are not.
+        """Return the rows of one step; those that bounds imply are not.
 
         Args:
             q: shape (n,), rad.
@@ -168,16 +175,40 @@ class CollisionAvoidance:
 
         Values that are not finite are the caller's to refuse.
         """
-        work = self._work
-        self._kinematics.update(q, v)
-        work.v[:], work.a_lower[:], work.a_upper[:] = v, a_lower, a_upper
-        work.disturbance[:] = 0.0 if disturbance is None else disturbance
-        self.count = k = self._find_rows()
-        chosen: slice | NDArray[np.int64] = slice(k)
-        if k > self._rows_max:
-            nearest = np.argpartition(work.rows.distance[:k], self._rows_max)
-            chosen = np.sort(nearest[: self._rows_max])
-        return CollisionRows._make([array[chosen] for array in work.rows])
+        segments, features, kept, dt = (
+            self.model.segments,
+            self._features,
+            self.settings.kept,
+            self.dt,
+        )
+        pin.computeJointJacobiansTimeVariation(self.model.arm, self._data, q, v)
+        np.concatenate(self._views, out=self._placements.reshape(-1, 3))
+        move_segments(
+            v, self._parent, self._placements, self._J, self._dJ, segments.joint, segments.ends,
+            self._twists, self._points,
+        )  # fmt: skip
+        count = find_features(
+            segments.radius, segments.boxes, *self.model.candidates, self._points, self.influence,
+            kept, dt, BRAKING, self.distances, *features,
+        )  # fmt: skip
+        self._limits[1], self._limits[2] = a_lower, a_upper
+        self._limits[3] = 0.0 if disturbance is None else disturbance
+        self.count = k = write_rows(
+            count, *features, self.model.moves, self._J, self._limits, kept, dt, self.speed_max,
+            self._G, self._lower, self._source, self._viable,
+        )  # fmt: skip
+        chosen = np.arange(k)
+        if k > self.rows_max:
+            gaps = features.motion[self._source[:k], 0]
+            chosen = np.sort(np.argpartition(gaps, self.rows_max)[: self.rows_max])
+        source = self._source[chosen]
+        return CollisionRows(
+            self._G[chosen],
+            self._lower[chosen],
+            features.pair[source],
+            *features.motion[source].T,
+            self._viable[chosen],
+        )
 
     def constraint(
         self, robot: RobotModel, bounds: AccelerationRange, disturbance: Array | None = None
@@ -193,27 +224,18 @@ class CollisionAvoidance:
             None in a state that is not finite, which the QP refuses.
         """
         q, v = robot.q, robot.v
-        a_lower, a_upper = bounds
         if not math.isfinite(q.dot(q) + v.dot(v)):
             return None
         # Infinite, or for the QP to refuse.
-        if not math.isfinite(a_lower.dot(a_lower) + a_upper.dot(a_upper)):
-            a_lower, a_upper = (
-                np.nan_to_num(limit, posinf=_FAST, neginf=-_FAST) for limit in (a_lower, a_upper)
-            )
-        rows = self.rows(q, v, a_lower, a_upper, disturbance)
-        lower = ROW_SCALE * rows.lower
-        return LinearConstraints(ROW_SCALE * rows.G, lower, self._no_limit[: len(lower)])
+        lower, upper = np.nan_to_num(bounds, posinf=_UNBOUNDED, neginf=-_UNBOUNDED)
+        rows = self.rows(q, v, lower, upper, disturbance)
+        k = len(rows.lower)
+        return LinearConstraints(ROW_SCALE * rows.G, ROW_SCALE * rows.lower, np.full(k, np.inf))
 
     @property
     def viable(self) -> bool:
         """Whether all rows of the last step were viable."""
-        return bool(self._work.rows.viable[: self.count].all())
-
-    @property
-    def distances(self) -> Array:
-        """Distances of all pairs in the last step, shape (p,), m; inf where one is far."""
-        return self._work.distances
+        return bool(self._viable[: self.count].all())
 
     def closest(self) -> tuple[float, str]:
         """Return the least distance in the last step, m, and between what; inf if all are far."""

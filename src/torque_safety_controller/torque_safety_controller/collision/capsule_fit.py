@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Capsules around triangles: a few round shapes in place of a link's mesh.
+"""The smallest capsule around points.
 
-A capsule is convex, so that it holds a triangle when it holds its corners. Parts of a mesh, split
-by triangles, in one capsule each, are therefore covered whole, the triangles along a cut too.
+A capsule is convex, so that it holds a mesh when it holds its vertices.
 """
 
 from __future__ import annotations
@@ -14,14 +13,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-CAPSULES_PER_LINK = 3
-"""Most capsules around a mesh."""
-
 _ROUNDS = 24
 _CANDIDATES = 48
 _EXTREMES = 96  # directions in which vertices are sought that decide the fit
-_CUTS = (0.25, 0.375, 0.5, 0.625, 0.75)
-_WORTH = 0.8  # a cut must leave less than this share of the volume
 _SMALLEST = 1e-4  # m; radius of the capsule around a point
 _ROUNDING = 1e-11  # m; what the squares of distances lack
 
@@ -44,29 +38,6 @@ class Capsule(NamedTuple):
         """In m^3."""
         length = float(np.linalg.norm(self.end - self.start))
         return float(np.pi * self.radius**2 * (length + 4.0 / 3.0 * self.radius))
-
-
-def capsules_around(
-    vertices: Array, triangles: NDArray[np.int64], most: int = CAPSULES_PER_LINK
-) -> list[Capsule]:
-    """Return up to `most` capsules that cover a mesh; more only where they are much smaller.
-
-    Args:
-        vertices: shape (m, 3), m.
-        triangles: indices of vertices, shape (k, 3); of none there are no capsules.
-        most: number of capsules, at least 1.
-    """
-    if not len(triangles):
-        return []
-    parts = [(triangles, fitted_capsule(vertices[np.unique(triangles)]))]
-    while len(parts) < most:
-        index = max(range(len(parts)), key=lambda i: parts[i][1].volume)
-        halves = _cut(vertices, parts[index][0])
-        whole = parts[index][1].volume
-        if halves is None or sum(c.volume for _, c in halves) > _WORTH * whole:
-            break
-        parts[index : index + 1] = halves
-    return [capsule for _, capsule in parts]
 
 
 def fitted_capsule(points: Array) -> Capsule:
@@ -92,32 +63,6 @@ def fitted_capsule(points: Array) -> Capsule:
         if volumes[best] < volume:
             axis, origin, volume = turned[best], moved[best], volumes[best]
     return _capsule_along(points, axis, origin)
-
-
-def _cut(
-    vertices: Array, triangles: NDArray[np.int64]
-) -> list[tuple[NDArray[np.int64], Capsule]] | None:
-    """Return the best cut of triangles in two across one of their principal axes."""
-    centroids = vertices[triangles].mean(axis=1)
-    best, least = None, np.inf
-    for axis in _principal_axes(centroids):
-        along = centroids @ axis
-        low, high = along.min(), along.max()
-        for share in _CUTS:
-            behind = along < low + share * (high - low)
-            if behind.all() or not behind.any():
-                continue
-            halves = [triangles[behind], triangles[~behind]]
-            volume = 0.0
-            for half in halves:
-                points = vertices[np.unique(half)]
-                axes = _principal_axes(points)
-                volume += _volumes(points, axes, _middle(points, axes)[None]).min()
-            if volume < least:
-                best, least = halves, volume
-    if best is None:
-        return None
-    return [(half, fitted_capsule(vertices[np.unique(half)])) for half in best]
 
 
 def _principal_axes(points: Array) -> Array:

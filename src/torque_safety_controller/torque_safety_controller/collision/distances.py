@@ -1,91 +1,372 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Distances of pairs of bodies, compiled."""
+"""Distances between capsules and obstacles, with their first and second derivatives, compiled.
+
+All bodies are segments with a radius, except boxes: these have segments as edges, and a segment
+that is the point nearest to something, or the edge through it. Segments move with their two ends:
+positions, velocities and accelerations in between are interpolated.
+`docs/collision_avoidance.md` derives the formulas.
+"""
 
 from __future__ import annotations
 
-from math import inf
+from math import inf, sqrt
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from torque_safety_controller.collision.closest_points import (
-    MET,
-    SurfacePoint,
-    across,
-    point_to_box,
-    segment_to_box,
-)
-from torque_safety_controller.collision.motion import ArmMotion, Bodies, place_bodies
-from torque_safety_controller.collision.vectors3 import (
-    Vector,
-    along,
-    at,
-    column,
-    compiled_vectors,
-    in_axes,
-    sub,
-)
-
 Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+_MET = 1e-9  # m; axes nearer than this give no direction
+_BLUNT = 1e-3  # m; no curvature is computed for axes nearer than this
+# Squared sine of the angle between two segments below which their closest points slide so fast
+# that the distances of the ends count instead.
+_PARALLEL = 1e-2
+_SAME = 1e-6  # lines that differ by less are one
+_BEHIND = 1.0  # m; how far behind a face its reference point is, so that the normal is exact
 
 
-class Pairs(NamedTuple):
-    """Which bodies are kept apart.
+class Segments(NamedTuple):
+    """Segments and boxes.
 
     Attributes:
-        first: a capsule along its z axis, shape (p,), int.
-        second: any body, shape (p,), int.
-        moves: 1 for joints that move the first body only, -1 the second only, shape (p, n).
+        joint: that moves a segment, shape (s,), int; 0 for what does not move.
+        ends: of the segments in the joint's axes, shape (s, 2, 3), m.
+        radius: of the segments, shape (s,), m; written where a segment is the point of a box.
+        boxes: centre, half the edges, and axes as rows, in the root frame, shape (b, 5, 3), m.
     """
 
-    first: NDArray[np.int64]
-    second: NDArray[np.int64]
-    moves: Array
+    joint: Integers
+    ends: Array
+    radius: Array
+    boxes: Array
 
 
-class Closest(NamedTuple):
-    """Closest points of a segment and a box: `point` in the root frame, `surface` in the box's."""
+class Candidates(NamedTuple):
+    """Distances that may matter, pair by pair.
 
-    share: float
-    point: Vector
-    surface: SurfacePoint
+    Of two segments they are that of their closest points, and those of each end from the other
+    segment; of a segment and a box those of the ends, that of the chord inside, and those of the
+    edges. So the closest points may jump from one to the other, as they do between parallel
+    segments: each of these distances is smooth there.
 
+    Attributes:
+        start: index of the first of each pair, shape (p + 1,), int.
+        bodies: the segment that moves, the other segment, and the box that this is a point of or
+            -1, shape (c, 3), int.
+        share: which part of either segment counts: from and to, in shares of its length, shape
+            (c, 4).
+    """
 
-@compiled_vectors
-def closest(i: int, part: int, j: int, other: int, bodies: Bodies, motion: ArmMotion) -> Closest:
-    """Return the closest points of a part of capsule `i` and a part of body `j`."""
-    axis, h = column(motion.rotation[i], 2), bodies.half[part, 2]
-    start = along(at(motion.centre, i), bodies.offset[part, 2] - h, axis)
-    R, half = motion.rotation[j], at(bodies.half, other)
-    x = sub(in_axes(R, sub(start, at(motion.centre, j))), at(bodies.offset, other))
-    u = along((0.0, 0.0, 0.0), 2.0 * h, in_axes(R, axis))
-    s = segment_to_box(x, u, half)
-    surface = point_to_box(along(x, s, u), half)
-    if surface.distance <= MET and half[0] * half[1] * half[2] == 0.0:
-        surface = SurfacePoint(surface.distance, across(u, half), surface.free)
-    return Closest(s, along(start, 2.0 * s * h, axis), surface)
+    start: Integers
+    bodies: Integers
+    share: Array
 
 
-@compiled_vectors
-def is_far(i: int, j: int, near: float, bodies: Bodies, motion: ArmMotion) -> bool:
-    """Return whether the ball around a capsule tells that a body is not near."""
-    middle = in_axes(motion.rotation[j], sub(at(motion.centre, i), at(motion.centre, j)))
-    d = point_to_box(middle, at(bodies.half, bodies.first[j])).distance
-    length = bodies.half[bodies.first[i], 2]
-    outside: bool = d - length - bodies.radius[i] - bodies.radius[j] > near
-    return outside
+class Features(NamedTuple):
+    """Distances that matter in a state; only the first ones, as many as were found, are valid.
+
+    Attributes:
+        pair: that each belongs to, shape (c,), int.
+        line: unit vector from the second body to the first, and its moment about the root's
+            origin, shape (c, 6): the distance's gradient is ``line (J_first - J_second)``.
+        motion: distance, m, its rate, m/s, and its acceleration at zero joint acceleration,
+            m/s^2, shape (c, 3).
+    """
+
+    pair: Integers
+    line: Array
+    motion: Array
 
 
-@compiled_vectors
-def pair_distances(
-    near: float, pairs: Pairs, bodies: Bodies, motion: ArmMotion, distances: Array
+@njit(cache=True)
+def move_segments(
+    v: Array, parent: Integers, placements: Array, J: Array, dJ: Array, joint: Integers,
+    ends: Array, twists: Array, points: Array,
+) -> None:  # fmt: skip
+    """Compute how the ends of segments move.
+
+    Args:
+        v: joint velocities, shape (n,), rad/s.
+        parent: of each joint, shape (n + 1,), int.
+        placements: of the joints: rows of the rotation, then the origin, m, shape (n + 1, 4, 3).
+        J: spatial velocity of each joint about the root's origin for a unit joint velocity, linear
+            first, shape (n, 6).
+        dJ: its time derivative, shape (n, 6).
+        joint: see `Segments`.
+        ends: see `Segments`.
+        twists: written: spatial velocity of each joint, and its rate, shape (n + 1, 2, 6).
+        points: written: position, velocity, and acceleration at zero joint acceleration, of both
+            ends of each segment, shape (s, 2, 3, 3), m, m/s, m/s^2.
+    """
+    for m in range(1, len(parent)):
+        for k in range(6):
+            twists[m, 0, k] = twists[parent[m], 0, k] + J[m - 1, k] * v[m - 1]
+            twists[m, 1, k] = twists[parent[m], 1, k] + dJ[m - 1, k] * v[m - 1]
+    for i in range(len(joint)):
+        m = joint[i]
+        for e in range(2):
+            for k in range(3):
+                x = placements[m, 3, k]
+                for c in range(3):
+                    x += placements[m, k, c] * ends[i, e, c]
+                points[i, e, 0, k] = x
+            # Velocity v + w x p; acceleration dv + dw x p + w x (v + w x p).
+            for order in range(2):
+                for k in range(3):
+                    y, z = (k + 1) % 3, (k + 2) % 3
+                    x = twists[m, order, k]
+                    for lower in range(order + 1):
+                        turning = order - lower
+                        x += twists[m, turning, 3 + y] * points[i, e, lower, z]
+                        x -= twists[m, turning, 3 + z] * points[i, e, lower, y]
+                    points[i, e, order + 1, k] = x
+
+
+@njit(cache=True)
+def find_features(
+    radius: Array, boxes: Array, start: Integers, bodies: Integers, share: Array, points: Array,
+    near: float, kept: float, dt: float, braking: float, distances: Array, pair_of: Integers,
+    line: Array, motion: Array,
+) -> int:  # fmt: skip
+    """Write the distances that matter in a state, and return how many there are.
+
+    Args:
+        radius: see `Segments`, like `boxes`.
+        boxes: likewise.
+        start: see `Candidates`, like `bodies` and `share`.
+        bodies: likewise.
+        share: likewise.
+        points: of `move_segments`.
+        near: distance within which pairs matter that do not approach fast, m.
+        kept: distance to be kept, m.
+        dt: how long an acceleration is held, s.
+        braking: deceleration that distances count on, m/s^2.
+        distances: written: of all pairs, shape (p,), m; inf for those that do not matter.
+        pair_of: written, see `Features`, like `line` and `motion`.
+        line: likewise.
+        motion: likewise.
+    """
+    rel, count = np.empty((7, 3)), 0
+    for pair in range(len(distances)):
+        i, j, box = bodies[start[pair], 0], bodies[start[pair], 1], bodies[start[pair], 2]
+        if box >= 0:
+            _place_foot(i, 0.5, boxes, box, radius, j, points)
+        _relative(i, 0.5, j, 0.5, points, rel)
+        # The balls around the bodies are not nearer to each other than this.
+        gap = _size(rel, 0) - 0.5 * (_size(rel, 3) + _size(rel, 5)) - radius[i] - radius[j]
+        speed = _approach(i, j, points)
+        limit = max(near, kept + dt * speed + speed * speed / braking)
+        distances[pair] = inf
+        if gap > limit:
+            continue
+        first, pierced = count, False
+        for c in range(start[pair], start[pair + 1]):
+            j, box, s_low, s_high = bodies[c, 1], bodies[c, 2], share[c, 0], share[c, 1]
+            if box >= 0:
+                if s_low < s_high:
+                    s_low = s_high = _chord(i, boxes, box, points)
+                    if s_low < 0.0:
+                        continue
+                    pierced = True
+                _place_foot(i, s_low, boxes, box, radius, j, points)
+            elif pierced:
+                continue
+            s, t = _closest(i, s_low, s_high, j, share[c, 2], share[c, 3], points)
+            edge = box < 0 and bodies[start[pair], 2] >= 0
+            if edge and not 0.0 < s < 1.0:
+                continue  # the ends have distances of their own
+            _relative(i, s, j, t, points, rel)
+            d = _size(rel, 0)
+            gap = d - radius[i] - radius[j]
+            distances[pair] = min(distances[pair], gap)
+            if gap > limit:
+                continue
+            _write_line(i, s, d, points, rel, line[count])
+            motion[count, 0] = gap
+            if _is_known(line, motion, first, count):
+                continue
+            flat = box >= 0 and radius[j] > 0.0
+            rate, bias = _derivatives(line[count], d, 0.0 < s < 1.0, 0.0 < t < 1.0, flat, rel)
+            motion[count, 1], motion[count, 2], pair_of[count] = rate, bias, pair
+            count += 1
+    return count
+
+
+@njit(cache=True)
+def _size(vectors: Array, k: int) -> float:
+    """Return the length of row `k`."""
+    return sqrt(vectors[k, 0] ** 2 + vectors[k, 1] ** 2 + vectors[k, 2] ** 2)
+
+
+@njit(cache=True)
+def _relative(i: int, s: float, j: int, t: float, points: Array, rel: Array) -> None:
+    """Write how a point of segment i moves relative to one of j.
+
+    Rows 0 to 2 are position, velocity and acceleration; rows 3 and 4 segment i from end to end and
+    its rate; rows 5 and 6 segment j and its rate.
+    """
+    for k in range(3):
+        for order in range(3):
+            p = (1.0 - s) * points[i, 0, order, k] + s * points[i, 1, order, k]
+            o = (1.0 - t) * points[j, 0, order, k] + t * points[j, 1, order, k]
+            rel[order, k] = p - o
+        for order in range(2):
+            rel[3 + order, k] = points[i, 1, order, k] - points[i, 0, order, k]
+            rel[5 + order, k] = points[j, 1, order, k] - points[j, 0, order, k]
+
+
+@njit(cache=True)
+def _approach(i: int, j: int, points: Array) -> float:
+    """Return the highest speed of points of segment i relative to points of segment j."""
+    most = 0.0
+    for e in range(2):
+        for f in range(2):
+            square = 0.0
+            for k in range(3):
+                square += (points[i, e, 1, k] - points[j, f, 1, k]) ** 2
+            most = max(most, square)
+    return sqrt(most)
+
+
+@njit(cache=True)
+def _closest(
+    i: int, s_low: float, s_high: float, j: int, t_low: float, t_high: float, points: Array
+) -> tuple[float, float]:
+    """Return the shares of two segments at which they are closest: 5.1.9 of [Ericson2005]."""
+    a, b, c, e, f = 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(3):
+        u = points[i, 1, 0, k] - points[i, 0, 0, k]
+        w = points[j, 1, 0, k] - points[j, 0, 0, k]
+        r = points[i, 0, 0, k] - points[j, 0, 0, k]
+        a, b, c, e, f = a + u * u, b + u * w, c + u * r, e + w * w, f + w * r
+    s, t, across = s_low, t_low, a * e - b * b
+    if across > 0.0:
+        s = min(max((b * f - c * e) / across, s_low), s_high)
+    if e > 0.0:
+        t = min(max((b * s + f) / e, t_low), t_high)
+    if a > 0.0:
+        s = min(max((b * t - c) / a, s_low), s_high)
+    return s, t
+
+
+@njit(cache=True)
+def _place_foot(
+    i: int, s: float, boxes: Array, box: int, radius: Array, j: int, points: Array
 ) -> None:
-    """Fill in the distances of all pairs, shape (p,), m; inf for what is not near."""
-    place_bodies(bodies, motion)
-    for k in range(len(distances)):
-        i, j = pairs.first[k], pairs.second[k]
-        distances[k] = inf
-        if not is_far(i, j, near, bodies, motion):
-            found = closest(i, bodies.first[i], j, bodies.first[j], bodies, motion)
-            distances[k] = found.surface.distance - bodies.radius[i] - bodies.radius[j]
+    """Make segment j the point of a box that is nearest to a point of segment i.
+
+    At an edge it is a piece of the edge around that point. Before a face or inside, it is a point
+    behind the nearest face, with a radius up to the face.
+    """
+    x, beyond, face, most = np.empty(3), 0, 0, -inf
+    for m in range(3):
+        x[m] = 0.0
+        for k in range(3):
+            p = (1.0 - s) * points[i, 0, 0, k] + s * points[i, 1, 0, k]
+            x[m] += boxes[box, 2 + m, k] * (p - boxes[box, 0, k])
+        out = abs(x[m]) - boxes[box, 1, m]
+        beyond += out > 0.0
+        if out > most:
+            face, most = m, out
+    radius[j] = _BEHIND if beyond < 2 else 0.0
+    for k in range(3):
+        points[j, 0, 0, k] = points[j, 1, 0, k] = boxes[box, 0, k]
+    for m in range(3):
+        half = boxes[box, 1, m]
+        foot, reach = min(max(x[m], -half), half), 0.0
+        if beyond < 2 and m == face:
+            foot = half - _BEHIND if x[m] > 0.0 else _BEHIND - half
+        elif beyond == 2 and abs(x[m]) <= half:
+            reach = 1.0
+        for k in range(3):
+            points[j, 0, 0, k] += (foot - reach) * boxes[box, 2 + m, k]
+            points[j, 1, 0, k] += (foot + reach) * boxes[box, 2 + m, k]
+
+
+@njit(cache=True)
+def _chord(i: int, boxes: Array, box: int, points: Array) -> float:
+    """Return the share of segment i at the middle of its part inside a box; -1 without one."""
+    enters, leaves = 0.0, 1.0
+    for m in range(3):
+        x, u, half = 0.0, 0.0, boxes[box, 1, m]
+        for k in range(3):
+            x += boxes[box, 2 + m, k] * (points[i, 0, 0, k] - boxes[box, 0, k])
+            u += boxes[box, 2 + m, k] * (points[i, 1, 0, k] - points[i, 0, 0, k])
+        if abs(u) > _MET:
+            enters = max(enters, min((-half - x) / u, (half - x) / u))
+            leaves = min(leaves, max((-half - x) / u, (half - x) / u))
+        elif abs(x) > half:
+            return -1.0
+    return 0.5 * (enters + leaves) if enters < leaves else -1.0
+
+
+@njit(cache=True)
+def _write_line(i: int, s: float, d: float, points: Array, rel: Array, line: Array) -> None:
+    """Write the unit vector along the distance d, and its moment about the origin.
+
+    Where the axes meet it is across both, or any.
+    """
+    if d > _MET:
+        for k in range(3):
+            line[k] = rel[0, k] / d
+    else:
+        for k in range(3):
+            y, z = (k + 1) % 3, (k + 2) % 3
+            line[k] = rel[3, y] * rel[5, z] - rel[3, z] * rel[5, y] + _MET * (0.5 + 0.1 * k)
+        size = sqrt(line[0] ** 2 + line[1] ** 2 + line[2] ** 2)
+        for k in range(3):
+            line[k] /= size
+    for k in range(3):
+        y, z = (k + 1) % 3, (k + 2) % 3
+        p_y = (1.0 - s) * points[i, 0, 0, y] + s * points[i, 1, 0, y]
+        p_z = (1.0 - s) * points[i, 0, 0, z] + s * points[i, 1, 0, z]
+        line[3 + k] = p_y * line[z] - p_z * line[y]
+
+
+@njit(cache=True)
+def _is_known(line: Array, motion: Array, first: int, count: int) -> bool:
+    """Return whether the distance at `count` is one of those from `first` on."""
+    for c in range(first, count):
+        off = abs(motion[c, 0] - motion[count, 0])
+        for k in range(6):
+            off = max(off, abs(line[c, k] - line[count, k]))
+        if off < _SAME:
+            return True
+    return False
+
+
+@njit(cache=True)
+def _derivatives(
+    line: Array, d: float, s_slides: bool, t_slides: bool, flat: bool, rel: Array
+) -> tuple[float, float]:
+    """Return the rate of a distance, and its acceleration at zero joint acceleration.
+
+    Args:
+        line: unit vector along the distance.
+        d: distance of the axes, m.
+        s_slides: whether the closest point may slide along the first segment.
+        t_slides: whether it may along the second.
+        flat: whether the second is a face.
+        rel: of `_relative`.
+    """
+    rate, bias, square, w_s, w_t, a, b, e = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(3):
+        v, u, w = rel[1, k], rel[3, k], rel[5, k]
+        rate, bias, square = rate + line[k] * v, bias + line[k] * rel[2, k], square + v * v
+        w_s += v * u + d * line[k] * rel[4, k]
+        w_t += v * w + d * line[k] * rel[6, k]
+        a, b, e = a + u * u, b + u * w, e + w * w
+    if flat or d < _BLUNT:
+        return rate, bias
+    # What sliding leaves of the curvature, less w' H^-1 w, by elimination.
+    curved, pivot = square - rate * rate, a
+    if t_slides and e > 0.0:
+        curved -= w_t * w_t / e
+        w_s -= b / e * w_t
+        pivot = max(a - b * b / e, _PARALLEL * a)
+    if s_slides and a > 0.0:
+        curved -= w_s * w_s / pivot
+    return rate, bias + curved / d

@@ -1,27 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What may collide with what: capsules around an arm's links, obstacles, and pairs of them."""
+"""Which shapes may collide: capsules around an arm's links, obstacles, and pairs of them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import product
+from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from torque_safety_controller.collision.bodies import CollisionBody, capsule
-from torque_safety_controller.collision.capsule_fit import Capsule, capsules_around
-from torque_safety_controller.collision.distances import Pairs, pair_distances
-from torque_safety_controller.collision.geometry import link_shapes
-from torque_safety_controller.collision.motion import Bodies, Kinematics
-from viability_bounds_pkg.compiled import bound
+from torque_safety_controller.collision.distances import Candidates, Segments
+from torque_safety_controller.collision.shapes import Shape
 from viability_bounds_pkg.exceptions import SettingError, did_you_mean
 
 Array = NDArray[np.float64]
 
-_MOSTLY = 0.5  # pairs that are near each other in more than this share of the samples are left out
+_MOSTLY = 0.5  # links that are near each other in more than this share of postures are left out
+_POSTURES = 200  # from which it is told
+_WHOLE, _ENDS = (0.0, 1.0), ((0.0, 0.0), (1.0, 1.0))  # shares of a segment
 
 
 @dataclass(frozen=True)
@@ -30,27 +27,28 @@ class CollisionModel:
 
     Attributes:
         arm: the arm's joints.
-        bodies: all shapes.
-        pairs: of them.
-        names: of the two bodies of each pair, ``link - link`` or ``link - obstacle``.
-        capsules: of each link, in the axes of the joint that moves it.
-        left_out: pairs that were pruned, by reason: ``far``, ``near at start``,
+        segments: capsules, and what boxes consist of.
+        candidates: distances of the pairs.
+        moves: 1 for joints that move the first shape of a pair only, -1 the second only, shape
+            (p, n).
+        names: of the two shapes of each pair, ``link - link`` or ``link - obstacle``.
+        left_out: pairs that are not kept apart, by reason: ``far``, ``near at start``,
             ``near mostly``; with obstacles ``near always``, as what the arm is mounted on.
     """
 
     arm: pin.Model
-    bodies: Bodies
-    pairs: Pairs
+    segments: Segments
+    candidates: Candidates
+    moves: Array
     names: tuple[str, ...]
-    capsules: dict[str, list[Capsule]]
     left_out: dict[str, list[str]]
 
 
 def build_collision_model(
     model: pin.Model,
-    geometry: pin.GeometryModel,
+    capsules: Sequence[Shape],
     q_start: ArrayLike,
-    obstacles: Sequence[CollisionBody] = (),
+    obstacles: Sequence[Shape] = (),
     pairs: Sequence[tuple[str, str]] | None = None,
     base_frame: str | None = None,
     near: float = 0.05,
@@ -61,13 +59,13 @@ def build_collision_model(
 
     Args:
         model: n joints with one coordinate each.
-        geometry: of `robot_description.load_geometry`.
+        capsules: around the links, whose names they have, in the links' frames.
         q_start: a configuration free of collisions, shape (n,), rad: of the pairs chosen
             automatically, those that are near each other there are left out.
         obstacles: that every link is kept away from which can move.
         pairs: of links to be kept apart; None chooses them automatically: all that are not
             neighbours, less those left out by the next three.
-        base_frame: that obstacles are given in; None: the URDF's root. Fixed to the base.
+        base_frame: that obstacles are given in, fixed to the base; None: the URDF's root.
         near: pairs that never come nearer than this are left out, m.
         clearance: pairs that are nearer than this at the start, or in most samples, are left
             out, m: more than the margin to be kept. Their capsules, not the links, are in each
@@ -75,154 +73,193 @@ def build_collision_model(
         samples: random configurations within the position limits; +-pi where there are none.
 
     Raises:
-        SettingError: an unknown link, a frame that moves, names that are not different, a
-            start of the wrong size, or nothing to keep apart in a pair asked for; named as the
+        SettingError: an unknown link, or nothing to keep apart in a pair asked for; named as the
             node's parameters.
     """
-    q_start = np.asarray(q_start, dtype=np.float64)
-    if q_start.shape != (model.nq,) or not np.isfinite(q_start).all():
-        raise SettingError("collision_posture", q_start, f"{model.nq} finite numbers")
-    capsules: dict[str, list[Capsule]] = {}
-    links: list[CollisionBody] = []
-    for shape in link_shapes(model, geometry):
-        around = shape.capsules + capsules_around(shape.vertices, shape.triangles)
-        capsules[shape.link] = around
-        links += [replace(capsule(shape.link, *each), joint=shape.joint) for each in around]
-    for index, obstacle in enumerate(obstacles):
-        if obstacle.name in capsules or obstacle.name in (o.name for o in obstacles[:index]):
-            allowed = "what no other obstacle and no link is called"
-            raise SettingError("obstacle_names", obstacle.name, allowed)
-    base = _base_placement(model, base_frame)
-    every = links + [replace(body, placement=base * body.placement) for body in obstacles]
-    chosen = _link_pairs(model, links, pairs)
+    frames = [_link_frame(model, shape.name) for shape in capsules]
+    root = model.frames[model.getFrameId(base_frame)] if base_frame else model.frames[0]
+    frames += [root] * len(obstacles)
+    shapes = [*capsules, *obstacles]
+    joints = [int(frame.parentJoint) for frame in frames]
+    chosen = _link_pairs(model, [c.name for c in capsules], joints, pairs)
     own = len(chosen)
     chosen += [
         (i, j)
-        for j in range(len(links), len(every))
-        for i, body in enumerate(links)
-        if body.joint > 0
+        for j in range(len(capsules), len(shapes))
+        for i in range(len(capsules))
+        if joints[i] > 0
     ]
-    bodies = _pack(every)
-    candidates = _pairs(model, every, chosen)
-    at_start, _ = _survey(model, bodies, candidates, near, clearance, q_start[None])
-    low = np.where(np.isfinite(model.lowerPositionLimit), model.lowerPositionLimit, -np.pi)
-    high = np.where(np.isfinite(model.upperPositionLimit), model.upperPositionLimit, np.pi)
-    q = np.random.default_rng(0).uniform(low, high, size=(samples, model.nq))
-    short, least = _survey(model, bodies, candidates, near, clearance, q)
-    kept, names = [], []
+    geometry = pin.GeometryModel()
+    for shape, frame in zip(shapes, frames, strict=True):
+        geometry.addGeometryObject(shape.geometry(frame.parentJoint, frame.placement))
+    for pair in chosen:
+        geometry.addCollisionPair(pin.CollisionPair(*pair))
+    survey = _Survey(model, geometry, samples)
+    at_start = survey.distances(np.asarray(q_start, dtype=np.float64)) < clearance
+    share, comes_near = survey.share(clearance), survey.comes_nearer(near)
+    kept: list[int] = []
     left_out: dict[str, list[str]] = {}
-    for k, (i, j) in enumerate(chosen):
-        name, reason = f"{every[i].name} - {every[j].name}", ""
-        if k >= own and short[k] == samples:
-            reason = "near always"
-        elif k < own and pairs is None and at_start[k]:
-            reason = "near at start"
-        elif k < own and pairs is None and short[k] > _MOSTLY * samples:
-            reason = "near mostly"
-        if least[k] > near and (k >= own or pairs is None):
+    names = [f"{shapes[i].name} - {shapes[j].name}" for i, j in chosen]
+    for k, name in enumerate(names):
+        reason = ""
+        if k >= own:
+            reason = "near always" if share[k] == 1.0 else "" if comes_near[k] else "far"
+        elif pairs is None and not comes_near[k]:
             reason = "far"
+        elif pairs is None and at_start[k]:
+            reason = "near at start"
+        elif pairs is None and share[k] > _MOSTLY:
+            reason = "near mostly"
         if reason:
             left_out.setdefault(reason, []).append(name)
         else:
             kept.append(k)
-            names.append(name)
-    remaining = Pairs._make(array[kept] for array in candidates)
-    return CollisionModel(model, bodies, remaining, tuple(names), capsules, left_out)
-
-
-def _pack(bodies: Sequence[CollisionBody]) -> Bodies:
-    """Return bodies as arrays, with their parts."""
-    parts = [_parts(body) for body in bodies]
-    flat = np.array([part for each in parts for part in each]).reshape(-1, 2, 3)
-    return Bodies(
-        joint=np.array([body.joint for body in bodies], dtype=np.int64),
-        rotation=np.array([body.placement.rotation for body in bodies]).reshape(-1, 3, 3),
-        centre=np.array([body.placement.translation for body in bodies]).reshape(-1, 3),
-        radius=np.array([body.radius for body in bodies]),
-        plane=np.array([body.plane for body in bodies], dtype=bool),
-        first=np.cumsum([0, *map(len, parts)]),
-        offset=flat[:, 0].copy(),
-        half=flat[:, 1].copy(),
+    moved = np.zeros((len(shapes), model.njoints))
+    for row, joint in zip(moved, joints, strict=True):
+        row[list(model.supports[joint])] = 1.0
+    first, second = np.array([chosen[k] for k in kept], dtype=np.int64).reshape(-1, 2).T
+    segments, candidates = _tables(shapes, frames, [chosen[k] for k in kept])
+    return CollisionModel(
+        arm=model,
+        segments=segments,
+        candidates=candidates,
+        moves=(moved[first] - moved[second])[:, 1:].copy(),
+        names=tuple(names[k] for k in kept),
+        left_out=left_out,
     )
 
 
-def _parts(body: CollisionBody) -> list[tuple[Array, Array]]:
-    """Return middle and half lengths of a body, and of the ends or edges that count apart."""
-    half, point = body.half, np.zeros(3)
-    parts = [(point, half)]
-    if body.plane or not half.any():
-        return parts
-    if not half.all():  # a segment
-        return [*parts, (-half, point), (half, point)]
-    for axis, signs in product(np.eye(3), product((-1.0, 1.0), repeat=2)):
-        corner = np.zeros(3)
-        corner[axis == 0.0] = signs
-        parts.append((corner * half, axis * half))
-    return parts
-
-
-def _pairs(
-    model: pin.Model, bodies: Sequence[CollisionBody], chosen: Sequence[tuple[int, int]]
-) -> Pairs:
-    """Return pairs as arrays."""
-    moved_by = np.zeros((len(bodies), model.njoints))
-    for row, body in zip(moved_by, bodies, strict=True):
-        row[list(model.supports[body.joint])] = 1.0
-    first, second = np.array(chosen, dtype=np.int64).reshape(-1, 2).T.copy()
-    return Pairs(first, second, (moved_by[first] - moved_by[second])[:, 1:].copy())
-
-
-def _base_placement(model: pin.Model, base_frame: str | None) -> pin.SE3:
-    if base_frame is None:
-        return pin.SE3.Identity()
-    if not model.existFrame(base_frame):
-        raise SettingError("base_frame", base_frame, "a frame of the URDF")
-    frame = model.frames[model.getFrameId(base_frame)]
-    if frame.parentJoint != 0:
-        raise SettingError("base_frame", base_frame, "a frame that is not moved by a joint")
-    return frame.placement
+def _link_frame(model: pin.Model, link: str) -> pin.Frame:
+    if model.existFrame(link, pin.FrameType.BODY):
+        return model.frames[model.getFrameId(link, pin.FrameType.BODY)]
+    links = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
+    raise SettingError("collision_capsules", link, f"links of the URDF{did_you_mean(link, links)}")
 
 
 def _link_pairs(
     model: pin.Model,
-    links: Sequence[CollisionBody],
+    links: Sequence[str],
+    joints: Sequence[int],
     pairs: Sequence[tuple[str, str]] | None,
 ) -> list[tuple[int, int]]:
     """Return the pairs of capsules of the links asked for, or of all that are not neighbours."""
-    joint_of = {body.name: body.joint for body in links}
+    joint_of = dict(zip(links, joints, strict=False))
     for pair in pairs or ():
         for link in pair:
             if link not in joint_of:
-                allowed = f"links with collision geometry: {', '.join(sorted(joint_of))}"
+                allowed = f"links with capsules: {', '.join(sorted(joint_of))}"
                 allowed += did_you_mean(link, joint_of)
                 raise SettingError("collision_pairs", link, allowed)
-        if len(pair) != 2 or joint_of[pair[0]] == joint_of[pair[1]]:
+        if joint_of[pair[0]] == joint_of[pair[1]]:
             raise SettingError("collision_pairs", pair, "two links that move to each other")
-    wanted = None if pairs is None else {frozenset(pair) for pair in pairs}
-    chosen = []
-    for i, first in enumerate(links):
-        for j, second in enumerate(links[:i]):
-            if wanted is not None:
-                apart = frozenset((first.name, second.name)) in wanted
-            else:
-                apart = second.joint not in (first.joint, model.parents[first.joint])
-                apart = apart and first.joint != model.parents[second.joint]
-            if apart:
-                chosen.append((i, j))
-    return chosen
+    if pairs is not None:
+        wanted = {frozenset(pair) for pair in pairs}
+        return [
+            (i, j)
+            for i in range(len(links))
+            for j in range(i)
+            if frozenset((links[i], links[j])) in wanted
+        ]
+    parents = model.parents
+    return [
+        (i, j)
+        for i in range(len(links))
+        for j in range(i)
+        if joints[j] not in (joints[i], parents[joints[i]]) and joints[i] != parents[joints[j]]
+    ]
 
 
-def _survey(
-    model: pin.Model, bodies: Bodies, pairs: Pairs, near: float, clearance: float, samples: Array
-) -> tuple[NDArray[np.int64], Array]:
-    """Return in how many samples each pair is nearer than `clearance`, and its least distance."""
-    kinematics, zero = Kinematics(model, len(bodies.joint)), np.zeros(model.nv)
-    found = np.zeros(len(pairs.first))
-    measure = bound(pair_distances, float(near), pairs, bodies, kinematics.motion, found)
-    short, least = np.zeros(len(found), dtype=np.int64), np.full(len(found), np.inf)
-    for q in samples:
-        kinematics.update(q, zero)
-        measure()
-        short += found < clearance
-        np.minimum(least, found, out=least)
-    return short, least
+class _Survey:
+    """Distances of pairs in random configurations, by coal.
+
+    Args:
+        model: of the arm.
+        geometry: its shapes and pairs.
+        samples: how many configurations.
+    """
+
+    def __init__(self, model: pin.Model, geometry: pin.GeometryModel, samples: int) -> None:
+        self._model, self._data = model, model.createData()
+        self._geometry, self._found = geometry, geometry.createData()
+        low = np.where(np.isfinite(model.lowerPositionLimit), model.lowerPositionLimit, -np.pi)
+        high = np.where(np.isfinite(model.upperPositionLimit), model.upperPositionLimit, np.pi)
+        self._q = np.random.default_rng(0).uniform(low, high, size=(samples, model.nq))
+
+    def distances(self, q: Array) -> Array:
+        """Return the distances of all pairs in a configuration of shape (n,), rad, in m."""
+        self._nearest(q)
+        return np.array([each.min_distance for each in self._found.distanceResults])
+
+    def share(self, clearance: float) -> Array:
+        """Return in which share of some configurations each pair is nearer than `clearance`."""
+        some = self._q[:_POSTURES]
+        share: Array = np.mean([self.distances(q) < clearance for q in some], axis=0)
+        return share
+
+    def comes_nearer(self, near: float) -> NDArray[np.bool_]:
+        """Return for each pair whether it is nearer than `near` in any configuration."""
+        nearer = np.zeros(len(self._geometry.collisionPairs), dtype=bool)
+        for q in self._q:
+            while not nearer.all():
+                pair = self._nearest(q)
+                if self._found.distanceResults[pair].min_distance >= near:
+                    break
+                nearer[pair] = True
+                self._found.deactivateCollisionPair(pair)
+        return nearer
+
+    def _nearest(self, q: Array) -> int:
+        """Return the pair of least distance among those that are active."""
+        if not len(self._geometry.collisionPairs):
+            return 0
+        return int(pin.computeDistances(self._model, self._data, self._geometry, self._found, q))
+
+
+def _tables(
+    shapes: Sequence[Shape], frames: Sequence[pin.Frame], pairs: Sequence[tuple[int, int]]
+) -> tuple[Segments, Candidates]:
+    """Return segments, one for each shape and then those of edges, and the distances of pairs."""
+    joint = [int(frame.parentJoint) for frame in frames]
+    ends = [shape.ends(frame.placement) for shape, frame in zip(shapes, frames, strict=True)]
+    radius = [shape.radius for shape in shapes]
+    boxes, box_of, edges_of = [], {}, {}
+    for index, shape in enumerate(shapes):
+        if shape.is_box:
+            middle, edges = (
+                frames[index].placement * shape.placement,
+                shape.edges(frames[index].placement),
+            )
+            box_of[index] = len(boxes)
+            boxes.append([middle.translation, shape.half, *middle.rotation.T])
+            edges_of[index] = range(len(ends), len(ends) + len(edges))
+            joint += [0] * len(edges)
+            ends += list(edges)
+            radius += [0.0] * len(edges)
+    start, bodies, share = [0], [], []
+    for i, j in pairs:
+        length, other_length = shapes[i].half[2], shapes[j].half[2]
+        if j in box_of:
+            chord = [_WHOLE] if length and edges_of[j] else []
+            own = [*(_ENDS if length else _ENDS[:1]), *chord]
+            bodies += [(i, j, box_of[j])] * len(own)
+            share += [(*part, *_WHOLE) for part in own]
+            if length:
+                bodies += [(i, edge, -1) for edge in edges_of[j]]
+                share += [(*_WHOLE, *_WHOLE)] * len(edges_of[j])
+        else:
+            found = [(*_WHOLE, *_WHOLE)]
+            found += [(*end, *_WHOLE) for end in _ENDS if length]
+            found += [(*_WHOLE, *end) for end in _ENDS if other_length]
+            bodies += [(i, j, -1)] * len(found)
+            share += found
+        start.append(len(bodies))
+    return Segments(
+        joint=np.array(joint, dtype=np.int64),
+        ends=np.array(ends).reshape(-1, 2, 3),
+        radius=np.array(radius),
+        boxes=np.array(boxes).reshape(-1, 5, 3),
+    ), Candidates(
+        start=np.array(start, dtype=np.int64),
+        bodies=np.array(bodies, dtype=np.int64).reshape(-1, 3),
+        share=np.array(share).reshape(-1, 4),
+    )

@@ -32,7 +32,6 @@ from viability_bounds_pkg.robot_configuration import load_model
 from viability_bounds_pkg.robot_description import (
     RobotDescriptionError,
     inertia_beyond,
-    load_geometry,
 )
 from viability_bounds_pkg.ros.robot_urdf import robot_urdf, warn_of_unusual
 from viability_bounds_pkg.stopping.coordinated_stop import MARGIN
@@ -65,7 +64,7 @@ def make_controller(
         SettingError: parameters that do not fit the URDF.
     """
     robot, base, urdf = load_robot(config, node)
-    collision = load_collision(config, urdf, robot.model)
+    collision = load_collision(config, robot.model)
     safety_filter = make_safety_filter(config, robot.model)
     controller = Controller(
         robot,
@@ -215,22 +214,22 @@ def _base_placement(model: pin.Model, frame: str) -> pin.SE3:
     return found.placement
 
 
-def load_collision(
-    config: ControllerConfiguration, urdf: str, model: pin.Model
-) -> CollisionAvoidance | None:
+def load_collision(config: ControllerConfiguration, model: pin.Model) -> CollisionAvoidance | None:
     """Return the collision avoidance of an arm, or None without one.
 
     Args:
         config: checked parameters.
-        urdf: text of the URDF.
-        model: made of it.
+        model: of the arm.
 
     Raises:
-        SettingError: collision geometry that does not load, or a link that there is not.
+        SettingError: there are no capsules, or those of a link that there is not.
     """
     collision = config.collision
     if not collision.collision_avoidance:
         return None
+    if not collision.capsules:
+        tool = "ros2 run torque_safety_controller fit_capsules FILE"
+        raise SettingError("collision_capsules", [], f"capsules, which '{tool}' writes")
     for index, obstacle in enumerate(collision.bodies):
         if model.existFrame(obstacle.name, pin.FrameType.BODY):
             raise SettingError(f"obstacles[{index}].name", obstacle.name, "no name of a link")
@@ -238,15 +237,10 @@ def load_collision(
     limited.lowerPositionLimit = config.position_min
     limited.upperPositionLimit = config.position_max
     kept = collision.settings.kept
-    try:
-        geometry = load_geometry(urdf, model, config.locked)
-    except RobotDescriptionError as error:
-        allowed = f"a URDF whose collision geometry loads ({error})"
-        raise SettingError("robot_description", config.robot_description, allowed) from error
     return CollisionAvoidance(
         build_collision_model(
             limited,
-            geometry,
+            collision.capsules,
             collision.posture(config),
             collision.bodies,
             collision.pairs,

@@ -11,7 +11,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from torque_safety_controller.collision.avoidance import CollisionSettings
-from torque_safety_controller.collision.bodies import SHAPES, CollisionBody, make_obstacle
+from torque_safety_controller.collision.shapes import SHAPES, Shape, capsule, make_obstacle
 from torque_safety_controller.parameters.entries import read_entries
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import (
@@ -21,6 +21,7 @@ from viability_bounds_pkg.parameter import (
     check_per_joint,
     group,
     joint_numbers,
+    number,
     numbers,
     switch,
     text,
@@ -45,10 +46,21 @@ class ObstacleEntry:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class CapsuleEntry:
+    """One entry of ``collision_capsules``."""
+
+    link: str = text("link that it is around")
+    start: Array = numbers("one end of its axis in the link's frame, m", FINITE, length=3)
+    end: Array = numbers("other end, m", FINITE, length=3)
+    radius: float = number("distance from the axis, m", POSITIVE)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class CollisionConfiguration:
     """Parameters of the collision avoidance; arrays of shape (n,) in `joints` order.
 
     Attributes:
+        capsules: around the links, in their frames.
         bodies: the obstacles, in the base frame.
         pairs: of links to keep apart; None to choose them automatically.
     """
@@ -57,6 +69,12 @@ class CollisionConfiguration:
         "whether links keep away from each other and from the obstacles below", default=False
     )
     settings: CollisionSettings = group(CollisionSettings, "collision_")
+    collision_capsules: tuple[str, ...] = texts(
+        "capsules around the links, which are kept apart in place of these, from the tool "
+        "fit_capsules: ends of the axis in the link's frame and radius, m",
+        default=(),
+        note="each a YAML mapping '{link: hand, start: [x, y, z], end: [x, y, z], radius: r}'",
+    )
     collision_pairs: tuple[str, ...] = texts(
         "pairs of links to keep apart; chosen automatically if empty",
         default=(),
@@ -90,11 +108,15 @@ class CollisionConfiguration:
         note="each a YAML mapping '{name: wall, shape: box, size: [x, y, z], position: "
         f"[x, y, z], rpy: [r, p, y]}}' with another name; shape is one of {', '.join(SHAPES)}",
     )
-    bodies: tuple[CollisionBody, ...] = field(init=False)
+    capsules: tuple[Shape, ...] = field(init=False)
+    bodies: tuple[Shape, ...] = field(init=False)
     pairs: tuple[tuple[str, str], ...] | None = field(init=False)
 
     def __post_init__(self) -> None:
-        """Read obstacles and pairs."""
+        """Read capsules, obstacles and pairs."""
+        entries = read_entries(CapsuleEntry, "collision_capsules", self.collision_capsules)
+        capsules = [capsule(each.link, each.start, each.end, each.radius) for each in entries]
+        object.__setattr__(self, "capsules", tuple(capsules))
         object.__setattr__(self, "bodies", _obstacles(self.obstacles))
         object.__setattr__(self, "pairs", tuple(map(_pair, self.collision_pairs)) or None)
 
@@ -128,8 +150,8 @@ class CollisionConfiguration:
         return np.where(limited, 0.5 * (np.where(limited, low, 0.0) + high), 0.0)
 
 
-def _obstacles(entries: Sequence[str]) -> tuple[CollisionBody, ...]:
-    obstacles: dict[str, CollisionBody] = {}
+def _obstacles(entries: Sequence[str]) -> tuple[Shape, ...]:
+    obstacles: dict[str, Shape] = {}
     for index, entry in enumerate(read_entries(ObstacleEntry, "obstacles", entries)):
         label, name, size = f"obstacles[{index}]", entry.name, entry.size
         if not name or name in obstacles:
