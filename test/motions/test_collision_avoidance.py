@@ -134,8 +134,8 @@ def test_pressed_against_an_obstacle_an_arm_stays_at_rest():
     ("shape", "size", "position", "depth"),
     [
         ("sphere", [0.2, 0.2, 0.2], [0.42, 0.0, 0.6], 0.03),
-        ("box", [0.6, 1.0, 0.1], [0.5, 0.0, 0.45], 0.03),
-        ("half_space", [], [0.0, 0.0, 0.52], 0.05),
+        ("box", [0.6, 1.0, 0.1], [0.5, 0.0, 0.45], 0.029),
+        ("half_space", [], [0.0, 0.0, 0.52], 0.049),
     ],
 )
 def test_an_arm_that_overlaps_an_obstacle_at_start_moves_out(shape, size, position, depth):

@@ -1,71 +1,68 @@
 # SPDX-License-Identifier: Apache-2.0
 """Distances and their first and second derivatives, against coal, differences and by hand."""
 
-import coal
 import numpy as np
 import pinocchio as pin
 import pytest
-from collision_arm import BALL, ROD, everything, panda, random_states, two_links, wide_rows
+from collision_arm import (
+    BALL,
+    ROD,
+    SURROUNDINGS,
+    box,
+    everything,
+    half_space,
+    panda,
+    random_states,
+    sphere,
+    two_links,
+    wide_rows,
+)
 
-from torque_safety_controller.collision.bodies import box, capsule, half_space, sphere
+from torque_safety_controller.collision.shapes import capsule
+from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
+from viability_bounds_pkg.parameter import read
+from viability_bounds_pkg.testing.ros_harness import read_config
+
+NODE = "controller_node"
 
 
 def names_of(avoidance, rows):
     return [avoidance.model.names[k] for k in rows.pair]
 
 
-def test_the_motion_of_the_joints_is_pinocchios():
-    """Velocity and bias of points fixed to the joints."""
-    arm = panda()[0]
-    avoidance, data = everything(), arm.model.createData()
-    motion = avoidance._work.motion
-    for q, v in random_states(20):
-        wide_rows(avoidance, q, v)
-        pin.forwardKinematics(arm.model, data, q, v, np.zeros(arm.n))
-        for i in range(1, arm.model.njoints):
-            placement = data.oMi[i]
-            np.testing.assert_allclose(motion.placements[i, :3], placement.rotation, atol=1e-13)
-            np.testing.assert_allclose(motion.placements[i, 3], placement.translation, atol=1e-13)
-            for ours, theirs in ((motion.velocity, data.v), (motion.bias, data.a)):
-                spatial = placement.act(theirs[i])
-                np.testing.assert_allclose(ours[i, 0], spatial.linear, atol=1e-12)
-                np.testing.assert_allclose(ours[i, 1], spatial.angular, atol=1e-12)
-
-
 def test_distances_are_coals():
     """Every pair of capsules, box and half space, by another implementation."""
-    avoidance = everything()
-    bodies, pairs = avoidance.model.bodies, avoidance.model.pairs
+    avoidance, data = everything(), panda()[0].model.createData()
+    arm, names = avoidance.model.arm, avoidance.model.names
+    shapes = {shape.name: (shape, arm.frames[0]) for shape in SURROUNDINGS}
+    for shape in read(ControllerConfiguration, read_config("panda", NODE)).collision.capsules:
+        shapes[shape.name] = (shape, arm.frames[arm.getFrameId(shape.name)])
+    geometry = pin.GeometryModel()
+    index = {
+        name: geometry.addGeometryObject(shape.geometry(frame.parentJoint, frame.placement))
+        for name, (shape, frame) in shapes.items()
+    }
+    for name in names:
+        geometry.addCollisionPair(pin.CollisionPair(*(index[each] for each in name.split(" - "))))
+    found = geometry.createData()
     compared = 0
     for q, v in random_states(60, seed=1):
         wide_rows(avoidance, q, v)
-        for i, j, d in zip(pairs.first, pairs.second, avoidance.distances, strict=True):
+        pin.computeDistances(arm, data, geometry, found, q)
+        for name, d, result in zip(names, avoidance.distances, found.distanceResults, strict=True):
             if d == np.inf:
                 continue
-            first, second = _coal_body(avoidance, i), _coal_body(avoidance, j)
-            request, result = coal.DistanceRequest(), coal.DistanceResult()
-            expected = coal.distance(*first, *second, request, result)
-            box_like = isinstance(second[0], coal.Box)
-            # A capsule whose axis is inside a box is measured otherwise: from its deepest point.
-            if box_like and d < -bodies.radius[i]:
-                assert expected < 0.0
+            shape, other = (shapes[each][0] for each in name.split(" - "))
+            # Of a capsule whose axis is inside a box, its ends and the middle of the part inside
+            # are measured.
+            if other.is_box and d < -shape.radius:
+                assert result.min_distance < 0.0
             else:
                 # coal goes by GJK for boxes, to 1e-6 m
-                assert d == pytest.approx(expected, abs=2e-6 if box_like else 1e-9)
+                tolerance = 2e-6 if other.is_box else 1e-9
+                assert d == pytest.approx(result.min_distance, abs=tolerance)
             compared += 1
     assert compared > 2000
-
-
-def _coal_body(avoidance, i):
-    bodies, motion = avoidance.model.bodies, avoidance._work.motion
-    half = bodies.half[bodies.first[i]]
-    R, centre = motion.rotation[i].copy(), motion.centre[i].copy()
-    if bodies.plane[i]:
-        surface = R[:, 2] @ centre + half[2]
-        return coal.Halfspace(R[:, 2], surface), coal.Transform3s()
-    if half.all():
-        return coal.Box(2.0 * half), coal.Transform3s(R, centre)
-    return coal.Capsule(float(bodies.radius[i]), 2.0 * half[2]), coal.Transform3s(R, centre)
 
 
 def test_rate_and_acceleration_by_finite_differences():

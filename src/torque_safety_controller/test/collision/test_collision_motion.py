@@ -3,10 +3,9 @@
 
 import numpy as np
 import pytest
-from collision_arm import Journey, panda, two_links
+from collision_arm import Journey, box, panda, sphere, two_links
 
 from torque_safety_controller.collision.avoidance import CollisionAvoidance
-from torque_safety_controller.collision.bodies import box, sphere
 from torque_safety_controller.collision.rows import RESERVE
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.joint_limits import JointLimits
@@ -17,7 +16,7 @@ TOLERANCE = 5e-4  # m; of the reserve of 2 mm, what may be used in these motions
 
 
 def journey(dt=2e-3, obstacles=True, move=None):
-    arm, limits, collision, _ = panda(obstacles)
+    arm, limits, collision = panda(obstacles)
     avoidance = CollisionAvoidance(collision, limits.a_min, limits.a_max, 2.0 * dt)
     return arm, Journey(avoidance, limits, dt, move)
 
@@ -56,7 +55,7 @@ def test_without_rows_the_same_goals_collide():
 def test_the_hand_driven_into_the_arm_or_the_table_stops_before_it(obstacles):
     """Under torques held for a step, by forward dynamics, as a robot moves."""
     dt = 2e-3
-    arm, limits, _, _ = panda(obstacles)
+    arm, limits, _ = panda(obstacles)
     robot = RobotModel(arm.model, arm.frame, dt)
 
     def move(q, v, a):

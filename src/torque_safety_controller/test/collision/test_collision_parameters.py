@@ -6,7 +6,6 @@ import yaml
 from collision_arm import panda
 
 from torque_safety_controller.collision.avoidance import CollisionSettings
-from torque_safety_controller.collision.bodies import SHAPES, make_obstacle
 from torque_safety_controller.node.assembly import load_collision
 from torque_safety_controller.parameters.collision_parameters import CollisionConfiguration
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
@@ -34,7 +33,7 @@ def configuration(**changes):
 def load(**changes):
     arm = panda()[0]
     config = controller_configuration(**changes)
-    return load_collision(config, config.read_urdf(), arm.model)
+    return load_collision(config, arm.model)
 
 
 def test_off_by_default_and_then_nothing_is_loaded():
@@ -57,18 +56,15 @@ def test_each_setting_arrives(name):
 
 def test_obstacles_become_shapes_in_the_base_frame():
     avoidance = load(obstacles=THINGS)
-    bodies = avoidance.model.bodies
-    table, ball, pole, floor = bodies.half[bodies.first[-5:-1]]
-    np.testing.assert_allclose(table, [0.2, 0.5, 0.025])
-    np.testing.assert_allclose(ball, 0.0)
-    np.testing.assert_allclose(pole, [0.0, 0.0, 0.5])
-    np.testing.assert_allclose(bodies.radius[-4:], [0.0, 0.1, 0.03, 0.0])
-    centres = [[0.7, 0.0, 0.2], [0.5, 0.3, 0.5], [0.4, -0.4, 0.5], [0.0, 0.0, -0.1 - floor[2]]]
-    np.testing.assert_allclose(bodies.centre[-4:], centres, atol=1e-12)
-    expected = pin.utils.rotate("z", 0.8)
-    np.testing.assert_allclose(bodies.rotation[-4], expected, atol=1e-12)
-    np.testing.assert_allclose(bodies.rotation[-3:, :, 2], [[0.0, 0.0, 1.0]] * 3, atol=1e-12)
-    assert bodies.plane.tolist()[-4:] == [False, False, False, True]
+    segments = avoidance.model.segments
+    table, ball, pole, floor = range(11, 15)
+    np.testing.assert_allclose(segments.radius[[table, ball, pole, floor]], [0.0, 0.1, 0.03, 0.0])
+    np.testing.assert_allclose(segments.ends[ball], [[0.5, 0.3, 0.5]] * 2)
+    np.testing.assert_allclose(segments.ends[pole], [[0.4, -0.4, 0.0], [0.4, -0.4, 1.0]])
+    table, floor = segments.boxes
+    np.testing.assert_allclose(table[:2], [[0.7, 0.0, 0.2], [0.2, 0.5, 0.025]])
+    np.testing.assert_allclose(table[2:], pin.utils.rotate("z", 0.8).T, atol=1e-12)
+    assert floor[0, 2] + floor[1, 2] == pytest.approx(-0.1)
     assert {"panda_hand - table", "panda_hand - ball"} <= set(avoidance.model.names)
 
 
@@ -170,6 +166,8 @@ def test_the_diameters_of_a_round_obstacle_are_the_same():
         ({"collision_pairs": ["panda_hand panda_link7"]}, "collision_pairs"),
         ({"acceleration_max": [-1.0] * 7}, "acceleration_max"),
         ({"obstacles": [THINGS[1].replace("ball", "panda_hand")]}, "obstacles[0].name"),
+        ({"collision_capsules": None}, "collision_capsules"),
+        ({"collision_capsules": ["{link: hand, radius: 0.1}"]}, "collision_capsules[0].start"),
     ],
 )
 def test_what_the_robot_does_not_have_is_refused_by_the_name_of_the_parameter(changes, name):
@@ -181,9 +179,3 @@ def test_what_the_robot_does_not_have_is_refused_by_the_name_of_the_parameter(ch
 def test_the_parameters_are_checked_even_while_it_is_off():
     with pytest.raises(SettingError, match="shape"):
         configuration(collision_avoidance=False, obstacles=["{name: table}"])
-
-
-def test_all_shapes_can_be_made():
-    for shape in SHAPES:
-        made = make_obstacle("thing", shape, [0.1] * 3, [1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
-        assert made.name == "thing"

@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 from collision_arm import (
     BALL,
+    box,
     everything,
+    half_space,
     panda,
     panda_avoidance,
     random_states,
@@ -20,7 +22,6 @@ from torque_safety_controller.collision.avoidance import (
     CollisionAvoidance,
     CollisionSettings,
 )
-from torque_safety_controller.collision.bodies import box, half_space
 from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.joint_limits import JointLimits
@@ -58,7 +59,7 @@ def test_rows_are_left_out_only_if_the_bounds_imply_them():
     for q, v in random_states(150, speed=1.5, seed=5):
         every = wide_rows(avoidance, q, v)
         every = every._replace(G=every.G.copy(), lower=every.lower.copy())
-        _, limits, _, _ = panda()
+        _, limits, _ = panda()
         rows = avoidance.rows(q, v, limits.a_min, limits.a_max)
         least = np.where(every.G > 0.0, limits.a_min, limits.a_max)
         assert len(rows.lower) == np.count_nonzero(np.sum(every.G * least, axis=1) < every.lower)
@@ -67,7 +68,7 @@ def test_rows_are_left_out_only_if_the_bounds_imply_them():
 
 
 def test_pairs_that_are_not_looked_at_have_twice_the_way_to_stop():
-    _, limits, collision, _ = panda()
+    _, limits, collision = panda()
     avoidance = everything()
     usual = panda_avoidance(1000)
     compared = 0
@@ -83,7 +84,7 @@ def test_pairs_that_are_not_looked_at_have_twice_the_way_to_stop():
 
 
 def test_of_too_many_rows_the_nearest_are_returned():
-    arm, limits, collision, _ = panda()
+    arm, limits, collision = panda()
     few, every = panda_avoidance(3), panda_avoidance(1000)
     cut = 0
     for q, v in random_states(100, speed=2.0, seed=8):
@@ -150,7 +151,7 @@ finite = st.floats(-1.0, 1.0, allow_nan=False)
     st.sampled_from([0.0, 1e-8, 1.0, 50.0]),
 )
 def test_rows_are_finite_in_every_state(position, velocity, speed):
-    arm, limits, _, _ = panda()
+    arm, limits, _ = panda()
     avoidance = _near()
     q = arm.q_min + (np.array(position) + 1.0) * 0.5 * (arm.q_max - arm.q_min)
     rows = avoidance.rows(q, speed * np.array(velocity), limits.a_min, limits.a_max)
@@ -164,7 +165,7 @@ _cache = []
 
 def _near():
     if not _cache:
-        _, limits, collision, _ = panda()
+        _, limits, collision = panda()
         _cache.append(CollisionAvoidance(collision, limits.a_min, limits.a_max, 2e-3))
     return _cache[0]
 
@@ -182,7 +183,7 @@ def test_settings_that_cannot_be_are_refused(changes, word):
 
 
 def test_limits_and_steps_that_cannot_be_are_refused():
-    _, limits, collision, _ = panda()
+    _, limits, collision = panda()
     with pytest.raises(SettingError, match="acceleration_max"):
         CollisionAvoidance(collision, limits.a_min, -limits.a_max, 1e-3)
     with pytest.raises(SettingError, match="acceleration_min"):

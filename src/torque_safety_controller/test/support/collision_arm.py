@@ -15,12 +15,29 @@ from torque_safety_controller.collision.avoidance import (
     CollisionRows,
     CollisionSettings,
 )
-from torque_safety_controller.collision.bodies import box, capsule, half_space, sphere
+from torque_safety_controller.collision.link_capsules import link_capsules
 from torque_safety_controller.collision.model import CollisionModel, build_collision_model
+from torque_safety_controller.collision.shapes import Shape, capsule, make_obstacle
+from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from viability_bounds_pkg.joint_limits import JointLimits
-from viability_bounds_pkg.robot_description import build_model, load_geometry, read_urdf
+from viability_bounds_pkg.parameter import read
+from viability_bounds_pkg.robot_description import build_model, load_geometry
 from viability_bounds_pkg.testing.ros_harness import read_config
 from viability_bounds_pkg.viability import BoundsSolver
+
+
+def box(name, centre, size, orientation=(0.0, 0.0, 0.0, 1.0)) -> Shape:
+    return make_obstacle(name, "box", size, centre, orientation)
+
+
+def sphere(name, centre, radius) -> Shape:
+    return make_obstacle(name, "sphere", [2.0 * radius] * 3, centre)
+
+
+def half_space(name, point, normal) -> Shape:
+    turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), np.array(normal))
+    return make_obstacle(name, "half_space", [], point, turn.coeffs())
+
 
 SURROUNDINGS = (
     box("table", [0.7, 0.0, 0.2], [0.4, 1.0, 0.05], [0.1, 0.2, 0.3, 1.0]),
@@ -56,9 +73,10 @@ def two_links(
     """Return an arm in the x-y plane whose forearm has one collision shape, 20 rad/s^2 a joint."""
     urdf = _TWO_LINKS.format(shape=shape, reach=reach, kind=kind, axis=axis)
     model = build_model(urdf, ["shoulder", "elbow"])
+    capsules = link_capsules(model, load_geometry(urdf, model))
     collision = build_collision_model(
         model,
-        load_geometry(urdf, model),
+        [capsule("fore", *each) for each in capsules["fore"]],
         np.zeros(2),
         obstacles,
         samples=10,
@@ -73,16 +91,16 @@ def two_links(
 
 def with_constants(avoidance: CollisionAvoidance, **constants: float) -> CollisionAvoidance:
     """Change what no setting reaches, to see more in a test."""
-    avoidance._use(avoidance._work._replace(**constants))
+    for name, value in constants.items():
+        setattr(avoidance, name, value)
     return avoidance
 
 
 @cache
-def panda(obstacles: bool = True) -> tuple[Arm, JointLimits, CollisionModel, pin.GeometryModel]:
-    """Return Panda with its limits, its collision model and the geometry this was made from."""
+def panda(obstacles: bool = True) -> tuple[Arm, JointLimits, CollisionModel]:
+    """Return Panda with its limits and its collision model."""
     arm = load_arm("panda")
     config, bounds = (read_config("panda", node) for node in ("controller_node", "bounds_node"))
-    geometry = load_geometry(read_urdf(config["robot_description"]), arm.model)
     limits = JointLimits(
         tuple(config["joints"]),
         arm.q_min,
@@ -92,8 +110,9 @@ def panda(obstacles: bool = True) -> tuple[Arm, JointLimits, CollisionModel, pin
         np.array(bounds["acceleration_max"]),
     )
     surroundings = SURROUNDINGS if obstacles else ()
-    collision = build_collision_model(arm.model, geometry, arm.q_start, surroundings, samples=3000)
-    return arm, limits, collision, geometry
+    capsules = read(ControllerConfiguration, config).collision.capsules
+    collision = build_collision_model(arm.model, capsules, arm.q_start, surroundings, samples=3000)
+    return arm, limits, collision
 
 
 def everything() -> CollisionAvoidance:
@@ -102,10 +121,9 @@ def everything() -> CollisionAvoidance:
 
 
 def panda_avoidance(rows_max: int) -> CollisionAvoidance:
-    _, limits, collision, _ = panda()
+    _, limits, collision = panda()
     avoidance = CollisionAvoidance(collision, limits.a_min, limits.a_max, 2e-3)
-    avoidance._rows_max = rows_max
-    return avoidance
+    return with_constants(avoidance, rows_max=rows_max)
 
 
 def random_states(count, speed=1.0, seed=0):

@@ -79,7 +79,7 @@ def write_rows(
             lever = max(lever, abs(g))
         d, rate, bias = motion[f, 0], motion[f, 1], motion[f, 2]
         room = d - kept
-        # A bias towards the other body takes from the braking, but it falls with the speed squared.
+        # A bias towards the other body takes from the braking, but falls with the speed squared.
         share = BRAKING_SHARE * brake
         counted = min(BRAKING, share)
         braking = max(min(counted, share + bias), _LEAST_SHARE * counted, _LEAST_BRAKING)
