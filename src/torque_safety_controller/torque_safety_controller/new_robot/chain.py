@@ -73,22 +73,33 @@ def find_chain(urdf: str, tips: Sequence[str], base: str = "") -> Chain:
     root = ElementTree.fromstring(urdf)
     above = _joints_above(root)
     links = [each.get("name", "") for each in root.findall("link")]
-    for what, link in (*(("tip", tip) for tip in tips), *((("base", base),) if base else ())):
+    for link in (*tips, *filter(None, [base])):
         if link not in links:
             parents = {_link(joint, "parent") for joint in root.findall("joint")}
             ends = ", ".join(link for link in links if link not in parents)
             hint = did_you_mean(link, links) or f"; links at the ends: {ends}"
-            raise NewRobotError(f"the URDF has no link '{link}' for the {what}{hint}")
+            raise NewRobotError(f"the URDF has no link '{link}'{hint}")
     elements: dict[str, Element] = {}
     for tip in tips:
         elements |= _way(above, tip, base)
     moving = {name: each for name, each in elements.items() if each.get("type") in _MOVING}
-    _check_kinds(root, above, elements, moving, tips, base)
+    for tip in tips:
+        way = _way(above, tip, "")
+        _check_kinds(
+            root,
+            {name: each for name, each in elements.items() if name in way},
+            {name: each for name, each in moving.items() if name in way},
+        )
+    if not moving:
+        raise NewRobotError(
+            f"no joint moves between '{base or 'the root'}' and {', '.join(tips)}; the tip must "
+            "be a link behind the arm's last joint"
+        )
     limits = np.array([_limits(name, each) for name, each in moving.items()]).T
     order = kinematic_order(urdf, tuple(moving))
     q_min, q_max, v_max, tau_max = limits[:, [list(moving).index(name) for name in order]]
     model = build_model(urdf, order)
-    _check_inertias(model, tau_max)
+    _check_inertias(model)
     others = (each for each in root.findall("joint") if each.get("type") in _MOVING)
     return Chain(
         name=_file_name(root.get("name", "robot")),
@@ -145,49 +156,38 @@ def _way(above: Mapping[str, Element], tip: str, base: str) -> dict[str, Element
 
 
 def _check_kinds(
-    root: Element,
-    above: Mapping[str, Element],
-    elements: Mapping[str, Element],
-    moving: Mapping[str, Element],
-    tips: Sequence[str],
-    base: str,
+    root: Element, elements: Mapping[str, Element], moving: Mapping[str, Element]
 ) -> None:
-    mimicked = {
+    """Refuse joints without a motor of their own, and grippers."""
+    followers = {
         mimic.get("joint", ""): joint.get("name", "")
         for joint in root.findall("joint")
         if (mimic := joint.find("mimic")) is not None
     }
     for name, each in elements.items():
-        parent, child = _link(each, "parent"), _link(each, "child")
-        kind = each.get("type")
+        parent, kind = _link(each, "parent"), each.get("type")
+        before = f"end the arm before it, with the tip {parent}"
         if kind in ("floating", "planar"):
             raise NewRobotError(
-                f"joint '{name}' is {kind}, which no motor moves; --base {child} leaves it out"
+                f"joint '{name}' is {kind}, which no motor moves; --base {_link(each, 'child')} "
+                "leaves it out"
             )
         if each.find("mimic") is not None and kind in _MOVING:
             raise NewRobotError(
                 f"joint '{name}' mimics another, as a gripper's do: it has no motor of its own; "
-                f"end the arm before it, with the tip {parent}"
+                f"{before}"
             )
-    for name, each in elements.items():
-        if name in mimicked:
-            parent = _link(each, "parent")
-            raise NewRobotError(
-                f"joint '{name}' is one that '{mimicked[name]}' mimics, as a gripper's are; end "
-                f"the arm before it, with the tip {parent}"
-            )
-    if not moving:
+    for name in filter(followers.get, elements):
         raise NewRobotError(
-            f"no joint moves between '{base or 'the root'}' and {', '.join(tips)}; the tip must "
-            "be a link behind the arm's last joint"
+            f"joint '{name}' is one that '{followers[name]}' mimics, as a gripper's are; end the "
+            f"arm before it, with the tip {_link(elements[name], 'parent')}"
         )
-    for tip in tips:
-        way = _way(above, tip, "")
-        last = [each for name, each in moving.items() if name in way][-1]
-        if last.get("type") == "prismatic" and len(moving) > 1:
+    if len(moving) > 1:
+        name, last = list(moving.items())[-1]
+        if last.get("type") == "prismatic":
             raise NewRobotError(
-                f"joint '{last.get('name')}', the last before '{tip}', slides, as a gripper's do; "
-                f"end the arm before it, with the tip {_link(last, 'parent')}"
+                f"joint '{name}', the last, slides, as a gripper's do; end the arm before it, "
+                f"with the tip {_link(last, 'parent')}"
             )
 
 
@@ -195,14 +195,15 @@ def _limits(name: str, joint: Element) -> tuple[float, float, float, float]:
     """Return position limits, speed and effort of a joint."""
     limit = joint.find("limit")
     values = {key: math.nan for key in ("lower", "upper", "velocity", "effort")}
-    for key in values if limit is not None else ():
-        try:
-            values[key] = float(limit.get(key, "nan"))  # type: ignore[union-attr]
-        except ValueError:
-            raise NewRobotError(
-                f"joint '{name}' has {key}=\"{limit.get(key)}\", not a number; "  # type: ignore
-                "correct its <limit> in the URDF"
-            ) from None
+    if limit is not None:
+        for key in values:
+            try:
+                values[key] = float(limit.get(key, "nan"))
+            except ValueError:
+                raise NewRobotError(
+                    f"joint '{name}' has {key}=\"{limit.get(key)}\", not a number; correct its "
+                    "<limit> in the URDF"
+                ) from None
     for key, what in (("effort", "torque"), ("velocity", "speed")):
         if not (math.isfinite(values[key]) and values[key] > 0.0):
             given = "no" if math.isnan(values[key]) else f"{values[key]:g} as"
@@ -210,30 +211,24 @@ def _limits(name: str, joint: Element) -> tuple[float, float, float, float]:
                 f"joint '{name}' has {given} {key} limit: nothing is known of its {what}; write "
                 f'{key}="..." into its <limit> in the URDF, from the data sheet'
             )
+    low, high = values["lower"], values["upper"]
     if joint.get("type") == "continuous":
-        return -math.inf, math.inf, values["velocity"], values["effort"]
-    if not values["lower"] < values["upper"]:
+        low, high = -math.inf, math.inf
+    if not low < high:
         raise NewRobotError(
-            f"joint '{name}' has no room between its position limits, {values['lower']:g} and "
-            f'{values["upper"]:g}; write lower="..." and upper="..." into its <limit>, or make '
-            "it continuous"
+            f"joint '{name}' has no room between its position limits, {low:g} and {high:g}; write "
+            'lower="..." and upper="..." into its <limit>, or make it continuous'
         )
-    return values["lower"], values["upper"], values["velocity"], values["effort"]
+    return low, high, values["velocity"], values["effort"]
 
 
-def _check_inertias(model: pin.Model, tau_max: Array) -> None:
-    M = pin.crba(model, model.createData(), np.zeros(model.nq))
-    light = np.flatnonzero(np.diag(M) <= NO_INERTIA)
-    for index in light:
-        name = model.names[1 + int(index)]
+def _check_inertias(model: pin.Model) -> None:
+    inertia = np.diag(pin.crba(model, model.createData(), np.zeros(model.nq)))
+    for index in np.flatnonzero(~(inertia > NO_INERTIA)).tolist():
         raise NewRobotError(
-            f"joint '{name}' moves no inertia: the links beyond it have no <inertial>; write mass "
-            "and moments of inertia into the URDF, or end the arm before it"
+            f"joint '{model.names[1 + index]}' moves no inertia: the links beyond it have no "
+            "<inertial>; write mass and moments of inertia into the URDF, or end the arm before it"
         )
-    fastest = tau_max / np.diag(M)
-    if (bad := np.flatnonzero(~np.isfinite(fastest))).size:
-        name = model.names[1 + int(bad[0])]
-        raise NewRobotError(f"joint '{name}' has an inertia that is no number; correct the URDF")
 
 
 def _file_name(name: str) -> str:

@@ -56,7 +56,7 @@ class SelfCollisions:
                 if joints[0] != joints[1] and parents[joints[1]] != joints[0]:
                     geometry.addCollisionPair(pin.CollisionPair(first, second))
         self._geometry = geometry
-        self._drop_those_that_always_touch(chain)
+        self._drop_pairs_in_touch(chain)
         self.pairs = len(geometry.collisionPairs)
         if not shapes:
             self.trouble = "the URDF has no collision shapes"
@@ -71,7 +71,7 @@ class SelfCollisions:
     def _update(self, q: Array) -> None:
         pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._found, q)
 
-    def _drop_those_that_always_touch(self, chain: Chain) -> None:
+    def _drop_pairs_in_touch(self, chain: Chain) -> None:
         """Leave out pairs that overlap nearly anywhere, as shapes of a wrist often do."""
         self._found = self._geometry.createData()
         # Copies: removing one moves what Pinocchio's own refer to.
@@ -121,9 +121,10 @@ def find_postures(chain: Chain, touches: SelfCollisions) -> Postures:
     start = _start(chain, touches, random)
     goals: list[Array] = []
     reached = np.zeros((len(start), 2), dtype=bool)
-    while len(goals) < _GOALS:
-        goal, at = _goal(chain, touches, start, random, reached)
-        if goal is None:
+    for _ in range(_GOALS):
+        tried = [_goal(chain, touches, start, random, reached) for _ in range(_TRIES)]
+        goal, at = max(tried, key=lambda each: int(each[1].sum()))
+        if not at.any():
             break
         goals.append(goal)
         reached |= at
@@ -177,35 +178,22 @@ def _goal(
     start: Array,
     random: np.random.Generator,
     reached: NDArray[np.bool_],
-) -> tuple[Array | None, NDArray[np.bool_]]:
-    """Return a posture with joints at limits where none has been yet, of those tried with most.
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Return a posture with joints at limits where none has been yet, and which, shape (n, 2).
 
     From the start one joint after the other, in random order, is brought to a limit if the arm can
     still go there straight. Continuous joints, which have no position limits, turn by half a turn
     instead.
-
-    Args:
-        chain: the arm.
-        touches: tells its collisions with itself.
-        start: from which a straight way leads there.
-        random: generator of orders.
-        reached: the limits that earlier goals have, shape (n, 2).
     """
     low = np.where(chain.continuous, start - np.pi, chain.q_min)
     high = np.where(chain.continuous, start + np.pi, chain.q_max)
-    best, of_best = None, np.zeros_like(reached)
-    for _ in range(_TRIES):
-        q, at = start, np.zeros_like(reached)
-        for joint, side in random.permutation(np.argwhere(~reached)):
-            if at[joint].any():
-                continue
-            there = q.copy()
-            there[joint] = (low, high)[side][joint]
-            if _leads_straight(chain, touches, start, there):
-                q, at[joint, side] = there, True
-        if at.sum() > of_best.sum():
-            best, of_best = q, at
-    return best, of_best
+    q, at = start, np.zeros_like(reached)
+    for joint, side in random.permutation(np.argwhere(~reached)):
+        there = q.copy()
+        there[joint] = (low, high)[side][joint]
+        if not at[joint].any() and _leads_straight(chain, touches, start, there):
+            q, at[joint, side] = there, True
+    return q, at
 
 
 def _leads_straight(chain: Chain, touches: SelfCollisions, start: Array, q: Array) -> bool:

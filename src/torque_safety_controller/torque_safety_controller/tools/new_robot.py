@@ -11,12 +11,13 @@ import argparse
 import re
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torque_safety_controller.loop_margins.gain_check import (
     HORIZON,
@@ -33,6 +34,7 @@ from torque_safety_controller.new_robot.files import (
 )
 from torque_safety_controller.new_robot.hardware import (
     GRADES,
+    Grade,
     acceleration_errors,
     with_rotors,
 )
@@ -50,6 +52,9 @@ from viability_bounds_pkg.robot_description import (
     resolve_uri,
 )
 from viability_bounds_pkg.user_input.parameter_files import read_files
+
+Array = NDArray[np.float64]
+Gains = dict[str, float]
 
 GAINS = {
     "pose_kp": 30.0,
@@ -180,65 +185,86 @@ def _run(options: argparse.Namespace) -> int:
     )
     if "urdf" in files:
         write_whole(files["urdf"], urdf)
-    gains = GAINS | {"disturbance_time": OBSERVER_PERIODS / estimates.rate_hz}
-    for _ in range(_ROUNDS):
-        text = parameter_file(
+
+    def robot_text(gains: Gains) -> str:
+        return parameter_file(
             chain, estimates, postures, touches, source=source, base=options.base, gains=gains
         )
-        write_whole(files["robot"], text)
-        beyond = _exceeded([files["robot"]])
-        if not beyond:
-            break
-        gains = _lowered(gains, beyond)
-    else:
-        raise NewRobotError(f"no gains suit this rate: {_told(beyond[0])}; a higher --rate")
+
+    begin = GAINS | {OBSERVER: OBSERVER_PERIODS / estimates.rate_hz}
+    text, gains = _with_gains_that_suit(robot_text, begin, [])
+    write_whole(files["robot"], text)
     write_whole(files["scenario"], scenario_file(chain, estimates, postures))
-    _write_imperfect(chain, estimates, gains, files)
+    write_whole(files["imperfect"], _imperfect(chain, estimates, gains, files["robot"]))
     for name, path in files.items():
-        if path.exists():
-            print(f"written: {path} ({name})")
+        print(f"written: {path} ({name})")
     return 0
 
 
-def _write_imperfect(
-    chain: Chain, ideal: Estimates, gains: dict[str, float], files: dict[str, Path]
-) -> None:
-    """Write the file of the imperfect robot, with the first grade of hardware that leaves bounds.
+def _imperfect(chain: Chain, ideal: Estimates, gains: Gains, robot: Path) -> str:
+    """Return the file of the imperfect robot, with the first grade of hardware that leaves bounds.
+
+    Args:
+        chain: the arm.
+        ideal: its limits, without rotors and imperfections.
+        gains: in its own file.
+        robot: that file.
 
     Raises:
-        NewRobotError: none does.
+        NewRobotError: no hardware leaves bounds.
     """
     real = with_rotors(chain)
     estimates = estimate(real, ideal.rate_hz)
-    path, reason = files["imperfect"], ""
+    reason = ""
     for grade in GRADES:
         disturbance = acceleration_errors(real, estimates, grade)
-        own = {**gains, **IMPERFECT_GAINS}
-        for _ in range(_ROUNDS):
-            changed: dict[str, Any] = {"integral_action": "joints"}
-            changed |= {name: value for name, value in own.items() if gains.get(name) != value}
-            text = imperfect_file(real, ideal, estimates, grade, disturbance, changed)
-            with tempfile.NamedTemporaryFile("w", suffix=".yaml") as trial:
-                trial.write(text)
-                trial.flush()
-                try:
-                    beyond = _exceeded([files["robot"], Path(trial.name)])
-                except ArmSafetyError as error:
-                    reason = str(error).partition(": ")[2]
-                    break
-            if not beyond:
-                write_whole(path, text)
-                return
-            reason = _told(beyond[0])
-            longer = [each for each in beyond if each.name == HORIZON]
-            if longer and np.isfinite(longer[0].limit):
-                grade = replace(grade, horizon=float(np.ceil(longer[0].limit / _INSIDE)))
-            elif longer:
-                break
-            own = _lowered(own, beyond)
+
+        def text(own: Gains, grade: Grade = grade, disturbance: Array = disturbance) -> str:
+            longer = replace(grade, horizon=own[HORIZON])
+            changed: dict[str, Any] = {"integral_action": "joints"} | {
+                name: value
+                for name, value in own.items()
+                if name != HORIZON and gains.get(name) != value
+            }
+            return imperfect_file(real, ideal, estimates, longer, disturbance, changed)
+
+        try:
+            begin = {**gains, **IMPERFECT_GAINS, HORIZON: grade.horizon}
+            return _with_gains_that_suit(text, begin, [robot])[0]
+        except ArmSafetyError as error:  # it leaves no bounds, or no gains suit
+            reason = str(error).partition(": ")[2]
     raise NewRobotError(
         f"no assumed hardware leaves this arm bounds at {ideal.rate_hz:g} Hz: {reason}; a higher "
         "--rate, or a file of your own like those in config/imperfect"
+    )
+
+
+def _with_gains_that_suit(
+    make: Callable[[Gains], str], gains: Gains, before: Sequence[Path]
+) -> tuple[str, Gains]:
+    """Return a parameter file, and gains in it that the robot bears: lowered until it does.
+
+    Args:
+        make: returns the file with gains.
+        gains: to begin with.
+        before: files that are given before it.
+
+    Raises:
+        ArmSafetyError: the files leave no bounds, or no gains suit.
+    """
+    for _ in range(_ROUNDS):
+        text = make(gains)
+        with tempfile.NamedTemporaryFile("w", suffix=".yaml") as trial:
+            trial.write(text)
+            trial.flush()
+            beyond = _exceeded([*before, Path(trial.name)])
+        if not beyond:
+            return text, gains
+        gains = _lowered(gains, beyond)
+    worst = beyond[0]
+    raise NewRobotError(
+        f"no gains suit this rate: '{worst.name}' is {worst.value:.4g}, beyond its limit "
+        f"{worst.limit:.3g}; a higher --rate"
     )
 
 
@@ -255,21 +281,19 @@ def _exceeded(paths: Sequence[Path]) -> list[GainLimit]:
     return [each for each in GainCheck(config, robot, model).limits() if each.exceeded]
 
 
-def _told(limit: GainLimit) -> str:
-    return f"'{limit.name}' is {limit.value:.4g}, beyond its limit {limit.limit:.3g}"
-
-
-def _lowered(gains: dict[str, float], beyond: Sequence[GainLimit]) -> dict[str, float]:
-    """Return gains, with those that are too large lowered to their limits."""
+def _lowered(gains: Gains, beyond: Sequence[GainLimit]) -> Gains:
+    """Return gains, with those that are beyond their limits brought inside."""
     changed = dict(gains)
     for each in beyond:
         task, _, kind = each.name.rpartition("_")
         share = _INSIDE * each.limit / each.value if each.value else 0.0
-        if each.name == OBSERVER:
-            changed[each.name] = float(f"{each.limit / _INSIDE:.3g}")
+        if each.name == HORIZON and HORIZON in gains and np.isfinite(each.limit):
+            changed[HORIZON] = float(np.ceil(each.limit / _INSIDE))
+        elif each.name == OBSERVER:
+            changed[OBSERVER] = float(f"{each.limit / _INSIDE:.3g}")
         elif kind == "kd" and f"{task}_kp" in gains:
             changed[f"{task}_kp"] = float(f"{gains[f'{task}_kp'] * share**2:.3g}")
-        elif each.name in gains:
+        elif each.name in gains and each.name != HORIZON:
             changed[each.name] = float(f"{gains[each.name] * share:.3g}")
     return changed
 
