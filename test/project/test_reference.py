@@ -150,7 +150,7 @@ def test_a_node_has_the_parameters_of_its_table_and_describes_them(ros, name):
     node = start(ros, name)
     own = {
         parameter
-        for parameter in node._parameters
+        for parameter in node.list_parameters([], 0).names
         if not parameter.startswith(("use_sim_time", "start_type_description", "qos_overrides"))
     }
     assert own == {row.name for row in make_reference.TABLES[name]}

@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidParameterTypeException
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
 from viability_bounds_pkg.exceptions import ArmSafetyError
@@ -17,8 +16,6 @@ from viability_bounds_pkg.ros.claim import Claim
 from viability_bounds_pkg.ros.direct_delivery import DirectDelivery
 from viability_bounds_pkg.ros.given_parameters import given_parameters
 from viability_bounds_pkg.ros.topics import Topic
-
-RCLError = rclpy_implementation.RCLError
 
 CLOCK_TIMEOUT = 5.0
 """How long ``/clock`` may be silent at start before a node warns, s."""
@@ -59,7 +56,7 @@ class ArmNode(Node):
         try:
             # With the services that `rqt_logger_level` uses.
             super().__init__(self.NAME, enable_logger_service=True, **node_arguments)
-        except (RCLError, InvalidParameterTypeException) as error:  # security; use_sim_time
+        except (RuntimeError, InvalidParameterTypeException) as error:  # security, use_sim_time
             raise StartError(str(error)) from error
         self.given = given_parameters(self.context, self.get_fully_qualified_name())
         for name in list(self.given):

@@ -8,13 +8,12 @@ last value given counts, and null is none.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from viability_bounds_pkg.user_input.parameter_files import read_sections
+from viability_bounds_pkg.user_input.parameter_files import is_section_of, read_sections
 from viability_bounds_pkg.user_input.yaml_file import load_yaml
 
 _ARGUMENTS: WeakKeyDictionary[Any, Sequence[str]] = WeakKeyDictionary()
@@ -48,10 +47,3 @@ def given_parameters(context: Any, node: str) -> dict[str, Any]:
             if not of or is_section_of(f"/**/{of}", node):
                 values[name] = load_yaml(value)
     return values
-
-
-def is_section_of(section: str, node: str) -> bool:
-    """Return whether a section, with ``*`` for a name and ``**`` for any, is for a node."""
-    words = (re.escape(word) for word in section.strip("/").split("/"))
-    kinds = {re.escape("**"): "(/[^/]+)*", re.escape("*"): "/[^/]+"}
-    return re.fullmatch("".join(kinds.get(word, f"/{word}") for word in words), node) is not None

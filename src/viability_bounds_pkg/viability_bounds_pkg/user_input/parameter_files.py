@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -52,12 +53,19 @@ def _sections(content: Any, path: str, section: str = "") -> Iterator[tuple[str,
             yield from _sections(value, path, f"{section}/{str(key).strip('/')}")
 
 
+def is_section_of(section: str, node: str) -> bool:
+    """Return whether a section, with ``*`` for a name and ``**`` for any, is for a node."""
+    words = (re.escape(word) for word in section.strip("/").split("/"))
+    kinds = {re.escape("**"): "(/[^/]+)*", re.escape("*"): "/[^/]+"}
+    return re.fullmatch("".join(kinds.get(word, f"/{word}") for word in words), node) is not None
+
+
 def node_parameters(paths: Sequence[Path], node: str) -> dict[str, Any]:
     """Return the parameters of one node, those for all nodes included.
 
     Args:
         paths: parameter files; of several values of a parameter the last one counts.
-        node: ``/**/name``; sections ``name`` and ``/name`` count as well.
+        node: its name, which may follow ``/**/``.
 
     Raises:
         YamlError: see `read_sections`.
@@ -66,7 +74,7 @@ def node_parameters(paths: Sequence[Path], node: str) -> dict[str, Any]:
     parameters: dict[str, Any] = {}
     for path in paths:
         for section, values in read_sections(path).items():
-            if section not in ("/**", f"/{node.rpartition('/')[2]}", node):
+            if not is_section_of(section, f"/{node.rpartition('/')[2]}"):
                 continue
             if unknown := unknown_parameters(values):
                 raise ParameterFileError(f"{path}: {unknown}")
