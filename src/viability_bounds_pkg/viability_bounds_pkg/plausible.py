@@ -14,9 +14,10 @@ A state is refused where
 - a position stays the same to the last bit while velocities beyond their errors lead away: it has
   frozen. What freezes while the arm is slower is not told.
 
-Afterwards states are accepted again at once if they go on from the last accepted one, or else when
-they have been plausible among themselves for `WINDOW`. After a gap of `GAP` in the stamps anything
-in range is accepted: robots that restart make one.
+Afterwards states are accepted again at once if they follow the last accepted one. Else they must
+have been plausible among themselves for `WINDOW`, and no joint may be farther away than it moves
+within `STOPPING`. After a gap of `GAP` in the stamps anything in range is accepted: robots that
+restart make one.
 """
 
 from __future__ import annotations
@@ -41,6 +42,9 @@ may be the velocities that were wrong, of an arm that stands."""
 GAP = 0.1
 """Time between states after which the later one is a new beginning, s; three periods at least."""
 
+STOPPING = 0.35
+"""How long an arm whose states are refused may move at its speed limits until it stands, s."""
+
 RESTART_GAP = 1.0
 """By how much the stamps of a robot leap that has started again, s."""
 
@@ -49,6 +53,9 @@ POSITION_ERROR = 2e-3
 
 VELOCITY_ERROR = 0.05
 """Error of velocities that need not be declared, as a share of the speed limits: filters."""
+
+FILTER = 3e-3
+"""Time constant of filters of velocities that are told from frozen positions, s."""
 
 FAST = 2.0
 """How many times faster than its limit a joint may move: it may be pushed."""
@@ -120,7 +127,8 @@ class PlausibilityCheck:
             self._velocity = self._velocity + velocity_error
         # An impact, at any moment of a period, changes a speed from one limit to the other.
         self._drift = self._position + WINDOW * self._velocity + 2.0 * dt * fastest
-        self._way = self._position + dt * fastest  # a robot may repeat a position once
+        # A robot may repeat a position once, and a filter let velocities outlast a hit.
+        self._way = self._position + max(dt, FILTER) * fastest
         self._dt = dt
         self.reset()
 
@@ -164,7 +172,7 @@ class PlausibilityCheck:
             reason, after = self._compare(self._doubted, state, time, unseen)
             if reason:
                 self._since = time
-            elif time - self._since >= WINDOW:
+            elif time - self._since >= WINDOW and self._within_reach(self._accepted.state, state):
                 self._accept(after)
                 return ""
         self._doubted = after
@@ -172,6 +180,11 @@ class PlausibilityCheck:
 
     def _accept(self, past: _Past) -> None:
         self._accepted, self._doubted = past, None
+
+    def _within_reach(self, before: State, state: State) -> bool:
+        """Return whether an arm that has stopped itself in between can be there."""
+        moved = np.abs(state.q - before.q)
+        return bool((moved <= self._position + STOPPING * self._v_max).all())
 
     def _out_of_range(self, state: State) -> str:
         if not ((self._low <= state.q) & (state.q <= self._high)).all():
