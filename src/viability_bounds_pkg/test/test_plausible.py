@@ -24,8 +24,8 @@ N, LIMIT = 4, np.full(4, 2.5)
 NONE = np.zeros(N)
 
 
-def make_check(h=0.002, velocity_error=NONE, limit=LIMIT):
-    return PlausibilityCheck(-limit, limit, np.full(N, 2.0), h, NONE, velocity_error)
+def make_check(h=0.002, velocity_error=NONE, limit=LIMIT, position_error=NONE):
+    return PlausibilityCheck(-limit, limit, np.full(N, 2.0), h, position_error, velocity_error)
 
 
 def sine(t, size=0.75, w=2.0):
@@ -115,6 +115,11 @@ def test_velocities_that_are_not_used_are_not_checked():
     assert not play(check, lambda state: State(state.q, 1e200 * rng.standard_normal(N)))
     check.reset()
     assert play(check, SPOILT["a position leaps"][0])[0][1] == JUMP
+    check.reset()
+    refused = play(check, SPOILT["frozen positions"][0])
+    assert refused[0][1] == FROZEN and 1.0 < refused[0][0] < 1.02
+    assert len([t for t, _ in refused if t < 1.6]) > 290
+    assert refused[-1][0] < 1.6 + 2.0 * WINDOW
 
 
 def test_joints_without_limits_may_turn_for_ever():
@@ -128,19 +133,26 @@ def test_joints_without_limits_may_turn_for_ever():
     h=st.sampled_from([0.001, 0.002, 0.01]),
     lag=st.sampled_from([0.0, 0.001, 0.003]),
     resolution=st.sampled_from([0.0, 1e-4, 1e-3]),
+    used=st.booleans(),
     lost=st.sampled_from([0.0, 0.3]),
     seed=st.integers(0, 1000),
 )
-def test_violent_motions_impacts_filters_and_encoders_are_accepted(h, lag, resolution, lost, seed):
-    """Accelerations of up to 60 rad/s^2, hits, and a stop by brakes within one period."""
-    rng, check = np.random.default_rng(seed), make_check(h, limit=np.full(N, np.inf))
+def test_violent_motions_impacts_filters_and_encoders_are_accepted(
+    h, lag, resolution, used, lost, seed
+):
+    """Accelerations of up to 60 rad/s^2, hits, and stops of all joints within one period.
+
+    The last only where velocities are used: positions alone would seem to have frozen.
+    """
+    rng = np.random.default_rng(seed)
+    check = make_check(h, NONE if used else None, np.full(N, np.inf), np.full(N, 0.5 * resolution))
     (q, v, seen), a = np.zeros((3, N)), np.zeros(N)
     for k in range(round(1.5 / h)):
         if k % round(0.1 / h) == 0:
             a = rng.uniform(-60.0, 60.0, N)
         before, (q, v) = v, State(q, v).after(np.clip(a, (-2.0 - v) / h, (2.0 - v) / h), h)
         if rng.random() < 0.02:
-            hit = rng.uniform(-2.0, 2.0, N) if rng.random() < 0.7 else NONE
+            hit = rng.uniform(-2.0, 2.0, N) if rng.random() < 0.7 or not used else NONE
             q, v = q + rng.random() * h * (hit - v), hit
         seen = v + np.exp(-h / lag) * (seen - v) if lag else v
         told = resolution * np.round(q / resolution) if resolution else q

@@ -12,7 +12,8 @@ A state is refused where
 
   is more than what errors, and one impact within h, explain;
 - a position stays the same to the last bit while velocities beyond their errors lead away: it has
-  frozen. What freezes while the arm is slower is not told.
+  frozen. What freezes while the arm is slower is not told. Where velocities are not used, all
+  positions must stay the same, and those of the positions before count, above `FAST_ENOUGH`.
 
 Afterwards states are accepted again at once if they follow the last accepted one. Else they must
 have been plausible among themselves for `WINDOW`, and no joint may be farther away than it moves
@@ -53,6 +54,12 @@ POSITION_ERROR = 2e-3
 
 VELOCITY_ERROR = 0.05
 """Error of velocities that need not be declared, as a share of the speed limits: filters."""
+
+FAST_ENOUGH = 0.2
+"""Speed, as a share of its limit, from which no arm stops to the last bit within some periods."""
+
+SMOOTHING = 1.0 / 3.0
+"""Share of the last period in the speed that is known from positions."""
 
 FILTER = 3e-3
 """Time constant of filters of velocities that are told from frozen positions, s."""
@@ -103,7 +110,7 @@ class PlausibilityCheck:
         dt: control period, s.
         position_error: declared error of positions, shape (n,), rad.
         velocity_error: declared error of velocities, shape (n,), rad/s; None where velocities are
-            not used, and so not checked.
+            not used, because they are estimated from positions.
     """
 
     def __init__(
@@ -122,9 +129,9 @@ class PlausibilityCheck:
         self._v_max, self._gap = fastest, max(GAP, 3.0 * dt)
         self._uses_velocities = velocity_error is not None
         self._position = POSITION_ERROR + 2.0 * position_error
-        self._velocity = VELOCITY_ERROR * fastest
+        self._velocity = FAST_ENOUGH * fastest + position_error / dt
         if velocity_error is not None:
-            self._velocity = self._velocity + velocity_error
+            self._velocity = VELOCITY_ERROR * fastest + velocity_error
         # An impact, at any moment of a period, changes a speed from one limit to the other.
         self._drift = self._position + WINDOW * self._velocity + 2.0 * dt * fastest
         # A robot may repeat a position once, and a filter let velocities outlast a hit.
@@ -156,8 +163,7 @@ class PlausibilityCheck:
             self._reason = nonsense
             return nonsense
         if self._accepted is None:
-            zero = np.zeros_like(self._v_max)
-            self._accept(_Past(state, time, zero, zero))
+            self._accept(self._first(state, time))
             return ""
         unseen = 0.0 if self._doubted else time - self._accepted.time - self._dt
         reason, after = self._compare(self._accepted, state, time, unseen)
@@ -177,6 +183,10 @@ class PlausibilityCheck:
                 return ""
         self._doubted = after
         return self._reason
+
+    def _first(self, state: State, time: float) -> _Past:
+        zero = np.zeros_like(self._v_max)
+        return _Past(state if self._uses_velocities else State(state.q, zero), time, zero, zero)
 
     def _accept(self, past: _Past) -> None:
         self._accepted, self._doubted = past, None
@@ -204,21 +214,24 @@ class PlausibilityCheck:
         """
         (q0, v0), (q, v), h = past.state, state, time - past.time
         zero, moved, fastest = np.zeros_like(q), q - q0, FAST * self._v_max
-        if not self._uses_velocities:
-            jumps = np.abs(moved) > self._position + h * fastest
-            return JUMP if jumps.any() else "", _Past(state, time, zero, zero)
-        mean = 0.5 * (v0 + v)
+        if self._uses_velocities:
+            mean, same, fastest = 0.5 * (v0 + v), moved == 0.0, np.maximum(fastest, np.abs(v))
+        else:
+            same = not moved.any()
+            mean = v = v0 if same else v0 + SMOOTHING * (moved / h - v0)
+        if (np.abs(moved) > self._position + h * fastest).any():
+            return JUMP, self._first(state, time)
         way = math.exp(-h / FORGETTING) * past.way
         way = way + h * np.where(np.abs(mean) > self._velocity, mean, 0.0)
-        way = np.where(moved == 0.0, _limited(way, 2.0 * self._way), 0.0)
-        doubtful = _Past(state, time, zero, way)
-        if (np.abs(moved) > self._position + h * np.maximum(fastest, np.abs(v))).any():
-            return JUMP, doubtful
+        way = np.where(same, _limited(way, 2.0 * self._way), 0.0)
+        state = State(q, v)
         if (np.abs(way) > self._way).any():
-            return FROZEN, doubtful
+            return FROZEN, _Past(state, time, zero, way)
+        if not self._uses_velocities:
+            return "", _Past(state, time, zero, way)
         drift = math.exp(-h / WINDOW) * past.drift + moved - h * mean
         if (np.abs(drift) > self._drift + max(unseen, 0.0) * fastest).any():
-            return CONTRADICTION, doubtful
+            return CONTRADICTION, _Past(state, time, zero, way)
         return "", _Past(state, time, _limited(drift, self._drift), way)
 
 
