@@ -17,8 +17,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from viability_bounds_pkg.compiled import compiled
-
 Array = NDArray[np.float64]
 
 _TINY = 1e-300  # for 0, so that it can be divided by
@@ -38,7 +36,7 @@ def scale_to_limits(u: ArrayLike, u_max: ArrayLike) -> Array:
         ValueError: wrong shapes, u not finite, or limits negative or NaN.
     """
     u, u_max = _checked(u_max, u=u)
-    return np.clip(scale_factor(u, u_max) * u, -u_max, u_max)
+    return clip(scale_factor(u, u_max) * u, u_max)
 
 
 def project_to_limits(u: ArrayLike, s: ArrayLike, u_max: ArrayLike) -> Array:
@@ -66,42 +64,35 @@ def project_to_limits(u: ArrayLike, s: ArrayLike, u_max: ArrayLike) -> Array:
     return project(u, s, u_max)
 
 
-@compiled
 def project(u: Array, s: Array, u_max: Array) -> Array:
     """Solve the QP of eq. (11); see `project_to_limits`, which checks the arguments first."""
     # Scaled to about 1, products of very large or small numbers stay numbers.
-    unit = max(np.abs(u).max(), _TINY)
+    unit = max(float(np.abs(u).max()), _TINY)
     s = np.where(u_max > 0.0, s, 0.0)  # it has no say where x is 0
-    s = s / max(np.abs(s).max(), _TINY)
+    s = s / max(float(np.abs(s).max()), _TINY)
     u, limits = u / unit, u_max / unit
     x = nearest_dissipating(u, s, limits, scale_factor(u, limits) * float(s @ u))
     return clip(unit * x, u_max)
 
 
-@compiled
 def scale_factor(u: Array, u_max: Array) -> float:
     """Return lambda_w of eq. (10); see `scale_to_limits`."""
-    factor = 1.0
-    for i in range(len(u)):
-        if abs(u[i]) > u_max[i]:
-            factor = min(factor, u_max[i] / abs(u[i]))
-    return factor
+    beyond = np.abs(u) > u_max
+    return float((u_max[beyond] / np.abs(u[beyond])).min(initial=1.0))
 
 
-@compiled
 def clip(u: Array, u_max: Array) -> Array:
     """Return `u` with each component cut to its limit, shape (n,)."""
     return np.minimum(np.maximum(u, -u_max), u_max)
 
 
-@compiled
 def nearest_dissipating(u: Array, s: Array, u_max: Array, level: float) -> Array:
     """Return the point nearest to `u` with |x| <= u_max and s'x >= level, shape (n,).
 
     It is ``x(nu) = clip(u + nu s)`` for the least nu >= 0 with s'x(nu) >= level. s'x(nu) never
     falls, and is linear between the values of nu at which a component leaves one limit or
-    arrives at the other. The two of those values next to the solution are found by trying them
-    all; between them the components that are free move together.
+    arrives at the other. Between the two of those values next to the solution the components
+    that are free move together.
 
     Args:
         u: shape (n,).
@@ -113,18 +104,15 @@ def nearest_dissipating(u: Array, s: Array, u_max: Array, level: float) -> Array
     if s @ x >= level:
         return x
     leaves, arrives = np.full(len(u), np.inf), np.full(len(u), -np.inf)
-    for i in range(len(u)):
-        if s[i] != 0.0:
-            end = np.copysign(u_max[i], s[i])
-            leaves[i] = (-end - u[i]) / s[i]
-            arrives[i] = (end - u[i]) / s[i]
-    nu, enough = 0.0, np.inf
-    for point in np.concatenate((leaves, arrives)):
-        if nu < point < enough:
-            if s @ clip(u + point * s, u_max) < level:
-                nu = point
-            else:
-                enough = point
+    moved = s != 0.0
+    end = np.copysign(u_max, s)[moved]
+    leaves[moved] = (-end - u[moved]) / s[moved]
+    arrives[moved] = (end - u[moved]) / s[moved]
+    points = np.concatenate((leaves, arrives))
+    points = points[(points > 0.0) & (points < np.inf)]
+    reached = clip(u + np.outer(points, s), u_max) @ s >= level
+    nu = points[~reached].max(initial=0.0)
+    enough = points[reached & (points > nu)].min(initial=np.inf)
     x = clip(u + nu * s, u_max)
     missing = level - s @ x
     push = np.where((leaves <= nu) & (nu < arrives), s, 0.0)
@@ -140,8 +128,8 @@ def nearest_dissipating(u: Array, s: Array, u_max: Array, level: float) -> Array
 
 def _checked(u_max: ArrayLike, **vectors: ArrayLike) -> list[Array]:
     """Return the vectors and then the limits as arrays of one length."""
-    arrays = {name: np.ascontiguousarray(x, dtype=np.float64) for name, x in vectors.items()}
-    limits = np.ascontiguousarray(u_max, dtype=np.float64)
+    arrays = {name: np.asarray(x, dtype=np.float64) for name, x in vectors.items()}
+    limits = np.asarray(u_max, dtype=np.float64)
     if any(x.ndim != 1 or x.shape != limits.shape for x in arrays.values()):
         shapes = ", ".join(f"{name} {x.shape}" for name, x in arrays.items())
         raise ValueError(f"must all have shape (n,): {shapes}, u_max {limits.shape}")

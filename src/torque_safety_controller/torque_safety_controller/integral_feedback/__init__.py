@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Integral action: passive, leaky and limited; what every kind of it has in common."""
+"""Integral action: passive, leaky and limited."""
 
-from torque_safety_controller.integral_feedback.action import ArmTerms, IntegralAction
-from torque_safety_controller.integral_feedback.feedback import (
+from torque_safety_controller.integral_feedback.joints import (
     InitialisationError,
     IntegralFeedback,
 )
+from torque_safety_controller.integral_feedback.law import ArmTerms, IntegralLaw
 from torque_safety_controller.integral_feedback.leaky_integrator import LeakyIntegrator
 from torque_safety_controller.integral_feedback.settings import METHODS, IntegralSettings
 
@@ -13,8 +13,8 @@ __all__ = [
     "METHODS",
     "ArmTerms",
     "InitialisationError",
-    "IntegralAction",
     "IntegralFeedback",
+    "IntegralLaw",
     "IntegralSettings",
     "LeakyIntegrator",
 ]

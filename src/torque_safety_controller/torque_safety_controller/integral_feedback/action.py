@@ -1,134 +1,273 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every integral action offers, and what it needs to know of the arm."""
+"""Integral action of one arm: extra torque on top of inverse dynamics, continuous whatever comes.
+
+Modes are ``joints``, every joint stiff, (3)-(14) of [Benallegue2021]; and ``task`` and
+``position``, the end effectors' poses or positions stiff and their null space free, (15)-(26),
+which are as printed where the anti-windup is. The torque does not jump when settings change, or
+when a state is missing or unusable.
+"""
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import replace
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from torque_safety_controller.integral_feedback.settings import (
-    WIDENING_TIME,
-    IntegralSettings,
-    Law,
-)
+from torque_safety_controller.integral_feedback.joints import IntegralFeedback
+from torque_safety_controller.integral_feedback.law import ArmTerms, IntegralLaw
+from torque_safety_controller.integral_feedback.settings import IntegralSettings
+from torque_safety_controller.nullspace.compliance import NullspaceCompliance
+from torque_safety_controller.nullspace.printed import PrintedCompliance
+from torque_safety_controller.robot_model import RobotModel
 
 Array = NDArray[np.float64]
 
+TASKS = {"task": slice(0, 6), "position": slice(0, 3)}
+"""Rows of the pose's Jacobian that are stiff in each mode that has a null space."""
 
-class ArmTerms(NamedTuple):
-    """Dynamics, task and velocity of an arm in one step.
+MODES = ("none", "joints", *TASKS)
 
-    Attributes:
-        M: mass matrix, shape (n, n), kg m^2.
-        C: Coriolis matrix with M' - 2 C skew-symmetric, as Pinocchio's, shape (n, n), N m s.
-        J: Jacobian of the task, shape (m, n).
-        J_dot: its time derivative, shape (m, n).
-        v: velocity, shape (n,), rad/s.
-    """
+LONGEST_GAP = 2.5
+"""Periods that a step may take, a missed deadline being 2; a longer gap is not integrated over."""
 
-    M: Array
-    C: Array
-    J: Array
-    J_dot: Array
-    v: Array
+_MOST = {"joints": 1.0} | dict.fromkeys(TASKS, 0.5)
+"""Product lambda h f that `stable_gain` allows in each mode.
+
+It is less with a null space: loops of P K P are unstable earlier in some postures."""
+
+_BACK = 0.5
+"""Steps by which the gain could be higher before it is raised."""
+
+_POSITION_JUMP = 0.05  # rad or m; beyond what the velocities account for
+_FADING_TIME = 0.2  # s; of what the memory cannot hold
 
 
-class IntegralAction(ABC):
-    """A torque made of the acceleration errors s' = a_ref - v' of the past.
+class IntegralAction:
+    """Torque of the integral of acceleration errors.
 
     Args:
-        settings: their number of joints stays.
-        memory: named tuple of arrays, with at least `v` and `widening`.
-        inputs: arrays that compiled functions read the arguments of a step from.
+        mode: one of `MODES` but ``none``.
+        settings: may be replaced between steps: the torque does not jump.
+        disturbance_max: largest disturbance of each joint that is integrated, shape (n,), N m;
+            what friction and a wrong model never are, but a sensor's glitch or a blow may be.
+        hands: end effectors whose rows are stacked to one task.
 
     Attributes:
-        memory: errors and budgets; the torque continues from it.
-        saturated: which joints were at their limits in the last step, shape (n,); overwritten by
-            the next.
+        settings: as they are set; `gain` may be lower where the arm is.
+        law: what gives the torque of a step.
+        last: torque of the last step, shape (n,), N m.
+        skipped: steps that were not integrated over: time jumped, or the state did.
+
+    Raises:
+        TaskShapeError: the task leaves no null space.
     """
 
-    def __init__(self, settings: IntegralSettings, memory: Any, inputs: Sequence[Array]) -> None:
-        n = len(settings.budget)
-        self.memory = memory
-        self.saturated = np.zeros(n, dtype=bool)
-        self._inputs = inputs
-        self._torque = np.zeros(n)
-        self._settings = settings
-        self._use(settings.law)
+    def __init__(
+        self, mode: str, settings: IntegralSettings, disturbance_max: Array, hands: int = 1
+    ) -> None:
+        self.settings = settings
+        self.law = _make_law(mode, settings, hands)
+        self.skipped = 0
+        self._rows = TASKS.get(mode, slice(0, 6))
+        self._most = _MOST[mode]
+        self._disturbance_max = disturbance_max
+        self._zero = np.zeros(len(settings.budget))
+        self.reset()
 
     @property
-    def settings(self) -> IntegralSettings:
-        """Settings; after a change of them `initialise` keeps the torque continuous."""
-        return self._settings
+    def gain(self) -> float:
+        """Gain lambda that is used, 1/s: what is set, or what is stable."""
+        return self.law.settings.gain
 
-    @settings.setter
-    def settings(self, settings: IntegralSettings) -> None:
-        settings.check_joints(len(self.saturated))
-        self._settings = settings
-        self._use(settings.law)
+    @property
+    def saturated(self) -> NDArray[np.bool_]:
+        """Which joints are at their budget, shape (n,)."""
+        return self.law.saturated
 
-    @abstractmethod
-    def _use(self, law: Law) -> None:
-        """Go by other settings from now on."""
+    def reset(self) -> None:
+        """Forget the past: the next step begins with nothing added."""
+        self._lowered = 0
+        self._asked = self.law.settings = self.settings
+        self._started = self._lost = self._resuming = False
+        self._q_last = self._v_last = self._zero
+        self.last = self._fading = self._zero
 
-    def reset(self, arm: ArmTerms) -> None:
-        """Forget everything; increments of s count from this state on."""
-        for array in self.memory:
-            array.fill(0.0)
-        self.memory.v[:] = arm.v
-        self.saturated.fill(False)
+    def forget(self) -> None:
+        """Let the integral begin anew: what it gives now fades."""
+        self._started = False
+        self._resuming = True
 
-    @abstractmethod
-    def torque(self, arm: ArmTerms, a_last: Array, dt: float) -> Array:
-        """Return the additional torque of a control step, shape (n,), N m.
+    def torque(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> Array:
+        """Return what to add in this step, shape (n,), N m; finite whatever comes.
 
-        To be called once a step, before the QP.
+        After a jump in time, or of the state, the torque goes on from the last one, and the
+        difference to what the memory asks for fades.
 
         Args:
-            arm: as it is now.
+            robot: of the arm, updated with rates.
+            v: velocity, shape (n,), rad/s.
             a_last: acceleration commanded in the last step, shape (n,), rad/s^2.
-            dt: time since the last step, s, >= 0.
-
-        Raises:
-            ValueError: unusable terms of the arm; nothing has changed then.
+            elapsed: time since the last step, s.
         """
+        try:
+            torque = self._next(robot, v, a_last, elapsed)
+        except ValueError:  # numbers that are not finite, or no mass matrix
+            self._lost = True
+            torque = None
+        if torque is None:
+            self._resuming = True
+            self.skipped += 1
+        else:
+            self.last = torque
+        return self.last
 
-    def skip(self, arm: ArmTerms, dt: float) -> None:
-        """Let a time pass of which nothing is known: the memory leaks and takes no increment.
+    def resume(self, robot: RobotModel, v: Array, torque: Array) -> None:
+        """Begin so that the torque is `torque` now.
+
+        The memory holds what it can of it, within budgets that are widened as far as they must
+        be and for some time; the rest fades.
 
         Args:
-            arm: as it is now.
-            dt: how long it took, s, >= 0; 0 if that is not known.
-
-        Raises:
-            ValueError: the velocity is not finite; nothing has changed then.
+            robot: of the arm, updated with rates.
+            v: velocity, shape (n,), rad/s.
+            torque: shape (n,), N m, finite.
         """
-        if not np.isfinite(arm.v).all():
-            raise ValueError(f"v must be finite, is {arm.v}")
-        self.memory.v[:] = arm.v
-        self.memory.widening[:] *= math.exp(-dt / WIDENING_TIME)
+        self._started = False
+        self._use(self._stable(np.ascontiguousarray(robot.M), robot.dt))
+        self._hold(robot, v, torque)
+        self.last = torque
 
-    @abstractmethod
-    def initialise(self, torque: Array, arm: ArmTerms) -> Array:
-        """Choose the memory so that the additional torque is `torque`, and return that of it.
+    def _next(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> Array | None:
+        """Return the torque of this step; None where the state jumped."""
+        arm, law = self._arm(robot, v), self.law
+        if not self._started:
+            self._begin(robot, arm)
+        longest = LONGEST_GAP * robot.dt
+        known = 0.0 < elapsed <= longest and not self._lost
+        jumped = known and _jumped(
+            arm.M,
+            self._q_last,
+            robot.q,
+            self._v_last,
+            v,
+            a_last,
+            elapsed,
+            self._disturbance_max,
+        )
+        if jumped or not known:
+            law.skip(arm, elapsed if 0.0 <= elapsed < math.inf else 0.0)
+        self._lost = False
+        self._q_last, self._v_last = robot.q.copy(), v.copy()
+        if jumped:
+            return None
+        if known:
+            torque = law.torque(arm, a_last, elapsed)
+        else:
+            self.skipped += 1
+            torque = law.torque(arm, self._zero, 0.0)
+        if self._resuming or not known:
+            self._resuming = False
+            self._fading = self.last - torque
+        gap = robot.dt if math.isinf(elapsed) else min(max(elapsed, 0.0), longest)
+        self._fading = self._fading * math.exp(-gap / _FADING_TIME)
+        torque = torque + self._fading
+        settings = self._stable(arm.M, robot.dt)
+        if settings is not law.settings:
+            self._use(settings)
+            self._hold(robot, v, torque)
+        return torque
 
-        A budget that it exceeds is widened, only as far as it must, and returns to what it
-        should be with `WIDENING_TIME`.
+    def _stable(self, M: Array, period: float) -> IntegralSettings:
+        """Return the settings with a gain that is stable here.
 
-        Args:
-            torque: shape (n,), N m.
-            arm: as it is now.
-
-        Raises:
-            ValueError: it cannot be done.
+        It is lowered by powers of sqrt(2), so that it changes seldom.
         """
+        asked, used = self.settings, self.law.settings
+        share = asked.gain * period * coupling(M) / self._most
+        if 0.0 < share < math.inf:
+            steps = 2.0 * math.log2(share)
+            if not steps <= self._lowered <= steps + 1.0 + _BACK:
+                self._lowered = max(0, math.ceil(steps))
+        gain = asked.gain * 2.0 ** (-0.5 * self._lowered)
+        if gain == used.gain and (asked is self._asked or asked.same_as(self._asked)):
+            return used
+        return asked if gain == asked.gain else replace(asked, gain=gain)
 
-    def _take(self, *arguments: Array) -> None:
-        """Copy the arguments of a step, in whatever layout they are, to `inputs`."""
-        for own, given in zip(self._inputs, arguments, strict=False):
-            own[:] = given
+    def _use(self, settings: IntegralSettings) -> None:
+        self._asked, self.law.settings = self.settings, settings
+
+    def _hold(self, robot: RobotModel, v: Array, torque: Array) -> None:
+        """Let the memory give `torque` now; what it cannot give fades."""
+        held = self._zero
+        try:
+            arm = self._arm(robot, v)
+            if not self._started:
+                self._begin(robot, arm)
+            held = self.law.initialise(torque, arm)
+        except ValueError:  # too fast, or numbers that are not finite: all of it fades
+            self._started = False
+        self._fading = torque - held
+
+    def _begin(self, robot: RobotModel, arm: ArmTerms) -> None:
+        """Let the memory begin, empty, at this state."""
+        self.law.reset(arm)
+        self._q_last, self._v_last = robot.q.copy(), arm.v.copy()
+        self._started, self._lost = True, False
+
+    def _arm(self, robot: RobotModel, v: Array) -> ArmTerms:
+        """Return what the law needs to know of the arm."""
+        hands, rows = (robot, *robot.others), self._rows
+        J = np.concatenate([hand.J[rows] for hand in hands])
+        J_dot = np.concatenate([hand.J_dot[rows] for hand in hands])
+        M, C = np.ascontiguousarray(robot.M), np.ascontiguousarray(robot.C)
+        return ArmTerms(M, C, J, J_dot, v)
+
+
+@njit(cache=True)
+def coupling(M: Array) -> float:
+    """Return the largest eigenvalue f of M^-1 D, D = diag(M); NaN where M is no mass matrix.
+
+    With K = lambda D the errors s of the speeds of an ideal arm become
+
+        s_next = (I - lambda h M^-1 D) s
+
+    in a period h: they grow where lambda h f > 2, and change sign where it is above 1. A joint
+    alone has f = 1; coupled ones have more, those of Panda in its worst posture 77.
+    """
+    if not (np.isfinite(M).all() and (np.diag(M) > 0.0).all()):
+        return np.nan
+    root = np.sqrt(np.diag(M))
+    least = np.linalg.eigvalsh(M / np.outer(root, root))[0]
+    return 1.0 / least if least > 0.0 else np.nan
+
+
+@njit(cache=True)
+def _jumped(
+    M: Array,
+    q_last: Array,
+    q: Array,
+    v_last: Array,
+    v: Array,
+    a_last: Array,
+    elapsed: float,
+    disturbance_max: Array,
+) -> bool:
+    """Return whether velocity or position of a joint changed by more than is possible.
+
+    At most `disturbance_max`, shape (n,), N m, acts on a joint's own inertia besides `a_last`.
+    """
+    impulse = np.diag(M) * np.abs(a_last * elapsed - (v - v_last))
+    way = np.abs(q - q_last) - elapsed * (np.abs(v) + np.abs(v_last))
+    # A NaN is not within its limits.
+    possible = (impulse <= disturbance_max * elapsed) & (way <= _POSITION_JUMP)
+    return not possible.all()
+
+
+def _make_law(mode: str, settings: IntegralSettings, hands: int) -> IntegralLaw:
+    if mode == "joints":
+        return IntegralFeedback(settings)
+    rows = hands * TASKS[mode].stop
+    return (PrintedCompliance if settings.as_printed else NullspaceCompliance)(settings, rows)

@@ -13,12 +13,9 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from viability_bounds_pkg.compiled import compiled
-
 Array = NDArray[np.float64]
 
 
-@compiled
 def leak_factors(theta: float, dt: float, paper_form: bool) -> tuple[float, float]:
     """Return what a step leaves of the past, and what it takes of the increment of s.
 
@@ -39,7 +36,6 @@ def leak_factors(theta: float, dt: float, paper_form: bool) -> tuple[float, floa
     return decay, -math.expm1(-x) / x
 
 
-@compiled
 def mix(fast: Array, slow: Array, mu: float) -> Array:
     """Return ``mu fast + (1 - mu) slow``, eq. (14), shape (n,)."""
     return mu * fast + (1.0 - mu) * slow

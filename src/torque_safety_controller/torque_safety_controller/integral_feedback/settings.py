@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,28 +13,10 @@ from viability_bounds_pkg.exceptions import SettingError
 
 Array = NDArray[np.float64]
 
-METHODS = ("none", "scaling", "paper", "qp", "paper_mass")
-"""Anti-windup: none, (10) or (11) as [Benallegue2021] prints them, that is for the torque of the
-gains only, with the integrators left alone and (13); or for the whole torque, integrators
-included; or (11) as printed with K = lambda M for lambda diag(M), which is more than the clip of
-each joint. With all but ``qp`` mode ``task`` is (16), (21) and (26) as printed."""
-
-NONE, SCALING, PAPER, QP, PAPER_MASS = range(len(METHODS))
-
-WIDENING_TIME = 1.0
-"""Time constant with which a budget widened by a handover returns to what it should be, s."""
-
-
-class Law(NamedTuple):
-    """The numbers of `IntegralSettings`, as compiled functions take them."""
-
-    budget: Array
-    gain: float
-    slow_leak_rate: float
-    fast_leak_rate: float
-    mu: float
-    method: int
-    null_leak_rate: float
+METHODS = ("qp", "paper", "scaling")
+"""Anti-windup: of the whole torque, integrators included; or (11) or (10) as [Benallegue2021]
+prints them, that is for the torque of the gains only, with the integrators left alone, (13), and
+in mode ``task`` with (16), (21) and (26) as printed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,24 +68,11 @@ class IntegralSettings:
             raise SettingError("anti_windup", self.anti_windup, " or ".join(METHODS))
 
     @property
-    def law(self) -> Law:
-        """The same numbers for compiled functions."""
-        return Law(
-            self.budget.copy(),
-            float(self.gain),
-            float(self.slow_leak_rate),
-            float(self.fast_leak_rate),
-            float(self.mu),
-            METHODS.index(self.anti_windup),
-            float(self.fast_leak_rate if self.null_leak_rate is None else self.null_leak_rate),
-        )
+    def as_printed(self) -> bool:
+        """Whether the law is the paper's to the letter."""
+        return self.anti_windup != "qp"
 
     def same_as(self, other: IntegralSettings) -> bool:
         """Return whether all values are those of `other`."""
         names = (field.name for field in fields(self))
         return all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
-
-    def check_joints(self, n: int) -> None:
-        """Raise `SettingError` unless these are settings for n joints."""
-        if self.budget.shape != (n,):
-            raise SettingError("budget", self.budget, f"one number for each of {n} joints")

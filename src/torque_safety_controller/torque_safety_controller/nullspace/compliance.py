@@ -11,35 +11,121 @@ and the torque added to that of the reference is
         + (1 - mu) P^T K P a + mu K a_fast,   P = J^+ J,   K = lambda diag(M).  (21), (26)
 
 The task's error is integrated, and its integral dies away; the null space is held by a memory of
-some 10 ms only. `docs/nullspace_compliance.md` says where this leaves the paper, and proves that
-nothing in it grows for ever.
+some 10 ms only. The torque is linear in the memory (a, x), where x = a - a_fast is what the fast
+memory has forgotten, and the stored energy is quadratic. `docs/nullspace_compliance.md` derives
+it, says where it leaves the paper, and proves that nothing in it grows for ever.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torque_safety_controller.integral_feedback.action import ArmTerms, IntegralAction
-from torque_safety_controller.integral_feedback.settings import IntegralSettings, Law
-from torque_safety_controller.nullspace.kernels import FADING_TIME, NullspaceMemory, step
-from torque_safety_controller.nullspace.printed import PrintedMemory
-from torque_safety_controller.nullspace.printed import step as printed_step
-from viability_bounds_pkg.compiled import bound
+from torque_safety_controller.anti_windup import clip, scale_factor
+from torque_safety_controller.integral_feedback.law import WIDENING_TIME, ArmTerms, IntegralLaw
+from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors
+from torque_safety_controller.integral_feedback.settings import IntegralSettings
+from torque_safety_controller.nullspace.kernels import (
+    THRESHOLD,
+    advance,
+    dynamically_consistent_inverse,
+    torque_matrix,
+)
 from viability_bounds_pkg.exceptions import ArmSafetyError
 
 Array = NDArray[np.float64]
+
+FADING_TIME = 0.2
+"""Time constant with which that part of an initial torque fades that the memory cannot hold, s."""
+
+_AT_LIMIT = 1.0 - 1e-9
+
+_SINGULAR = 1e-12  # relative; smaller pivots are rounding
 
 
 class TaskShapeError(ArmSafetyError, ValueError):
     """A task that leaves an arm no null space."""
 
 
-class NullspaceCompliance(IntegralAction):
+class Memory(NamedTuple):
+    """What lasts from one step to the next; written in place.
+
+    Attributes:
+        a: the error that dies away, eq. (16), shape (n,), rad/s.
+        s: its part in the null space, (1 - J^+ J) a, shape (n,), rad/s.
+        integral: integral(J' s), which is - J a, shape (m,).
+        root: ``sqrt(diag M) x``, shape (n,): its square is the fast memory's energy whatever M
+            does.
+        offset: what is left of an initial torque that the memory cannot hold, shape (n,), N m.
+        widening: of the budgets, shape (n,), N m.
+        v: velocity, shape (n,), rad/s.
+        J: Jacobian of the task, shape (m, n).
+    """
+
+    a: Array
+    s: Array
+    integral: Array
+    root: Array
+    offset: Array
+    widening: Array
+    v: Array
+    J: Array
+
+
+class TaskLaw(IntegralLaw):
+    """Integral action that is stiff in a task of m < n rows.
+
+    Args:
+        settings: their number of joints stays.
+        m: rows of the task's Jacobian.
+        memory: type of the named tuple; its `integral` gets m numbers, `J` shape (m, n), all
+            others n numbers.
+
+    Raises:
+        TaskShapeError: `m` leaves n joints no null space.
+    """
+
+    def __init__(self, settings: IntegralSettings, m: int, memory: Any) -> None:
+        n = len(settings.budget)
+        if not 0 < m < n:
+            raise TaskShapeError(
+                f"a task of {m} rows for {n} joints; null-space compliance needs 1 to {n - 1} rows"
+            )
+        shapes = {"integral": (m,), "J": (m, n)}
+        super().__init__(settings, memory(*(np.zeros(shapes.get(k, n)) for k in memory._fields)))
+
+    def reset(self, arm: ArmTerms) -> None:
+        """See `IntegralLaw`."""
+        super().reset(arm)
+        self.memory.J[:] = arm.J
+
+    def skip(self, arm: ArmTerms, dt: float) -> None:
+        """See `IntegralLaw`."""
+        super().skip(arm, dt)
+        self.memory = self.memory._replace(J=arm.J.copy())
+
+    def _check(self, arm: ArmTerms, vector: Array) -> None:
+        """Raise `ValueError` unless all is finite, and M can be a mass matrix."""
+        M, C, J, J_dot, v = arm
+        total = M.sum() + C.sum() + J.sum() + J_dot.sum() + v.sum() + vector.sum()
+        if not (math.isfinite(total) and (np.diagonal(M) > 0.0).all()):
+            raise ValueError("M must be positive definite, and all numbers finite")
+
+    def _initial(self, arm: ArmTerms, J_plus: Array, torque: Array) -> Array:
+        """Return the a whose slow memory gives what the task feels of `torque`.
+
+        The task feels the force F = J^+^T torque. Where J a = y the slow torque is
+        J^T ((1 - mu) J^+^T K J^+ y), which is J^T F for this y.
+        """
+        K = self.settings.gain * np.diagonal(arm.M)
+        B = (1.0 - self.settings.mu) * (J_plus.T * K) @ J_plus
+        return J_plus @ (np.linalg.pinv(B, _SINGULAR) @ (J_plus.T @ torque))
+
+
+class NullspaceCompliance(TaskLaw):
     """Additional torque that is stiff in a task of m < n rows; a change of settings keeps s.
 
     An initial torque that the task does not feel fades with `FADING_TIME`.
@@ -52,73 +138,139 @@ class NullspaceCompliance(IntegralAction):
         TaskShapeError: `m` leaves n joints no null space.
     """
 
-    _MEMORY: ClassVar[Any] = NullspaceMemory
-    """`integral` has m numbers, `J` has shape (m, n), all others have n numbers."""
-    _KERNEL: ClassVar[Callable[..., bool]] = step
+    memory: Memory
 
     def __init__(self, settings: IntegralSettings, m: int) -> None:
-        n = len(settings.budget)
-        if not 0 < m < n:
-            raise TaskShapeError(
-                f"a task of {m} rows for {n} joints; null-space compliance needs 1 to {n - 1} rows"
-            )
-        shapes = {"integral": (m,), "J": (m, n)}
-        fields = (np.zeros(shapes.get(name, (n,))) for name in self._MEMORY._fields)
-        J, J_dot = np.zeros((2, m, n))
-        self._arm = ArmTerms(np.eye(n), np.zeros((n, n)), J, J_dot, np.zeros(n))
-        super().__init__(settings, self._MEMORY(*fields), (*self._arm, np.zeros(n)))
-
-    def _use(self, law: Law) -> None:
-        self._law = law
-        results = self._torque, self.saturated
-        self._step = bound(
-            self._KERNEL, self.memory, law, self._arm, self._inputs[-1], *results, numbers=2
-        )
-
-    def reset(self, arm: ArmTerms) -> None:
-        """See `IntegralAction`."""
-        super().reset(arm)
-        self.memory.J[:] = arm.J
-
-    def torque(self, arm: ArmTerms, a_last: Array, dt: float) -> Array:
-        """See `IntegralAction`."""
-        return self._next(arm, a_last, dt, initialise=0.0)
-
-    def initialise(self, torque: Array, arm: ArmTerms) -> Array:
-        """See `IntegralAction`; the slow memory takes what the task feels of it."""
-        self._torque[:] = torque
-        return self._next(arm, arm.v, 0.0, initialise=1.0)
+        super().__init__(settings, m, Memory)
 
     def skip(self, arm: ArmTerms, dt: float) -> None:
-        """See `IntegralAction`."""
+        """See `IntegralLaw`."""
         super().skip(arm, dt)
-        self.memory.J[:] = arm.J
-        self._leak(dt)
+        memory, decay = self.memory, math.exp(-self.settings.slow_leak_rate * dt)
+        self.memory = memory._replace(
+            a=decay * memory.a,
+            s=decay * memory.s,
+            integral=decay * memory.integral,
+            root=decay * memory.root,
+            offset=math.exp(-dt / FADING_TIME) * memory.offset,
+        )
 
-    def _leak(self, dt: float) -> None:
-        """Let the memory leak for a time, s."""
-        memory, decay = self.memory, math.exp(-self._law.slow_leak_rate * dt)
-        for array in (memory.a, memory.s, memory.integral, memory.root):
-            array *= decay
-        memory.offset[:] *= math.exp(-dt / FADING_TIME)
+    def torque(self, arm: ArmTerms, a_last: Array, dt: float) -> Array:
+        """See `IntegralLaw`."""
+        self._check(arm, a_last)
+        M, C, J, J_dot, v = arm
+        settings, memory = self.settings, self.memory
+        slow, null = settings.slow_leak_rate, settings.null_leak_rate
+        a, x, own, J_plus, H = advance(
+            memory.a,
+            memory.s,
+            memory.integral,
+            memory.root,
+            memory.J,
+            J,
+            J_dot,
+            M,
+            C,
+            a_last * dt - (v - memory.v),
+            settings.gain,
+            settings.mu,
+            *leak_factors(slow, dt, False),
+            *leak_factors(settings.fast_leak_rate, dt, False),
+            math.exp((slow - (settings.fast_leak_rate if null is None else null)) * dt),
+        )
+        widening = math.exp(-dt / WIDENING_TIME) * memory.widening
+        offset = math.exp(-dt / FADING_TIME) * memory.offset
+        a, x, own = self._limited(M, H, settings.budget + widening, a, x, own)
+        return self._finish(arm, J_plus, a, x, own, offset, widening)
 
-    def _next(self, arm: ArmTerms, a_last: Array, dt: float, initialise: float) -> Array:
-        self._take(*arm, a_last)
-        try:
-            usable = self._step(dt, initialise)
-        except np.linalg.LinAlgError as error:
-            raise ValueError("M must be positive definite") from error
-        if not usable:
-            raise ValueError("M must be positive definite, and all numbers finite")
-        return self._torque.copy()
+    def initialise(self, torque: Array, arm: ArmTerms) -> Array:
+        """See `IntegralLaw`; the slow memory takes what the task feels of it."""
+        self._check(arm, torque)
+        M, C, J, J_dot, _ = arm
+        gain, mu = self.settings.gain, self.settings.mu
+        inverse = dynamically_consistent_inverse(J, J_dot, M, C + C.T, THRESHOLD)
+        a = self._initial(arm, inverse[0], torque)
+        forgets = self.settings.fast_leak_rate > self.settings.slow_leak_rate
+        x = a if forgets else np.zeros_like(a)
+        H = torque_matrix(J, J_dot, M, C, gain, mu, *inverse)
+        widening = np.maximum(np.abs(torque) - self.settings.budget, 0.0)
+        own = H @ a - mu * gain * np.diagonal(M) * x
+        a, x, own = self._limited(M, H, self.settings.budget + widening, a, x, own)
+        return self._finish(arm, inverse[0], a, x, own, torque - own, widening)
+
+    def _limited(
+        self, M: Array, H: Array, limit: Array, a: Array, x: Array, torque: Array
+    ) -> tuple[Array, Array, Array]:
+        """Return a memory and its torque with |torque| <= limit that stores no more energy.
+
+        Scaling all of the memory by (10) does both, but weakens every joint for the sake of one.
+        So a is changed such that only the torques beyond their limits change, to the limits. If
+        that stores more energy than before, it is done in part: the memory is the furthest point
+        on the way from the scaled one that does not. Both ends are within the limits, and with
+        them the way.
+
+        Args:
+            M: mass matrix, shape (n, n).
+            H: of `torque_matrix`.
+            limit: shape (n,), >= 0, may be infinite.
+            a: shape (n,).
+            x: shape (n,).
+            torque: that they give, shape (n,).
+        """
+        settings, scale = self.settings, scale_factor(torque, limit)
+        self._cut = scale < 1.0
+        if not self._cut:
+            return a, x, torque
+        cut = clip(torque, limit) - torque
+        regular = H + _SINGULAR * (np.abs(H).max() + 1e-300) * np.eye(len(H))
+        shift, way = np.linalg.solve(regular, cut), 0.0
+        if np.abs(H @ shift - cut).max() <= 1e-6 * np.abs(cut).max():
+            way = _way(settings, M, a, x, scale, shift)
+        else:
+            shift = np.zeros_like(a)
+        keep = scale + way * (1.0 - scale)
+        return keep * a + way * shift, keep * x, clip(keep * torque + way * cut, limit)
+
+    def _finish(
+        self,
+        arm: ArmTerms,
+        J_plus: Array,
+        a: Array,
+        x: Array,
+        own: Array,
+        offset: Array,
+        widening: Array,
+    ) -> Array:
+        """Write the memory; return the torque, which is its own and the offset within limits."""
+        integral, budget = -(arm.J @ a), self.settings.budget
+        torque = clip(own + offset, budget + widening)
+        if not math.isfinite(torque.sum() + a.sum() + x.sum() + integral.sum()):
+            raise ValueError("all numbers must be finite")
+        s, root = a + J_plus @ integral, np.sqrt(np.diagonal(arm.M)) * x
+        self.memory = Memory(a, s, integral, root, offset, widening, arm.v.copy(), arm.J.copy())
+        self.saturated = self._cut & (np.abs(torque) >= _AT_LIMIT * budget)
+        return torque
 
 
-class PrintedCompliance(NullspaceCompliance):
-    """The same by (16), (21) and (26) as printed: see `printed`."""
+def energy_product(
+    settings: IntegralSettings, M: Array, a: Array, x: Array, b: Array, y: Array
+) -> float:
+    """Return the inner product of (a, x) and (b, y) whose square is twice the energy, J."""
+    weight = 0.0
+    if settings.fast_leak_rate > settings.slow_leak_rate:
+        weight = settings.mu * settings.gain / (settings.fast_leak_rate - settings.slow_leak_rate)
+    return float(a @ (M @ b) + weight * (x @ (np.diagonal(M) * y)))
 
-    _MEMORY = PrintedMemory
-    _KERNEL = printed_step
 
-    def _leak(self, dt: float) -> None:
-        self.memory.slow[:] *= math.exp(-self._law.slow_leak_rate * dt)
-        self.memory.fast[:] *= math.exp(-self._law.fast_leak_rate * dt)
+def _way(
+    settings: IntegralSettings, M: Array, a: Array, x: Array, scale: float, shift: Array
+) -> float:
+    """Return how far from (scale a, scale x) to (a + shift, x) the energy is that of (a, x)."""
+    da, dx = (1.0 - scale) * a + shift, (1.0 - scale) * x
+    spare = (1.0 - scale * scale) * energy_product(settings, M, a, x, a, x)
+    linear = scale * energy_product(settings, M, a, x, da, dx)
+    square = energy_product(settings, M, da, dx, da, dx)
+    if square + 2.0 * linear <= spare:
+        return 1.0
+    root = math.sqrt(linear * linear + square * spare)
+    return spare / (linear + root) if linear > 0.0 else (root - linear) / square

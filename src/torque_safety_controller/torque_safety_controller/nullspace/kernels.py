@@ -1,244 +1,176 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One step of null-space compliance, compiled; `docs/nullspace_compliance.md` derives it.
+"""Compiled parts of null-space compliance: a task's inverse with its rate, and a step.
 
-The torque is linear in the memory (a, x), where x = a - a_fast is what the fast memory has
-forgotten, and the stored energy is quadratic.
+The dynamically consistent inverse of a task Jacobian is
+
+    J^+ = M^-1 J^T (J M^-1 J^T + c D)^-1,   c = n / tr M                            [Khatib1995]
+
+Torques in the null space of its transpose do not accelerate the task. D damps the directions in
+which J is nearly singular; it is exactly zero while all singular values of J are above a
+threshold, and its derivative is continuous there. With X = M^-1 J^T and Y = J X + c D,
+
+    X' = M^-1 (J'^T - M' X),   Y' = J' X + J X' + c D' + c' D,   (J^+)' = (X' - J^+ Y') Y^-1,
+
+where J X' = (J' X)^T - X^T M' X. The damping leaves ``J J^+ = 1 - c D Y^-1``: identity in all
+directions that are not damped.
+
+With G = J J^T = sum g_i u_i u_i^T, where g_i is the square of a singular value of J, and the
+threshold e,
+
+    D = h(G) = sum h(g_i) u_i u_i^T,    h(g) = (e^2 - g)^2 / e^2 below e^2, 0 above.
+
+h is C1, so that D has a continuous derivative also where eigenvalues meet (Daleckii and Krein),
+
+    D' = U (F o (U^T G' U)) U^T,   F_ij = (h(g_i) - h(g_j)) / (g_i - g_j),   F_ii = h'(g_i),
+
+with o the product entry by entry. For this h the quotients have closed forms without
+cancellation.
 """
 
 from __future__ import annotations
 
-import math
-from typing import NamedTuple
-
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
-
-from torque_safety_controller.anti_windup import clip, scale_factor
-from torque_safety_controller.integral_feedback.action import ArmTerms
-from torque_safety_controller.integral_feedback.kernels import gain_matrix
-from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors
-from torque_safety_controller.integral_feedback.settings import WIDENING_TIME, Law
-from torque_safety_controller.linalg.generalized_inverse import (
-    THRESHOLD,
-    dynamically_consistent_inverse,
-)
-from viability_bounds_pkg.compiled import compiled
 
 Array = NDArray[np.float64]
 
-FADING_TIME = 0.2
-"""Time constant with which that part of an initial torque fades that the memory cannot hold, s."""
-
-_AT_LIMIT = 1.0 - 1e-9
-
-_SINGULAR = 1e-12  # relative; smaller pivots are rounding
+THRESHOLD = 0.03
+"""Singular value of J below which its direction is damped."""
 
 
-class NullspaceMemory(NamedTuple):
-    """What lasts from one step to the next; written in place.
+@njit(cache=True)
+def dynamically_consistent_inverse(
+    J: Array, J_dot: Array, M: Array, M_dot: Array, threshold: float
+) -> tuple[Array, Array]:
+    """Return J^+ and its time derivative, shape (n, m) each.
 
-    Attributes:
-        a: the error that dies away, eq. (16), shape (n,), rad/s.
-        s: its part in the null space, (1 - J^+ J) a, shape (n,), rad/s.
-        integral: integral(J' s), which is - J a, shape (m,).
-        root: ``sqrt(diag M) x``, shape (n,): its square is the fast memory's energy whatever M
-            does.
-        offset: what is left of an initial torque that the memory cannot hold, shape (n,), N m.
-        widening: of the budgets, shape (n,), N m.
-        v: velocity, shape (n,), rad/s.
-        J: Jacobian of the task, shape (m, n).
-    """
-
-    a: Array
-    s: Array
-    integral: Array
-    root: Array
-    offset: Array
-    widening: Array
-    v: Array
-    J: Array
-
-
-@compiled
-def step(
-    memory: NullspaceMemory,
-    law: Law,
-    arm: ArmTerms,
-    a_ref: Array,
-    torque: Array,
-    saturated: NDArray[np.bool_],
-    dt: float,
-    initialise: float,
-) -> bool:
-    """Take one step; return whether the arguments were usable. If not, the memory is as before.
-
-    `a_ref` is the acceleration commanded in the last step, shape (n,), rad/s^2, and `dt` the time
-    since then, s. With `initialise` above 0 the memory is chosen such that the torque is what
-    `torque` holds, shape (n,), N m. It receives the torque, and `saturated`, shape (n,), which
-    joints are at their budgets.
+    Args:
+        J: Jacobian of the task, shape (m, n) with m < n; this and the others contiguous.
+        J_dot: its time derivative, shape (m, n).
+        M: mass matrix, shape (n, n), kg m^2.
+        M_dot: its time derivative, shape (n, n); C + C^T with Pinocchio's Coriolis matrix.
+        threshold: singular value of J below which its direction is damped, in units of J. Rows
+            of different units can be scaled to like size before; that changes the damping only.
 
     Raises:
-        LinAlgError: M is singular.
+        LinAlgError: M is singular, or there are numbers that are not finite.
     """
-    M, C, J, J_dot, v = arm
-    if not usable(arm, a_ref, torque, initialise):
-        return False
-    J_plus, J_plus_dot = dynamically_consistent_inverse(J, J_dot, M, C + C.T, THRESHOLD)
-    root_M = np.sqrt(np.diag(M))
-    if initialise > 0.0:
-        a = initial_memory(law, arm, J_plus, torque)
-        x = a if law.fast_leak_rate > law.slow_leak_rate else np.zeros_like(a)
-        widening = np.maximum(np.abs(torque) - law.budget, 0.0)
-    else:
-        a, x = _advance(memory, law, arm, J_plus, root_M, a_ref, dt)
-        widening = math.exp(-dt / WIDENING_TIME) * memory.widening
-    limit = law.budget + widening
-    own = law_torque(law, arm, J_plus, J_plus_dot, a, x)
-    limited = scale_factor(own, limit) < 1.0
-    if limited:
-        H = torque_matrix(law, arm, J_plus, J_plus_dot)
-        a, x, own = _limited(law, M, H, limit, a, x, own)
-    offset = torque - own if initialise > 0.0 else math.exp(-dt / FADING_TIME) * memory.offset
-    result = clip(own + offset, limit)
-    integral = -(J @ a)
-    if not math.isfinite(result.sum() + a.sum() + x.sum() + integral.sum()):
-        return False
-    torque[:] = result
-    saturated[:] = limited & (np.abs(result) >= _AT_LIMIT * law.budget)
-    memory.a[:] = a
-    memory.s[:] = a + J_plus @ integral
-    memory.integral[:] = integral
-    memory.root[:] = root_M * x
-    memory.offset[:] = offset
-    memory.widening[:] = widening
-    memory.v[:] = v
-    memory.J[:] = J
-    return True
+    M_inv = np.linalg.inv(M)
+    X = M_inv @ J.T
+    M_dot_X, J_dot_X = M_dot @ X, J_dot @ X
+    Y, Y_dot = J @ X, J_dot_X + J_dot_X.T - X.T @ M_dot_X
+    half = J_dot @ J.T
+    D, D_dot = damping(J @ J.T, half + half.T, threshold)
+    if D.any():
+        trace = np.trace(M)
+        scale = len(M) / trace
+        Y += scale * D
+        Y_dot += scale * (D_dot - np.trace(M_dot) / trace * D)
+    Y_inv = np.linalg.inv(Y)
+    J_plus = X @ Y_inv
+    X_dot = M_inv @ (J_dot.T - M_dot_X)
+    return J_plus, (X_dot - J_plus @ Y_dot) @ Y_inv
 
 
-@compiled
-def law_torque(
-    law: Law, arm: ArmTerms, J_plus: Array, J_plus_dot: Array, a: Array, x: Array
+@njit(cache=True)
+def damping(G: Array, G_dot: Array, threshold: float) -> tuple[Array, Array]:
+    """Return D = h(G) and D', shape (m, m) each.
+
+    Args:
+        G: J J^T, shape (m, m).
+        G_dot: its time derivative, shape (m, m).
+        threshold: singular value of J below which a direction is damped.
+    """
+    e2 = threshold * threshold
+    g, U = np.linalg.eigh(G)
+    below = np.maximum(e2 - g, 0.0)
+    F = np.zeros_like(G)
+    if not below.any():
+        return F, F
+    for i in range(len(g)):
+        for j in range(len(g)):
+            sum_below = below[i] + below[j]
+            if below[i] > 0.0 and below[j] > 0.0:
+                F[i, j] = -sum_below / e2
+            elif sum_below > 0.0:
+                # One below and one above: |g_i - g_j| is at least the part below.
+                F[i, j] = -sum_below / e2 * (sum_below / abs(g[i] - g[j]))
+    D = (U * (below * below / e2)) @ U.T
+    return D, U @ (F * (U.T @ G_dot @ U)) @ U.T
+
+
+@njit(cache=True)
+def torque_matrix(
+    J: Array,
+    J_dot: Array,
+    M: Array,
+    C: Array,
+    gain: float,
+    mu: float,
+    J_plus: Array,
+    J_plus_dot: Array,
 ) -> Array:
-    """Return the additional torque of eq. (21) with (26), shape (n,)."""
-    K = law.gain * np.diag(arm.M)
-    Ja = arm.J @ a
-    Pa = J_plus @ Ja
+    """Return H of the torque H a - mu K x of eq. (21) with (26), shape (n, n)."""
+    K = gain * np.diag(M)
+    P = J_plus @ J
     # J^+ J' s + (J^+)' integral, where s = (1 - P) a and integral = - J a.
-    inner = J_plus @ (arm.J_dot @ (a - Pa)) - J_plus_dot @ Ja
-    slow = arm.J.T @ (J_plus.T @ (K * Pa))
-    return arm.C @ a - arm.M @ inner + (1.0 - law.mu) * slow + law.mu * K * (a - x)
-
-
-@compiled
-def torque_matrix(law: Law, arm: ArmTerms, J_plus: Array, J_plus_dot: Array) -> Array:
-    """Return how `law_torque` depends on a, shape (n, n)."""
-    K = law.gain * np.diag(arm.M)
-    P = J_plus @ arm.J
-    inner = J_plus @ (arm.J_dot - arm.J_dot @ P) - J_plus_dot @ arm.J
-    H = arm.C - arm.M @ inner
-    H += (1.0 - law.mu) * (P.T * K) @ P
-    for i in range(len(H)):
-        H[i, i] += law.mu * K[i]
+    H = C - M @ (J_plus @ (J_dot - J_dot @ P) - J_plus_dot @ J)
+    H += (1.0 - mu) * ((P.T * K) @ P) + mu * np.diag(K)
     return H
 
 
-@compiled
-def energy_product(law: Law, M: Array, a: Array, x: Array, b: Array, y: Array) -> float:
-    """Return the inner product of (a, x) and (b, y) whose square is twice the energy, J."""
-    weight = 0.0
-    if law.fast_leak_rate > law.slow_leak_rate:
-        weight = law.mu * law.gain / (law.fast_leak_rate - law.slow_leak_rate)
-    return float(a @ (M @ b) + weight * (x @ (np.diag(M) * y)))
-
-
-@compiled
-def _advance(
-    memory: NullspaceMemory,
-    law: Law,
-    arm: ArmTerms,
-    J_plus: Array,
-    root_M: Array,
-    a_ref: Array,
-    dt: float,
-) -> tuple[Array, Array]:
-    """Return a and x after the acceleration error of the last step."""
-    slow, slow_gain = leak_factors(law.slow_leak_rate, dt, False)
-    fast, fast_gain = leak_factors(law.fast_leak_rate, dt, False)
-    ratio = fast_gain / slow_gain
-    left = slow * memory.s
-    s = left + slow_gain * (a_ref * dt - (arm.v - memory.v))
-    # With the middle of s the product rule is exact: J a grows by the middle of J times the
-    # increment of s.
-    integral = slow * memory.integral + (arm.J - memory.J) @ (0.5 * (left + s))
-    a = s - J_plus @ integral
-    # The fast memory takes fast_gain of what a gained, of which slow_gain is seen.
-    x = (1.0 - ratio) * a + (ratio * slow - fast) * memory.a + fast * memory.root / root_M
-    forgotten = -math.expm1((law.slow_leak_rate - law.null_leak_rate) * dt)  # in the null space
-    return a - forgotten * (a - J_plus @ (arm.J @ a)), x
-
-
-@compiled
-def usable(arm: ArmTerms, a_ref: Array, torque: Array, initialise: float) -> bool:
-    """Return whether the arguments of a step are numbers, and M can be a mass matrix."""
-    M, C, J, J_dot, v = arm
-    total = M.sum() + C.sum() + J.sum() + J_dot.sum() + v.sum() + a_ref.sum()
-    if initialise > 0.0:
-        total += torque.sum()
-    return math.isfinite(total) and bool((np.diag(M) > 0.0).all())
-
-
-@compiled
-def initial_memory(law: Law, arm: ArmTerms, J_plus: Array, torque: Array) -> Array:
-    """Return the a whose slow memory gives what the task feels of `torque`.
-
-    The task feels the force F = J^+^T torque. Where J a = y the slow torque is
-    J^T ((1 - mu) J^+^T K J^+ y), which is J^T F for this y.
-    """
-    B = (1.0 - law.mu) * (J_plus.T @ gain_matrix(law, arm.M)) @ J_plus
-    return J_plus @ (np.linalg.pinv(B, _SINGULAR) @ (J_plus.T @ torque))
-
-
-@compiled
-def _limited(
-    law: Law, M: Array, H: Array, limit: Array, a: Array, x: Array, torque: Array
-) -> tuple[Array, Array, Array]:
-    """Return a memory and its torque with |torque| <= limit that stores no more energy.
-
-    Scaling all of the memory by (10) does both, but weakens every joint for the sake of one. So
-    a is changed such that only the torques beyond their limits change, to the limits. If that
-    stores more energy than before, it is done in part: the memory is the furthest point on the
-    way from the scaled one that does not. Both ends are within the limits, and with them the way.
+@njit(cache=True)
+def advance(
+    a_old: Array,
+    s_old: Array,
+    integral_old: Array,
+    root: Array,
+    J_old: Array,
+    J: Array,
+    J_dot: Array,
+    M: Array,
+    C: Array,
+    increment: Array,
+    gain: float,
+    mu: float,
+    slow: float,
+    slow_gain: float,
+    fast: float,
+    fast_gain: float,
+    null: float,
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return a, x and the torque after a step, shape (n,) each, J^+ and `torque_matrix`.
 
     Args:
-        law: settings.
+        a_old: memory of the last step, as the next four; see `NullspaceCompliance`.
+        s_old: shape (n,), rad/s.
+        integral_old: shape (m,).
+        root: shape (n,).
+        J_old: shape (m, n).
+        J: Jacobian of the task, shape (m, n).
+        J_dot: its time derivative.
         M: mass matrix, shape (n, n).
-        H: of `torque_matrix`.
-        limit: shape (n,), >= 0, may be infinite.
-        a: shape (n,).
-        x: shape (n,).
-        torque: that they give, shape (n,).
+        C: Coriolis matrix, shape (n, n).
+        increment: of s, shape (n,), rad/s.
+        gain: lambda, 1/s.
+        mu: weight of the fast memory.
+        slow: what a step leaves of the slow memory.
+        slow_gain: what it takes of the increment.
+        fast: the same of the fast memory.
+        fast_gain: likewise.
+        null: what is left in the null space of what the slow memory keeps.
     """
-    scale = scale_factor(torque, limit)
-    cut = clip(torque, limit) - torque
-    regular = H + _SINGULAR * (np.abs(H).max() + 1e-300) * np.eye(len(H))
-    shift, way = np.linalg.solve(regular, cut), 0.0
-    if np.abs(H @ shift - cut).max() <= 1e-6 * np.abs(cut).max():
-        way = _way(law, M, a, x, scale, shift)
-    else:
-        shift[:] = 0.0
-    keep = scale + way * (1.0 - scale)
-    return keep * a + way * shift, keep * x, clip(keep * torque + way * cut, limit)
-
-
-@compiled
-def _way(law: Law, M: Array, a: Array, x: Array, scale: float, shift: Array) -> float:
-    """Return how far from (scale a, scale x) to (a + shift, x) the energy is that of (a, x)."""
-    da, dx = (1.0 - scale) * a + shift, (1.0 - scale) * x
-    spare = (1.0 - scale * scale) * energy_product(law, M, a, x, a, x)
-    linear = scale * energy_product(law, M, a, x, da, dx)
-    square = energy_product(law, M, da, dx, da, dx)
-    if square + 2.0 * linear <= spare:
-        return 1.0
-    root = math.sqrt(linear * linear + square * spare)
-    return spare / (linear + root) if linear > 0.0 else (root - linear) / square
+    J_plus, J_plus_dot = dynamically_consistent_inverse(J, J_dot, M, C + C.T, THRESHOLD)
+    ratio = fast_gain / slow_gain
+    left = slow * s_old
+    s = left + slow_gain * increment
+    # With the middle of s the product rule is exact: J a grows by the middle of J times the
+    # increment of s.
+    integral = slow * integral_old + (J - J_old) @ (0.5 * (left + s))
+    a = s - J_plus @ integral
+    # The fast memory takes fast_gain of what a gained, of which slow_gain is seen.
+    x = (1.0 - ratio) * a + (ratio * slow - fast) * a_old + fast * root / np.sqrt(np.diag(M))
+    a = a - (1.0 - null) * (a - J_plus @ (J @ a))
+    H = torque_matrix(J, J_dot, M, C, gain, mu, J_plus, J_plus_dot)
+    return a, x, H @ a - mu * gain * np.diag(M) * x, J_plus, H

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Null-space compliance as [Benallegue2021] prints it, III-D, to be compared with.
+"""Null-space compliance as [Benallegue2021] prints it, III-D.
 
     a = s - J^+ integral(J' s)                                                            (16)
     u = C a - M J^+ J' s - M (J^+)' integral(J' s) + u_K                                  (21)
     u_K = (1 - mu) J^T J^+^T K J^+ J a_slow + mu K a_fast                                 (26)
     a_theta,k = exp(-theta dt) a_theta,k-1 + a_k - a_k-1                                  (13)
 
-u_K is limited by (10), by (11) with a for s, or not at all. Nothing but a_slow and a_fast leaks:
-under a lasting push s, its integral and with them the rest of u grow without limit.
+u_K is limited by (10), or by (11) with a for s. Nothing but a_slow and a_fast leaks: under a
+lasting push s, its integral and with them the rest of u grow without limit.
 `docs/departures.md` says what the law of `NullspaceCompliance` does instead.
 """
 
@@ -20,21 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torque_safety_controller.anti_windup import clip, project, scale_factor
-from torque_safety_controller.integral_feedback.action import ArmTerms
-from torque_safety_controller.integral_feedback.kernels import gain_torque
-from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors
-from torque_safety_controller.integral_feedback.settings import (
-    NONE,
-    SCALING,
-    WIDENING_TIME,
-    Law,
-)
-from torque_safety_controller.linalg.generalized_inverse import (
-    THRESHOLD,
-    dynamically_consistent_inverse,
-)
-from torque_safety_controller.nullspace.kernels import initial_memory, usable
-from viability_bounds_pkg.compiled import compiled
+from torque_safety_controller.integral_feedback.law import WIDENING_TIME, ArmTerms
+from torque_safety_controller.integral_feedback.settings import IntegralSettings
+from torque_safety_controller.nullspace.compliance import TaskLaw
+from torque_safety_controller.nullspace.kernels import THRESHOLD, dynamically_consistent_inverse
 
 Array = NDArray[np.float64]
 
@@ -62,65 +51,88 @@ class PrintedMemory(NamedTuple):
     J: Array
 
 
-@compiled
-def step(
-    memory: PrintedMemory,
-    law: Law,
-    arm: ArmTerms,
-    a_ref: Array,
-    torque: Array,
-    saturated: NDArray[np.bool_],
-    dt: float,
-    initialise: float,
-) -> bool:
-    """Take one step; return whether the arguments were usable. If not, the memory is as before.
+class PrintedCompliance(TaskLaw):
+    """Additional torque of (16), (21) and (26), with the torque of the gains limited.
 
-    Arguments as of `nullspace.kernels.step`; `torque` receives what the memory holds of it.
+    Args:
+        settings: their number of joints stays.
+        m: rows of the task's Jacobian.
 
     Raises:
-        LinAlgError: M is singular.
+        TaskShapeError: `m` leaves n joints no null space.
     """
-    M, C, J, J_dot, v = arm
-    if not usable(arm, a_ref, torque, initialise):
-        return False
-    J_plus, J_plus_dot = dynamically_consistent_inverse(J, J_dot, M, C + C.T, THRESHOLD)
-    if initialise > 0.0:
-        s = initial_memory(law, arm, J_plus, torque)
-        integral = np.zeros(len(J))
-        a = s
-        slow, fast = a, np.zeros_like(a)
-    else:
-        s = memory.s + a_ref * dt - (v - memory.v)
-        integral = memory.integral + (J - memory.J) @ (0.5 * (memory.s + s))
-        a = s - J_plus @ integral
-        slow_kept, _ = leak_factors(law.slow_leak_rate, dt, True)
-        fast_kept, _ = leak_factors(law.fast_leak_rate, dt, True)
-        slow = slow_kept * memory.slow + a - memory.a
-        fast = fast_kept * memory.fast + a - memory.a
-    stiff = gain_torque(law, M, J_plus @ (J @ slow))
-    u_K = (1.0 - law.mu) * (J.T @ (J_plus.T @ stiff)) + law.mu * gain_torque(law, M, fast)
-    if initialise > 0.0:
-        widening = np.maximum(np.abs(u_K) - law.budget, 0.0)
-    else:
+
+    memory: PrintedMemory
+
+    def __init__(self, settings: IntegralSettings, m: int) -> None:
+        super().__init__(settings, m, PrintedMemory)
+
+    def skip(self, arm: ArmTerms, dt: float) -> None:
+        """See `IntegralLaw`."""
+        super().skip(arm, dt)
+        self.memory = self.memory._replace(
+            slow=math.exp(-self.settings.slow_leak_rate * dt) * self.memory.slow,
+            fast=math.exp(-self.settings.fast_leak_rate * dt) * self.memory.fast,
+        )
+
+    def torque(self, arm: ArmTerms, a_last: Array, dt: float) -> Array:
+        """See `IntegralLaw`."""
+        inverse = self._inverse(arm, a_last)
+        memory, settings = self.memory, self.settings
+        s = memory.s + a_last * dt - (arm.v - memory.v)
+        integral = memory.integral + (arm.J - memory.J) @ (0.5 * (memory.s + s))
+        a = s - inverse[0] @ integral
+        slow = math.exp(-settings.slow_leak_rate * dt) * memory.slow + a - memory.a
+        fast = math.exp(-settings.fast_leak_rate * dt) * memory.fast + a - memory.a
+        u_K = self._gain_torque(arm, inverse[0], slow, fast)
         widening = math.exp(-dt / WIDENING_TIME) * memory.widening
-    limit = law.budget + widening
-    if law.method == NONE:
-        limited = u_K
-    elif law.method == SCALING:
-        limited = clip(scale_factor(u_K, limit) * u_K, limit)
-    else:
-        limited = project(u_K, a, limit)
-    result = C @ a - M @ (J_plus @ (J_dot @ s) + J_plus_dot @ integral) + limited
-    if not math.isfinite(result.sum() + a.sum() + integral.sum()):
-        return False
-    torque[:] = result
-    saturated[:] = (np.abs(u_K) > limit) & (law.method != NONE)
-    memory.s[:] = s
-    memory.integral[:] = integral
-    memory.a[:] = a
-    memory.slow[:] = slow
-    memory.fast[:] = fast
-    memory.widening[:] = widening
-    memory.v[:] = v
-    memory.J[:] = J
-    return True
+        return self._finish(arm, *inverse, s, integral, a, slow, fast, u_K, widening)
+
+    def initialise(self, torque: Array, arm: ArmTerms) -> Array:
+        """See `IntegralLaw`; the slow memory takes what the task feels of it."""
+        inverse = self._inverse(arm, torque)
+        a = self._initial(arm, inverse[0], torque)
+        fast, integral = np.zeros_like(a), np.zeros(len(arm.J))
+        u_K = self._gain_torque(arm, inverse[0], a, fast)
+        widening = np.maximum(np.abs(u_K) - self.settings.budget, 0.0)
+        return self._finish(arm, *inverse, a, integral, a, a, fast, u_K, widening)
+
+    def _inverse(self, arm: ArmTerms, vector: Array) -> tuple[Array, Array]:
+        """Return J^+ and its time derivative; see `_check`."""
+        self._check(arm, vector)
+        M, C, J, J_dot, _ = arm
+        return dynamically_consistent_inverse(J, J_dot, M, C + C.T, THRESHOLD)
+
+    def _gain_torque(self, arm: ArmTerms, J_plus: Array, slow: Array, fast: Array) -> Array:
+        """Return u_K of (26), shape (n,)."""
+        K, mu = self.settings.gain * np.diagonal(arm.M), self.settings.mu
+        stiff = K * (J_plus @ (arm.J @ slow))
+        u_K: Array = (1.0 - mu) * (arm.J.T @ (J_plus.T @ stiff)) + mu * K * fast
+        return u_K
+
+    def _finish(
+        self,
+        arm: ArmTerms,
+        J_plus: Array,
+        J_plus_dot: Array,
+        s: Array,
+        integral: Array,
+        a: Array,
+        slow: Array,
+        fast: Array,
+        u_K: Array,
+        widening: Array,
+    ) -> Array:
+        """Write the memory; return the torque of (21)."""
+        M, C, J, J_dot, v = arm
+        limit = self.settings.budget + widening
+        if self.settings.anti_windup == "scaling":
+            limited = clip(scale_factor(u_K, limit) * u_K, limit)
+        else:
+            limited = project(u_K, a, limit)
+        torque = C @ a - M @ (J_plus @ (J_dot @ s) + J_plus_dot @ integral) + limited
+        if not math.isfinite(torque.sum() + a.sum() + integral.sum()):
+            raise ValueError("all numbers must be finite")
+        self.memory = PrintedMemory(s, integral, a, slow, fast, widening, v.copy(), J.copy())
+        self.saturated = np.abs(u_K) > limit
+        return torque
