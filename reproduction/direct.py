@@ -105,9 +105,19 @@ class DirectLoop:
 
     def change_friction(self, **settings: Any) -> None:
         """Change settings of the friction compensation, also those that are no parameters."""
-        additional = self.controller.additional
-        friction = replace(additional.settings.friction, **settings)
-        additional.settings = replace(additional.settings, friction=friction)
+        friction = self.controller.friction
+        friction.settings = replace(friction.settings, **settings)
+
+    @property
+    def integral_budget(self) -> np.ndarray:
+        """Budget of the integral action by the parameters, shape (n,), N m."""
+        return self._controller_configuration().integral_settings.budget
+
+    def unlimit_integral(self) -> None:
+        """Take the budgets of the integral action away, so that no anti-windup acts."""
+        integral = self.controller.integral
+        budget = np.full(len(integral.settings.budget), np.inf)
+        integral.settings = replace(integral.settings, budget=budget)
 
     @property
     def dt(self) -> float:
@@ -197,7 +207,7 @@ class DirectLoop:
                 q,
                 v,
                 tau.copy(),
-                self.controller.additional.integral.copy(),
+                self.controller.integral.last.copy(),
                 self.controller.goals.error(self.controller.robot.pose),
             )
         )

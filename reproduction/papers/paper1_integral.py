@@ -23,15 +23,25 @@ from figure import Figure, reproduce, table
 ROBOT = "talos_left_arm"
 ELBOW = 5
 HAND = "wrist_left_ft_tool_link"
+UNLIMIT = "without anti-windup"
+"""Key of no parameter: budgets are infinite."""
 # Section IV-A: lambda = 2, tau_m = 0.1 of the torque limits, theta 0.1 and 100 1/s, mu = 0.5.
 PAPER: dict[str, Any] = {"integral_lambda": 2.0, "integral_budget": []}
 PRINTED = PAPER | {"integral_anti_windup": "paper"}
-UNLIMITED = PAPER | {"integral_anti_windup": "none"}
+UNLIMITED = PRINTED | {UNLIMIT: True}
 PLAIN = UNLIMITED | {"integral_leak": [0.0, 100.0, 0.0]}
 # Pushes in world axes, N: to the side, and down.
 PUSHES = ((0.0, -60.0, 0.0), (0.0, 0.0, -100.0))
 AWAY = 0.01  # m
 SENSOR_SETTLES = 0.1  # s
+
+
+def make_loop(changed: dict[str, Any]) -> DirectLoop:
+    """Return the arm with changed parameters, without anti-windup where that is asked for."""
+    loop = DirectLoop(ROBOT, {name: value for name, value in changed.items() if name != UNLIMIT})
+    if UNLIMIT in changed:
+        loop.unlimit_integral()
+    return loop
 
 
 def goal(loop: DirectLoop, start: pin.SE3, offset: tuple[float, ...]) -> None:
@@ -50,7 +60,7 @@ def figure_3() -> Figure:
 
 def _handover(figure: Figure, name: str, changed: dict[str, Any]) -> plt.Figure:
     """Add a handover to the figure; return the picture."""
-    loop = DirectLoop(ROBOT, changed)
+    loop = make_loop(changed)
     q = loop.config.start_positions.copy()
     for k in range(1500):  # move, so that friction holds a part of the weight, and rest
         q[ELBOW] = loop.config.start_positions[ELBOW] + 0.1 * min(1.0, k / 1000)
@@ -113,7 +123,7 @@ def push(
         before: how long it moves to its goal first, s.
         after: how long it is watched when it is released, s.
     """
-    loop = DirectLoop(ROBOT, changed)
+    loop = make_loop(changed)
     interaction = loop.controller.interaction
     start = loop.pose()
     loop.run(0.1)
@@ -135,8 +145,7 @@ def push(
     places = hand_places(loop, released) - target
     direction = places[0] / np.linalg.norm(places[0])
     far = np.flatnonzero(np.linalg.norm(places, axis=1) > AWAY)
-    budget = loop.controller.additional.settings.integral.budget
-    share = np.abs(column(pushed + released, "additional")) / budget
+    share = np.abs(column(pushed + released, "additional")) / loop.integral_budget
     let_go, settled = len(pushed), round(SENSOR_SETTLES / loop.dt)
     return {
         "loop": loop,
@@ -174,7 +183,7 @@ def figure_5() -> Figure:
             loop, samples = run["loop"], run["samples"]
             t = column(samples, "t") - samples[0].t
             additional = column(samples, "additional")[:, ELBOW]
-            budget = loop.controller.additional.settings.integral.budget[ELBOW]
+            budget = loop.integral_budget[ELBOW]
             others = (run["felt"], "measured force [N]"), (1e3 * distance(samples), "hand [mm]")
             for axis, (values, label) in zip(row[2 * k : 2 * k + 2], others, strict=True):
                 axis.plot(t, additional, color="tab:red", label="additional torque, elbow")
@@ -228,7 +237,7 @@ OFFSETS = ((0.05, 0.1, 0.15), (0.1, -0.1, -0.05), (0.0, 0.0, 0.1), (0.0, 0.0, 0.
 
 def track(changed: dict[str, Any], seconds: float = 8.0) -> tuple[DirectLoop, float, float]:
     """Send the hand to several places; return the mean distance while there, and all the way."""
-    loop = DirectLoop(ROBOT, changed)
+    loop = make_loop(changed)
     start = loop.pose()
     rest, way = [], []
     for offset in OFFSETS:
@@ -286,7 +295,6 @@ def ablation() -> Figure:
         "leaky (12)-(14)": UNLIMITED,
         "leaky, (10)": PAPER | {"integral_anti_windup": "scaling"},
         "leaky, (11) as printed": PRINTED,
-        "leaky, (11) as printed, K = λM": PAPER | {"integral_anti_windup": "paper_mass"},
         "leaky, (11), whole torque": PAPER,
         "the same, the file's values": {},
         "and friction compensation": {"friction_compensation": 1.0},

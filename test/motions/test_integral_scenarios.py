@@ -67,9 +67,9 @@ def test_a_pause_of_the_robot_does_not_kick():
     step = loop.controller.step(
         State(q + 0.05, v + 0.2), AccelerationRange(bounds.a_min, bounds.a_max), elapsed=3.0
     )
-    additional = loop.controller.additional.last
+    integral = loop.controller.integral.last
     assert np.isfinite(step.tau).all()
-    jump = np.abs(additional - before.additional) / loop.config.torque_max
+    jump = np.abs(integral - before.additional) / loop.config.torque_max
     assert jump.max() < 1e-2
 
 

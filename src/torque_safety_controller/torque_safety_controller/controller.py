@@ -13,11 +13,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from torque_safety_controller.additional_torque import (
-    LONGEST_GAP,
-    AdditionalTorque,
-)
 from torque_safety_controller.contact.interaction import Interaction
+from torque_safety_controller.friction.compensation import FrictionCompensation
+from torque_safety_controller.integral_feedback.action import LONGEST_GAP, FadingTorque
 from torque_safety_controller.qp import (
     AccelerationRange,
     Constraint,
@@ -76,7 +74,8 @@ class Controller:
         tau_max: torque limits, shape (n,), N m.
         gains: initial gains.
         torque_rate_max: greatest change of torque, shape (n,), N m/s; inf for none.
-        additional: integral action; the torque limits hold with it counted in.
+        integral: integral action; the torque limits hold with it counted in.
+        friction: friction compensation; likewise.
         solver: of the QP, one of `inverse_dynamics_qp.SOLVERS`.
         constraints: on the accelerations, besides bounds and torque limits.
         interaction: forces at the hand and other contacts; None for nothing.
@@ -88,7 +87,7 @@ class Controller:
 
     Attributes:
         goals: of the end effector and the joints.
-        additional, constraints, interaction, safety_filter: as given.
+        integral, friction, constraints, interaction, safety_filter: as given.
         iterations: of the last QP.
     """
 
@@ -98,7 +97,8 @@ class Controller:
         tau_max: Array,
         gains: Gains,
         torque_rate_max: Array | None = None,
-        additional: AdditionalTorque | None = None,
+        integral: FadingTorque | None = None,
+        friction: FrictionCompensation | None = None,
         solver: str = "daqp",
         constraints: Sequence[Constraint] = (),
         interaction: Interaction | None = None,
@@ -110,7 +110,8 @@ class Controller:
         self.robot = robot
         self.gains = gains
         self.goals = Goals(n, len(robot.others))
-        self.additional = additional
+        self.integral = integral
+        self.friction = friction
         self.constraints = constraints
         self.interaction = interaction
         self.safety_filter = safety_filter
@@ -149,14 +150,16 @@ class Controller:
     @property
     def integral_gain(self) -> float:
         """Gain of the integral action that is used here, 1/s; 0 without one."""
-        return 0.0 if self.additional is None else self.additional.gain
+        return 0.0 if self.integral is None else self.integral.gain
 
     def _forget(self) -> None:
         self._a_last = np.zeros(self.robot.n)
         self._limiter.reset()
         self._observer.reset()
-        if self.additional is not None:
-            self.additional.reset()
+        if self.integral is not None:
+            self.integral.reset()
+        if self.friction is not None:
+            self.friction.reset()
         if self.interaction is not None:
             self.interaction.start()
         if self.safety_filter is not None:
@@ -201,7 +204,7 @@ class Controller:
             tasks, contacts = self.interaction.rehearsal(self.robot, self.gains)
             self._solve(tasks, wide, None, contacts)
         self.goals = Goals(self.robot.n, len(self.robot.others))
-        self.robot.rates = self.additional is not None
+        self.robot.rates = self.integral is not None and self.integral.rates
         self.robot.update(state, zero)
         self.reset(zero)
         if self.safety_filter is not None:
@@ -228,8 +231,8 @@ class Controller:
         self._order = order = order or Order()
         if order.forget_disturbance:
             self._observer.reset()
-        if order.forget_integral and self.additional is not None:
-            self.additional.forget()
+        if order.forget_integral and self.integral is not None:
+            self.integral.forget()
         additional = self._begin(state, elapsed)
         if limits is None:
             if self._own_bounds is None:
@@ -258,7 +261,7 @@ class Controller:
         """
         self._forget()
         self._order = Order()
-        self.robot.rates = self.additional is not None
+        self.robot.rates = self.integral is not None and self.integral.rates
         self.robot.update(state, self._a_last)
         here = copy(self.goals)
         here.posture = state.q.copy()
@@ -272,28 +275,31 @@ class Controller:
             return output
         self.goals = here
         last = self._limiter.go_on_from(tau)
-        if self.additional is not None:
-            self.additional.initialise(self.robot, state.v, last - output.tau)
+        if self.integral is not None:
+            self.integral.resume(self.robot, state.v, last - output.tau)
         return output
 
     def _begin(self, state: State, elapsed: float | None) -> Array | None:
         """Update the model and return the additional torque of a step, or None."""
-        robot, additional = self.robot, self.additional
-        robot.rates = additional is not None and not additional.idle
+        robot, integral, friction = self.robot, self.integral, self.friction
+        robot.rates = integral is not None and integral.rates
         robot.update(state, self._a_last)
         elapsed = robot.dt if elapsed is None else elapsed
-        observer = self._observer
+        observer, obeyed = self._observer, self._order.obeyed
         observer.time_constant = self.gains.disturbance_time
-        known = elapsed if self._order.obeyed and elapsed <= LONGEST_GAP * robot.dt else 0.0
+        known = elapsed if obeyed and 0.0 < elapsed <= LONGEST_GAP * robot.dt else 0.0
         observer.observe(robot.v, self._a_last, known, self.tau_max, robot.M)
         if self.interaction is not None:
             self.interaction.observe(robot, self.goals, elapsed)
-        if additional is None or not robot.rates:
+        if integral is None and friction is None:
             return None
-        before = additional.integral
-        time = elapsed if self._order.obeyed else math.inf
-        torque = additional.torque(robot, robot.v, self._a_last, time)
-        observer.expect(additional.integral - before, self.tau_max, robot.M)
+        torque = self._no_torque
+        if integral is not None:
+            before, time = integral.last, elapsed if obeyed else math.inf
+            torque = integral.torque(robot, robot.v, self._a_last, time)
+            observer.expect(torque - before, self.tau_max, robot.M)
+        if friction is not None:
+            torque = torque + friction.torque(robot.M, robot.v, self._a_last, known, robot.dt)
         return torque
 
     def _tasks(self) -> tuple[list[Task], ContactForces | None]:

@@ -13,13 +13,11 @@ from arms import load_arm
 from controller_chain import NODE, ControllerChain
 from controllers import posture_only
 
-from torque_safety_controller.additional_torque import (
-    AdditionalSettings,
-    AdditionalTorque,
-)
 from torque_safety_controller.controller import Controller
+from torque_safety_controller.friction.compensation import FrictionCompensation
 from torque_safety_controller.friction.settings import FrictionModel, FrictionSettings
 from torque_safety_controller.integral_feedback import IntegralSettings
+from torque_safety_controller.integral_feedback.action import make_integral
 from torque_safety_controller.parameters.friction_parameters import FrictionConfiguration
 from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.exceptions import SettingError
@@ -34,6 +32,7 @@ DT = 1e-3
 COULOMB = 0.1 * ARM.tau_max
 MODEL = FrictionModel(COULOMB, 1.3 * COULOMB, 0.2 * COULOMB, np.full(N, 0.02))
 ON = FrictionSettings(MODEL, 0.2 * ARM.tau_max, 1.0)
+OFF = FrictionSettings(MODEL, 0.2 * ARM.tau_max, 0.0)
 GAINS = posture_only(100.0, 20.0)
 WIDE = np.full(N, 50.0)
 V = 0.3 * np.sign(0.5 - np.arange(N) % 2)
@@ -42,13 +41,11 @@ WANTED = -np.sign(V)
 FIRM = slice(0, 5)  # joints with inertia enough to call for all of the friction
 
 
-def additional(mode="none", friction=ON, budget=0.05) -> AdditionalTorque:
-    integral = IntegralSettings(budget * ARM.tau_max, gain=30.0)
-    return AdditionalTorque(AdditionalSettings(mode, integral, 2.0 * ARM.tau_max, friction))
-
-
-def controller(**others) -> Controller:
-    made = Controller(ARM.robot(DT), ARM.tau_max, GAINS, None, additional(**others))
+def controller(mode="none", friction=ON) -> Controller:
+    settings = IntegralSettings(0.05 * ARM.tau_max, gain=30.0)
+    integral = make_integral(mode, settings, 2.0 * ARM.tau_max)
+    compensation = FrictionCompensation(friction)
+    made = Controller(ARM.robot(DT), ARM.tau_max, GAINS, None, integral, compensation)
     made.reset(ARM.q_start)
     made.set_posture_goal(ARM.q_start)
     return made
@@ -63,22 +60,23 @@ def steps(made, count, q=ARM.q_start, v=V):
 
 def test_both_are_added_and_the_integral_s_budget_is_its_own():
     made = controller(mode="joints")
-    steps(made, 3000)
-    both = made.additional
-    np.testing.assert_allclose(both.last, both.integral + both.friction.last)
-    assert both.saturated.any()
-    budget = both.settings.integral.budget
-    assert (np.abs(both.integral) <= budget * (1.0 + 1e-9)).all()
-    assert (np.abs(both.last) > budget).any()
+    step = steps(made, 3000)
+    integral, friction = made.integral, made.friction
+    both = step.tau - made.robot.torque(step.a)
+    np.testing.assert_allclose(both, integral.last + friction.last, atol=1e-9)
+    assert integral.saturated.any()
+    budget = integral.settings.budget
+    assert (np.abs(integral.last) <= budget * (1.0 + 1e-9)).all()
+    assert (np.abs(both) > budget).any()
 
 
 def test_without_integral_action_there_is_friction_only():
     made = controller()
     tau = steps(made, 2000).tau
-    np.testing.assert_array_equal(made.additional.last, made.additional.friction.last)
-    without = controller(friction=None)
+    assert not made.integral.last.any()
+    without = controller(friction=OFF)
     steps(without, 2000)
-    assert without.additional.idle
+    assert without.friction.idle
     full = WANTED * np.minimum(MODEL.level(V), ON.budget)
     added = tau - steps(without, 1).tau
     np.testing.assert_allclose(added[FIRM], full[FIRM], rtol=1e-2)
@@ -97,7 +95,7 @@ def test_the_qp_keeps_the_sum_within_the_torque_limits(share):
         step = made.step(State(q, v), AccelerationRange(-WIDE, WIDE))
         assert (np.abs(step.tau) <= ARM.tau_max).all()
         assert not step.failure
-        wanted = made.robot.torque(step.a) + made.additional.last
+        wanted = made.robot.torque(step.a) + made.friction.last
         np.testing.assert_allclose(step.tau, wanted, atol=0.02 * ARM.tau_max.max())
         at_limit += (np.abs(step.tau) > 0.98 * ARM.tau_max).any()
     assert at_limit > 20
@@ -110,29 +108,27 @@ def test_the_handover_goes_on_from_the_drives_torque_and_friction_fades_in():
     made.robot.update(State(q, rest), rest)
     tau = made.robot.h + 0.04 * ARM.tau_max
     made.bumpless_transfer(State(q, V), AccelerationRange(-WIDE, WIDE), tau)
-    np.testing.assert_array_equal(made.additional.friction.last, 0.0)
+    np.testing.assert_array_equal(made.friction.last, 0.0)
     first = made.step(State(q, V), AccelerationRange(-WIDE, WIDE))
-    friction = made.additional.friction.last
+    friction = made.friction.last
     assert (np.abs(friction) <= 1.01 * DT / 0.2 * MODEL.level(V)).all()
     assert np.abs((first.tau - tau) / ARM.tau_max).max() < 0.01
     steps(made, 2000)
     full = WANTED * MODEL.level(V)
-    np.testing.assert_allclose(made.additional.friction.last[FIRM], full[FIRM], rtol=1e-2)
+    np.testing.assert_allclose(made.friction.last[FIRM], full[FIRM], rtol=1e-2)
 
 
 def test_what_comes_after_a_gap_or_a_jump_does_not_kick():
     made = controller(mode="joints")
     before = steps(made, 500)
     for elapsed in (0.4, 0.0, -1.0, math.nan):
-        w = made.additional.friction.reference_velocity.copy()
+        w = made.friction.reference_velocity.copy()
         tau = made.step(State(ARM.q_start, V), AccelerationRange(-WIDE, WIDE), None, elapsed).tau
-        np.testing.assert_array_equal(made.additional.friction.reference_velocity, w)
+        np.testing.assert_array_equal(made.friction.reference_velocity, w)
         assert np.abs((tau - before.tau) / ARM.tau_max).max() < 2e-3
-    w = made.additional.friction.last.copy()
-    made.step(
-        State(ARM.q_start, V + 200.0), AccelerationRange(-WIDE, WIDE)
-    )  # a glitch of the sensor
-    np.testing.assert_array_equal(made.additional.friction.last, w)
+    # A glitch of the sensor, by which friction would be more than the budget.
+    made.step(State(ARM.q_start, V + 200.0), AccelerationRange(-WIDE, WIDE))
+    assert (np.abs(made.friction.last) <= ON.budget).all()
 
 
 # Parameters

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 from controllers import EXACT, KHZ, assert_may_be_sent, gravity, pose_at, wide, with_integral
 
-from torque_safety_controller.additional_torque import (
-    MODES,
-)
+from torque_safety_controller.integral_feedback.action import MODES
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.supervisor import REST
 from viability_bounds_pkg.state import State
@@ -63,7 +61,7 @@ def test_a_handover_that_fails_leaves_everything_as_it_was(arm, bad):
     tau = nan if bad == "torque" else 0.5 * arm.tau_max
     step = controller.bumpless_transfer(State(q, np.zeros(arm.n)), AccelerationRange(*bounds), tau)
     assert step.failure
-    assert not controller.additional.last.any()
+    assert not controller.integral.last.any()
     assert controller.goals.pose_des is goal
     assert controller.goals.q_des is None
     step = controller.step(State(arm.q_start, np.zeros(arm.n)), None, REST)

@@ -12,7 +12,6 @@ from controllers import (
     NUMBERS,
     VECTORS,
     assert_may_be_sent,
-    integral,
     pose_at,
     wide,
     with_integral,
@@ -20,9 +19,7 @@ from controllers import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torque_safety_controller.additional_torque import (
-    MODES,
-)
+from torque_safety_controller.integral_feedback.action import MODES
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.supervisor import REST
 from torque_safety_controller.tasks.pose_task import pose_error
@@ -31,7 +28,7 @@ from viability_bounds_pkg.state import State
 DEEDS = st.lists(
     st.tuples(
         st.sampled_from(["step", "brake", "hold", "bumpless_transfer", "reset"]),
-        st.sampled_from([None, *MODES]),
+        st.sampled_from([None, 1.0, 40.0]),
         st.one_of(st.none(), NUMBERS),
         st.one_of(st.just(np.zeros(7)), VECTORS),
         st.one_of(st.just(np.zeros(7)), VECTORS),
@@ -55,9 +52,9 @@ def test_torque_limits_hold_whatever_the_integral_does(mode, share, rate, deeds)
     controller = with_integral(arm, mode, rate=np.full(arm.n, rate), budget=budget)
     controller.set_posture_goal(arm.q_start + 0.3)
     with np.errstate(all="ignore"):
-        for deed, other, elapsed, dq, v, x in deeds:
-            if other is not None:
-                controller.additional.settings = integral(arm, other, budget=budget)
+        for deed, gain, elapsed, dq, v, x in deeds:
+            if gain is not None:
+                controller.integral.settings = replace(controller.integral.settings, gain=gain)
             q = arm.q_start + dq
             bounds = AccelerationRange(-np.abs(x), np.abs(x))
             if deed == "reset":
@@ -67,7 +64,7 @@ def test_torque_limits_hold_whatever_the_integral_does(mode, share, rate, deeds)
             last = {"hold": (elapsed,), "bumpless_transfer": (bounds, x)}
             step = act(State(q, v), *last.get(deed, (bounds, elapsed)))
             assert_may_be_sent(step, arm)
-            assert np.isfinite(controller.additional.last).all()
+            assert np.isfinite(controller.integral.last).all()
         # Once the world makes sense again, so does the controller.
         controller.goals.pose_des = None
         controller.set_posture_goal(arm.q_start)
@@ -115,7 +112,7 @@ def test_the_limits_on_torque_leave_the_integral_its_share(arm):
             step = controller.step(state, wide(arm))
             assert_may_be_sent(step, arm)
             assert not step.failure
-            added = controller.additional.last
+            added = controller.integral.last
             assert (np.abs(added) > 0.01 * arm.tau_max).any()
             # The limits are those in the middle of a step with the acceleration of the last one.
             model = controller.robot.torque(step.a)
@@ -137,6 +134,6 @@ def test_in_hold_nothing_grows_on_what_the_motors_cannot_give(arm):
         saturated += abs(step.tau[0]) == arm.tau_max[0]
         q, v = arm.move(q, v, step.tau, KHZ, steps=2)
     assert saturated > 4
-    assert controller.additional.skipped == 0
+    assert controller.integral.skipped == 0
     # With the accelerations that were wished for, half of the budget would be used up by now.
-    assert (np.abs(controller.additional.last) < 0.02 * arm.tau_max).all()
+    assert (np.abs(controller.integral.last) < 0.02 * arm.tau_max).all()

@@ -22,7 +22,6 @@ from controllers import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torque_safety_controller.additional_torque import AdditionalTorque
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.supervisor import REST, Order
 from viability_bounds_pkg.state import State
@@ -31,16 +30,16 @@ from viability_bounds_pkg.state import State
 class Fixed:
     """An additional torque that is always the same."""
 
-    idle = False
+    rates = False
 
     def __init__(self, torque) -> None:
-        self._torque = self.integral = torque
+        self.last = torque
 
     def reset(self) -> None:
         """Nothing to forget."""
 
     def torque(self, robot, v, a_last, elapsed):
-        return self._torque
+        return self.last
 
 
 @settings(max_examples=150, deadline=None, derandomize=True)
@@ -58,7 +57,7 @@ def test_torques_are_finite_and_within_their_limits_whatever_comes(
 ):
     arm = load_arm("baxter_left_arm")
     torque = None if additional is None else Fixed(additional)
-    controller = make(arm, additional=torque)
+    controller = make(arm, integral=torque)
     if goals in ("pose", "both"):
         controller.set_pose_goal(pose_at(arm, arm.q_start + 0.2))
     if goals in ("posture", "both"):
@@ -120,7 +119,7 @@ def test_a_state_that_is_not_finite_is_survived(arm):
 
 
 def test_an_additional_torque_that_is_not_finite_leaves_the_arm_held(arm):
-    controller = make(arm, additional=Fixed(np.full(arm.n, math.nan)))
+    controller = make(arm, integral=Fixed(np.full(arm.n, math.nan)))
     controller.set_pose_goal(pose_at(arm, arm.q_start))
     q, v = arm.q_start, np.zeros(arm.n)
     for step in (
@@ -135,7 +134,7 @@ def test_an_additional_torque_that_is_not_finite_leaves_the_arm_held(arm):
 def test_the_torque_limits_hold_with_the_additional_torque_in_them(arm):
     push = 0.8 * arm.tau_max
     rng = np.random.default_rng(2)
-    controller = make(arm, additional=Fixed(push))
+    controller = make(arm, integral=Fixed(push))
     controller.set_posture_goal(arm.q_max)
     exact = limited = 0
     for _ in range(60):
@@ -228,20 +227,20 @@ def test_where_the_motors_cannot_let_it_rest_the_bounds_count_alone(arm):
 def test_nothing_is_learned_from_a_motion_that_was_not_commanded():
     """Neither of disturbances nor by the integral action; the torque does not jump."""
     arm = load_arm("panda")
-    controller = make(arm, additional=AdditionalTorque(integral(arm, "joints")))
+    controller = make(arm, integral=integral(arm, "joints"))
     controller.gains = replace(controller.gains, disturbance_time=0.0)
     controller.reset(arm.q_start)
     controller.set_posture_goal(arm.q_start + 0.1)
     at_rest = State(arm.q_start, np.zeros(arm.n))
     for _ in range(20):
         controller.step(at_rest, wide(arm))
-    learned, torque = controller._observer.estimate.copy(), controller.additional.integral
+    learned, torque = controller._observer.estimate.copy(), controller.integral.last
     assert learned.any() and torque.any()
     for k in range(20):
         state = State(arm.q_start, np.full(arm.n, 0.01 * k))
         controller.step(state, wide(arm), Order(obeyed=False))
     # What the additional torque changes by as it goes on counts.
     np.testing.assert_allclose(controller._observer.estimate, learned, rtol=0.05)
-    np.testing.assert_allclose(controller.additional.integral, torque, rtol=0.05)
+    np.testing.assert_allclose(controller.integral.last, torque, rtol=0.05)
     controller.step(State(arm.q_start, np.full(arm.n, 0.5)), wide(arm))
     assert np.abs(controller._observer.estimate - learned).max() > 10.0

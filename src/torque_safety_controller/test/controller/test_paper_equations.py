@@ -14,9 +14,9 @@ import pytest
 from arms import load_arm
 from general_solver import nearest
 
-from torque_safety_controller.additional_torque import AdditionalSettings, AdditionalTorque
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.integral_feedback import IntegralSettings
+from torque_safety_controller.integral_feedback.action import IntegralAction
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.tasks.gains import Gains
 from viability_bounds_pkg.state import State
@@ -130,9 +130,10 @@ def moved(method, tracking):
         posture_weight=POSTURE_WEIGHT,
     )
     budget = np.full(N, np.inf) if method == "none" else LIMIT
-    law = IntegralSettings(budget, LAMBDA, SLOW, FAST, MU, method)
-    additional = AdditionalTorque(AdditionalSettings("joints", law, np.full(N, np.inf)))
-    controller = Controller(ARM.robot(STEP), np.full(N, 1e4), gains, additional=additional)
+    anti_windup = "paper" if method == "none" else method
+    law = IntegralSettings(budget, LAMBDA, SLOW, FAST, MU, anti_windup)
+    integral = IntegralAction("joints", law, np.full(N, np.inf))
+    controller = Controller(ARM.robot(STEP), np.full(N, 1e4), gains, integral=integral)
     controller.reset(q_at(0.0))
     posture = q_at(0.0) + 0.3 * np.sin(np.arange(N))
     goal = None

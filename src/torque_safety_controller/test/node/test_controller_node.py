@@ -198,32 +198,32 @@ def test_integral_action_fades_where_the_motors_give_other_torques_for_long(ros)
     """It would push against a robot that keeps its own limits, and so go on not to be obeyed."""
     motors = Motors(ros, integral_action="joints")
     motors.answer(150)
-    added = motors.chain.node._controller.additional
-    before = np.abs(added.integral).max()
+    added = motors.chain.node._controller.integral
+    before = np.abs(added.last).max()
     assert before > 0.1
     others = -motors.tau
     motors.answer(45, others)
-    assert np.abs(added.integral).max() == pytest.approx(before, rel=0.1)
+    assert np.abs(added.last).max() == pytest.approx(before, rel=0.1)
     motors.answer(80, others)
-    assert np.abs(added.integral).max() < 0.1 * before
+    assert np.abs(added.last).max() < 0.1 * before
 
 
 def test_integral_action_fades_after_a_pause_in_which_the_robot_stopped_itself(ros):
     """It balanced the friction of a motion; an arm that stands would be pushed by it."""
     motors = Motors(ros, integral_action="joints", bounds_timeout=0.2)
     motors.answer(150)
-    added = motors.chain.node._controller.additional
-    before = np.abs(added.integral).max()
+    added = motors.chain.node._controller.integral
+    before = np.abs(added.last).max()
     assert before > 0.1
     motors.stamp += 150  # shorter
     motors.answer(1)
-    assert np.abs(added.integral).max() > 0.9 * before
+    assert np.abs(added.last).max() > 0.9 * before
     motors.stamp += 300
     motors.answer(1)
-    after = np.abs(added.integral).max()
+    after = np.abs(added.last).max()
     assert after > 0.8 * before  # no kick
     motors.answer(30)
-    assert np.abs(added.integral).max() < 0.5 * before
+    assert np.abs(added.last).max() < 0.5 * before
 
 
 def test_where_torques_are_not_reported_any_more_commands_count_as_obeyed(ros):

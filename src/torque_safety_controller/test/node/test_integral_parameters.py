@@ -10,12 +10,10 @@ import pytest
 from arms import load_arm
 from controller_chain import NODE, ControllerChain, gains_of
 
-from torque_safety_controller.additional_torque import (
-    AdditionalSettings,
-    AdditionalTorque,
-)
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.integral_feedback import IntegralSettings
+from torque_safety_controller.integral_feedback.action import changed as integral_with
+from torque_safety_controller.integral_feedback.action import make_integral
 from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.exceptions import SettingError
@@ -47,14 +45,14 @@ DEFAULT = {"budget": 0.1 * ARM.tau_max}
 
 def core(mode="joints", **changed) -> Controller:
     """The node's core, set up by hand; also says what its defaults are."""
-    additional = AdditionalTorque(make_settings(mode, **changed))
-    controller = Controller(ARM.robot(), ARM.tau_max, GAINS, additional=additional)
+    integral = make_integral(mode, make_settings(**changed), 2.0 * ARM.tau_max)
+    controller = Controller(ARM.robot(), ARM.tau_max, GAINS, integral=integral)
     controller.reset(Q)
     return controller
 
 
-def make_settings(mode="joints", **changed) -> AdditionalSettings:
-    return AdditionalSettings(mode, IntegralSettings(**DEFAULT | changed), 2.0 * ARM.tau_max)
+def make_settings(**changed) -> IntegralSettings:
+    return IntegralSettings(**DEFAULT | changed)
 
 
 class IntegralChain(ControllerChain):
@@ -117,11 +115,6 @@ TASK = {"mode": "task"}
             TASK | {"null_leak_rate": 1.0},
             TASK,
         ),
-        (
-            {"integral_anti_windup": "none", "integral_budget": SMALL},
-            SMALL_BUDGET | {"anti_windup": "none"},
-            SMALL_BUDGET,
-        ),
     ],
     ids=lambda value: " ".join(value),
 )
@@ -153,8 +146,12 @@ def test_parameters_change_while_it_runs_and_the_torque_goes_on(ros):
     ):  # fmt: skip
         ros.accepts(NODE, **changed)
         common |= by_hand
-        controller.additional.settings = make_settings(**common)
-        before = controller.additional.last
+        others = {name: value for name, value in common.items() if name != "mode"}
+        mode = common.get("mode", "joints")
+        controller.integral = integral_with(
+            controller.integral, mode, make_settings(**others), 2.0 * ARM.tau_max
+        )
+        before = controller.integral.last
         for k, v in enumerate(SPEEDS):
             expected = controller.step(State(Q, v), AccelerationRange(-WIDE, WIDE)).tau
             np.testing.assert_allclose(
@@ -162,7 +159,7 @@ def test_parameters_change_while_it_runs_and_the_torque_goes_on(ros):
             )
             if k == 0:
                 # The same state as the last one, but for v.
-                change = controller.additional.last - before
+                change = controller.integral.last - before
                 assert (np.abs(change) < 0.01 * ARM.tau_max).all(), changed
     ros.wait_until(lambda: ros.reported(NODE, "integral_action") == "joints")
 
@@ -190,7 +187,7 @@ BAD = [
     ("integral_leak", [0.1, 100.0], "3 or 4 finite numbers"),
     ("integral_leak", [0.1, 100.0, 0.5, 0.05], "theta_null >= theta_s"),
     ("integral_leak", [0.1, 100.0, 0.5, 9.0, 9.0], "3 or 4 finite numbers"),
-    ("integral_anti_windup", "qp2", "one of none, scaling, paper, qp"),
+    ("integral_anti_windup", "qp2", "one of qp, paper, scaling"),
 ]
 
 
@@ -237,7 +234,6 @@ def test_six_joints_have_no_null_space_of_a_pose(ros):
 def test_six_joints_have_a_null_space_of_a_position(ros):
     values = six_joints() | {"integral_action": "position"}
     ros.start(ControllerNode, values)
-    ros.accepts(NODE, integral_action="joints")
 
 
 # Time

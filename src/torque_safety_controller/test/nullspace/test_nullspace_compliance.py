@@ -9,17 +9,14 @@ from hypothesis import strategies as st
 from task_arm import TaskArm
 
 from torque_safety_controller.integral_feedback import (
-    ArmTerms,
     IntegralFeedback,
 )
-from torque_safety_controller.linalg.generalized_inverse import THRESHOLD
-from torque_safety_controller.nullspace.compliance import NullspaceCompliance, TaskShapeError
-from torque_safety_controller.nullspace.kernels import (
+from torque_safety_controller.nullspace.compliance import (
+    NullspaceCompliance,
+    TaskShapeError,
     energy_product,
-    law_torque,
-    torque_matrix,
 )
-from viability_bounds_pkg.exceptions import SettingError
+from torque_safety_controller.nullspace.kernels import THRESHOLD, torque_matrix
 
 # What it is for
 
@@ -108,18 +105,18 @@ def test_gain_matrix_is_positive(seed, m, mu):
     n = 7
     J, J_plus = rng.normal(size=(m, n)), rng.normal(size=(n, m))
     M = np.diag(rng.uniform(0.01, 3.0, n))
-    K, law = 2.0 * np.diag(M), unlimited(n, mu=mu).law
+    K = 2.0 * np.diag(M)
     # At rest: neither C nor J'.
-    rest = ArmTerms(M, 0.0 * M, J, 0.0 * J, np.zeros(n))
-    H = torque_matrix(law, rest, J_plus, 0.0 * J_plus)
+    H = torque_matrix(J, 0.0 * J, M, 0.0 * M, 2.0, mu, J_plus, 0.0 * J_plus)
     np.testing.assert_allclose(H, H.T, atol=1e-12 * np.abs(H).max())
     P = J_plus @ J
     expected = (1.0 - mu) * P.T @ np.diag(K) @ P + mu * np.diag(K)
-    # The torque is linear in the memory, moving or not.
-    moving = rest._replace(C=rng.normal(size=(n, n)), J_dot=rng.normal(size=(m, n)))
-    rates, a, x = rng.normal(size=(n, m)), rng.normal(size=n), rng.normal(size=n)
-    torque = torque_matrix(law, moving, J_plus, rates) @ a - mu * K * x
-    found = law_torque(law, moving, J_plus, rates, a, x)
+    # And in motion it is (21) with (26).
+    C, J_dot = rng.normal(size=(n, n)), rng.normal(size=(m, n))
+    rates, a = rng.normal(size=(n, m)), rng.normal(size=n)
+    found = torque_matrix(J, J_dot, M, C, 2.0, mu, J_plus, rates) @ a
+    s, integral = a - P @ a, -J @ a
+    torque = C @ a - M @ (J_plus @ J_dot @ s + rates @ integral) + expected @ a
     np.testing.assert_allclose(found, torque, atol=1e-11 * np.abs(torque).max())
     np.testing.assert_allclose(H, expected, atol=1e-12 * H.max())
     smallest = np.linalg.eigvalsh(H)[0]
@@ -194,14 +191,8 @@ def test_any_task_with_a_null_space_is_served(m):
     assert np.isfinite(run.torques).all()
 
 
-def test_budgets_of_another_arm_are_refused():
-    compliance = NullspaceCompliance(unlimited(7), 6)
-    with pytest.raises(SettingError, match="one number for each of 7 joints"):
-        compliance.settings = unlimited(6)
-
-
 def test_energy_is_a_norm_of_the_memory():
-    law = unlimited(3).law
+    law = unlimited(3)
     M = np.array([[2.0, 0.3, 0.0], [0.3, 1.0, 0.1], [0.0, 0.1, 0.5]])
     a, x = np.array([1.0, -2.0, 0.5]), np.array([0.2, 0.4, -1.0])
     weight = 0.5 * 2.0 / (100.0 - 0.1)

@@ -14,11 +14,8 @@ from torque_safety_controller.integral_feedback import (
     IntegralFeedback,
     IntegralSettings,
 )
-from torque_safety_controller.integral_feedback.settings import WIDENING_TIME
-from torque_safety_controller.nullspace.compliance import NullspaceCompliance
-from torque_safety_controller.nullspace.kernels import (
-    FADING_TIME,
-)
+from torque_safety_controller.integral_feedback.law import WIDENING_TIME
+from torque_safety_controller.nullspace.compliance import FADING_TIME, NullspaceCompliance
 
 # Limits
 

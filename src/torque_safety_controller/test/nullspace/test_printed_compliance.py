@@ -15,7 +15,8 @@ from printed_law import FAST, LAMBDA, MU, SLOW, STEP, PrintedLaw
 from task_arm import TaskArm, arm_terms
 
 from torque_safety_controller.integral_feedback import IntegralSettings
-from torque_safety_controller.nullspace.compliance import NullspaceCompliance, PrintedCompliance
+from torque_safety_controller.nullspace.compliance import NullspaceCompliance
+from torque_safety_controller.nullspace.printed import PrintedCompliance
 
 SMALL = 1e-5  # s; of differences
 
@@ -23,10 +24,10 @@ SMALL = 1e-5  # s; of differences
 class Motion(PrintedLaw):
     """A real arm on a motion, and how its torque is limited."""
 
-    def __init__(self, robot, rows, limit, limit_torque, mass):
+    def __init__(self, robot, rows, limit, limit_torque):
         self.arm = TaskArm(robot, rows, armature=0.1)
         super().__init__(self.arm.model, self.arm.posture, rows, 0.3, 2.0, SMALL)
-        self.limit, self.limit_torque, self.mass = limit, limit_torque, mass
+        self.limit, self.limit_torque = limit, limit_torque
         self.binding = 0
 
     def J(self, t):
@@ -34,10 +35,6 @@ class Motion(PrintedLaw):
 
     def limited(self, u):
         return self.limit_torque(self, u)
-
-
-def free(motion, u):
-    return u
 
 
 def factor(u, limit):
@@ -57,7 +54,7 @@ def solved(motion, u):
     return x
 
 
-LIMITED = {"none": free, "scaling": scaled, "paper": solved, "paper_mass": solved}
+LIMITED = {"scaling": scaled, "paper": solved}
 
 
 @pytest.mark.parametrize("method", LIMITED)
@@ -66,9 +63,8 @@ def test_it_is_what_the_paper_prints(method, robot, rows):
     """What differs is J' in the middle of a step: less than 1e-4 of the torque."""
     n = TaskArm(robot, rows).n
     limit = np.where(np.arange(n) % 3 == 0, 0.02, 1.0)
-    motion = Motion(robot, rows, limit, LIMITED[method], method == "paper_mass")
-    budget = np.full(n, np.inf) if method == "none" else limit
-    compliance = PrintedCompliance(IntegralSettings(budget, LAMBDA, SLOW, FAST, MU, method), rows)
+    motion = Motion(robot, rows, limit, LIMITED[method])
+    compliance = PrintedCompliance(IntegralSettings(limit, LAMBDA, SLOW, FAST, MU, method), rows)
 
     def terms(t):
         return arm_terms(motion.arm.terms(motion.q(t), motion.v(t)), motion.v(t))
@@ -81,7 +77,7 @@ def test_it_is_what_the_paper_prints(method, robot, rows):
         found = compliance.torque(terms(t), motion.a_ref(t - STEP), STEP)
         np.testing.assert_allclose(found, expected, atol=1e-4 * max(1.0, np.abs(expected).max()))
         limited += compliance.saturated.any()
-    assert (limited > 100) == (method != "none")
+    assert limited > 100
     # Its second condition is rarely felt; here it is throughout.
     if method == "paper":
         assert (motion.binding > 200) == ((robot, rows) == ("panda", 3))
@@ -92,7 +88,7 @@ def test_energy_falls_at_the_rate_of_the_paper_s_proof():
     offs = []
     for dt in (1e-3, 5e-4):
         arm = TaskArm("panda", 6)
-        law = unlimited(7, slow_leak_rate=0.0, fast_leak_rate=0.0, anti_windup="none")
+        law = unlimited(7, slow_leak_rate=0.0, fast_leak_rate=0.0, anti_windup="paper")
         compliance = PrintedCompliance(law, 6)
         q, v = arm.posture.copy(), 0.5 * np.cos(np.arange(7))
         now = arm.terms(q, v)

@@ -11,10 +11,10 @@ import pinocchio as pin
 import pytest
 from printed_law import FAST, LAMBDA, MU, SLOW, STEP, PrintedLaw
 
-from torque_safety_controller.additional_torque import AdditionalSettings, AdditionalTorque
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.integral_feedback import IntegralSettings
-from torque_safety_controller.nullspace.compliance import NullspaceCompliance
+from torque_safety_controller.integral_feedback.action import IntegralAction
+from torque_safety_controller.nullspace.compliance import NullspaceCompliance, TaskShapeError
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks.gains import Gains
@@ -78,7 +78,7 @@ def additional(anti_windup, **changed):
     budget = np.full(len(Motion.start), np.inf)
     law = IntegralSettings(budget, LAMBDA, SLOW, FAST, MU, anti_windup)
     law = IntegralSettings(budget, anti_windup=anti_windup, **changed) if changed else law
-    return AdditionalTorque(AdditionalSettings("task", law, budget), hands=2)
+    return IntegralAction("task", law, budget, hands=2)
 
 
 def at(arm, motion, t):
@@ -89,7 +89,7 @@ def at(arm, motion, t):
 
 
 def test_one_integral_for_both_is_what_the_paper_prints():
-    motion, arm, action = Motion(), robot(), additional("none")
+    motion, arm, action = Motion(), robot(), additional("paper")
     action.torque(at(arm, motion, 0.0), motion.v(0.0), motion.a_ref(0.0), 0.0)
     for k in range(1, 60):
         t = k * STEP
@@ -104,7 +104,7 @@ def test_the_errors_of_both_hands_are_integrated_exactly():
     motion, arm = Motion(), robot()
     action = additional("qp", gain=5.0, slow_leak_rate=0.0, fast_leak_rate=50.0)
     action.torque(at(arm, motion, 0.0), motion.v(0.0), motion.a_ref(0.0), 0.0)
-    task, total = action.actions["task"], np.zeros(12)
+    task, total = action.law, np.zeros(12)
     assert isinstance(task, NullspaceCompliance)
     for k in range(1, 40):
         t = k * STEP
@@ -117,9 +117,10 @@ def test_the_errors_of_both_hands_are_integrated_exactly():
 
 def test_without_a_null_space_left_there_is_no_such_action():
     """11 joints, 12 rows."""
-    settings = AdditionalSettings("task", IntegralSettings(np.ones(11)), np.ones(11))
-    assert set(AdditionalTorque(settings, hands=2).actions) >= {"joints", "position"}
-    assert "task" not in AdditionalTorque(settings, hands=2).actions
+    settings = IntegralSettings(np.ones(11)), np.ones(11)
+    IntegralAction("position", *settings, hands=2)
+    with pytest.raises(TaskShapeError):
+        IntegralAction("task", *settings, hands=2)
 
 
 @pytest.mark.parametrize("only_second", [False, True])

@@ -8,12 +8,9 @@ import pinocchio as pin
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from torque_safety_controller.additional_torque import (
-    AdditionalSettings,
-    AdditionalTorque,
-)
 from torque_safety_controller.controller import Controller, Gains
 from torque_safety_controller.integral_feedback import IntegralSettings
+from torque_safety_controller.integral_feedback.action import FadingTorque, make_integral
 from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.state import State
 
@@ -79,15 +76,14 @@ def assert_may_be_sent(step, arm) -> None:
     assert (np.abs(step.tau) <= arm.tau_max).all()
 
 
-def integral(arm, mode, **changed) -> AdditionalSettings:
+def integral(arm, mode, **changed) -> FadingTorque:
     settings = IntegralSettings(**{"budget": 0.2 * arm.tau_max, "gain": 30.0} | changed)
-    return AdditionalSettings(mode, settings, 2.0 * arm.tau_max)
+    return make_integral(mode, settings, 2.0 * arm.tau_max)
 
 
 def with_integral(arm, mode="joints", gains=GAINS, rate=None, **changed) -> Controller:
     """A controller at 1 kHz."""
-    additional = AdditionalTorque(integral(arm, mode, **changed))
-    return Controller(arm.robot(KHZ), arm.tau_max, gains, rate, additional)
+    return Controller(arm.robot(KHZ), arm.tau_max, gains, rate, integral(arm, mode, **changed))
 
 
 NUMBERS = st.one_of(

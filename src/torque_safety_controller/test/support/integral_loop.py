@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A Panda with an additional torque, whose motors give what they are told, for tests."""
+"""A Panda with integral action, whose motors give what they are told, for tests."""
 
 from copy import deepcopy
 from functools import cache
@@ -7,8 +7,8 @@ from functools import cache
 import numpy as np
 from arms import load_arm
 
-from torque_safety_controller.additional_torque import AdditionalSettings, AdditionalTorque
 from torque_safety_controller.integral_feedback import IntegralSettings
+from torque_safety_controller.integral_feedback.action import make_integral
 from viability_bounds_pkg.state import State
 
 ARM = load_arm("panda")
@@ -21,18 +21,17 @@ REST = np.zeros(N)
 DISTURBANCE = 0.06 * ARM.tau_max * np.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0])
 
 
-def make_settings(mode="joints", disturbance=2.0, **changed) -> AdditionalSettings:
-    integral = IntegralSettings(**{"budget": BUDGET, "gain": LAMBDA} | changed)
-    return AdditionalSettings(mode, integral, disturbance * ARM.tau_max)
+def make_settings(**changed) -> IntegralSettings:
+    return IntegralSettings(**{"budget": BUDGET, "gain": LAMBDA} | changed)
 
 
 class IntegralLoop:
-    """An arm that holds its posture by a spring and a damper, and the additional torque."""
+    """An arm that holds its posture by a spring and a damper, and the integral action."""
 
-    def __init__(self, mode="joints", **changed) -> None:
+    def __init__(self, mode="joints", disturbance=2.0, **changed) -> None:
         self.robot = ARM.robot(DT)
         self.robot.rates = True
-        self.additional = AdditionalTorque(make_settings(mode, **changed))
+        self.action = make_integral(mode, make_settings(**changed), disturbance * ARM.tau_max)
         self.q, self.v, self.a = ARM.q_start.copy(), REST, REST
         self.torques = [REST]
 
@@ -40,7 +39,7 @@ class IntegralLoop:
         """Play a period; return what was added."""
         v = self.v if v_seen is None else v_seen
         self.robot.update(State(self.q, v), self.a)
-        added = self.additional.torque(self.robot, v, self.a, elapsed)
+        added = self.action.torque(self.robot, v, self.a, elapsed)
         self.a = 100.0 * (ARM.q_start - self.q) - 20.0 * v
         tau = self.robot.torque(self.a) + added + disturbance
         self.q, self.v = ARM.move(self.q, self.v, tau, DT, steps=1)
@@ -62,13 +61,13 @@ def relative(torque) -> float:
 
 
 def settled(mode, **changed) -> IntegralLoop:
-    """An arm whose additional torque carries a good part of the disturbance, to be moved on."""
+    """An arm whose integral action carries a good part of the disturbance, to be moved on."""
     return deepcopy(settled_once(mode, **changed))
 
 
 @cache
 def settled_once(mode, **changed) -> IntegralLoop:
     loop = IntegralLoop(mode, **changed).run(0.4)
-    assert relative(loop.additional.last) > 0.03 or mode == "none"
+    assert relative(loop.action.last) > 0.03 or mode == "none"
     assert loop.steps(50) < 2e-4
     return loop

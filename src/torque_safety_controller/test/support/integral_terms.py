@@ -7,7 +7,7 @@ from torque_safety_controller.integral_feedback import (
     ArmTerms,
     IntegralFeedback,
 )
-from torque_safety_controller.integral_feedback.kernels import nearest_with_leak
+from torque_safety_controller.integral_feedback.joints import nearest_with_leak
 
 N = 5
 DT = 1e-3
@@ -51,10 +51,10 @@ def torque_now(feedback, M, C):
 
 def uncorrected(law, s, M, C):
     """Torque and leak of (11*) for this s, before the integrators are corrected."""
-    torque, limit = np.empty(len(s)), law.budget.copy()
+    limit = law.budget
     Ks = law.gain * np.diag(M) * s
     w = C @ s + np.clip(Ks, -limit, limit)
-    return torque, nearest_with_leak(M, s, C @ s + Ks, limit, w, torque)
+    return nearest_with_leak(M, s, C @ s + Ks, limit, w)
 
 
 def moving(feedback, rng, steps=50):

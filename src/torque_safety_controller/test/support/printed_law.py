@@ -23,9 +23,6 @@ class PrintedLaw:
         small: of differences, s.
     """
 
-    mass = False
-    """Whether K is lambda M."""
-
     def __init__(self, model, middle, rows, swing, pace, small) -> None:
         self.model, self.middle, self.n = model, middle, model.nv
         self.swing, self.pace, self.small = swing, pace, small
@@ -66,7 +63,7 @@ class PrintedLaw:
         data = self.model.createData()
         C = pin.computeCoriolisMatrix(self.model, data, self.q(t), self.v(t))
         M, J, J_plus = self.M(t), self.J(t), self.inverse(t)
-        K = LAMBDA * (M if self.mass else np.diag(np.diag(M)))
+        K = LAMBDA * np.diag(np.diag(M))
         s_last, a_last = self.s, self.a
         self.s = s_last + self.a_ref(t - dt) * dt - (self.v(t) - self.v(t - dt))
         middle = 0.5 * (s_last + self.s)

@@ -45,60 +45,39 @@ _POSITION_JUMP = 0.05  # rad or m; beyond what the velocities account for
 _FADING_TIME = 0.2  # s; of what the memory cannot hold
 
 
-class IntegralAction:
-    """Torque of the integral of acceleration errors.
+class FadingTorque:
+    """Torque taken over at a handover, which fades; what there is without integral action.
 
     Args:
-        mode: one of `MODES` but ``none``.
-        settings: may be replaced between steps: the torque does not jump.
-        disturbance_max: largest disturbance of each joint that is integrated, shape (n,), N m;
-            what friction and a wrong model never are, but a sensor's glitch or a blow may be.
-        hands: end effectors whose rows are stacked to one task.
+        settings: as of `IntegralAction`.
 
     Attributes:
-        settings: as they are set; `gain` may be lower where the arm is.
-        law: what gives the torque of a step.
+        mode: one of `MODES`.
+        settings: as they are set.
         last: torque of the last step, shape (n,), N m.
         skipped: steps that were not integrated over: time jumped, or the state did.
-
-    Raises:
-        TaskShapeError: the task leaves no null space.
+        gain: lambda that is used, 1/s; what is set, or what is stable; 0 for none.
+        saturated: which joints are at their budget, shape (n,).
+        rates: whether the robot's matrices are needed with their rates.
     """
 
-    def __init__(
-        self, mode: str, settings: IntegralSettings, disturbance_max: Array, hands: int = 1
-    ) -> None:
+    mode = "none"
+    rates = False
+    gain = 0.0
+
+    def __init__(self, settings: IntegralSettings) -> None:
         self.settings = settings
-        self.law = _make_law(mode, settings, hands)
         self.skipped = 0
-        self._rows = TASKS.get(mode, slice(0, 6))
-        self._most = _MOST[mode]
-        self._disturbance_max = disturbance_max
         self._zero = np.zeros(len(settings.budget))
+        self.saturated = np.zeros(len(settings.budget), dtype=bool)
         self.reset()
-
-    @property
-    def gain(self) -> float:
-        """Gain lambda that is used, 1/s: what is set, or what is stable."""
-        return self.law.settings.gain
-
-    @property
-    def saturated(self) -> NDArray[np.bool_]:
-        """Which joints are at their budget, shape (n,)."""
-        return self.law.saturated
 
     def reset(self) -> None:
         """Forget the past: the next step begins with nothing added."""
-        self._lowered = 0
-        self._asked = self.law.settings = self.settings
-        self._started = self._lost = self._resuming = False
-        self._q_last = self._v_last = self._zero
         self.last = self._fading = self._zero
 
     def forget(self) -> None:
         """Let the integral begin anew: what it gives now fades."""
-        self._started = False
-        self._resuming = True
 
     def torque(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> Array:
         """Return what to add in this step, shape (n,), N m; finite whatever comes.
@@ -112,16 +91,7 @@ class IntegralAction:
             a_last: acceleration commanded in the last step, shape (n,), rad/s^2.
             elapsed: time since the last step, s.
         """
-        try:
-            torque = self._next(robot, v, a_last, elapsed)
-        except ValueError:  # numbers that are not finite, or no mass matrix
-            self._lost = True
-            torque = None
-        if torque is None:
-            self._resuming = True
-            self.skipped += 1
-        else:
-            self.last = torque
+        self.last = self._faded(elapsed, robot.dt)
         return self.last
 
     def resume(self, robot: RobotModel, v: Array, torque: Array) -> None:
@@ -135,18 +105,99 @@ class IntegralAction:
             v: velocity, shape (n,), rad/s.
             torque: shape (n,), N m, finite.
         """
+        self.last = self._fading = torque
+
+    def go_on_from(self, torque: Array) -> None:
+        """Let the next step continue what another action added, shape (n,), N m."""
+        self.last = self._fading = torque
+
+    def _faded(self, elapsed: float, period: float) -> Array:
+        """Let the time pass for what fades, and return it; infinite time is a period."""
+        gap = min(elapsed, LONGEST_GAP * period) if elapsed > 0.0 else 0.0  # also for a NaN
+        gap = period if math.isinf(elapsed) else gap
+        self._fading = self._fading * math.exp(-gap / _FADING_TIME)
+        return self._fading
+
+
+class IntegralAction(FadingTorque):
+    """Torque of the integral of acceleration errors.
+
+    Args:
+        mode: one of `MODES` but ``none``.
+        settings: may be replaced between steps: the torque does not jump.
+        disturbance_max: largest disturbance of each joint that is integrated, shape (n,), N m;
+            what friction and a wrong model never are, but a sensor's glitch or a blow may be.
+        hands: end effectors whose rows are stacked to one task.
+
+    Attributes:
+        law: what gives the torque of a step.
+
+    Raises:
+        TaskShapeError: the task leaves no null space.
+    """
+
+    rates = True
+
+    def __init__(
+        self, mode: str, settings: IntegralSettings, disturbance_max: Array, hands: int = 1
+    ) -> None:
+        self.mode = mode
+        self.law = _make_law(mode, settings, hands)
+        self._rows = TASKS.get(mode, slice(0, 6))
+        self._most = _MOST[mode]
+        self._disturbance_max = disturbance_max
+        super().__init__(settings)
+
+    def reset(self) -> None:
+        """See `FadingTorque`."""
+        super().reset()
+        self._lowered = 0
+        self._use(self.settings)
+        self._started = self._lost = self._resuming = self._due = False
+        self._q_last = self._v_last = self._zero
+
+    def forget(self) -> None:
+        """See `FadingTorque`."""
+        self._started = False
+        self._resuming = True
+
+    def torque(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> Array:
+        """See `FadingTorque`."""
+        if self._due:
+            self._due = False
+            self.resume(robot, v, self.last)
+            return self.last
+        try:
+            torque = self._next(robot, v, a_last, elapsed)
+        except ValueError:  # numbers that are not finite, or no mass matrix
+            self._lost = True
+            torque = None
+        if torque is None:
+            self._resuming = True
+            self.skipped += 1
+        else:
+            self.last = torque
+        self.saturated = self.law.saturated
+        return self.last
+
+    def resume(self, robot: RobotModel, v: Array, torque: Array) -> None:
+        """See `FadingTorque`."""
         self._started = False
         self._use(self._stable(np.ascontiguousarray(robot.M), robot.dt))
         self._hold(robot, v, torque)
         self.last = torque
+
+    def go_on_from(self, torque: Array) -> None:
+        """See `FadingTorque`; the memory holds what it can of it from then on."""
+        super().go_on_from(torque)
+        self._due = True
 
     def _next(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> Array | None:
         """Return the torque of this step; None where the state jumped."""
         arm, law = self._arm(robot, v), self.law
         if not self._started:
             self._begin(robot, arm)
-        longest = LONGEST_GAP * robot.dt
-        known = 0.0 < elapsed <= longest and not self._lost
+        known = 0.0 < elapsed <= LONGEST_GAP * robot.dt and not self._lost
         jumped = known and _jumped(
             arm.M,
             self._q_last,
@@ -171,9 +222,7 @@ class IntegralAction:
         if self._resuming or not known:
             self._resuming = False
             self._fading = self.last - torque
-        gap = robot.dt if math.isinf(elapsed) else min(max(elapsed, 0.0), longest)
-        self._fading = self._fading * math.exp(-gap / _FADING_TIME)
-        torque = torque + self._fading
+        torque = torque + self._faded(elapsed, robot.dt)
         settings = self._stable(arm.M, robot.dt)
         if settings is not law.settings:
             self._use(settings)
@@ -198,6 +247,7 @@ class IntegralAction:
 
     def _use(self, settings: IntegralSettings) -> None:
         self._asked, self.law.settings = self.settings, settings
+        self.gain = settings.gain
 
     def _hold(self, robot: RobotModel, v: Array, torque: Array) -> None:
         """Let the memory give `torque` now; what it cannot give fades."""
@@ -264,6 +314,31 @@ def _jumped(
     # A NaN is not within its limits.
     possible = (impulse <= disturbance_max * elapsed) & (way <= _POSITION_JUMP)
     return not possible.all()
+
+
+def make_integral(
+    mode: str, settings: IntegralSettings, disturbance_max: Array, hands: int = 1
+) -> FadingTorque:
+    """Return the integral action of a mode; see `IntegralAction`."""
+    if mode == "none":
+        return FadingTorque(settings)
+    return IntegralAction(mode, settings, disturbance_max, hands)
+
+
+def changed(
+    action: FadingTorque,
+    mode: str,
+    settings: IntegralSettings,
+    disturbance_max: Array,
+    hands: int = 1,
+) -> FadingTorque:
+    """Return an action with other settings, or one of another law, which continues its torque."""
+    if (mode, settings.as_printed) == (action.mode, action.settings.as_printed):
+        action.settings = settings
+        return action
+    other = make_integral(mode, settings, disturbance_max, hands)
+    other.go_on_from(action.last)
+    return other
 
 
 def _make_law(mode: str, settings: IntegralSettings, hands: int) -> IntegralLaw:

@@ -144,8 +144,8 @@ class GainCheck:
             "hold": (0.0, gains.hold_kd),
         }
         self.tasks = {name: pair for name, pair in self.tasks.items() if pair[1] > 0.0}
-        integral = config.additional.integral
-        self.integral = 0.0 if config.additional.mode == "none" else integral.gain
+        integral = config.integral_settings
+        self.integral = 0.0 if config.integral.integral_action == "none" else integral.gain
         self._leak = integral.slow_leak_rate, integral.fast_leak_rate, integral.mu
         self._disturbance_time = gains.disturbance_time
         self._robot, self._tau_max = robot, config.torque_max

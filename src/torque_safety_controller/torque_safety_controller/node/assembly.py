@@ -9,14 +9,17 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
-from torque_safety_controller.additional_torque import AdditionalTorque
 from torque_safety_controller.collision.avoidance import CollisionAvoidance
 from torque_safety_controller.collision.model import build_collision_model
 from torque_safety_controller.contact.contacts import Contacts, FrictionContact
 from torque_safety_controller.contact.interaction import Interaction
 from torque_safety_controller.contact.wrench_sensor import WrenchSensor
 from torque_safety_controller.controller import Controller
+from torque_safety_controller.friction.compensation import FrictionCompensation
+from torque_safety_controller.integral_feedback.action import changed, make_integral
+from torque_safety_controller.integral_feedback.settings import IntegralSettings
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parameters.interaction_parameters import ContactPoint
 from torque_safety_controller.robot_model import RobotModel
@@ -43,6 +46,9 @@ if TYPE_CHECKING:
 
 HORIZON = 2.0
 """Control periods that an acceleration is assumed to last, as in the bounds: no chatter."""
+
+DISTURBANCE_MAX = 2.0
+"""Disturbances beyond this many torque limits are not integrated."""
 
 _BEYOND = 0.003  # m; beyond margin and reserve, pairs nearer than this are too near from the start
 _NEAR = 0.028  # m; beyond margin and reserve, pairs that never come nearer need no guard
@@ -71,7 +77,8 @@ def make_controller(
         config.torque_max,
         config.gains,
         config.torque_rate_max,
-        AdditionalTorque(config.additional, hands=len(config.end_effectors)),
+        make_integral(*_integral(config)),
+        FrictionCompensation(config.friction_settings),
         config.qp_solver,
         [] if collision is None else [collision],
         make_interaction(config, robot, urdf),
@@ -157,11 +164,21 @@ def make_own_bounds(
 def configure(controller: Controller, config: ControllerConfiguration) -> None:
     """Apply the live parameters to a running controller."""
     controller.gains = config.gains
-    if controller.additional is not None:
-        controller.additional.settings = config.additional
+    if controller.integral is not None:
+        controller.integral = changed(controller.integral, *_integral(config))
+    if controller.friction is not None:
+        controller.friction.settings = config.friction_settings
     if controller.interaction is not None:
         controller.interaction.settings = config.interaction.settings
         controller.interaction.sensor.settings = config.interaction.sensor
+
+
+def _integral(
+    config: ControllerConfiguration,
+) -> tuple[str, IntegralSettings, NDArray[np.float64], int]:
+    """Return the arguments of `make_integral`."""
+    mode, hands = config.integral.integral_action, len(config.end_effectors)
+    return mode, config.integral_settings, DISTURBANCE_MAX * config.torque_max, hands
 
 
 class LoadedRobot(NamedTuple):

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from torque_safety_controller.additional_torque import AdditionalSettings
+from torque_safety_controller.friction.settings import FrictionSettings
+from torque_safety_controller.integral_feedback.settings import IntegralSettings
 from torque_safety_controller.parameters.collision_parameters import CollisionConfiguration
 from torque_safety_controller.parameters.friction_parameters import FrictionConfiguration
 from torque_safety_controller.parameters.integral_parameters import IntegralConfiguration
@@ -38,16 +39,14 @@ from viability_bounds_pkg.whole_arm.safety_filter import RESERVE
 
 Array = NDArray[np.float64]
 
-DISTURBANCE_MAX = 2.0
-"""Disturbances beyond this many torque limits are not integrated."""
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfiguration):
     """Parameters of the controller node; arrays of shape (n,) in `joints` order.
 
     Attributes:
-        additional: settings of the integral action and of the friction compensation.
+        integral_settings: of the integral action.
+        friction_settings: of the friction compensation.
     """
 
     NOT_NEEDED = frozenset({"velocity_max"})
@@ -112,7 +111,8 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
     ros2_control_topic: str = text(
         "where to publish efforts as std_msgs/Float64MultiArray too; empty: nowhere", default=""
     )
-    additional: AdditionalSettings = field(init=False)
+    integral_settings: IntegralSettings = field(init=False)
+    friction_settings: FrictionSettings = field(init=False)
 
     def __post_init__(self) -> None:
         """Check all that does not depend on the URDF, and make the settings."""
@@ -124,13 +124,9 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
         if not (self.torque_reserve < (1.0 - RESERVE) * self.torque_max).all():
             allowed = f"less than {1.0 - RESERVE:g} of torque_max"
             raise SettingError("torque_reserve", self.torque_reserve, allowed)
-        additional = AdditionalSettings(
-            self.integral.integral_action,
-            self.integral.settings(self.torque_max, len(self.end_effectors)),
-            DISTURBANCE_MAX * self.torque_max,
-            self.friction.settings(self.torque_max),
-        )
-        object.__setattr__(self, "additional", additional)
+        integral = self.integral.settings(self.torque_max, len(self.end_effectors))
+        object.__setattr__(self, "integral_settings", integral)
+        object.__setattr__(self, "friction_settings", self.friction.settings(self.torque_max))
         self.collision.check(self)
         if self.safety_filter:
             self.collision.check_accelerations(self)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from torque_safety_controller.additional_torque import MODES, TASKS
+from torque_safety_controller.integral_feedback.action import MODES, TASKS
 from torque_safety_controller.integral_feedback.settings import METHODS, IntegralSettings
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import (
@@ -62,9 +62,8 @@ class IntegralConfiguration:
     )
     integral_anti_windup: str = text(
         "qp limits the whole torque and the integrators; paper and scaling limit the torque of "
-        "the gains only, by eq. (11) and (10) as printed, paper_mass by (11) with K = lambda M, "
-        "none nothing: with these four the law is as printed, task and position with (16), (21) "
-        "and (26)",
+        "the gains only, by eq. (11) and (10), and the law is as printed, that of task and "
+        "position with (16), (21) and (26)",
         default="qp",
         live=True,
         choices=METHODS,

@@ -89,12 +89,13 @@ class StepRecord:
             "latency_p50_us": 1e6 * self._latencies.percentile(50),
             "latency_p99_us": 1e6 * self._latencies.percentile(99),
         }
-        if controller.additional is not None:
+        integral, friction = controller.integral, controller.friction
+        if integral is not None and friction is not None:
             values |= {
-                "additional_torque_nm": controller.additional.last,
-                "friction_torque_nm": controller.additional.friction.last,
-                "joints_at_integral_budget": _named(joints, controller.additional.saturated),
-                "integral_skipped_steps": controller.additional.skipped,
+                "additional_torque_nm": integral.last + friction.last,
+                "friction_torque_nm": friction.last,
+                "joints_at_integral_budget": _named(joints, integral.saturated),
+                "integral_skipped_steps": integral.skipped,
             }
         if controller.safety_filter is not None:
             values |= {
