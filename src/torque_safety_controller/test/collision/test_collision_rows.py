@@ -182,16 +182,6 @@ def test_settings_that_cannot_be_are_refused(changes, word):
         CollisionSettings(**changes)
 
 
-def test_limits_and_steps_that_cannot_be_are_refused():
-    _, limits, collision = panda()
-    with pytest.raises(SettingError, match="acceleration_max"):
-        CollisionAvoidance(collision, limits.a_min, -limits.a_max, 1e-3)
-    with pytest.raises(SettingError, match="acceleration_min"):
-        CollisionAvoidance(collision, limits.a_min[:3], limits.a_max, 1e-3)
-    with pytest.raises(SettingError, match="dt"):
-        CollisionAvoidance(collision, limits.a_min, limits.a_max, 0.0)
-
-
 def ball_before_a_wall(**changes):
     """An arm in the x-y plane with a ball at its end, and a wall at x = 0.9 m."""
     block = box("block", [1.0, 0.0, 0.0], [0.2, 2.0, 2.0])

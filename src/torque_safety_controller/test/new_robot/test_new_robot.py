@@ -259,6 +259,8 @@ def test_files_are_not_replaced_unasked_and_say_where_numbers_come_from(tmp_path
     values = yaml.safe_load(text)["/**"]["ros__parameters"]
     assert values["joints"] == ["shoulder", "wrist"]
     assert "torque_max" not in values  # the URDF has it
+    links = yaml.safe_load(text)["/**/controller_node"]["ros__parameters"]["collision_capsules"]
+    assert any(entry.startswith("{link: hand, ") for entry in links)
     lines = text.splitlines()
     for name in ("rate_hz", "start_positions", "acceleration_min", "acceleration_drift"):
         index = next(i for i, line in enumerate(lines) if line.strip().startswith(f"{name}:"))

@@ -14,16 +14,11 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from torque_safety_controller.collision.distances import (
-    Features,
-    find_features,
-    move_segments,
-)
+from torque_safety_controller.collision.distances import Features, find_features, move_segments
 from torque_safety_controller.collision.model import CollisionModel
 from torque_safety_controller.collision.rows import BRAKING, RESERVE, SPEED_MAX, write_rows
 from torque_safety_controller.qp import AccelerationRange, LinearConstraints
 from torque_safety_controller.robot_model import RobotModel
-from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import Range, check, number
 
 Array = NDArray[np.float64]
@@ -99,13 +94,12 @@ class CollisionAvoidance:
         settings: distances.
 
     Attributes:
-        model, settings: as given.
-        influence, speed_max, rows_max: `INFLUENCE` and the margin, `SPEED_MAX`, `ROWS_MAX`.
+        model, dt, settings: as given.
+        influence: distance within which pairs matter that do not approach fast, m.
+        speed_max: largest speed of approach, m/s.
+        rows_max: rows that a step returns at most.
         count: how many rows the last step had, before those beyond `rows_max` were dropped.
         distances: of all pairs in the last step, shape (p,), m; inf where one is far.
-
-    Raises:
-        SettingError: limits of the wrong size or sign, or a step that is not positive.
     """
 
     def __init__(
@@ -116,35 +110,26 @@ class CollisionAvoidance:
         dt: float,
         settings: CollisionSettings | None = None,
     ) -> None:
-        n = model.arm.nv
-        lower, upper = np.asarray(a_min, dtype=np.float64), np.asarray(a_max, dtype=np.float64)
-        for name, limit, sign in (("min", lower, -1.0), ("max", upper, 1.0)):
-            if limit.shape != (n,) or not (np.isfinite(limit) & (sign * limit > 0.0)).all():
-                kind = "negative" if sign < 0.0 else "positive"
-                raise SettingError(f"acceleration_{name}", limit, f"{n} finite {kind} numbers")
-        if not 0.0 < dt < math.inf:
-            raise SettingError("dt", dt, "a finite number > 0")
-        self.model, self.dt = model, float(dt)
+        self.model, self.dt = model, dt
         self.settings = settings = settings or CollisionSettings()
         self.influence, self.speed_max = settings.margin + INFLUENCE, SPEED_MAX
         self.rows_max, self.count = ROWS_MAX, 0
         self.distances = np.full(len(model.names), np.inf)
+        n, joints, most = model.arm.nv, model.arm.njoints, len(model.candidates.bodies)
         self._data = data = model.arm.createData()
-        joints = model.arm.njoints
         self._parent = np.array(list(model.arm.parents), dtype=np.int64)
         self._J, self._dJ = data.J.T, data.dJ.T  # views of Pinocchio's memory, like those below
-        self._placements = np.zeros((joints, 4, 3))
         # To read each placement anew takes ten times as long.
         self._views = [
             view
-            for placement in data.oMi
-            for view in (placement.rotation, placement.translation[None])
+            for m in range(joints)
+            for view in (data.oMi[m].rotation, data.oMi[m].translation[None])
         ]
+        self._placements = np.zeros((joints, 4, 3))
         self._twists = np.zeros((joints, 2, 6))
         self._points = np.zeros((len(model.segments.joint), 2, 3, 3))
         self._limits = np.zeros((4, n))
-        self._limits[0] = np.minimum(-lower, upper)
-        most = len(model.candidates.bodies)
+        self._limits[0] = np.minimum(-np.asarray(a_min), a_max)
         # A row more than there are distances: what is not kept is written, too.
         self._features = Features(
             pair=np.zeros(most + 1, dtype=np.int64),
@@ -175,13 +160,9 @@ class CollisionAvoidance:
 
         Values that are not finite are the caller's to refuse.
         """
-        segments, features, kept, dt = (
-            self.model.segments,
-            self._features,
-            self.settings.kept,
-            self.dt,
-        )
-        pin.computeJointJacobiansTimeVariation(self.model.arm, self._data, q, v)
+        arm, segments, features = self.model.arm, self.model.segments, self._features
+        kept, dt = self.settings.kept, self.dt
+        pin.computeJointJacobiansTimeVariation(arm, self._data, q, v)
         np.concatenate(self._views, out=self._placements.reshape(-1, 3))
         move_segments(
             v, self._parent, self._placements, self._J, self._dJ, segments.joint, segments.ends,
@@ -199,15 +180,18 @@ class CollisionAvoidance:
         )  # fmt: skip
         chosen = np.arange(k)
         if k > self.rows_max:
-            gaps = features.motion[self._source[:k], 0]
-            chosen = np.sort(np.argpartition(gaps, self.rows_max)[: self.rows_max])
+            distances = features.motion[self._source[:k], 0]
+            chosen = np.sort(np.argpartition(distances, self.rows_max)[: self.rows_max])
         source = self._source[chosen]
+        distance, rate, bias = features.motion[source].T
         return CollisionRows(
-            self._G[chosen],
-            self._lower[chosen],
-            features.pair[source],
-            *features.motion[source].T,
-            self._viable[chosen],
+            G=self._G[chosen],
+            lower=self._lower[chosen],
+            pair=features.pair[source],
+            distance=distance,
+            rate=rate,
+            bias=bias,
+            viable=self._viable[chosen],
         )
 
     def constraint(

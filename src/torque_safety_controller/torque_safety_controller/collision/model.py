@@ -222,13 +222,12 @@ def _tables(
     joint = [int(frame.parentJoint) for frame in frames]
     ends = [shape.ends(frame.placement) for shape, frame in zip(shapes, frames, strict=True)]
     radius = [shape.radius for shape in shapes]
-    boxes, box_of, edges_of = [], {}, {}
+    boxes: list[list[Array]] = []
+    box_of, edges_of = {}, {}
     for index, shape in enumerate(shapes):
         if shape.is_box:
-            middle, edges = (
-                frames[index].placement * shape.placement,
-                shape.edges(frames[index].placement),
-            )
+            middle = frames[index].placement * shape.placement
+            edges = shape.edges(frames[index].placement)
             box_of[index] = len(boxes)
             boxes.append([middle.translation, shape.half, *middle.rotation.T])
             edges_of[index] = range(len(ends), len(ends) + len(edges))

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from torque_safety_controller.collision.link_capsules import capsule_entries
 from torque_safety_controller.new_robot.chain import Chain, NewRobotError
 from viability_bounds_pkg.robot_description import RobotDescriptionError, load_geometry
 
@@ -37,16 +38,19 @@ class SelfCollisions:
     Attributes:
         trouble: why shapes are not looked at; empty if they are.
         pairs: how many pairs of shapes are looked at.
+        capsules: around the links, entries of ``collision_capsules``.
     """
 
     def __init__(self, chain: Chain, urdf: str, folder: Path | None) -> None:
         self.trouble, self.pairs = "", 0
+        self.capsules: list[str] = []
         self._model, self._data = chain.model, chain.model.createData()
         try:
             geometry = load_geometry(_with_absolute_meshes(urdf, folder), chain.model)
         except RobotDescriptionError as error:
             self.trouble = str(error).splitlines()[0]
             return
+        self.capsules = capsule_entries(chain.model, geometry)
         shapes = geometry.geometryObjects
         parents = list(chain.model.parents)
         for first in range(len(shapes)):

@@ -15,7 +15,7 @@ from pathlib import Path
 from torque_safety_controller.collision.link_capsules import capsule_entries
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from viability_bounds_pkg.cli.command_line import Parser, run_tool
-from viability_bounds_pkg.cli.limits_file import CONTROLLER
+from viability_bounds_pkg.cli.limits_file import CONTROLLER, check_writable, write_whole
 from viability_bounds_pkg.robot_configuration import load_model
 from viability_bounds_pkg.robot_description import load_geometry
 from viability_bounds_pkg.user_input.parameter_files import ParameterFileError, read_files
@@ -59,11 +59,12 @@ def with_capsules(text: str, entries: Sequence[str]) -> str:
 
 
 def _run(options: argparse.Namespace) -> int:
+    check_writable(options.file)
     config = read_files(ControllerConfiguration, [options.file], CONTROLLER)
     urdf = config.read_urdf()
     model = load_model(config, urdf)
     entries = capsule_entries(model, load_geometry(urdf, model, config.locked))
-    options.file.write_text(with_capsules(options.file.read_text(), entries))
+    write_whole(options.file, with_capsules(options.file.read_text(), entries))
     print(f"{options.file}: {len(entries)} capsules")
     return 0
 

@@ -40,6 +40,7 @@ from torque_safety_controller.new_robot.hardware import (
 )
 from torque_safety_controller.new_robot.postures import SelfCollisions, find_postures
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
+from torque_safety_controller.tools.fit_capsules import with_capsules
 from viability_bounds_pkg.cli.command_line import Parser, positive, run_tool
 from viability_bounds_pkg.cli.limits_file import CONTROLLER, NODE, check_writable, write_whole
 from viability_bounds_pkg.exceptions import ArmSafetyError
@@ -193,6 +194,8 @@ def _run(options: argparse.Namespace) -> int:
 
     begin = GAINS | {OBSERVER: OBSERVER_PERIODS / estimates.rate_hz}
     text, gains = _with_gains_that_suit(robot_text, begin, [])
+    if touches.capsules:
+        text = with_capsules(text, touches.capsules)
     write_whole(files["robot"], text)
     write_whole(files["scenario"], scenario_file(chain, estimates, postures))
     write_whole(files["imperfect"], _imperfect(chain, estimates, gains, files["robot"]))
