@@ -170,6 +170,10 @@ FINGER = (
     '<link name="finger"/><joint name="finger" type="revolute"><parent link="hand"/>'
     f'<child link="finger"/><axis xyz="0 1 0"/>{LIMIT}<mimic joint="{{}}"/></joint>'
 )
+BALL = (
+    '<link name="ball"><collision><geometry><sphere radius="0.1"/></geometry></collision></link>'
+    '<joint name="grip" type="fixed"><parent link="hand"/><child link="ball"/></joint>'
+)
 LOOP = '<joint name="rod" type="fixed"><parent link="base"/><child link="hand"/></joint>'
 
 
@@ -251,7 +255,7 @@ def test_xacro_in_a_comment_is_none(tmp_path):
 
 def test_files_are_not_replaced_unasked_and_say_where_numbers_come_from(tmp_path, capsys):
     path = tmp_path / "arm.urdf"
-    path.write_text(urdf())
+    path.write_text(urdf(more=BALL))
     assert main([str(path), "hand", "--out", str(tmp_path)]) == 0
     assert main([str(path), "hand", "--out", str(tmp_path)]) == 1
     assert "exists; --force replaces it" in capsys.readouterr().err
@@ -260,7 +264,7 @@ def test_files_are_not_replaced_unasked_and_say_where_numbers_come_from(tmp_path
     assert values["joints"] == ["shoulder", "wrist"]
     assert "torque_max" not in values  # the URDF has it
     links = yaml.safe_load(text)["/**/controller_node"]["ros__parameters"]["collision_capsules"]
-    assert any(entry.startswith("{link: hand, ") for entry in links)
+    assert any(entry.startswith("{link: ball, ") for entry in links)
     lines = text.splitlines()
     for name in ("rate_hz", "start_positions", "acceleration_min", "acceleration_drift"):
         index = next(i for i, line in enumerate(lines) if line.strip().startswith(f"{name}:"))
