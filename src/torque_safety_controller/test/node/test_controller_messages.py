@@ -242,6 +242,19 @@ def test_an_impossible_state_is_refused_and_forgotten(ros):
     )
 
 
+def test_states_that_freeze_in_motion_stop_the_arm_until_they_are_plausible_again(ros):
+    chain = NodeChain(ros)
+    stamps = iter(range(give_goal(chain) + 10, 100_000, 10))
+    chain.await_mode("STOPPED", each=lambda: chain.both(next(stamps), v=0.5 * ARM.v_max))
+    assert chain.reported("reason") == "joint states are refused: impossible"
+    assert "impossible" in chain.reported("states_refused")
+    rng = np.random.default_rng(0)  # the last bits of an arm that stands
+    chain.await_mode(
+        "TRACKING",
+        each=lambda: chain.both(next(stamps), q=Q + 1e-9 * rng.random(ARM.n), v=REST),
+    )
+
+
 def test_an_estimate_without_a_solution_is_held_and_forgotten(ros):
     chain = NodeChain(ros, use_estimated_states=True)  # estimates are not checked once more
     stamp = give_goal(chain)
