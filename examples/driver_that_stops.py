@@ -44,7 +44,7 @@ def main() -> int:
         elif silent >= TIMEOUT:  # between them the last command is held
             if silent == TIMEOUT:
                 print(f"stops from {np.abs(v).max():.2f} rad/s: {stop.time_to_rest(v):.3f} s")
-                stop.begin(q, v)
+                stop.start(q, v)
             tau = stop.torque(q, v)
             at_rest = at_rest or step * stop.at_rest
         a = pin.aba(model, data, q + 0.5 * H * v, v, tau)

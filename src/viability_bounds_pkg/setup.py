@@ -16,6 +16,7 @@ setup(
     ],
     python_requires=">=3.10",
     install_requires=[
+        "daqp>=0.7",
         "numba>=0.59",
         "numpy>=1.26",
         "pin>=3",

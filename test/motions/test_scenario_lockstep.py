@@ -229,7 +229,7 @@ def test_a_run_without_a_pose_has_metrics_without_a_pose_error(tmp_path, ros, ca
     path.write_text(yaml.safe_dump(scenario))
     result = run_chain(load_values(ROBOT), scenario, {})
     config = ros.start(ScenarioNode, load_values(ROBOT) | {"scenario": str(path)}).config
-    made = config, result.run, result.robot, {"method": "exact"}
+    made = config, result.run, result.robot, {"method": "exact"}, {}
     assert write_report(tmp_path / "out", *made)
     full = tmp_path / "full"
     with (

@@ -241,9 +241,9 @@ class BulletRobot(BulletBody):
             self._release_brakes()
             q, v, _ = self.state()
             if self._stepped:
-                law.begin(q, v, self.believed_torque, (v - self._v_before) / self.physics_dt)
+                law.start(q, v, self.believed_torque, (v - self._v_before) / self.physics_dt)
             else:
-                law.begin(q, v)
+                law.start(q, v)
             self._law = law
         motors = self._motors
 

@@ -338,8 +338,15 @@ def main(args: list[str] | None = None) -> int:
             return 0
         from sim_bridge.scenario.report import write_report  # matplotlib takes a second to import
 
-        bounds = node.listener.diagnostics["bounds_node"]
-        kept = write_report(options.out, node.config, node.recorded_run(), node.robot, bounds)
+        told = node.listener.diagnostics
+        kept = write_report(
+            options.out,
+            node.config,
+            node.recorded_run(),
+            node.robot,
+            told["bounds_node"],
+            told["controller_node"],
+        )
         return 0 if kept else 1
     except (TimeoutError, ScenarioRefused, OSError) as error:
         report_refusal(error)

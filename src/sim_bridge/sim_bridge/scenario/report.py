@@ -38,6 +38,7 @@ def write_report(
     run: RecordedRun,
     robot: dict[str, str],
     bounds: dict[str, str],
+    controller: dict[str, str],
 ) -> bool:
     """Write ``figure.png``, ``data.npz`` and ``metrics.json``; print a table and the verdict.
 
@@ -47,6 +48,7 @@ def write_report(
         run: the recording.
         robot: the robot's last diagnostics, by key; they cover every physics step.
         bounds: the bounds node's last diagnostics.
+        controller: the controller's.
 
     Returns:
         Whether every limit was kept.
@@ -56,7 +58,7 @@ def write_report(
     """
     reference = pose_reference(config.plan.events, run.t)
     errors = _errors(config, run, reference)
-    metrics = _metrics(config, run, robot, errors, bounds)
+    metrics = _metrics(config, run, robot, errors, bounds, controller)
     _print_table(metrics)
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -152,6 +154,7 @@ def _metrics(
     robot: dict[str, str],
     errors: Array,
     bounds: dict[str, str],
+    controller: dict[str, str],
 ) -> Metrics:
     position = _floats(robot, "position_violation_rad")
     velocity = _floats(robot, "velocity_violation_rad_s")
@@ -160,6 +163,7 @@ def _metrics(
     return {
         "robot": config.robot_name,
         "bounds_method": bounds.get("method", "unknown"),
+        "torque_rates_clipped": controller.get("torque_rate_max") == "clipped",
         "clock": robot["clock"],
         "rate_hz": 1.0 / float(robot["period_s"]),
         "measured_rate_hz": float(robot["rate_hz"]),
@@ -263,6 +267,8 @@ def verdict(metrics: Metrics) -> str:
             ": the promise needs a command in every period (give the nodes their own cores, or "
             "lower rate_hz)"
         )
+    if metrics["torque_rates_clipped"]:
+        said += "; torque_rate_max is clipped: limits are not promised with it"
     return said + "."
 
 

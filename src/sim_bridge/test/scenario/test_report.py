@@ -7,6 +7,7 @@ KEPT = {
     "limits_kept": True,
     "clock": "lockstep",
     "bounds_method": "exact",
+    "torque_rates_clipped": False,
     "steps": 6145,
     "deadline_misses": 0,
     "late_periods": 0,
@@ -33,6 +34,11 @@ REASON = "the promise needs a command in every period"
             {"clock": "real_time", "deadline_misses": 7, "braked_periods": 2},
             "step; 7 of 6145 deadlines were missed; the robot braked without commands for 2 of "
             "6145 periods.",
+            REASON,
+        ),
+        (
+            {"torque_rates_clipped": True},
+            "step; torque_rate_max is clipped: limits are not promised with it.",
             REASON,
         ),
         ({"late_periods": 4}, "; the simulation itself was late by 4 periods.", REASON),

@@ -152,12 +152,13 @@ class ControllerNode(ArmNode):
                 "parameter 'obstacles' is given, but 'collision_avoidance' is false: the arm does "
                 "not avoid them"
             )
+        clipped = "; torque_rate_max is clipped: limits are not promised with it"
         avoiding = "with" if config.collision.collision_avoidance else "without"
         self.announce(
             config.joints,
             config.rate_hz,
             f"{config.start_control} control, integral action {config.integral.integral_action}, "
-            f"{avoiding} collision avoidance",
+            f"{avoiding} collision avoidance{clipped if config.clips_torque_rates else ''}",
         )
 
     def _configure(self, config: ControllerConfiguration) -> None:
@@ -379,6 +380,7 @@ class ControllerNode(ArmNode):
                 "control": self._handover.control.value,
                 "integral_action": self._config.integral.integral_action,
                 "integral_lambda": self._controller.integral_gain,
+                "torque_rate_max": "clipped" if self._config.clips_torque_rates else "none",
                 "goals_pending": len(self._goals),
                 "goals_refused": self._goals.refused,
                 "states_refused": self._states.refused,

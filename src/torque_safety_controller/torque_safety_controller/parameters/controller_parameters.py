@@ -114,6 +114,11 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
     integral_settings: IntegralSettings = field(init=False)
     friction_settings: FrictionSettings = field(init=False)
 
+    @property
+    def clips_torque_rates(self) -> bool:
+        """Whether torques are clipped to rates, so that no other limit is promised."""
+        return bool(np.isfinite(self.torque_rate_max).any())
+
     def __post_init__(self) -> None:
         """Check all that does not depend on the URDF, and make the settings."""
         super().__post_init__()

@@ -20,7 +20,7 @@ def test_no_command_held_for_however_long_passes_a_limit(arm):
     stop, asked = arm.stop(), 0.0
     for _ in range(10):
         q, v = arm.edge(rng)
-        stop.begin(q, v)
+        stop.start(q, v)
         for step in range(300):
             if step % 25 == 0:
                 command = arm.tau_max * rng.choice([-1.0, 1.0], arm.n)
@@ -37,7 +37,7 @@ def test_a_command_within_the_limits_passes_unchanged(arm):
     rng = np.random.default_rng(1)
     q, v = arm.inside(rng)
     stop = arm.stop(observer_time=0.002)
-    stop.begin(q, v)
+    stop.start(q, v)
     for k in range(60):
         a = rng.uniform(-1.0, 1.0, arm.n)
         command = pin.rnea(arm.model, arm.data, q, v, a)
@@ -52,7 +52,7 @@ def test_commands_that_pass_a_limit_do_not_act_by_themselves(arm):
     rng = np.random.default_rng(3)
     q, v = arm.inside(rng)
     stop = arm.stop(observer_time=0.002)
-    stop.begin(q, v)
+    stop.start(q, v)
     for _ in range(3 * round(PASS_TIME / H)):
         command = pin.rnea(arm.model, arm.data, q, v, 1.2 * arm.limits.a_max)
         q, v = arm.move(q, v, stop.follow(q, v, command))
@@ -64,7 +64,7 @@ def test_a_command_after_a_stop_takes_effect_without_a_step(arm):
     stop = arm.stop(observer_time=0.002)
     for moving in (True, False):  # the command returns in the middle of the stop, or after it
         q, v = arm.inside(rng)
-        stop.begin(q, v)
+        stop.start(q, v)
         last = stop.torque(q, v)
         while not (moving or stop.at_rest):
             q, v = arm.move(q, v, last)
@@ -97,7 +97,7 @@ def test_friction_that_is_known_when_the_law_takes_over_is_no_step(arm, known):
         friction = 0.1 * arm.tau_max * rng.choice([-1.0, 1.0], arm.n)
         a = rng.uniform(-1.0, 1.0, arm.n)
         command = pin.rnea(arm.model, arm.data, q, v, a) + friction
-        stop.begin(q, v, *((command, a) if known else ()))
+        stop.start(q, v, *((command, a) if known else ()))
         steps = np.abs(stop.follow(q, v, command) - command) / arm.tau_max
         largest = max(largest, float(steps.max()))
     assert largest < 1e-3 if known else largest > 0.03

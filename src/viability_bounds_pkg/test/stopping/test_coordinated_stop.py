@@ -40,7 +40,7 @@ def test_all_joints_slow_down_together_along_the_direction_of_motion(arm):
     for seed in range(3):
         q, v = arm.inside(np.random.default_rng(seed))
         v0, time = v, stop.time_to_rest(v)
-        stop.begin(q, v)
+        stop.start(q, v)
         steps = 0
         while not stop.at_rest:
             q, v = arm.move(q, v, stop.torque(q, v))
@@ -60,7 +60,7 @@ def test_no_limit_is_passed_from_the_edge_of_the_kernel(arm):
     for _ in range(10):
         q, v = arm.edge(rng)
         time = stop.time_to_rest(v)
-        stop.begin(q, v)
+        stop.start(q, v)
         fastest = np.abs(v)
         for _ in range(round((time + FEW_STEPS) / H)):
             tau = stop.torque(q, v)
@@ -84,7 +84,7 @@ def test_joints_come_to_rest_clear_of_their_limits_where_they_can(arm):
         q = np.clip(q, lowest, highest)
         low, high = BoundsSolver(inner, H, arm.margin).velocity_range(q)
         v = rng.uniform(0.7, 1.0, arm.n) * np.where(rng.random(arm.n) < 0.5, low, high)
-        stop.begin(q, v)
+        stop.start(q, v)
         while not stop.at_rest:
             q, v = arm.move(q, v, stop.torque(q, v))
             assert (np.minimum(highest - q, q - lowest) >= -2e-5).all()
@@ -100,7 +100,7 @@ def test_an_adversary_of_accelerations_within_the_margin_passes_no_limit(panda, 
     for _ in range(10):
         q, v = panda.edge(rng)
         way = np.sign(v)
-        stop.begin(q, v)
+        stop.start(q, v)
         time = stop.time_to_rest(v) / (1.0 - MARGIN)
         for k in range(round((time + 4 * FEW_STEPS) / H)):
             stop.torque(q, v)
@@ -130,7 +130,7 @@ def test_motors_with_a_lag_pass_no_limit_where_the_law_knows_it(arm, told):
     for _ in range(3):
         q, v = arm.edge(rng)
         tau = pin.rnea(arm.model, arm.data, q, v, np.zeros(arm.n)).copy()
-        stop.begin(q, v)
+        stop.start(q, v)
         for _ in range(round((stop.time_to_rest(v) + 0.2) / H)):
             asked = stop.torque(q, v, tau if told else None)
             before = tau
@@ -149,7 +149,7 @@ def test_the_observer_balances_what_the_model_does_not_know(arm):
     unknown = 0.1 * arm.tau_max * rng.uniform(-1.0, 1.0, arm.n)
     without, with_it = arm.stop(), arm.stop(observer_time=0.002)
     for stop in (without, with_it):
-        stop.begin(q, v)
+        stop.start(q, v)
     state = {without: (q, v), with_it: (q, v)}
     for _ in range(600):
         for stop in state:
@@ -165,7 +165,7 @@ def test_the_observer_balances_what_the_model_does_not_know(arm):
 def test_at_rest_it_holds_its_place_and_gives_way_to_a_long_push(panda):
     stop = panda.stop(observer_time=0.005)
     q, v = panda.inside(np.random.default_rng(3))
-    stop.begin(q, v)
+    stop.start(q, v)
     for _ in range(300):
         q, v = panda.move(q, v, stop.torque(q, v), 1)
     held = q
@@ -197,7 +197,7 @@ def test_from_outside_it_goes_no_further_than_full_braking_and_comes_back_slowly
         end = q + v * np.abs(v) / (2.0 * stop._braking(v))
         allowed = np.maximum(panda.beyond(end), panda.beyond(q)) + 2e-5
         fastest = np.maximum(np.abs(v), limits.v_max)
-        stop.begin(q, v)
+        stop.start(q, v)
         for _ in range(2500):
             beyond, before = panda.beyond(q), np.abs(v)
             hardest = HARDER * stop._braking(v) + ROUNDING
@@ -221,7 +221,7 @@ def test_torque_limits_win_whatever_the_state(arm):
     for _ in range(200):
         q = rng.uniform(arm.limits.q_min - 0.3, arm.limits.q_max + 0.3)
         v = rng.normal(size=arm.n) * arm.limits.v_max
-        stop.begin(q, v)
+        stop.start(q, v)
         tau = stop.torque(q, v)
         assert np.isfinite(tau).all()
         assert (np.abs(tau) <= weak).all()
@@ -242,8 +242,8 @@ def test_joints_may_be_in_any_order(panda):
     rng = np.random.default_rng(6)
     for _ in range(5):
         q, v = panda.edge(rng)
-        one.begin(q, v)
-        other.begin(q[order], v[order])
+        one.start(q, v)
+        other.start(q[order], v[order])
         for k in range(3):  # the second on: what it observes counts too
             moved = q + k * H * v
             expected = one.torque(moved, 0.9 * v)[order]
@@ -255,11 +255,11 @@ def test_a_stop_begun_anew_remembers_nothing(panda):
     rng = np.random.default_rng(7)
     q, v = panda.edge(rng)
     fresh, used = panda.stop(observer_time=0.002), panda.stop(observer_time=0.002)
-    used.begin(*panda.edge(rng))
+    used.start(*panda.edge(rng))
     for _ in range(5):
         used.torque(*panda.edge(rng))
     for stop in (fresh, used):
-        stop.begin(q, v)
+        stop.start(q, v)
     np.testing.assert_array_equal(fresh.torque(q, v), used.torque(q, v))
 
 

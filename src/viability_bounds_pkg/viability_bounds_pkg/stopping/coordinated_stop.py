@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Brings an arm to rest with all limits kept: `docs/stopping.md` derives and proves it.
+"""Stop law for drives: brings an arm to rest with all limits kept, without commands.
+
+`docs/stopping.md` derives and proves it.
 
 At each step of the drive, h, the joints slow down in proportion to their speeds, so that the arm
 keeps its direction and all joints come to rest together, as soon as their acceleration limits
@@ -86,7 +88,7 @@ RETURN_TIME = 0.1
 class CoordinatedStop:
     """A law for the drives of an arm that brings it to rest and holds it, without commands.
 
-    Call `begin` once when a command is missing, then at each step of the drive `follow` as long as
+    Call `start` once when a command is missing, then at each step of the drive `follow` as long as
     the last command is held, `torque` when it is not any more, and `follow` again with those that
     return, until `returned`. Arrays are of shape (n,), in the order of `limits.names`: positions
     q, rad, velocities v, rad/s, accelerations a, rad/s^2, torques, N m.
@@ -149,7 +151,6 @@ class CoordinatedStop:
         # Where the joints of the model are in the caller's arrays, and the other way round.
         self._order = np.array([limits.names.index(name) for name in names])
         self._back = np.argsort(self._order)
-        self._in_order = bool((self._order == np.arange(len(names))).all())
         self._model, self._data = model, model.createData()
         self._share = 0.0 if math.isinf(observer_time) else -math.expm1(-dt / observer_time)
         self._rest_speed = rest_speed
@@ -157,16 +158,16 @@ class CoordinatedStop:
         self._lag = lag if lag.any() else None
         clear = np.minimum(HOLD_CLEARANCE, 0.5 * (limits.q_max - limits.q_min))
         self._lowest, self._highest = limits.q_min + clear, limits.q_max - clear
-        self.begin(np.zeros(len(names)), np.zeros(len(names)))
+        self.start(np.zeros(len(names)), np.zeros(len(names)))
 
-    def begin(
+    def start(
         self,
         q: ArrayLike,
         v: ArrayLike,
         motor_torque: Array | None = None,
         acceleration: Array | None = None,
     ) -> None:
-        """Begin a stop; what an earlier one held and observed is forgotten.
+        """Start a stop; what an earlier one held and observed is forgotten.
 
         With an observer, and where the motors' last torque and the acceleration that it gave are
         told, what acts besides is balanced from the first step on, not only once it is observed:
@@ -232,20 +233,23 @@ class CoordinatedStop:
         outside = not viable.all()
         if outside:
             lower, upper = self._gentle_return(q, v, lower, upper)
-        wanted = self._wanted(q, v) if command is None else self._commanded(q, v, command)
+        wanted = self._stopping(q, v) if command is None else self._commanded(q, v, command)
         a = np.minimum(np.maximum(wanted, lower), upper)
         if outside:
             a = np.where(viable, a, self._harder(q, v, a))
         # Commands that the limits change are not safe to act by themselves.
         passed = bool((np.abs(a - wanted) <= MARGIN * self._scale).all())
         self._passed_for = self._passed_for + h if passed and command is not None else 0.0
-        q_mid, v_mid = q + 0.5 * h * v + 0.125 * h * h * a, v + 0.5 * h * a
-        tau = self._inverse_dynamics(q_mid, v_mid, a) - self._disturbance
+        middle = q + 0.5 * h * v + 0.125 * h * h * a, v + 0.5 * h * a
+        tau = self._inverse_dynamics(*middle, a) - self._disturbance
         feasible = bool((np.abs(tau) <= self._tau_max).all())
         if self._share or not feasible:
-            self._M = M = self._mass_matrix(q_mid)
+            self._M = M = self._mass_matrix(middle[0])
             if not feasible:
-                tau, a = self._limited(tau, a, lower, upper, M)
+                nearest = self._nearest(tau, a, lower, upper, M)
+                tau = np.clip(tau + M @ (nearest - a), -self._tau_max, self._tau_max)
+                middle = q + 0.5 * h * v + 0.125 * h * h * nearest, v + 0.5 * h * nearest
+                a = self._forward_dynamics(*middle, tau + self._disturbance)
         self.acceleration = a
         self._expected = lead + h * a
         return tau
@@ -281,7 +285,7 @@ class CoordinatedStop:
         """Return the hardest braking within the acceleration limits, rad/s^2."""
         return np.where(v > 0.0, -self._limits.a_min, self._limits.a_max)
 
-    def _wanted(self, q: Array, v: Array) -> Array:
+    def _stopping(self, q: Array, v: Array) -> Array:
         """Return accelerations that stop the arm, or hold it, regardless of its limits."""
         self._resting = True
         if not self.at_rest and float(np.abs(v).max()) <= self._rest_speed:
@@ -322,21 +326,14 @@ class CoordinatedStop:
             settled, self._disturbance, np.clip(change, -self._tau_max, self._tau_max)
         )
 
-    def _limited(
-        self, tau: Array, a: Array, lower: Array, upper: Array, M: Array
-    ) -> tuple[Array, Array]:
-        """Return torques within their limits, and the accelerations that they give."""
-        tau_max = self._tau_max
+    def _nearest(self, tau: Array, a: Array, lower: Array, upper: Array, M: Array) -> Array:
+        """Return the accelerations nearest to `a` that the motors can give."""
         # More than the acceleration limits costs no other limit.
         lower = np.where(lower <= self._limits.a_min, -np.inf, lower)
         upper = np.where(upper >= self._limits.a_max, np.inf, upper)
-        nearest = within_torque_limits(a, lower, upper, self._scale, M, tau, tau_max)
-        given = np.clip(tau + M @ (nearest - a), -tau_max, tau_max)
-        return given, a + np.linalg.solve(M, given - tau)
+        return within_torque_limits(a, lower, upper, self._scale, M, tau, self._tau_max)
 
     def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
-        if self._in_order:
-            return np.array(pin.rnea(self._model, self._data, q, v, a))
         order = self._order
         tau: Array = pin.rnea(self._model, self._data, q[order], v[order], a[order])
         return tau[self._back]
