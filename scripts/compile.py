@@ -26,7 +26,6 @@ from torque_safety_controller.safety.command_watch import CommandWatch
 from viability_bounds_pkg.cli.command_line import INTERRUPTED
 from viability_bounds_pkg.compiled import compilations, compiled_functions, is_kept
 from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError
-from viability_bounds_pkg.stopping.coordinated_stop import CoordinatedStop
 
 CONFIG = Path(__file__).resolve().parent.parent / "config"
 TABLE = Obstacle("table", "box", (0.2, 0.6, 0.1), (0.30702, 0.0, 0.42237), (0.0, 0.0, 0.0, 1.0))
@@ -56,7 +55,6 @@ def compile_all() -> None:
                 print(f"setup: nothing is compiled for {path.name}: {error}", file=sys.stderr)
         play("panda", wall["ros__parameters"])
         touch()
-        stop()
         watch()
         project_to_limits(np.zeros(1), np.zeros(1), np.ones(1))
 
@@ -76,15 +74,6 @@ def touch() -> None:
     loop.robot.obstacles.add(TABLE)
     for _ in range(100):
         loop.robot.step(np.zeros(loop.model.nv), loop.config.substeps)
-
-
-def stop() -> None:
-    """Ask motors for a stop that they are too weak for."""
-    loop = DirectLoop("panda")
-    q, v, _ = loop.robot.state()
-    law = CoordinatedStop(loop.model, loop.limits, np.full(len(q), 0.1), loop.dt)
-    law.begin(q, v)
-    law.torque(q, v)
 
 
 def watch() -> None:
