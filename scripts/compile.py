@@ -22,7 +22,6 @@ from direct import DirectLoop
 
 from sim_bridge.bullet.obstacles import Obstacle
 from torque_safety_controller.anti_windup import project_to_limits
-from torque_safety_controller.safety.command_watch import CommandWatch
 from viability_bounds_pkg.cli.command_line import INTERRUPTED
 from viability_bounds_pkg.compiled import compilations, compiled_functions, is_kept
 from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError
@@ -55,7 +54,6 @@ def compile_all() -> None:
                 print(f"setup: nothing is compiled for {path.name}: {error}", file=sys.stderr)
         play("panda", wall["ros__parameters"])
         touch()
-        watch()
         project_to_limits(np.zeros(1), np.zeros(1), np.ones(1))
 
 
@@ -76,11 +74,6 @@ def touch() -> None:
         loop.robot.step(np.zeros(loop.model.nv), loop.config.substeps)
 
 
-def watch() -> None:
-    """Make what looks at states, limits and torques."""
-    loop = DirectLoop("panda")
-    none = np.zeros(loop.model.nv)
-    CommandWatch(none, 1)
 
 
 @contextmanager

@@ -22,6 +22,7 @@ from sim_bridge.viewer.node.viewer_parameters import ViewerConfiguration
 from torque_safety_controller.node import topics as controller_topics
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.remote.moveit_parameters import MoveitConfiguration
+from torque_safety_controller.supervisor import CAUSES, CHANGES
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 from viability_bounds_pkg.node.estimator_parameters import EstimatorConfiguration
 from viability_bounds_pkg.parameter import REQUIRED, Parameter, parameter_table
@@ -107,7 +108,41 @@ A robot of your own takes the place of `bullet_node`.
         ("service", "type", "meaning"),
         ((f"`{s.server}/{s.name}`", _type_name(s.kind), s.meaning) for s in SERVICES),
     )
-    return text
+    return text + _modes()
+
+
+def _modes() -> str:
+    """Return what the modes of the controller follow from."""
+    text = """
+## Modes of controller_node
+
+What mode and reason follow from, and the share of the goals that the arm serves. Of all that lasts
+the first row gives the mode; without any it is TRACKING, and the share rises to 1 within 0.5 s
+([stopping.md](stopping.md#the-controllers-part)). `/diagnostics` has mode, reason and share.
+
+"""
+    text += _table(
+        ("begins with", "ends with", "mode", "reason", "goals"),
+        (
+            (
+                cause.event,
+                cause.ends,
+                cause.mode.value if cause.mode else "as without it",
+                cause.reason or "that of the event",
+                cause.goals.value,
+            )
+            for cause in CAUSES.values()
+        ),
+    )
+    text += """
+`control` in `/diagnostics` says which control commands the joints. A robot that was away is given
+positions again where `start_control` is `position`.
+
+"""
+    return text + _table(
+        ("control", "event", "control after it"),
+        ((before.value, event, after.value) for (before, event), after in CHANGES.items()),
+    )
 
 
 def parameter_names() -> str:

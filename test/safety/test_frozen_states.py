@@ -12,7 +12,7 @@ from direct import DirectLoop, posture_at_limits
 from sim_bridge.nodes.bullet_parameters import make_stop
 from torque_safety_controller.node.assembly import make_plausibility_check
 from torque_safety_controller.qp import AccelerationRange
-from torque_safety_controller.safety.rate_watch import RateWatch
+from torque_safety_controller.slow_down import Ramp
 from torque_safety_controller.supervisor import Order
 from viability_bounds_pkg.state import State
 
@@ -54,7 +54,7 @@ def play(robot: str, seed: int, lie: Lie, checked: bool = True) -> Played:
     loop = DirectLoop(robot, HASTE)
     config, arm, law = loop.config, loop.robot, make_stop(loop.config)
     check = make_plausibility_check(loop._controller_configuration(), None)
-    watch, low, high = RateWatch(config.dt, 1), config.position_min, config.position_max
+    ramp, low, high = Ramp(config.dt), config.position_min, config.position_max
     tau, in_row, answered = np.zeros(low.size), 0, 0.0
     begins = 2.0 + EVERY * np.arange(int((SECONDS - 2.0) / EVERY))
     begins += rng.uniform(0.0, 0.1, begins.size)
@@ -74,12 +74,12 @@ def play(robot: str, seed: int, lie: Lie, checked: bool = True) -> Played:
                 first = None
             wrong = check.fault(state, 1.0 + t) if checked else ""
             if wrong:
-                watch.slow(wrong)
+                ramp.fall(at_once=True)
                 in_row += 1
             else:
                 in_row = 0
-                watch.note(t - answered)
-                answered, order = t, Order(watch.share)
+                ramp.advance(t - answered, at_rest=True)
+                answered, order = t, Order(ramp.share)
                 bounds = AccelerationRange(*loop.bounds(*state)[:2])
                 tau = loop.controller.step(state, bounds, order, config.dt).tau
             if first and wrong:

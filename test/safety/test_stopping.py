@@ -13,7 +13,7 @@ from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.nodes.bullet_node import BulletNode
 from sim_bridge.nodes.bullet_parameters import make_robot, make_stop
 from torque_safety_controller.node.controller_node import ControllerNode
-from torque_safety_controller.safety.rate_watch import RateWatch
+from torque_safety_controller.slow_down import Ramp
 from torque_safety_controller.supervisor import REST, Order
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.ros.runtime import GOAL_QOS
@@ -208,7 +208,7 @@ def test_no_limit_is_passed_in_hold_without_acceleration_limits(robot):
 def test_after_hold_an_arm_goes_on_without_a_jolt_wherever_it_stopped():
     """Also within the margins of a limit, where friction lets go of a joint now and then."""
     loop = DirectLoop("talos_left_arm", HASTE)
-    rng, rate = np.random.default_rng(1), RateWatch(loop.dt, 1)
+    rng, ramp = np.random.default_rng(1), Ramp(loop.dt)
     postures, controller = goals(read_config("talos_left_arm"), rng), loop.controller
     steps = []
     with closing(loop.robot) as arm:
@@ -218,11 +218,11 @@ def test_after_hold_an_arm_goes_on_without_a_jolt_wherever_it_stopped():
             for _ in range(round(0.4 / loop.dt)):
                 q, v, _ = arm.state()
                 arm.step(controller.step(State(q, v), None, REST).tau, loop.config.substeps)
-            rate.slow("it was in HOLD")
+            ramp.fall(at_once=True)
             last = arm.believed_torque
             for _ in range(round(0.1 / loop.dt)):
-                rate.note(loop.dt)
-                loop.step(Order(rate.share))
+                ramp.advance(loop.dt, at_rest=True)
+                loop.step(Order(ramp.share))
                 tau = arm.believed_torque
                 steps.append(np.abs((tau - last) / loop.config.torque_max).max())
                 last = tau
@@ -244,18 +244,21 @@ def test_the_arm_is_slowed_after_a_row_of_states_that_is_too_long_and_goes_on(ro
         end = arm._periods + round(seconds * values["rate_hz"])
         ros.wait_until(lambda: arm._periods >= end, "control periods", timeout=60.0)
 
+    def share():
+        return controller._supervisor.values()["goal_share"]
+
     play(0.1)
-    assert controller._recovery.rate.share == 1.0
+    assert share() == 1.0
     for _ in range(4):  # states that the controller does not see
         arm._advance()
         arm._next_state()
-    ros.wait_until(lambda: controller._recovery.rate.too_long, "a row that is too long")
+    ros.wait_until(lambda: share() < 1.0, "a row that is too long")
     play(0.4)
     assert "the bounds cover 1: the arm is slowed" in capfd.readouterr().err
-    assert 0.0 < controller._recovery.rate.share < 1.0
+    assert 0.0 < share() < 1.0
     assert "slowed to" in controller._report()[1]
     play(3.0)
-    assert controller._recovery.rate.share == 1.0
+    assert share() == 1.0
     assert "the arm goes on" in capfd.readouterr().err
     assert np.abs(arm.true_positions - goal).max() < 0.02
     assert not arm._monitor.violated

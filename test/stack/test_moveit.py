@@ -16,7 +16,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint, MultiDOFJ
 
 from sim_bridge.nodes.bullet_node import BulletNode
 from torque_safety_controller.node.controller_node import ControllerNode
-from torque_safety_controller.safety.rate_watch import RETURN_TIME
+from torque_safety_controller.slow_down import RISE_TIME
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.ros.claim import TakenError
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp, stamp_to_ns
@@ -101,7 +101,7 @@ class User:
             ros.start(BoundsNode, VALUES | {"state_timeout": silence})
             self.robot = ros.start(BulletNode, VALUES | {"clock": clock})
             ros.wait_until(lambda: len(self.states) > 2)
-            self.run(1.5 * RETURN_TIME)  # goals fade in
+            self.run(1.5 * RISE_TIME)  # goals fade in
 
     @property
     def q(self):

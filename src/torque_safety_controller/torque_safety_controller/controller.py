@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torque_safety_controller.contact.interaction import Interaction
 from torque_safety_controller.friction.compensation import FrictionCompensation
 from torque_safety_controller.integral_feedback.action import LONGEST_GAP, FadingTorque
+from torque_safety_controller.limiter import TorqueLimiter
 from torque_safety_controller.qp import (
     AccelerationRange,
     Constraint,
@@ -28,7 +29,6 @@ from torque_safety_controller.qp import (
 )
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.safety.disturbance_observer import DisturbanceObserver
-from torque_safety_controller.safety.torque_limiter import TorqueLimiter
 from torque_safety_controller.slow_down import SlowDown
 from torque_safety_controller.supervisor import Order
 from torque_safety_controller.tasks.damping_task import DampingTask

@@ -30,7 +30,6 @@ from node_chain import (
 )
 
 from torque_safety_controller.qp import AccelerationRange
-from torque_safety_controller.safety.modes import Mode
 from torque_safety_controller.supervisor import REST as HELD
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.state import State
@@ -169,7 +168,7 @@ def test_while_the_motors_give_other_torques_the_arm_is_slowed(ros, capfd):
     others = -motors.tau
     assert motors.answer(2, others) == pytest.approx(1.0)
     shares = [motors.answer(1, others) for _ in range(20)]
-    assert max(shares) < 0.1
+    assert (np.diff(shares) < 1e-3).all() and max(shares[5:]) < 0.1  # within 50 ms
     motors.chain.ros.wait_until(
         lambda: motors.chain.reported("commands_ignored") == "1", "the report"
     )
@@ -230,7 +229,7 @@ def test_where_torques_are_not_reported_any_more_commands_count_as_obeyed(ros):
     motors = Motors(ros)
     motors.answer(150)
     motors.answer(5, -motors.tau)
-    assert not motors.chain.node._recovery.order.obeyed
+    assert motors.chain.node._supervisor._causes.get("ignored")
     motors.stamp += 10
 
     def send():
@@ -238,29 +237,7 @@ def test_where_torques_are_not_reported_any_more_commands_count_as_obeyed(ros):
         motors.chain.send_state(motors.stamp, Q, np.zeros(ARM.n), [])
 
     motors.chain.await_command(motors.stamp, send)
-    assert motors.chain.node._recovery.order.obeyed
-
-
-def test_motors_whose_other_torques_have_frozen_are_sent_nothing_for_a_while(ros):
-    motors = Motors(ros)
-    motors.answer(150)
-    chain, frozen, answered = motors.chain, -motors.tau, []
-    for _ in range(100):
-        motors.stamp += 10
-        chain.bound(motors.stamp)
-        chain.send_state(motors.stamp, Q, np.zeros(ARM.n), frozen)
-        ros.wait_until(lambda: chain.node._states.answered_stamp == motors.stamp * MS, "the state")
-        if chain.node._modes.mode is Mode.STOPPED:
-            assert "to the last bit" in chain.node._modes.reason
-        else:
-            answered.append(motors.stamp)
-    ros.run_for(0.05)
-    assert chain.commands.stamps[-len(answered) :] == [stamp * MS for stamp in answered]
-    gaps = np.diff(answered)
-    assert np.count_nonzero(gaps >= 400) == 2  # it is tried again
-    assert np.count_nonzero(gaps == 10) < 15
-    assert motors.answer(60) == pytest.approx(1.0)
-    chain.await_mode("TRACKING")
+    assert not motors.chain.node._supervisor._causes.get("ignored")
 
 
 @pytest.mark.parametrize("changed", [{}, {"effort_tolerance": 0.0}], ids=["unknown", "not wanted"])
@@ -351,6 +328,7 @@ def test_states_that_are_refused_are_not_answered_so_that_the_robot_stops(ros, b
             joint_state(JOINTS[1:], (stamp + 10) * MS, Q[1:], V[1:])
         ),
     }[bad]
+    ros.run_for(0.05)  # answers to repeats
     chain.commands.clear()
     chain.await_mode("STOPPED", f"joint states are refused: {bad}", each=send)
     ros.run_for(0.15, each=send)
@@ -376,12 +354,12 @@ def test_what_was_learned_of_disturbances_is_forgotten_after_a_row_that_is_too_l
     """After a reset a wrist that had been driven wild was driven at 10 rad/s: found by fuzzing."""
     chain = NodeChain(ros, disturbance_time=0.02)
     stamp = give_goal(chain)
-    learned = chain.node._controller._observer.estimate
-    learned[:] = 5.0
+    observer = chain.node._controller._observer
+    observer.estimate[:] = 5.0
     chain.answer(stamp + 5)
-    assert learned.any()
+    assert observer.estimate.any()
     chain.answer(stamp + 105)
-    assert not learned.any()
+    assert not observer.estimate.any()
 
 
 def test_silence_stops_it_and_a_new_state_wakes_it(ros):

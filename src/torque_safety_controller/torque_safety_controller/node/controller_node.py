@@ -6,15 +6,16 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
-from torque_safety_controller.controller import ControlOutput
+from torque_safety_controller.command_check import CommandCheck
+from torque_safety_controller.handover import Handover, HandoverRefused
 from torque_safety_controller.node.assembly import (
     configure,
     make_controller,
@@ -23,8 +24,6 @@ from torque_safety_controller.node.assembly import (
 from torque_safety_controller.node.declared import covered_row, declared_robot, longest_way
 from torque_safety_controller.node.driving import Driving
 from torque_safety_controller.node.goals import GoalSubscriber
-from torque_safety_controller.node.position_control import PositionControl
-from torque_safety_controller.node.recovery import STUCK, Recovery
 from torque_safety_controller.node.reports.collision_report import CollisionReport
 from torque_safety_controller.node.reports.controller_report import (
     LEVELS,
@@ -37,12 +36,11 @@ from torque_safety_controller.node.reports.state_publisher import StatePublisher
 from torque_safety_controller.node.streams.joint_commands import JointCommands
 from torque_safety_controller.node.streams.limits import LimitsReader
 from torque_safety_controller.node.streams.states import UNSEEN, StateStream
-from torque_safety_controller.node.topics import GOALS
+from torque_safety_controller.node.topics import ENABLE_TORQUE, GOALS
 from torque_safety_controller.node.wrenches import WrenchSubscriber
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.qp import AccelerationRange
-from torque_safety_controller.safety.handover import Control, Handover
-from torque_safety_controller.safety.modes import Mode, ModeKeeper
+from torque_safety_controller.supervisor import Control, Mode, Supervisor
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import Arrival, Diagnostics, PeriodCheck
 from viability_bounds_pkg.ros.parameters import NodeParameters
@@ -59,10 +57,6 @@ from viability_bounds_pkg.state import State
 
 _QUIET = 1.5
 """Time without a joint state after which the robot is silent, in times of `bounds_timeout`."""
-
-_SILENT = "no joint state"
-_STALE = "acceleration limits are stale"
-_CONTESTED = "several nodes publish goals"
 
 
 class ControllerNode(ArmNode):
@@ -85,12 +79,7 @@ class ControllerNode(ArmNode):
             self._controller, base = make_controller(config, self, declared)
         self._config = config
         self._handover = Handover(
-            config.start_control,
-            config.joints,
-            config.position_min,
-            config.position_max,
-            config.torque_max,
-            config.dt,
+            config.joints, config.position_min, config.position_max, config.torque_max, config.dt
         )
         check = make_plausibility_check(config, declared)
         self._states = StateStream(config.joints, config.state_timeout, self._warn, check)
@@ -109,32 +98,26 @@ class ControllerNode(ArmNode):
             *heard, self._controller.interaction, self._goals, config, base
         )
         self._driving = Driving(self, self._goals, self._controller, config, base, self._states)
-        self._modes = ModeKeeper()
-        self._before = self._modes.mode, self._modes.reason  # what they were before silence
-        self._recovery = Recovery(
-            self._states,
-            config,
+        commands = None
+        if config.effort_tolerance > 0.0:
+            tolerance = config.effort_tolerance * config.torque_max
+            commands = CommandCheck(tolerance, longest_way(declared))
+        self._supervisor = Supervisor(
+            config.dt,
+            config.start_control,
             covered_row(declared),
-            longest_way(declared),
-            partial(self._later, self._warn),
+            config.bounds_timeout,
+            commands,
+            self._on_mode,
+            lambda line: self._later(self._warn, line),
         )
         self._record = StepRecord(len(config.joints))
         self._shortfall = Shortfall(config.joints, config.position_min, config.position_max)
         self._collision = CollisionReport(self.get_logger(), self._controller.constraints)
 
         self._commands = JointCommands(self, config.joints, config.ros2_control_topic)
-        self._drives = PositionControl(
-            self,
-            config,
-            self._handover,
-            self._controller,
-            self._states,
-            self._limits,
-            self._goals,
-            self._commands,
-            self._enter,
-        )
         self._published = StatePublisher(self, self._controller, config, base, self._states)
+        ENABLE_TORQUE.serve(self, self._on_enable_torque)
         self._states_topic = states.subscription(self, self._on_state).topic_name
         limits = ACCELERATION_LIMITS.subscription(self, self._on_limits)
         self._limits_topic = limits.topic_name
@@ -172,177 +155,155 @@ class ControllerNode(ArmNode):
             return
         states, stamp = self._states, message.header.stamp
         arrival = states.read(message, time.monotonic())
-        if arrival is not Arrival.NEW and not self._begins(arrival, stamp):
-            return
-        if states.unseen and self._handover.by_drives:
-            # They would jump to where the arm was held before, from where it has been put.
-            self._handover.robot_was_away()
-        if self._handover.control is Control.POSITION:
-            self._recovery.motors.reset()
-            self._drives.hold(stamp)
-        elif self._limits.stamp == states.stamp:
-            self._track(stamp)
-        elif self._limits.lost:
-            self._hold(stamp)
-
-    def _begins(self, arrival: Arrival, stamp: Any) -> bool:
-        """Deal with a state that is not the next one; return whether the arm begins anew."""
-        states = self._states
         if arrival is Arrival.REFUSED:
             self._on_refused(stamp)
-        elif arrival is not Arrival.REPEATED:
-            self._begin(arrival)
-            return True
-        elif states.answered_stamp == states.stamp:
-            if self._recovery.motors.stuck:  # a robot that waits for the answer, as in lockstep
-                self._recovery.motors.retry()
-            elif self._modes.reason == _SILENT:  # it was late only
-                self._enter(*self._before)
-            self._commands.again(stamp)
-        return False
-
-    def _on_refused(self, stamp: Any) -> None:
-        """Leave the arm to the robot's own stop, or to its drives: nothing is known of it."""
-        states = self._states
-        if states.answered_stamp < 0 or self._modes.mode is Mode.STOPPED:
             return
-        in_row = states.count_refused()
-        if self._handover.by_drives:
-            self._drives.hold(stamp)
-        elif in_row == UNSEEN:
-            self._recovery.why = states.why_refused
-            self._enter(Mode.STOPPED, states.why_refused)
-
-    def _begin(self, arrival: Arrival) -> None:
-        """Start anew: the robot was silent, or restarted."""
-        states = self._states
-        if states.missed:
-            self._recovery.why = "joint states were missing"
-        if arrival is Arrival.RESTARTED and self._limits.stamp == states.answered_stamp:
-            self._limits.stamp = -1  # from before the restart; its stamps may come again
-        if self._by_others():
-            self._recovery.why = "the motors held the arm before"
-        states.begin()
-        self._recovery.motors.reset()
-        self._controller.reset(states.q)
-        self._handover.robot_was_away()
-
-    def _by_others(self) -> bool:
-        """Return whether the motors are on, as far as is known, though nothing is commanded."""
-        effort = self._states.effort()
-        return effort is None or bool(effort.any())
+        if arrival is Arrival.REPEATED:
+            if states.answered_stamp == states.stamp:
+                self._supervisor.repeated()
+                self._commands.again(stamp)
+            return
+        if arrival is not Arrival.NEW:
+            self._begin(arrival)
+        elif states.unseen and self._supervisor.by_drives:
+            # They would jump to where the arm was held before, from where it has been put.
+            self._put_elsewhere()
+        if self._limits.stamp == states.stamp:
+            self._answer(stamp, self._limits.range)
+        elif self._supervisor.control is Control.POSITION or self._supervisor.stale:
+            self._answer(stamp, None)
 
     def _on_limits(self, message: JointTrajectory) -> None:
         if not (self.publisher_watch.admits(self._limits_topic) and self._limits.read(message)):
             return
         if self._limits.stamp == self._states.stamp != self._states.answered_stamp:
-            self._track(message.header.stamp)
+            self._answer(message.header.stamp, self._limits.range)
         elif self._limits.stamp == self._states.stamp:
-            # Limits come again, but this state has been answered in HOLD already.
-            self._limits.lost = False
+            self._supervisor.limits_came()
 
-    def _track(self, stamp: Any) -> None:
-        """Answer the newest state, whose acceleration limits are there."""
-        self._limits.lost = False
-        if self._handover.by_drives:
-            self._drives.go_on(stamp)
+    def _on_refused(self, stamp: Any) -> None:
+        """Leave the arm to the robot's own stop, or to its drives: nothing is known of it."""
+        states = self._states
+        if states.answered_stamp < 0 or self._supervisor.mode is Mode.STOPPED:
             return
-        state = State(self._states.q, self._states.v)
-        self._goals.apply_due(self._states.stamp, state)
-        if not self._sees_motors():
+        in_row = states.count_refused()
+        if self._supervisor.by_drives:
+            self._commands.position(self._handover.hold(states.q), stamp)
+        elif in_row == UNSEEN:
+            self._supervisor.refused(states.why_refused)
+
+    def _begin(self, arrival: Arrival) -> None:
+        """Start anew: the robot was silent, or restarted."""
+        states, reason = self._states, ""
+        if arrival is Arrival.RESTARTED and self._limits.stamp == states.answered_stamp:
+            self._limits.stamp = -1  # from before the restart; its stamps may come again
+        effort = states.effort()
+        if effort is None or effort.any():  # though nothing is commanded
+            reason = "the motors held the arm before"
+        elif states.missed:
+            reason = "joint states were missing"
+        states.begin()
+        self._controller.reset(states.q)
+        self._supervisor.begin(reason)
+        self._handover.release()
+
+    def _put_elsewhere(self) -> None:
+        self._supervisor.put_elsewhere()
+        self._handover.release()
+
+    def _answer(self, stamp: Any, limits: AccelerationRange | None) -> None:
+        """Answer the newest state, whose acceleration limits are there or do not come."""
+        states, supervisor, goal = self._states, self._supervisor, ""
+        state, elapsed = State(states.q, states.v), states.elapsed()
+        if not supervisor.by_drives:
+            self._goals.apply_due(states.stamp, state)
+            goal = self._goals.trouble
+        order = supervisor.state(elapsed, state.v, states.effort(), limits is not None, goal)
+        if supervisor.by_drives:
+            self._commands.position(self._handover.hold(state.q), stamp)
+            states.answered()
+            if supervisor.control is Control.TAKING_OVER and limits is not None:
+                self._take_over(state, limits)
+            supervisor.answered()
             return
-        contested = self._goals.contested
-        if contested:
-            self._recovery.why = _CONTESTED
-        else:
-            self._recovery.slow()
-        self._recovery.look()
-        limits = AccelerationRange(self._limits.lower, self._limits.upper)
-        lost = contested or self._goals.lost
-        track = not lost and self._handover.control is not Control.GIVING_BACK
-        order = self._recovery.order._replace(track=track)
-        step = self._controller.step(state, limits, order, self._states.elapsed())
-        self._recovery.note(step)
-        self._answer(step, stamp)
-
-    def _sees_motors(self) -> bool:
-        """Return whether the newest state is to be answered; else the robot is to stop itself."""
-        if self._recovery.sees_motors():
-            return True
-        self._states.answered()  # by silence
-        self._enter(Mode.STOPPED, STUCK)
-        return False
-
-    def _answer(self, step: ControlOutput, stamp: Any) -> None:
-        """Publish the torques of `step` for the state with `stamp`."""
-        states, now = self._states, time.monotonic()
-        elapsed = states.elapsed() or 0.0
+        step = self._controller.step(state, limits, order, elapsed)
         self._commands.torque(step.tau, stamp)
-        self._recovery.motors.note(step.tau)
         states.answered()
-        self._record.note(step, now - states.message_at)
+        supervisor.answered(step.tau, step.failure, not self._controller.lost)
+        self._record.note(step, time.monotonic() - states.message_at)
         self._wrenches.note()
         self._collision.note(step)
-        self._recovery.why = self._recovery.why or step.failure
-        if step.tracking and not self._recovery.why:
-            self._enter(Mode.TRACKING, "goal")
-        else:
-            self._enter(Mode.HOLD, self._why_hold(step))
-        if self._handover.control is Control.GIVING_BACK:
-            self._handover.slow_down(states.q, states.v, elapsed)
 
-    def _why_hold(self, step: ControlOutput) -> str:
-        if step.failure:
-            return f"solver failed: {step.failure}"
-        if self._limits.lost:
-            return _STALE
-        if self._handover.control is Control.GIVING_BACK:
-            return "on the way to position control"
-        if self._controller.lost:
-            return "no plan within all limits is known"
-        if self._goals.contested:
-            return _CONTESTED
-        if self._goals.lost:
-            return "goal lost"
-        if self._controller.goals.any:
-            return f"comes to rest: {self._recovery.why}"
-        return "no goal"
+    # Handover
 
-    def _hold(self, stamp: Any) -> None:
-        """Answer the newest state without acceleration limits."""
-        if not self._sees_motors():
+    def _take_over(self, state: State, limits: AccelerationRange) -> None:
+        """Prepare to go on with torque from the next state, if that of the motors is known."""
+        if self._goals.apply_due(self._states.stamp, state):
+            self.get_logger().warning("goals from before the handover are dropped")
+        try:
+            found = self._handover.torque(state.q, self._states.effort())
+            if found is None:
+                return
+            step = self._controller.bumpless_transfer(state, limits, found.mean)
+            if step.failure:
+                raise HandoverRefused(f"solver failed: {step.failure}")
+        except HandoverRefused as error:
+            self._supervisor.change("failed", f"handover failed: {error}")
             return
-        self._recovery.why = _STALE
-        self._recovery.slow()  # an arm within margins returns gently here, too
-        self._recovery.look()
-        state = State(self._states.q, self._states.v)
-        order = self._recovery.order._replace(track=False)
-        self._answer(self._controller.step(state, None, order, self._states.elapsed()), stamp)
+        self._goals.renew()
+        self._handover.release()
+        self._supervisor.change("torque known", "enable_torque")
+        self.get_logger().info(
+            f"torque of the motors at the handover: from {found.samples} states, off by at most "
+            f"{found.error.max():.2%} of torque_max"
+        )
+
+    def _on_enable_torque(
+        self, request: SetBool.Request, response: SetBool.Response
+    ) -> SetBool.Response:
+        """Start a handover, or say why not."""
+        try:
+            self._check_enable(request.data)
+        except HandoverRefused as error:
+            response.message = str(error)
+            self.get_logger().warning(f"enable_torque refused: {error}")
+            return response
+        self._supervisor.enable(request.data)
+        what = "torque control begins when the torque of the motors is known"
+        response.message = what if request.data else "position control begins when the arm rests"
+        response.success = True
+        return response
+
+    def _check_enable(self, torque: bool) -> None:
+        """Raise `HandoverRefused` where a handover cannot begin."""
+        states, config, control = self._states, self._config, self._supervisor.control
+        if torque == (control in (Control.TORQUE, Control.TAKING_OVER)):
+            raise HandoverRefused(f"{'torque' if torque else 'position'} control is on already")
+        silence = time.monotonic() - states.usable_at
+        if silence > (config.bounds_timeout if torque else config.state_timeout):
+            raise HandoverRefused("no joint state, or only old ones")
+        if not torque:
+            return
+        # After a restart of the robot, earlier limits may have later stamps.
+        apart = 1e-9 * abs(states.stamp - self._limits.stamp)
+        if self._limits.stamp < 0 or apart > config.bounds_timeout:
+            raise HandoverRefused("no acceleration limits, or only old ones")
+        if control is Control.POSITION:
+            self._handover.begin(states.q, states.effort())
 
     # Watchdogs
 
     def _watch(self) -> None:
         now, config, states = time.monotonic(), self._config, self._states
-        quiet = now - states.message_at > _QUIET * config.bounds_timeout
-        if quiet or states.silent(now):
-            if self._modes.mode is not Mode.STOPPED:
-                self._before = self._modes.mode, self._modes.reason
-                silent = self.publisher_watch.several or _SILENT
-                self._enter(Mode.STOPPED, silent if quiet else states.why_refused)
-            return
-        if states.waits(now) > config.bounds_timeout:
-            self._limits.lost = True
-            if self._handover.control is Control.TAKING_OVER:
-                self._drives.fail(_STALE)
-            if self._handover.by_drives:
-                self._drives.hold(states.message_stamp)
-            else:
-                self._hold(states.message_stamp)
+        if now - states.message_at > _QUIET * config.bounds_timeout:
+            self._supervisor.silent(self.publisher_watch.several or "no joint state")
+        elif states.silent(now):
+            self._supervisor.silent(states.why_refused)
+        elif states.waits(now) > config.bounds_timeout:
+            self._answer(states.message_stamp, None)
 
-    def _enter(self, mode: Mode, reason: str) -> None:
-        before = self._modes.mode
-        if self._modes.set(mode, reason):
-            self._later(self._tell, mode, reason, mode is not before)
+    def _on_mode(self, mode: Mode, reason: str) -> None:
+        self._later(self._tell, mode, reason)
 
     def _later(self, tell: Callable[..., None], *what: Any) -> None:
         """Tell something when the command has left: at 1 kHz a log line takes half a period."""
@@ -351,9 +312,8 @@ class ControllerNode(ArmNode):
         else:
             self.executor.create_task(tell, *what)
 
-    def _tell(self, mode: Mode, reason: str, new: bool) -> None:
-        if new:
-            self._published.mode(mode)
+    def _tell(self, mode: Mode, reason: str) -> None:
+        self._published.mode(mode)
         text = f"{mode.value}: {reason}"
         # One call site per severity: rclpy ties the two together.
         if mode in (Mode.TRACKING, Mode.POSITION):
@@ -372,12 +332,8 @@ class ControllerNode(ArmNode):
         values |= (
             self._collision.values()
             | self._wrenches.values()
-            | self._recovery.values()
+            | self._supervisor.values()
             | {
-                "mode": self._modes.mode.value,
-                "reason": self._modes.reason,
-                "mode_changes": self._modes.changes,
-                "control": self._handover.control.value,
                 "integral_action": self._config.integral.integral_action,
                 "integral_lambda": self._controller.integral_gain,
                 "torque_rate_max": "clipped" if self._config.clips_torque_rates else "none",
@@ -387,13 +343,14 @@ class ControllerNode(ArmNode):
                 "limits_refused": self._limits.refused,
             }
         )
-        level, text = LEVELS[self._modes.mode], f"{self._modes.mode.value}: {self._modes.reason}"
+        mode = self._supervisor.mode
+        level, text = LEVELS[mode], f"{mode.value}: {self._supervisor.reason}"
         weak = too_weak(self._config.joints, self._controller)
         weak = weak and f"the arm cannot be held where it would come to rest: {weak}"
         heavy = goal_too_heavy(self._config.joints, self._controller)
         heavy = heavy and f"the goal cannot be held: {heavy}"
         troubles = (
-            self._recovery.rate.trouble,
+            self._supervisor.trouble,
             self._collision.too_near,
             self._wrenches.trouble,
             weak,
@@ -402,7 +359,7 @@ class ControllerNode(ArmNode):
         for trouble in filter(None, troubles):
             level, text = max(level, DiagnosticStatus.WARN), f"{text}; {trouble}"
         short = self._shortfall.look(self._controller, 1e-9 * self._states.stamp)
-        short = short if self._modes.mode is Mode.TRACKING else ""
+        short = short if mode is Mode.TRACKING else ""
         values["short_of_goal"] = short or "none"
         if short:
             text += f"; {short}"

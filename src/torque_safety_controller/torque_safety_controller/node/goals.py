@@ -193,17 +193,16 @@ class GoalSubscriber:
         return len(self._pending)
 
     @property
-    def contested(self) -> bool:
-        """Whether a goal came on a topic of several publishers, which are there still."""
+    def trouble(self) -> str:
+        """Cause not to serve goals, a key of `supervisor.CAUSES`; empty for none."""
         if self._contested:
             self._contested = {name for name in self._contested if not self._watch.admits(name)}
-        return bool(self._contested)
-
-    @property
-    def lost(self) -> bool:
-        """Whether the last goal is older than ``goal_timeout``."""
+            if self._contested:
+                return "rival"
         timeout = self._config.goal_timeout
-        return timeout > 0.0 and time.monotonic() - self._renewed_at > timeout
+        if timeout > 0.0 and time.monotonic() - self._renewed_at > timeout:
+            return "old goal"
+        return "" if self._controller.goals.any else "no goal"
 
     def renew(self) -> None:
         """Count the age of the last goal from now on."""

@@ -15,7 +15,7 @@ from torque_safety_controller.parameters.friction_parameters import FrictionConf
 from torque_safety_controller.parameters.integral_parameters import IntegralConfiguration
 from torque_safety_controller.parameters.interaction_parameters import InteractionConfiguration
 from torque_safety_controller.qp import SOLVERS
-from torque_safety_controller.safety.modes import CONTROLS
+from torque_safety_controller.supervisor import CONTROLS
 from torque_safety_controller.tasks.gains import Gains
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import (

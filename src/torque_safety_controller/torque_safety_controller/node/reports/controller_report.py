@@ -10,7 +10,7 @@ import pinocchio as pin
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from torque_safety_controller.controller import Controller, ControlOutput
-from torque_safety_controller.safety.modes import Mode
+from torque_safety_controller.supervisor import Mode
 from viability_bounds_pkg.recent_values import RecentValues
 
 LEVELS = {

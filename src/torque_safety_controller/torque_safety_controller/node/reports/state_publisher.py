@@ -19,7 +19,7 @@ from torque_safety_controller.node.topics import (
     HAND_POSITION_ERROR,
 )
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.safety.modes import Mode
+from torque_safety_controller.supervisor import Mode
 from torque_safety_controller.tasks.pose_task import pose_difference
 from viability_bounds_pkg.ros.messages import JointStateReader, pose_message
 
@@ -59,18 +59,22 @@ class StatePublisher:
         self._position_error = HAND_POSITION_ERROR.publisher(node)
         self._orientation_error = HAND_ORIENTATION_ERROR.publisher(node)
         self._mode = CONTROLLER_MODE.publisher(node)
+        self._last: Mode | None = None
         self.mode(Mode.STOPPED)
         # The steady clock, as with use_sim_time the other one may be slower than the robot.
         node.create_timer(_PERIOD, self._publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def mode(self, mode: Mode) -> None:
-        """Publish a new mode; the other topics are silent while it is STOPPED."""
-        self._stopped = mode is Mode.STOPPED
-        self._mode.publish(String(data=mode.value))
+        """Publish the mode if it is new; the other topics are silent while it is STOPPED."""
+        if mode is not self._last:
+            self._last = mode
+            self._mode.publish(String(data=mode.value))
 
     def _publish(self) -> None:
         publishers = self._pose, self._position_error, self._orientation_error
-        if self._stopped or not any(each.get_subscription_count() for each in publishers):
+        if self._last is Mode.STOPPED or not any(
+            each.get_subscription_count() for each in publishers
+        ):
             return
         pin.forwardKinematics(self._model, self._data, self._states.q)
         pose = pin.updateFramePlacement(self._model, self._data, self._frame)

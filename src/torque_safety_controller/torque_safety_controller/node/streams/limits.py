@@ -23,7 +23,6 @@ class LimitsReader:
     Attributes:
         lower, upper: of the last accepted message, shape (n,), rad/s^2.
         stamp: of the state that they belong to, ns.
-        lost: whether states are answered without them, because they did not come in time.
         refused: how many messages were dropped, by reason.
     """
 
@@ -32,7 +31,6 @@ class LimitsReader:
         self.lower = np.zeros(len(joints))
         self.upper = np.zeros(len(joints))
         self.stamp = -1
-        self.lost = False
         self.refused: Counter[str] = Counter()
         self._joints = list(joints)
 
@@ -55,6 +53,11 @@ class LimitsReader:
         self.lower, self.upper = lower, upper
         self.stamp = stamp_to_ns(message.header.stamp)
         return True
+
+    @property
+    def range(self) -> AccelerationRange:
+        """Those of the last accepted message."""
+        return AccelerationRange(self.lower, self.upper)
 
     def _refuse(self, reason: str, detail: str = "") -> bool:
         self.refused[reason] += 1

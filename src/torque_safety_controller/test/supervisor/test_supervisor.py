@@ -1,0 +1,346 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Events in; mode, reason and share of the goals out."""
+
+import numpy as np
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+
+from torque_safety_controller.command_check import ENOUGH, CommandCheck
+from torque_safety_controller.slow_down import FALL_TIME, RISE_TIME
+from torque_safety_controller.supervisor import (
+    CAUSES,
+    CHANGES,
+    REST_PATIENCE,
+    Control,
+    Goals,
+    Mode,
+    Supervisor,
+)
+
+DT, COVERED, PAUSE = 0.01, 1, 0.2
+REST, MOVES, TAU = np.zeros(2), np.array([0.0, 0.5]), np.ones(2)
+
+
+class Chain:
+    """A supervisor, and what it has told."""
+
+    def __init__(self, control="torque", commands=None):
+        self.told, self.warned, self.v = [], [], REST
+        self.supervisor = Supervisor(
+            DT,
+            control,
+            COVERED,
+            PAUSE,
+            commands,
+            lambda mode, reason: self.told.append((mode, reason)),
+            self.warned.append,
+        )
+
+    def answer(self, elapsed=DT, v=None, tau=TAU, failure="", planned=True, **state):
+        """Answer a state; return the order."""
+        order = self.supervisor.state(elapsed, self.v if v is None else v, tau, **state)
+        by_drives = self.supervisor.by_drives
+        self.supervisor.answered(None if by_drives else TAU, failure, planned)
+        return order
+
+    def run(self, count, **state):
+        """Answer states; return the shares."""
+        return [self.answer(**state).share for _ in range(count)]
+
+    @property
+    def now(self):
+        return self.supervisor.mode, self.supervisor.reason
+
+
+def test_it_is_stopped_until_the_first_state():
+    chain = Chain()
+    assert chain.now == (Mode.STOPPED, "no joint state yet")
+    chain.supervisor.silent("no joint state")
+    assert chain.now == (Mode.STOPPED, "no joint state yet")
+    chain.supervisor.begin("")
+    assert chain.answer(None).share == 1.0
+    assert chain.now == (Mode.TRACKING, "goal")
+    assert chain.told == [(Mode.TRACKING, "goal")]
+
+
+# Each row of CAUSES: how it begins, and how it ends.
+ROWS = {
+    "silent": (lambda c: c.supervisor.silent("no joint state"), lambda c: c.answer()),
+    "refused": (lambda c: c.supervisor.refused("refused"), lambda c: c.answer()),
+    "failed": (lambda c: c.answer(failure="why"), lambda c: c.answer()),
+    "stale": (lambda c: c.answer(limits=False), lambda c: c.answer()),
+    "giving back": (
+        lambda c: (c.supervisor.enable(False), c.answer(v=MOVES)),
+        lambda c: (c.supervisor.enable(True), c.answer()),
+    ),
+    "no plan": (lambda c: c.answer(planned=False), lambda c: c.answer()),
+    "rival": (lambda c: c.answer(goal="rival"), lambda c: c.answer()),
+    "old goal": (lambda c: c.answer(goal="old goal"), lambda c: c.answer()),
+    "no goal": (lambda c: c.answer(goal="no goal"), lambda c: c.answer()),
+    "moves": (
+        lambda c: (c.supervisor.begin("why"), c.answer(None, v=MOVES)),
+        lambda c: c.run(3),
+    ),
+    "drives": (
+        lambda c: (c.supervisor.enable(False), c.answer()),
+        lambda c: (
+            c.supervisor.enable(True),
+            c.supervisor.change("torque known", "why"),
+            c.answer(),
+        ),
+    ),
+    "missed": (lambda c: c.answer((COVERED + 2) * DT), lambda c: c.answer()),
+    "ignored": (lambda c: c.run(3, tau=-TAU), lambda c: c.answer()),
+}
+
+
+@pytest.mark.parametrize("name", CAUSES)
+def test_each_cause_gives_its_mode_and_its_share_and_ends(name):
+    begins, ends = ROWS[name]
+    cause, chain = CAUSES[name], Chain(commands=CommandCheck(0.1 * TAU, 1))
+    chain.supervisor.begin("")
+    chain.answer(None)
+    chain.run(ENOUGH)
+    begins(chain)
+    mode, reason = chain.now
+    assert mode is (cause.mode or Mode.TRACKING)
+    assert not cause.reason or cause.mode is None or reason == cause.reason
+    share = chain.supervisor.values()["goal_share"]
+    assert (share == 0.0) == (cause.goals is Goals.SLOWED)
+    assert (share == 1.0) == (cause.goals in (Goals.KEPT, Goals.ASIDE))
+    chain.v = MOVES
+    ends(chain)
+    if cause.goals is Goals.SLOWED:
+        assert chain.now[0] is Mode.HOLD and chain.now[1].startswith("comes to rest: ")
+    chain.v = REST
+    shares = chain.run(round((RISE_TIME + 2 * FALL_TIME) / DT) + 2)
+    assert chain.now == (Mode.TRACKING, "goal")
+    assert shares[-1] == 1.0
+
+
+def test_the_first_cause_counts():
+    chain = Chain()
+    chain.answer(None, goal="no goal")
+    assert chain.now == (Mode.HOLD, "no goal")
+    chain.answer(goal="no goal", limits=False)
+    assert chain.now == (Mode.HOLD, "acceleration limits are stale")
+    chain.supervisor.silent("no joint state")
+    assert chain.now == (Mode.STOPPED, "no joint state")
+    chain.supervisor.repeated()
+    assert chain.now == (Mode.HOLD, "acceleration limits are stale")
+    assert chain.supervisor.stale
+    chain.supervisor.limits_came()
+    assert not chain.supervisor.stale
+
+
+def test_a_repeated_state_of_a_robot_that_was_late_restores_the_mode():
+    chain = Chain()
+    chain.answer(None)
+    chain.supervisor.silent("no joint state")
+    chain.supervisor.repeated()
+    assert chain.now == (Mode.TRACKING, "goal")
+
+
+def test_rows_are_counted_told_once_and_forgotten():
+    chain = Chain()
+    chain.answer(None)
+    assert not chain.answer((COVERED + 1) * DT).forget_disturbance
+    order = chain.answer((COVERED + 2) * DT)
+    assert order.forget_disturbance and not order.forget_integral
+    assert order.share < 1.0
+    chain.answer(4 * DT)
+    assert chain.warned == [
+        "2 states in a row without an answer, the bounds cover 1: the arm is slowed"
+    ]
+    assert chain.now == (Mode.TRACKING, "goal")
+    values = chain.supervisor.values()
+    assert (values["missed_rows_too_long"], values["missed_row_longest"]) == (2, 3)
+    assert "slowed to" in chain.supervisor.trouble
+    chain.run(100)
+    assert chain.warned[-1] == "the arm goes on"
+    assert not chain.supervisor.trouble
+
+
+def test_a_pause_in_which_the_robot_stops_itself_holds_the_arm_until_it_rests():
+    chain = Chain()
+    chain.answer(None)
+    order = chain.answer(PAUSE + 2 * DT, v=MOVES)
+    assert order.share == 0.0 and order.forget_disturbance and order.forget_integral
+    chain.run(20, v=MOVES)
+    assert chain.now[0] is Mode.HOLD and "states were not answered" in chain.now[1]
+    chain.run(2)
+    assert chain.now == (Mode.TRACKING, "goal")
+
+
+def test_nothing_is_learned_and_the_integral_fades_while_commands_do_not_act():
+    chain = Chain(commands=CommandCheck(0.1 * TAU, 1))
+    chain.answer(None)
+    chain.run(ENOUGH)
+    orders = [chain.answer(tau=-TAU) for _ in range(60)]
+    assert not any(order.obeyed for order in orders)
+    assert [order.forget_disturbance for order in orders[:4]] == [False, False, True, True]
+    assert not orders[40].forget_integral and orders[55].forget_integral
+    assert orders[1].share == 1.0 and orders[10].share == 0.0
+    assert chain.answer(tau=None).obeyed, "it is not known"
+
+
+def test_the_share_waits_for_a_goal():
+    chain = Chain()
+    chain.supervisor.begin("the motors held the arm before")
+    assert chain.answer(None, goal="no goal").share == 0.0
+    assert not any(chain.run(100, goal="no goal"))
+    assert 0.0 < chain.answer().share < 0.01
+
+
+# Control
+
+
+@pytest.mark.parametrize("control", Control)
+@pytest.mark.parametrize("event", sorted({event for _, event in CHANGES}))
+def test_control_changes_by_its_table_and_not_else(control, event):
+    chain = Chain()
+    chain.supervisor._set_control(control, "here")
+    chain.supervisor.change(event, "there")
+    assert chain.supervisor.control is CHANGES.get((control, event), control)
+    assert chain.supervisor.by_drives == ("position" in chain.supervisor.control.value) or (
+        chain.supervisor.control is Control.TAKING_OVER
+    )
+
+
+@pytest.mark.parametrize(
+    ("start", "control", "after"),
+    [
+        ("torque", Control.TORQUE, Control.TORQUE),
+        ("position", Control.TORQUE, Control.POSITION),
+        ("torque", Control.TAKING_OVER, Control.POSITION),
+        ("torque", Control.GIVING_BACK, Control.POSITION),
+        ("torque", Control.POSITION, Control.POSITION),
+    ],
+)
+def test_a_robot_that_was_away_does_not_get_torque_unasked(start, control, after):
+    chain = Chain(start)
+    chain.supervisor._set_control(control, "")
+    chain.supervisor.begin("")
+    assert chain.supervisor.control is after
+
+
+def test_an_arm_in_motion_comes_to_rest_before_its_drives_get_it():
+    chain = Chain()
+    chain.answer(None)
+    chain.supervisor.enable(False)
+    assert not chain.answer(v=MOVES).track
+    assert chain.now == (Mode.HOLD, "on the way to position control")
+    chain.answer()
+    assert chain.now == (Mode.POSITION, "enable_torque")
+
+
+def test_an_arm_that_does_not_come_to_rest_is_not_waited_for_for_ever():
+    chain = Chain()
+    chain.answer(None)
+    chain.supervisor.enable(False)
+    chain.run(round(REST_PATIENCE / DT) - 1, v=MOVES)
+    assert chain.supervisor.control is Control.GIVING_BACK
+    chain.run(2, v=MOVES)
+    assert chain.supervisor.control is Control.POSITION
+
+
+def test_a_handover_ends_where_limits_stop_coming():
+    chain = Chain("position")
+    chain.answer(None, limits=False)
+    assert chain.now == (Mode.POSITION, "as at start")
+    chain.supervisor.enable(True)
+    chain.answer()
+    assert chain.supervisor.control is Control.TAKING_OVER
+    chain.answer(limits=False)
+    assert chain.now == (Mode.POSITION, "handover failed: acceleration limits are stale")
+    chain.answer(limits=False)
+    assert not chain.supervisor.stale
+
+
+# Whatever comes
+
+
+class Events(RuleBasedStateMachine):
+    """Events in any order; times of less than a second."""
+
+    def __init__(self):
+        super().__init__()
+        self.chain = Chain("torque", CommandCheck(0.1 * TAU, 2))
+        self.supervisor, self.share = self.chain.supervisor, 1.0
+        self.answered = False
+
+    @rule(
+        elapsed=st.sampled_from([None, DT, DT, DT, 3 * DT, 0.5]),
+        moves=st.booleans(),
+        effort=st.sampled_from([None, TAU, TAU, -TAU]),
+        limits=st.booleans(),
+        goal=st.sampled_from(["", "", "", "no goal", "old goal", "rival"]),
+        failure=st.sampled_from(["", "", "", "why"]),
+        planned=st.booleans(),
+        count=st.sampled_from([1, 1, 60, 120]),
+    )
+    def state(self, elapsed, moves, effort, limits, goal, failure, planned, count):
+        """States and their answers; some come again and again."""
+        supervisor = self.supervisor
+        for _ in range(count):
+            order = supervisor.state(elapsed, MOVES if moves else REST, effort, limits, goal)
+            by_drives = supervisor.by_drives
+            assert 0.0 <= order.share <= 1.0
+            if not by_drives:
+                # The ramp is in the root of the share.
+                assert np.sqrt(order.share) <= np.sqrt(self.share) + DT / RISE_TIME + 1e-9
+                self.share = order.share
+            supervisor.answered(None if by_drives else TAU, failure * (not by_drives), planned)
+            mode = supervisor.mode
+            assert mode is not Mode.STOPPED, "it was answered"
+            assert (mode is Mode.POSITION) == by_drives
+            if mode is Mode.TRACKING:
+                assert limits and not goal and not failure and order.track
+        self.answered = True
+
+    @rule(reason=st.sampled_from(["", "the motors held the arm before"]))
+    def begin(self, reason):
+        """The robot begins anew."""
+        self.supervisor.begin(reason)
+
+    @rule(event=st.sampled_from(["silent", "refused"]))
+    def stop(self, event):
+        """A watchdog barks."""
+        getattr(self.supervisor, event)("why")
+        assert self.supervisor.mode is Mode.STOPPED
+        self.answered = False
+
+    @rule()
+    def repeated(self):
+        """A state comes again that was answered."""
+        if self.answered:
+            self.supervisor.repeated()
+
+    @rule()
+    def limits_came(self):
+        """Limits come late."""
+        self.supervisor.limits_came()
+
+    @rule(torque=st.booleans())
+    def enable(self, torque):
+        """The user wants another control."""
+        self.supervisor.enable(torque)
+
+    @rule(event=st.sampled_from(["torque known", "failed"]))
+    def change(self, event):
+        """A handover succeeds or fails."""
+        self.supervisor.change(event, "why")
+
+    @invariant()
+    def mode_has_a_reason(self):
+        """Each change is told, with a reason; the number of changes agrees."""
+        assert isinstance(self.supervisor.mode, Mode) and self.supervisor.reason
+        assert len(self.chain.told) == self.supervisor.changes
+        if self.chain.told:
+            assert self.chain.told[-1] == self.chain.now
+
+
+TestEvents = Events.TestCase
+TestEvents.settings = settings(max_examples=100, stateful_step_count=30, deadline=None)
