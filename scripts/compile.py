@@ -74,8 +74,6 @@ def touch() -> None:
         loop.robot.step(np.zeros(loop.model.nv), loop.config.substeps)
 
 
-
-
 @contextmanager
 def progress() -> Iterator[None]:
     """Show on stderr how many functions are compiled."""
