@@ -55,33 +55,28 @@ class _Jog:
 
     def __init__(self) -> None:
         self.velocity = np.zeros(0)
-        self._command: Array | None = None
-        self._until = self._stamp = -1
+        self._command = np.zeros(0)
+        self._ends = self._stamp = -1
 
     def command(self, velocity: Array) -> None:
         """Command a velocity, shape (k,), from the next step on."""
-        self._command, self._until = velocity, -1
+        self._command, self._ends = velocity, -1
 
-    @property
-    def begun(self) -> bool:
-        """Whether a step has been made."""
-        return self._stamp >= 0
+    def _step(self, stamp: int) -> tuple[Array | None, float]:
+        """Return u, shape (k,), None when the jog has ended; and the time since the last step, s.
 
-    def _elapsed(self, stamp: int) -> float:
-        """Note a step; return the time since the last one, s, and 0 for the first."""
-        if self._until < 0:
-            self._until = stamp + round(1e9 * TIMEOUT)
-        elapsed = 1e-9 * (stamp - self._stamp) if self.begun else 0.0
-        if elapsed < 0.0:  # the robot has restarted
-            self._until = 0
+        Args:
+            stamp: of the state, ns.
+        """
+        if self._ends < 0:
+            self._ends = stamp + round(1e9 * TIMEOUT)
+        elapsed = 1e-9 * (stamp - self._stamp) if self._stamp >= 0 else 0.0
         self._stamp = stamp
-        return min(max(elapsed, 0.0), SMOOTHING)
-
-    def _wanted(self, stamp: int) -> Array:
-        """Return u, shape (k,)."""
-        if self._command is None or stamp > self._until:
-            return np.zeros_like(self.velocity)
-        return self._command
+        if elapsed >= 0.0 and stamp <= self._ends:
+            return self._command, min(elapsed, SMOOTHING)
+        self._ends = 0  # also where the robot has restarted
+        rests = float(np.abs(self.velocity).max()) <= _REST
+        return None if rests else np.zeros_like(self.velocity), min(max(elapsed, 0.0), SMOOTHING)
 
     def _smooth(self, wanted: Array, elapsed: float) -> Array:
         """Let w follow `wanted`; return w', shape (k,)."""
@@ -89,9 +84,6 @@ class _Jog:
         self.velocity = self.velocity + share * (wanted - self.velocity)
         rate: Array = (wanted - self.velocity) / SMOOTHING
         return rate
-
-    def _goes_on(self, stamp: int) -> bool:
-        return stamp <= self._until or float(np.abs(self.velocity).max()) > _REST
 
 
 class JointJog(_Jog):
@@ -111,11 +103,10 @@ class JointJog(_Jog):
 
     def advance(self, controller: Controller, state: State, stamp: int) -> bool:
         """Set the goal of one control step; see `Motion`."""
-        elapsed = self._elapsed(stamp)
         if not len(self._q_des):
             self._q_des, self.velocity = state.q.copy(), state.v.copy()
-        wanted = self._wanted(stamp)
-        if (wanted == 0.0).all() and not self._goes_on(stamp):
+        wanted, elapsed = self._step(stamp)
+        if wanted is None:
             controller.set_posture_goal(self._q_des)
             return False
         # All by the same share: the direction stays.
@@ -159,14 +150,13 @@ class HandJog(_Jog):
 
     def advance(self, controller: Controller, state: State, stamp: int) -> bool:
         """Set the goal of one control step; see `Motion`."""
-        elapsed = self._elapsed(stamp)
         robot = controller.robot
         if self._goal is None:
             # What the robot's model knows is the last step, or nothing.
             robot.update(state, robot.a_last)
             self._goal, self.velocity = robot.pose.copy(), robot.J @ robot.v
-        wanted = self._wanted(stamp)
-        if (wanted == 0.0).all() and not self._goes_on(stamp):
+        wanted, elapsed = self._step(stamp)
+        if wanted is None:
             controller.set_pose_goal(self._goal)
             return False
         R = self._goal.rotation

@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
 from torque_safety_controller.friction.joint_recording import (
     Blocks,
@@ -210,18 +211,15 @@ def _fill(fit: JointFit, data: JointRegression, standing: float) -> None:
 
 def _best(data: JointRegression, candidates: Array, kept: Sequence[int]) -> float:
     """Return the v_s that fits best: of the candidates, then between the best one's neighbours."""
-    if 1 not in kept:
-        return float(candidates[0])
-    costs = [data.solve(v_s, kept)[0] for v_s in candidates]
+    costs = [data.solve(v_s, kept)[0] for v_s in candidates] if 1 in kept else [0.0]
     k = int(np.argmin(costs))
     if k == 0:
         return float(candidates[0])
-    low, high = np.log(candidates[k - 1]), np.log(candidates[min(k + 1, len(candidates) - 1)])
-    ratio = 0.5 * (np.sqrt(5.0) - 1.0)
-    while high - low > 1e-3:
-        left, right = high - ratio * (high - low), low + ratio * (high - low)
-        if data.solve(np.exp(left), kept)[0] < data.solve(np.exp(right), kept)[0]:
-            high = right
-        else:
-            low = left
-    return float(np.exp(0.5 * (low + high)))
+    ends = np.log(candidates[[k - 1, min(k + 1, len(candidates) - 1)]])
+    found = minimize_scalar(
+        lambda x: data.solve(np.exp(x), kept)[0],
+        bounds=ends,
+        method="bounded",
+        options={"xatol": 1e-3},
+    )
+    return float(np.exp(found.x))

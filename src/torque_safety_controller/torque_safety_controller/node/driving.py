@@ -15,7 +15,7 @@ from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMessage
 
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.driving.jog import HAND_SPEED_MAX, TIMEOUT, HandJog, JointJog
-from torque_safety_controller.driving.joint_trajectory import (
+from torque_safety_controller.driving.trajectory import (
     JointMotion,
     JointPoint,
     JointTrajectory,

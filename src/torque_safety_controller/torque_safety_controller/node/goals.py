@@ -18,7 +18,7 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from torque_safety_controller.controller import Controller
-from torque_safety_controller.driving.motion import Motion, TrajectoryMotion
+from torque_safety_controller.driving.trajectory import Motion, TrajectoryMotion
 from torque_safety_controller.node.topics import (
     TARGET_POSE,
     TARGET_POSE_SECOND,

@@ -26,7 +26,6 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from torque_safety_controller.driving.execution import Execution, Progress, Tolerances
 from torque_safety_controller.node.driving import joint_trajectory_from_message
 from torque_safety_controller.node.goals import GoalRefused
 from torque_safety_controller.node.topics import (
@@ -34,6 +33,7 @@ from torque_safety_controller.node.topics import (
     JOG_JOINTS,
     TARGET_JOINT_TRAJECTORY,
 )
+from torque_safety_controller.remote.execution import Execution, Progress, Tolerances
 from torque_safety_controller.remote.moveit_parameters import MoveitConfiguration
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import JointStateReader
@@ -47,7 +47,7 @@ Result = FollowJointTrajectory.Result
 Feedback = FollowJointTrajectory.Feedback
 
 PERIOD = 0.05
-"""Between two looks at the arm, s."""
+"""Between two judgements of the arm, s."""
 _SILENT = 1.0
 """How long the joint states may be silent while the arm follows a trajectory, s."""
 _CONNECTING = 5.0
@@ -104,13 +104,13 @@ def tolerances_from_message(
 
 @dataclass(eq=False)
 class _Run:
-    """A goal of the action that has been taken."""
+    """A goal of the action that has been accepted."""
 
     handle: ServerGoalHandle
     execution: Execution | None
     ended: Future = field(default_factory=Future)
     result: Any = field(default_factory=Result)
-    taken: float = field(default_factory=time.monotonic)
+    accepted: float = field(default_factory=time.monotonic)
     sent: bool = False
     moves: bool = False
     """Whether the arm moves by it, or still by the one before."""
@@ -181,11 +181,11 @@ class MoveitNode(ArmNode):
             FollowJointTrajectory,
             "~/follow_joint_trajectory",
             self._answer,
-            handle_accepted_callback=self._take,
+            handle_accepted_callback=self._accept,
             cancel_callback=lambda _: CancelResponse.ACCEPT,
         )
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(PERIOD, self._look, clock=steady)
+        self.create_timer(PERIOD, self._tick, clock=steady)
         self.get_logger().info(f"action {action}, jogs on {self.get_name()}/joint_jog")
 
     def destroy_node(self) -> None:
@@ -200,8 +200,8 @@ class MoveitNode(ArmNode):
 
     # Goals
 
-    def _take(self, handle: ServerGoalHandle) -> None:
-        """Begin with a goal, in place of the one before."""
+    def _accept(self, handle: ServerGoalHandle) -> None:
+        """Start a goal, in place of the one before."""
         run = self._runs[_identity(handle)] = _Run(handle, None)
         try:
             run.execution = self._execution(handle.request)
@@ -276,8 +276,8 @@ class MoveitNode(ArmNode):
             self.get_logger().info("follow_joint_trajectory: reached")
         run.ended.set_result(None)
 
-    def _look(self) -> None:
-        """Go on with the goal; let others jog when nobody does here."""
+    def _tick(self) -> None:
+        """Send or judge the goal; let others jog when nobody does here."""
         now, run = time.monotonic(), self._run
         if now - self._jogged > _JOG_TIME:
             self._jogs.close()
@@ -304,15 +304,15 @@ class MoveitNode(ArmNode):
             self._trajectories.publish(run.handle.request.trajectory)
             run.sent = run.moves = True
             ago = round(1e9 * (now - self._reader.heard_at))
-            execution.begin_at(self._state(), self._reader.stamp + ago)
-        elif now - run.taken > _CONNECTING:
+            execution.start(self._state(), self._reader.stamp + ago)
+        elif now - run.accepted > _CONNECTING:
             missing = "no controller is heard" if heard else "no joint states are heard"
             self._end(run, Result.INVALID_GOAL, f"{missing} for {_CONNECTING:g} s")
 
     def _judge(self, run: _Run, execution: Execution) -> None:
         """Compare the arm with the trajectory, and tell the client."""
         state, stamp = self._state(), self._reader.stamp
-        progress = execution.look(state, stamp)
+        progress = execution.judge(state, stamp)
         feedback = Feedback(joint_names=list(self._config.joints))
         set_stamp(feedback.header.stamp, stamp)
         q, v, a = execution.desired
@@ -321,7 +321,7 @@ class MoveitNode(ArmNode):
         feedback.error = _point(*execution.off)
         set_stamp(feedback.desired.time_from_start, max(0, stamp - execution.begin))
         run.handle.publish_feedback(feedback)
-        if progress is not Progress.GOES_ON:
+        if progress is not Progress.MOVING:
             text = execution.why
             if text and self._mode != "TRACKING":
                 text += f"; the controller's mode is {self._mode}"

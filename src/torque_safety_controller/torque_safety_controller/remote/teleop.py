@@ -71,7 +71,7 @@ class Teleop:
         self._until = 0.0
 
     def press(self, key: str, now: float) -> str:
-        """Take a key that came at `now`, s; return what to tell the user, or nothing."""
+        """Handle a key pressed at `now`, s; return what to tell the user, or nothing."""
         if key == "t":
             self._frame = 1 - self._frame
             return f"axes of {self._frames[self._frame]}"

@@ -1,22 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trajectories of the joints: cubic or quintic polynomials between points.
+"""Motions along trajectories: of the joints, and of the end effector's pose.
 
-Between points with accelerations they are quintics, between points with velocities cubics. Points
-with positions only get the velocities of monotone interpolation (PCHIP), which does not overshoot,
-and rest at both ends.
+Trajectories of the joints are polynomials: quintics between points with accelerations, cubics
+between points with velocities. Points with positions only get the velocities of monotone
+interpolation (PCHIP), which does not overshoot, and rest at both ends.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator, PPoly
+from scipy.interpolate import CubicHermiteSpline, PchipInterpolator, PPoly
 
 from torque_safety_controller.controller import Controller
 from viability_bounds_pkg.exceptions import ArmSafetyError
+from viability_bounds_pkg.pose_trajectory import PoseTrajectory
 from viability_bounds_pkg.state import State
 
 Array = NDArray[np.float64]
@@ -24,9 +25,21 @@ Array = NDArray[np.float64]
 ACCELERATION_MAX = 100.0
 """Larger accelerations are not fed forward, rad/s^2: no arm has them."""
 
-
 SPEED_MAX = 1e3
 """Trajectories that are faster anywhere are no motion of an arm, rad/s."""
+
+
+class Motion(Protocol):
+    """Sets the controller's goal anew in each control step."""
+
+    def advance(self, controller: Controller, state: State, stamp: int) -> bool:
+        """Set the goal of one control step; return whether the motion continues.
+
+        Args:
+            controller: is given the goal, which stays where it is when the motion has ended.
+            state: of the joints now.
+            stamp: of the state, ns.
+        """
 
 
 class JointTrajectoryError(ArmSafetyError, ValueError):
@@ -137,22 +150,19 @@ def _curves(
     if v is None:
         v = PchipInterpolator(times, q).derivative()(times)
         v[0] = v[-1] = 0.0
-    T = np.diff(times)[:, None]
     if a is None:
-        dx, dv = q[1:] - q[:-1] - v[:-1] * T, v[1:] - v[:-1]
-        rows = [(dv * T - 2.0 * dx) / T**3, (3.0 * dx - dv * T) / T**2, v[:-1], q[:-1]]
+        curve = CubicHermiteSpline(times, q, v)
     else:
+        T = np.diff(times)[:, None]
         dx = q[1:] - (q[:-1] + v[:-1] * T + 0.5 * a[:-1] * T**2)
         dv, da = v[1:] - (v[:-1] + a[:-1] * T), a[1:] - a[:-1]
         rows = [
             (6.0 * dx - 3.0 * dv * T + 0.5 * da * T**2) / T**5,
             (-15.0 * dx + 7.0 * dv * T - da * T**2) / T**4,
             (10.0 * dx - 4.0 * dv * T + 0.5 * da * T**2) / T**3,
-            0.5 * a[:-1],
-            v[:-1],
-            q[:-1],
+            *(0.5 * a[:-1], v[:-1], q[:-1]),
         ]
-    curve = PPoly(np.stack(rows), times)
+        curve = PPoly(np.stack(rows), times)
     return curve, curve.derivative(), curve.derivative(2)
 
 
@@ -188,3 +198,22 @@ class JointMotion:
             np.clip(a, -ACCELERATION_MAX, ACCELERATION_MAX),
         )
         return 0.0 <= t < self._trajectory.duration
+
+
+class TrajectoryMotion:
+    """The end effector follows a trajectory.
+
+    Args:
+        trajectory: in the URDF's root frame.
+        begin: its time 0, ns; 0 for the first step.
+    """
+
+    def __init__(self, trajectory: PoseTrajectory, begin: int) -> None:
+        self._trajectory, self._begin = trajectory, begin
+
+    def advance(self, controller: Controller, state: State, stamp: int) -> bool:
+        """Set the goal of one control step; see `Motion`."""
+        self._begin = self._begin or stamp
+        t = 1e-9 * (stamp - self._begin)
+        controller.set_pose_goal(*self._trajectory.sample(t))
+        return t < self._trajectory.duration

@@ -10,7 +10,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from torque_safety_controller.driving.joint_trajectory import JointTrajectory
+from torque_safety_controller.driving.trajectory import JointTrajectory
 from viability_bounds_pkg.state import State
 
 Array = NDArray[np.float64]
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 class Progress(Enum):
     """Where an execution is."""
 
-    GOES_ON = 0
+    MOVING = 0
     """It has not ended."""
     REACHED = 1
     """The arm is at the end of the trajectory."""
@@ -61,7 +61,7 @@ class Execution:
     Times are those of the stamps of joint states.
 
     Attributes:
-        desired: positions, velocities and accelerations of the trajectory at the last look, shape
+        desired: positions, velocities and accelerations of the trajectory at the last state, shape
             (n,) each.
         off: of the arm from it in position and velocity, shape (n,) each, rad and rad/s; desired
             minus actual.
@@ -84,8 +84,8 @@ class Execution:
     off: tuple[Array, Array] = field(init=False)
     why: str = field(init=False, default="")
 
-    def begin_at(self, state: State, stamp: int) -> None:
-        """Note that the trajectory has been sent: as the controller does it, it begins from there.
+    def start(self, state: State, stamp: int) -> None:
+        """Start the trajectory from where the arm is, as the controller does.
 
         Args:
             state: of the joints.
@@ -94,7 +94,7 @@ class Execution:
         self.begin = self.begin or stamp
         self.trajectory = self.trajectory.from_state(state)
 
-    def look(self, state: State, stamp: int) -> Progress:
+    def judge(self, state: State, stamp: int) -> Progress:
         """Judge a state of the arm.
 
         Args:
@@ -105,12 +105,12 @@ class Execution:
         self.desired = self.trajectory.sample(t)
         self.off = self.desired[0] - state.q, self.desired[1] - state.v
         if t < 0.0:
-            return Progress.GOES_ON
+            return Progress.MOVING
         if t < self.trajectory.duration:
             self.why = self.path.exceeded(self.joints, *self.off)
-            return Progress.OFF_PATH if self.why else Progress.GOES_ON
+            return Progress.OFF_PATH if self.why else Progress.MOVING
         self.why = self.goal.exceeded(self.joints, *self.off)
         if not self.why:
             return Progress.REACHED
         over = t >= self.trajectory.duration + self.patience
-        return Progress.NOT_REACHED if over else Progress.GOES_ON
+        return Progress.NOT_REACHED if over else Progress.MOVING

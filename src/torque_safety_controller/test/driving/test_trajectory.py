@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BPoly
 
-from torque_safety_controller.driving.joint_trajectory import (
+from torque_safety_controller.driving.trajectory import (
     JointPoint,
     JointTrajectory,
     JointTrajectoryError,
