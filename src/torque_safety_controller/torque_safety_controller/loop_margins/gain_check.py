@@ -189,16 +189,16 @@ class GainCheck:
         Tasks are judged without the integral action; that with the fastest of them.
         """
         for task, (kp, kd) in self.tasks.items():
-            margin = _largest_scale(
-                lambda s, kp=kp, kd=kd: self.margin(kp * s * s, kd * s, 0.0) >= MARGIN
-            )
-            resolution = _largest_scale(lambda s, kp=kp, kd=kd: self._calm(kp * s * s, kd * s))
+            margin = _largest_scale(self._has_margin, kp, kd)
+            resolution = _largest_scale(self._is_calm, kp, kd)
             if kp > 0.0:
                 yield GainLimit(f"{task}_kp", kp, kp * margin**2, kp * resolution**2)
             yield GainLimit(f"{task}_kd", kd, kd * margin, kd * resolution)
         if gain := self.integral:
             kp, kd = max(self.tasks.values(), key=lambda pair: pair[1])
-            margin = _largest_scale(lambda s: self.margin(kp, kd, gain * s) >= MARGIN)
+            margin = _largest_scale(
+                lambda s, kp, kd: self.margin(kp, kd, gain * s) >= MARGIN, kp, kd
+            )
             step = self._own(gain * self.steps[1])
             resolution = TORQUE_STEP / step if step > 0.0 else math.inf
             yield GainLimit("integral_lambda", gain, gain * margin, gain * resolution)
@@ -245,10 +245,14 @@ class GainCheck:
         braking = np.minimum(-robot.limits.a_min, robot.limits.a_max)
         return limit_gains(factor * robot.dt, robot.declared.acceleration_disturbance, braking)
 
-    def _calm(self, kp: float, kd: float) -> bool:
+    def _has_margin(self, scale: float, kp: float, kd: float) -> bool:
+        return self.margin(kp * scale**2, kd * scale, 0.0) >= MARGIN
+
+    def _is_calm(self, scale: float, kp: float, kd: float) -> bool:
         """Return whether encoders that all step at once, the worst way round, change little."""
         position, velocity = self.steps
-        torque = np.abs(self.inertia.matrices) @ (kp * position + kd * velocity)
+        accelerations = kp * scale**2 * position + kd * scale * velocity
+        torque = np.abs(self.inertia.matrices) @ accelerations
         return bool((torque.max(axis=0) <= TORQUE_STEP * self._tau_max).all())
 
     def _calm_on_limits(self, factor: float) -> bool:
@@ -275,9 +279,9 @@ class GainCheck:
         return 0.0 if share >= 1.0 or share == 0.0 else -dt / math.log1p(-share)
 
 
-def _largest_scale(good: Callable[[float], bool]) -> float:
+def _largest_scale(good: Callable[[float, float, float], bool], kp: float, kd: float) -> float:
     """Return the largest factor for which `good` holds; infinite if there is none in reach."""
-    scale = _last_good(good, *_SCALES)
+    scale = _last_good(lambda s: good(s, kp, kd), *_SCALES)
     return math.inf if scale == _SCALES[1] else scale
 
 
