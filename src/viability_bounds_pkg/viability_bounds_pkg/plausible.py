@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from viability_bounds_pkg.state import State
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_] | np.bool_
 
 WINDOW = 0.2
 """Over which positions are compared with velocities, and how long they must agree again, s."""
@@ -124,12 +125,15 @@ class PlausibilityCheck:
     ) -> None:
         fastest = np.where(np.isfinite(velocity_max), velocity_max, NO_SPEED_LIMIT)
         width = position_max - position_min
-        self._low = np.maximum(position_min - width, -FARTHEST)
-        self._high = np.minimum(position_max + width, FARTHEST)
+        low = np.maximum(position_min - width, -FARTHEST)
+        high = np.minimum(position_max + width, FARTHEST)
+        self._middle, self._half = 0.5 * (low + high), 0.5 * (high - low)
         self._v_max, self._gap = fastest, max(GAP, 3.0 * dt)
+        self._fastest, self._zero = FAST * fastest, np.zeros_like(fastest)
         self._uses_velocities = velocity_error is not None
         self._position = POSITION_ERROR + 2.0 * position_error
         self._velocity = FAST_ENOUGH * fastest + position_error / dt
+        self._impossible = np.inf if velocity_error is None else IMPOSSIBLE * fastest
         if velocity_error is not None:
             self._velocity = VELOCITY_ERROR * fastest + velocity_error
         # An impact, at any moment of a period, changes a speed from one limit to the other.
@@ -185,7 +189,7 @@ class PlausibilityCheck:
         return self._reason
 
     def _first(self, state: State, time: float) -> _Past:
-        zero = np.zeros_like(self._v_max)
+        zero = self._zero
         return _Past(state if self._uses_velocities else State(state.q, zero), time, zero, zero)
 
     def _accept(self, past: _Past) -> None:
@@ -197,10 +201,9 @@ class PlausibilityCheck:
         return bool((moved <= self._position + STOPPING * self._v_max).all())
 
     def _out_of_range(self, state: State) -> str:
-        if not ((self._low <= state.q) & (state.q <= self._high)).all():
-            return OUTSIDE
-        if self._uses_velocities and (np.abs(state.v) > IMPOSSIBLE * self._v_max).any():
-            return TOO_FAST
+        outside = np.abs(state.q - self._middle) > self._half
+        if (outside | (np.abs(state.v) > self._impossible)).any():
+            return OUTSIDE if outside.any() else TOO_FAST
         return ""
 
     def _compare(self, past: _Past, state: State, time: float, unseen: float) -> tuple[str, _Past]:
@@ -213,26 +216,36 @@ class PlausibilityCheck:
             unseen: time between both of which nothing is known, s.
         """
         (q0, v0), (q, v), h = past.state, state, time - past.time
-        zero, moved, fastest = np.zeros_like(q), q - q0, FAST * self._v_max
+        moved, fastest, drift = q - q0, self._fastest, self._zero
+        same = moved == 0.0
         if self._uses_velocities:
-            mean, same, fastest = 0.5 * (v0 + v), moved == 0.0, np.maximum(fastest, np.abs(v))
+            mean = 0.5 * (v0 + v)
+            fastest = np.maximum(fastest, np.abs(v))
+            drift = math.exp(-h / WINDOW) * past.drift + moved - h * mean
         else:
-            same = not moved.any()
+            same = np.logical_and.reduce(same)
             mean = v = v0 if same else v0 + SMOOTHING * (moved / h - v0)
-        if (np.abs(moved) > self._position + h * fastest).any():
+        way = self._way_since(past, same, h, mean)
+        jumps = np.abs(moved) > self._position + h * fastest
+        frozen = np.abs(way) > self._way
+        room = self._drift if unseen <= 0.0 else self._drift + unseen * self._fastest
+        contradicts = np.abs(drift) > room
+        if not (jumps | frozen | contradicts).any():
+            if unseen > 0.0:
+                drift = _limited(drift, self._drift)
+            return "", _Past(State(q, v), time, drift, way)
+        if jumps.any():
             return JUMP, self._first(state, time)
+        reason = FROZEN if frozen.any() else CONTRADICTION
+        return reason, _Past(State(q, v), time, self._zero, way)
+
+    def _way_since(self, past: _Past, same: Mask, h: float, mean: Array) -> Array:
+        """Return the way by velocities since positions changed, shape (n,), rad."""
+        if not np.any(same):
+            return self._zero
         way = math.exp(-h / FORGETTING) * past.way
         way = way + h * np.where(np.abs(mean) > self._velocity, mean, 0.0)
-        way = np.where(same, _limited(way, 2.0 * self._way), 0.0)
-        state = State(q, v)
-        if (np.abs(way) > self._way).any():
-            return FROZEN, _Past(state, time, zero, way)
-        if not self._uses_velocities:
-            return "", _Past(state, time, zero, way)
-        drift = math.exp(-h / WINDOW) * past.drift + moved - h * mean
-        if (np.abs(drift) > self._drift + max(unseen, 0.0) * fastest).any():
-            return CONTRADICTION, _Past(state, time, zero, way)
-        return "", _Past(state, time, _limited(drift, self._drift), way)
+        return np.where(same, _limited(way, 2.0 * self._way), 0.0)
 
 
 def _limited(x: Array, limit: Array) -> Array:
