@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cache, partial
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -221,7 +221,6 @@ def group(kind: type, prefix: str = "") -> Any:
     return field(metadata={_GROUP: (kind, prefix)})
 
 
-@cache
 def parameter_table(kind: Any, prefix: str = "") -> tuple[Parameter, ...]:
     """Return the parameters that a dataclass and its groups declare, in their order.
 

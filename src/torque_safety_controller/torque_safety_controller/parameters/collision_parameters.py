@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -150,7 +149,7 @@ class CollisionConfiguration:
         return np.where(limited, 0.5 * (np.where(limited, low, 0.0) + high), 0.0)
 
 
-def _obstacles(entries: Sequence[str]) -> tuple[Shape, ...]:
+def _obstacles(entries: tuple[str, ...]) -> tuple[Shape, ...]:
     obstacles: dict[str, Shape] = {}
     for index, entry in enumerate(read_entries(ObstacleEntry, "obstacles", entries)):
         label, name, size = f"obstacles[{index}]", entry.name, entry.size

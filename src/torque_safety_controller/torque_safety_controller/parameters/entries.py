@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import lru_cache
 from typing import TypeVar
 
 from viability_bounds_pkg.exceptions import SettingError, did_you_mean
@@ -13,7 +13,8 @@ from viability_bounds_pkg.user_input.yaml_file import YamlError, load_yaml
 Entry = TypeVar("Entry")
 
 
-def read_entries(kind: type[Entry], parameter: str, entries: Sequence[str]) -> tuple[Entry, ...]:
+@lru_cache(maxsize=16)  # other parameters change while a control loop waits
+def read_entries(kind: type[Entry], parameter: str, entries: tuple[str, ...]) -> tuple[Entry, ...]:
     """Return what the entries of a parameter say.
 
     Args:

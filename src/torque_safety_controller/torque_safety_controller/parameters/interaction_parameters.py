@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -127,7 +126,7 @@ class InteractionConfiguration:
         )
 
 
-def _contact_points(entries: Sequence[str]) -> tuple[ContactPoint, ...]:
+def _contact_points(entries: tuple[str, ...]) -> tuple[ContactPoint, ...]:
     points = read_entries(ContactPoint, "contacts", entries)
     for index, point in enumerate(points):
         allowed = "the same at all points"
