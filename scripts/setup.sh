@@ -177,6 +177,7 @@ _compile() {
     if [ "$(cat "$compiled" 2>/dev/null)" = "$now" ]; then
         return 0
     fi
+    echo "setup: compiling what Numba compiles, about a minute" >&2
     if ! PYTHONPATH="$root/reproduction:${PYTHONPATH:-}" python "$root/scripts/compile.py"; then
         echo "setup: compiling ahead failed; the nodes compile when they start" >&2
         return 0

@@ -18,10 +18,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from sim_bridge.bullet.obstacles import ContactMaterial
-from viability_bounds_pkg.compiled import compiled
 
 Array = NDArray[Any]
 
@@ -80,7 +80,7 @@ class Bristle:
         )
 
 
-@compiled
+@njit(cache=True)
 def _update(
     points: Array,
     motion: Array,

@@ -24,10 +24,10 @@ link that a gear constraint couples to its joint; docs/simulated_robot.md has th
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from sim_bridge.bullet.vectors import finite_vector
-from viability_bounds_pkg.compiled import compiled
 
 Array = NDArray[np.float64]
 
@@ -115,7 +115,7 @@ class JointFriction:
         return self._loads[0], self._loads[1]
 
 
-@compiled
+@njit(cache=True)
 def _loads(v: Array, tau: Array, parameters: Array, out: Array) -> None:
     bias, viscous, coulomb, excess, stribeck = parameters
     for j in range(v.size):

@@ -18,6 +18,7 @@ from enum import Enum
 
 import numpy as np
 import pinocchio as pin
+from numba import njit
 from numpy.typing import NDArray
 
 from torque_safety_controller.contact.admittance import AdmittanceGains, AdmittanceTask
@@ -28,7 +29,6 @@ from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.goals import Goals
 from torque_safety_controller.tasks.task import Task
-from viability_bounds_pkg.compiled import compiled
 
 Array = NDArray[np.float64]
 
@@ -312,7 +312,7 @@ class Interaction:
             self.changes += 1
 
 
-@compiled
+@njit(cache=True)
 def _counted(
     goal: Array,
     measured: Array,
@@ -353,7 +353,7 @@ def _counted(
     return counted
 
 
-@compiled
+@njit(cache=True)
 def _shorten(vector: Array, longest: float) -> None:
     """Shorten a vector, in place, to a length of at most `longest`."""
     length = math.sqrt((vector * vector).sum())

@@ -18,9 +18,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from viability_bounds_pkg.compiled import compiled
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.parameter import above, number
 
@@ -155,7 +155,7 @@ class WrenchSensor:
         return self.bias
 
 
-@compiled
+@njit(cache=True)
 def _measured(
     raw: Array,
     gravity: Array,

@@ -19,11 +19,11 @@ from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
+from numba import njit
 from numpy.typing import NDArray
 
 from torque_safety_controller.qp import TaskTerm
 from torque_safety_controller.robot_model import HandModel, RobotModel
-from viability_bounds_pkg.compiled import compiled
 
 Array = NDArray[np.float64]
 
@@ -160,7 +160,7 @@ def pose_error(pose: pin.SE3, pose_des: pin.SE3) -> Array:
     return error
 
 
-@compiled
+@njit(cache=True)
 def _spring_damper(
     J: Array, v: Array, error: Array, drift: Array, kp: float, kd: float, separate: bool
 ) -> Array:
