@@ -148,7 +148,7 @@ class CollisionAvoidance:
         a_upper: Array,
         disturbance: Array | None = None,
     ) -> CollisionRows:
-        """Return the rows of one step; those that bounds imply are not.
+        """Return the rows of one step, valid until the next; those that bounds imply are not.
 
         Args:
             q: shape (n,), rad.
@@ -178,7 +178,7 @@ class CollisionAvoidance:
             count, *features, self.model.moves, self._J, self._limits, kept, dt, self.speed_max,
             self._G, self._lower, self._source, self._viable,
         )  # fmt: skip
-        chosen = np.arange(k)
+        chosen: slice | NDArray[np.int64] = slice(k)
         if k > self.rows_max:
             distances = features.motion[self._source[:k], 0]
             chosen = np.sort(np.argpartition(distances, self.rows_max)[: self.rows_max])

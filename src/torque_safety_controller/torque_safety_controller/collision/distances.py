@@ -25,6 +25,7 @@ _BLUNT = 1e-3  # m; no curvature is computed for axes nearer than this
 # that the distances of the ends count instead.
 _PARALLEL = 1e-2
 _SAME = 1e-6  # lines that differ by less are one
+_PIECE = 1e-3  # m; half the length of an edge that stands for it around a point
 _BEHIND = 1.0  # m; how far behind a face its reference point is, so that the normal is exact
 
 
@@ -280,7 +281,7 @@ def _place_foot(
         if beyond < 2 and m == face:
             foot = half - _BEHIND if x[m] > 0.0 else _BEHIND - half
         elif beyond == 2 and abs(x[m]) <= half:
-            reach = 1.0
+            reach = _PIECE
         for k in range(3):
             points[j, 0, 0, k] += (foot - reach) * boxes[box, 2 + m, k]
             points[j, 1, 0, k] += (foot + reach) * boxes[box, 2 + m, k]
