@@ -22,8 +22,8 @@ def stream():
     """A stream in which a state with the stamp 100 ms came at 10 s, and was answered."""
     made = StateStream(JOINTS, TIMEOUT)
     assert arrives(made, 100, 10.0) is Arrival.RESTARTED
-    made.begin()
-    made.answered()
+    made.forget_answers()
+    made.mark_answered()
     return made
 
 
@@ -67,7 +67,7 @@ def test_a_state_waits_until_it_is_answered_and_none_while_they_are_refused(stre
     arrives(stream, 106, 10.5)
     assert stream.refused_in_row == 0
     assert stream.waits(10.5) == pytest.approx(0.4)
-    stream.answered()
+    stream.mark_answered()
     assert (stream.waits(10.6), stream.elapsed()) == (0.0, 0.0)
 
 
@@ -76,7 +76,7 @@ def test_silence_is_told_and_whether_states_were_missing_meanwhile(stream):
     assert stream.silent(10.01 + TIMEOUT)
     arrives(stream, 700, 10.6)
     assert stream.missed
-    stream.begin()
+    stream.forget_answers()
     assert stream.elapsed() is None
     assert stream.waits(10.7) == pytest.approx(0.1)
     arrives(stream, 702, 10.61)

@@ -202,7 +202,7 @@ class ControllerNode(ArmNode):
             reason = "the motors held the arm before"
         elif states.missed:
             reason = "joint states were missing"
-        states.begin()
+        states.forget_answers()
         self._controller.reset(states.q)
         self._supervisor.begin(reason)
         self._handover.release()
@@ -221,14 +221,14 @@ class ControllerNode(ArmNode):
         order = supervisor.state(elapsed, state.v, states.effort(), limits is not None, goal)
         if supervisor.by_drives:
             self._commands.position(self._handover.hold(state.q), stamp)
-            states.answered()
+            states.mark_answered()
             if supervisor.control is Control.TAKING_OVER and limits is not None:
                 self._take_over(state, limits)
             supervisor.answered()
             return
         step = self._controller.step(state, limits, order, elapsed)
         self._commands.torque(step.tau, stamp)
-        states.answered()
+        states.mark_answered()
         supervisor.answered(step.tau, step.failure, not self._controller.lost)
         self._record.note(step, time.monotonic() - states.message_at)
         self._wrenches.note()
@@ -325,7 +325,7 @@ class ControllerNode(ArmNode):
     # Diagnostics
 
     def _report(self) -> tuple[bytes, str, dict[str, Any]]:
-        self._period.look(self._states)
+        self._period.compare(self._states)
         values = self._record.values(
             self._config.joints, self._controller, self._limits.lower, self._limits.upper
         )

@@ -115,7 +115,7 @@ class BoundsNode(ArmNode):
 
     def _report(self) -> tuple[bytes, str, dict[str, Any]]:
         config = self._node_parameters.configuration
-        self._period.look(self._reader)
+        self._period.compare(self._reader)
         silent = self._reader.stamp < 0
         values = {
             "method": config.method,

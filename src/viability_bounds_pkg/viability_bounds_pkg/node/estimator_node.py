@@ -119,7 +119,7 @@ class EstimatorNode(ArmNode):
 
     def _report(self) -> tuple[bytes, str, dict[str, Any]]:
         config, estimator, reader = self._config, self._estimator, self._reader
-        self._period.look(reader)
+        self._period.compare(reader)
         values: dict[str, Any] = {
             "velocity_estimation": config.velocity_estimation,
             "delay_periods": config.declared.delay,

@@ -214,8 +214,8 @@ class PeriodCheck:
         self._dt, self._warn = dt, warn
         self._count, self._stamp, self._wrong = 0, -1, 0
 
-    def look(self, states: JointStateReader) -> None:
-        """Look at the states that came since the last look; two looks must agree to warn."""
+    def compare(self, states: JointStateReader) -> None:
+        """Compare the states since the last call; two calls must agree to warn."""
         count, span = states.accepted - self._count, 1e-9 * (states.stamp - self._stamp)
         known, self._count, self._stamp = self._stamp >= 0, states.accepted, states.stamp
         if not known or count < _PERIODS_SEEN or span <= 0.0 or self._wrong > 1:

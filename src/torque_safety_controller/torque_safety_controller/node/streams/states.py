@@ -16,7 +16,6 @@ from viability_bounds_pkg.ros.messages import Arrival, JointStateReader
 UNSEEN = 3
 """Refused states in a row after which nothing is known of the arm."""
 
-
 ELSEWHERE = 0.05
 """By how much positions differ where an arm has been moved while its stamps leapt, rad."""
 
@@ -87,12 +86,12 @@ class StateStream(JointStateReader):
         self.refused_in_row += 1
         return self.refused_in_row
 
-    def answered(self) -> None:
+    def mark_answered(self) -> None:
         """Count the last state as answered."""
         self.answered_stamp = self.stamp
 
-    def begin(self) -> None:
-        """Count from the last usable state on: nothing before it was answered."""
+    def forget_answers(self) -> None:
+        """Start at the last usable state: nothing before it was answered."""
         self.answered_stamp = -1
         self.waiting_since = self.usable_at
 
