@@ -133,12 +133,6 @@ def run_together(
         The exit code: 0 after SIGINT, SIGTERM or shutdown; 1 when a node cannot start, after one
         line on stderr that says why.
     """
-    try:
-        add_scheduling(parser)
-        options = initialise(parser, args)
-    except ArmSafetyError as error:
-        report_refusal(error)
-        return 1
     nodes: list[ArmNode] = []
     told: list[int] = []
 
@@ -146,28 +140,14 @@ def run_together(
         told.append(number)
         raise KeyboardInterrupt
 
-    # What is raised while a callback of compiled code runs is lost.
-    signal.signal(signal.SIGINT, interrupt)
     try:
+        add_scheduling(parser)
+        options = initialise(parser, args)
+        # What is raised while a callback of compiled code runs is lost.
+        signal.signal(signal.SIGINT, interrupt)
         for node in make_nodes(DirectDelivery()):
             nodes.append(node)
-        logger = nodes[0].get_logger()
-        executor = make_executor()
-        if EventsExecutor is None:
-            logger.warning(
-                "rclpy has no EventsExecutor; the single-threaded one adds about 2 ms a cycle"
-            )
-        for node in nodes:
-            executor.add_node(node)
-        # What exists by now lives until the end: the collector need not visit it in the control
-        # loop.
-        gc.collect()
-        gc.freeze()
-        granted, refused = schedule(options)
-        if granted:
-            logger.info(f"scheduling: {'; '.join(granted)}")
-        if refused:
-            logger.warning(f"scheduling: {'; '.join(refused)}; see docs/performance.md")
+        executor = _prepare(nodes, options)
         if not told:
             spin(executor, nodes[0])
     except (KeyboardInterrupt, ExternalShutdownException):
@@ -182,6 +162,26 @@ def run_together(
         leave(*nodes)
         gc.unfreeze()
     return 0
+
+
+def _prepare(nodes: Sequence[ArmNode], options: argparse.Namespace) -> Executor:
+    """Return an executor with nodes; ask the system for what the options say."""
+    logger, executor = nodes[0].get_logger(), make_executor()
+    if EventsExecutor is None:
+        logger.warning(
+            "rclpy has no EventsExecutor; the single-threaded one adds about 2 ms a cycle"
+        )
+    for node in nodes:
+        executor.add_node(node)
+    # What exists by now lives until the end: the collector need not visit it in the control loop.
+    gc.collect()
+    gc.freeze()
+    granted, refused = schedule(options)
+    if granted:
+        logger.info(f"scheduling: {'; '.join(granted)}")
+    if refused:
+        logger.warning(f"scheduling: {'; '.join(refused)}; see docs/performance.md")
+    return executor
 
 
 def leave(*nodes: Node) -> None:
