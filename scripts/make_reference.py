@@ -62,7 +62,8 @@ def parameters_page() -> str:
 in the order of `joints`; an array that may be empty may be left out. A value that is not allowed
 stops a node at start with one line that names the parameter, the value and what is allowed. *Live*
 parameters can change while the node runs, where such a value is refused; all others are read-only.
-Whole numbers are accepted where a double is expected.
+Whole numbers are accepted where a double is expected. Of several values given the last one counts,
+whether it comes from a file or from `-p`, and whatever section of the file it is in.
 """
     rows = {row.name: row for table in TABLES.values() for row in table}
     shared = [name for name in rows if _is_shared(name)]
