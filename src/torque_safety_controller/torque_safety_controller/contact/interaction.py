@@ -18,16 +18,16 @@ from enum import Enum
 
 import numpy as np
 import pinocchio as pin
-from numba import njit
 from numpy.typing import NDArray
 
 from torque_safety_controller.contact.admittance import AdmittanceGains, AdmittanceTask
-from torque_safety_controller.contact.contacts import Contacts
+from torque_safety_controller.contact.contacts import Contacts, FrictionContact
 from torque_safety_controller.contact.wrench_sensor import WrenchSensor
 from torque_safety_controller.qp import ContactForces
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.goals import Goals
+from torque_safety_controller.tasks.pose_task import shorten
 from torque_safety_controller.tasks.task import Task
 
 Array = NDArray[np.float64]
@@ -113,9 +113,6 @@ class Interaction:
         self._settings = self.settings = settings or InteractionSettings()
         self.state, self.reason, self.changes = Compliance.OFF, "at start", 0
         self.start()
-        # Compiled now, not in a control loop.
-        zero = np.zeros(6)
-        _counted(zero, zero, self._to_contact, np.zeros(3), 0.0, 0.0, 0.0)
 
     @property
     def settings(self) -> InteractionSettings:
@@ -237,15 +234,7 @@ class Interaction:
         if self.contacts is None:
             return
         (contact,) = self.contacts.contacts
-        self._counted = _counted(
-            self._goal,
-            measured,
-            self._to_contact,
-            contact.normal,
-            contact.friction,
-            contact.lever,
-            FORCE_STEP,
-        )
+        self._counted = _counted(self._goal, measured, self._to_contact, contact)
 
     @property
     def stiffness(self) -> Array | None:
@@ -312,50 +301,26 @@ class Interaction:
             self.changes += 1
 
 
-@njit(cache=True)
-def _counted(
-    goal: Array,
-    measured: Array,
-    to_contact: Array,
-    normal: Array,
-    friction: float,
-    lever: float,
-    force_step: float,
-) -> Array:
+def _counted(goal: Array, measured: Array, to_contact: Array, contact: FrictionContact) -> Array:
     """Return the wrench that the QP may count on at a contact, in its axes, shape (6,).
+
+    Along the normal it exceeds what is felt by `FORCE_STEP` at most.
 
     Args:
         goal: wrench on the arm that is wanted, in the end effector's axes, shape (6,).
         measured: wrench on the arm, likewise.
         to_contact: takes wrenches to the contact's axes and origin, shape (6, 6).
-        normal: direction in which the environment pushes, in these axes, shape (3,), length 1.
-        friction: coefficient of friction.
-        lever: farthest point of the contact from its origin, m.
-        force_step: by how much it may exceed what is felt along the normal, N.
+        contact: has normal, friction and lever.
     """
-    wanted = felt = 0.0
-    counted = np.zeros(6)
-    for i in range(6):
-        for j in range(6):
-            counted[i] += to_contact[i, j] * goal[j]
-            if i < 3:
-                felt += normal[i] * to_contact[i, j] * measured[j]
-        if i < 3:
-            wanted += normal[i] * counted[i]
-    most = max(felt, 0.0) + force_step
-    share = min(1.0, most / wanted) if wanted > 0.0 else 0.0
+    normal = contact.normal
+    counted = to_contact @ goal
+    wanted = float(normal @ counted[:3])
+    felt = float(normal @ (to_contact[:3] @ measured))
+    share = min(1.0, (max(felt, 0.0) + FORCE_STEP) / wanted) if wanted > 0.0 else 0.0
     pressing = share * wanted
     counted *= share
     counted[:3] -= pressing * normal
-    _shorten(counted[:3], friction * pressing)
+    shorten(counted[:3], contact.friction * pressing)
     counted[:3] += pressing * normal
-    _shorten(counted[3:], lever * math.sqrt((counted[:3] * counted[:3]).sum()))
+    shorten(counted[3:], contact.lever * math.hypot(*counted[:3].tolist()))
     return counted
-
-
-@njit(cache=True)
-def _shorten(vector: Array, longest: float) -> None:
-    """Shorten a vector, in place, to a length of at most `longest`."""
-    length = math.sqrt((vector * vector).sum())
-    if length > longest:
-        vector *= longest / length

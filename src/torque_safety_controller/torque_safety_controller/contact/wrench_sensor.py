@@ -18,7 +18,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from viability_bounds_pkg.exceptions import ArmSafetyError
@@ -84,9 +83,6 @@ class WrenchSensor:
         R = tool.mass * placement.rotation.T
         self._weight = np.vstack([R, pin.skew(tool.lever) @ R])  # shape (6, 3)
         self._gravity = np.asarray(gravity, dtype=np.float64)
-        # Compiled now, not in a control loop.
-        a, b = np.zeros(6), np.zeros(6)
-        _measured(a, np.zeros(3), self._weight, self._action, a, a, b, 0.0, 0.0, 1.0)
         self.start()
 
     def start(self) -> None:
@@ -126,18 +122,12 @@ class WrenchSensor:
         if self.silent or not time > 0.0:
             time = math.inf
         cut_off = 2.0 * math.pi * self.settings.filter_hz
-        self.wrench, self.rate = _measured(
-            self._raw,
-            self._gravity.dot(rotation),
-            self._weight,
-            self._action,
-            self.bias,
-            self._filtered,
-            self._mean,
-            -math.expm1(-cut_off * time),
-            -math.expm1(-time / _TARE_TIME),
-            time,
-        )
+        found = self._raw - self._weight @ self._gravity.dot(rotation)
+        change = -math.expm1(-cut_off * time) * (found - self._filtered)
+        self._filtered = self._filtered + change
+        self._mean = self._mean - math.expm1(-time / _TARE_TIME) * (found - self._mean)
+        self.wrench = self._action @ (self._filtered - self.bias)
+        self.rate = self._action @ (change / time)
         self._raw, self.silent = None, False
 
     def tare(self) -> Array:
@@ -153,44 +143,3 @@ class WrenchSensor:
         self.wrench = self.wrench + self._action @ (self.bias - self._mean)
         self.bias = self._mean.copy()
         return self.bias
-
-
-@njit(cache=True)
-def _measured(
-    raw: Array,
-    gravity: Array,
-    weight: Array,
-    action: Array,
-    bias: Array,
-    filtered: Array,
-    mean: Array,
-    share: float,
-    mean_share: float,
-    time: float,
-) -> tuple[Array, Array]:
-    """Return wrench and rate, shape (6,) each; go on with `filtered` and `mean`, shape (6,).
-
-    Args:
-        raw: measurement, in the sensor's axes, shape (6,).
-        gravity: in the end effector's axes, shape (3,).
-        weight: from gravity to the wrench of the tool's weight, shape (6, 3).
-        action: of the sensor's placement on wrenches, shape (6, 6).
-        bias: shape (6,).
-        filtered: measurement without the tool's weight, shape (6,).
-        mean: the same, over a longer time.
-        share: of the new measurement in `filtered`.
-        mean_share: of the new measurement in `mean`.
-        time: since the last measurement, s; inf if there was none.
-    """
-    wrench, rate = np.zeros(6), np.zeros(6)
-    for j in range(6):
-        found = raw[j]
-        for k in range(3):
-            found -= weight[j, k] * gravity[k]
-        change = share * (found - filtered[j])
-        filtered[j] += change
-        mean[j] += mean_share * (found - mean[j])
-        for i in range(6):
-            wrench[i] += action[i, j] * (filtered[j] - bias[j])
-            rate[i] += action[i, j] * (change / time)
-    return wrench, rate

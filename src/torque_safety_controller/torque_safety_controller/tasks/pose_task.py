@@ -19,7 +19,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from numba import njit
 from numpy.typing import NDArray
 
 from torque_safety_controller.qp import TaskTerm
@@ -75,11 +74,15 @@ class PoseTask:
             shorten(error[3:], self.error_max[1])
         if self.stiffness is not None:
             error = self.stiffness * error
-        b = _spring_damper(robot.J, robot.v, error, robot.drift, self.kp, self.kd, self.separate)
+        twist = robot.J @ robot.v
+        b = self.kp * error - self.kd * twist - robot.drift
+        if self.separate:
+            # The rows of J a + J' v are in axes that turn with w: the origin has w x v more.
+            b[:3] -= pin.skew(twist[3:]) @ twist[:3]
         if self.motion is not None and self.separate:
             b += self._separate_feedforward(robot.pose, self.motion)
         elif self.motion is not None:
-            b += self._feedforward(robot.pose, robot.J @ robot.v, self.motion)
+            b += self._feedforward(robot.pose, twist, self.motion)
         return TaskTerm(robot.J, b, self.weight)
 
     def _separate_feedforward(self, pose: pin.SE3, motion: PoseMotion) -> Array:
@@ -158,25 +161,3 @@ def pose_error(pose: pin.SE3, pose_des: pin.SE3) -> Array:
     """Return ``log(H^-1 H_des)``, shape (6,): m, then rad, in the end effector's axes."""
     error: Array = pin.log6(pose.actInv(pose_des)).vector
     return error
-
-
-@njit(cache=True)
-def _spring_damper(
-    J: Array, v: Array, error: Array, drift: Array, kp: float, kd: float, separate: bool
-) -> Array:
-    """Return the accelerations ``kp error - kd J v - J' v``, shape (6,), in the hand's axes.
-
-    With `separate` those of the hand's origin are meant: the linear rows of J a + J' v are the
-    rate of the velocity in axes that turn with w, and the origin accelerates by w x v more.
-    """
-    n = len(v)
-    b, twist = np.empty(6), np.zeros(6)
-    for i in range(6):
-        for k in range(n):
-            twist[i] += J[i, k] * v[k]
-        b[i] = kp * error[i] - kd * twist[i] - drift[i]
-    if separate:
-        b[0] -= twist[4] * twist[2] - twist[5] * twist[1]
-        b[1] -= twist[5] * twist[0] - twist[3] * twist[2]
-        b[2] -= twist[3] * twist[1] - twist[4] * twist[0]
-    return b
