@@ -19,10 +19,10 @@ from sim_bridge.nodes import topics as bullet_topics
 from sim_bridge.nodes.bullet_parameters import BulletConfiguration
 from sim_bridge.scenario.scenario import ScenarioConfiguration
 from sim_bridge.viewer.node.viewer_parameters import ViewerConfiguration
+from torque_safety_controller.modes import CAUSES, CHANGES
 from torque_safety_controller.node import topics as controller_topics
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.remote.moveit_parameters import MoveitConfiguration
-from torque_safety_controller.supervisor import CAUSES, CHANGES
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 from viability_bounds_pkg.node.estimator_parameters import EstimatorConfiguration
 from viability_bounds_pkg.parameter import REQUIRED, Parameter, parameter_table

@@ -8,16 +8,9 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from torque_safety_controller.command_check import ENOUGH, CommandCheck
+from torque_safety_controller.modes import CAUSES, CHANGES, Control, Goals, Mode
 from torque_safety_controller.slow_down import FALL_TIME, RISE_TIME
-from torque_safety_controller.supervisor import (
-    CAUSES,
-    CHANGES,
-    REST_PATIENCE,
-    Control,
-    Goals,
-    Mode,
-    Supervisor,
-)
+from torque_safety_controller.supervisor import REST_PATIENCE, Supervisor
 
 DT, COVERED, PAUSE = 0.01, 1, 0.2
 REST, MOVES, TAU = np.zeros(2), np.array([0.0, 0.5]), np.ones(2)

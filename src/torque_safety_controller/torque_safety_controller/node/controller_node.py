@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
@@ -16,6 +15,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from torque_safety_controller.command_check import CommandCheck
 from torque_safety_controller.handover import Handover, HandoverRefused
+from torque_safety_controller.modes import Control, Mode
 from torque_safety_controller.node.assembly import (
     configure,
     make_controller,
@@ -24,14 +24,7 @@ from torque_safety_controller.node.assembly import (
 from torque_safety_controller.node.declared import covered_row, declared_robot, longest_way
 from torque_safety_controller.node.driving import Driving
 from torque_safety_controller.node.goals import GoalSubscriber
-from torque_safety_controller.node.reports.collision_report import CollisionReport
-from torque_safety_controller.node.reports.controller_report import (
-    LEVELS,
-    Shortfall,
-    StepRecord,
-    goal_too_heavy,
-    too_weak,
-)
+from torque_safety_controller.node.reports.controller_report import ControllerReport
 from torque_safety_controller.node.reports.state_publisher import StatePublisher
 from torque_safety_controller.node.streams.joint_commands import JointCommands
 from torque_safety_controller.node.streams.limits import LimitsReader
@@ -40,9 +33,9 @@ from torque_safety_controller.node.topics import ENABLE_TORQUE, GOALS
 from torque_safety_controller.node.wrenches import WrenchSubscriber
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.qp import AccelerationRange
-from torque_safety_controller.supervisor import Control, Mode, Supervisor
+from torque_safety_controller.supervisor import Supervisor
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.messages import Arrival, Diagnostics, PeriodCheck
+from viability_bounds_pkg.ros.messages import Arrival, Diagnostics
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
@@ -83,7 +76,6 @@ class ControllerNode(ArmNode):
         )
         check = make_plausibility_check(config, declared)
         self._states = StateStream(config.joints, config.state_timeout, self._warn, check)
-        self._period = PeriodCheck(config.dt, self._warn)
         self._limits = LimitsReader(config.joints, self._warn)
         states = state_topic(config.use_estimated_states)
         alone = JOINT_COMMANDS, states, ACCELERATION_LIMITS, FT_WRENCH, *GOALS
@@ -111,10 +103,16 @@ class ControllerNode(ArmNode):
             self._on_mode,
             lambda line: self._later(self._warn, line),
         )
-        self._record = StepRecord(len(config.joints))
-        self._shortfall = Shortfall(config.joints, config.position_min, config.position_max)
-        self._collision = CollisionReport(self.get_logger(), self._controller.constraints)
-
+        self._report = ControllerReport(
+            self,
+            self._node_parameters,
+            self._controller,
+            self._supervisor,
+            self._states,
+            self._limits,
+            self._goals,
+            self._wrenches,
+        )
         self._commands = JointCommands(self, config.joints, config.ros2_control_topic)
         self._published = StatePublisher(self, self._controller, config, base, self._states)
         ENABLE_TORQUE.serve(self, self._on_enable_torque)
@@ -230,9 +228,8 @@ class ControllerNode(ArmNode):
         self._commands.torque(step.tau, stamp)
         states.mark_answered()
         supervisor.answered(step.tau, step.failure, not self._controller.lost)
-        self._record.note(step, time.monotonic() - states.message_at)
+        self._report.add(step, time.monotonic() - states.message_at)
         self._wrenches.note()
-        self._collision.note(step)
 
     # Handover
 
@@ -321,49 +318,6 @@ class ControllerNode(ArmNode):
         else:
             self.get_logger().warning(text)
         self._diagnostics.publish()
-
-    # Diagnostics
-
-    def _report(self) -> tuple[bytes, str, dict[str, Any]]:
-        self._period.compare(self._states)
-        values = self._record.values(
-            self._config.joints, self._controller, self._limits.lower, self._limits.upper
-        )
-        values |= (
-            self._collision.values()
-            | self._wrenches.values()
-            | self._supervisor.values()
-            | {
-                "integral_action": self._config.integral.integral_action,
-                "integral_lambda": self._controller.integral_gain,
-                "torque_rate_max": "clipped" if self._config.clips_torque_rates else "none",
-                "goals_pending": len(self._goals),
-                "goals_refused": self._goals.refused,
-                "states_refused": self._states.refused,
-                "limits_refused": self._limits.refused,
-            }
-        )
-        mode = self._supervisor.mode
-        level, text = LEVELS[mode], f"{mode.value}: {self._supervisor.reason}"
-        weak = too_weak(self._config.joints, self._controller)
-        weak = weak and f"the arm cannot be held where it would come to rest: {weak}"
-        heavy = goal_too_heavy(self._config.joints, self._controller)
-        heavy = heavy and f"the goal cannot be held: {heavy}"
-        troubles = (
-            self._supervisor.trouble,
-            self._collision.too_near,
-            self._wrenches.trouble,
-            weak,
-            heavy,
-        )
-        for trouble in filter(None, troubles):
-            level, text = max(level, DiagnosticStatus.WARN), f"{text}; {trouble}"
-        short = self._shortfall.look(self._controller, 1e-9 * self._states.stamp)
-        short = short if mode is Mode.TRACKING else ""
-        values["short_of_goal"] = short or "none"
-        if short:
-            text += f"; {short}"
-        return level, text, values
 
 
 def main(args: list[str] | None = None) -> int:

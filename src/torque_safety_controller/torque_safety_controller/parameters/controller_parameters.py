@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from torque_safety_controller.friction.settings import FrictionSettings
 from torque_safety_controller.integral_feedback.settings import IntegralSettings
+from torque_safety_controller.modes import CONTROLS
 from torque_safety_controller.parameters.collision_parameters import CollisionConfiguration
 from torque_safety_controller.parameters.friction_parameters import FrictionConfiguration
 from torque_safety_controller.parameters.integral_parameters import IntegralConfiguration
 from torque_safety_controller.parameters.interaction_parameters import InteractionConfiguration
 from torque_safety_controller.qp import SOLVERS
-from torque_safety_controller.supervisor import CONTROLS
 from torque_safety_controller.tasks.gains import Gains
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import (

@@ -8,10 +8,20 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.node import Node
 
 from torque_safety_controller.controller import Controller, ControlOutput
-from torque_safety_controller.supervisor import Mode
+from torque_safety_controller.modes import Mode
+from torque_safety_controller.node.goals import GoalSubscriber
+from torque_safety_controller.node.reports.collision_report import CollisionReport
+from torque_safety_controller.node.streams.limits import LimitsReader
+from torque_safety_controller.node.streams.states import StateStream
+from torque_safety_controller.node.wrenches import WrenchSubscriber
+from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
+from torque_safety_controller.supervisor import Supervisor
 from viability_bounds_pkg.recent_values import RecentValues
+from viability_bounds_pkg.ros.messages import PeriodCheck
+from viability_bounds_pkg.ros.parameters import NodeParameters
 
 LEVELS = {
     Mode.TRACKING: DiagnosticStatus.OK,
@@ -36,43 +46,77 @@ _SHORT = np.array([0.005, 0.02])
 """What counts as short of the goal, m and rad."""
 
 
-class StepRecord:
-    """Counts steps, failures and relaxations, and keeps latencies.
+class ControllerReport:
+    """Diagnostics of the controller node.
 
     Args:
-        n: number of joints.
+        node: logs.
+        parameters: with the present configuration.
+        controller: of the arm.
+        supervisor: has mode, reason and share.
+        states: as they come.
+        limits: as they come.
+        goals: waiting and refused.
+        wrenches: measured and wanted.
     """
 
-    def __init__(self, n: int) -> None:
+    def __init__(
+        self,
+        node: Node,
+        parameters: NodeParameters[ControllerConfiguration],
+        controller: Controller,
+        supervisor: Supervisor,
+        states: StateStream,
+        limits: LimitsReader,
+        goals: GoalSubscriber,
+        wrenches: WrenchSubscriber,
+    ) -> None:
+        self._parameters, self._controller, self._supervisor = parameters, controller, supervisor
+        self._states, self._limits = states, limits
+        self._goals, self._wrenches = goals, wrenches
+        config = parameters.configuration
+        self._collision = CollisionReport(node.get_logger(), controller.constraints)
+        self._shortfall = Shortfall(config.joints, config.position_min, config.position_max)
+        self._period = PeriodCheck(config.dt, node.get_logger().warning)
         self._steps = self._relaxed_steps = self._failures = 0
         self._latencies = RecentValues()
-        self._last_relaxation = np.zeros(n)
+        self._last_relaxation = np.zeros(len(config.joints))
 
-    def note(self, step: ControlOutput, latency: float) -> None:
+    def add(self, step: ControlOutput, latency: float) -> None:
         """Count a step that was answered `latency` seconds after its state came."""
         self._latencies.note(latency)
         self._steps += 1
-        if step.failure:
-            self._failures += 1
+        self._failures += bool(step.failure)
         if step.relaxation is not None and step.relaxation.max() > _SLIGHT:
             self._relaxed_steps += 1
             self._last_relaxation = step.relaxation
+        self._collision.note(step)
 
-    def values(
-        self,
-        joints: tuple[str, ...],
-        controller: Controller,
-        a_lower: np.ndarray,
-        a_upper: np.ndarray,
-    ) -> dict[str, Any]:
-        """Return what to report.
+    def __call__(self) -> tuple[bytes, str, dict[str, Any]]:
+        """Return level, message and values of the node's status."""
+        self._period.compare(self._states)
+        supervisor, controller = self._supervisor, self._controller
+        joints, mode = self._parameters.configuration.joints, supervisor.mode
+        level, text = LEVELS[mode], f"{mode.value}: {supervisor.reason}"
+        weak, heavy = too_weak(joints, controller), goal_too_heavy(joints, controller)
+        troubles = (
+            supervisor.trouble,
+            self._collision.too_near,
+            self._wrenches.trouble,
+            weak and f"the arm cannot be held where it would come to rest: {weak}",
+            heavy and f"the goal cannot be held: {heavy}",
+        )
+        for trouble in filter(None, troubles):
+            level, text = max(level, DiagnosticStatus.WARN), f"{text}; {trouble}"
+        short = self._shortfall.look(controller, 1e-9 * self._states.stamp)
+        if mode is not Mode.TRACKING:
+            short = ""
+        values = self._values() | {"short_of_goal": short or "none"}
+        return level, f"{text}; {short}" if short else text, values
 
-        Args:
-            joints: names of the n joints.
-            controller: which they are controlled by.
-            a_lower: acceleration limits of the last step, shape (n,), rad/s^2.
-            a_upper: shape (n,), rad/s^2.
-        """
+    def _values(self) -> dict[str, Any]:
+        config, controller = self._parameters.configuration, self._controller
+        joints, (a_lower, a_upper) = config.joints, self._limits.range
         a = controller.acceleration
         near = 1e-3 * (a_upper - a_lower) + 1e-6
         at_limit = (a <= a_lower + near) | (a >= a_upper - near)
@@ -88,6 +132,13 @@ class StepRecord:
             "joints_at_acceleration_limit": _named(joints, at_limit),
             "latency_p50_us": 1e6 * self._latencies.percentile(50),
             "latency_p99_us": 1e6 * self._latencies.percentile(99),
+            "integral_action": config.integral.integral_action,
+            "integral_lambda": controller.integral_gain,
+            "torque_rate_max": "clipped" if config.clips_torque_rates else "none",
+            "goals_pending": len(self._goals),
+            "goals_refused": self._goals.refused,
+            "states_refused": self._states.refused,
+            "limits_refused": self._limits.refused,
         }
         integral, friction = controller.integral, controller.friction
         if integral is not None and friction is not None:
@@ -103,6 +154,9 @@ class StepRecord:
                 "plan_torque_left": controller.safety_filter.slack,
                 "joints_too_weak_to_hold": too_weak(joints, controller) or "none",
             }
+        parts = self._collision, self._wrenches, self._supervisor
+        for part in parts:
+            values |= part.values()
         return values
 
 

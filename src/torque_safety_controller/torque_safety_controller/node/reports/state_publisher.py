@@ -12,6 +12,7 @@ from rclpy.node import Node
 from std_msgs.msg import Header, String
 
 from torque_safety_controller.controller import Controller
+from torque_safety_controller.modes import Mode
 from torque_safety_controller.node.topics import (
     CONTROLLER_MODE,
     HAND_ORIENTATION_ERROR,
@@ -19,7 +20,6 @@ from torque_safety_controller.node.topics import (
     HAND_POSITION_ERROR,
 )
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.supervisor import Mode
 from torque_safety_controller.tasks.pose_task import pose_difference
 from viability_bounds_pkg.ros.messages import JointStateReader, pose_message
 

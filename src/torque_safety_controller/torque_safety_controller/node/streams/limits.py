@@ -21,15 +21,14 @@ class LimitsReader:
         warn: told in words when a message is dropped for a reason for the first time.
 
     Attributes:
-        lower, upper: of the last accepted message, shape (n,), rad/s^2.
+        range: of the last accepted message, shape (n,) each, rad/s^2.
         stamp: of the state that they belong to, ns.
         refused: how many messages were dropped, by reason.
     """
 
     def __init__(self, joints: Sequence[str], warn: Callable[[str], object] | None = None) -> None:
         self._warn = warn
-        self.lower = np.zeros(len(joints))
-        self.upper = np.zeros(len(joints))
+        self.range = AccelerationRange(np.zeros(len(joints)), np.zeros(len(joints)))
         self.stamp = -1
         self.refused: Counter[str] = Counter()
         self._joints = list(joints)
@@ -48,16 +47,12 @@ class LimitsReader:
                 return self._refuse("missing joint", f": there is no '{missing}'")
             index = [where[joint] for joint in self._joints]
             lower, upper = lower[index], upper[index]
-        if fault := AccelerationRange(lower, upper).fault:
+        limits = AccelerationRange(lower, upper)
+        if fault := limits.fault:
             return self._refuse(fault)
-        self.lower, self.upper = lower, upper
+        self.range = limits
         self.stamp = stamp_to_ns(message.header.stamp)
         return True
-
-    @property
-    def range(self) -> AccelerationRange:
-        """Those of the last accepted message."""
-        return AccelerationRange(self.lower, self.upper)
 
     def _refuse(self, reason: str, detail: str = "") -> bool:
         self.refused[reason] += 1
