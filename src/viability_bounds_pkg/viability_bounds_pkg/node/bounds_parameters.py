@@ -18,7 +18,6 @@ from viability_bounds_pkg.parameter import (
     NEGATIVE,
     POSITIVE,
     Range,
-    above,
     group,
     joint_amounts,
     joint_numbers,
@@ -104,14 +103,6 @@ class BoundsConfiguration(VelocityEstimation, StateSource, ControlRate, LimitedR
         default="exact",
         live=True,
         choices=METHODS,
-    )
-    damper_influence: float = number(
-        "for method damper: distance to a limit from which on it acts, rad",
-        above(0.0, 10.0),
-        default=0.2,
-    )
-    damper_gain: float = number(
-        "for method damper: speed allowed there, rad/s", above(0.0, 1e3), default=1.0
     )
     state_timeout: float = timeout(
         "silence after which older stamps are accepted again, s", default=0.5
@@ -202,9 +193,7 @@ def make_bounds(config: BoundsConfiguration) -> Bounds:
     """
     if config.method == "exact":
         return make_solver(config).bounds
-    own = {"influence": config.damper_influence, "gain": config.damper_gain}
-    settings = own if config.method == "damper" else {}
-    return partial(BASELINES[config.method], limits=config.limits, dt=config.horizon, **settings)
+    return partial(BASELINES[config.method], limits=config.limits, dt=config.horizon)
 
 
 def make_plausibility_check(config: BoundsConfiguration) -> PlausibilityCheck | None:
