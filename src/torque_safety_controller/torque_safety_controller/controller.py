@@ -383,7 +383,7 @@ class Controller:
     def _look_ahead(
         self, bounds: AccelerationRange, additional: Array | None, disturbance: Array | None
     ) -> LinearConstraints | None:
-        """Let the filter look; return its constraints on the commanded accelerations."""
+        """Prepare the filter; return its constraints on the commanded accelerations."""
         if self.safety_filter is None:
             return None
         robot = self.robot
