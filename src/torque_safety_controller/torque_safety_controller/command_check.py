@@ -63,8 +63,9 @@ class CommandCheck:
         """
         if self._count == 0:
             return True
-        nearest = np.clip(effort, self._sent.min(axis=0), self._sent.max(axis=0))
-        if bool((np.abs(effort - nearest) <= self._tolerance).all()):
+        low, high = np.minimum.reduce(self._sent), np.maximum.reduce(self._sent)
+        beyond = np.maximum(low - effort, effort - high) - self._tolerance
+        if beyond.max() <= 0.0:  # not so where it is NaN
             self._agreed += 1
             self._in_row = 0
             return True

@@ -6,7 +6,11 @@ from types import SimpleNamespace
 import pytest
 from rclpy.context import Context
 
-from torque_safety_controller.node.declared import covered_row, declared_robot, longest_way
+from torque_safety_controller.node.declared import (
+    commands_in_flight,
+    covered_misses,
+    declared_robot,
+)
 from viability_bounds_pkg.ros.given_parameters import note_arguments
 from viability_bounds_pkg.testing.ros_harness import config_folder
 
@@ -31,9 +35,9 @@ def declared(*words):
 def test_late_and_missed_commands_are_within_reach(given, row, way):
     rules = [word for rule in given for word in ("-p", rule)]
     robot = declared("--params-file", str(config_folder() / "panda.yaml"), *rules)
-    assert (covered_row(robot), longest_way(robot)) == (row, way)
+    assert (covered_misses(robot), commands_in_flight(robot)) == (row, way)
 
 
 def test_without_a_file_little_is_declared():
     assert declared() is None
-    assert (covered_row(None), longest_way(None)) == (1, 4)
+    assert (covered_misses(None), commands_in_flight(None)) == (1, 4)

@@ -21,7 +21,11 @@ from torque_safety_controller.node.assembly import (
     make_controller,
     make_plausibility_check,
 )
-from torque_safety_controller.node.declared import covered_row, declared_robot, longest_way
+from torque_safety_controller.node.declared import (
+    commands_in_flight,
+    covered_misses,
+    declared_robot,
+)
 from torque_safety_controller.node.driving import Driving
 from torque_safety_controller.node.goals import GoalSubscriber
 from torque_safety_controller.node.reports.controller_report import ControllerReport
@@ -93,11 +97,11 @@ class ControllerNode(ArmNode):
         commands = None
         if config.effort_tolerance > 0.0:
             tolerance = config.effort_tolerance * config.torque_max
-            commands = CommandCheck(tolerance, longest_way(declared))
+            commands = CommandCheck(tolerance, commands_in_flight(declared))
         self._supervisor = Supervisor(
             config.dt,
             config.start_control,
-            covered_row(declared),
+            covered_misses(declared),
             config.bounds_timeout,
             commands,
             self._on_mode,
@@ -229,7 +233,7 @@ class ControllerNode(ArmNode):
         states.mark_answered()
         supervisor.answered(step.tau, step.failure, not self._controller.lost)
         self._report.add(step, time.monotonic() - states.message_at)
-        self._wrenches.note()
+        self._wrenches.log_changes()
 
     # Handover
 

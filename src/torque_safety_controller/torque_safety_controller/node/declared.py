@@ -23,16 +23,16 @@ def declared_robot(node: Node) -> BoundsConfiguration | None:
         return None
 
 
-def longest_way(robot: BoundsConfiguration | None) -> int:
+def commands_in_flight(robot: BoundsConfiguration | None) -> int:
     """Return how many of the last commands may act at a state, by what is declared.
 
     Late ones and missed periods count; two are added for what nobody declares.
     """
     late = 0 if robot is None else robot.declared.delay + robot.declared.delay_jitter
-    return 3 + late + covered_row(robot)
+    return 3 + late + covered_misses(robot)
 
 
-def covered_row(robot: BoundsConfiguration | None) -> int:
+def covered_misses(robot: BoundsConfiguration | None) -> int:
     """Return how many missed periods in a row the bounds cover."""
     if robot is None:
         return UNDECLARED

@@ -128,7 +128,7 @@ class WrenchSubscriber:
         response.message = f"bias: {np.array2string(bias, precision=3)}"
         return response
 
-    def note(self) -> None:
+    def log_changes(self) -> None:
         """Log a change of the compliance state."""
         interaction = self._interaction
         if interaction is None or interaction.changes == self._changes:

@@ -50,8 +50,8 @@ class CollisionReport:
             if pairs:
                 logger.warning(f"not kept apart, {meaning}: {', '.join(pairs)}")
 
-    def note(self, step: ControlOutput) -> None:
-        """Look at the distances in a step."""
+    def add(self, step: ControlOutput) -> None:
+        """Count a step, and log pairs that are too near."""
         avoidance = self._avoidance
         if avoidance is None:
             return

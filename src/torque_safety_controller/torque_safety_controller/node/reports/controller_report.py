@@ -90,7 +90,7 @@ class ControllerReport:
         if step.relaxation is not None and step.relaxation.max() > _SLIGHT:
             self._relaxed_steps += 1
             self._last_relaxation = step.relaxation
-        self._collision.note(step)
+        self._collision.add(step)
 
     def __call__(self) -> tuple[bytes, str, dict[str, Any]]:
         """Return level, message and values of the node's status."""
@@ -108,7 +108,7 @@ class ControllerReport:
         )
         for trouble in filter(None, troubles):
             level, text = max(level, DiagnosticStatus.WARN), f"{text}; {trouble}"
-        short = self._shortfall.look(controller, 1e-9 * self._states.stamp)
+        short = self._shortfall.text(controller, 1e-9 * self._states.stamp)
         if mode is not Mode.TRACKING:
             short = ""
         values = self._values() | {"short_of_goal": short or "none"}
@@ -200,7 +200,7 @@ class Shortfall:
         self._since = 0.0
         self._least = np.zeros(2)
 
-    def look(self, controller: Controller, now: float) -> str:
+    def text(self, controller: Controller, now: float) -> str:
         """Return by how much, once it has come no nearer for `_STANDS`; else nothing.
 
         Args:
