@@ -10,15 +10,21 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import numpy as np
+import yaml
 from direct import DirectLoop
 
+from sim_bridge.bullet.obstacles import Obstacle
 from viability_bounds_pkg.exceptions import ArmSafetyError
 
 CONFIG = Path(__file__).resolve().parent.parent / "config"
 
+TABLE = Obstacle("table", "box", (0.2, 0.6, 0.1), (0.30702, 0.0, 0.42237), (0.0, 0.0, 0.0, 1.0))
+"""5 mm below Panda's fingertips at its start."""
+
 
 def main() -> None:
-    """Play a few steps of each robot."""
+    """Play a few steps of each robot, one of them beside a wall, and touch something."""
     for path in sorted(CONFIG.glob("*.yaml")):
         try:
             loop = DirectLoop(path.stem)
@@ -27,6 +33,18 @@ def main() -> None:
                 loop.run(2.0 * loop.dt)
         except ArmSafetyError as error:  # a file of the user's; its nodes will say so, too
             print(f"setup: nothing is compiled for {path.name}: {error}", file=sys.stderr)
+    (wall,) = yaml.safe_load((CONFIG / "obstacles" / "panda_wall.yaml").read_text()).values()
+    loop = DirectLoop("panda", wall["ros__parameters"])
+    loop.run(2.0 * loop.dt)
+    touch()
+
+
+def touch() -> None:
+    """Let an arm without torque fall on a table: friction of contacts is compiled at the first."""
+    loop = DirectLoop("panda")
+    loop.robot.obstacles.add(TABLE)
+    for _ in range(100):
+        loop.robot.step(np.zeros(loop.model.nv), loop.config.substeps)
 
 
 if __name__ == "__main__":
