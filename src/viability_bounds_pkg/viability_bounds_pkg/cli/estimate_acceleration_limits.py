@@ -230,9 +230,9 @@ def _report_search(names: Sequence[str], worst: WorstCases) -> None:
             q, v = worst.q[side, j], worst.v[side, j]
             print(f"  worst {limit} at q = {_vector(q)}, v = {_vector(v)}")
         print("  after N " + "".join(f"{entry.evaluations:>10}" for entry in history))
-        for side in ("a_min", "a_max"):
-            row = "".join(f"{getattr(entry, side)[j]:>10.4g}" for entry in history)
-            print(f"  {side}   {row}")
+        for limit in ("a_min", "a_max"):
+            row = "".join(f"{getattr(entry, limit)[j]:>10.4g}" for entry in history)
+            print(f"  {limit}   {row}")
     print(f"{worst.evaluations} evaluations of the dynamics\n")
 
 
