@@ -78,7 +78,7 @@ SPOILT = {
 def test_what_cannot_be_is_refused_and_what_comes_afterwards_is_accepted(name, h):
     spoil, reason, within = SPOILT[name]
     # Of an arm that stands to the last bit the position may have frozen, or the velocity lied.
-    longest = FORGETTING if name == "a biased velocity" else 2.0 * WINDOW
+    longest = 1.2 * FORGETTING if name == "a biased velocity" else 2.0 * WINDOW
     refused = play(make_check(h), spoil, h, last=2.1 + longest)
     first, why = refused[0]
     assert why == reason and 1.0 - 1e-9 <= first <= 1.0 + within + 2.0 * h

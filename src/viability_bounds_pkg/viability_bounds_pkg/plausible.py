@@ -138,7 +138,8 @@ class PlausibilityCheck:
             self._velocity = VELOCITY_ERROR * fastest + velocity_error
         # An impact, at any moment of a period, changes a speed from one limit to the other.
         self._drift = self._position + WINDOW * self._velocity + 2.0 * dt * fastest
-        # A robot may repeat a position once, and a filter let velocities outlast a hit.
+        # A robot may repeat a position once, and a filter let velocities fade after a hit.
+        self._way_of_same = self._position + dt * fastest
         self._way = self._position + max(dt, FILTER) * fastest
         self._dt = dt
         self.reset()
@@ -227,7 +228,7 @@ class PlausibilityCheck:
             mean = v = v0 if same else v0 + SMOOTHING * (moved / h - v0)
         way = self._way_since(past, same, h, mean)
         jumps = np.abs(moved) > self._position + h * fastest
-        frozen = np.abs(way) > self._way
+        frozen = np.abs(way) > np.where(v == v0, self._way_of_same, self._way)
         room = self._drift if unseen <= 0.0 else self._drift + unseen * self._fastest
         contradicts = np.abs(drift) > room
         if not (jumps | frozen | contradicts).any():
