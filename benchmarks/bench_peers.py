@@ -21,7 +21,9 @@ import pinocchio as pin
 from live_robot import load
 from other_environment import TSID, Arrays, worker
 
-from torque_safety_controller.controller import Controller, Gains
+from torque_safety_controller.controller import Controller
+from torque_safety_controller.parts.goals import Goals
+from torque_safety_controller.parts.joint_bounds import JointBounds
 from torque_safety_controller.qp import (
     AccelerationRange,
     DaqpSolver,
@@ -32,7 +34,7 @@ from torque_safety_controller.qp import (
     Status,
 )
 from torque_safety_controller.robot_model import RobotModel
-from torque_safety_controller.tasks.goals import Goals
+from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.pose_task import PoseTask
 from torque_safety_controller.tasks.posture_task import PostureTask
 from torque_safety_controller.tasks.task import Task
@@ -94,7 +96,7 @@ class Ours:
             posture_weight=POSTURE_WEIGHT,
         )
         robot = RobotModel(self.model, FRAME, 0.0 if as_tsid else DT)
-        self.controller = Controller(robot, TAU_MAX, gains)
+        self.controller = Controller(robot, [Goals(robot.n, gains), JointBounds()], TAU_MAX)
         if as_tsid:
             self.controller.goals = TsidGoals(n)
             self.controller._qp = InverseDynamicsQP(n, REGULARISATION)
@@ -103,8 +105,8 @@ class Ours:
 
     def set_goal(self, pose: np.ndarray, posture: np.ndarray) -> None:
         """Set goals: rotation and translation, shape (3, 4), and positions, shape (7,)."""
-        self.controller.set_pose_goal(pin.SE3(pose[:, :3], pose[:, 3]))
-        self.controller.set_posture_goal(posture)
+        self.controller.goals.set_pose(pin.SE3(pose[:, :3], pose[:, 3]))
+        self.controller.goals.set_posture(posture)
 
     def step(self, q: np.ndarray, v: np.ndarray) -> Any:
         """Return the output for a state, bounds included."""

@@ -17,7 +17,9 @@ import pinocchio as pin
 import yaml
 
 from torque_safety_controller.contact.contacts import Contacts, FrictionContact
-from torque_safety_controller.controller import Controller, Gains
+from torque_safety_controller.controller import Controller
+from torque_safety_controller.parts.goals import Goals
+from torque_safety_controller.parts.joint_bounds import JointBounds
 from torque_safety_controller.qp import (
     SOLVERS,
     AccelerationRange,
@@ -25,6 +27,7 @@ from torque_safety_controller.qp import (
     LinearConstraints,
 )
 from torque_safety_controller.robot_model import RobotModel
+from torque_safety_controller.tasks.gains import Gains
 from viability_bounds_pkg.robot_description import build_model, read_urdf
 from viability_bounds_pkg.state import State
 
@@ -142,10 +145,12 @@ def main() -> None:
     def make(solver: str) -> Controller:
         robot = RobotModel(model, values["end_effector_frame"], 1.0 / values["rate_hz"])
         gains = Gains(pose_kp=10.0, pose_kd=6.3, posture_kp=10.0, posture_kd=6.3)
-        controller = Controller(robot, np.array(values["torque_max"]), gains, solver=solver)
+        controller = Controller(
+            robot, [Goals(robot.n, gains), JointBounds()], values["torque_max"], solver=solver
+        )
         controller.reset(state.q)
         robot.update(State(state.q + 0.1, state.v), state.v)
-        controller.set_pose_goal(robot.pose.copy())
+        controller.goals.set_pose(robot.pose.copy())
         return controller
 
     def off_and_on(controller: Controller) -> Callable[[], Any]:

@@ -12,9 +12,12 @@ import sys
 import numpy as np
 import pinocchio as pin
 
-from torque_safety_controller.controller import Controller, Gains
+from torque_safety_controller.controller import Controller
+from torque_safety_controller.parts.goals import Goals
+from torque_safety_controller.parts.joint_bounds import JointBounds
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.robot_model import RobotModel
+from torque_safety_controller.tasks.gains import Gains
 from viability_bounds_pkg.acceleration_limits import estimate_acceleration_limits
 from viability_bounds_pkg.hold_error import discretisation_margin
 from viability_bounds_pkg.joint_limits import JointLimits
@@ -40,10 +43,11 @@ def main() -> int:
     margins = torque_margins(1.1 * jerk, DT)
     solver = BoundsSolver(tightened(limits, margins), 2 * DT, margins.acceleration, period=DT)
     gains = Gains(pose_kp=100.0, posture_kp=10.0, posture_kd=6.0)
-    controller = Controller(RobotModel(model, "effector_body", DT), tau_max, gains)
+    robot = RobotModel(model, "effector_body", DT)
+    controller = Controller(robot, [Goals(robot.n, gains), JointBounds()], tau_max)
     q, v, data = np.full(n, 0.3), np.zeros(n), model.createData()
     controller.reset(q)
-    controller.set_pose_goal(pin.SE3(np.eye(3), np.array([0.0, -3.0, 0.0])))
+    controller.goals.set_pose(pin.SE3(np.eye(3), np.array([0.0, -3.0, 0.0])))
     position = speed = torque = -np.inf
     for _ in range(round(3.0 / DT)):
         bounds = solver.bounds(q, v)

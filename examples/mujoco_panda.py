@@ -17,9 +17,12 @@ import mujoco
 import numpy as np
 import pinocchio as pin
 
-from torque_safety_controller.controller import Controller, Gains
+from torque_safety_controller.controller import Controller
+from torque_safety_controller.parts.goals import Goals
+from torque_safety_controller.parts.joint_bounds import JointBounds
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.robot_model import RobotModel
+from torque_safety_controller.tasks.gains import Gains
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.robot_configuration import TaskFrames, load_model
@@ -77,7 +80,7 @@ def drive(method: str = "exact", duration: float = DURATION, seed: int = 0) -> E
     dt, tau_max, v_max = config.dt, config.torque_max, config.velocity_max
     low, high = config.position_min, config.position_max
     robot = RobotModel(model, frames.end_effector_frame, dt)
-    controller = Controller(robot, tau_max, gains)
+    controller = Controller(robot, [Goals(robot.n, gains), JointBounds()], tau_max)
     arm = mujoco_arm(config.read_urdf(), config.joints, dt / STEPS)
     data, rng = mujoco.MjData(arm), np.random.default_rng(seed)
     data.qpos[:] = 0.5 * (low + high)
@@ -87,7 +90,7 @@ def drive(method: str = "exact", duration: float = DURATION, seed: int = 0) -> E
     for k in range(round(duration / dt)):
         if k % round(CHANGE / dt) == 0:
             goal.update(State(rng.uniform(low, high), rest), rest)
-            controller.set_pose_goal(goal.pose.copy())
+            controller.goals.set_pose(goal.pose.copy())
         q, v = data.qpos.copy(), data.qvel.copy()
         limits = bounds(q, v)
         tau = controller.step(State(q, v), AccelerationRange(limits.lower, limits.upper)).tau

@@ -18,10 +18,14 @@ from chain import load_node_values
 from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.nodes.bullet_parameters import BulletConfiguration, make_robot
 from sim_bridge.nodes.ft_sensor import ForceTorqueReading
-from torque_safety_controller.controller import ControlOutput
+from torque_safety_controller.contact.interaction import Interaction
+from torque_safety_controller.integral_feedback.action import FadingTorque
 from torque_safety_controller.node import assembly
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
+from torque_safety_controller.parts.friction import Friction
+from torque_safety_controller.parts.integral import Integral
 from torque_safety_controller.qp import AccelerationRange
+from torque_safety_controller.step import Step
 from torque_safety_controller.supervisor import Order
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
 from viability_bounds_pkg.parameter import read
@@ -82,8 +86,8 @@ class DirectLoop:
         )
         self.sensing = True
         self._sensor = None
-        interaction = self.controller.interaction
-        if self.robot.sensor and interaction is not None and interaction.sensor is not None:
+        interaction = self.controller.find(Interaction)
+        if self.robot.sensor and interaction is not None:
             self._sensor = ForceTorqueReading(self.robot.sensor, config.sensor)
         self.samples: list[Sample] = []
         self.t = 0.0
@@ -101,11 +105,11 @@ class DirectLoop:
     def change(self, **parameters: Any) -> None:
         """Change live parameters of the controller, as a running node would."""
         self._changed |= parameters
-        assembly.configure(self.controller, self._controller_configuration())
+        self.controller.configure(self._controller_configuration())
 
     def change_friction(self, **settings: Any) -> None:
         """Change settings of the friction compensation, also those that are no parameters."""
-        friction = self.controller.friction
+        friction = self.controller.find(Friction).compensation
         friction.settings = replace(friction.settings, **settings)
 
     @property
@@ -115,9 +119,14 @@ class DirectLoop:
 
     def unlimit_integral(self) -> None:
         """Take the budgets of the integral action away, so that no anti-windup acts."""
-        integral = self.controller.integral
+        integral = self.integral
         budget = np.full(len(integral.settings.budget), np.inf)
         integral.settings = replace(integral.settings, budget=budget)
+
+    @property
+    def integral(self) -> FadingTorque:
+        """Integral action of the controller."""
+        return self.controller.find(Integral).action
 
     @property
     def dt(self) -> float:
@@ -128,10 +137,10 @@ class DirectLoop:
         """Make where the arm is its goal, and forget the past."""
         q = self.robot.state().q
         self.controller.reset(q)
-        self.controller.set_posture_goal(q)
-        self.controller.set_pose_goal(self.pose())
+        self.controller.goals.set_posture(q)
+        self.controller.goals.set_pose(self.pose())
         for k, hand in enumerate(self.controller.robot.others):
-            self.controller.set_other_pose_goal(k, self.pose(hand.frame))
+            self.controller.goals.set_other_pose(k, self.pose(hand.frame))
 
     def pose(self, frame: str = "") -> pin.SE3:
         """Return the true pose of a frame, the end effector if empty, in the URDF's root frame."""
@@ -155,11 +164,11 @@ class DirectLoop:
             self.step()
         return tuple(self.samples[first:])
 
-    def step(self, order: Order | None = None) -> ControlOutput:
+    def step(self, order: Order | None = None) -> Step:
         """Play one control step under torque control, by an order of the supervisor."""
         q, v, _ = self.robot.state()
         if self._sensor is not None and self.sensing:
-            self.controller.interaction.sensor.receive(self._sensor.read())
+            self.controller.find(Interaction).sensor.receive(self._sensor.read())
         bounds = self.bounds(q, v)
         limits = AccelerationRange(bounds.lower, bounds.upper)
         step = self.controller.step(State(q, v), limits, order)
@@ -195,9 +204,7 @@ class DirectLoop:
         """Prepare torque control in a step that is still the drives'."""
         q, v, tau = self.robot.state()
         bounds = self.bounds(q, v)
-        self.controller.bumpless_transfer(
-            State(q, v), AccelerationRange(bounds.lower, bounds.upper), tau
-        )
+        self.controller.resume(State(q, v), AccelerationRange(bounds.lower, bounds.upper), tau)
         self.move(q_des)
 
     def _record(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> None:
@@ -207,7 +214,7 @@ class DirectLoop:
                 q,
                 v,
                 tau.copy(),
-                self.controller.integral.last.copy(),
+                self.integral.last.copy(),
                 self.controller.goals.error(self.controller.robot.pose),
             )
         )

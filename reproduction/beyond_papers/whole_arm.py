@@ -28,6 +28,7 @@ from direct import DirectLoop, column
 from figure import Figure, table, verdict
 from pieces import in_pieces
 
+from torque_safety_controller.parts.safety_filter import WholeArm
 from viability_bounds_pkg.whole_arm.braking_plan import PlanLimits, PlanTorques, braking_periods
 from viability_bounds_pkg.whole_arm.safety_filter import RESERVE
 
@@ -130,12 +131,12 @@ class Errors:
     def __init__(self, loop: DirectLoop, goals: str, goal: np.ndarray) -> None:
         self._loop, self._goal = loop, goal if goals == "posture" else None
         if goals == "posture":
-            loop.controller.set_posture_goal(goal)
+            loop.controller.goals.set_posture(goal)
         else:
             data = loop.model.createData()
             pin.framesForwardKinematics(loop.model, data, goal)
             frame = loop.model.getFrameId(loop.controller.robot.frame)
-            loop.controller.set_pose_goal(data.oMf[frame].copy())
+            loop.controller.goals.set_pose(data.oMf[frame].copy())
 
     def now(self) -> np.ndarray:
         """Return the largest of a joint, rad; or those of the hand, m and rad."""
@@ -180,7 +181,7 @@ def play(name: str, seed: int, limit: float, duration: float = 60.0) -> dict[str
             loop.change(**own)
             goal = random_goal(loop, rng, 0.5 if goals == "posture" else 0.0)
             times[goals].append(arrive(loop, goals, goal, limit))
-    monitor, keeper = loop.robot.monitor, loop.controller.safety_filter
+    monitor, keeper = loop.robot.monitor, loop.controller.find(WholeArm).filter
     return {
         "position": float(monitor.max_position_violation.max()),
         "speed": float(monitor.max_velocity_violation.max()),
@@ -260,7 +261,7 @@ def shoulder(axis: plt.Axes, seed: int = 4) -> None:
         for _ in range(10):
             ends = np.where(rng.random(low.size) < 0.5, low, high)
             goal = np.where(rng.random(low.size) < 0.5, ends, rng.uniform(low, high))
-            loop.controller.set_posture_goal(goal)
+            loop.controller.goals.set_posture(goal)
             samples = loop.run(3.0)
         del samples
         t = np.arange(len(loop.samples)) * loop.dt

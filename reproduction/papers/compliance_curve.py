@@ -107,7 +107,7 @@ def draw(
         while due and t - begin >= due[0][0] - 0.5 * loop.dt:
             loop.change(integral_action=due.pop(0)[1])
         pose, twist, twist_rate = trajectory.sample(t - begin)
-        loop.controller.set_pose_goal(pose, twist, twist_rate)
+        loop.controller.goals.set_pose(pose, twist, twist_rate)
         goals.append(pose.translation)
         contacts = loop.robot.obstacles.contacts() if poles else []
         forces.append(sum(np.linalg.norm(contact.force) for contact in contacts))

@@ -15,6 +15,7 @@ from direct import DirectLoop, within_limits
 from figure import Figure, verdict
 
 from sim_bridge.bullet.obstacles import Obstacle
+from torque_safety_controller.contact.interaction import Interaction
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory, TrajectoryPoint
 
 DUAL = {"integral_action": "task", "yield_threshold": [10.0, 2.0]}
@@ -98,7 +99,7 @@ def lead(
             for the controller's own.
     """
     loop = DirectLoop(ROBOT, DUAL | dict(changed or {}))
-    interaction = loop.controller.interaction
+    interaction = loop.controller.find(Interaction)
     if admittance is not None:
         gains = replace(interaction.settings.yielding_gains, kp=(admittance, admittance))
         interaction.settings = replace(interaction.settings, yielding_gains=gains)
@@ -242,7 +243,7 @@ def press(
 ) -> Pressed:
     """Let a hand find a table, press on it and slide along it."""
     loop = DirectLoop(hand.robot, hand.changed)
-    interaction = loop.controller.interaction
+    interaction = loop.controller.find(Interaction)
     start = loop.pose()
     x, y, z = start.translation
     table = (x, y, z - hand.reach - GAP - 0.05)
@@ -264,7 +265,7 @@ def press(
         if abs(t - TARE - 0.1) < 0.5 * loop.dt:
             interaction.set_target(np.array([0.0, 0.0, hand.axis * FORCE, 0.0, 0.0, 0.0]))
         if t >= slide[0]:
-            loop.controller.set_pose_goal(*way.sample(t - slide[0]))
+            loop.controller.goals.set_pose(*way.sample(t - slide[0]))
         force = sum(
             (np.asarray(contact.force) for contact in loop.robot.obstacles.contacts()), np.zeros(3)
         )

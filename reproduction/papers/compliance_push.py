@@ -13,6 +13,8 @@ import pinocchio as pin
 from direct import DirectLoop, Sample, column, hand_errors, within_limits
 from figure import Figure
 
+from torque_safety_controller.parts.friction import Friction
+
 ROBOT = "talos_left_arm"
 HAND = "wrist_left_ft_tool_link"
 ELBOW = "arm_left_4_link"  # its origin is the elbow
@@ -87,7 +89,7 @@ def weakest_direction(loop: DirectLoop, link: str) -> tuple[np.ndarray, float]:
     null = np.linalg.svd(J)[2][6:].T
     directions = null @ np.random.default_rng(0).normal(size=(null.shape[1], 100_000))
     # The compensation's model is the friction as identified.
-    stiction = loop.controller.friction.settings.model.static
+    stiction = loop.controller.find(Friction).compensation.settings.model.static
     motion = J_link[:3] @ directions / (np.abs(directions).T @ stiction)
     sizes = np.linalg.norm(motion, axis=0)
     best = sizes.argmax()

@@ -20,6 +20,8 @@ from chain import ROOT
 from direct import DirectLoop, column, distance, hand_places
 from figure import Figure, reproduce, table
 
+from torque_safety_controller.contact.interaction import Interaction
+
 ROBOT = "talos_left_arm"
 ELBOW = 5
 HAND = "wrist_left_ft_tool_link"
@@ -46,7 +48,7 @@ def make_loop(changed: dict[str, Any]) -> DirectLoop:
 
 def goal(loop: DirectLoop, start: pin.SE3, offset: tuple[float, ...]) -> None:
     """Send the hand to a place near `start`, without turning it."""
-    loop.controller.set_pose_goal(pin.SE3(start.rotation, start.translation + np.array(offset)))
+    loop.controller.goals.set_pose(pin.SE3(start.rotation, start.translation + np.array(offset)))
 
 
 def figure_3() -> Figure:
@@ -66,7 +68,7 @@ def _handover(figure: Figure, name: str, changed: dict[str, Any]) -> plt.Figure:
         q[ELBOW] = loop.config.start_positions[ELBOW] + 0.1 * min(1.0, k / 1000)
         loop.move(q)
     before = len(loop.samples)
-    loop.bumpless_transfer(q)
+    loop.resume(q)
     loop.run(1.5)
     samples = tuple(loop.samples[before - 500 :])
     tau, additional = column(samples, "tau"), column(samples, "additional")
@@ -124,7 +126,7 @@ def push(
         after: how long it is watched when it is released, s.
     """
     loop = make_loop(changed)
-    interaction = loop.controller.interaction
+    interaction = loop.controller.find(Interaction)
     start = loop.pose()
     loop.run(0.1)
     interaction.sensor.tare()

@@ -16,6 +16,7 @@ from std_msgs.msg import Float64MultiArray
 
 from sim_bridge.nodes.bullet_node import BulletNode
 from sim_bridge.nodes.scenario_node import ScenarioNode, ScenarioRefused, play
+from torque_safety_controller.contact.interaction import Interaction
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.ros.claim import Claim, TakenError
@@ -201,7 +202,7 @@ def test_wrenches_of_several_nodes_count_as_silence(ros):
         lambda: node._wrenches.refused["several nodes publish '/ft_wrench'"] > 2,
         each=lambda: theirs.publish(FT_WRENCH.message()),
     )
-    assert not node._controller.interaction.sensor.wrench.any()
+    assert not node._controller.find(Interaction).sensor.wrench.any()
 
 
 def test_a_topic_of_ros2_control_is_watched_where_there_is_one(ros):

@@ -10,6 +10,7 @@ from direct import DirectLoop, column
 
 from sim_bridge.scenario.events import AddObstacle, PoseGoal
 from sim_bridge.scenario.scenario import load_scenario
+from torque_safety_controller.parts.collision import Collision
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.supervisor import REST
 from viability_bounds_pkg.robot_description import load_geometry, read_urdf
@@ -73,10 +74,10 @@ def play(loop, duration, events=()):
             elif isinstance(event, PoseGoal):
                 rotation = pin.Quaternion(np.array(event.orientation)).toRotationMatrix()
                 goal = pin.SE3(rotation, np.array(event.position))
-                loop.controller.set_pose_goal(goal)
+                loop.controller.goals.set_pose(goal)
         loop.step()
-        if loop.controller.constraints:
-            distances.append(loop.controller.constraints[0].closest()[0])
+        if loop.controller.find(Collision):
+            distances.append(loop.controller.find(Collision).avoidance.closest()[0])
         contacts = max(contacts, len(loop.robot.obstacles.contacts()))
     return np.array(distances), contacts
 
@@ -102,7 +103,7 @@ def test_goals_behind_obstacles_and_inside_the_arm_end_at_rest_at_the_margin():
     assert distances.min() > MARGIN + RESERVE - 1e-5
     obstacles = [e.obstacle for e in scenario.events if isinstance(e, AddObstacle)]
     meshes = Meshes(loop.model, read_urdf(URDF), obstacles)
-    pairs = set(loop.controller.constraints[0].model.names)
+    pairs = set(loop.controller.find(Collision).avoidance.model.names)
     q, v = column(loop.samples, "q"), column(loop.samples, "v")
     nearest = np.argsort(distances)[:: len(distances) // 40]
     assert min(meshes.least(q[k], pairs) for k in nearest) > MARGIN
@@ -176,7 +177,7 @@ def test_a_push_into_the_wall_is_countered():
 
 def rows_of(loop, q, v, bounds):
     """The rows of a state, as the controller gets them, in their own scale."""
-    found = loop.controller.constraints[0].rows(q, v, -bounds, bounds)
+    found = loop.controller.find(Collision).avoidance.rows(q, v, -bounds, bounds)
     return found.G.copy(), found.lower.copy()
 
 
@@ -187,18 +188,18 @@ def test_every_way_to_solve_has_the_rows_and_none_has_a_nan():
     # The hand 5 mm before the limit of its distance to the wall, on its way in.
     play(loop, 1.0, [PoseGoal(0.0, (0.75, 0.0, 0.45), (1.0, 0.0, 0.0, 0.0))])
     q = loop.robot.state().q
-    distance = controller.constraints[0].closest()[0]
+    distance = controller.find(Collision).avoidance.closest()[0]
     assert distance < 0.03
     v, wide = np.array([0.0, 0.3, 0.0, 0.3, 0.0, 0.0, 0.0]), np.full(7, 15.0)
     G, lower = rows_of(loop, q, v, wide)
     assert len(lower) > 0
-    assert (G @ (-controller.gains.hold_kd * v) < lower).any(), "damping alone would do"
+    assert (G @ (-controller.hold_kd * v) < lower).any(), "damping alone would do"
     controller.reset(q)
     for order in (REST, None):
         step = controller.step(State(q, v), AccelerationRange(-wide, wide), order)
         assert not step.failure
         assert (G @ step.a >= lower - 1e-6).all()
-    step = controller.bumpless_transfer(State(q, v), AccelerationRange(-wide, wide), np.zeros(7))
+    step = controller.resume(State(q, v), AccelerationRange(-wide, wide), np.zeros(7))
     assert not step.failure
     assert (G @ step.a >= lower - 1e-6).all()
     infinite = np.full(7, np.inf)

@@ -165,7 +165,7 @@ def begin(loop, event):
     match event:
         case PoseGoal():
             rotation = pin.Quaternion(np.array(event.orientation)).toRotationMatrix()
-            loop.controller.set_pose_goal(pin.SE3(rotation, np.array(event.position)))
+            loop.controller.goals.set_pose(pin.SE3(rotation, np.array(event.position)))
         case Push():
             loop.robot.apply_wrench(event.link, event.force, event.torque)
         case ParameterChange():

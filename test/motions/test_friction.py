@@ -16,6 +16,7 @@ from sim_bridge.tools.record_excitation import record
 from torque_safety_controller.friction.compensation import GAIN
 from torque_safety_controller.friction.identification import friction_model, identify
 from torque_safety_controller.friction.joint_recording import Recording
+from torque_safety_controller.parts.friction import Friction
 from torque_safety_controller.tasks.gains import critical_damping
 from viability_bounds_pkg.cli.limits_file import read_robot
 from viability_bounds_pkg.parameter import read
@@ -70,7 +71,7 @@ def test_the_file_has_what_is_identified(found):
 def loop(integral, share) -> DirectLoop:
     """TALOS that believes in `share` of its friction and compensates that; 0: off."""
     made = DirectLoop(ROBOT, {"integral_action": integral})
-    model = made.controller.friction.settings.model
+    model = made.controller.find(Friction).compensation.settings.model
     believed = {f"friction_model_{name}": share * getattr(model, name) for name in MODEL}
     if share:
         made.change(friction_compensation=1.0, **believed)
@@ -82,7 +83,7 @@ def reach(made) -> tuple[float, float, float]:
     home = made.pose()
     worst = speed = 0.0
     for goal in (home * pin.SE3(np.eye(3), np.array([0.06, -0.08, 0.05])), home):
-        made.controller.set_pose_goal(goal)
+        made.controller.goals.set_pose(goal)
         last = made.run(2.5)[-300:]
         worst = max(worst, np.linalg.norm(column(last, "error")[:, :3], axis=1).max())
         speed = max(speed, np.abs(column(last, "v")).max())

@@ -73,12 +73,12 @@ def test_a_start_with_a_stretched_elbow_and_a_goal_beyond_reach(mode):
     assert np.linalg.svd(loop.controller.robot.J)[1][-1] < 0.05
     start = loop.pose()
     away = start.translation / np.linalg.norm(start.translation)
-    loop.controller.set_pose_goal(pin.SE3(start.rotation, start.translation + 0.2 * away))
+    loop.controller.goals.set_pose(pin.SE3(start.rotation, start.translation + 0.2 * away))
     samples = loop.run(2.5)
     last = np.array([sample.error[:3] for sample in samples[-200:]])
     assert np.ptp(last, axis=0).max() < 0.005
     back = start.translation - 0.1 * away
-    loop.controller.set_pose_goal(pin.SE3(start.rotation, back))
+    loop.controller.goals.set_pose(pin.SE3(start.rotation, back))
     loop.run(2.5)
     assert np.linalg.norm(loop.pose().translation - back) < 0.02
     assert within_limits(loop)

@@ -18,6 +18,7 @@ from paper1_integral import (
     push,
 )
 
+from torque_safety_controller.parts.integral import Integral
 from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.state import State
 
@@ -67,7 +68,7 @@ def test_a_pause_of_the_robot_does_not_kick():
     step = loop.controller.step(
         State(q + 0.05, v + 0.2), AccelerationRange(bounds.a_min, bounds.a_max), elapsed=3.0
     )
-    integral = loop.controller.integral.last
+    integral = loop.controller.find(Integral).action.last
     assert np.isfinite(step.tau).all()
     jump = np.abs(integral - before.additional) / loop.config.torque_max
     assert jump.max() < 1e-2
@@ -79,7 +80,7 @@ def test_the_handover_does_not_jolt():
     for k in range(1200):
         q[5] = loop.config.start_positions[5] + 0.1 * min(1.0, k / 1000)
         loop.move(q)
-    loop.bumpless_transfer(q)
+    loop.resume(q)
     loop.run(0.2)
     samples = tuple(loop.samples[1000:])
     jumps = np.abs(np.diff(column(samples, "tau"), axis=0)) / loop.config.torque_max

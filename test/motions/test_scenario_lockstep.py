@@ -74,7 +74,7 @@ def play_directly():
             on = round(begin / loop.dt) <= k < round(end / loop.dt)
             loop.robot.apply_wrench(link, force if on else np.zeros(3), np.zeros(3))
         if k >= round(BEGIN / loop.dt):
-            loop.controller.set_pose_goal(*trajectory.sample(t - BEGIN))
+            loop.controller.goals.set_pose(*trajectory.sample(t - BEGIN))
         touched.append(len(loop.robot.obstacles.contacts()) > 0)
 
     return loop.run(DURATION, before), np.array(touched), start

@@ -11,8 +11,11 @@ import pytest
 from arms import load_arm
 from controllers import GAINS
 
-from torque_safety_controller.controller import Controller, Gains
+from torque_safety_controller.controller import Controller
+from torque_safety_controller.parts.goals import Goals
+from torque_safety_controller.parts.joint_bounds import JointBounds
 from torque_safety_controller.qp import AccelerationRange
+from torque_safety_controller.tasks.gains import Gains
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.parameter import parameter_table
 from viability_bounds_pkg.state import State
@@ -54,7 +57,8 @@ def test_the_task_asks_for_the_acceleration_of_the_point(examples):
 def test_the_limit_is_kept_in_motion(examples, limited):
     arm = load_arm("panda")
     limits = [examples["HeightLimit"](FLOOR, 1.0, 2.0, arm.dt)] if limited else []
-    controller = Controller(arm.robot(), arm.tau_max, STIFF, constraints=limits)
+    robot = arm.robot()
+    controller = Controller(robot, [Goals(robot.n, STIFF), JointBounds(), *limits], arm.tau_max)
     a_max = np.full(arm.n, 15.0)
     bounds = BoundsSolver(
         JointLimits(arm.model.names[1:], arm.q_min, arm.q_max, arm.v_max, -a_max, a_max),
@@ -67,7 +71,7 @@ def test_the_limit_is_kept_in_motion(examples, limited):
     goal = robot.pose.copy()
     goal.translation[2] = FLOOR - 0.1
     controller.reset(q)
-    controller.set_pose_goal(goal)
+    controller.goals.set_pose(goal)
     heights = []
     for _ in range(round(2.0 / arm.dt)):
         now = bounds.bounds(q, v)

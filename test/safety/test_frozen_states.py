@@ -12,7 +12,7 @@ from direct import DirectLoop, posture_at_limits
 from sim_bridge.nodes.bullet_parameters import make_stop
 from torque_safety_controller.node.assembly import make_plausibility_check
 from torque_safety_controller.qp import AccelerationRange
-from torque_safety_controller.slow_down import Ramp
+from torque_safety_controller.ramp import Ramp
 from torque_safety_controller.supervisor import Order
 from viability_bounds_pkg.state import State
 
@@ -63,7 +63,7 @@ def play(robot: str, seed: int, lie: Lie, checked: bool = True) -> Played:
         for k in range(round(SECONDS / config.dt)):
             t = k * config.dt
             if k % round(0.7 / config.dt) == 0:
-                loop.controller.set_posture_goal(posture_at_limits(rng, low, high))
+                loop.controller.goals.set_posture(posture_at_limits(rng, low, high))
             q, v, _ = arm.state()
             state = State(q.copy(), v.copy())
             last = int(np.count_nonzero(begins <= t)) - 1

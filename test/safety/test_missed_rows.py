@@ -30,7 +30,7 @@ def play(mode: str, seed: int) -> tuple[float, float, int]:
     with closing(robot):
         for k in range(round(SECONDS * RATE)):
             if k % RATE == 0:
-                loop.controller.set_posture_goal(posture_at_limits(rng, low, high))
+                loop.controller.goals.set_posture(posture_at_limits(rng, low, high))
             if k and row == 0 and rng.random() < PROBABILITY:
                 row = int(rng.integers(1, LONGEST + 1))
             lost, row = row > 0, max(0, row - 1)

@@ -13,7 +13,7 @@ from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.nodes.bullet_node import BulletNode
 from sim_bridge.nodes.bullet_parameters import make_robot, make_stop
 from torque_safety_controller.node.controller_node import ControllerNode
-from torque_safety_controller.slow_down import Ramp
+from torque_safety_controller.ramp import Ramp
 from torque_safety_controller.supervisor import REST, Order
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.ros.runtime import GOAL_QOS
@@ -75,7 +75,7 @@ def test_no_limit_is_passed_when_commands_fail_at_a_random_moment(robot):
     with closing(loop.robot), closing(make_robot(config)) as other:
         monitor = other.monitor = LimitMonitor(*limits)
         for _ in range(MOMENTS):
-            loop.controller.set_posture_goal(next(postures))
+            loop.controller.goals.set_posture(next(postures))
             (*_, last) = loop.run(rng.uniform(0.1, 0.3))
             q, v, _ = loop.robot.state()
             fastest = max(fastest, float((np.abs(v) / config.velocity_max).max()))
@@ -195,7 +195,7 @@ def test_no_limit_is_passed_in_hold_without_acceleration_limits(robot):
     fastest = 0.0
     with closing(loop.robot) as arm:
         for _ in range(8):
-            loop.controller.set_posture_goal(next(postures))
+            loop.controller.goals.set_posture(next(postures))
             loop.run(rng.uniform(0.2, 0.6))
             fastest = max(fastest, float((np.abs(arm.state().v) / loop.config.velocity_max).max()))
             for _ in range(round(0.6 / loop.dt)):
@@ -213,7 +213,7 @@ def test_after_hold_an_arm_goes_on_without_a_jolt_wherever_it_stopped():
     steps = []
     with closing(loop.robot) as arm:
         for _ in range(12):
-            controller.set_posture_goal(next(postures))
+            controller.goals.set_posture(next(postures))
             loop.run(rng.uniform(0.3, 1.2))
             for _ in range(round(0.4 / loop.dt)):
                 q, v, _ = arm.state()

@@ -7,6 +7,8 @@ import pytest
 from direct import DirectLoop, column
 from whole_arm import CLEAR, KEPT_FREE, arrive, random_goal
 
+from torque_safety_controller.parts.safety_filter import WholeArm
+
 STIFF = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
 """A posture task that drives each joint to its limits, whatever the hand does."""
 FILTERED = {"safety_filter": True}
@@ -42,7 +44,7 @@ def race(robot, seconds, seed, **changed):
     for _ in range(round(seconds / 3.0)):
         ends = np.where(rng.random(n) < 0.5, low, high)
         goal = np.where(rng.random(n) < 0.5, ends, rng.uniform(low, high))
-        loop.controller.set_posture_goal(goal)
+        loop.controller.goals.set_posture(goal)
         loop.run(3.0)
     return loop
 
@@ -71,7 +73,7 @@ def test_baxters_shoulder_keeps_its_limits_only_with_the_filter():
     assert without[1] > 0.1
     loop = race("baxter_left_arm", 30.0, 4, safety_filter=True)
     assert_kept(loop)
-    outcomes = loop.controller.safety_filter.outcomes
+    outcomes = loop.controller.find(WholeArm).filter.outcomes
     assert outcomes["outside"] == 0
     assert outcomes["as wanted"] > 0.9 * outcomes.total()
 
@@ -90,14 +92,14 @@ def test_a_posture_that_cannot_be_held_is_approached_as_far_as_one_that_can(gain
     loop = DirectLoop("baxter_left_arm", gains | {"safety_filter": True})
     assert load_at(loop, STRETCHED)[SHOULDER] > 1.0
     start = loop.robot.state().q
-    loop.controller.set_posture_goal(STRETCHED)
+    loop.controller.goals.set_posture(STRETCHED)
     last = loop.run(10.0)[-100:]
     q = column(last, "q")
     assert np.ptp(q, axis=0).max() < 0.02, "it does not stay"
     assert 0.9 < load_at(loop, q[-1])[SHOULDER] <= 0.98
     assert np.abs(q[-1] - STRETCHED).max() < 0.8 * np.abs(start - STRETCHED).max()
     assert beyond(loop)[:2] == (0.0, 0.0)
-    assert loop.controller.safety_filter.outcomes["outside"] == 0
+    assert loop.controller.find(WholeArm).filter.outcomes["outside"] == 0
 
 
 def test_an_arm_that_starts_where_it_cannot_be_held_comes_down_slowly():
@@ -105,7 +107,7 @@ def test_an_arm_that_starts_where_it_cannot_be_held_comes_down_slowly():
     loop.robot.reset(STRETCHED, np.zeros(7))
     loop.begin()
     samples = loop.run(8.0)
-    assert loop.controller.safety_filter.slack >= -1e-3
+    assert loop.controller.find(WholeArm).filter.slack >= -1e-3
     assert np.abs(column(samples, "v")[-1]).max() < 0.1
     assert load_at(loop, samples[-1].q)[SHOULDER] < 0.98
     assert beyond(loop)[:2] == (0.0, 0.0)
@@ -118,7 +120,7 @@ def test_before_what_cannot_be_held_the_arm_stops_short_of_its_goal():
     below = np.array([0.0, 0.9, 0.0, 0.0, 0.0, 0.0, 0.0])
     loop.robot.reset(above, np.zeros(7))
     loop.begin()
-    loop.controller.set_posture_goal(below)
+    loop.controller.goals.set_posture(below)
     samples = loop.run(14.0)
     assert np.abs(samples[-1].q - below).max() > 0.01
     assert np.abs(samples[-1].v).max() < 0.05

@@ -9,6 +9,8 @@ from direct import DirectLoop, column
 from test_collision_avoidance import MARGIN, around_the_wall, play
 from test_whole_arm import STIFF, assert_kept, beyond
 
+from torque_safety_controller.parts.safety_filter import WholeArm
+
 pytestmark = pytest.mark.long
 
 STRONG = {"safety_filter": True}
@@ -28,7 +30,7 @@ def race(loop, seconds, seed, each=None, pause=3.0):
     for _ in range(round(seconds / pause)):
         ends = np.where(rng.random(low.size) < 0.5, low, high)
         goal = np.where(rng.random(low.size) < 0.5, ends, rng.uniform(low, high))
-        loop.controller.set_posture_goal(goal)
+        loop.controller.goals.set_posture(goal)
         for _ in range(round(pause / loop.dt)):
             if each is not None:
                 each(loop)
@@ -59,7 +61,7 @@ def test_a_constant_push_is_in_the_plans(robot, share, force):
     hand = loop.controller.robot.frame
     loop.robot.apply_wrench(hand, force, np.zeros(3))
     loop.run(1.0)
-    model, keeper = loop.controller.robot, loop.controller.safety_filter
+    model, keeper = loop.controller.robot, loop.controller.find(WholeArm).filter
     gravity = pin.computeGeneralizedGravity(loop.model, loop.model.createData(), model.q)
     push = model.J[:3].T @ (model.pose.rotation.T @ force)
     assert np.abs(push).max() > 1.0
@@ -74,8 +76,8 @@ def test_an_arm_that_is_stretched_out_withstands_what_is_reserved_for(reserve):
     own = {"start_positions": [0.0, -1.2, 0.0, 2.0, 0.0, 0.0, 0.0]}
     own |= {} if reserve is None else {"torque_reserve": reserve}
     loop = DirectLoop("baxter_left_arm", STIFF | STRONG | own)
-    keeper, hand = loop.controller.safety_filter, loop.controller.robot.frame
-    loop.controller.set_posture_goal(np.zeros(7))
+    keeper, hand = loop.controller.find(WholeArm).filter, loop.controller.robot.frame
+    loop.controller.goals.set_posture(np.zeros(7))
     loop.run(4.0)
     np.testing.assert_allclose(abs(keeper.rest_torque[1]), keeper.usable[1], rtol=0.02)
     stood = loop.robot.state().q[1]
@@ -106,7 +108,7 @@ def test_a_weak_arm_keeps_its_distances_only_with_the_filter():
         for _ in range(3):
             ends = np.where(rng.random(low.size) < 0.5, low, high)
             goal = np.where(rng.random(low.size) < 0.5, ends, rng.uniform(low, high))
-            loop.controller.set_posture_goal(goal)
+            loop.controller.goals.set_posture(goal)
             distances.append(play(loop, 2.0)[0].min())
         least[filtered], beyonds[filtered] = min(distances), beyond(loop)
     assert least[False] < 0.0
@@ -121,7 +123,7 @@ def test_a_table_is_pressed_on_as_without_the_filter():
     pressing = run.force[round(2.0 / run.loop.dt) :, 2]
     np.testing.assert_allclose(pressing, FORCE, atol=1.5)
     assert_kept(run.loop)
-    outcomes = run.loop.controller.safety_filter.outcomes
+    outcomes = run.loop.controller.find(WholeArm).filter.outcomes
     assert outcomes["as wanted"] == outcomes.total()
 
 

@@ -16,7 +16,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint, MultiDOFJ
 
 from sim_bridge.nodes.bullet_node import BulletNode
 from torque_safety_controller.node.controller_node import ControllerNode
-from torque_safety_controller.slow_down import RISE_TIME
+from torque_safety_controller.ramp import RISE_TIME
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.ros.claim import TakenError
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp, stamp_to_ns

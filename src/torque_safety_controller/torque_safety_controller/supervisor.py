@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from torque_safety_controller.command_check import CommandCheck
 from torque_safety_controller.modes import CAUSES, CHANGES, Control, Goals, Mode
-from torque_safety_controller.slow_down import Ramp
+from torque_safety_controller.ramp import Ramp
 
 Array = NDArray[np.float64]
 

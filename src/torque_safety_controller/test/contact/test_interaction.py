@@ -21,6 +21,8 @@ from torque_safety_controller.contact.interaction import (
 )
 from torque_safety_controller.contact.wrench_sensor import SensorSettings, WrenchSensor
 from torque_safety_controller.controller import Controller
+from torque_safety_controller.parts.goals import Goals
+from torque_safety_controller.parts.joint_bounds import JointBounds
 from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.state import State
 
@@ -48,13 +50,18 @@ class SimulatedHand:
         contacts = None
         if contact:
             contacts = Contacts(ARM.model, [FrictionContact(ARM.frame, np.zeros(3), NORMAL, 0.5)])
-        self.interaction = Interaction(sensor, contacts, settings=InteractionSettings(**settings))
-        self.controller = Controller(ARM.robot(DT), tau_max, gains, interaction=self.interaction)
+        robot = ARM.robot(DT)
+        goals = Goals(robot.n, gains)
+        self.interaction = Interaction(
+            goals, sensor, contacts, settings=InteractionSettings(**settings)
+        )
+        parts = [self.interaction, goals, JointBounds()]
+        self.controller = Controller(robot, parts, tau_max, hold_kd=gains.hold_kd)
         self.controller.warm_up()
         self.controller.reset(Q)
         self.pose = ARM.robot(0.0)
         self.pose.update(State(Q, REST), REST)
-        self.controller.set_pose_goal(self.pose.pose.copy())
+        self.controller.goals.set_pose(self.pose.pose.copy())
 
     def step(self, wrench=None, q=Q, v=REST, bounds=WIDE):
         if wrench is not None:
@@ -129,7 +136,7 @@ def test_a_hand_that_feels_too_little_moves_on_and_too_much_back():
 def test_no_stiffness_is_left_where_force_is_controlled():
     hand = SimulatedHand(directions=Z)
     goal = hand.pose.pose * pin.SE3(np.eye(3), np.array([0.01, 0.0, 0.02]))
-    hand.controller.set_pose_goal(goal)
+    hand.controller.goals.set_pose(goal)
     hand.interaction.set_target(np.zeros(6))
     a = hand.hand_acceleration(hand.step(force()))
     assert a[0] == pytest.approx(GAINS.pose_kp * 0.01, rel=1e-2)
@@ -263,12 +270,12 @@ def test_where_the_hand_is_let_go_is_its_new_goal():
     hand.step(force(x=20.0))
     elsewhere = Q + 0.05
     hand.step(force(x=20.0), elsewhere)
-    taken = hand.controller.goals.taken
+    taken = hand.controller.goals.held
     there = hand.controller.robot.pose.copy()
     hand.step(force(x=1.0), elsewhere + 1e-3)
     assert hand.state is Compliance.HOLDING
     assert hand.controller.goals.pose_des.isApprox(there)
-    assert hand.controller.goals.taken == taken
+    assert hand.controller.goals.held == taken
     hand.step(force(x=1.0), Q)
     assert hand.controller.goals.pose_des.isApprox(there)
 
@@ -322,9 +329,9 @@ def test_directions_exchanged_while_pressing_hold_the_hand_where_it_is():
     hand.step(force(), elsewhere)
     assert hand.state is Compliance.FORCE
     assert hand.controller.goals.pose_des.isApprox(hand.controller.robot.pose)
-    taken = hand.controller.goals.taken
+    taken = hand.controller.goals.held
     hand.step(force(), elsewhere)
-    assert hand.controller.goals.taken == taken
+    assert hand.controller.goals.held == taken
 
 
 def test_settings_that_change_do_not_let_go_of_a_hand_that_is_led():

@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 from arms import load_arm
 from controller_chain import NODE, ControllerChain
-from controllers import posture_only
+from controllers import make, posture_only
 
 from torque_safety_controller.controller import Controller
-from torque_safety_controller.friction.compensation import FrictionCompensation
 from torque_safety_controller.friction.settings import FrictionModel, FrictionSettings
 from torque_safety_controller.integral_feedback import IntegralSettings
 from torque_safety_controller.integral_feedback.action import make_integral
 from torque_safety_controller.parameters.friction_parameters import FrictionConfiguration
+from torque_safety_controller.parts.friction import Friction
+from torque_safety_controller.parts.integral import Integral
 from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import group, read
@@ -44,10 +45,9 @@ FIRM = slice(0, 5)  # joints with inertia enough to call for all of the friction
 def controller(mode="none", friction=ON) -> Controller:
     settings = IntegralSettings(0.05 * ARM.tau_max, gain=30.0)
     integral = make_integral(mode, settings, 2.0 * ARM.tau_max)
-    compensation = FrictionCompensation(friction)
-    made = Controller(ARM.robot(DT), ARM.tau_max, GAINS, None, integral, compensation)
+    made = make(ARM, robot=ARM.robot(DT), gains=GAINS, integral=integral, friction=friction)
     made.reset(ARM.q_start)
-    made.set_posture_goal(ARM.q_start)
+    made.goals.set_posture(ARM.q_start)
     return made
 
 
@@ -61,7 +61,7 @@ def steps(made, count, q=ARM.q_start, v=V):
 def test_both_are_added_and_the_integral_s_budget_is_its_own():
     made = controller(mode="joints")
     step = steps(made, 3000)
-    integral, friction = made.integral, made.friction
+    integral, friction = made.find(Integral).action, made.find(Friction).compensation
     both = step.tau - made.robot.torque(step.a)
     np.testing.assert_allclose(both, integral.last + friction.last, atol=1e-9)
     assert integral.saturated.any()
@@ -73,10 +73,10 @@ def test_both_are_added_and_the_integral_s_budget_is_its_own():
 def test_without_integral_action_there_is_friction_only():
     made = controller()
     tau = steps(made, 2000).tau
-    assert not made.integral.last.any()
+    assert not made.find(Integral).action.last.any()
     without = controller(friction=OFF)
     steps(without, 2000)
-    assert without.friction.idle
+    assert without.find(Friction).compensation.idle
     full = WANTED * np.minimum(MODEL.level(V), ON.budget)
     added = tau - steps(without, 1).tau
     np.testing.assert_allclose(added[FIRM], full[FIRM], rtol=1e-2)
@@ -95,7 +95,7 @@ def test_the_qp_keeps_the_sum_within_the_torque_limits(share):
         step = made.step(State(q, v), AccelerationRange(-WIDE, WIDE))
         assert (np.abs(step.tau) <= ARM.tau_max).all()
         assert not step.failure
-        wanted = made.robot.torque(step.a) + made.friction.last
+        wanted = made.robot.torque(step.a) + made.find(Friction).compensation.last
         np.testing.assert_allclose(step.tau, wanted, atol=0.02 * ARM.tau_max.max())
         at_limit += (np.abs(step.tau) > 0.98 * ARM.tau_max).any()
     assert at_limit > 20
@@ -107,28 +107,28 @@ def test_the_handover_goes_on_from_the_drives_torque_and_friction_fades_in():
     q, rest = ARM.q_start, np.zeros(N)
     made.robot.update(State(q, rest), rest)
     tau = made.robot.h + 0.04 * ARM.tau_max
-    made.bumpless_transfer(State(q, V), AccelerationRange(-WIDE, WIDE), tau)
-    np.testing.assert_array_equal(made.friction.last, 0.0)
+    made.resume(State(q, V), AccelerationRange(-WIDE, WIDE), tau)
+    np.testing.assert_array_equal(made.find(Friction).compensation.last, 0.0)
     first = made.step(State(q, V), AccelerationRange(-WIDE, WIDE))
-    friction = made.friction.last
+    friction = made.find(Friction).compensation.last
     assert (np.abs(friction) <= 1.01 * DT / 0.2 * MODEL.level(V)).all()
     assert np.abs((first.tau - tau) / ARM.tau_max).max() < 0.01
     steps(made, 2000)
     full = WANTED * MODEL.level(V)
-    np.testing.assert_allclose(made.friction.last[FIRM], full[FIRM], rtol=1e-2)
+    np.testing.assert_allclose(made.find(Friction).compensation.last[FIRM], full[FIRM], rtol=1e-2)
 
 
 def test_what_comes_after_a_gap_or_a_jump_does_not_kick():
     made = controller(mode="joints")
     before = steps(made, 500)
     for elapsed in (0.4, 0.0, -1.0, math.nan):
-        w = made.friction.reference_velocity.copy()
+        w = made.find(Friction).compensation.reference_velocity.copy()
         tau = made.step(State(ARM.q_start, V), AccelerationRange(-WIDE, WIDE), None, elapsed).tau
-        np.testing.assert_array_equal(made.friction.reference_velocity, w)
+        np.testing.assert_array_equal(made.find(Friction).compensation.reference_velocity, w)
         assert np.abs((tau - before.tau) / ARM.tau_max).max() < 2e-3
     # A glitch of the sensor, by which friction would be more than the budget.
     made.step(State(ARM.q_start, V + 200.0), AccelerationRange(-WIDE, WIDE))
-    assert (np.abs(made.friction.last) <= ON.budget).all()
+    assert (np.abs(made.find(Friction).compensation.last) <= ON.budget).all()
 
 
 # Parameters

@@ -29,7 +29,7 @@ def test_each_gain_of_the_tasks_reaches_the_torque(arm, gain, value):
     def tau(gains):
         controller = make(arm, gains=gains)
         controller.reset(arm.q_start + 0.1)
-        controller.set_pose_goal(pose_at(arm, arm.q_start + 0.05))
+        controller.goals.set_pose(pose_at(arm, arm.q_start + 0.05))
         return controller.step(State(arm.q_start, 0.02 * arm.v_max), wide(arm)).tau
 
     changed = replace(GAINS, **{gain: value})
@@ -37,8 +37,8 @@ def test_each_gain_of_the_tasks_reaches_the_torque(arm, gain, value):
     # Also when it changes while the controller runs.
     controller = make(arm)
     controller.reset(arm.q_start + 0.1)
-    controller.set_pose_goal(pose_at(arm, arm.q_start + 0.05))
-    controller.gains = changed
+    controller.goals.set_pose(pose_at(arm, arm.q_start + 0.05))
+    controller.goals.gains = changed
     step = controller.step(State(arm.q_start, 0.02 * arm.v_max), wide(arm))
     np.testing.assert_allclose(step.tau, tau(changed), atol=1e-6)
 
@@ -59,6 +59,6 @@ def test_the_damping_in_hold_reaches_the_acceleration(arm, way):
 def test_a_pose_without_weight_is_left_out(arm):
     controller = strong(arm, gains=replace(GAINS, pose_weight=0.0))
     controller.reset(arm.q_start + 0.1)
-    controller.set_pose_goal(pose_at(arm, arm.q_start + 0.3))
+    controller.goals.set_pose(pose_at(arm, arm.q_start + 0.3))
     step = controller.step(State(arm.q_start, np.zeros(arm.n)), wide(arm))
     np.testing.assert_allclose(step.a, GAINS.posture_kp * 0.1, atol=1e-3)

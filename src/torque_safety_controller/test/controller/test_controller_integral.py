@@ -20,6 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torque_safety_controller.integral_feedback.action import MODES
+from torque_safety_controller.parts.integral import Integral
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.supervisor import REST
 from torque_safety_controller.tasks.pose_task import pose_error
@@ -50,11 +51,13 @@ def test_torque_limits_hold_whatever_the_integral_does(mode, share, rate, deeds)
     arm = load_arm("panda")
     budget = share * arm.tau_max
     controller = with_integral(arm, mode, rate=np.full(arm.n, rate), budget=budget)
-    controller.set_posture_goal(arm.q_start + 0.3)
+    controller.goals.set_posture(arm.q_start + 0.3)
     with np.errstate(all="ignore"):
         for deed, gain, elapsed, dq, v, x in deeds:
             if gain is not None:
-                controller.integral.settings = replace(controller.integral.settings, gain=gain)
+                controller.find(Integral).action.settings = replace(
+                    controller.find(Integral).action.settings, gain=gain
+                )
             q = arm.q_start + dq
             bounds = AccelerationRange(-np.abs(x), np.abs(x))
             if deed == "reset":
@@ -64,10 +67,10 @@ def test_torque_limits_hold_whatever_the_integral_does(mode, share, rate, deeds)
             last = {"hold": (elapsed,), "bumpless_transfer": (bounds, x)}
             step = act(State(q, v), *last.get(deed, (bounds, elapsed)))
             assert_may_be_sent(step, arm)
-            assert np.isfinite(controller.integral.last).all()
+            assert np.isfinite(controller.find(Integral).action.last).all()
         # Once the world makes sense again, so does the controller.
-        controller.goals.pose_des = None
-        controller.set_posture_goal(arm.q_start)
+        controller.goals.release_pose()
+        controller.goals.set_posture(arm.q_start)
         rest = State(arm.q_start, np.zeros(arm.n)), wide(arm)
         for _ in range(3):
             assert_may_be_sent(controller.step(*rest), arm)
@@ -90,7 +93,7 @@ def test_the_integral_carries_what_the_model_does_not_know():
         controller = with_integral(arm, mode, STIFF)
         goal = pose_at(arm, arm.q_start)
         controller.reset(arm.q_start)
-        controller.set_pose_goal(goal)
+        controller.goals.set_pose(goal)
         q, v = arm.q_start, np.zeros(arm.n)
         for _ in range(round(0.6 / KHZ)):
             q, v = pushed(arm, q, v, controller.step(State(q, v), wide(arm)).tau, push)
@@ -105,14 +108,14 @@ def test_the_limits_on_torque_leave_the_integral_its_share(arm):
     saturated = 0
     for sign in (1.0, -1.0):
         controller = with_integral(arm, gains=replace(GAINS, posture_kp=1e4))
-        controller.bumpless_transfer(state, wide(arm), sign * 0.5 * arm.tau_max)
-        controller.goals.pose_des = None
-        controller.set_posture_goal(arm.q_max)
+        controller.resume(state, wide(arm), sign * 0.5 * arm.tau_max)
+        controller.goals.release_pose()
+        controller.goals.set_posture(arm.q_max)
         for _ in range(5):
             step = controller.step(state, wide(arm))
             assert_may_be_sent(step, arm)
             assert not step.failure
-            added = controller.integral.last
+            added = controller.find(Integral).action.last
             assert (np.abs(added) > 0.01 * arm.tau_max).any()
             # The limits are those in the middle of a step with the acceleration of the last one.
             model = controller.robot.torque(step.a)
@@ -134,6 +137,6 @@ def test_in_hold_nothing_grows_on_what_the_motors_cannot_give(arm):
         saturated += abs(step.tau[0]) == arm.tau_max[0]
         q, v = arm.move(q, v, step.tau, KHZ, steps=2)
     assert saturated > 4
-    assert controller.integral.skipped == 0
+    assert controller.find(Integral).action.skipped == 0
     # With the accelerations that were wished for, half of the budget would be used up by now.
-    assert (np.abs(controller.integral.last) < 0.02 * arm.tau_max).all()
+    assert (np.abs(controller.find(Integral).action.last) < 0.02 * arm.tau_max).all()

@@ -8,6 +8,7 @@ import numpy as np
 from arms import load_arm
 from controllers import (
     EXACT,
+    GAINS,
     SOLVED,
     VECTORS,
     assert_may_be_sent,
@@ -22,6 +23,7 @@ from controllers import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from torque_safety_controller.parts.integral import Integral
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.supervisor import REST, Order
 from viability_bounds_pkg.state import State
@@ -59,9 +61,9 @@ def test_torques_are_finite_and_within_their_limits_whatever_comes(
     torque = None if additional is None else Fixed(additional)
     controller = make(arm, integral=torque)
     if goals in ("pose", "both"):
-        controller.set_pose_goal(pose_at(arm, arm.q_start + 0.2))
+        controller.goals.set_pose(pose_at(arm, arm.q_start + 0.2))
     if goals in ("posture", "both"):
-        controller.set_posture_goal(arm.q_start - 0.2)
+        controller.goals.set_posture(arm.q_start - 0.2)
     controller.reset(arm.q_start)
     with np.errstate(all="ignore"):
         upper = a + np.abs(width)
@@ -83,7 +85,7 @@ def test_torques_are_finite_and_within_their_limits_whatever_comes(
 def test_random_states_outside_all_limits(arm):
     rng = np.random.default_rng(1)
     controller = make(arm)
-    controller.set_pose_goal(pose_at(arm, arm.q_start))
+    controller.goals.set_pose(pose_at(arm, arm.q_start))
     saturated = relaxed = 0
     for _ in range(300):
         q = rng.uniform(1.5 * arm.q_min, 1.5 * arm.q_max)
@@ -102,7 +104,7 @@ def test_random_states_outside_all_limits(arm):
 
 def test_a_state_that_is_not_finite_is_survived(arm):
     controller = make(arm)
-    controller.set_pose_goal(pose_at(arm, arm.q_start))
+    controller.goals.set_pose(pose_at(arm, arm.q_start))
     rest = State(arm.q_start, np.zeros(arm.n)), wide(arm)
     before = controller.step(*rest)
     for bad in (math.nan, math.inf, 1e200):
@@ -120,7 +122,7 @@ def test_a_state_that_is_not_finite_is_survived(arm):
 
 def test_an_additional_torque_that_is_not_finite_leaves_the_arm_held(arm):
     controller = make(arm, integral=Fixed(np.full(arm.n, math.nan)))
-    controller.set_pose_goal(pose_at(arm, arm.q_start))
+    controller.goals.set_pose(pose_at(arm, arm.q_start))
     q, v = arm.q_start, np.zeros(arm.n)
     for step in (
         controller.step(State(q, v), wide(arm)),
@@ -135,7 +137,7 @@ def test_the_torque_limits_hold_with_the_additional_torque_in_them(arm):
     push = 0.8 * arm.tau_max
     rng = np.random.default_rng(2)
     controller = make(arm, integral=Fixed(push))
-    controller.set_posture_goal(arm.q_max)
+    controller.goals.set_posture(arm.q_max)
     exact = limited = 0
     for _ in range(60):
         q, v = arm.random_state(rng)
@@ -155,7 +157,7 @@ def test_the_rate_of_torque_is_limited_whatever_comes(arm):
     rate = rng.uniform(50.0, 500.0, arm.n)
     rate[2] = np.inf
     controller = make(arm, torque_rate_max=rate)
-    controller.set_pose_goal(pose_at(arm, arm.q_start))
+    controller.goals.set_pose(pose_at(arm, arm.q_start))
     last, reached = None, np.zeros(arm.n, dtype=bool)
     for k in range(300):
         q, v = arm.random_state(rng)
@@ -188,12 +190,12 @@ def test_a_share_of_the_goals_mixes_their_accelerations_with_those_of_braking():
     arm = load_arm("panda")
     controller = make(arm)
     controller.reset(arm.q_start)
-    controller.set_pose_goal(pose_at(arm, arm.q_start + 0.01))
+    controller.goals.set_pose(pose_at(arm, arm.q_start + 0.01))
     state = State(arm.q_start, np.full(arm.n, 0.02))
     found = {}
     for share in (0.0, 0.25, 1.0):
         found[share] = controller.step(state, wide(arm), Order(share)).a
-    rest = -controller.gains.hold_kd * state.v
+    rest = -controller.hold_kd * state.v
     np.testing.assert_allclose(found[0.0], rest, atol=1e-3)
     np.testing.assert_allclose(found[0.25], 0.25 * found[1.0] + 0.75 * rest, atol=1e-3)
     assert np.abs(found[1.0] - rest).max() > 0.1
@@ -203,7 +205,7 @@ def test_a_far_goal_gets_its_effect_back_without_a_jolt(arm):
     """However far away it is, and however stiff the gains: the bounds open with the share."""
     bounds = AccelerationRange(np.full(arm.n, -15.0), np.full(arm.n, 15.0))
     controller = strong(arm, gains=posture_only(400.0, 40.0))
-    controller.set_posture_goal(arm.q_start + 3.0)
+    controller.goals.set_posture(arm.q_start + 3.0)
     state = State(arm.q_start, np.zeros(arm.n))
     last, increment = np.zeros(arm.n), 0.01
     for share in np.arange(0.0, 1.0, increment):
@@ -218,7 +220,7 @@ def test_where_the_motors_cannot_let_it_rest_the_bounds_count_alone(arm):
     weight = np.abs(gravity(arm, arm.q_start))
     weak = np.where(weight > 1.0, 0.9 * weight, arm.tau_max)
     controller = make(arm, tau_max=weak, gains=posture_only(100.0, 20.0))
-    controller.set_posture_goal(arm.q_start + 1.0)
+    controller.goals.set_posture(arm.q_start + 1.0)
     step = controller.step(state, wide(arm), Order(share=0.0))
     assert step.relaxation is None
     assert np.abs(step.a).max() > 0.01, "it rests"
@@ -227,20 +229,21 @@ def test_where_the_motors_cannot_let_it_rest_the_bounds_count_alone(arm):
 def test_nothing_is_learned_from_a_motion_that_was_not_commanded():
     """Neither of disturbances nor by the integral action; the torque does not jump."""
     arm = load_arm("panda")
-    controller = make(arm, integral=integral(arm, "joints"))
-    controller.gains = replace(controller.gains, disturbance_time=0.0)
+    gains = replace(GAINS, disturbance_time=0.0)
+    controller = make(arm, integral=integral(arm, "joints"), gains=gains)
     controller.reset(arm.q_start)
-    controller.set_posture_goal(arm.q_start + 0.1)
+    controller.goals.set_posture(arm.q_start + 0.1)
     at_rest = State(arm.q_start, np.zeros(arm.n))
     for _ in range(20):
         controller.step(at_rest, wide(arm))
-    learned, torque = controller._observer.estimate.copy(), controller.integral.last
+    learned = controller.step(at_rest, wide(arm)).disturbance.copy()
+    torque = controller.find(Integral).action.last
     assert learned.any() and torque.any()
     for k in range(20):
         state = State(arm.q_start, np.full(arm.n, 0.01 * k))
-        controller.step(state, wide(arm), Order(obeyed=False))
+        step = controller.step(state, wide(arm), Order(obeyed=False))
     # What the additional torque changes by as it goes on counts.
-    np.testing.assert_allclose(controller._observer.estimate, learned, rtol=0.05)
-    np.testing.assert_allclose(controller.integral.last, torque, rtol=0.05)
-    controller.step(State(arm.q_start, np.full(arm.n, 0.5)), wide(arm))
-    assert np.abs(controller._observer.estimate - learned).max() > 10.0
+    np.testing.assert_allclose(step.disturbance, learned, rtol=0.05)
+    np.testing.assert_allclose(controller.find(Integral).action.last, torque, rtol=0.05)
+    step = controller.step(State(arm.q_start, np.full(arm.n, 0.5)), wide(arm))
+    assert np.abs(step.disturbance - learned).max() > 10.0

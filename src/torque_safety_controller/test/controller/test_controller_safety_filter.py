@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The safety filter in the controller: what the QP is given, and what is sent in the end."""
 
+from dataclasses import replace
+
+import controllers
 import numpy as np
 import pytest
 from arms import load_arm
 from controllers import posture_only
 
-from torque_safety_controller.controller import Controller
+from torque_safety_controller.parts.safety_filter import WholeArm
 from torque_safety_controller.qp import AccelerationRange, LinearConstraints
 from torque_safety_controller.supervisor import REST
 from viability_bounds_pkg.state import State
@@ -25,20 +28,16 @@ FOLDED = np.array([0.0, -0.8, 0.0, 2.2, 0.0, 0.5, 0.0])
 GAINS = posture_only(100.0, 20.0)
 
 
-def make(filtered=True, **arguments):
+def make(filtered=True, gains=GAINS, **arguments):
     keeper = SafetyFilter(ARM.model, ARM.q_min, ARM.q_max, -A_MAX, A_MAX, ARM.tau_max, ARM.dt)
-    return Controller(
-        ARM.robot(),
-        ARM.tau_max,
-        GAINS,
-        safety_filter=keeper if filtered else None,
-        **arguments,
-    )
+    robot = ARM.robot()
+    parts = [WholeArm(keeper, robot, ARM.tau_max)] if filtered else []
+    return controllers.make(ARM, *parts, robot=robot, gains=gains, **arguments)
 
 
 def towards_stretched(controller, q=EDGE, v=ZERO, bounds=A_MAX):
     controller.reset(q)
-    controller.set_posture_goal(STRETCHED)
+    controller.goals.set_posture(STRETCHED)
     return controller.step(State(q, v), AccelerationRange(-bounds, bounds))
 
 
@@ -55,7 +54,7 @@ def test_elsewhere_nothing_is_changed():
     for filtered in (False, True):
         controller = make(filtered)
         controller.reset(q)
-        controller.set_posture_goal(q + 0.1)
+        controller.goals.set_posture(q + 0.1)
         outputs.append(controller.step(State(q, ZERO), AccelerationRange(-A_MAX, A_MAX)))
     np.testing.assert_allclose(outputs[0].tau, outputs[1].tau, atol=1e-6)
 
@@ -76,7 +75,7 @@ def test_plans_brake_harder_than_the_acceleration_limits_where_they_must():
     state.q[6] = ARM.q_max[6] - 0.25  # 32 rad/s^2 are needed
     tight = AccelerationRange(np.full(ARM.n, -15.0), np.full(ARM.n, 15.0))
     controller.reset(state.q)
-    controller.set_posture_goal(ARM.q_start)
+    controller.goals.set_posture(ARM.q_start)
     hardest = 0.0
     for _ in range(30):
         output = controller.step(state, tight)
@@ -90,11 +89,11 @@ def test_plans_brake_harder_than_the_acceleration_limits_where_they_must():
 def test_the_plan_is_allowed_where_the_bounds_ask_for_what_cannot_be_done():
     controller = make()
     controller.reset(EDGE)
-    controller.set_posture_goal(STRETCHED)
+    controller.goals.set_posture(STRETCHED)
     up = np.full(ARM.n, 8.0)
     output = controller.step(State(EDGE, ZERO), AccelerationRange(up, up))
     assert output.relaxation is None
-    assert (output.a >= controller.safety_filter.plan - 1e-6).all()
+    assert (output.a >= controller.find(WholeArm).filter.plan - 1e-6).all()
 
 
 def test_without_a_plan_the_arm_brakes():
@@ -105,7 +104,7 @@ def test_without_a_plan_the_arm_brakes():
     for q in (FOLDED, STRETCHED):
         controller = make()
         controller.reset(q)
-        controller.set_posture_goal(q + 0.5)
+        controller.goals.set_posture(q + 0.5)
         output = controller.step(State(q, v), AccelerationRange(-A_MAX, A_MAX))
         assert output.tracking == (q is FOLDED)
         moved.append(output.a[6])
@@ -128,10 +127,10 @@ def test_without_a_qp_the_arm_brakes_as_the_filter_allows():
     v = np.array([0.1, 0.4, 0.0, 0.0, 0.0, 0.0, 0.0])
     controller.reset(FOLDED)
     output = controller.step(State(FOLDED, v), None, REST)
-    assert controller.safety_filter.outcomes == {"as wanted": 1}
+    assert controller.find(WholeArm).filter.outcomes == {"as wanted": 1}
     np.testing.assert_allclose(output.a, -GAINS.hold_kd * v)
     output = controller.step(State(EDGE, v), None, REST)
-    assert controller.safety_filter.outcomes.total() == 2
+    assert controller.find(WholeArm).filter.outcomes.total() == 2
     assert (np.abs(output.tau) <= ARM.tau_max).all()
 
 
@@ -139,8 +138,7 @@ def test_a_disturbance_that_is_known_counts():
     """Seen after a few steps in which the arm fell more than it was told to."""
     loads = []
     for fall in (0.0, -2.0):
-        controller = make()
-        controller.gains = GAINS.__class__(**{**vars(GAINS), "disturbance_time": 0.0})
+        controller = make(gains=replace(GAINS, disturbance_time=0.0))
         v = np.zeros(ARM.n)
         for _ in range(3):
             output = towards_stretched(controller, ARM.q_start, v)
@@ -148,7 +146,7 @@ def test_a_disturbance_that_is_known_counts():
             v[SHOULDER] += ARM.dt * fall
             controller.goals.posture = ARM.q_start
             controller.step(State(ARM.q_start, v), AccelerationRange(-A_MAX, A_MAX))
-        loads.append(controller.safety_filter.rest_torque[SHOULDER])
+        loads.append(controller.find(WholeArm).filter.rest_torque[SHOULDER])
     assert abs(loads[1] - loads[0]) > 0.5
 
 
@@ -160,10 +158,10 @@ def test_with_the_plan_the_qp_never_has_to_give_way(seed):
     controller.reset(q)
     for k in range(300):
         if k % 60 == 0:
-            controller.set_posture_goal(rng.uniform(ARM.q_min, ARM.q_max))
+            controller.goals.set_posture(rng.uniform(ARM.q_min, ARM.q_max))
         output = controller.step(State(q, v), AccelerationRange(-A_MAX, A_MAX))
-        if controller.safety_filter.slack >= KEPT:
+        if controller.find(WholeArm).filter.slack >= KEPT:
             assert output.relaxation is None or output.relaxation.max() < 1e-3
         q, v = q + v * ARM.dt + 0.5 * output.a * ARM.dt**2, v + output.a * ARM.dt
         v = np.clip(v, -ARM.v_max, ARM.v_max)
-    assert controller.safety_filter.outcomes["as wanted"] > 200
+    assert controller.find(WholeArm).filter.outcomes["as wanted"] > 200

@@ -28,7 +28,7 @@ from viability_bounds_pkg.state import State
 def test_accelerations_stay_inside_their_bounds(arm):
     rng = np.random.default_rng(4)
     controller = make(arm)
-    controller.set_posture_goal(arm.q_max - 0.1)
+    controller.goals.set_posture(arm.q_max - 0.1)
     at_bound = 0
     for _ in range(50):
         lower, upper = -rng.uniform(0.1, 1.0, arm.n), rng.uniform(0.1, 1.0, arm.n)
@@ -45,7 +45,7 @@ def test_accelerations_stay_inside_their_bounds(arm):
 def test_the_torque_gives_the_acceleration_asked_for(arm):
     rng = np.random.default_rng(5)
     controller = strong(arm)
-    controller.set_pose_goal(pose_at(arm, arm.q_start + 0.1))
+    controller.goals.set_pose(pose_at(arm, arm.q_start + 0.1))
     for _ in range(10):
         q, v = arm.random_state(rng)
         controller.reset(q)
@@ -57,7 +57,7 @@ def test_the_torque_gives_the_acceleration_asked_for(arm):
 
 def test_bounds_that_the_motors_cannot_keep_are_relaxed_and_reported(arm):
     controller = make(arm)
-    controller.set_posture_goal(arm.q_start)
+    controller.goals.set_posture(arm.q_start)
     lower = np.full(arm.n, 300.0)
     step = controller.step(
         State(arm.q_start, np.zeros(arm.n)), AccelerationRange(lower, lower + 1.0)
@@ -87,9 +87,9 @@ def test_with_a_goal_it_tracks(arm, goal):
     controller = strong(arm)
     controller.reset(arm.q_start)
     if goal == "pose":
-        controller.set_pose_goal(pose_at(arm, arm.q_start + 0.1))
+        controller.goals.set_pose(pose_at(arm, arm.q_start + 0.1))
     else:
-        controller.set_posture_goal(arm.q_start + 0.1)
+        controller.goals.set_posture(arm.q_start + 0.1)
     step = controller.step(State(arm.q_start, np.zeros(arm.n)), wide(arm))
     assert step.tracking
     assert not step.failure
@@ -137,7 +137,7 @@ def test_the_programs_of_a_run_are_solved_to_optimality(arm, monkeypatch):
 
     monkeypatch.setattr(controller._qp, "solve", recorded)
     controller.reset(arm.q_start)
-    controller.set_pose_goal(pose_at(arm, arm.q_start + 0.8))
+    controller.goals.set_pose(pose_at(arm, arm.q_start + 0.8))
     bounds = AccelerationRange(-0.3 * arm.v_max, 0.3 * arm.v_max)
     turns = itertools.cycle([bounds, wide(arm)])
     start = arm.q_start, np.zeros(arm.n), 1.0
@@ -165,7 +165,7 @@ def test_a_pose_goal_is_reached(arm):
     controller = make(arm)
     goal = pose_at(arm, arm.q_start + np.array([0.2, -0.1, 0.2, 0.1, -0.2, 0.1, 0.1]))
     controller.reset(arm.q_start)
-    controller.set_pose_goal(goal)
+    controller.goals.set_pose(goal)
     bounds = np.full(arm.n, -3.0), np.full(arm.n, 3.0)
     first = last = None
     for q, _, _ in simulate(
@@ -185,19 +185,19 @@ def test_a_pose_goal_is_reached(arm):
 
 def test_the_posture_is_where_it_started_until_one_is_asked_for(arm):
     controller = strong(arm, gains=replace(GAINS, pose_weight=0.0))
-    controller.set_pose_goal(pose_at(arm, arm.q_start))
+    controller.goals.set_pose(pose_at(arm, arm.q_start))
     at_rest = State(arm.q_start, np.zeros(arm.n)), wide(arm)
     controller.reset(arm.q_start + 0.1)
     np.testing.assert_allclose(controller.step(*at_rest).a, GAINS.posture_kp * 0.1, atol=1e-3)
     controller.reset(arm.q_start - 0.1)
     np.testing.assert_allclose(controller.step(*at_rest).a, -GAINS.posture_kp * 0.1, atol=1e-3)
-    controller.set_posture_goal(arm.q_start + 0.05)
+    controller.goals.set_posture(arm.q_start + 0.05)
     np.testing.assert_allclose(controller.step(*at_rest).a, GAINS.posture_kp * 0.05, atol=1e-3)
 
 
 def test_start_keeps_a_copy_of_the_state(arm):
     controller = strong(arm, gains=replace(GAINS, pose_weight=0.0))
-    controller.set_pose_goal(pose_at(arm, arm.q_start))
+    controller.goals.set_pose(pose_at(arm, arm.q_start))
     q = arm.q_start.copy()
     controller.reset(q)
     q += 1.0  # a reader may use its array again

@@ -12,9 +12,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from arms import load_arm
+from controllers import make
 from general_solver import nearest
 
-from torque_safety_controller.controller import Controller
 from torque_safety_controller.integral_feedback import IntegralSettings
 from torque_safety_controller.integral_feedback.action import IntegralAction
 from torque_safety_controller.qp import AccelerationRange
@@ -133,16 +133,18 @@ def moved(method, tracking):
     anti_windup = "paper" if method == "none" else method
     law = IntegralSettings(budget, LAMBDA, SLOW, FAST, MU, anti_windup)
     integral = IntegralAction("joints", law, np.full(N, np.inf))
-    controller = Controller(ARM.robot(STEP), np.full(N, 1e4), gains, integral=integral)
+    controller = make(
+        ARM, robot=ARM.robot(STEP), tau_max=np.full(N, 1e4), gains=gains, integral=integral
+    )
     controller.reset(q_at(0.0))
     posture = q_at(0.0) + 0.3 * np.sin(np.arange(N))
     goal = None
     if tracking == "pose":
         away = pin.Motion(np.array([0.06, -0.05, 0.04, 0.3, -0.2, 0.4]))
         goal = places(q_at(0.0))[-1] * pin.exp6(away)
-        controller.set_pose_goal(goal)
+        controller.goals.set_pose(goal)
     else:
-        controller.set_posture_goal(posture, POSTURE_SPEED)
+        controller.goals.set_posture(posture, POSTURE_SPEED)
     wide = AccelerationRange(np.full(N, -1e4), np.full(N, 1e4))
     a_last, slow, fast, found, expected = np.zeros(N), np.zeros(N), np.zeros(N), [], []
     for k in range(12):

@@ -69,7 +69,7 @@ def largest_step(robot, joint, seconds, delay=0, **changed) -> float:
     controller.reset(q)
     goal = q.copy()
     goal[joint] = bounds.position_max[joint] + 0.3
-    controller.set_posture_goal(goal)
+    controller.goals.set_posture(goal)
     encoders = None
     if "position_error" in changed:
         encoders = Encoders(model, bounds, q)

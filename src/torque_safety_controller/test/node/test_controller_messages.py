@@ -165,9 +165,9 @@ def test_goals_take_effect_at_their_stamps(ros):
     core = expected()
     for stamp in range(10, 100, 10):
         if stamp == 50:
-            core.set_pose_goal(GOAL)
+            core.goals.set_pose(GOAL)
         elif stamp == 70:
-            core.set_pose_goal(other)
+            core.goals.set_pose(other)
         tau = chain.answer(stamp)
         np.testing.assert_allclose(
             tau,

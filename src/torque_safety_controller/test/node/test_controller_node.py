@@ -29,6 +29,7 @@ from node_chain import (
     torque_for,
 )
 
+from torque_safety_controller.parts.integral import Integral
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.supervisor import REST as HELD
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
@@ -197,7 +198,7 @@ def test_integral_action_fades_where_the_motors_give_other_torques_for_long(ros)
     """It would push against a robot that keeps its own limits, and so go on not to be obeyed."""
     motors = Motors(ros, integral_action="joints")
     motors.answer(150)
-    added = motors.chain.node._controller.integral
+    added = motors.chain.node._controller.find(Integral).action
     before = np.abs(added.last).max()
     assert before > 0.1
     others = -motors.tau
@@ -211,7 +212,7 @@ def test_integral_action_fades_after_a_pause_in_which_the_robot_stopped_itself(r
     """It balanced the friction of a motion; an arm that stands would be pushed by it."""
     motors = Motors(ros, integral_action="joints", bounds_timeout=0.2)
     motors.answer(150)
-    added = motors.chain.node._controller.integral
+    added = motors.chain.node._controller.find(Integral).action
     before = np.abs(added.last).max()
     assert before > 0.1
     motors.stamp += 150  # shorter

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 from arms import load_arm
 from controller_chain import NODE, ControllerChain, gains_of
+from controllers import make
 
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.integral_feedback import IntegralSettings
 from torque_safety_controller.integral_feedback.action import changed as integral_with
 from torque_safety_controller.integral_feedback.action import make_integral
 from torque_safety_controller.node.controller_node import ControllerNode
+from torque_safety_controller.parts.integral import Integral
 from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.state import State
@@ -46,7 +48,7 @@ DEFAULT = {"budget": 0.1 * ARM.tau_max}
 def core(mode="joints", **changed) -> Controller:
     """The node's core, set up by hand; also says what its defaults are."""
     integral = make_integral(mode, make_settings(**changed), 2.0 * ARM.tau_max)
-    controller = Controller(ARM.robot(), ARM.tau_max, GAINS, integral=integral)
+    controller = make(ARM, gains=GAINS, integral=integral)
     controller.reset(Q)
     return controller
 
@@ -148,10 +150,10 @@ def test_parameters_change_while_it_runs_and_the_torque_goes_on(ros):
         common |= by_hand
         others = {name: value for name, value in common.items() if name != "mode"}
         mode = common.get("mode", "joints")
-        controller.integral = integral_with(
-            controller.integral, mode, make_settings(**others), 2.0 * ARM.tau_max
+        controller.find(Integral).action = integral_with(
+            controller.find(Integral).action, mode, make_settings(**others), 2.0 * ARM.tau_max
         )
-        before = controller.integral.last
+        before = controller.find(Integral).action.last
         for k, v in enumerate(SPEEDS):
             expected = controller.step(State(Q, v), AccelerationRange(-WIDE, WIDE)).tau
             np.testing.assert_allclose(
@@ -159,7 +161,7 @@ def test_parameters_change_while_it_runs_and_the_torque_goes_on(ros):
             )
             if k == 0:
                 # The same state as the last one, but for v.
-                change = controller.integral.last - before
+                change = controller.find(Integral).action.last - before
                 assert (np.abs(change) < 0.01 * ARM.tau_max).all(), changed
     ros.wait_until(lambda: ros.reported(NODE, "integral_action") == "joints")
 

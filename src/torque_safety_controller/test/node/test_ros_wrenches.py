@@ -13,6 +13,7 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from std_srvs.srv import Trigger
 
 from torque_safety_controller.contact import interaction
+from torque_safety_controller.contact.interaction import Interaction
 from torque_safety_controller.contact.wrench_sensor import STRONGEST
 from torque_safety_controller.node.assembly import make_controller
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
@@ -191,7 +192,7 @@ def test_a_tare_takes_what_is_felt_for_the_bias_but_not_from_a_hand_that_is_led(
         hand.step()
     answer = ros.call(Trigger, f"{NODE}/tare_ft_sensor", Trigger.Request())
     assert answer.success
-    np.testing.assert_allclose(hand.node._controller.interaction.sensor.bias[0], 4.0)
+    np.testing.assert_allclose(hand.node._controller.find(Interaction).sensor.bias[0], 4.0)
     hand.feels = wrench(force=(40.0, 0.0, 0.0))
     hand.until("compliance", "yielding")
     answer = ros.call(Trigger, f"{NODE}/tare_ft_sensor", Trigger.Request())
@@ -271,7 +272,7 @@ def test_what_a_tool_weighs_is_that_of_the_parameter_or_of_the_urdf():
 
     def left(tool, mass, lever):
         controller = build(ft_tool=tool, ft_filter_hz=1e4)
-        robot, sensor = controller.robot, controller.interaction.sensor
+        robot, sensor = controller.robot, controller.find(Interaction).sensor
         robot.update(State(ARM.q_start, np.zeros(ARM.n)), np.zeros(ARM.n))
         rotation = robot.pose.rotation @ sensor.placement.rotation
         weight = rotation.T @ (mass * robot.model.gravity.linear)
@@ -292,11 +293,11 @@ def test_points_of_one_link_are_one_contact():
     controller = build(
         contacts=[contact(point=corner) for corner in corners],
     )
-    (hand,) = controller.interaction.contacts.contacts
+    (hand,) = controller.find(Interaction).contacts.contacts
     np.testing.assert_array_equal(hand.points, corners)
     assert hand.friction == 0.5
 
 
 def test_without_a_sensor_there_is_nothing_to_do():
     controller = build(ft_frame="", force_directions=[], yield_threshold=[])
-    assert controller.interaction is None
+    assert controller.find(Interaction) is None

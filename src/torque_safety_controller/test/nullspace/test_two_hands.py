@@ -15,6 +15,8 @@ from torque_safety_controller.controller import Controller
 from torque_safety_controller.integral_feedback import IntegralSettings
 from torque_safety_controller.integral_feedback.action import IntegralAction
 from torque_safety_controller.nullspace.compliance import NullspaceCompliance, TaskShapeError
+from torque_safety_controller.parts.goals import Goals
+from torque_safety_controller.parts.joint_bounds import JointBounds
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks.gains import Gains
@@ -123,21 +125,26 @@ def test_without_a_null_space_left_there_is_no_such_action():
         IntegralAction("task", *settings, hands=2)
 
 
+def two_hands(tau_max, gains) -> Controller:
+    arm = robot(STEP)
+    return Controller(arm, [Goals(arm.n, gains, len(arm.others)), JointBounds()], tau_max)
+
+
 @pytest.mark.parametrize("only_second", [False, True])
 def test_each_hand_accelerates_towards_its_own_goal(only_second):
     """(7) and (8), by differences along the motion; the posture's stiffness moves neither."""
     rng = np.random.default_rng(1)
     q, v = Motion.start + 0.1 * rng.normal(size=16), 0.2 * rng.normal(size=16)
     gains = Gains(pose_kp=100.0, pose_kd=7.0, posture_kp=30.0, posture_kd=1.0, posture_weight=1e-7)
-    controller = Controller(robot(STEP), np.full(16, 1e5), gains)
+    controller = two_hands(np.full(16, 1e5), gains)
     controller.reset(q + 0.3)
     goals = [
         pose * pin.exp6(pin.Motion(np.r_[0.1 * rng.normal(size=3), 0.3 * rng.normal(size=3)]))
         for pose in hands(q)
     ]
     if not only_second:
-        controller.set_pose_goal(goals[0])
-    controller.set_other_pose_goal(0, goals[1])
+        controller.goals.set_pose(goals[0])
+    controller.goals.set_other_pose(0, goals[1])
     wide = np.full(16, 1e5)
     a = controller.step(State(q, v), AccelerationRange(-wide, wide)).a
     path = [hands(q + h * v + 0.5 * h * h * a) for h in (-SMALL, 0.0, SMALL)]
@@ -163,10 +170,10 @@ def test_the_stiffness_of_the_posture_moves_neither_hand():
     gains = Gains(pose_kp=100.0, pose_kd=7.0, posture_kp=30.0, posture_kd=1.0, posture_weight=0.1)
     found = []
     for posture in (q, q + 0.2 * np.sin(np.arange(16))):
-        controller = Controller(robot(STEP), wide, gains)
+        controller = two_hands(wide, gains)
         controller.reset(posture)
-        controller.set_pose_goal(hands(q)[0])
-        controller.set_other_pose_goal(0, hands(q)[1])
+        controller.goals.set_pose(hands(q)[0])
+        controller.goals.set_other_pose(0, hands(q)[1])
         found.append(controller.step(State(q, rest), AccelerationRange(-wide, wide)).a)
     difference = found[1] - found[0]
     assert np.abs(difference).max() > 1.0

@@ -9,7 +9,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from torque_safety_controller.command_check import ENOUGH, CommandCheck
 from torque_safety_controller.modes import CAUSES, CHANGES, Control, Goals, Mode
-from torque_safety_controller.slow_down import FALL_TIME, RISE_TIME
+from torque_safety_controller.ramp import FALL_TIME, RISE_TIME
 from torque_safety_controller.supervisor import REST_PATIENCE, Supervisor
 
 DT, COVERED, PAUSE = 0.01, 1, 0.2

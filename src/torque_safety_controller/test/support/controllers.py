@@ -8,10 +8,18 @@ import pinocchio as pin
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from torque_safety_controller.controller import Controller, Gains
+from torque_safety_controller.controller import Controller
+from torque_safety_controller.friction.compensation import FrictionCompensation
 from torque_safety_controller.integral_feedback import IntegralSettings
 from torque_safety_controller.integral_feedback.action import FadingTorque, make_integral
+from torque_safety_controller.parts.disturbance import Disturbance
+from torque_safety_controller.parts.friction import Friction
+from torque_safety_controller.parts.goals import Goals
+from torque_safety_controller.parts.integral import Integral
+from torque_safety_controller.parts.joint_bounds import JointBounds
+from torque_safety_controller.parts.slow_down import SlowDown
 from torque_safety_controller.qp import AccelerationRange
+from torque_safety_controller.tasks.gains import Gains
 from viability_bounds_pkg.state import State
 
 GAINS = Gains(
@@ -42,11 +50,30 @@ def posture_only(kp: float, kd: float) -> Gains:
     )
 
 
-def make(arm, **arguments) -> Controller:
+def make(
+    arm,
+    *further,
+    robot=None,
+    tau_max=None,
+    gains=GAINS,
+    integral=None,
+    friction=None,
+    **arguments,
+) -> Controller:
+    """A controller with goals, bounds, and what is asked for; `further` follow the bounds."""
+    robot = arm.robot() if robot is None else robot
+    parts = [Goals(robot.n, gains, len(robot.others))]
+    if integral is not None:
+        parts.append(Integral(integral, robot))
+    if friction is not None:
+        parts.append(Friction(FrictionCompensation(friction)))
+    if gains.disturbance_time is not None:
+        parts.append(Disturbance(robot.n, gains.disturbance_time))
     return Controller(
-        arm.robot(),
-        arguments.pop("tau_max", arm.tau_max),
-        arguments.pop("gains", GAINS),
+        robot,
+        [*parts, JointBounds(), *further, SlowDown(arm.q_min, arm.q_max, robot.dt)],
+        arm.tau_max if tau_max is None else tau_max,
+        hold_kd=gains.hold_kd,
         **arguments,
     )
 
@@ -83,7 +110,8 @@ def integral(arm, mode, **changed) -> FadingTorque:
 
 def with_integral(arm, mode="joints", gains=GAINS, rate=None, **changed) -> Controller:
     """A controller at 1 kHz."""
-    return Controller(arm.robot(KHZ), arm.tau_max, gains, rate, integral(arm, mode, **changed))
+    action = integral(arm, mode, **changed)
+    return make(arm, robot=arm.robot(KHZ), gains=gains, integral=action, torque_rate_max=rate)
 
 
 NUMBERS = st.one_of(

@@ -7,6 +7,7 @@ import numpy as np
 import pinocchio as pin
 from arms import load_arm
 from controller_chain import NODE, ControllerChain, gains_of
+from controllers import make
 from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import JointState
 
@@ -37,12 +38,12 @@ SAME_TORQUE = 1e-6  # N m; two runs of the solver
 
 def expected(pose=None, posture=None, gains=GAINS) -> Controller:
     """The node's core, set up by hand."""
-    controller = Controller(ARM.robot(), ARM.tau_max, gains)
+    controller = make(ARM, gains=gains)
     controller.reset(Q)
     if pose is not None:
-        controller.set_pose_goal(pose)
+        controller.goals.set_pose(pose)
     if posture is not None:
-        controller.set_posture_goal(posture)
+        controller.goals.set_posture(posture)
     return controller
 
 

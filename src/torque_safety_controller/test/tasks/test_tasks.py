@@ -6,10 +6,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from torque_safety_controller.tasks.damping_task import DampingTask
 from torque_safety_controller.tasks.gains import Gains, critical_damping
 from torque_safety_controller.tasks.pose_task import PoseMotion, PoseTask, pose_error
 from torque_safety_controller.tasks.posture_task import PostureTask
+from torque_safety_controller.tasks.rest_task import RestTask
 from viability_bounds_pkg.state import State
 
 KP, KD, WEIGHT = 30.0, 7.0, 2.5
@@ -218,7 +218,7 @@ def test_posture_and_damping_terms():
     assert A is None
     assert weight == WEIGHT
     np.testing.assert_allclose(b, KP * (q_des - q) - KD * v, rtol=1e-15)
-    A, b, _ = DampingTask(KD).term(robot)
+    A, b, _ = RestTask(-KD * robot.v).term(robot)
     assert A is None
     np.testing.assert_allclose(b, -KD * v, rtol=1e-15)
 

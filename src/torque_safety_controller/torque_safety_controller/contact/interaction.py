@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
@@ -23,12 +24,15 @@ from numpy.typing import NDArray
 from torque_safety_controller.contact.admittance import AdmittanceGains, AdmittanceTask
 from torque_safety_controller.contact.contacts import Contacts, FrictionContact
 from torque_safety_controller.contact.wrench_sensor import WrenchSensor
+from torque_safety_controller.parts.goals import Goals
 from torque_safety_controller.qp import ContactForces
 from torque_safety_controller.robot_model import RobotModel
-from torque_safety_controller.tasks.gains import Gains
-from torque_safety_controller.tasks.goals import Goals
+from torque_safety_controller.step import Part, Step
 from torque_safety_controller.tasks.pose_task import shorten
 from torque_safety_controller.tasks.task import Task
+
+if TYPE_CHECKING:
+    from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 
 Array = NDArray[np.float64]
 
@@ -79,10 +83,13 @@ class InteractionSettings:
     yielding_gains: AdmittanceGains = AdmittanceGains((0.1, 1.0), (0.0, 0.0), (0.25, 1.0))
 
 
-class Interaction:
-    """What an arm does about forces.
+class Interaction(Part):
+    """Exerts wrenches at the hand, and yields to them.
+
+    Where the hand yields or presses, its pose becomes the goal of `goals`.
 
     Args:
+        goals: of the arm.
         sensor: at the hand.
         contacts: the hand's, with which a wrench is exerted; None for none.
         placement: of the contact's frame in the end effector's.
@@ -98,11 +105,13 @@ class Interaction:
 
     def __init__(
         self,
+        goals: Goals,
         sensor: WrenchSensor,
         contacts: Contacts | None = None,
         placement: pin.SE3 | None = None,
         settings: InteractionSettings | None = None,
     ) -> None:
+        self._goals = goals
         self.sensor = sensor
         self.contacts = contacts
         placement = pin.SE3.Identity() if placement is None else placement
@@ -112,7 +121,7 @@ class Interaction:
         self._turned = False
         self._settings = self.settings = settings or InteractionSettings()
         self.state, self.reason, self.changes = Compliance.OFF, "at start", 0
-        self.start()
+        self._clear()
 
     @property
     def settings(self) -> InteractionSettings:
@@ -127,8 +136,7 @@ class Interaction:
         self._rows = np.flatnonzero(settings.directions)
         self._shares = np.where(settings.directions, 0.0, 1.0)
 
-    def start(self) -> None:
-        """Forget the past and the target."""
+    def _clear(self) -> None:
         self._target = None
         self._goal = self._goal_rate = self.reference = np.zeros(6)
         self._counted = np.zeros(6)  # on, at the contact of the hand, in its axes
@@ -154,15 +162,54 @@ class Interaction:
 
     # Each step
 
-    def observe(self, robot: RobotModel, goals: Goals, elapsed: float) -> None:
-        """Go by what is measured; take the pose where the hand is for its goal when it yields.
+    def configure(self, config: ControllerConfiguration) -> None:
+        """See `Part.configure`."""
+        self.settings = config.interaction.settings
+        self.sensor.settings = config.interaction.sensor
 
-        Args:
-            robot: updated to the current state.
-            goals: of the arm.
-            elapsed: time since the last step, s.
-        """
-        sensor = self.sensor
+    def reset(self, robot: RobotModel) -> None:
+        """Forget the past and the target."""
+        self._clear()
+
+    def prepare(self, step: Step) -> None:
+        """Add the admittance task, (27), and what the contact may exert."""
+        self._change_state(step.robot, step.elapsed)
+        if not (step.order.track and self._goals.any):
+            return
+        step.tasks += self._tasks()
+        if self.state is Compliance.FORCE:
+            step.stiffness = self._shares
+            step.forces = self._forces(step.robot)
+
+    def learn(self, step: Step) -> None:
+        """Remember what the QP counts on at the contact less than is wanted."""
+        if step.forces is None or step.solution is None or self.contacts is None:
+            return
+        missing = self._counted - self.contacts.wrench(0, step.solution.rho)
+        if len(self.contacts.contacts[0].points) == 1:
+            missing[3:] = 0.0  # a point exerts no moment; none was asked of it
+        self._missing = self._to_hand @ missing
+
+    def report(self) -> dict[str, Any]:
+        """See `Part.report`."""
+        return {
+            "compliance": self.state.value,
+            "compliance_reason": self.reason,
+            "compliance_changes": self.changes,
+            "hand_wrench": self.sensor.wrench,
+            "target_wrench": self.target,
+            "ft_bias": self.sensor.bias,
+        }
+
+    @property
+    def trouble(self) -> str:
+        """Whether the sensor says nothing, though it is needed."""
+        silent = self.state is Compliance.SILENT
+        return "the force/torque sensor is silent" if silent else ""
+
+    def _change_state(self, robot: RobotModel, elapsed: float) -> None:
+        """Choose what is done, and make the pose of a hand that yields its goal."""
+        sensor, goals = self.sensor, self._goals
         sensor.update(robot.pose.rotation, elapsed)
         active = self.state in (Compliance.FORCE, Compliance.YIELDING)
         if sensor.silent:
@@ -177,7 +224,7 @@ class Interaction:
                 self._enter(state, "no measurement")
             return
         if self._target is not None and self._rows.size:
-            self._exert(*self._target, sensor.wrench, robot, goals, elapsed)
+            self._exert(*self._target, sensor.wrench, robot, elapsed)
             return
         if self.state is Compliance.FORCE:
             goals.hold(robot.pose)
@@ -202,9 +249,9 @@ class Interaction:
         rotation: Array | None,
         measured: Array,
         robot: RobotModel,
-        goals: Goals,
         elapsed: float,
     ) -> None:
+        goals = self._goals
         if rotation is not None:
             turn = robot.pose.rotation.T @ rotation
             wrench = np.concatenate([turn @ wrench[:3], turn @ wrench[3:]])
@@ -236,18 +283,10 @@ class Interaction:
         (contact,) = self.contacts.contacts
         self._counted = _counted(self._goal, measured, self._to_contact, contact)
 
-    @property
-    def stiffness(self) -> Array | None:
-        """Share of the pose task's stiffness by direction, shape (6,); None for all of it."""
-        return self._shares if self.state is Compliance.FORCE else None
-
-    def tasks(self, gains: Gains) -> list[Task]:
-        """Return the admittance task, (27), if there is one in this state.
-
-        Args:
-            gains: of the tasks.
-        """
-        settings, sensor, weight = self._settings, self.sensor, gains.pose_weight
+    def _tasks(self) -> list[Task]:
+        """Return the admittance task, (27), if there is one in this state."""
+        settings, sensor, gains = self._settings, self.sensor, self._goals.gains
+        weight = gains.pose_weight
         if weight == 0.0:
             return []
         if self.state not in (Compliance.FORCE, Compliance.YIELDING):
@@ -261,39 +300,13 @@ class Interaction:
         a = settings.gains.acceleration(mask * error, mask * error_rate, gains.pose_kd)
         return [AdmittanceTask(a, weight, self._rows)]
 
-    def forces(self, robot: RobotModel) -> ContactForces | None:
-        """Return what the contact may exert in this step, with its wrench task; None if nothing.
-
-        Args:
-            robot: updated to the current state.
-        """
+    def _forces(self, robot: RobotModel) -> ContactForces | None:
+        """Return what the contact may exert in this step, with its wrench task."""
         contacts = self.contacts
-        if contacts is None or self.state is not Compliance.FORCE:
+        if contacts is None:
             return None
         contacts.update(robot.data)
         return contacts.forces([contacts.wrench_task(0, self._counted, WRENCH_WEIGHT)])
-
-    def rehearsal(
-        self, robot: RobotModel, gains: Gains
-    ) -> tuple[list[Task], ContactForces | None]:
-        """Return tasks and forces of every kind that there may be, to compile what they need."""
-        zero = np.zeros(6)
-        tasks: list[Task] = [AdmittanceTask(zero, max(gains.pose_weight, 1.0), np.arange(6))]
-        contacts = self.contacts
-        if contacts is None:
-            return tasks, None
-        contacts.update(robot.data)
-        return tasks, contacts.forces([contacts.wrench_task(0, zero, 1.0)])
-
-    def note_forces(self, rho: Array) -> None:
-        """Take note of the forces that the QP counts on, shape (r,), N."""
-        contacts = self.contacts
-        if contacts is None or self.state is not Compliance.FORCE:
-            return
-        missing = self._counted - contacts.wrench(0, rho)
-        if len(contacts.contacts[0].points) == 1:
-            missing[3:] = 0.0  # a point exerts no moment; none was asked of it
-        self._missing = self._to_hand @ missing
 
     def _enter(self, state: Compliance, reason: str) -> None:
         if state is not self.state:

@@ -107,7 +107,7 @@ class JointJog(_Jog):
             self._q_des, self.velocity = state.q.copy(), state.v.copy()
         wanted, elapsed = self._step(stamp)
         if wanted is None:
-            controller.set_posture_goal(self._q_des)
+            controller.goals.set_posture(self._q_des)
             return False
         # All by the same share: the direction stays.
         wanted = wanted / max(1.0, float((np.abs(wanted) / self._v_max).max()))
@@ -117,8 +117,8 @@ class JointJog(_Jog):
         self._q_des = np.clip(q_des, self._q_min, self._q_max)
         at_limit = q_des != self._q_des
         self.velocity[at_limit] = rate[at_limit] = 0.0
-        controller.release_pose_goal()
-        controller.set_posture_goal(self._q_des, self.velocity, rate)
+        controller.goals.release_pose()
+        controller.goals.set_posture(self._q_des, self.velocity, rate)
         return True
 
 
@@ -157,7 +157,7 @@ class HandJog(_Jog):
             self._goal, self.velocity = robot.pose.copy(), robot.J @ robot.v
         wanted, elapsed = self._step(stamp)
         if wanted is None:
-            controller.set_pose_goal(self._goal)
+            controller.goals.set_pose(self._goal)
             return False
         R = self._goal.rotation
         if not self._in_hand:
@@ -174,5 +174,5 @@ class HandJog(_Jog):
             shorten(turn, HAND_LEAD[1])
             R = robot.pose.rotation @ pin.exp3(turn)
         self._goal = pin.SE3(R, robot.pose.translation + ahead)
-        controller.set_pose_goal(self._goal, self.velocity.copy(), rate)
+        controller.goals.set_pose(self._goal, self.velocity.copy(), rate)
         return True

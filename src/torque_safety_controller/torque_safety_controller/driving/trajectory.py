@@ -191,8 +191,8 @@ class JointMotion:
             self._trajectory = self._trajectory.from_state(state)
         t = 1e-9 * (stamp - self._begin)
         q, v, a = self._trajectory.sample(t)
-        controller.release_pose_goal()
-        controller.set_posture_goal(
+        controller.goals.release_pose()
+        controller.goals.set_posture(
             np.clip(q, self._q_min, self._q_max),
             np.clip(v, -self._v_max, self._v_max),
             np.clip(a, -ACCELERATION_MAX, ACCELERATION_MAX),
@@ -215,5 +215,5 @@ class TrajectoryMotion:
         """Set the goal of one control step; see `Motion`."""
         self._begin = self._begin or stamp
         t = 1e-9 * (stamp - self._begin)
-        controller.set_pose_goal(*self._trajectory.sample(t))
+        controller.goals.set_pose(*self._trajectory.sample(t))
         return t < self._trajectory.duration

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes the controller from its configuration and the URDF, and applies live changes."""
+"""Makes the controller from its configuration and the URDF: which parts, in which order."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from torque_safety_controller.collision.avoidance import CollisionAvoidance
 from torque_safety_controller.collision.model import build_collision_model
@@ -18,11 +17,19 @@ from torque_safety_controller.contact.interaction import Interaction
 from torque_safety_controller.contact.wrench_sensor import WrenchSensor
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.friction.compensation import FrictionCompensation
-from torque_safety_controller.integral_feedback.action import changed, make_integral
-from torque_safety_controller.integral_feedback.settings import IntegralSettings
+from torque_safety_controller.integral_feedback.action import make_integral
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parameters.interaction_parameters import ContactPoint
+from torque_safety_controller.parts.collision import Collision
+from torque_safety_controller.parts.disturbance import Disturbance
+from torque_safety_controller.parts.friction import Friction
+from torque_safety_controller.parts.goals import Goals
+from torque_safety_controller.parts.integral import Integral, integral_arguments
+from torque_safety_controller.parts.joint_bounds import JointBounds
+from torque_safety_controller.parts.safety_filter import WholeArm
+from torque_safety_controller.parts.slow_down import SlowDown
 from torque_safety_controller.robot_model import RobotModel
+from torque_safety_controller.step import Part
 from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError, did_you_mean
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.node.bounds_parameters import (
@@ -47,9 +54,6 @@ if TYPE_CHECKING:
 HORIZON = 2.0
 """Control periods that an acceleration is assumed to last, as in the bounds: no chatter."""
 
-DISTURBANCE_MAX = 2.0
-"""Disturbances beyond this many torque limits are not integrated."""
-
 _BEYOND = 0.003  # m; beyond margin and reserve, pairs nearer than this are too near from the start
 _NEAR = 0.028  # m; beyond margin and reserve, pairs that never come nearer need no guard
 
@@ -70,24 +74,56 @@ def make_controller(
         SettingError: parameters that do not fit the URDF.
     """
     robot, base, urdf = load_robot(config, node)
-    collision = load_collision(config, robot.model)
-    safety_filter = make_safety_filter(config, robot.model)
     controller = Controller(
         robot,
+        make_parts(config, robot, urdf, declared),
         config.torque_max,
-        config.gains,
         config.torque_rate_max,
-        make_integral(*_integral(config)),
-        FrictionCompensation(config.friction_settings),
         config.qp_solver,
-        [] if collision is None else [collision],
-        make_interaction(config, robot, urdf),
-        safety_filter,
-        make_own_bounds(config, declared),
-        (config.position_min, config.position_max),
+        config.gains.hold_kd,
     )
     controller.warm_up()
     return controller, base
+
+
+def make_parts(
+    config: ControllerConfiguration,
+    robot: RobotModel,
+    urdf: str,
+    declared: BoundsConfiguration | None,
+) -> list[Part]:
+    """Return the parts of a controller that its parameters ask for, in their order.
+
+    A part reads only what parts before it have written.
+
+    Args:
+        config: checked parameters.
+        robot: model of the arm.
+        urdf: text of its URDF.
+        declared: of the robot, for the bounds node.
+
+    Raises:
+        SettingError: parameters that do not fit the URDF.
+    """
+    goals = Goals(robot.n, config.gains, len(robot.others))
+    parts = [
+        # It may make the hand's pose the goal, and soften the pose task.
+        make_interaction(config, robot, urdf, goals),
+        goals,
+        # What is added to the model's torque leaves less of it to the QP and to plans.
+        Integral(make_integral(*integral_arguments(config)), robot),
+        Friction(FrictionCompensation(config.friction_settings)),
+        # A change of that torque disturbs before it can be measured.
+        make_disturbance(config),
+        # All before can run while the limits are on their way; all after narrows their bounds.
+        JointBounds(make_own_bounds(config, declared)),
+        make_whole_arm(config, robot),
+        # A slowed arm is slowed inside of what the filter allows.
+        SlowDown(config.position_min, config.position_max, config.dt),
+        # It counts on no more braking than the bounds leave.
+        load_collision(config, robot.model),
+    ]
+    return [part for part in parts if part is not None]
 
 
 def make_plausibility_check(
@@ -112,18 +148,24 @@ def make_plausibility_check(
     )
 
 
-def make_safety_filter(config: ControllerConfiguration, model: pin.Model) -> SafetyFilter | None:
+def make_disturbance(config: ControllerConfiguration) -> Disturbance | None:
+    """Return what estimates disturbances; None where that is off."""
+    time = config.gains.disturbance_time
+    return None if time is None else Disturbance(len(config.joints), time)
+
+
+def make_whole_arm(config: ControllerConfiguration, robot: RobotModel) -> WholeArm | None:
     """Return what keeps a plan in hand; None where that is off.
 
     Args:
         config: checked parameters.
-        model: of the arm.
+        robot: model of the arm.
     """
     if not config.safety_filter:
         return None
     limits = config.collision
-    return SafetyFilter(
-        model,
+    safety_filter = SafetyFilter(
+        robot.model,
         config.position_min,
         config.position_max,
         limits.acceleration_min,
@@ -132,6 +174,7 @@ def make_safety_filter(config: ControllerConfiguration, model: pin.Model) -> Saf
         config.dt,
         config.torque_reserve,
     )
+    return WholeArm(safety_filter, robot, config.torque_max)
 
 
 def make_own_bounds(
@@ -159,26 +202,6 @@ def make_own_bounds(
     )
     margin = MARGIN * np.minimum(-low, high)
     return BoundsSolver(limits, HORIZON * config.dt, margin, period=config.dt).bounds
-
-
-def configure(controller: Controller, config: ControllerConfiguration) -> None:
-    """Apply the live parameters to a running controller."""
-    controller.gains = config.gains
-    if controller.integral is not None:
-        controller.integral = changed(controller.integral, *_integral(config))
-    if controller.friction is not None:
-        controller.friction.settings = config.friction_settings
-    if controller.interaction is not None:
-        controller.interaction.settings = config.interaction.settings
-        controller.interaction.sensor.settings = config.interaction.sensor
-
-
-def _integral(
-    config: ControllerConfiguration,
-) -> tuple[str, IntegralSettings, NDArray[np.float64], int]:
-    """Return the arguments of `make_integral`."""
-    mode, hands = config.integral.integral_action, len(config.end_effectors)
-    return mode, config.integral_settings, DISTURBANCE_MAX * config.torque_max, hands
 
 
 class LoadedRobot(NamedTuple):
@@ -231,8 +254,8 @@ def _base_placement(model: pin.Model, frame: str) -> pin.SE3:
     return found.placement
 
 
-def load_collision(config: ControllerConfiguration, model: pin.Model) -> CollisionAvoidance | None:
-    """Return the collision avoidance of an arm, or None without one.
+def load_collision(config: ControllerConfiguration, model: pin.Model) -> Collision | None:
+    """Return the collision avoidance of an arm; None where that is off.
 
     Args:
         config: checked parameters.
@@ -254,7 +277,7 @@ def load_collision(config: ControllerConfiguration, model: pin.Model) -> Collisi
     limited.lowerPositionLimit = config.position_min
     limited.upperPositionLimit = config.position_max
     kept = collision.settings.kept
-    return CollisionAvoidance(
+    avoidance = CollisionAvoidance(
         build_collision_model(
             limited,
             collision.capsules,
@@ -270,10 +293,11 @@ def load_collision(config: ControllerConfiguration, model: pin.Model) -> Collisi
         HORIZON * config.dt,
         collision.settings,
     )
+    return Collision(avoidance)
 
 
 def make_interaction(
-    config: ControllerConfiguration, robot: RobotModel, urdf: str
+    config: ControllerConfiguration, robot: RobotModel, urdf: str, goals: Goals
 ) -> Interaction | None:
     """Return what handles forces; None without a sensor.
 
@@ -281,6 +305,7 @@ def make_interaction(
         config: checked parameters.
         robot: model of the arm.
         urdf: text of its URDF.
+        goals: of the arm.
 
     Raises:
         SettingError: a frame that the URDF does not have or that is not where it must be.
@@ -290,10 +315,10 @@ def make_interaction(
     if sensor is None:
         return None
     if contact is None:
-        return Interaction(sensor, settings=config.interaction.settings)
+        return Interaction(goals, sensor, settings=config.interaction.settings)
     placement = _between(robot.model, robot.frame, contact.frame)
     contacts = Contacts(robot.model, [contact])
-    return Interaction(sensor, contacts, placement, config.interaction.settings)
+    return Interaction(goals, sensor, contacts, placement, config.interaction.settings)
 
 
 def _sensor(config: ControllerConfiguration, robot: RobotModel, urdf: str) -> WrenchSensor | None:

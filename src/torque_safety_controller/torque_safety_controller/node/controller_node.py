@@ -14,10 +14,10 @@ from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
 from torque_safety_controller.command_check import CommandCheck
+from torque_safety_controller.contact.interaction import Interaction
 from torque_safety_controller.handover import Handover, HandoverRefused
 from torque_safety_controller.modes import Control, Mode
 from torque_safety_controller.node.assembly import (
-    configure,
     make_controller,
     make_plausibility_check,
 )
@@ -91,7 +91,7 @@ class ControllerNode(ArmNode):
         heard = self, self.publisher_watch
         self._goals = GoalSubscriber(*heard, self._controller, config, base)
         self._wrenches = WrenchSubscriber(
-            *heard, self._controller.interaction, self._goals, config, base
+            *heard, self._controller.find(Interaction), self._goals, config, base
         )
         self._driving = Driving(self, self._goals, self._controller, config, base, self._states)
         commands = None
@@ -148,7 +148,7 @@ class ControllerNode(ArmNode):
 
     def _configure(self, config: ControllerConfiguration) -> None:
         self._config = config
-        configure(self._controller, config)
+        self._controller.configure(config)
 
     # Streams
 
@@ -231,7 +231,7 @@ class ControllerNode(ArmNode):
         step = self._controller.step(state, limits, order, elapsed)
         self._commands.torque(step.tau, stamp)
         states.mark_answered()
-        supervisor.answered(step.tau, step.failure, not self._controller.lost)
+        supervisor.answered(step.tau, step.failure, step.planned)
         self._report.add(step, time.monotonic() - states.message_at)
         self._wrenches.log_changes()
 
@@ -245,7 +245,7 @@ class ControllerNode(ArmNode):
             found = self._handover.torque(state.q, self._states.effort())
             if found is None:
                 return
-            step = self._controller.bumpless_transfer(state, limits, found.mean)
+            step = self._controller.resume(state, limits, found.mean)
             if step.failure:
                 raise HandoverRefused(f"solver failed: {step.failure}")
         except HandoverRefused as error:

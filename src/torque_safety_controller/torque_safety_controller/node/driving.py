@@ -177,7 +177,7 @@ class Driving:
         self._goals.add(message, jog)
 
     def _hand_speed_max(self) -> tuple[float, float]:
-        largest = self._controller.gains.pose_speed_max
+        largest = self._controller.goals.gains.pose_speed_max
         if not len(largest):
             return HAND_SPEED_MAX
         return float(largest[0]), float(largest[1])

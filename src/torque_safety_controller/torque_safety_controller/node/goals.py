@@ -186,7 +186,7 @@ class GoalSubscriber:
         self.listen(TARGET_POSTURE, self._on_posture)
         self.listen(TARGET_TRAJECTORY, self._on_trajectory)
         self.motion: Motion | None = None
-        self._taken = controller.goals.taken
+        self._taken = controller.goals.held
         self.renew()
 
     def __len__(self) -> int:
@@ -247,8 +247,8 @@ class GoalSubscriber:
         Returns:
             Whether any were due, or a motion goes on.
         """
-        if self._taken != self._controller.goals.taken:
-            self._taken, self.motion = self._controller.goals.taken, None
+        if self._taken != self._controller.goals.held:
+            self._taken, self.motion = self._controller.goals.held, None
         due = False
         while self._pending and self._pending[0][0] <= stamp:
             self._pending.pop(0)[1]()
@@ -267,11 +267,11 @@ class GoalSubscriber:
 
     def _on_second_pose(self, message: PoseStamped) -> None:
         pose = pose_from_message(message, self._config.base_frame)
-        self.add(message, lambda: self._controller.set_other_pose_goal(0, self._base * pose))
+        self.add(message, lambda: self._controller.goals.set_other_pose(0, self._base * pose))
 
     def _rest_at(self, pose: pin.SE3) -> None:
         self.motion = None
-        self._controller.set_pose_goal(pose)
+        self._controller.goals.set_pose(pose)
 
     def _on_trajectory(self, message: MultiDOFJointTrajectory) -> None:
         config = self._config
@@ -295,7 +295,7 @@ class GoalSubscriber:
     def _take_posture(self, q_des: np.ndarray) -> None:
         if not isinstance(self.motion, TrajectoryMotion):  # which leaves the posture to others
             self.motion = None
-        self._controller.set_posture_goal(q_des)
+        self._controller.goals.set_posture(q_des)
 
     def refuse(self, topic: Topic, reason: GoalRefused | str) -> None:
         """Count and log a goal that cannot be followed, or a publisher that cannot be heard."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections import Counter
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -140,26 +139,3 @@ class WrenchSubscriber:
             self._logger.warning(text)
         else:
             self._logger.info(text)
-
-    @property
-    def trouble(self) -> str:
-        """Present problem in words, empty if there is none."""
-        interaction = self._interaction
-        if interaction is None or interaction.state is not Compliance.SILENT:
-            return ""
-        return "the force/torque sensor is silent"
-
-    def values(self) -> dict[str, Any]:
-        """Return what to report in /diagnostics."""
-        interaction = self._interaction
-        if interaction is None:
-            return {"compliance": Compliance.OFF.value}
-        return {
-            "compliance": interaction.state.value,
-            "compliance_reason": interaction.reason,
-            "compliance_changes": interaction.changes,
-            "hand_wrench": interaction.sensor.wrench,
-            "target_wrench": interaction.target,
-            "ft_bias": interaction.sensor.bias,
-            "wrenches_refused": self.refused,
-        }

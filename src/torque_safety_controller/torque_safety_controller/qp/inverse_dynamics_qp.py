@@ -46,6 +46,11 @@ class Solution(NamedTuple):
     iterations: int
     """Of the solver."""
 
+    @property
+    def exact(self) -> bool:
+        """Whether no limit was relaxed."""
+        return self.relaxation is None and self.constraint_relaxation is None
+
 
 class InverseDynamicsQP:
     """Builds the QP of a control step, and solves it, starting from the solution of the last one.

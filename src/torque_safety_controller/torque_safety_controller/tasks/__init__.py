@@ -1,17 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tasks: what the accelerations should do, and the goals that they serve."""
 
-from torque_safety_controller.tasks.damping_task import DampingTask
 from torque_safety_controller.tasks.gains import Gains
-from torque_safety_controller.tasks.goals import Goals
 from torque_safety_controller.tasks.pose_task import PoseMotion, PoseTask
 from torque_safety_controller.tasks.posture_task import PostureTask
+from torque_safety_controller.tasks.rest_task import RestTask
 from torque_safety_controller.tasks.task import Task
 
 __all__ = [
-    "DampingTask",
+    "RestTask",
     "Gains",
-    "Goals",
     "PoseMotion",
     "PoseTask",
     "PostureTask",

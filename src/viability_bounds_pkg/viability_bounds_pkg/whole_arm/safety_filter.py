@@ -187,7 +187,7 @@ class SafetyFilter:
 
     def reset(self) -> None:
         """Forget the plan in hand."""
-        self._time, self._periods = USUAL_TIME, None
+        self._time, self._periods, self._turn = USUAL_TIME, None, 0
 
     def prepare(self, q: Array, v: Array, extra: Array, lower: Array, upper: Array) -> Rows | None:
         """Bring the plan to the present state; return the constraints on the step's accelerations.

@@ -10,14 +10,16 @@ import pinocchio as pin
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 
-from torque_safety_controller.controller import Controller, ControlOutput
+from torque_safety_controller.controller import Controller
 from torque_safety_controller.modes import Mode
 from torque_safety_controller.node.goals import GoalSubscriber
-from torque_safety_controller.node.reports.collision_report import CollisionReport
+from torque_safety_controller.node.reports.collision_report import log_pairs
 from torque_safety_controller.node.streams.limits import LimitsReader
 from torque_safety_controller.node.streams.states import StateStream
 from torque_safety_controller.node.wrenches import WrenchSubscriber
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
+from torque_safety_controller.parts.collision import Collision
+from torque_safety_controller.step import Step, joints_named
 from torque_safety_controller.supervisor import Supervisor
 from viability_bounds_pkg.recent_values import RecentValues
 from viability_bounds_pkg.ros.messages import PeriodCheck
@@ -75,37 +77,32 @@ class ControllerReport:
         self._states, self._limits = states, limits
         self._goals, self._wrenches = goals, wrenches
         config = parameters.configuration
-        self._collision = CollisionReport(node.get_logger(), controller.constraints)
-        self._shortfall = Shortfall(config.joints, config.position_min, config.position_max)
+        if collision := controller.find(Collision):
+            log_pairs(node.get_logger(), collision)
+        self._shortfall = Shortfall(config.position_min, config.position_max)
         self._period = PeriodCheck(config.dt, node.get_logger().warning)
         self._steps = self._relaxed_steps = self._failures = 0
         self._latencies = RecentValues()
         self._last_relaxation = np.zeros(len(config.joints))
+        self._last: Step | None = None
 
-    def add(self, step: ControlOutput, latency: float) -> None:
+    def add(self, step: Step, latency: float) -> None:
         """Count a step that was answered `latency` seconds after its state came."""
         self._latencies.note(latency)
+        self._last = step
         self._steps += 1
         self._failures += bool(step.failure)
         if step.relaxation is not None and step.relaxation.max() > _SLIGHT:
             self._relaxed_steps += 1
             self._last_relaxation = step.relaxation
-        self._collision.add(step)
 
     def __call__(self) -> tuple[bytes, str, dict[str, Any]]:
         """Return level, message and values of the node's status."""
         self._period.compare(self._states)
         supervisor, controller = self._supervisor, self._controller
-        joints, mode = self._parameters.configuration.joints, supervisor.mode
+        mode = supervisor.mode
         level, text = LEVELS[mode], f"{mode.value}: {supervisor.reason}"
-        weak, heavy = too_weak(joints, controller), goal_too_heavy(joints, controller)
-        troubles = (
-            supervisor.trouble,
-            self._collision.too_near,
-            self._wrenches.trouble,
-            weak and f"the arm cannot be held where it would come to rest: {weak}",
-            heavy and f"the goal cannot be held: {heavy}",
-        )
+        troubles = supervisor.trouble, *(part.trouble for part in controller.parts)
         for trouble in filter(None, troubles):
             level, text = max(level, DiagnosticStatus.WARN), f"{text}; {trouble}"
         short = self._shortfall.text(controller, 1e-9 * self._states.stamp)
@@ -115,87 +112,50 @@ class ControllerReport:
         return level, f"{text}; {short}" if short else text, values
 
     def _values(self) -> dict[str, Any]:
-        config, controller = self._parameters.configuration, self._controller
-        joints, (a_lower, a_upper) = config.joints, self._limits.range
-        a = controller.acceleration
-        near = 1e-3 * (a_upper - a_lower) + 1e-6
-        at_limit = (a <= a_lower + near) | (a >= a_upper - near)
-        error = controller.goals.error(controller.robot.pose)
+        config = self._parameters.configuration
         values = {
             "steps": self._steps,
-            "position_error_m": float(np.linalg.norm(error[:3])),
-            "orientation_error_rad": float(np.linalg.norm(error[3:])),
-            "qp_iterations": controller.iterations,
             "qp_failures": self._failures,
             "bounds_relaxed_steps": self._relaxed_steps,
             "bounds_last_relaxation_rad_s2": self._last_relaxation,
-            "joints_at_acceleration_limit": _named(joints, at_limit),
             "latency_p50_us": 1e6 * self._latencies.percentile(50),
             "latency_p99_us": 1e6 * self._latencies.percentile(99),
             "integral_action": config.integral.integral_action,
-            "integral_lambda": controller.integral_gain,
             "torque_rate_max": "clipped" if config.clips_torque_rates else "none",
             "goals_pending": len(self._goals),
             "goals_refused": self._goals.refused,
             "states_refused": self._states.refused,
             "limits_refused": self._limits.refused,
+            "wrenches_refused": self._wrenches.refused,
         }
-        integral, friction = controller.integral, controller.friction
-        if integral is not None and friction is not None:
-            values |= {
-                "additional_torque_nm": integral.last + friction.last,
-                "friction_torque_nm": friction.last,
-                "joints_at_integral_budget": _named(joints, integral.saturated),
-                "integral_skipped_steps": integral.skipped,
-            }
-        if controller.safety_filter is not None:
-            values |= {
-                "steps_by_plan": controller.safety_filter.outcomes,
-                "plan_torque_left": controller.safety_filter.slack,
-                "joints_too_weak_to_hold": too_weak(joints, controller) or "none",
-            }
-        parts = self._collision, self._wrenches, self._supervisor
-        for part in parts:
-            values |= part.values()
-        return values
+        values |= self._supervisor.values() | self._controller.report()
+        return values if self._last is None else values | self._of_step(self._last)
 
-
-def too_weak(joints: tuple[str, ...], controller: Controller) -> str:
-    """Return which joints cannot hold the arm where it would come to rest; empty for none."""
-    if controller.safety_filter is None:
-        return ""
-    return _beyond(joints, controller.safety_filter.rest_torque, controller.tau_max)
-
-
-def goal_too_heavy(joints: tuple[str, ...], controller: Controller) -> str:
-    """Return which joints cannot hold the arm at the joints' goal; empty for none."""
-    goals, robot = controller.goals, controller.robot
-    if goals.q_des is None or goals.pose_des is not None:
-        return ""
-    torque = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), goals.q_des)
-    return _beyond(joints, torque, controller.tau_max)
-
-
-def _beyond(joints: tuple[str, ...], torque: np.ndarray, most: np.ndarray) -> str:
-    """Return which joints need more torque than they have; empty for none."""
-    return ", ".join(
-        f"{name} needs {needed:.1f} of {limit:.1f} N m"
-        for name, needed, limit in zip(joints, np.abs(torque), most, strict=True)
-        if needed > limit
-    )
+    def _of_step(self, step: Step) -> dict[str, Any]:
+        """Return values of the last step."""
+        robot, (lower, upper) = step.robot, step.commanded(step.bounds)
+        error = self._controller.goals.error(robot.pose)
+        near = 1e-3 * (upper - lower) + 1e-6
+        at_limit = (step.a <= lower + near) | (step.a >= upper - near)
+        return {
+            "position_error_m": float(np.linalg.norm(error[:3])),
+            "orientation_error_rad": float(np.linalg.norm(error[3:])),
+            "qp_iterations": 0 if step.solution is None else step.solution.iterations,
+            "joints_at_acceleration_limit": joints_named(robot, at_limit),
+            "additional_torque_nm": step.torque,
+        }
 
 
 class Shortfall:
     """Tells that the arm stands short of a pose that stays the goal.
 
     Args:
-        joints: names of the n joints.
         q_min: lower position limits, shape (n,), rad.
         q_max: upper ones, shape (n,), rad.
     """
 
-    def __init__(self, joints: tuple[str, ...], q_min: np.ndarray, q_max: np.ndarray) -> None:
-        self._joints, self._q_min, self._q_max = joints, q_min, q_max
+    def __init__(self, q_min: np.ndarray, q_max: np.ndarray) -> None:
+        self._q_min, self._q_max = q_min, q_max
         self._goal: pin.SE3 | None = None
         self._since = 0.0
         self._least = np.zeros(2)
@@ -221,9 +181,4 @@ class Shortfall:
             return ""
         near = np.minimum(robot.q - self._q_min, self._q_max - robot.q) < _NEAR
         text = f"stands {1e3 * left[0]:.0f} mm and {left[1]:.2f} rad short of its goal"
-        return text + (f", on limits of {_named(self._joints, near)}" if near.any() else "")
-
-
-def _named(joints: tuple[str, ...], flags: np.ndarray) -> str:
-    """Return the names of the joints that are flagged."""
-    return ", ".join(name for name, flag in zip(joints, flags, strict=True) if flag) or "none"
+        return text + (f", on limits of {joints_named(robot, near)}" if near.any() else "")

@@ -5,20 +5,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from torque_safety_controller.qp import TaskTerm
 from torque_safety_controller.robot_model import RobotModel
 
+Array = NDArray[np.float64]
+
 
 @dataclass(slots=True)
-class DampingTask:
+class RestTask:
     """Brings the joints to rest wherever they are.
 
     Attributes:
-        kd: damping, 1/s.
+        a: accelerations that do, as `Step.rest`, shape (n,), rad/s^2.
     """
 
-    kd: float
+    a: Array
 
     def term(self, robot: RobotModel) -> TaskTerm:
-        """Return ``a = -kd v`` as a term of the cost."""
-        return TaskTerm(None, -self.kd * robot.v, 1.0)
+        """Return the accelerations as a term of the cost."""
+        return TaskTerm(None, self.a, 1.0)
