@@ -267,7 +267,7 @@ def test_an_estimate_without_a_solution_is_held_and_forgotten(ros):
     chain.await_mode("TRACKING", each=lambda: chain.both(next(stamps)))
 
 
-def test_the_rate_of_torque_is_limited(ros):
+def test_the_rate_of_torque_is_limited_and_that_is_told(ros, capfd):
     rate = np.full(ARM.n, 100.0)
     chain = NodeChain(ros, torque_rate_max=rate.tolist())
     tau = [
@@ -277,6 +277,8 @@ def test_the_rate_of_torque_is_limited(ros):
     change = np.abs(np.diff(tau, axis=0))
     assert (change <= rate * ARM.dt + 1e-9).all()
     assert (change > 0.3 * rate * ARM.dt).any()
+    ros.wait_until(lambda: chain.reported("torque_rate_max") == "clipped")
+    assert "limits are not promised with it" in capfd.readouterr().err
 
 
 def test_joints_at_a_limit_are_named(ros):
