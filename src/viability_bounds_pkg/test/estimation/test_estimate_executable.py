@@ -229,7 +229,7 @@ def test_a_link_without_mass_that_carries_others_is_fine(write_robot, call):
         ({"hand_mass": 0.0}, "joint wrist moves no inertia"),
         ({"hand_mass": 0.0, "mass": 0.0}, "joint shoulder moves no inertia"),
         ({"parameters": "    velocity_max: [1.0]"}, "'velocity_max' is [1]; allowed: 2 numbers"),
-        ({"parameters": "    velocity_max: [1, fast]"}, "allowed: items of one type"),
+        ({"parameters": "    velocity_max: [1, fast]"}, "allowed: a list of numbers"),
         ({"parameters": "    velocity_max: [1, 0]"}, "allowed: finite numbers > 0"),
         ({"parameters": "    position_min: [9, 0]"}, "'position_max' is [2, 2]; allowed: above"),
         (
