@@ -63,9 +63,12 @@ def test_torque_limits_hold_whatever_the_integral_does(mode, share, rate, deeds)
             if deed == "reset":
                 controller.reset(q)
                 continue
-            act = getattr(controller, deed)
-            last = {"hold": (elapsed,), "bumpless_transfer": (bounds, x)}
-            step = act(State(q, v), *last.get(deed, (bounds, elapsed)))
+            state = State(q, v)
+            if deed == "bumpless_transfer":
+                step = controller.bumpless_transfer(state, bounds, x)
+            else:
+                order = None if deed == "step" else REST
+                step = controller.step(state, None if deed == "hold" else bounds, order, elapsed)
             assert_may_be_sent(step, arm)
             assert np.isfinite(controller.find(Integral).action.last).all()
         # Once the world makes sense again, so does the controller.

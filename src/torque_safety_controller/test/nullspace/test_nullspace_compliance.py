@@ -156,12 +156,8 @@ def test_bad_input_changes_nothing():
         bad.flat[0] = np.nan
         with pytest.raises(ValueError, match="finite"):
             compliance.torque(now._replace(**{name: bad}), run.a_ref, DT)
-        with pytest.raises(ValueError, match="broadcast"):
-            compliance.torque(now._replace(**{name: bad[..., :-1]}), run.a_ref, DT)
     with pytest.raises(ValueError, match="finite"):
         compliance.torque(now, np.full(9, np.nan), DT)
-    with pytest.raises(ValueError, match="broadcast"):
-        compliance.torque(now, np.zeros(8), DT)
     negative = now._replace(M=-now.M)
     for M in (negative, now._replace(M=0.0 * now.M)):
         with pytest.raises(ValueError, match="positive definite"):

@@ -57,7 +57,7 @@ class FrictionCompensation:
         n = self.settings.model.n
         self._friction = np.zeros((3, n))  # of Coulomb, of stiction beyond it, and viscous
         self._others = np.array([self.settings.model.stribeck_velocity, self.settings.budget])
-        self._started = False
+        self._faded, self._started = True, False
         self.last = self.reference_velocity = np.zeros(n)
 
     def torque(self, M: Array, v: Array, a_last: Array, elapsed: float, period: float) -> Array:
@@ -76,7 +76,8 @@ class FrictionCompensation:
         """
         settings, model = self.settings, self.settings.model
         if self.idle:
-            self.reset()
+            if self._started:
+                self.reset()
             return self.last
         if not self._started:
             self.reference_velocity = v
@@ -85,6 +86,7 @@ class FrictionCompensation:
         wanted = np.array([model.coulomb, model.static - model.coulomb, model.viscous])
         self._friction += blend * (settings.scale * wanted - self._friction)
         self._others += blend * ([model.stribeck_velocity, settings.budget] - self._others)
+        self._faded = bool(self._friction.sum(axis=0).max() < _NEGLIGIBLE)
         (coulomb, excess, viscous), (stribeck_velocity, budget) = self._friction, self._others
 
         speed = np.abs(v)

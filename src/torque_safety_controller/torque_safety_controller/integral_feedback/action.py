@@ -242,6 +242,7 @@ class IntegralAction(FadingTorque):
                 self._lowered = max(0, math.ceil(steps))
         gain = asked.gain * 2.0 ** (-0.5 * self._lowered)
         if gain == used.gain and (asked is self._asked or asked.same_as(self._asked)):
+            self._asked = asked
             return used
         return asked if gain == asked.gain else replace(asked, gain=gain)
 
@@ -323,6 +324,21 @@ def make_integral(
     if mode == "none":
         return FadingTorque(settings)
     return IntegralAction(mode, settings, disturbance_max, hands)
+
+
+def warm_up(settings: IntegralSettings, hands: int = 1) -> None:
+    """Use every law once, so that a change of mode has nothing to compile in a control loop."""
+    n = len(settings.budget)
+    one, zero = np.eye(n), np.zeros(n)
+    coupling(one)
+    _jumped(one, zero, zero, zero, zero, zero, 0.0, zero)
+    for mode in MODES[1:]:
+        m = hands * TASKS[mode].stop if mode in TASKS else 1
+        if m < n:
+            J = np.eye(m, n)
+            arm, law = ArmTerms(one, 0.0 * one, J, 0.0 * J, zero), _make_law(mode, settings, hands)
+            law.torque(arm, zero, 0.0)
+            law.initialise(zero, arm)
 
 
 def changed(

@@ -127,7 +127,8 @@ class IntegralFeedback(IntegralLaw):
         # A NaN is not of sensible size.
         if not np.abs(K * s).max() <= _AMPLIFIED * np.abs(torque).max():
             raise InitialisationError("the arm moves too fast: C + K cannot be inverted")
-        fast, slow = memory.fast, memory.slow
+        fast: Array = memory.fast
+        slow: Array = memory.slow
         if settings.mu < 1.0:
             slow = (s - settings.mu * fast) / (1.0 - settings.mu)
         else:
@@ -217,7 +218,7 @@ def nearest_with_leak(M: Array, s: Array, u: Array, limit: Array, w: Array) -> t
         momentum = M @ direction
         size = math.sqrt(momentum @ momentum)
         power = direction @ momentum
-        damping = power / size if size > 0.0 and power > 0.0 else 0.0
+        damping = float(power / size) if size > 0.0 and power > 0.0 else 0.0
     result = nearest_dissipating(
         np.append(u, 0.0),
         np.append(direction, damping),

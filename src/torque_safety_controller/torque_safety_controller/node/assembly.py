@@ -17,7 +17,7 @@ from torque_safety_controller.contact.interaction import Interaction
 from torque_safety_controller.contact.wrench_sensor import WrenchSensor
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.friction.compensation import FrictionCompensation
-from torque_safety_controller.integral_feedback.action import make_integral
+from torque_safety_controller.integral_feedback.action import make_integral, warm_up
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parameters.interaction_parameters import ContactPoint
 from torque_safety_controller.parts.collision import Collision
@@ -82,6 +82,7 @@ def make_controller(
         config.qp_solver,
         config.gains.hold_kd,
     )
+    warm_up(config.integral_settings, len(config.end_effectors))
     controller.warm_up()
     return controller, base
 

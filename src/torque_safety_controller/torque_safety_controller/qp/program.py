@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from torque_safety_controller.robot_model import RobotModel
@@ -197,37 +198,111 @@ def build_program(
         )
     if B.shape != (n, len(rho_max)):
         raise ValueError(f"forces on {n} joints with B {B.shape}, rho_max {rho_max.shape}")
-    greatest = max((term[2] for term in (*tasks, *wrench_tasks) if term[2] > 0.0), default=0.0)
+    weights = [task.weight for task in tasks] + [task.weight for task in wrench_tasks]
+    greatest = max((weight for weight in weights if weight > 0.0), default=0.0)
     if greatest == 0.0:
         raise NoSolutionFound("no task with a weight above 0")
-    size = n + len(rho_max)
-    H, g, C = np.zeros((size, size)), np.zeros(size), np.zeros((n + len(G), size))
-    diagonal = H.reshape(-1)[:: size + 1]
-    diagonal += gamma
+    r, k = len(rho_max), len(G)
+    size = n + r
+    H, g, C = np.empty((size, size)), np.empty(size), np.empty((n + k, size))
+    lower, upper = np.empty(size + n + k), np.empty(size + n + k)
+    write_plain(H, g, C, lower, upper, gamma, *bounds, M, tau_lower, tau_upper)
+    if r:
+        C[:n, n:] = -B
+        upper[n:size] = rho_max
+    if k:
+        C[n:, :n] = G
+        lower[size + n :] = row_lower
+        upper[size + n :] = row_upper
     for A, b, weight in tasks:
-        weight /= greatest
         if A is None:
-            diagonal[:n] += weight
-            g[:n] -= weight * b
+            add_identity(H, g, b, weight / greatest)
         else:
-            _add(H, g, A, b, weight, 0)
+            add_least_squares(H, g, A, b, weight / greatest, 0)
     for W, F_des, weight, first in wrench_tasks:
-        m, r = W.shape
-        if F_des.shape != (m,) or not 0 <= first <= len(rho_max) - r:
+        rows, columns = W.shape
+        if F_des.shape != (rows,) or not 0 <= first <= r - columns:
             raise ValueError(
-                f"wrench task with W {W.shape} from force {first} of {len(rho_max)} on, "
-                f"F_des {F_des.shape}"
+                f"wrench task with W {W.shape} from force {first} of {r} on, F_des {F_des.shape}"
             )
-        _add(H, g, W, F_des, weight / greatest, n + first)
-    C[:n, :n], C[:n, n:], C[n:, :n] = M, -B, G
-    lower = np.concatenate([bounds.lower, np.zeros_like(rho_max), tau_lower, row_lower])
-    upper = np.concatenate([bounds.upper, rho_max, tau_upper, row_upper])
+        add_least_squares(H, g, W, F_des, weight / greatest, n + first)
     return QuadraticProgram(H, g, C, lower, upper)
 
 
-def _add(H: Array, g: Array, A: Array, b: Array, weight: float, first: int) -> None:
-    """Add ``weight * |A z - b|^2 / 2`` to the cost, in place, with z the x from `first` on."""
-    z = slice(first, first + A.shape[1])
-    weighted = weight * A.T
-    H[z, z] += weighted @ A
-    g[z] -= weighted @ b
+# Compiled, because they are called at every step and NumPy takes several times as long.
+
+
+@njit(cache=True)
+def write_plain(
+    H: Array,
+    g: Array,
+    C: Array,
+    lower: Array,
+    upper: Array,
+    gamma: float,
+    a_lower: Array,
+    a_upper: Array,
+    M: Array,
+    tau_lower: Array,
+    tau_upper: Array,
+) -> None:
+    """Write a program in x = (a, rho) with C = (M, 0; 0, 0) and the cost gamma |x|^2 / 2.
+
+    Args:
+        H: shape (n + r, n + r), written, like the next four.
+        g: shape (n + r,).
+        C: shape (n + k, n + r).
+        lower: of a, rho, M a and k more, shape (n + r + n + k,); zero but for a and M a.
+        upper: same shape.
+        gamma: weight of |x|^2.
+        a_lower: limits of a, shape (n,).
+        a_upper: shape (n,).
+        M: shape (n, n).
+        tau_lower: limits of M a, shape (n,).
+        tau_upper: shape (n,).
+    """
+    n, size = len(a_lower), len(g)
+    for i in range(size):
+        for j in range(size):
+            H[i, j] = 0.0
+        H[i, i] = gamma
+        g[i] = lower[i] = upper[i] = 0.0
+    for i in range(len(C)):
+        for j in range(size):
+            C[i, j] = 0.0
+        lower[size + i] = upper[size + i] = 0.0
+    for i in range(n):
+        for j in range(n):
+            C[i, j] = M[i, j]
+        lower[i], upper[i] = a_lower[i], a_upper[i]
+        lower[size + i], upper[size + i] = tau_lower[i], tau_upper[i]
+
+
+@njit(cache=True)
+def add_least_squares(H: Array, g: Array, A: Array, b: Array, weight: float, first: int) -> None:
+    """Add ``weight * |A z - b|^2 / 2`` to the cost ``x'Hx / 2 + g'x``, in place.
+
+    z are as many of x as A has columns, from index `first` on.
+    """
+    m, n = A.shape
+    for i in range(n):
+        for j in range(i + 1):
+            s = 0.0
+            for k in range(m):
+                s += A[k, i] * A[k, j]
+            s *= weight
+            H[first + i, first + j] += s
+            if i != j:
+                H[first + j, first + i] += s
+        s = 0.0
+        for k in range(m):
+            s += A[k, i] * b[k]
+        g[first + i] -= weight * s
+
+
+@njit(cache=True)
+def add_identity(H: Array, g: Array, b: Array, weight: float) -> None:
+    """Add ``weight * |z - b|^2 / 2`` to the cost ``x'Hx / 2 + g'x``, z the first of x."""
+    for i in range(len(b)):
+        H[i, i] += weight
+        g[i] -= weight * b[i]

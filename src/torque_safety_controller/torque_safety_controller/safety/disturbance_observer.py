@@ -22,6 +22,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -70,8 +71,9 @@ class DisturbanceObserver:
             return
         if elapsed > 0.0 and self._v_last is not None:
             gain = -math.expm1(-elapsed / self.time_constant) if self.time_constant > 0.0 else 1.0
-            error = (v - self._v_last) / elapsed - a_last
-            self._set(self.estimate + gain * (error - self.estimate), tau_max, M)
+            self.estimate = _observe(
+                self.estimate, v, self._v_last, a_last, elapsed, gain, tau_max, M
+            )
         self._v_last = v.copy()
 
     def expect(self, torque: Array, tau_max: Array, M: Array) -> None:
@@ -90,13 +92,8 @@ class DisturbanceObserver:
         except np.linalg.LinAlgError:
             return
         if np.isfinite(change).all():
-            self._set(self.estimate + change, tau_max, M)
-
-    def _set(self, estimate: Array, tau_max: Array, M: Array) -> None:
-        """Set the estimate, within what motors can give; joints with a NaN begin anew."""
-        largest = tau_max / np.diagonal(M)
-        usable = (estimate == estimate) & (largest > 0.0)
-        self.estimate = np.where(usable, np.clip(estimate, -largest, largest), 0.0)
+            largest = tau_max / np.diagonal(M)
+            self.estimate = np.clip(self.estimate + change, -largest, largest)
 
     @property
     def known(self) -> Array | None:
@@ -112,9 +109,41 @@ class DisturbanceObserver:
         """
         if self.time_constant is None:
             return lower, upper
-        pushed_up = self.estimate > 0.0
-        low, high = lower - np.minimum(self.estimate, 0.0), upper - np.maximum(self.estimate, 0.0)
-        return (
-            np.where(pushed_up, np.minimum(low, high), low),
-            np.where(pushed_up, high, np.maximum(low, high)),
-        )
+        return _shift(self.estimate, lower, upper)
+
+
+@njit(cache=True)
+def _observe(
+    old: Array,
+    v: Array,
+    v_last: Array,
+    a_last: Array,
+    elapsed: float,
+    gain: float,
+    tau_max: Array,
+    M: Array,
+) -> Array:
+    """Return the estimate filtered with `gain`, within what motors can give."""
+    estimate = old.copy()
+    for j in range(v.size):
+        e = (v[j] - v_last[j]) / elapsed - a_last[j]
+        e = estimate[j] + gain * (e - estimate[j])
+        largest = tau_max[j] / M[j, j]
+        # A NaN resets the estimate.
+        estimate[j] = min(max(e, -largest), largest) if e == e and largest > 0.0 else 0.0
+    return estimate
+
+
+@njit(cache=True)
+def _shift(estimate: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+    """Return the bounds tightened by the estimate: the upper one, or the lower one."""
+    low, high = lower.copy(), upper.copy()
+    for j in range(low.size):
+        e = estimate[j]
+        if e > 0.0:
+            high[j] -= e
+            low[j] = min(low[j], high[j])
+        else:
+            low[j] -= e
+            high[j] = max(low[j], high[j])
+    return low, high
