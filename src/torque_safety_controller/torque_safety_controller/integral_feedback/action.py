@@ -141,7 +141,7 @@ class IntegralAction(FadingTorque):
     def __init__(
         self, mode: str, settings: IntegralSettings, disturbance_max: Array, hands: int = 1
     ) -> None:
-        self.mode = mode
+        self.mode, self._asked = mode, settings
         self.law = _make_law(mode, settings, hands)
         self._rows = TASKS.get(mode, slice(0, 6))
         self._most = _MOST[mode]

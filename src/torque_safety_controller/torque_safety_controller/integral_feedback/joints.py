@@ -13,6 +13,7 @@ all, and says where it goes beyond the paper.
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -120,10 +121,9 @@ class IntegralFeedback(IntegralLaw):
         """
         settings, memory = self.settings, self.memory
         K = settings.gain * np.diagonal(arm.M)
-        try:
-            s = np.linalg.solve(arm.C + np.diag(K), torque)
-        except np.linalg.LinAlgError:
-            s = np.full_like(torque, np.nan)
+        s: Array = np.full(len(K), np.nan)
+        with suppress(np.linalg.LinAlgError):
+            s[:] = np.linalg.solve(arm.C + np.diag(K), torque)
         # A NaN is not of sensible size.
         if not np.abs(K * s).max() <= _AMPLIFIED * np.abs(torque).max():
             raise InitialisationError("the arm moves too fast: C + K cannot be inverted")
