@@ -110,8 +110,9 @@ class Supervisor:
             self._decide()
 
     def repeated(self) -> None:
-        """A state that was answered comes again: the robot is not silent."""
+        """A state that was answered comes again, and gets the same answer."""
         self._causes.pop("silent", None)
+        self._causes.pop("refused", None)
         self._decide()
 
     def limits_came(self) -> None:

@@ -89,6 +89,22 @@ ROWS = {
 }
 
 
+def test_what_must_not_change_by_accident():
+    """Nothing is sent without a usable state; without limits or a solution goals do not count."""
+    stops = {name for name, cause in CAUSES.items() if cause.mode is Mode.STOPPED}
+    slows = {name for name, cause in CAUSES.items() if cause.goals is Goals.SLOWED}
+    serves = {name for name, cause in CAUSES.items() if cause.goals is Goals.KEPT}
+    assert stops == {"silent", "refused"}
+    assert slows == {"refused", "failed", "stale", "rival", "moves"}
+    assert serves == {"silent", "drives", "no plan"}
+    assert list(CAUSES)[:3] == ["silent", "refused", "drives"]
+    into_torque = {before for before, after in CHANGES.items() if after is Control.TORQUE}
+    assert into_torque == {
+        (Control.TAKING_OVER, "torque known"),
+        (Control.GIVING_BACK, "enable"),
+    }
+
+
 @pytest.mark.parametrize("name", CAUSES)
 def test_each_cause_gives_its_mode_and_its_share_and_ends(name):
     begins, ends = ROWS[name]
@@ -303,13 +319,13 @@ class Events(RuleBasedStateMachine):
         """A watchdog barks."""
         getattr(self.supervisor, event)("why")
         assert self.supervisor.mode is Mode.STOPPED
-        self.answered = False
 
     @rule()
     def repeated(self):
         """A state comes again that was answered."""
         if self.answered:
             self.supervisor.repeated()
+            assert self.supervisor.mode is not Mode.STOPPED
 
     @rule()
     def limits_came(self):
