@@ -39,7 +39,7 @@ from torque_safety_controller.tasks.pose_task import PoseTask
 from torque_safety_controller.tasks.posture_task import PostureTask
 from torque_safety_controller.tasks.task import Task
 from viability_bounds_pkg.joint_limits import JointLimits
-from viability_bounds_pkg.robot_description import build_model, read_urdf, resolve_uri
+from viability_bounds_pkg.robot.description import build_model, read_urdf, resolve_uri
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.viability import BoundsSolver
 

@@ -50,6 +50,7 @@ from torque_safety_controller.controller import Controller
 from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.node.safety_stack import make_nodes
 from torque_safety_controller.node.streams.limits import LimitsReader
+from torque_safety_controller.parts.whole_arm.safety_filter import SafetyFilter
 from torque_safety_controller.qp import InverseDynamicsQP
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.cli.command_line import Parser
@@ -63,7 +64,6 @@ from viability_bounds_pkg.ros.program import initialise, leave
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, make_executor
 from viability_bounds_pkg.state_estimation.estimator import StateEstimator
-from viability_bounds_pkg.whole_arm.safety_filter import SafetyFilter
 
 CASES = (
     ("panda", 500.0),

@@ -28,7 +28,7 @@ from torque_safety_controller.qp import (
 )
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks.gains import Gains
-from viability_bounds_pkg.robot_description import build_model, read_urdf
+from viability_bounds_pkg.robot.description import build_model, read_urdf
 from viability_bounds_pkg.state import State
 
 ROOT = Path(__file__).resolve().parent.parent

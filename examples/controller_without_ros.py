@@ -19,10 +19,10 @@ from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks.gains import Gains
 from viability_bounds_pkg.acceleration_limits import estimate_acceleration_limits
-from viability_bounds_pkg.hold_error import discretisation_margin
+from viability_bounds_pkg.bounds.torque_margin import tightened, torque_margins
+from viability_bounds_pkg.estimate.hold_error import discretisation_margin
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.state import State
-from viability_bounds_pkg.torque_margin import tightened, torque_margins
 from viability_bounds_pkg.viability import BoundsSolver
 
 DT, SUBSTEPS = 0.002, 8  # s

@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from viability_bounds_pkg.cli.limits_file import read_robot
 from viability_bounds_pkg.joint_limits import JointLimits
-from viability_bounds_pkg.stopping import CoordinatedStop
+from viability_bounds_pkg.stop import CoordinatedStop
 from viability_bounds_pkg.viability import BoundsSolver
 
 CONFIG = Path(__file__).resolve().parent.parent / "config" / "panda.yaml"

@@ -25,9 +25,9 @@ from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks.gains import Gains
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
 from viability_bounds_pkg.parameter import read
-from viability_bounds_pkg.robot_configuration import TaskFrames, load_model
+from viability_bounds_pkg.parameter_files import node_parameters, read_files
+from viability_bounds_pkg.robot.configuration import TaskFrames, load_model
 from viability_bounds_pkg.state import State
-from viability_bounds_pkg.user_input.parameter_files import node_parameters, read_files
 
 FILES = [Path(__file__).resolve().parent.parent / "config" / "panda.yaml"]
 STEPS = 4  # of physics in a control period of 2 ms

@@ -22,7 +22,7 @@ from sim_bridge.scenario.recording import RecordedRun
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.node.estimator_node import EstimatorNode
-from viability_bounds_pkg.user_input.yaml_file import YamlError, read_yaml
+from viability_bounds_pkg.parameter_files import YamlError, read_yaml
 
 ROOT = Path(__file__).resolve().parent.parent
 NODES = {

@@ -29,9 +29,9 @@ from torque_safety_controller.step import Step
 from torque_safety_controller.supervisor import Order
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
 from viability_bounds_pkg.parameter import read
-from viability_bounds_pkg.robot_configuration import load_model
+from viability_bounds_pkg.robot.configuration import load_model
 from viability_bounds_pkg.state import State
-from viability_bounds_pkg.stopping.coordinated_stop import CoordinatedStop
+from viability_bounds_pkg.stop import CoordinatedStop
 
 Configuration = TypeVar("Configuration")
 

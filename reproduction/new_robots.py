@@ -16,7 +16,7 @@ import yaml
 from chain import ROOT
 from figure import RESULTS, Figure, table
 
-from viability_bounds_pkg.robot_description import package_directories
+from viability_bounds_pkg.robot.description import package_directories
 
 PAGE = ROOT / "docs" / "new_robot.md"
 BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"

@@ -38,7 +38,7 @@ from imperfect_page import (
     write_page,
 )
 
-from viability_bounds_pkg.robot_description import build_model, read_urdf
+from viability_bounds_pkg.robot.description import build_model, read_urdf
 from viability_bounds_pkg.testing.ros_harness import private_domain
 
 ROBOTS = ("panda", "talos_left_arm", "baxter_left_arm")

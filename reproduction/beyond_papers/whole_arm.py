@@ -29,8 +29,12 @@ from figure import Figure, table, verdict
 from pieces import in_pieces
 
 from torque_safety_controller.parts.safety_filter import WholeArm
-from viability_bounds_pkg.whole_arm.braking_plan import PlanLimits, PlanTorques, braking_periods
-from viability_bounds_pkg.whole_arm.safety_filter import RESERVE
+from torque_safety_controller.parts.whole_arm.braking_plan import (
+    PlanLimits,
+    PlanTorques,
+    braking_periods,
+)
+from torque_safety_controller.parts.whole_arm.safety_filter import RESERVE
 
 POSTURE = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
 """Gains on the way to postures."""

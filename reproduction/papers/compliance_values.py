@@ -21,7 +21,7 @@ from compliance_push import ELBOW, HAND, HAND_FORCE, MODES, ROBOT, judge, push, 
 from direct import DirectLoop
 from figure import Figure, table
 
-from viability_bounds_pkg.user_input.yaml_file import read_yaml
+from viability_bounds_pkg.parameter_files import read_yaml
 
 VALUES_NAME, STICTION_NAME = "paper1-values", "paper1-stiction"
 PAPER: dict[str, Any] = {"integral_lambda": 2.0, "integral_budget": []}

@@ -22,7 +22,7 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from viability_bounds_pkg import baselines, viability
 from viability_bounds_pkg.acceleration_limits import estimate_acceleration_limits
 from viability_bounds_pkg.joint_limits import JointLimits
-from viability_bounds_pkg.robot_description import build_model, read_urdf
+from viability_bounds_pkg.robot.description import build_model, read_urdf
 
 sys.path.insert(0, f"{Path(__file__).resolve().parents[2]}/src/viability_bounds_pkg/test/support")
 

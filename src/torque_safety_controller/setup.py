@@ -17,9 +17,11 @@ setup(
     python_requires=">=3.10",
     install_requires=[
         "daqp>=0.7",
+        "numba>=0.59",
         "numpy>=1.26",
         "pin>=3",
         "proxsuite>=0.6",
+        "PyYAML>=6",
         "scipy>=1.11",
         "tqdm>=4",
         "viability_bounds_pkg",

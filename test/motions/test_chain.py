@@ -8,9 +8,9 @@ import pytest
 import yaml
 from chain import load_values, run_chain
 
-from viability_bounds_pkg.robot_description import build_model, read_urdf
+from viability_bounds_pkg.parameter_files import YamlError
+from viability_bounds_pkg.robot.description import build_model, read_urdf
 from viability_bounds_pkg.testing.ros_harness import config_folder
-from viability_bounds_pkg.user_input.yaml_file import YamlError
 
 ROBOTS = ("baxter_left_arm", "panda")
 

@@ -13,7 +13,7 @@ from sim_bridge.scenario.scenario import load_scenario
 from torque_safety_controller.parts.collision import Collision
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.supervisor import REST
-from viability_bounds_pkg.robot_description import load_geometry, read_urdf
+from viability_bounds_pkg.robot.description import load_geometry, read_urdf
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import config_folder
 

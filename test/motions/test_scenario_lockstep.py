@@ -15,7 +15,7 @@ from sim_bridge.bullet.obstacles import Obstacle
 from sim_bridge.nodes.scenario_node import ScenarioNode, ScenarioRefused
 from sim_bridge.scenario.report import write_report
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory, circle
-from viability_bounds_pkg.robot_description import read_urdf
+from viability_bounds_pkg.robot.description import read_urdf
 from viability_bounds_pkg.testing.executables import room_on_disk
 from viability_bounds_pkg.testing.ros_harness import config_folder
 

@@ -13,12 +13,12 @@ from sim_bridge.nodes.bullet_node import BulletNode
 from sim_bridge.nodes.scenario_node import ScenarioNode
 from sim_bridge.viewer.node.viewer_node import ViewerNode
 from torque_safety_controller.node.controller_node import ControllerNode
+from viability_bounds_pkg import parameter_files
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.node.estimator_node import EstimatorNode
 from viability_bounds_pkg.parameter import REQUIRED, read
 from viability_bounds_pkg.ros.parameters import describe
 from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
-from viability_bounds_pkg.user_input import known_names
 
 ROOT = Path(__file__).resolve().parents[2]
 _SPEC = importlib.util.spec_from_file_location(
@@ -164,7 +164,7 @@ def test_a_node_has_the_parameters_of_its_table_and_describes_them(ros, name):
 
 
 def test_the_names_of_all_nodes_are_known():
-    assert set(make_reference.TABLES) == set(known_names.NODES)
+    assert set(make_reference.TABLES) == set(parameter_files.NODES)
 
 
 def test_the_controller_has_at_most_59_parameters():

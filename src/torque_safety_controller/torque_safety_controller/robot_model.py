@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from viability_bounds_pkg.robot_description import unknown_name
+from viability_bounds_pkg.robot.description import unknown_name
 from viability_bounds_pkg.state import State
 
 Array = NDArray[np.float64]

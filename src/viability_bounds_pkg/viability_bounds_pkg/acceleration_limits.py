@@ -26,7 +26,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from viability_bounds_pkg.worst_case import (
+from viability_bounds_pkg.estimate.worst_case import (
     Array,
     LimitEstimateError,
     StateSpace,

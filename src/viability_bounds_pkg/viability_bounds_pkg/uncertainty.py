@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from viability_bounds_pkg.bounds.torque_margin import TorqueMargins, tightened
 from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError
 from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
 from viability_bounds_pkg.parameter import joint_amounts, periods, switch
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.state_estimation.observer import ObserverDesign, design_observer
-from viability_bounds_pkg.torque_margin import TorqueMargins, tightened
 from viability_bounds_pkg.viability import BoundsSolver
 
 Array = NDArray[np.float64]

@@ -21,15 +21,15 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from viability_bounds_pkg.discrete_time import (
+from viability_bounds_pkg.bounds.discrete_time import (
     Margins,
     checked_step,
     discrete_time,
     discrete_time_condition,
     without_position_error,
 )
+from viability_bounds_pkg.bounds.kernel import AccelerationBounds, make_table, solve
 from viability_bounds_pkg.joint_limits import ROUNDING, JointLimits, JointLimitsError, joint_array
-from viability_bounds_pkg.kernel import AccelerationBounds, make_table, solve
 
 Array = NDArray[np.float64]
 

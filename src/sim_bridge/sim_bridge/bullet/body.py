@@ -23,7 +23,7 @@ from sim_bridge.bullet.obstacles import ContactMaterial, LinkWrench
 from sim_bridge.bullet.vectors import finite_vector
 from sim_bridge.urdf.payload import PayloadError, payload_link, with_payloads
 from sim_bridge.urdf.preparation import FramePlacement, PreparedUrdf, prepare_urdf
-from viability_bounds_pkg.robot_description import RobotDescriptionError, unknown_name
+from viability_bounds_pkg.robot.description import RobotDescriptionError, unknown_name
 
 Array = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from sim_bridge.bullet.obstacles import LinkWrench
 from sim_bridge.urdf.elements import joints_on, scale_masses
-from viability_bounds_pkg.robot_description import build_model, kinematic_order
+from viability_bounds_pkg.robot.description import build_model, kinematic_order
 
 Array = NDArray[np.float64]
 

@@ -31,7 +31,7 @@ from sim_bridge.bullet.obstacles import (
     Obstacle,
     ObstacleError,
 )
-from viability_bounds_pkg.robot_description import RobotDescriptionError
+from viability_bounds_pkg.robot.description import RobotDescriptionError
 
 Array = NDArray[Any]
 Kept = TypeVar("Kept")

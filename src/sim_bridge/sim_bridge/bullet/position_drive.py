@@ -32,7 +32,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from viability_bounds_pkg.robot_description import build_model, kinematic_order
+from viability_bounds_pkg.robot.description import build_model, kinematic_order
 
 Array = NDArray[np.float64]
 

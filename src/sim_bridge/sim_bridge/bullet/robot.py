@@ -37,7 +37,7 @@ from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.bullet.position_drive import PositionDrive
 from sim_bridge.bullet.vectors import finite_vector
 from sim_bridge.hardware.motors import Motors
-from viability_bounds_pkg.stopping.coordinated_stop import CoordinatedStop
+from viability_bounds_pkg.stop import CoordinatedStop
 
 Array = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ class BulletRobot(BulletBody):
     """One arm with motors and brakes, fixed to the ground, in a world of its own.
 
     Its dynamics equal those of the Pinocchio model that
-    `viability_bounds_pkg.robot_description.build_model` makes of the same arguments, plus joint
+    `viability_bounds_pkg.robot.description.build_model` makes of the same arguments, plus joint
     friction, rotors and scaled masses where given. Call `close` after use; `contextlib.closing`
     does. Methods raise `ValueError` for an array of another shape or with numbers that are not
     finite, `RobotDescriptionError` for a link that the URDF does not have.

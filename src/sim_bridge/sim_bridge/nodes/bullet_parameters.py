@@ -39,13 +39,13 @@ from viability_bounds_pkg.parameter import (
     timeout,
     whole_number,
 )
-from viability_bounds_pkg.robot_configuration import ControlRate, LimitedRobotConfiguration
-from viability_bounds_pkg.robot_description import (
+from viability_bounds_pkg.robot.configuration import ControlRate, LimitedRobotConfiguration
+from viability_bounds_pkg.robot.description import (
     RobotDescriptionError,
     build_model,
     kinematic_order,
 )
-from viability_bounds_pkg.stopping.coordinated_stop import CoordinatedStop
+from viability_bounds_pkg.stop import CoordinatedStop
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from sim_bridge.bullet.obstacles import Obstacle, ObstacleError
 from sim_bridge.bullet.robot import BulletRobot
 from sim_bridge.nodes.topics import EXTERNAL_WRENCH, OBSTACLES, PAYLOAD
 from sim_bridge.urdf.payload import PayloadError, payload_inertia
-from viability_bounds_pkg.robot_description import RobotDescriptionError
+from viability_bounds_pkg.robot.description import RobotDescriptionError
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 
 _SHAPES = {Marker.CUBE: "box", Marker.SPHERE: "sphere", Marker.CYLINDER: "cylinder"}

@@ -22,8 +22,8 @@ from sim_bridge.scenario.fields import (
 from sim_bridge.scenario.trajectory import read_trajectory
 from sim_bridge.urdf.payload import PayloadError, payload_inertia
 from viability_bounds_pkg.exceptions import did_you_mean
+from viability_bounds_pkg.parameter_files import NODES, unknown_parameters
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory
-from viability_bounds_pkg.user_input.known_names import NODES, unknown_parameters
 
 _ZERO = (0.0, 0.0, 0.0)
 

@@ -21,8 +21,8 @@ from sim_bridge.scenario.events import (
 from sim_bridge.scenario.fields import ScenarioError, positive, read_fields, refuse
 from viability_bounds_pkg.exceptions import SettingError, did_you_mean
 from viability_bounds_pkg.parameter import text, timeout
-from viability_bounds_pkg.robot_configuration import LimitedRobotConfiguration, TaskFrames
-from viability_bounds_pkg.user_input.yaml_file import YamlError, read_yaml
+from viability_bounds_pkg.parameter_files import YamlError, read_yaml
+from viability_bounds_pkg.robot.configuration import LimitedRobotConfiguration, TaskFrames
 
 
 @dataclass(frozen=True)

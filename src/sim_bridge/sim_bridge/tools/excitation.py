@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viability_bounds_pkg.exceptions import ArmSafetyError
-from viability_bounds_pkg.robot_configuration import LimitedRobotConfiguration
+from viability_bounds_pkg.robot.configuration import LimitedRobotConfiguration
 
 Array = NDArray[np.float64]
 

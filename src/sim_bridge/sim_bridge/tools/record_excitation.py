@@ -28,7 +28,7 @@ from sim_bridge.nodes.bullet_parameters import (
 from sim_bridge.tools.excitation import ExcitationError, excitation
 from viability_bounds_pkg.cli.command_line import Parser, positive, run_tool
 from viability_bounds_pkg.cli.limits_file import check_writable, write_whole
-from viability_bounds_pkg.user_input.parameter_files import ParameterFileError, read_files
+from viability_bounds_pkg.parameter_files import ParameterFileError, read_files
 
 Array = NDArray[np.float64]
 

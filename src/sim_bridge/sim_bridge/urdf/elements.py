@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from viability_bounds_pkg.robot_description import RobotDescriptionError, unknown_name
+from viability_bounds_pkg.robot.description import RobotDescriptionError, unknown_name
 
 Array = NDArray[np.float64]
 

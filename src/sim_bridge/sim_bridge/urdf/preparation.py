@@ -40,7 +40,7 @@ from sim_bridge.urdf.elements import (
     scale_masses,
     transform_of,
 )
-from viability_bounds_pkg.robot_description import (
+from viability_bounds_pkg.robot.description import (
     RobotDescriptionError,
     resolve_uri,
     unknown_name,

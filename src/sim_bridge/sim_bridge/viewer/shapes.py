@@ -12,7 +12,7 @@ import pinocchio as pin
 import trimesh
 from numpy.typing import NDArray
 
-from viability_bounds_pkg.robot_description import load_geometry
+from viability_bounds_pkg.robot.description import load_geometry
 
 Array = NDArray[np.float64]
 

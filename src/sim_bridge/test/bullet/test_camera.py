@@ -9,7 +9,7 @@ import pytest
 from sim_bridge.bullet.obstacles import Obstacle
 from sim_bridge.bullet.robot import BulletRobot
 from sim_bridge.tools.camera import Camera
-from viability_bounds_pkg.robot_description import read_urdf
+from viability_bounds_pkg.robot.description import read_urdf
 from viability_bounds_pkg.testing.ros_harness import read_config
 
 CONFIG = read_config("panda", "bullet_node")

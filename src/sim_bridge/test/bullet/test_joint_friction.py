@@ -24,7 +24,7 @@ from talos_joints import (
 
 from sim_bridge.bullet.joint_friction import JointFriction
 from sim_bridge.bullet.robot import BulletRobot
-from viability_bounds_pkg.robot_description import (
+from viability_bounds_pkg.robot.description import (
     read_urdf,
 )
 

@@ -10,7 +10,7 @@ import pytest
 from sim_bridge.bullet.joint_friction import JointFriction
 from sim_bridge.bullet.obstacles import ContactMaterial, Obstacle, ObstacleError
 from sim_bridge.bullet.robot import BulletRobot
-from viability_bounds_pkg.robot_description import (
+from viability_bounds_pkg.robot.description import (
     RobotDescriptionError,
     build_model,
     read_urdf,

@@ -9,7 +9,7 @@ from sim_bridge.bullet.joint_friction import JointFriction
 from sim_bridge.bullet.obstacles import Obstacle
 from sim_bridge.bullet.robot import BulletRobot
 from sim_bridge.urdf.payload import PayloadError, payload_inertia
-from viability_bounds_pkg.robot_description import (
+from viability_bounds_pkg.robot.description import (
     RobotDescriptionError,
     build_model,
     inertia_beyond,

@@ -10,7 +10,7 @@ import pytest
 from sim_bridge.bullet.joint_friction import JointFriction
 from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.bullet.robot import BulletRobot
-from viability_bounds_pkg.robot_description import build_model, read_urdf
+from viability_bounds_pkg.robot.description import build_model, read_urdf
 
 H = 1e-3  # s
 ACCURACY = 1e-3  # rad, what drives hold

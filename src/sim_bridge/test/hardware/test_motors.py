@@ -11,7 +11,7 @@ from sim_bridge.bullet.robot import BulletRobot
 from sim_bridge.hardware.imperfections import Imperfections
 from sim_bridge.hardware.motors import RIPPLE_PERIODS, Motors
 from viability_bounds_pkg.parameter import parameter_table
-from viability_bounds_pkg.robot_description import build_model, read_urdf
+from viability_bounds_pkg.robot.description import build_model, read_urdf
 
 N = 7
 H = 1e-3

@@ -15,7 +15,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from sim_bridge.nodes.bullet_node import BulletNode
-from viability_bounds_pkg.robot_description import inertia_beyond, read_urdf
+from viability_bounds_pkg.robot.description import inertia_beyond, read_urdf
 from viability_bounds_pkg.ros.runtime import (
     LATCHED_QOS,
     stamp_to_ns,

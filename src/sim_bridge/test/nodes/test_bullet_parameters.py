@@ -10,7 +10,7 @@ from robot_probe import JOINTS, VALUES, Q, RobotProbe
 from sensor_msgs.msg import JointState
 
 from sim_bridge.nodes.bullet_node import BulletNode
-from viability_bounds_pkg.robot_description import build_model, read_urdf
+from viability_bounds_pkg.robot.description import build_model, read_urdf
 from viability_bounds_pkg.ros.runtime import (
     stamp_to_ns,
 )

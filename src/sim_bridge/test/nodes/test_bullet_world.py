@@ -14,7 +14,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from sim_bridge.nodes.topics import EXTERNAL_WRENCH, OBSTACLES
 from sim_bridge.urdf.payload import payload_inertia
-from viability_bounds_pkg.robot_description import build_model, inertia_beyond, read_urdf
+from viability_bounds_pkg.robot.description import build_model, inertia_beyond, read_urdf
 from viability_bounds_pkg.ros.runtime import (
     CONTROL_QOS,
     GOAL_QOS,

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sim_bridge.bullet.robot import BulletRobot
-from viability_bounds_pkg.robot_description import (
+from viability_bounds_pkg.robot.description import (
     build_model,
     read_urdf,
 )

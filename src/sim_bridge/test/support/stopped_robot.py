@@ -5,10 +5,10 @@ import numpy as np
 
 from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.nodes.bullet_parameters import BulletConfiguration, make_robot, make_stop
+from viability_bounds_pkg.bounds.torque_margin import tightened
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.testing.ros_harness import read_config
-from viability_bounds_pkg.torque_margin import tightened
 from viability_bounds_pkg.viability import viable_velocity_range
 
 

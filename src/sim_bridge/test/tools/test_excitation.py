@@ -12,7 +12,7 @@ import pytest
 
 from sim_bridge.tools.excitation import PARTS, ROOM, ExcitationError, excitation
 from sim_bridge.tools.record_excitation import main
-from viability_bounds_pkg.robot_configuration import LimitedRobotConfiguration
+from viability_bounds_pkg.robot.configuration import LimitedRobotConfiguration
 from viability_bounds_pkg.testing.executables import called, started
 from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
 

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from sim_bridge.viewer.shapes import visual_shapes
-from viability_bounds_pkg.robot_description import RobotDescriptionError, build_model
+from viability_bounds_pkg.robot.description import RobotDescriptionError, build_model
 
 URDF = """<robot name="two">
   <link name="base"><visual><geometry><box size="0.2 0.4 0.6"/></geometry></visual></link>

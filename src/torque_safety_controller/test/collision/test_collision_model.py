@@ -15,14 +15,14 @@ from torque_safety_controller.parameters.controller_parameters import Controller
 from torque_safety_controller.tools.fit_capsules import main, with_capsules
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import read
-from viability_bounds_pkg.robot_configuration import load_model
-from viability_bounds_pkg.robot_description import (
+from viability_bounds_pkg.parameter_files import ParameterFileError
+from viability_bounds_pkg.robot.configuration import load_model
+from viability_bounds_pkg.robot.description import (
     RobotDescriptionError,
     build_model,
     load_geometry,
 )
 from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
-from viability_bounds_pkg.user_input.parameter_files import ParameterFileError
 
 FEW = 300  # samples
 PANDA = read_config("panda", "controller_node")

@@ -13,7 +13,7 @@ from torque_safety_controller.contact.wrench_sensor import (
     WrenchError,
     WrenchSensor,
 )
-from viability_bounds_pkg.robot_description import (
+from viability_bounds_pkg.robot.description import (
     RobotDescriptionError,
     inertia_beyond,
     read_urdf,

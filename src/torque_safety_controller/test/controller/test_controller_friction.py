@@ -23,7 +23,7 @@ from torque_safety_controller.parts.integral import Integral
 from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import group, read
-from viability_bounds_pkg.robot_configuration import RobotConfiguration
+from viability_bounds_pkg.robot.configuration import RobotConfiguration
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import names_parameter, read_config
 

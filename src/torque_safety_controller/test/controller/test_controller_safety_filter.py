@@ -10,11 +10,11 @@ from arms import load_arm
 from controllers import posture_only
 
 from torque_safety_controller.parts.safety_filter import WholeArm
+from torque_safety_controller.parts.whole_arm.safety_filter import KEPT, SafetyFilter
 from torque_safety_controller.qp import AccelerationRange, LinearConstraints
 from torque_safety_controller.supervisor import REST
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import read_config
-from viability_bounds_pkg.whole_arm.safety_filter import KEPT, SafetyFilter
 
 ARM = load_arm("baxter_left_arm")
 VALUES = read_config("baxter_left_arm", "controller_node")

@@ -14,7 +14,7 @@ from torque_safety_controller.parameters.controller_parameters import Controller
 from torque_safety_controller.safety.disturbance_observer import DisturbanceObserver
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 from viability_bounds_pkg.parameter import read
-from viability_bounds_pkg.robot_configuration import load_model
+from viability_bounds_pkg.robot.configuration import load_model
 from viability_bounds_pkg.testing.ros_harness import read_config
 
 BOUNDS, CONTROLLER = (

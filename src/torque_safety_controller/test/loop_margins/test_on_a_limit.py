@@ -17,7 +17,7 @@ from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.safety.disturbance_observer import DisturbanceObserver
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
 from viability_bounds_pkg.parameter import read
-from viability_bounds_pkg.robot_configuration import load_model
+from viability_bounds_pkg.robot.configuration import load_model
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.state_estimation.observer import Observer
 from viability_bounds_pkg.testing.ros_harness import read_config

@@ -18,7 +18,7 @@ from torque_safety_controller.new_robot.hardware import (
 )
 from torque_safety_controller.new_robot.postures import SelfCollisions, find_postures
 from torque_safety_controller.tools.new_robot import main
-from viability_bounds_pkg.robot_description import read_urdf
+from viability_bounds_pkg.robot.description import read_urdf
 
 ROBOTS = "package://example-robot-data/robots/"
 UR5 = ROBOTS + "ur_description/urdf/ur5_robot.urdf"

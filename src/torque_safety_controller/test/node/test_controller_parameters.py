@@ -14,7 +14,7 @@ from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.tasks.gains import critical_damping
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.robot_description import read_urdf
+from viability_bounds_pkg.robot.description import read_urdf
 from viability_bounds_pkg.ros.runtime import LATCHED_QOS
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import joint_state, names_parameter, read_config

@@ -11,7 +11,7 @@ from geometry_msgs.msg import PoseStamped
 from node_chain import pose_message
 
 from torque_safety_controller.node.controller_node import ControllerNode
-from viability_bounds_pkg.robot_description import build_model, read_urdf
+from viability_bounds_pkg.robot.description import build_model, read_urdf
 from viability_bounds_pkg.ros.runtime import GOAL_QOS
 from viability_bounds_pkg.testing.ros_harness import read_config
 

@@ -21,7 +21,7 @@ from torque_safety_controller.collision.shapes import Shape, capsule, make_obsta
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.parameter import read
-from viability_bounds_pkg.robot_description import build_model, load_geometry
+from viability_bounds_pkg.robot.description import build_model, load_geometry
 from viability_bounds_pkg.testing.ros_harness import read_config
 from viability_bounds_pkg.viability import BoundsSolver
 

@@ -25,7 +25,7 @@ from viability_bounds_pkg.cli.limits_file import (
     read_robot,
     write_whole,
 )
-from viability_bounds_pkg.user_input.parameter_files import ParameterFileError
+from viability_bounds_pkg.parameter_files import ParameterFileError
 
 NODE = "/**/controller_node"
 """Node that the written parameters are for."""

@@ -11,7 +11,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from torque_safety_controller.collision.capsule_fit import Capsule, fitted_capsule
-from viability_bounds_pkg.robot_description import RobotDescriptionError
+from viability_bounds_pkg.robot.description import RobotDescriptionError
 
 Array = NDArray[np.float64]
 

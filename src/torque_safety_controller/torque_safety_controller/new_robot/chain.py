@@ -13,9 +13,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from viability_bounds_pkg.estimate.worst_case import NO_INERTIA
 from viability_bounds_pkg.exceptions import ArmSafetyError, did_you_mean
-from viability_bounds_pkg.robot_description import build_model, kinematic_order
-from viability_bounds_pkg.worst_case import NO_INERTIA
+from viability_bounds_pkg.robot.description import build_model, kinematic_order
 
 Array = NDArray[np.float64]
 

@@ -23,8 +23,8 @@ from viability_bounds_pkg.acceleration_limits import (
     unavailable_share,
 )
 from viability_bounds_pkg.cli.limits_file import rounded
-from viability_bounds_pkg.hold_error import discretisation_margin
-from viability_bounds_pkg.worst_case import StateSpace, WorstCases, search_refined
+from viability_bounds_pkg.estimate.hold_error import discretisation_margin
+from viability_bounds_pkg.estimate.worst_case import StateSpace, WorstCases, search_refined
 
 Array = NDArray[np.float64]
 

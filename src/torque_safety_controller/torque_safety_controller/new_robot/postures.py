@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from torque_safety_controller.collision.link_capsules import capsule_entries
 from torque_safety_controller.new_robot.chain import Chain, NewRobotError
-from viability_bounds_pkg.robot_description import RobotDescriptionError, load_geometry
+from viability_bounds_pkg.robot.description import RobotDescriptionError, load_geometry
 
 Array = NDArray[np.float64]
 

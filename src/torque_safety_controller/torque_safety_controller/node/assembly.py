@@ -28,6 +28,7 @@ from torque_safety_controller.parts.integral import Integral, integral_arguments
 from torque_safety_controller.parts.joint_bounds import JointBounds
 from torque_safety_controller.parts.safety_filter import WholeArm
 from torque_safety_controller.parts.slow_down import SlowDown
+from torque_safety_controller.parts.whole_arm.safety_filter import SafetyFilter
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.step import Part
 from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError, did_you_mean
@@ -38,15 +39,14 @@ from viability_bounds_pkg.node.bounds_parameters import (
     make_bounds,
 )
 from viability_bounds_pkg.plausible import PlausibilityCheck
-from viability_bounds_pkg.robot_configuration import load_model
-from viability_bounds_pkg.robot_description import (
+from viability_bounds_pkg.robot.configuration import load_model
+from viability_bounds_pkg.robot.description import (
     RobotDescriptionError,
     inertia_beyond,
 )
 from viability_bounds_pkg.ros.robot_urdf import robot_urdf, warn_of_unusual
-from viability_bounds_pkg.stopping.coordinated_stop import MARGIN
+from viability_bounds_pkg.stop import MARGIN
 from viability_bounds_pkg.viability import BoundsSolver
-from viability_bounds_pkg.whole_arm.safety_filter import SafetyFilter
 
 if TYPE_CHECKING:
     from rclpy.node import Node

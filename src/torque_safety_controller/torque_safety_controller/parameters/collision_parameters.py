@@ -26,7 +26,7 @@ from viability_bounds_pkg.parameter import (
     text,
     texts,
 )
-from viability_bounds_pkg.robot_configuration import RobotConfiguration
+from viability_bounds_pkg.robot.configuration import RobotConfiguration
 
 Array = NDArray[np.float64]
 

@@ -15,6 +15,7 @@ from torque_safety_controller.parameters.collision_parameters import CollisionCo
 from torque_safety_controller.parameters.friction_parameters import FrictionConfiguration
 from torque_safety_controller.parameters.integral_parameters import IntegralConfiguration
 from torque_safety_controller.parameters.interaction_parameters import InteractionConfiguration
+from torque_safety_controller.parts.whole_arm.safety_filter import RESERVE
 from torque_safety_controller.qp import SOLVERS
 from torque_safety_controller.tasks.gains import Gains
 from viability_bounds_pkg.exceptions import SettingError
@@ -29,13 +30,12 @@ from viability_bounds_pkg.parameter import (
     text,
     timeout,
 )
-from viability_bounds_pkg.robot_configuration import (
+from viability_bounds_pkg.robot.configuration import (
     ControlRate,
     RobotConfiguration,
     StateSource,
     TaskFrames,
 )
-from viability_bounds_pkg.whole_arm.safety_filter import RESERVE
 
 Array = NDArray[np.float64]
 

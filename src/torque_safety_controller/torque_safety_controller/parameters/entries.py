@@ -8,7 +8,7 @@ from typing import TypeVar
 
 from viability_bounds_pkg.exceptions import SettingError, did_you_mean
 from viability_bounds_pkg.parameter import parameter_table, read
-from viability_bounds_pkg.user_input.yaml_file import YamlError, load_yaml
+from viability_bounds_pkg.parameter_files import YamlError, load_yaml
 
 Entry = TypeVar("Entry")
 

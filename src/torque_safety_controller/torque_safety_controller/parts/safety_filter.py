@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torque_safety_controller.parts.whole_arm.safety_filter import SafetyFilter
 from torque_safety_controller.qp import AccelerationRange, LinearConstraints
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.step import Part, Step, joints_beyond
 from torque_safety_controller.tasks.rest_task import RestTask
-from viability_bounds_pkg.whole_arm.safety_filter import SafetyFilter
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from viability_bounds_pkg.parameter import above, number
-from viability_bounds_pkg.robot_configuration import RobotConfiguration
+from viability_bounds_pkg.robot.configuration import RobotConfiguration
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

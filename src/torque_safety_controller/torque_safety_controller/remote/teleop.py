@@ -21,9 +21,9 @@ from sensor_msgs.msg import JointState
 from torque_safety_controller.node.topics import JOG_HAND, JOG_JOINTS
 from viability_bounds_pkg.cli.command_line import Parser, positive, run_tool
 from viability_bounds_pkg.exceptions import ArmSafetyError
-from viability_bounds_pkg.robot_configuration import RobotConfiguration, TaskFrames
+from viability_bounds_pkg.parameter_files import read_files
+from viability_bounds_pkg.robot.configuration import RobotConfiguration, TaskFrames
 from viability_bounds_pkg.ros.runtime import settle_dds
-from viability_bounds_pkg.user_input.parameter_files import read_files
 
 HELP = """keys, while held:
   w s   hand along x        u o   hand about x

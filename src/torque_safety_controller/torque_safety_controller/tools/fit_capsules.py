@@ -16,9 +16,9 @@ from torque_safety_controller.collision.link_capsules import capsule_entries
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from viability_bounds_pkg.cli.command_line import Parser, run_tool
 from viability_bounds_pkg.cli.limits_file import CONTROLLER, check_writable, write_whole
-from viability_bounds_pkg.robot_configuration import load_model
-from viability_bounds_pkg.robot_description import load_geometry
-from viability_bounds_pkg.user_input.parameter_files import ParameterFileError, read_files
+from viability_bounds_pkg.parameter_files import ParameterFileError, read_files
+from viability_bounds_pkg.robot.configuration import load_model
+from viability_bounds_pkg.robot.description import load_geometry
 
 SECTION = "/**/controller_node:\n"
 """Of a parameter file, where capsules are written."""

@@ -23,8 +23,8 @@ from torque_safety_controller.parameters.controller_parameters import Controller
 from viability_bounds_pkg.cli.command_line import Parser, run_tool
 from viability_bounds_pkg.cli.limits_file import CONTROLLER, NODE
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
-from viability_bounds_pkg.robot_configuration import load_model
-from viability_bounds_pkg.user_input.parameter_files import read_files
+from viability_bounds_pkg.parameter_files import read_files
+from viability_bounds_pkg.robot.configuration import load_model
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:

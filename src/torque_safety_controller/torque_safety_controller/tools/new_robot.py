@@ -45,14 +45,14 @@ from viability_bounds_pkg.cli.command_line import Parser, positive, run_tool
 from viability_bounds_pkg.cli.limits_file import CONTROLLER, NODE, check_writable, write_whole
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
-from viability_bounds_pkg.robot_configuration import load_model
-from viability_bounds_pkg.robot_description import (
+from viability_bounds_pkg.parameter_files import read_files
+from viability_bounds_pkg.robot.configuration import load_model
+from viability_bounds_pkg.robot.description import (
     check_urdf,
     package_directories,
     read_urdf,
     resolve_uri,
 )
-from viability_bounds_pkg.user_input.parameter_files import read_files
 
 Array = NDArray[np.float64]
 Gains = dict[str, float]

@@ -8,8 +8,8 @@ from rclpy.context import Context
 from rclpy.parameter import Parameter
 
 from viability_bounds_pkg.node.bounds_node import BoundsNode
+from viability_bounds_pkg.parameter_files import is_section_of
 from viability_bounds_pkg.ros.given_parameters import given_parameters, note_arguments
-from viability_bounds_pkg.user_input.parameter_files import is_section_of
 
 PLAIN = {
     "joints": ["one"],

@@ -23,7 +23,7 @@ from viability_bounds_pkg.parameter import (
     texts,
     whole_number,
 )
-from viability_bounds_pkg.robot_configuration import RobotConfiguration
+from viability_bounds_pkg.robot.configuration import RobotConfiguration
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.given_parameters import note_arguments
 from viability_bounds_pkg.ros.parameters import NodeParameters, UnknownParameterError

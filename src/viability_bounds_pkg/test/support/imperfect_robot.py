@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from adversary import Violations, advance
 
+from viability_bounds_pkg.bounds.torque_margin import TorqueMargins
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.state import State
-from viability_bounds_pkg.torque_margin import TorqueMargins
 from viability_bounds_pkg.uncertainty import DeclaredUncertainty, Loop, uncertainty_margins
 from viability_bounds_pkg.viability import BoundsSolver
 

@@ -6,8 +6,7 @@ import pinocchio as pin
 
 from viability_bounds_pkg.cli.limits_file import read_robot
 from viability_bounds_pkg.joint_limits import JointLimits
-from viability_bounds_pkg.stopping import CoordinatedStop
-from viability_bounds_pkg.stopping.coordinated_stop import MARGIN
+from viability_bounds_pkg.stop import MARGIN, CoordinatedStop
 from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
 from viability_bounds_pkg.viability import BoundsSolver
 

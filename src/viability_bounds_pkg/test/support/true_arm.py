@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 import pinocchio as pin
 
-from viability_bounds_pkg.robot_description import build_model, read_urdf
+from viability_bounds_pkg.robot.description import build_model, read_urdf
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import read_config
 

@@ -36,9 +36,14 @@ from viability_bounds_pkg.cli.limits_file import (
     rounded,
     write_whole,
 )
-from viability_bounds_pkg.hold_error import ZeroOrderHoldError, discretisation_margin
-from viability_bounds_pkg.user_input.parameter_files import ParameterFileError
-from viability_bounds_pkg.worst_case import Array, LimitEstimateError, StateSpace, WorstCases
+from viability_bounds_pkg.estimate.hold_error import ZeroOrderHoldError, discretisation_margin
+from viability_bounds_pkg.estimate.worst_case import (
+    Array,
+    LimitEstimateError,
+    StateSpace,
+    WorstCases,
+)
+from viability_bounds_pkg.parameter_files import ParameterFileError
 
 HISTORY_COLUMNS = 9
 

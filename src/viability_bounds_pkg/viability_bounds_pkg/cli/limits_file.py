@@ -16,9 +16,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from viability_bounds_pkg.robot_configuration import LimitedRobotConfiguration
-from viability_bounds_pkg.robot_description import build_model
-from viability_bounds_pkg.user_input.parameter_files import ParameterFileError, read_files
+from viability_bounds_pkg.parameter_files import ParameterFileError, read_files
+from viability_bounds_pkg.robot.configuration import LimitedRobotConfiguration
+from viability_bounds_pkg.robot.description import build_model
 
 Array = NDArray[np.float64]
 

@@ -20,7 +20,7 @@ from viability_bounds_pkg.node.bounds_parameters import (
     make_solver,
 )
 from viability_bounds_pkg.node.slow_topics import SlowTopics
-from viability_bounds_pkg.robot_configuration import TOPIC
+from viability_bounds_pkg.robot.configuration import TOPIC
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import Arrival, Diagnostics, JointStateReader, PeriodCheck
 from viability_bounds_pkg.ros.parameters import NodeParameters

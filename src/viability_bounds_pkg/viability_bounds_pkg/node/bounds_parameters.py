@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viability_bounds_pkg import baselines, viability
+from viability_bounds_pkg.bounds.torque_margin import TorqueMargins, torque_margins
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
 from viability_bounds_pkg.parameter import (
@@ -27,13 +28,12 @@ from viability_bounds_pkg.parameter import (
     timeout,
 )
 from viability_bounds_pkg.plausible import PlausibilityCheck
-from viability_bounds_pkg.robot_configuration import (
+from viability_bounds_pkg.robot.configuration import (
     ControlRate,
     LimitedRobotConfiguration,
     RobotConfiguration,
     StateSource,
 )
-from viability_bounds_pkg.torque_margin import TorqueMargins, torque_margins
 from viability_bounds_pkg.uncertainty import (
     DeclaredUncertainty,
     Loop,

@@ -17,7 +17,7 @@ from viability_bounds_pkg.node.estimator_parameters import (
     make_estimator,
     make_plausibility_check,
 )
-from viability_bounds_pkg.robot_configuration import TOPIC, load_model
+from viability_bounds_pkg.robot.configuration import TOPIC, load_model
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.joint_command import TorqueCommand, accept_command
 from viability_bounds_pkg.ros.messages import Arrival, Diagnostics, JointStateReader, PeriodCheck

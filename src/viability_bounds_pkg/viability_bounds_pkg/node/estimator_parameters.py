@@ -9,7 +9,7 @@ import pinocchio as pin
 
 from viability_bounds_pkg.parameter import group, timeout
 from viability_bounds_pkg.plausible import PlausibilityCheck
-from viability_bounds_pkg.robot_configuration import ControlRate, LimitedRobotConfiguration
+from viability_bounds_pkg.robot.configuration import ControlRate, LimitedRobotConfiguration
 from viability_bounds_pkg.state_estimation.estimator import StateEstimator
 from viability_bounds_pkg.state_estimation.observer import ObserverDesign
 from viability_bounds_pkg.uncertainty import DeclaredUncertainty, VelocityEstimation

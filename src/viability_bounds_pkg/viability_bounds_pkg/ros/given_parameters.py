@@ -13,8 +13,7 @@ from itertools import pairwise
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from viability_bounds_pkg.user_input.parameter_files import is_section_of, read_sections
-from viability_bounds_pkg.user_input.yaml_file import load_yaml
+from viability_bounds_pkg.parameter_files import is_section_of, load_yaml, read_sections
 
 _ARGUMENTS: WeakKeyDictionary[Any, Sequence[str]] = WeakKeyDictionary()
 

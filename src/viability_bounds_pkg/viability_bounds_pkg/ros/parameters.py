@@ -19,8 +19,8 @@ from rcl_interfaces.msg import (
 
 from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError
 from viability_bounds_pkg.parameter import REQUIRED, Parameter, parameter_table, read
+from viability_bounds_pkg.parameter_files import unknown_parameters
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.user_input.known_names import unknown_parameters
 
 Configuration = TypeVar("Configuration")
 

@@ -22,11 +22,11 @@ from viability_bounds_pkg.cli.command_line import Parser
 from viability_bounds_pkg.cli.scheduling import add_scheduling, schedule
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.parameter import parameter_table
+from viability_bounds_pkg.parameter_files import read_sections
 from viability_bounds_pkg.ros.arm_node import ArmNode, StartError
 from viability_bounds_pkg.ros.direct_delivery import DirectDelivery
 from viability_bounds_pkg.ros.given_parameters import note_arguments
 from viability_bounds_pkg.ros.runtime import EventsExecutor, make_executor, settle_dds
-from viability_bounds_pkg.user_input.parameter_files import read_sections
 
 _SIGNAL_CHECK_PERIOD = 0.2
 

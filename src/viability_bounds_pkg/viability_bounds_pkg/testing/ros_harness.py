@@ -36,6 +36,7 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.parameter_files import read_yaml
 from viability_bounds_pkg.ros.runtime import (
     CONTROL_QOS,
     make_executor,
@@ -43,7 +44,6 @@ from viability_bounds_pkg.ros.runtime import (
     settle_dds,
     stamp_to_ns,
 )
-from viability_bounds_pkg.user_input.yaml_file import read_yaml
 
 
 def config_folder() -> Path:

@@ -19,8 +19,8 @@ from viability_bounds_pkg.cli.command_line import Parser, run_tool
 from viability_bounds_pkg.cli.limits_file import NODE
 from viability_bounds_pkg.joint_limits import JointLimitsError
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
+from viability_bounds_pkg.parameter_files import read_files
 from viability_bounds_pkg.uncertainty import DeclaredUncertainty, Loop
-from viability_bounds_pkg.user_input.parameter_files import read_files
 
 NAME = "uncertainty_cost"
 

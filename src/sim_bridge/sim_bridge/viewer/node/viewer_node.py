@@ -31,8 +31,8 @@ from sim_bridge.viewer.node.viewer_parameters import ViewerConfiguration
 from sim_bridge.viewer.page import Page, Picture, SettingAsked
 from sim_bridge.viewer.shapes import visual_shapes
 from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError
-from viability_bounds_pkg.robot_configuration import load_model
-from viability_bounds_pkg.robot_description import RobotDescriptionError
+from viability_bounds_pkg.robot.configuration import load_model
+from viability_bounds_pkg.robot.description import RobotDescriptionError
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import JointStateReader
 from viability_bounds_pkg.ros.parameters import NodeParameters

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, limits_of
 from viability_bounds_pkg.parameter import Range, redeclared, text, whole_number
-from viability_bounds_pkg.robot_configuration import LimitedRobotConfiguration, TaskFrames
+from viability_bounds_pkg.robot.configuration import LimitedRobotConfiguration, TaskFrames
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

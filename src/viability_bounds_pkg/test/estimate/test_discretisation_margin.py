@@ -10,13 +10,13 @@ import pinocchio as pin
 import pytest
 from estimated_models import GRAVITY, PENDULUM_LENGTH, baxter, limits_of, panda, pendulum
 
-from viability_bounds_pkg.hold_error import (
+from viability_bounds_pkg.estimate.hold_error import (
     discretisation_margin,
     jerk_under_held_torque,
     mid_step_torque,
     zero_order_hold_error,
 )
-from viability_bounds_pkg.worst_case import LimitEstimateError
+from viability_bounds_pkg.estimate.worst_case import LimitEstimateError
 
 
 def test_acceleration_rate_is_the_time_derivative():

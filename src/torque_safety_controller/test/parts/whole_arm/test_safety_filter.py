@@ -7,12 +7,12 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from torque_safety_controller.parts.whole_arm.braking_plan import braking_periods
+from torque_safety_controller.parts.whole_arm.safety_filter import KEPT, RESERVE, SafetyFilter
 from viability_bounds_pkg.cli.limits_file import read_robot
 from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
 from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
 from viability_bounds_pkg.viability import BoundsSolver
-from viability_bounds_pkg.whole_arm.braking_plan import braking_periods
-from viability_bounds_pkg.whole_arm.safety_filter import KEPT, RESERVE, SafetyFilter
 
 ROUNDING = 1e-9
 SHOULDER, ELBOW = 1, 3

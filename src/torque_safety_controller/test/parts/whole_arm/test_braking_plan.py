@@ -5,7 +5,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from viability_bounds_pkg.whole_arm.braking_plan import (
+from torque_safety_controller.parts.whole_arm.braking_plan import (
     AT_REST,
     UNIFORM,
     PlanLimits,

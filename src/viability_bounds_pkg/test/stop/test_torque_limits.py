@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from viability_bounds_pkg.stopping.torque_limits import STIFFNESS, within_torque_limits
+from viability_bounds_pkg.stop import STIFFNESS, within_torque_limits
 
 
 def problem(seed, n=5, weak=1):

@@ -2,8 +2,8 @@
 import numpy as np
 import pytest
 
+from viability_bounds_pkg.bounds.torque_margin import tightened, torque_margins
 from viability_bounds_pkg.joint_limits import JointLimits
-from viability_bounds_pkg.torque_margin import tightened, torque_margins
 from viability_bounds_pkg.viability import BoundsSolver
 
 JOINTS = 200

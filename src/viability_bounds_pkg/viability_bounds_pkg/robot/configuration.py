@@ -26,7 +26,7 @@ from viability_bounds_pkg.parameter import (
     text,
     texts,
 )
-from viability_bounds_pkg.robot_description import RobotDescriptionError, build_model, read_urdf
+from viability_bounds_pkg.robot.description import RobotDescriptionError, build_model, read_urdf
 
 Array = NDArray[np.float64]
 

@@ -10,14 +10,14 @@ from stopping_arm import Arm, H
 
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
-from viability_bounds_pkg.stopping import CoordinatedStop
-from viability_bounds_pkg.stopping.coordinated_stop import (
+from viability_bounds_pkg.stop import (
     GIVE_WAY,
     HARDER,
     HOLD_CLEARANCE,
     HOLD_GAIN,
     MARGIN,
     RETURN_SPEED,
+    CoordinatedStop,
 )
 from viability_bounds_pkg.viability import BoundsSolver
 

@@ -1,21 +1,93 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameter files, as tools read them without ROS, and mistakes in them that rcl ignores."""
+"""Parameter files: YAML as rcl takes it, and mistakes that rcl ignores, each told in one line."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cache
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, TypeVar
 
+import yaml
+
 from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError, did_you_mean
 from viability_bounds_pkg.parameter import read
-from viability_bounds_pkg.user_input.known_names import NODES, unknown_parameters
-from viability_bounds_pkg.user_input.yaml_file import read_yaml
 
 Configuration = TypeVar("Configuration")
 
+NODES = (
+    "bounds_node",
+    "estimator_node",
+    "controller_node",
+    "bullet_node",
+    "scenario_node",
+    "viewer_node",
+    "moveit_node",
+)
+"""Nodes of this project."""
+
 _VALUES = "ros__parameters"
+
+
+class YamlError(ArmSafetyError, ValueError):
+    """A file that cannot be read, is no YAML, or has a key twice."""
+
+
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    """Takes each key of a mapping once, and 1e-3 for a number, as rcl does."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        keys = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.value in keys:
+                problem = f"'{key.value}' a second time"
+                raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
+            keys.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$"),
+    list("-+.0123456789"),
+)
+
+
+def load_yaml(text: str, where: str = "") -> Any:
+    """Return what a YAML text says.
+
+    Args:
+        text: one document.
+        where: its file, for errors.
+
+    Raises:
+        YamlError: it is no YAML, or a key stands twice in a mapping.
+    """
+    try:
+        return yaml.load(text, _Loader)
+    except (yaml.YAMLError, ValueError) as error:
+        mark = getattr(error, "problem_mark", None)
+        place = where if mark is None else f"{where}, line {mark.line + 1}"
+        problem = getattr(error, "problem", None) or " ".join(str(error).split())
+        raise YamlError(f"{place}: {problem}".lstrip(",: ")) from error
+
+
+def read_yaml(path: str | Path) -> Any:
+    """Return what a YAML file says.
+
+    Raises:
+        YamlError: the file cannot be read, is no YAML, or has a key twice in a mapping.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        hint = did_you_mean(Path(path).name, (each.name for each in Path(path).parent.glob("*")))
+        raise YamlError(f"{path}: there is no such file{hint}") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise YamlError(f"{path}: {getattr(error, 'strerror', 'it is no text')}") from error
+    return load_yaml(text, str(path))
 
 
 class ParameterFileError(ArmSafetyError, ValueError):
@@ -105,3 +177,24 @@ def read_files(kind: type[Configuration], paths: Sequence[Path], node: str) -> C
 
 def _listed(paths: Sequence[Path]) -> str:
     return ", ".join(map(str, paths))
+
+
+@cache
+def parameter_names() -> frozenset[str]:
+    """Return the parameters of all nodes, as `scripts/make_reference.py` lists them."""
+    text = files("viability_bounds_pkg").joinpath("ros", "parameter_names.txt").read_text("utf-8")
+    return frozenset(text.split())
+
+
+def unknown_parameters(given: Iterable[str], known: Iterable[str] = ()) -> str:
+    """Return which names are no parameters, in words with the nearest known ones; empty if none.
+
+    A file has parameters of several nodes in its section for all of them.
+
+    Args:
+        given: the names.
+        known: those that are parameters although no node of this project has them.
+    """
+    every = {*known, *parameter_names()}
+    unknown = sorted(set(given) - every)
+    return "; ".join(f"unknown parameter '{each}'{did_you_mean(each, every)}" for each in unknown)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from xml.etree import ElementTree
 
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.robot_configuration import RobotConfiguration, urdf_joints
+from viability_bounds_pkg.robot.configuration import RobotConfiguration, urdf_joints
 
 _TURNS_MAX = 2.0
 """Turns of a joint with limits from which on its angles are surely degrees."""

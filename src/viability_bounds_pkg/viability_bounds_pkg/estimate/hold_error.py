@@ -17,7 +17,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from viability_bounds_pkg.worst_case import Array, LimitEstimateError, StateSpace
+from viability_bounds_pkg.estimate.worst_case import Array, LimitEstimateError, StateSpace
 
 SUBSTEPS = 2
 """Runge-Kutta steps a period: their own error is of order (dt / SUBSTEPS)^5."""

@@ -26,7 +26,7 @@ from viability_bounds_pkg.acceleration_limits import (
     limits_in_share,
     unavailable_share,
 )
-from viability_bounds_pkg.worst_case import (
+from viability_bounds_pkg.estimate.worst_case import (
     LimitEstimateError,
     StateSpace,
     search_by_sampling,

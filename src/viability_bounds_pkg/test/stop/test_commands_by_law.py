@@ -6,7 +6,7 @@ import pinocchio as pin
 import pytest
 from stopping_arm import Arm, H
 
-from viability_bounds_pkg.stopping.coordinated_stop import PASS_TIME, RETURN_TIME
+from viability_bounds_pkg.stop import PASS_TIME, RETURN_TIME
 
 
 @pytest.fixture(scope="module", params=["panda", "talos_left_arm"])

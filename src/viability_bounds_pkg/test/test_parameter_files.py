@@ -7,14 +7,15 @@ from pathlib import Path
 import pytest
 
 from viability_bounds_pkg.exceptions import did_you_mean
-from viability_bounds_pkg.user_input.known_names import unknown_parameters
-from viability_bounds_pkg.user_input.parameter_files import (
+from viability_bounds_pkg.parameter_files import (
     ParameterFileError,
+    YamlError,
+    load_yaml,
     node_parameters,
     read_sections,
+    unknown_parameters,
 )
-from viability_bounds_pkg.user_input.urdf_check import check_with_urdf
-from viability_bounds_pkg.user_input.yaml_file import YamlError, load_yaml
+from viability_bounds_pkg.robot.urdf_check import check_with_urdf
 
 
 @pytest.mark.parametrize(

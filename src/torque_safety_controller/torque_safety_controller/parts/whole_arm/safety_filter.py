@@ -21,9 +21,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from viability_bounds_pkg.joint_limits import JointLimitsError, joint_array
-from viability_bounds_pkg.state import State
-from viability_bounds_pkg.whole_arm.braking_plan import (
+from torque_safety_controller.parts.whole_arm.braking_plan import (
     AT_REST,
     FIRST,
     BrakingPlans,
@@ -33,6 +31,8 @@ from viability_bounds_pkg.whole_arm.braking_plan import (
     narrow,
     torque_change,
 )
+from viability_bounds_pkg.joint_limits import JointLimitsError, joint_array
+from viability_bounds_pkg.state import State
 
 Array = NDArray[np.float64]
 

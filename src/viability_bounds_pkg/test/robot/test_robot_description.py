@@ -7,7 +7,9 @@ import pytest
 import yaml
 
 from viability_bounds_pkg.cli.limits_file import read_robot
-from viability_bounds_pkg.robot_description import (
+from viability_bounds_pkg.estimate.worst_case import torque_terms
+from viability_bounds_pkg.parameter_files import ParameterFileError
+from viability_bounds_pkg.robot.description import (
     RobotDescriptionError,
     build_model,
     kinematic_order,
@@ -15,8 +17,6 @@ from viability_bounds_pkg.robot_description import (
     read_urdf,
     resolve_uri,
 )
-from viability_bounds_pkg.user_input.parameter_files import ParameterFileError
-from viability_bounds_pkg.worst_case import torque_terms
 
 PANDA = "package://example-robot-data/robots/panda_description/urdf/panda.urdf"
 JOINTS = [f"panda_joint{i}" for i in range(1, 8)]
