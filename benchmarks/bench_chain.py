@@ -36,8 +36,9 @@ from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.node.estimator_node import EstimatorNode
 from viability_bounds_pkg.robot.description import build_model, read_urdf
-from viability_bounds_pkg.ros.direct_delivery import DirectDelivery
+from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, make_executor, set_stamp
+from viability_bounds_pkg.ros.streams import connect
 from viability_bounds_pkg.ros.topics import JOINT_COMMANDS, JOINT_STATES
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -46,21 +47,20 @@ WAYS = ("middleware", "one process")
 KINDS = ("real", "relay")
 
 
-class Probe(Node):
+class Probe(ArmNode):
     """Plays the robot: publishes states, notes when the command comes."""
 
-    def __init__(
-        self, joints: list[str], robot: BulletRobot, direct_delivery=None, **arguments
-    ) -> None:
-        super().__init__("probe", **arguments)
-        self.direct_delivery = direct_delivery
+    NAME = "probe"
+
+    def __init__(self, joints: list[str], robot: BulletRobot, **arguments) -> None:
+        super().__init__(**arguments)
         self._state = JointState(name=joints, effort=array("d", [0.0] * len(joints)))
         self.robot = robot
         self._stamp = 0
         self.command: array | None = None
-        self._publisher = JOINT_STATES.publisher(self)
+        self._publisher = self.stream(JOINT_STATES)
         self._goal = self.create_publisher(PoseStamped, "target_pose", GOAL_QOS)
-        JOINT_COMMANDS.subscription(self, self._on_command)
+        self.listen(JOINT_COMMANDS, self._on_command)
 
     def set_goal(self, goal: PoseGoal) -> None:
         """Give the controller something to track."""
@@ -156,13 +156,16 @@ def main() -> None:
     probes: dict[str, Probe] = {}
     for way in WAYS:
         real, relay = ({"namespace": f"{kind}_{way.replace(' ', '_')}"} for kind in KINDS)
-        for chain in (real, relay):
-            chain["direct_delivery"] = DirectDelivery() if way == "one process" else None
         given = real | {"parameter_overrides": overridden(values)}
-        nodes += [BoundsNode(**given), ControllerNode(**given)]
-        nodes += [RelayLimits(joints, **relay), RelayCommand(joints, **relay)]
-        probes[f"real, {way}"] = Probe(joints, make_robot(), **real)
-        probes[f"relay, {way}"] = Probe(joints, make_robot(), **relay)
+        for name, chain in (
+            (f"real, {way}", [BoundsNode(**given), ControllerNode(**given)]),
+            (f"relay, {way}", [RelayLimits(joints, **relay), RelayCommand(joints, **relay)]),
+        ):
+            namespace = real if name.startswith("real") else relay
+            probes[name] = Probe(joints, make_robot(), **namespace)
+            if way == "one process":
+                connect([probes[name], *chain])
+            nodes += chain
     if options.imperfect:
         for kind in (EstimatorNode, BoundsNode, ControllerNode):
             own = overridden(remedies(options.robot, kind.NAME))

@@ -58,11 +58,12 @@ from viability_bounds_pkg.cli.scheduling import add_scheduling
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.node.estimator_node import EstimatorNode
 from viability_bounds_pkg.recent_values import RecentValues
-from viability_bounds_pkg.ros.direct_delivery import DirectDelivery
+from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader
 from viability_bounds_pkg.ros.program import initialise, leave
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, make_executor
+from viability_bounds_pkg.ros.streams import connect
 from viability_bounds_pkg.state_estimation.estimator import StateEstimator
 
 CASES = (
@@ -233,7 +234,7 @@ STAGES = (
     (ControllerNode, "_on_limits", "controller: rest of the node"),
     (Publisher, "publish", "publish"),
     (Diagnostics, "publish", "diagnostics"),
-    (PublisherWatch, "look", "watch of the graph"),
+    (PublisherWatch, "check", "watch of the graph"),
 )
 watch = Stopwatch()
 
@@ -247,8 +248,8 @@ def stages(robot: str, rate: float, seconds: float, imperfect: bool) -> None:
         watch.watch(owner, function, stage)
     watch.each(BulletNode, "_next_state")
     periods = {
-        way: stages_of(robot, rate, seconds, imperfect, delivery)
-        for way, delivery in (("direct", DirectDelivery()), ("messages", None))
+        way: stages_of(robot, rate, seconds, imperfect, way == "direct")
+        for way in ("direct", "messages")
     }
     whole = {
         way: np.diff([each["whole period"] for each in found[1:]])
@@ -275,7 +276,7 @@ def stages(robot: str, rate: float, seconds: float, imperfect: bool) -> None:
 
 
 def stages_of(
-    robot: str, rate: float, seconds: float, imperfect: bool, delivery: DirectDelivery | None
+    robot: str, rate: float, seconds: float, imperfect: bool, connected: bool
 ) -> list[dict[str, float]]:
     """Run the nodes in lockstep for some seconds; return the times of each period by stage, s."""
     arguments = configuration(robot, rate, imperfect=imperfect)
@@ -290,7 +291,9 @@ def stages_of(
     parser = Parser(prog="bench_realtime")
     initialise(parser, ["bench_realtime", "--ros-args", *arguments, "--log-level", "error"])
     watch.periods.clear()
-    nodes: list[Node] = [BulletNode(direct_delivery=delivery), *make_nodes(delivery)]
+    nodes: list[ArmNode] = [BulletNode(), *make_nodes()]
+    if connected:
+        connect(nodes)
     user = Node("user")
     publisher = user.create_publisher(PoseStamped, "target_pose", GOAL_QOS)
     turns = itertools.cycle(goals(robot))

@@ -23,6 +23,7 @@ from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.node.estimator_node import EstimatorNode
 from viability_bounds_pkg.parameter_files import YamlError, read_yaml
+from viability_bounds_pkg.ros.streams import connect
 
 ROOT = Path(__file__).resolve().parent.parent
 NODES = {
@@ -126,10 +127,12 @@ def run_chain(
                 own = values | lockstep | {"scenario": str(path)} | per_node.get(name, {})
                 given = [Parameter(key, value=value) for key, value in own.items() if value != []]
                 nodes[name] = kind(parameter_overrides=given)
-            for each in list(nodes["scenario_node"].subscriptions):
-                if each.topic_name.removeprefix("/") in not_recorded:
-                    nodes["scenario_node"].destroy_subscription(each)
             player = nodes["scenario_node"]
+            for each in list(player.inputs):
+                if each.topic_name.removeprefix("/") in not_recorded:
+                    each.unsubscribe()
+                    player.inputs.remove(each)
+            connect(list(nodes.values()))
             play(
                 player, others=[each for each in nodes.values() if each is not player], quiet=True
             )

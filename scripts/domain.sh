@@ -2,13 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 # Sets ROS_DOMAIN_ID for a demo, so that other robots and demos do not interfere. Source it.
 #
-# Where it is set already, it is refused in one line if nodes of this project run in that domain,
-# or another demo of this user is starting in it. Otherwise a domain is taken that no program on
+# Where it is set already, it is refused in one line if another demo of this user runs in that
+# domain. Otherwise a domain is taken that no program on
 # this machine uses.
 
-_has_nodes() { # of this project, without a namespace: what they claim, see ros/claim.py
-    grep -qE "@viability_bounds $1 /[^/]+\$" /proc/net/unix
-}
 _is_used() { # by any ROS node: the port of the first one
     grep -qF "$(printf ':%04X ' $((7410 + 250 * $1)))" /proc/net/udp
 }
@@ -20,8 +17,8 @@ _keep() { # until this shell and the nodes that it starts have ended
 _choose_domain() {
     local i
     if [ -n "${ROS_DOMAIN_ID:-}" ]; then
-        _keep "$ROS_DOMAIN_ID" && ! _has_nodes "$ROS_DOMAIN_ID" && return
-        echo "error: another robot or demo runs in ROS domain $ROS_DOMAIN_ID: stop it, or set" \
+        _keep "$ROS_DOMAIN_ID" && return
+        echo "error: another demo runs in ROS domain $ROS_DOMAIN_ID: stop it, or set" \
             "another ROS_DOMAIN_ID or none" >&2
         return 1
     fi

@@ -31,7 +31,6 @@ from viability_bounds_pkg.cli import estimate_acceleration_limits
 from viability_bounds_pkg.node import bounds_node, estimator_node
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.ros import arm_node, messages, program
-from viability_bounds_pkg.ros.claim import TakenError
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS, stamp_to_ns
 from viability_bounds_pkg.testing.ros_harness import (
     RosHarness,
@@ -70,7 +69,7 @@ def of_kind(*kinds: str) -> list[Any]:
 def test_there_are_many_and_no_two_are_the_same():
     assert len(ALL) >= 80
     assert len({mistake["did"] for mistake in ALL}) == len(ALL)
-    keys = ("run", "send", "set", "call", "scene", "twice")
+    keys = ("run", "send", "set", "call", "scene")
     assert all(len(set(keys) & set(mistake)) == 1 for mistake in ALL)
 
 
@@ -306,6 +305,11 @@ def other_type(running):
     running.other.probe.create_publisher(String, "target_pose", GOAL_QOS)
 
 
+def two_robots(running):
+    running.start(BulletNode)
+    running.start(BulletNode)
+
+
 def no_clock(running):
     running.start(BoundsNode, use_sim_time=True)
 
@@ -323,13 +327,3 @@ def test_in_a_scene(mistake, ros, gets, monkeypatch):
     finally:
         if running.other is not None:
             running.other.close()
-
-
-@pytest.mark.parametrize("mistake", of_kind("twice"))
-def test_in_two_nodes_of_a_kind(mistake, ros):
-    running = Running(ros)
-    running.start(BulletNode)
-    with pytest.raises(TakenError) as caught:
-        running.start(BulletNode)
-    line = re.sub(r"process \d+", "process N", str(caught.value))
-    assert line.replace(f"domain {ros.domain} ", "domain D ") == mistake["line"]

@@ -1,18 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Imperfect robots and the nodes that know what is wrong with them, in lockstep."""
 
-from functools import partial
-
-import chain
 import numpy as np
 import pytest
-from chain import NODES, run_chain
+from chain import run_chain
 from imperfect import CASES, STIFF, Course, node_values
 from sensor_msgs.msg import JointState
 
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
-from viability_bounds_pkg.ros.direct_delivery import DirectDelivery
 from viability_bounds_pkg.testing.ros_harness import read_config
 
 
@@ -24,18 +20,10 @@ def test_nodes_say_that_the_estimator_is_missing(ros, kind, name):
     ros.probe.create_publisher(JointState, "joint_states", 1)
     ros.wait_until(lambda: node.count_publishers("joint_states"), "the robot")
     for _ in range(3):
-        node.publisher_watch.look()
+        node.publisher_watch.check()
     node._diagnostics.publish()
     missing = "'/joint_states' has a publisher, '/estimated_joint_states' has none"
     ros.wait_until(lambda: missing in ros.reported(name, "message"), "the message")
-
-
-@pytest.fixture(autouse=True)
-def in_one_process(monkeypatch):
-    """Past the middleware, which is faster: `test_one_process.py` shows that nothing differs."""
-    delivery = DirectDelivery()
-    nodes = {name: partial(kind, direct_delivery=delivery) for name, kind in NODES.items()}
-    monkeypatch.setattr(chain, "NODES", nodes)
 
 
 def play(robot, case, duration, seed=1):

@@ -18,7 +18,6 @@ from sim_bridge.nodes.bullet_node import BulletNode
 from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.ramp import RISE_TIME
 from viability_bounds_pkg.node.bounds_node import BoundsNode
-from viability_bounds_pkg.ros.claim import TakenError
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp, stamp_to_ns
 from viability_bounds_pkg.testing.ros_harness import read_config
 
@@ -325,9 +324,3 @@ def test_its_help_lists_its_parameters(moveit, monkeypatch, capsys):
         moveit.main()
     assert end.value.code == 0
     assert "  trajectory_goal_tolerance: how near" in capsys.readouterr().out
-
-
-def test_a_second_one_of_its_name_does_not_start(ros, moveit):
-    start_node(ros, moveit)
-    with pytest.raises(TakenError, match="serves '/moveit_node/follow_joint_trajectory'"):
-        start_node(ros, moveit)

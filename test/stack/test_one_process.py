@@ -20,8 +20,8 @@ from trajectory_msgs.msg import JointTrajectory
 
 from sim_bridge.nodes import simulated_stack
 from torque_safety_controller.node import safety_stack
-from viability_bounds_pkg.ros.direct_delivery import DirectDelivery
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS
+from viability_bounds_pkg.ros.streams import Queue
 from viability_bounds_pkg.testing.executables import as_child
 from viability_bounds_pkg.testing.ros_harness import joint_state, private_domain
 
@@ -56,15 +56,13 @@ def test_in_lockstep_all_numbers_are_those_of_messages(monkeypatch, robot, overl
     demo = yaml.safe_load((ROOT / "config" / "scenarios" / f"{robot}_demo.yaml").read_text())
     events = [*demo["events"][:1], {"time": 0.2, "push": push}]
     scenario = {"duration": 0.4, "events": events}
-    apart = run_chain(values, scenario, per_node).run
-    delivery = DirectDelivery()
-    given = []
-    deliver = delivery._deliver
-    monkeypatch.setattr(delivery, "_deliver", lambda node: (given.append(node), deliver(node)))
-    together = {name: partial(kind, direct_delivery=delivery) for name, kind in NODES.items()}
-    monkeypatch.setattr(chain, "NODES", together)
+    turns = []
+    deliver = Queue._deliver
+    monkeypatch.setattr(Queue, "_deliver", lambda queue: (turns.append(queue), deliver(queue)))
     run = run_chain(values, scenario, per_node).run
-    assert len(given) >= len(run.t), "messages went directly"
+    assert len(turns) >= len(run.t), "messages went directly"
+    monkeypatch.setattr(chain, "connect", lambda nodes: None)
+    apart = run_chain(values, scenario, per_node).run
     assert np.ptp(run.q, axis=0).max() > 0.02, "it moves"
     for name in ("t", "q", "v", "a_lower", "a_upper", "tau", "ft_wrench"):
         np.testing.assert_array_equal(getattr(run, name), getattr(apart, name), name)
@@ -130,7 +128,7 @@ def test_each_node_keeps_name_parameters_and_topics(ros):
         readers = {
             each.node_name for each in ros.probe.get_subscriptions_info_by_topic("/left/torques")
         }
-        assert readers == {"bullet_node", "estimator_node", "probe"}
+        assert readers == {"probe"}
 
 
 def played(ros, directory, *, stopped):

@@ -35,7 +35,6 @@ from viability_bounds_pkg.ros.joint_command import PositionCommand, TorqueComman
 from viability_bounds_pkg.ros.messages import Diagnostics
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
-from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.robot_urdf import warn_of_unusual
 from viability_bounds_pkg.ros.runtime import set_stamp
 from viability_bounds_pkg.ros.topics import (
@@ -79,7 +78,7 @@ class BulletNode(ArmNode):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__(**node_arguments)
-        with self.starting(JOINT_STATES):
+        with self.starting():
             self._node_parameters = NodeParameters(self, BulletConfiguration)
             config = self._node_parameters.configuration
             warn_of_unusual(self, config, config.urdf)
@@ -107,12 +106,12 @@ class BulletNode(ArmNode):
             self, self._robot, config.external_wrench_timeout, self._refused
         )
         self._ft_wrench = WrenchStamped()
-        self._ft_publisher = FT_WRENCH.publisher(self) if self._robot.sensor else None
+        self._ft_publisher = self.stream(FT_WRENCH) if self._robot.sensor else None
         imperfect = config.imperfections
         senses = imperfect.of_sensing or imperfect.of_motors
         self._sensing = Sensing(imperfect, config.torque_max, config.dt) if senses else None
         warn = self.get_logger().warning
-        self._commands = CommandStream(config, self._refused, self._one_controller, warn)
+        self._commands = CommandStream(config, self._refused, warn)
         self._restart()
 
         # Joints that are locked, too: robot_state_publisher places no link without its joint.
@@ -120,21 +119,19 @@ class BulletNode(ArmNode):
         self._locked_at = array("d", locked.values())
         self._at_rest = array("d", [0.0] * len(locked))
         self._names = [*config.joints, *locked]
-        self._state_publisher = JOINT_STATES.publisher(self)
+        self._state_publisher = self.stream(JOINT_STATES)
         self._clock_publisher = CLOCK.publisher(self) if config.publish_clock else None
         description = ROBOT_DESCRIPTION.publisher(self)
         description.publish(String(data=config.urdf))
-        self._commands_topic = JOINT_COMMANDS.subscription(self, self._on_command).topic_name
+        self.listen(JOINT_COMMANDS, self._on_command)
         RESET.serve(self, self._on_reset)
         PAUSE.serve(self, self._on_pause)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         if not config.lockstep:
             self.create_timer(config.dt, self._tick, clock=steady)
         self.create_timer(_RETRY_PERIOD, self._retry, clock=steady)
-        alone = [JOINT_STATES.name, JOINT_COMMANDS.name, FT_WRENCH.name]
         if self._clock_publisher is not None:
-            alone.append(CLOCK.name)
-        self.publisher_watch = PublisherWatch(self, alone)
+            self.publisher_watch.add(self._clock_publisher.topic_name)
         self._diagnostics = Diagnostics(self, self._report, watch=self.publisher_watch)
         self.announce(config.joints, config.rate_hz, f"simulated, clock {config.clock}")
         self._next_state()
@@ -273,9 +270,6 @@ class BulletNode(ArmNode):
         # After a pause by itself the next state is not published: time stops for all nodes.
         if self._config.lockstep and not self._paused:
             self._next_state()
-
-    def _one_controller(self) -> bool:
-        return self.publisher_watch.admits(self._commands_topic)
 
     # Services
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The stream of commands: which one acts, and which are late, refused, or of a rival."""
+"""The stream of commands: which one acts, and which are late or refused."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ class CommandStream:
     Args:
         config: of the robot.
         refused: counts messages that are dropped, by reason.
-        admits: tells whether they come from one node only; else none is obeyed.
         warn: told in words what is wrong with them.
 
     Attributes:
@@ -41,11 +40,10 @@ class CommandStream:
         self,
         config: BulletConfiguration,
         refused: Counter[str],
-        admits: Callable[[], bool],
         warn: Callable[[str], object],
     ) -> None:
         self._config, self._refused = config, refused
-        self._admits, self._warn = admits, warn
+        self._warn = warn
         self._joints = list(config.joints)
         self._dt_ns = round(1e9 * config.dt)
         self.restart()
@@ -80,7 +78,7 @@ class CommandStream:
             if not paused:
                 self._note_stray(own, stamp)
             return False
-        if paused or not self._admits():
+        if paused:
             return False
         command = self._read(message)
         if command is None:

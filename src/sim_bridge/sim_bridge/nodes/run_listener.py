@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
@@ -21,10 +20,12 @@ from trajectory_msgs.msg import JointTrajectory, MultiDOFJointTrajectory
 from sim_bridge.nodes.topics import EXTERNAL_WRENCH, OBSTACLES
 from sim_bridge.recording.mcap_file import McapFile
 from sim_bridge.scenario.recording import Array, RecordedRun
+from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import Arrival, JointStateReader
 from viability_bounds_pkg.ros.runtime import LATCHED_QOS, stamp_to_ns
 from viability_bounds_pkg.ros.topics import (
     ACCELERATION_LIMITS,
+    DIAGNOSTICS,
     FT_WRENCH,
     JOINT_COMMANDS,
     JOINT_STATES,
@@ -73,8 +74,7 @@ class RunListener:
             name.
     """
 
-    def __init__(self, node: Node, joints: Sequence[str], file: McapFile | None = None) -> None:
-        self._file = file
+    def __init__(self, node: ArmNode, joints: Sequence[str], file: McapFile | None = None) -> None:
         self._unfiled: list[tuple[str, bytes]] = []
         self.stamp = self.answered = -1
         self.q: Array = np.zeros(len(joints))
@@ -99,25 +99,29 @@ class RunListener:
             (FT_WRENCH, self._on_wrench),
         ):
             self.topics += (topic.name,)
-            self._listen(node, topic.message, topic.name, take, _RECORDING_QOS)
-        self._listen(node, DiagnosticArray, "/diagnostics", self._on_diagnostics, _MANY)
-        if file is not None:
-            for name, kind, qos in _FURTHER:
-                self._listen(node, kind, name, None, qos)
+            if file is None:
+                node.listen(topic, take, _RECORDING_QOS)
+            else:
+                self._keep(file, node, topic.message, topic.name, take, _RECORDING_QOS)
+                node.publisher_watch.add(node.resolve_topic_name(topic.name))
+        if file is None:
+            DIAGNOSTICS.subscription(node, self._on_diagnostics)
+            return
+        self._keep(file, node, DiagnosticArray, "/diagnostics", self._on_diagnostics, _MANY)
+        for name, kind, qos in _FURTHER:
+            self._keep(file, node, kind, name, None, qos)
 
-    def _listen(
+    def _keep(
         self,
-        node: Node,
+        file: McapFile,
+        node: ArmNode,
         kind: type,
         name: str,
         take: Callable[[Any], None] | None,
         qos: QoSProfile,
     ) -> None:
-        """Subscribe; what comes goes to the file, if there is one, and to `take`."""
-        if self._file is None:
-            node.create_subscription(kind, name, take, qos)
-            return
-        file, path = self._file, node.resolve_topic_name(name)
+        """Subscribe; what comes goes to the file and to `take`."""
+        path = node.resolve_topic_name(name)
         file.add_topic(path, kind)
 
         def keep(serialized: bytes) -> None:

@@ -46,7 +46,6 @@ from viability_bounds_pkg.ros.program import (
     node_parser,
     report_refusal,
 )
-from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.runtime import make_executor
 
 _POLL_PERIOD = 0.02
@@ -85,15 +84,12 @@ class ScenarioNode(ArmNode):
     def __init__(self, *, file: McapFile | None = None, **node_arguments: Any) -> None:
         super().__init__(**node_arguments)
         with self.starting():
-            robot = self.resolve_service_name(RESET.service).rpartition("/")[0]
-            self.claim("plays a scenario on", robot)
             config = NodeParameters(self, ScenarioConfiguration).configuration
         self.config = config
         self.awaits = ""
         self.ended: Future[None] = Future()
         self.failure: ScenarioRefused | None = None
         self.listener = RunListener(self, config.joints, file)
-        self._publisher_watch = PublisherWatch(self, self.listener.topics)
         self._first, self._period = 0, 1
         self._refused: dict[str, list[str]] | None = None  # when the messages begin; else None
         frames = config.base_frame, config.end_effectors[0]
@@ -215,7 +211,7 @@ class ScenarioNode(ArmNode):
 
     def _check_publishers(self) -> None:
         """Refuse to record what several robots, bounds nodes or controllers publish."""
-        if trouble := self._publisher_watch.trouble:
+        if trouble := self.publisher_watch.trouble:
             raise ScenarioRefused(f"{trouble}; allowed: one")
 
     def _check_refusals(self, known: dict[str, list[str]]) -> None:

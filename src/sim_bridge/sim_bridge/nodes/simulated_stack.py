@@ -11,7 +11,6 @@ from types import ModuleType
 from sim_bridge.nodes.bullet_node import BulletNode
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.direct_delivery import DirectDelivery
 from viability_bounds_pkg.ros.program import report_refusal, run_together, stack_parser
 
 STACKS = "arm_safety.stacks"
@@ -44,9 +43,9 @@ def main(args: list[str] | None = None) -> int:
         report_refusal(error)
         return 1
 
-    def make_nodes(direct_delivery: DirectDelivery) -> Iterator[ArmNode]:
-        yield BulletNode(direct_delivery=direct_delivery)
-        yield from stack.make_nodes(direct_delivery)
+    def make_nodes() -> Iterator[ArmNode]:
+        yield BulletNode()
+        yield from stack.make_nodes()
 
     kinds = BulletNode, *stack.KINDS
     parser = stack_parser("simulated_stack", (__doc__ or "").strip(), kinds)

@@ -20,9 +20,9 @@ class Robot:
     """A stream, and what it says."""
 
     def __init__(self, **changed):
-        self.refused, self.said, self.alone = Counter(), [], True
+        self.refused, self.said = Counter(), []
         config = read(BulletConfiguration, VALUES | {"clock": "real_time"} | changed)
-        self.stream = CommandStream(config, self.refused, lambda: self.alone, self.said.append)
+        self.stream = CommandStream(config, self.refused, self.said.append)
 
     def takes(self, stamp, tau=TAU, *, ended=False, paused=False):
         message = joint_state(JOINTS, stamp, tau=tau)
@@ -69,11 +69,8 @@ def test_a_late_one_acts_when_it_would_have_acted_anyhow():
     np.testing.assert_array_equal(stream.acting.tau, TAU)
 
 
-def test_while_there_is_a_rival_or_a_pause_none_is_obeyed():
+def test_during_a_pause_none_is_obeyed():
     robot = Robot()
-    robot.alone = False
-    assert not robot.takes(NOW)
-    robot.alone = True
     assert not robot.takes(NOW, paused=True)
     assert not robot.takes(NOW + PERIOD, paused=True)
     assert robot.stream.acting is None

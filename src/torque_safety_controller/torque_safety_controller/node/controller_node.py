@@ -33,7 +33,7 @@ from torque_safety_controller.node.reports.state_publisher import StatePublisher
 from torque_safety_controller.node.streams.joint_commands import JointCommands
 from torque_safety_controller.node.streams.limits import LimitsReader
 from torque_safety_controller.node.streams.states import UNSEEN, StateStream
-from torque_safety_controller.node.topics import ENABLE_TORQUE, GOALS
+from torque_safety_controller.node.topics import ENABLE_TORQUE
 from torque_safety_controller.node.wrenches import WrenchSubscriber
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.qp import AccelerationRange
@@ -42,14 +42,8 @@ from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import Arrival, Diagnostics
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
-from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.robot_urdf import DescriptionWatch
-from viability_bounds_pkg.ros.topics import (
-    ACCELERATION_LIMITS,
-    FT_WRENCH,
-    JOINT_COMMANDS,
-    state_topic,
-)
+from viability_bounds_pkg.ros.topics import ACCELERATION_LIMITS
 from viability_bounds_pkg.state import State
 
 _QUIET = 1.5
@@ -69,7 +63,7 @@ class ControllerNode(ArmNode):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__(**node_arguments)
-        with self.starting(JOINT_COMMANDS):
+        with self.starting():
             self._node_parameters = NodeParameters(self, ControllerConfiguration, self._configure)
             config = self._node_parameters.configuration
             declared = declared_robot(self)
@@ -81,17 +75,9 @@ class ControllerNode(ArmNode):
         check = make_plausibility_check(config, declared)
         self._states = StateStream(config.joints, config.state_timeout, self._warn, check)
         self._limits = LimitsReader(config.joints, self._warn)
-        states = state_topic(config.use_estimated_states)
-        alone = JOINT_COMMANDS, states, ACCELERATION_LIMITS, FT_WRENCH, *GOALS
-        self.publisher_watch = PublisherWatch(
-            self,
-            filter(None, [*(topic.name for topic in alone), config.ros2_control_topic]),
-            needs_estimates=config.use_estimated_states,
-        )
-        heard = self, self.publisher_watch
-        self._goals = GoalSubscriber(*heard, self._controller, config, base)
+        self._goals = GoalSubscriber(self, self._controller, config, base)
         self._wrenches = WrenchSubscriber(
-            *heard, self._controller.find(Interaction), self._goals, config, base
+            self, self._controller.find(Interaction), self._goals, config, base
         )
         self._driving = Driving(self, self._goals, self._controller, config, base, self._states)
         commands = None
@@ -120,9 +106,8 @@ class ControllerNode(ArmNode):
         self._commands = JointCommands(self, config.joints, config.ros2_control_topic)
         self._published = StatePublisher(self, self._controller, config, base, self._states)
         ENABLE_TORQUE.serve(self, self._on_enable_torque)
-        self._states_topic = states.subscription(self, self._on_state).topic_name
-        limits = ACCELERATION_LIMITS.subscription(self, self._on_limits)
-        self._limits_topic = limits.topic_name
+        self.listen_to_states(config.use_estimated_states, self._on_state)
+        self.listen(ACCELERATION_LIMITS, self._on_limits)
         # Use the steady clock, so that watchdogs fire when /clock stops.
         self._watchdog = self.create_timer(
             min(config.bounds_timeout, config.state_timeout) / 4,
@@ -153,8 +138,6 @@ class ControllerNode(ArmNode):
     # Streams
 
     def _on_state(self, message: JointState) -> None:
-        if not self.publisher_watch.admits(self._states_topic):
-            return
         states, stamp = self._states, message.header.stamp
         arrival = states.read(message, time.monotonic())
         if arrival is Arrival.REFUSED:
@@ -176,7 +159,7 @@ class ControllerNode(ArmNode):
             self._answer(stamp, None)
 
     def _on_limits(self, message: JointTrajectory) -> None:
-        if not (self.publisher_watch.admits(self._limits_topic) and self._limits.read(message)):
+        if not self._limits.read(message):
             return
         if self._limits.stamp == self._states.stamp != self._states.answered_stamp:
             self._answer(message.header.stamp, self._limits.range)

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 from geometry_msgs.msg import Point, PoseStamped, Quaternion, Vector3
-from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
@@ -32,7 +31,7 @@ from viability_bounds_pkg.pose_trajectory import (
     TrajectoryError,
     TrajectoryPoint,
 )
-from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
+from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import Topic
 from viability_bounds_pkg.state import State
@@ -157,7 +156,6 @@ class GoalSubscriber:
 
     Args:
         node: listens and logs what is refused.
-        watch: tells whether several nodes publish a topic.
         controller: is given the goals when they are due.
         config: has the names and limits that they are checked by.
         base: placement of the base frame in the URDF's root frame.
@@ -169,8 +167,7 @@ class GoalSubscriber:
 
     def __init__(
         self,
-        node: Node,
-        watch: PublisherWatch,
+        node: ArmNode,
         controller: Controller,
         config: ControllerConfiguration,
         base: pin.SE3,
@@ -178,7 +175,7 @@ class GoalSubscriber:
         self.refused: Counter[str] = Counter()
         self._pending: list[tuple[int, Callable[[], None]]] = []
         self._controller, self._config, self._base = controller, config, base
-        self._node, self._watch = node, watch
+        self._node, self._watch = node, node.publisher_watch
         self._contested: set[str] = set()
         self.listen(TARGET_POSE, self._on_pose)
         if len(config.end_effectors) > 1:
@@ -214,6 +211,7 @@ class GoalSubscriber:
         It may raise `GoalRefused`.
         """
         name = self._node.resolve_topic_name(topic.name)
+        self._watch.add(name)
 
         def receive(message: Any) -> None:
             if self._watch.admits(name):

@@ -10,7 +10,6 @@ import numpy as np
 import pinocchio as pin
 from geometry_msgs.msg import WrenchStamped
 from numpy.typing import NDArray
-from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from torque_safety_controller.contact.interaction import Compliance, Interaction
@@ -18,7 +17,7 @@ from torque_safety_controller.contact.wrench_sensor import STRONGEST, WrenchErro
 from torque_safety_controller.node.goals import GoalRefused, GoalSubscriber
 from torque_safety_controller.node.topics import TARE_FT_SENSOR, TARGET_WRENCH
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
+from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.topics import FT_WRENCH
 
 Array = NDArray[np.float64]
@@ -47,8 +46,7 @@ class WrenchSubscriber:
 
     def __init__(
         self,
-        node: Node,
-        watch: PublisherWatch,
+        node: ArmNode,
         interaction: Interaction | None,
         goals: GoalSubscriber,
         config: ControllerConfiguration,
@@ -56,22 +54,19 @@ class WrenchSubscriber:
     ) -> None:
         self._interaction, self._goals, self._config = interaction, goals, config
         self._base = base
-        self._logger, self._watch = node.get_logger(), watch
+        self._logger = node.get_logger()
         self.refused: Counter[str] = Counter()
         self._changes = 0
         goals.listen(TARGET_WRENCH, self._on_target)
         if interaction is None:
             return
         sensor = interaction.sensor
-        measured = FT_WRENCH.subscription(node, partial(self._on_measured, sensor))
-        self._topic = measured.topic_name
+        node.listen(FT_WRENCH, partial(self._on_measured, sensor))
         TARE_FT_SENSOR.serve(node, partial(self._on_tare, interaction, sensor))
 
     def _on_measured(self, sensor: WrenchSensor, message: WrenchStamped) -> None:
         frame, wanted = message.header.frame_id, self._config.interaction.ft_frame
-        if not self._watch.admits(self._topic):
-            self._refuse(f"several nodes publish '{self._topic}'")
-        elif frame not in ("", wanted):
+        if frame not in ("", wanted):
             # Counted together, whatever the frame: senders do not make the report longer.
             detail = f"frame_id is '{frame}'; allowed: '{wanted}' or empty"
             self._refuse("another frame_id", detail)

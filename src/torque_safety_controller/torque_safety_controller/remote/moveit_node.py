@@ -168,9 +168,7 @@ class MoveitNode(ArmNode):
         self._jogged = -math.inf
         self._mode = ""
         self._server: ActionServer | None = None
-        action = f"{self.get_fully_qualified_name()}/follow_joint_trajectory"
         with self.starting():
-            self.claim("serves", action)
             self._config = NodeParameters(self, MoveitConfiguration).configuration
         self._reader = JointStateReader(self._config.joints)
         SLOW_JOINT_STATES.subscription(self, self._on_state)
@@ -186,7 +184,7 @@ class MoveitNode(ArmNode):
         )
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(PERIOD, self._tick, clock=steady)
-        self.get_logger().info(f"action {action}, jogs on {self.get_name()}/joint_jog")
+        self.get_logger().info(f"action and jogs in {self.get_fully_qualified_name()}")
 
     def destroy_node(self) -> None:
         """Stop what the arm was sent to do."""

@@ -11,7 +11,6 @@ from sensor_msgs.msg import JointState
 from true_arm import model
 
 from viability_bounds_pkg.node.estimator_node import EstimatorNode
-from viability_bounds_pkg.ros.claim import TakenError
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.state_estimation.estimator import StateEstimator
 from viability_bounds_pkg.state_estimation.observer import design_observer
@@ -291,12 +290,6 @@ def test_diagnostics_tell_lag_noise_and_errors(ros):
     ros.wait_until(lambda: arm.reported("message") == larger)
     assert ros.diagnostics[NODE]["level"] == DiagnosticStatus.WARN
     assert float(arm.reported("innovation_max_rad").split()[0]) >= 4e-4
-
-
-def test_a_second_one_does_not_start(ros):
-    EstimatorProbe(ros)
-    with pytest.raises(TakenError, match="estimated_joint_states"):
-        ros.start(EstimatorNode, VALUES)
 
 
 @pytest.mark.parametrize(

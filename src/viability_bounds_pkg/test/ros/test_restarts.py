@@ -55,7 +55,7 @@ def answering(ros):
 
 
 def test_one_that_was_killed_and_started_again_is_heard_and_obeyed(ros):
-    watch = PublisherWatch(ros.probe, ["answer"])
+    watch = PublisherWatch(ros.probe)
     ask = ros.probe.create_publisher(String, "ask", CONTROL_QOS)
     obeyed = set()
 
@@ -70,6 +70,7 @@ def test_one_that_was_killed_and_started_again_is_heard_and_obeyed(ros):
                 lambda pid=program.pid: pid in obeyed,
                 "an answer that is obeyed",
                 each=lambda: ask.publish(String()),
+                timeout=5.0,
             )
     assert len(obeyed) == STARTS
 

@@ -25,9 +25,8 @@ from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import Arrival, Diagnostics, JointStateReader, PeriodCheck
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
-from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.robot_urdf import DescriptionWatch, warn_of_unusual
-from viability_bounds_pkg.ros.topics import ACCELERATION_LIMITS, state_topic
+from viability_bounds_pkg.ros.topics import ACCELERATION_LIMITS
 
 
 class BoundsNode(ArmNode):
@@ -44,7 +43,7 @@ class BoundsNode(ArmNode):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__(**node_arguments)
-        with self.starting(ACCELERATION_LIMITS):
+        with self.starting():
             self._node_parameters = NodeParameters(
                 self, BoundsConfiguration, self._configure, make_bounds
             )
@@ -61,15 +60,8 @@ class BoundsNode(ArmNode):
         self._answer = JointTrajectory(
             joint_names=list(joints), points=[JointTrajectoryPoint(), JointTrajectoryPoint()]
         )
-        self._publisher = ACCELERATION_LIMITS.publisher(self)
-        states = state_topic(config.use_estimated_states)
-        subscription = states.subscription(self, self._on_state)
-        self._states_topic = subscription.topic_name
-        self.publisher_watch = PublisherWatch(
-            self,
-            [ACCELERATION_LIMITS.name, states.name],
-            needs_estimates=config.use_estimated_states,
-        )
+        self._limits = self.stream(ACCELERATION_LIMITS)
+        self.listen_to_states(config.use_estimated_states, self._on_state)
         self._slow_topics = SlowTopics(self, config, self._reader, self._answer)
         self._diagnostics = Diagnostics(
             self, self._report, self.publisher_watch, DescriptionWatch(self)
@@ -97,8 +89,6 @@ class BoundsNode(ArmNode):
                 )
 
     def _on_state(self, message: JointState) -> None:
-        if not self.publisher_watch.admits(self._states_topic):
-            return
         arrival = self._reader.read(message, time.monotonic())
         if arrival is Arrival.REFUSED:
             return
@@ -111,7 +101,7 @@ class BoundsNode(ArmNode):
             if False in bounds.viable.tolist():  # faster than NumPy's for few
                 self._outside += ~bounds.viable
             self._answered += 1
-        self._publisher.publish(self._answer)
+        self._limits.publish(self._answer)
 
     def _report(self) -> tuple[bytes, str, dict[str, Any]]:
         config = self._node_parameters.configuration

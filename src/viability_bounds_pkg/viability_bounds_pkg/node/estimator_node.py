@@ -23,7 +23,6 @@ from viability_bounds_pkg.ros.joint_command import TorqueCommand, accept_command
 from viability_bounds_pkg.ros.messages import Arrival, Diagnostics, JointStateReader, PeriodCheck
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
-from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.robot_urdf import DescriptionWatch, robot_urdf, warn_of_unusual
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import ESTIMATED_JOINT_STATES, JOINT_COMMANDS, JOINT_STATES
@@ -45,7 +44,7 @@ class EstimatorNode(ArmNode):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__(**node_arguments)
-        with self.starting(ESTIMATED_JOINT_STATES):
+        with self.starting():
             parameters = NodeParameters(self, EstimatorConfiguration)
             config = self._config = parameters.configuration
             urdf = robot_urdf(config, self)
@@ -62,12 +61,9 @@ class EstimatorNode(ArmNode):
         self._refused: Counter[str] = Counter()
         self._answered = self._restarts = self.commands_heard = 0
         self._answer = JointState()
-        self._publisher = ESTIMATED_JOINT_STATES.publisher(self)
-        self._states_topic = JOINT_STATES.subscription(self, self._on_state).topic_name
-        self._commands_topic = JOINT_COMMANDS.subscription(self, self._on_command).topic_name
-        self.publisher_watch = PublisherWatch(
-            self, [ESTIMATED_JOINT_STATES.name, JOINT_STATES.name, JOINT_COMMANDS.name]
-        )
+        self._estimates = self.stream(ESTIMATED_JOINT_STATES)
+        self.listen(JOINT_STATES, self._on_state)
+        self.listen(JOINT_COMMANDS, self._on_command)
         self._diagnostics = Diagnostics(
             self, self._report, self.publisher_watch, DescriptionWatch(self)
         )
@@ -81,8 +77,6 @@ class EstimatorNode(ArmNode):
         )
 
     def _on_state(self, message: JointState) -> None:
-        if not self.publisher_watch.admits(self._states_topic):
-            return
         reader = self._reader
         arrival = reader.read(message, time.monotonic())
         if arrival is Arrival.REFUSED:
@@ -93,7 +87,7 @@ class EstimatorNode(ArmNode):
             state = estimator.step(reader.stamp, reported, reader.effort())
             self._answer = reader.with_state(state)
             self._answered += 1
-        self._publisher.publish(self._answer)
+        self._estimates.publish(self._answer)
         if arrival is Arrival.NEW and self._estimator.resets.total() != self._restarts:
             self._tell_restart()
 
@@ -105,8 +99,6 @@ class EstimatorNode(ArmNode):
             self._warn(f"starts anew from the reported state: {reason}; later ones are counted")
 
     def _on_command(self, message: JointState) -> None:
-        if not self.publisher_watch.admits(self._commands_topic):
-            return
         self.commands_heard += 1
         command = accept_command(message, self._joints, self._refused, self._warn)
         if command is None:

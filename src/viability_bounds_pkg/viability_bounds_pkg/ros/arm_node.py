@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all nodes of this project have in common besides what rclpy gives them."""
+"""Base class of all nodes: a start as a whole, warnings about topics and clock."""
 
 from __future__ import annotations
 
@@ -9,13 +9,10 @@ from typing import Any, ClassVar
 
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidParameterTypeException
-from rclpy.node import Node
 
 from viability_bounds_pkg.exceptions import ArmSafetyError
-from viability_bounds_pkg.ros.claim import Claim
-from viability_bounds_pkg.ros.direct_delivery import DirectDelivery
 from viability_bounds_pkg.ros.given_parameters import given_parameters
-from viability_bounds_pkg.ros.topics import Topic
+from viability_bounds_pkg.ros.streams import StreamNode
 
 CLOCK_TIMEOUT = 5.0
 """How long ``/clock`` may be silent at start before a node warns, s."""
@@ -32,12 +29,8 @@ class StartError(ArmSafetyError, RuntimeError):
     """rclpy cannot start, or not make a node."""
 
 
-class ArmNode(Node):
-    """A node that starts as a whole or not at all, and alone publishes what an arm obeys.
-
-    Args:
-        direct_delivery: to the other nodes of the process; None sends them messages, too, by the
-            middleware alone.
+class ArmNode(StreamNode):
+    """A node that starts as a whole or not at all.
 
     Attributes:
         NAME: of the node, unless it is remapped.
@@ -48,11 +41,7 @@ class ArmNode(Node):
     NAME: ClassVar[str]
     PARAMETERS: ClassVar[type]
 
-    def __init__(
-        self, *, direct_delivery: DirectDelivery | None = None, **node_arguments: Any
-    ) -> None:
-        self.direct_delivery = direct_delivery
-        self._claims: list[Claim] = []
+    def __init__(self, **node_arguments: Any) -> None:
         try:
             # With the services that `rqt_logger_level` uses.
             super().__init__(self.NAME, enable_logger_service=True, **node_arguments)
@@ -63,27 +52,14 @@ class ArmNode(Node):
             if name.startswith(_OF_ROS):
                 del self.given[name]
 
-    def _warn(self, text: str) -> None:
-        self.get_logger().warning(text)
-
     @contextmanager
-    def starting(self, *topics: Topic) -> Iterator[None]:
-        """Claim topics, and take the node down again if what is done meanwhile is refused.
-
-        Raises:
-            TakenError: another node publishes one of the topics.
-        """
+    def starting(self) -> Iterator[None]:
+        """Take the node down again if what is done meanwhile is refused."""
         try:
-            for topic in topics:
-                self.claim("publishes", self.resolve_topic_name(topic.name))
             yield
         except ArmSafetyError:
             self.destroy_node()
             raise
-
-    def claim(self, does: str, name: str) -> None:
-        """Let no second node on this host do something while this one exists, see `Claim`."""
-        self._claims.append(Claim(self, does, name))
 
     def announce(self, joints: Sequence[str], rate: float, what: str) -> None:
         """Log in one line what the node does, for which joints, and the topics that it uses.
@@ -153,11 +129,3 @@ class ArmNode(Node):
 
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_TYPE_PERIOD, look, clock=steady)
-
-    def destroy_node(self) -> None:
-        """Give up the claims, too."""
-        for claim in self._claims:
-            claim.close()
-        if self.direct_delivery is not None:
-            self.direct_delivery.leave(self)
-        super().destroy_node()

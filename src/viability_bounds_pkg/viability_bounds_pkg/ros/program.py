@@ -24,9 +24,9 @@ from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.parameter import parameter_table
 from viability_bounds_pkg.parameter_files import read_sections
 from viability_bounds_pkg.ros.arm_node import ArmNode, StartError
-from viability_bounds_pkg.ros.direct_delivery import DirectDelivery
 from viability_bounds_pkg.ros.given_parameters import note_arguments
 from viability_bounds_pkg.ros.runtime import EventsExecutor, make_executor, settle_dds
+from viability_bounds_pkg.ros.streams import connect
 
 _SIGNAL_CHECK_PERIOD = 0.2
 
@@ -114,19 +114,19 @@ def initialise(parser: Parser, args: Sequence[str] | None = None) -> argparse.Na
 
 def run(make_node: type[ArmNode], args: list[str] | None = None) -> int:
     """Run one node; return the exit code, as `run_together`."""
-    return run_together(node_parser(make_node), lambda _: [make_node()], args)
+    return run_together(node_parser(make_node), lambda: [make_node()], args)
 
 
 def run_together(
     parser: Parser,
-    make_nodes: Callable[[DirectDelivery], Iterable[ArmNode]],
+    make_nodes: Callable[[], Iterable[ArmNode]],
     args: list[str] | None = None,
 ) -> int:
     """Start nodes in one process, run them on one executor until they are told to stop.
 
     Args:
         parser: of the program's own arguments.
-        make_nodes: makes the nodes, one after the other, with what delivers their messages.
+        make_nodes: makes the nodes, one after the other, in the order in which they get messages.
         args: the command line; None for that of the process.
 
     Returns:
@@ -145,8 +145,9 @@ def run_together(
         options = initialise(parser, args)
         # What is raised while a callback of compiled code runs is lost.
         signal.signal(signal.SIGINT, interrupt)
-        for node in make_nodes(DirectDelivery()):
+        for node in make_nodes():
             nodes.append(node)
+        connect(nodes)
         executor = _prepare(nodes, options)
         if not told:
             spin(executor, nodes[0])

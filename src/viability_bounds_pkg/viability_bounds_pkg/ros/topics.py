@@ -19,7 +19,6 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory
 
-from viability_bounds_pkg.ros.direct_delivery import DirectDelivery
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, LATCHED_QOS, SLOW_QOS, STATUS_QOS
 
 USER = "user"
@@ -51,9 +50,7 @@ class Topic:
 
     def publisher(self, node: Node, name: str | None = None) -> Publisher:
         """Return a publisher; `name` is for topics that a parameter names."""
-        arguments = node, self.message, name or self.name, self.qos
-        direct = self._direct(node)
-        return direct.publisher(*arguments) if direct else Node.create_publisher(*arguments)
+        return node.create_publisher(self.message, name or self.name, self.qos)
 
     def subscription(
         self,
@@ -70,18 +67,12 @@ class Topic:
                 as it is best effort where the subscription is reliable; None leaves it to rclpy,
                 which logs it.
         """
-        if direct := self._direct(node):
-            return direct.subscription(node, self.message, self.name, self.qos, callback)
         events = SubscriptionEventCallbacks()
         if refuse is not None:
             events.incompatible_qos = lambda _: refuse(BEST_EFFORT)
         return node.create_subscription(
             self.message, self.name, callback, self.qos, event_callbacks=events
         )
-
-    def _direct(self, node: Node) -> DirectDelivery | None:
-        """Return what delivers the messages within the process; None for the middleware."""
-        return getattr(node, "direct_delivery", None) if self.qos is CONTROL_QOS else None
 
 
 @dataclass(frozen=True)

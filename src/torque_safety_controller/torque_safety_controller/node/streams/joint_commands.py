@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from torque_safety_controller.node.topics import ROS2_CONTROL_EFFORTS
+from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import JOINT_COMMANDS
 
@@ -26,16 +26,17 @@ class JointCommands:
         ros2_control_topic: of the torques in `joints` order; empty for none.
     """
 
-    def __init__(self, node: Node, joints: Sequence[str], ros2_control_topic: str) -> None:
+    def __init__(self, node: ArmNode, joints: Sequence[str], ros2_control_topic: str) -> None:
         self._torques = JointState(name=list(joints))
         self._positions = JointState(
             name=list(joints), velocity=array("d", np.zeros(len(joints)).tobytes())
         )
         self._last = self._torques
-        self._publisher = JOINT_COMMANDS.publisher(node)
+        self._commands = node.stream(JOINT_COMMANDS)
         self._efforts = None
         if ros2_control_topic:
             self._efforts = ROS2_CONTROL_EFFORTS.publisher(node, ros2_control_topic)
+            node.publisher_watch.add(self._efforts.topic_name)
 
     @property
     def stamp(self) -> int:
@@ -57,6 +58,6 @@ class JointCommands:
     def again(self, stamp: Any) -> None:
         """Send the last command again, torques or positions, because a state was repeated."""
         self._last.header.stamp = stamp
-        self._publisher.publish(self._last)
+        self._commands.publish(self._last)
         if self._efforts is not None and self._last is self._torques:
             self._efforts.publish(Float64MultiArray(data=self._torques.effort))
