@@ -149,7 +149,7 @@ def test_no_folder_of_tests_is_crowded():
 
 @pytest.mark.parametrize(
     "path",
-    [p for p in modules() if p.stem.endswith("_node") or p.stem == "streams"],
+    [p for p in modules() if p.stem.endswith(("_node", "streams"))],
     ids=lambda path: path.stem,
 )
 def test_nodes_take_no_name_that_rclpy_uses_itself(path):
