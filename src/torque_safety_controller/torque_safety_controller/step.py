@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from torque_safety_controller.qp import (
@@ -113,13 +114,7 @@ class Step:
         For one upwards the upper bound is lowered, and else the lower one raised; if they cross,
         the other one follows.
         """
-        e, (lower, upper) = self.disturbance, bounds
-        low, high = lower - np.minimum(e, 0.0), upper - np.maximum(e, 0.0)
-        upwards = e > 0.0
-        return AccelerationRange(
-            np.where(upwards, np.minimum(low, high), low),
-            np.where(upwards, high, np.maximum(low, high)),
-        )
+        return AccelerationRange(*_narrowed(self.disturbance, *bounds))
 
     def relaxation_of(self, part: Part) -> Array | None:
         """Return by how much the QP relaxed the rows of a part, in their units; None for not."""
@@ -171,6 +166,21 @@ class Part:
     def trouble(self) -> str:
         """What is wrong at present, in words; empty for nothing."""
         return ""
+
+
+@njit(cache=True)
+def _narrowed(disturbance: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+    """Return bounds of the commanded accelerations, see `Step.commanded`."""
+    low, high = lower.copy(), upper.copy()
+    for j in range(low.size):
+        e = disturbance[j]
+        if e > 0.0:
+            high[j] -= e
+            low[j] = min(low[j], high[j])
+        else:
+            low[j] -= e
+            high[j] = max(low[j], high[j])
+    return low, high
 
 
 def joints_beyond(robot: RobotModel, torque: Array, most: Array) -> str:

@@ -11,7 +11,7 @@ from torque_safety_controller.loop_margins.gain_check import (
     GainCheck,
 )
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.safety.disturbance_observer import DisturbanceObserver
+from torque_safety_controller.parts.disturbance import DisturbanceObserver
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.robot.configuration import load_model
@@ -138,6 +138,6 @@ def test_disturbances_are_not_estimated_faster_than_predicted_commands_act():
             observer.observe(v, np.full(1, wanted), 1e-3, most, mass)
             v = v + change
         observer.observe(v, np.full(1, wanted), 1e-3, most, mass)
-        assert (abs(observer.known[0]) <= abs(acted - wanted)) == within
+        assert (abs(observer.estimate[0]) <= abs(acted - wanted)) == within
     assert not limits(delay=3, predicted=True)["disturbance_time"].exceeded
     assert not limits(delay=5)["disturbance_time"].exceeded

@@ -1,16 +1,94 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Disturbances: by how much the real accelerations differ from the commanded ones."""
+"""Disturbances: by how much the real accelerations differ from the commanded ones.
+
+The acceleration bounds are for the real accelerations, the controller chooses the commanded ones.
+Friction, payloads, external forces and integral torque that is no longer needed make them differ.
+The difference of the last step is known,
+
+    e = (v - v_last) / dt - a_last,
+
+and disturbances that last longer than a step act in the next one too. The bounds for the commanded
+acceleration are therefore shifted by e, but only inward, see `Step.commanded`: friction, which
+opposes the motion, does not widen them.
+
+With a filter of time constant T for the noise of the velocity, the error that remains is the
+change of the disturbance within T: after a step by d the bound is exceeded by d exp(-t / T).
+`docs/disturbances.md` measures it.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import math
+from contextlib import suppress
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
 
 from torque_safety_controller.robot_model import RobotModel
-from torque_safety_controller.safety.disturbance_observer import DisturbanceObserver
 from torque_safety_controller.step import Part, Step
 
-if TYPE_CHECKING:
-    from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
+Array = NDArray[np.float64]
+
+
+class DisturbanceObserver:
+    """Filtered difference between measured and commanded accelerations.
+
+    Args:
+        n: number of joints.
+        time_constant: of the filter, s, >= 0.
+
+    Attributes:
+        estimate: e, filtered, shape (n,), rad/s^2; not to be changed.
+    """
+
+    def __init__(self, n: int, time_constant: float) -> None:
+        self._time_constant, self._n = time_constant, n
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past."""
+        self.estimate = np.zeros(self._n)
+        self.pause()
+
+    def pause(self) -> None:
+        """Keep the estimate, and learn nothing from the time until the next step."""
+        self._v_last: Array | None = None
+
+    def observe(self, v: Array, a_last: Array, elapsed: float, tau_max: Array, M: Array) -> None:
+        """Update the estimate with the step that has just passed.
+
+        Args:
+            v: velocity now, shape (n,), rad/s.
+            a_last: acceleration commanded for the step, shape (n,), rad/s^2.
+            elapsed: duration of the step, s; 0 if it is not known: then nothing is learnt. What
+                disturbed before is the best guess: the integral action goes on from its last
+                torque, too, which is to balance it.
+            tau_max: torque limits, shape (n,), N m. The estimate is limited to what the motors
+                could compensate: more than that is an impact, which does not last.
+            M: mass matrix, shape (n, n), kg m^2.
+        """
+        if elapsed > 0.0 and self._v_last is not None:
+            time = self._time_constant
+            gain = -math.expm1(-elapsed / time) if time > 0.0 else 1.0
+            self.estimate = _observe(
+                self.estimate, v, self._v_last, a_last, elapsed, gain, tau_max, M
+            )
+        self._v_last = v.copy()
+
+    def expect(self, torque: Array, tau_max: Array, M: Array) -> None:
+        """Count a change of the additional torque before it can be seen.
+
+        Args:
+            torque: what the integral action adds in this step more than in the last one, shape
+                (n,), N m; what is not finite does not count.
+            tau_max: torque limits, shape (n,), N m.
+            M: mass matrix, shape (n, n), kg m^2.
+        """
+        if not (torque.any() and math.isfinite(torque.dot(torque))):
+            return
+        with suppress(ValueError):  # of NumPy's, where M is no mass matrix
+            self.estimate = _expect(self.estimate, torque, tau_max, np.ascontiguousarray(M))
 
 
 class Disturbance(Part):
@@ -23,10 +101,6 @@ class Disturbance(Part):
 
     def __init__(self, n: int, time_constant: float) -> None:
         self._observer = DisturbanceObserver(n, time_constant)
-
-    def configure(self, config: ControllerConfiguration) -> None:
-        """See `Part.configure`."""
-        self._observer.time_constant = config.gains.disturbance_time
 
     def reset(self, robot: RobotModel) -> None:
         """See `Part.reset`."""
@@ -46,3 +120,35 @@ class Disturbance(Part):
         """Learn nothing from braking without a solution: motors may not give what it asks for."""
         if step.failure:
             self._observer.pause()
+
+
+@njit(cache=True)
+def _observe(
+    old: Array,
+    v: Array,
+    v_last: Array,
+    a_last: Array,
+    elapsed: float,
+    gain: float,
+    tau_max: Array,
+    M: Array,
+) -> Array:
+    """Return the estimate filtered with `gain`, within what motors can give."""
+    estimate = old.copy()
+    for j in range(v.size):
+        e = (v[j] - v_last[j]) / elapsed - a_last[j]
+        e = estimate[j] + gain * (e - estimate[j])
+        largest = tau_max[j] / M[j, j]
+        # A NaN resets the estimate.
+        estimate[j] = min(max(e, -largest), largest) if e == e and largest > 0.0 else 0.0
+    return estimate
+
+
+@njit(cache=True)
+def _expect(estimate: Array, torque: Array, tau_max: Array, M: Array) -> Array:
+    """Return the estimate with M^-1 torque added, within what motors can give."""
+    change = np.linalg.solve(M, torque)
+    for j in range(estimate.size):
+        largest = tau_max[j] / M[j, j]
+        change[j] = min(max(estimate[j] + change[j], -largest), largest)
+    return change

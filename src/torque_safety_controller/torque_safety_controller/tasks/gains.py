@@ -71,7 +71,6 @@ class Gains:
         "bounds by it, s; -1: not at all",
         Range(0.0, 0.1, special=OFF),
         default=OFF,
-        live=True,
     )
 
     def __post_init__(self) -> None:

@@ -3,15 +3,28 @@ import math
 
 import numpy as np
 import pytest
+from arms import load_arm
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torque_safety_controller.safety.disturbance_observer import DisturbanceObserver
+from torque_safety_controller.parts.disturbance import DisturbanceObserver
+from torque_safety_controller.qp import AccelerationRange
+from torque_safety_controller.step import Step
+from torque_safety_controller.supervisor import Order
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.viability import BoundsSolver
 
 DT = 1e-3
 LARGEST = np.array([50.0])
+
+
+def commanded(observer, lower, upper) -> AccelerationRange:
+    """Bounds of the commanded accelerations, for bounds of the real ones."""
+    n = len(lower)
+    step = Step(load_arm("panda").robot(), None, Order(), DT, LARGEST, np.zeros(7), 20.0)
+    step.disturbance = observer.estimate
+    assert len(observer.estimate) == n
+    return step.commanded(AccelerationRange(lower, upper))
 
 
 def ride(time_constant, disturbance, noise=0.0, seed=0):
@@ -21,15 +34,16 @@ def ride(time_constant, disturbance, noise=0.0, seed=0):
     """
     limits = JointLimits(["joint"], [-1.0], [1.0], [1.0], [-20.0], [20.0])
     solver = BoundsSolver(limits, 2 * DT, period=DT)
-    observer = DisturbanceObserver(1, time_constant)
+    observer = DisturbanceObserver(1, time_constant or 0.0)
     rng = np.random.default_rng(seed)
     q, v, a = np.array([-0.9]), np.zeros(1), np.zeros(1)
     beyond = [-math.inf, -math.inf]
     for k in range(4000):
         seen = v + noise * rng.normal(size=1)
         bounds = solver.bounds(q, seen)
-        observer.observe(seen, a, DT, LARGEST, np.eye(1))
-        _, upper = observer.shift(bounds.lower, bounds.upper)
+        if time_constant is not None:
+            observer.observe(seen, a, DT, LARGEST, np.eye(1))
+        _, upper = commanded(observer, bounds.lower, bounds.upper)
         a = upper
         true = a + disturbance(k * DT)
         q = q + DT * v + 0.5 * DT * DT * true
@@ -59,7 +73,7 @@ def test_friction_does_not_widen_the_bounds():
     observer.observe(v, a, DT, LARGEST, np.eye(1))
     observer.observe(v, a, DT, LARGEST, np.eye(1))  # asked for 3 rad/s^2 and had none
     np.testing.assert_allclose(observer.estimate, -3.0)
-    low, high = observer.shift(lower, upper)
+    low, high = commanded(observer, lower, upper)
     assert high == upper and low == lower + 3.0
 
 
@@ -79,7 +93,7 @@ def test_bounds_stay_bounds(v, a):
     with np.errstate(all="ignore"):
         for sign in (1.0, -1.0, 1.0):
             observer.observe(sign * np.array(v), np.array(a), DT, largest, np.eye(3))
-            low, high = observer.shift(lower, upper)
+            low, high = commanded(observer, lower, upper)
             assert (low <= high).all()
             assert (np.abs(low - lower) <= 30.0 + 10.0).all()
 
@@ -99,7 +113,7 @@ def test_it_keeps_what_it_knows_over_a_time_it_does_not_know():
     assert observer.estimate == pytest.approx(3.0)
     observer.reset()
     lower, upper = np.array([-1.0]), np.array([1.0])
-    assert observer.shift(lower, upper) == (lower, upper)
+    assert commanded(observer, lower, upper) == AccelerationRange(lower, upper)
 
 
 def test_a_change_of_the_additional_torque_counts_before_it_is_seen():
@@ -111,7 +125,7 @@ def test_a_change_of_the_additional_torque_counts_before_it_is_seen():
     d = np.linalg.inv(M) @ change
     np.testing.assert_allclose(observer.estimate, d)
     lower, upper = np.full(2, -3.0), np.full(2, 3.0)
-    low, high = observer.shift(lower, upper)
+    low, high = commanded(observer, lower, upper)
     assert (low + np.minimum(d, 0.0) >= lower - 1e-12).all()
     assert (high + np.maximum(d, 0.0) <= upper + 1e-12).all()
     observer.expect(np.full(2, 1e9), np.full(2, 1e3), M)
