@@ -44,8 +44,8 @@ from rclpy.publisher import Publisher
 from rclpy.task import Future
 
 from sim_bridge.bullet.robot import BulletRobot
-from sim_bridge.nodes import command_stream
-from sim_bridge.nodes.bullet_node import BulletNode
+from sim_bridge.node import command_stream
+from sim_bridge.node.bullet_node import BulletNode
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.node.safety_stack import make_nodes

@@ -14,7 +14,7 @@ from typing import Any
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from sim_bridge.nodes.bullet_node import BulletNode
+from sim_bridge.node.bullet_node import BulletNode
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.program import run_together, stack_parser
 from viability_bounds_pkg.ros.topics import ACCELERATION_LIMITS, JOINT_COMMANDS, JOINT_STATES

@@ -20,7 +20,7 @@ from torque_safety_controller.remote.arm_client import ArmClient, NotReachedErro
 
 CONFIG = Path(__file__).resolve().parent.parent / "config" / "panda.yaml"
 JOINTS = [f"panda_joint{i}" for i in range(1, 8)]
-STACK = [sys.executable, "-m", "sim_bridge.nodes.simulated_stack", "--ros-args"]
+STACK = [sys.executable, "-m", "sim_bridge.node.simulated_stack", "--ros-args"]
 STACK += ["--params-file", str(CONFIG), "-p", "clock:=lockstep", "--log-level", "error"]
 
 

@@ -16,9 +16,9 @@ import rclpy
 import yaml
 from rclpy.parameter import Parameter
 
-from sim_bridge.nodes.bullet_node import BulletNode
-from sim_bridge.nodes.scenario_node import ScenarioNode, play
-from sim_bridge.scenario.recording import RecordedRun
+from sim_bridge.node.bullet_node import BulletNode
+from sim_bridge.node.scenario_node import ScenarioNode, play
+from sim_bridge.scenario.report import RecordedRun
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.node.estimator_node import EstimatorNode

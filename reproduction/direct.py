@@ -16,8 +16,8 @@ import pinocchio as pin
 from chain import load_node_values
 
 from sim_bridge.bullet.limit_monitor import LimitMonitor
-from sim_bridge.nodes.bullet_parameters import BulletConfiguration, make_robot
-from sim_bridge.nodes.ft_sensor import ForceTorqueReading
+from sim_bridge.bullet.sensor import ForceTorqueReading
+from sim_bridge.node.bullet_parameters import BulletConfiguration, make_robot
 from torque_safety_controller.contact.interaction import Interaction
 from torque_safety_controller.integral_feedback.action import FadingTorque
 from torque_safety_controller.node import assembly

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
-from sim_bridge.nodes import topics as bullet_topics
-from sim_bridge.nodes.bullet_parameters import BulletConfiguration
+from sim_bridge.node import topics as bullet_topics
+from sim_bridge.node.bullet_parameters import BulletConfiguration
+from sim_bridge.node.viewer_node import ViewerConfiguration
 from sim_bridge.scenario.scenario import ScenarioConfiguration
-from sim_bridge.viewer.node.viewer_parameters import ViewerConfiguration
 from torque_safety_controller.modes import CAUSES, CHANGES
 from torque_safety_controller.node import topics as controller_topics
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration

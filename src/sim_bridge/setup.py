@@ -43,11 +43,11 @@ setup(
     license_files=["LICENSE"],
     entry_points={
         "console_scripts": [
-            "bullet_node = sim_bridge.cli.ros_program:bullet_node",
-            "record_excitation = sim_bridge.cli.ros_program:record_excitation",
-            "viewer_node = sim_bridge.cli.ros_program:viewer_node",
-            "simulated_stack = sim_bridge.cli.ros_program:simulated_stack",
-            "scenario_node = sim_bridge.cli.ros_program:scenario_node",
+            "bullet_node = sim_bridge.programs:bullet_node",
+            "record_excitation = sim_bridge.programs:record_excitation",
+            "viewer_node = sim_bridge.programs:viewer_node",
+            "simulated_stack = sim_bridge.programs:simulated_stack",
+            "scenario_node = sim_bridge.programs:scenario_node",
         ],
     },
 )

@@ -14,8 +14,8 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
-from sim_bridge.nodes.bullet_node import BulletNode
-from sim_bridge.nodes.scenario_node import ScenarioNode, ScenarioRefused, play
+from sim_bridge.node.bullet_node import BulletNode
+from sim_bridge.node.scenario_node import ScenarioNode, ScenarioRefused, play
 from torque_safety_controller.contact.interaction import Interaction
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode

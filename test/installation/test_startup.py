@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from sim_bridge.nodes import bullet_node
+from sim_bridge.node import bullet_node
 from torque_safety_controller.node import controller_node
 from viability_bounds_pkg.node import bounds_node, estimator_node
 from viability_bounds_pkg.testing.executables import as_child

@@ -12,7 +12,7 @@ from chain import load_values, run_chain
 from direct import DirectLoop, column
 
 from sim_bridge.bullet.obstacles import Obstacle
-from sim_bridge.nodes.scenario_node import ScenarioNode, ScenarioRefused
+from sim_bridge.node.scenario_node import ScenarioNode, ScenarioRefused
 from sim_bridge.scenario.report import write_report
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory, circle
 from viability_bounds_pkg.robot.description import read_urdf

@@ -5,10 +5,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from sim_bridge.nodes.scenario_messages import to_controller
-from sim_bridge.scenario.events import TrajectoryGoal
+from sim_bridge.node.scenario_messages import to_controller
+from sim_bridge.scenario.events import TrajectoryGoal, read_trajectory
 from sim_bridge.scenario.scenario import Scenario
-from sim_bridge.scenario.trajectory import read_trajectory
 from torque_safety_controller.node.goals import trajectory_from_message
 
 
@@ -37,9 +36,9 @@ def test_the_controller_follows_the_trajectory_of_the_scenario(seed):
         for k in range(4)
     ]
     circle = {
-        "centre": [1.0, 2.0, 3.0],
-        "radius": 0.3,
-        "normal": rng.normal(size=3).tolist(),
+        "start": [1.0, 2.0, 3.0],
+        "diameter": 0.6,
+        "plane": ["-z", "x"],
         "phase": 0.4,
         "period": 1.5,
         "ramp": 0.2,

@@ -21,8 +21,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
-from sim_bridge.nodes import bullet_node, scenario_node
-from sim_bridge.nodes.bullet_node import BulletNode
+from sim_bridge.node import bullet_node, scenario_node
+from sim_bridge.node.bullet_node import BulletNode
 from torque_safety_controller.cli import identify_friction
 from torque_safety_controller.node import controller_node
 from torque_safety_controller.node.controller_node import ControllerNode

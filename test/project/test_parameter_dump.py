@@ -12,8 +12,8 @@ from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
 from rclpy.parameter import parameter_value_to_python
 from rclpy.signals import SignalHandlerOptions
 
-from sim_bridge.nodes.bullet_node import BulletNode
-from sim_bridge.nodes.scenario_node import ScenarioNode
+from sim_bridge.node.bullet_node import BulletNode
+from sim_bridge.node.scenario_node import ScenarioNode
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.parameter import parameter_table

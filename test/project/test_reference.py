@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
-from sim_bridge.nodes.bullet_node import BulletNode
-from sim_bridge.nodes.scenario_node import ScenarioNode
-from sim_bridge.viewer.node.viewer_node import ViewerNode
+from sim_bridge.node.bullet_node import BulletNode
+from sim_bridge.node.scenario_node import ScenarioNode
+from sim_bridge.node.viewer_node import ViewerNode
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg import parameter_files
 from viability_bounds_pkg.node.bounds_node import BoundsNode

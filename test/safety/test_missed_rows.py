@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from direct import DirectLoop, posture_at_limits
 
-from sim_bridge.nodes.bullet_parameters import make_stop
+from sim_bridge.node.bullet_parameters import make_stop
 from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.state import State
 

@@ -10,8 +10,8 @@ from sensor_msgs.msg import JointState
 from stopped_robot import Stopped
 
 from sim_bridge.bullet.limit_monitor import LimitMonitor
-from sim_bridge.nodes.bullet_node import BulletNode
-from sim_bridge.nodes.bullet_parameters import make_robot, make_stop
+from sim_bridge.node.bullet_node import BulletNode
+from sim_bridge.node.bullet_parameters import make_robot, make_stop
 from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.ramp import Ramp
 from torque_safety_controller.supervisor import REST, Order

@@ -12,7 +12,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from sim_bridge.nodes.bullet_node import BulletNode
+from sim_bridge.node.bullet_node import BulletNode
 from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.remote.teleop import Teleop
 from viability_bounds_pkg.node.bounds_node import BoundsNode

@@ -14,7 +14,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint, MultiDOFJointTrajectoryPoint
 
-from sim_bridge.nodes.bullet_node import BulletNode
+from sim_bridge.node.bullet_node import BulletNode
 from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.ramp import RISE_TIME
 from viability_bounds_pkg.node.bounds_node import BoundsNode

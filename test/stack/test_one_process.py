@@ -18,7 +18,7 @@ from rcl_interfaces.srv import GetParameters
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
-from sim_bridge.nodes import simulated_stack
+from sim_bridge.node import simulated_stack
 from torque_safety_controller.node import safety_stack
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS
 from viability_bounds_pkg.ros.streams import Queue

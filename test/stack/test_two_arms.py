@@ -11,8 +11,8 @@ import yaml
 from chain import load_values
 from std_srvs.srv import Trigger
 
-from sim_bridge.nodes.bullet_node import BulletNode
-from sim_bridge.nodes.scenario_node import ScenarioNode
+from sim_bridge.node.bullet_node import BulletNode
+from sim_bridge.node.scenario_node import ScenarioNode
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.testing.executables import as_child

@@ -8,11 +8,10 @@ import pinocchio as pin
 import pytest
 from browser import Browser, find_browser
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from trajectory_msgs.msg import JointTrajectory
 
-from sim_bridge.nodes.bullet_node import BulletNode
-from sim_bridge.viewer.node.viewer_node import PERIOD, ViewerNode
-from sim_bridge.viewer.page import DrivingAsked, GoalAsked, JointsAsked, PushAsked, SettingAsked
+from sim_bridge.node.bullet_node import BulletNode
+from sim_bridge.node.viewer_node import PERIOD, ViewerNode
+from sim_bridge.viewer.page import DrivingAsked, GoalAsked, PushAsked
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.node.bounds_node import BoundsNode
@@ -31,7 +30,6 @@ class Viewed:
         values = VALUES | changed
         self.ros = ros
         self.goals = ros.listen(PoseStamped, "target_pose")
-        self.trajectories = ros.listen(JointTrajectory, "target_joint_trajectory")
         self.pushes = ros.listen(WrenchStamped, "external_wrench")
         self.controller = ros.start(ControllerNode, values)
         self.bounds = ros.start(BoundsNode, values)
@@ -48,7 +46,7 @@ class Viewed:
             shown = time.monotonic() + PERIOD
             while time.monotonic() < shown:
                 self.ros.spin(0.01)
-            self.viewer.proceed()
+            self.viewer.update_page()
 
     def run(self, duration):
         """Let time pass, s."""
@@ -59,7 +57,7 @@ class Viewed:
         """Do as the user of the page would."""
         for request in requests:
             self.page._requests.put(request)
-        self.viewer.proceed()
+        self.viewer.update_page()
 
     def hand(self):
         return self.page._data.oMf[self.page._hand].copy()
@@ -72,7 +70,7 @@ def arm(ros):
 
 def test_nothing_is_sent_before_the_user_drives(arm):
     goal = pin.SE3(np.eye(3), np.array([0.4, 0.1, 0.5]))
-    arm.ask(GoalAsked(goal), JointsAsked(np.zeros(7)), PushAsked("panda_link4", np.ones(3)))
+    arm.ask(GoalAsked(goal), PushAsked("panda_link4", np.ones(3)))
     assert arm.controller.count_publishers("target_pose") == 0
     arm.ask(DrivingAsked(True))
     arm.wait(lambda: arm.controller.count_publishers("target_pose") == 1)
@@ -85,27 +83,6 @@ def test_nothing_is_sent_before_the_user_drives(arm):
     arm.ask(DrivingAsked(False))
     arm.wait(lambda: arm.pushes[-1].wrench.force.y == 0.0)
     arm.wait(lambda: arm.controller.count_publishers("target_pose") == 0)
-
-
-def test_sliders_move_the_joints(arm):
-    target = arm.viewer._reader.q + 0.1
-    arm.ask(DrivingAsked(True))
-    arm.wait(lambda: arm.controller.count_publishers("target_joint_trajectory") == 1)
-    arm.ask(JointsAsked(target))
-    arm.wait(lambda: np.abs(arm.viewer._reader.q - target).max() < 0.01)
-
-
-def test_settings_of_other_nodes_are_read_and_changed(arm):
-    values = arm.viewer._settings.values
-    arm.wait(lambda: len(values) == 3)
-    assert values["bounds_node", "method"] == "exact"
-    arm.ask(SettingAsked("bounds_node", "method", "naive"))
-    arm.wait(lambda: arm.bounds.get_parameter("method").value == "naive")
-    arm.ask(SettingAsked("controller_node", "integral_action", "task"))
-    arm.wait(lambda: arm.controller.get_parameter("integral_action").value == "task")
-    arm.ask(SettingAsked("controller_node", "integral_action", "sideways"))
-    arm.wait(lambda: "integral_action" in arm.viewer._settings.refused)
-    assert arm.controller.get_parameter("integral_action").value == "task"
 
 
 @pytest.mark.parametrize(

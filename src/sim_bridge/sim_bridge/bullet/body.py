@@ -16,13 +16,17 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from sim_bridge.bullet.client import BulletClient, pybullet, silenced
-from sim_bridge.bullet.force_torque_sensor import ForceTorqueSensor
-from sim_bridge.bullet.obstacle_bodies import BulletObstacles
-from sim_bridge.bullet.obstacles import ContactMaterial, LinkWrench
-from sim_bridge.bullet.vectors import finite_vector
-from sim_bridge.urdf.payload import PayloadError, payload_link, with_payloads
-from sim_bridge.urdf.preparation import FramePlacement, PreparedUrdf, prepare_urdf
+from sim_bridge.bullet.client import BulletClient, finite_vector, pybullet, silenced
+from sim_bridge.bullet.obstacles import BulletObstacles, ContactMaterial, LinkWrench
+from sim_bridge.bullet.sensor import ForceTorqueSensor
+from sim_bridge.urdf import (
+    FramePlacement,
+    PayloadError,
+    PreparedUrdf,
+    payload_link,
+    prepare_urdf,
+    with_payloads,
+)
 from viability_bounds_pkg.robot.description import RobotDescriptionError, unknown_name
 
 Array = NDArray[np.float64]
@@ -105,7 +109,7 @@ class BulletBody:
         self.obstacles = BulletObstacles(
             bullet,
             self.body_id,
-            {index: link for link, index in self._links.items()},
+            self._link_names(),
             material or ContactMaterial(),
             physics_dt,
             gravity.tolist(),
@@ -167,6 +171,10 @@ class BulletBody:
             if info.kind != pybullet.JOINT_FIXED:
                 bullet.setJointMotorControl2(body, info.id, pybullet.VELOCITY_CONTROL, force=0.0)
         self._gears = [self._couple(joint, rotor) for joint, rotor in self._rotors.items()]
+
+    def _link_names(self) -> dict[int, str]:
+        """Return the names of links by PyBullet's indices."""
+        return {index: link for link, index in self._links.items()}
 
     def _couple(self, joint: int, rotor: int) -> int:
         """Couple a rotor to its joint by a gear constraint, and return that.
@@ -275,7 +283,7 @@ class BulletBody:
         self._place(
             *np.nan_to_num(np.array([state[:2] for state in states]).T, posinf=0.0, neginf=0.0)
         )
-        self.obstacles.follow(self.body_id, {index: link for link, index in self._links.items()})
+        self.obstacles.replace_robot(self.body_id, self._link_names())
 
     def apply_wrench(self, link: str, force: ArrayLike, torque: ArrayLike) -> None:
         """Apply a wrench to a link, from the next physics step until `clear_wrenches`.

@@ -12,6 +12,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 _flush = ctypes.CDLL(None).fflush
 
 
@@ -35,11 +38,27 @@ with silenced(2):
     import pybullet
 
 
-__all__ = ["BulletClient", "JointInfo", "pybullet", "silenced"]
+__all__ = ["BulletClient", "JointInfo", "finite_vector", "pybullet", "silenced"]
+
+
+def finite_vector(
+    name: str, value: ArrayLike, size: int, *, signed: bool = True
+) -> NDArray[np.float64]:
+    """Return `value` as an array of `size` finite numbers, not negative unless `signed`.
+
+    Raises:
+        ValueError: it is not.
+    """
+    array = np.asarray(value, dtype=float)
+    if array.shape != (size,) or not np.isfinite(array).all():
+        raise ValueError(f"{name} must be {size} finite numbers, not {value!r}")
+    if not signed and np.any(array < 0.0):
+        raise ValueError(f"{name} must not be negative: {array}")
+    return array
 
 
 class JointInfo(NamedTuple):
-    """What PyBullet says about a joint."""
+    """A joint as PyBullet numbers and names it."""
 
     id: int
     name: str

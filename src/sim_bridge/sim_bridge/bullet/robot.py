@@ -32,11 +32,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim_bridge.bullet.body import BulletBody
-from sim_bridge.bullet.joint_friction import JointFriction
+from sim_bridge.bullet.client import finite_vector
+from sim_bridge.bullet.friction import JointFriction
 from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.bullet.position_drive import PositionDrive
-from sim_bridge.bullet.vectors import finite_vector
-from sim_bridge.hardware.motors import Motors
+from sim_bridge.hardware import Motors
 from viability_bounds_pkg.stop import CoordinatedStop
 
 Array = NDArray[np.float64]
@@ -108,7 +108,7 @@ class BulletRobot(BulletBody):
         self._driving = False
         self._law: CoordinatedStop | None = None  # the one in charge
         self._stepped = False  # since the last reset
-        self._v_before = self._v  # at the begin of the last physics step, rad/s
+        self._v_before = self._v  # at the start of the last physics step, rad/s
 
     @property
     def finite(self) -> bool:

@@ -3,29 +3,46 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
 from sim_bridge.bullet.obstacles import Obstacle, ObstacleError
-from sim_bridge.scenario.fields import (
+from sim_bridge.scenario.events import (
     Check,
     ScenarioError,
     name,
     not_negative,
     number,
+    one_of,
     positive,
     quaternion,
     read_fields,
     refuse,
     vector,
 )
-from sim_bridge.scenario.trajectory import read_trajectory
-from sim_bridge.urdf.payload import PayloadError, payload_inertia
+from sim_bridge.urdf import PayloadError, payload_inertia
 from viability_bounds_pkg.exceptions import did_you_mean
 from viability_bounds_pkg.parameter_files import NODES, unknown_parameters
-from viability_bounds_pkg.pose_trajectory import PoseTrajectory
+from viability_bounds_pkg.pose_trajectory import (
+    PoseTrajectory,
+    TrajectoryError,
+    TrajectoryPoint,
+    circle,
+)
+
+Array = NDArray[np.float64]
 
 _ZERO = (0.0, 0.0, 0.0)
+_AXES = {
+    sign + letter: factor * np.eye(3)[k]
+    for k, letter in enumerate("xyz")
+    for sign, factor in (("", 1.0), ("-", -1.0))
+}
 
 
 class PoseGoal(NamedTuple):
@@ -216,6 +233,82 @@ def _parameter(value: Any, where: str) -> Any:
     raise refuse(where, value, "true, false, a number, a string, or a list of numbers or strings")
 
 
+def read_trajectory(content: Any, where: str) -> PoseTrajectory:
+    """Return a trajectory in the base frame: points, or a circle.
+
+    Raises:
+        ScenarioError: an entry is unknown, malformed or out of range.
+    """
+    forms: dict[str, Check] = {"points": _points, "circle": _circle}
+    given = read_fields(content, where, forms, optional=forms)
+    try:
+        return PoseTrajectory(given[one_of(forms, given, where)])
+    except TrajectoryError as error:
+        raise ScenarioError(f"{where}.{error}") from None
+
+
+def _points(content: Any, where: str) -> list[TrajectoryPoint]:
+    if not isinstance(content, list) or not content:
+        raise refuse(where, content, "a list of at least one point")
+    points = []
+    for k, entry in enumerate(content):
+        fields = read_fields(entry, f"{where}[{k}]", _POINT, ("velocity", "acceleration"))
+        velocity, acceleration = np.zeros((2, 6))
+        velocity[:3] = fields.get("velocity", 0.0)
+        acceleration[:3] = fields.get("acceleration", 0.0)
+        pose = _pose(fields, "position")
+        points.append(TrajectoryPoint(fields["time"], pose, velocity, acceleration))
+    return points
+
+
+def _circle(content: Any, where: str) -> list[TrajectoryPoint]:
+    fields = read_fields(content, where, _CIRCLE, ("phase", "turns", "ramp"))
+    first, second = fields["plane"]
+    phase = fields.get("phase", 0.0)
+    outward = math.cos(phase) * first + math.sin(phase) * second
+    along = math.cos(phase) * second - math.sin(phase) * first
+    turns, period, ramp = fields.get("turns", 1), fields["period"], fields.get("ramp")
+    if ramp is not None and ramp > turns * period:
+        allowed = f"at most {turns * period:g}, the time of all turns"
+        raise refuse(f"{where}.ramp", ramp, allowed)
+    radius = 0.5 * fields["diameter"]
+    return circle(
+        _pose(fields, "start"), radius, (outward, along), period=period, turns=turns, ramp=ramp
+    )
+
+
+def _pose(fields: Mapping[str, Any], place: str) -> pin.SE3:
+    return pin.SE3(pin.Quaternion(np.array(fields["orientation"])), np.array(fields[place]))
+
+
+def _plane(value: Any, where: str) -> tuple[Array, Array]:
+    """Check the names of two axes at right angles; return them, shape (3,) each."""
+    allowed = "two of x, y, z, -x, -y, -z at right angles"
+    if not isinstance(value, list) or len(value) != 2 or not {*map(str, value)} <= {*_AXES}:
+        raise refuse(where, value, allowed)
+    first, second = (_AXES[axis] for axis in value)
+    if first @ second != 0.0:
+        raise refuse(where, value, allowed)
+    return first, second
+
+
+_POINT: dict[str, Check] = {
+    "time": not_negative,
+    "position": vector,
+    "orientation": quaternion,
+    "velocity": vector,
+    "acceleration": vector,
+}
+_CIRCLE: dict[str, Check] = {
+    "start": vector,
+    "orientation": quaternion,
+    "diameter": positive,
+    "plane": _plane,
+    "phase": number,
+    "turns": positive,
+    "period": positive,
+    "ramp": positive,
+}
 _OBSTACLE: dict[str, Check] = {
     "name": name,
     "shape": name,

@@ -6,21 +6,16 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
 from sim_bridge.bullet.robot import BulletRobot
 from sim_bridge.scenario.events import EnableTorque, Event, PoseGoal, TrajectoryGoal
-from sim_bridge.scenario.recording import RecordedRun
 from sim_bridge.scenario.scenario import ScenarioConfiguration
 
 Array = NDArray[np.float64]
@@ -30,6 +25,37 @@ TOLERANCE = 1e-9
 """Of a violation, rad, rad/s and share of the torque limit: excludes rounding."""
 
 _RECORDED = ("t", "q", "v", "a_lower", "a_upper", "tau", "ft_wrench")
+
+
+@dataclass(frozen=True)
+class RecordedRun:
+    """A recorded run; arrays of N control periods by n joints, NaN where a message was lost.
+
+    Attributes:
+        joints: names, n of them.
+        t: shape (N,), s of robot time from the first recorded state.
+        q, v: position and velocity, rad and rad/s.
+        a_lower, a_upper: acceleration limits, rad/s^2.
+        tau: commanded torque, N m; NaN under position control too.
+        ft_wrench: of the force/torque sensor, force and torque, N and N m, shape (N, 6); NaN
+            without a sensor.
+        answered: whether there was a command, shape (N,).
+    """
+
+    joints: tuple[str, ...]
+    t: Array
+    q: Array
+    v: Array
+    a_lower: Array
+    a_upper: Array
+    tau: Array
+    ft_wrench: Array
+    answered: NDArray[np.bool_]
+
+    @property
+    def lost(self) -> int:
+        """Number of periods without recorded limits or command."""
+        return int((np.isnan(self.a_lower[:, 0]) | ~self.answered).sum())
 
 
 def write_report(
@@ -276,10 +302,13 @@ def _draw(
     path: Path, config: ScenarioConfiguration, run: RecordedRun, errors: Array, metrics: Metrics
 ) -> None:
     """Draw the joint nearest to a limit in detail, and all joints relative to their limits."""
+    from matplotlib.figure import Figure  # takes a second to import
+
     clearance = np.minimum(run.q - config.position_min, config.position_max - run.q).min(axis=0)
     j = int(np.argmin(clearance))
     t = run.t
-    figure, axes = plt.subplots(4, 2, figsize=(12, 10), sharex=True, layout="constrained")
+    figure = Figure(figsize=(12, 10), layout="constrained")
+    axes = figure.subplots(4, 2, sharex=True)
     outcome = "no limit broken" if metrics["limits_kept"] else "LIMITS BROKEN"
     figure.suptitle(
         f"{config.robot_name}: {metrics['bounds_method']} bounds, {metrics['rate_hz']:g} Hz, "
@@ -326,4 +355,6 @@ def _draw(
     for axis in axes.flat:
         axis.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
-    plt.close(figure)
+
+
+Array = NDArray[np.float64]

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Command line tools and a camera for the simulated robot."""
+"""Command line tools for the simulated robot."""

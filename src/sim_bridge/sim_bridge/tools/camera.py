@@ -8,12 +8,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sim_bridge.bullet.client import BulletClient, pybullet, silenced
-from sim_bridge.bullet.obstacle_bodies import shape_arguments
+from sim_bridge.bullet.client import BulletClient, finite_vector, pybullet, silenced
 from sim_bridge.bullet.obstacles import Obstacle
 from sim_bridge.bullet.robot import BulletRobot
-from sim_bridge.bullet.vectors import finite_vector
-from sim_bridge.urdf.preparation import prepare_urdf
+from sim_bridge.urdf import prepare_urdf
 
 _OVERSAMPLING = 2  # PyBullet's renderer does not smooth edges
 _NEAR, _FAR = 0.05, 20.0  # m
@@ -117,7 +115,7 @@ class Camera:
         return np.round(blocks.mean(axis=(1, 3))).astype(np.uint8)
 
     def _add_body(self, obstacle: Obstacle, color: Sequence[float]) -> int:
-        arguments = shape_arguments(obstacle)
+        arguments = obstacle.pybullet_shape()
         if "height" in arguments:
             arguments["length"] = arguments.pop("height")
         shape = self._bullet.createVisualShape(**arguments, rgbaColor=(*color, 1.0))

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page in the browser: what it shows, and what its user asks for."""
+"""The page in the browser: the arm in 3D, its joints, and what its user asks for."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
 from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple
@@ -20,19 +20,10 @@ from viability_bounds_pkg.joint_limits import JointLimits
 
 Array = NDArray[np.float64]
 
-METHODS = "exact", "naive"
-COMPLIANCE = {
-    "none": "no integral action",
-    "joints": "stiff in all joints",
-    "task": "stiff at the hand",
-}
-"""Values of the controller's ``integral_action``, and what they mean."""
-UNKNOWN = "unknown"
-
-_BASE = (150, 150, 155)
-_FORCE, _FELT = (220, 60, 40), (40, 90, 200)
-_FORCE_LENGTH = 0.01
-"""Of an arrow, m/N."""
+_BASE_COLOUR = (150, 150, 155)
+_PUSH_COLOUR, _MEASURED_COLOUR = (220, 60, 40), (40, 90, 200)
+_ARROW_LENGTH = 0.01
+"""m/N."""
 
 
 class GoalAsked(NamedTuple):
@@ -40,13 +31,6 @@ class GoalAsked(NamedTuple):
 
     pose: pin.SE3
     """In the base frame."""
-
-
-class JointsAsked(NamedTuple):
-    """The user moved the slider of a joint."""
-
-    q: Array
-    """Positions of all joints, shape (n,), rad."""
 
 
 class PushAsked(NamedTuple):
@@ -57,21 +41,13 @@ class PushAsked(NamedTuple):
     """Shape (3,), N in world axes; zeros end the push."""
 
 
-class SettingAsked(NamedTuple):
-    """The user chose the value of another node's parameter."""
-
-    node: str
-    name: str
-    value: Any
-
-
 class DrivingAsked(NamedTuple):
-    """The user begins to drive the arm, or leaves it to others."""
+    """The user switched "drive the arm" on or off."""
 
-    begin: bool
+    drive: bool
 
 
-Request = GoalAsked | JointsAsked | PushAsked | SettingAsked | DrivingAsked
+Request = GoalAsked | PushAsked | DrivingAsked
 
 
 class Picture(NamedTuple):
@@ -82,22 +58,19 @@ class Picture(NamedTuple):
     """Pose goal in the base frame; None if there is none."""
     pushes: Mapping[str, Array]
     """Forces on links, N in world axes, by link."""
-    felt: Array | None
-    """Force that the wrist's sensor measures, N in its axes; None if there is none."""
-    state: str
-    """In words, Markdown."""
-    settings: Mapping[tuple[str, str], Any]
-    """Values of parameters that can be chosen, by node and name; only those known."""
+    measured_force: Array | None
+    """Of the wrist's sensor, N in its axes; None if there is none."""
+    text: str
+    """State in words, Markdown."""
 
 
 class Page:
-    """Serves the page, shows pictures, and keeps what its user asks for until it is fetched.
+    """Serves the page, shows pictures, and queues what its user asks for.
 
     Args:
-        host: address to serve on.
-        port: to serve on; the next free one if it is taken.
+        address: host and port to serve on; the next free port if it is taken.
         model: of the arm.
-        shapes: what of it is to be seen.
+        shapes: visual geometry of the arm.
         limits: of the n joints.
         tau_max: torque limits, shape (n,), N m.
         frames: names of the base, of the hand and of the force sensor; the latter may be empty.
@@ -108,8 +81,7 @@ class Page:
 
     def __init__(
         self,
-        host: str,
-        port: int,
+        address: tuple[str, int],
         model: pin.Model,
         shapes: Sequence[VisualShape],
         limits: JointLimits,
@@ -119,20 +91,20 @@ class Page:
         self._model, self._data = model, model.createData()
         self._limits, self._tau_max = limits, tau_max
         # Of the last picture, whole at any time: the threads of the server read them, too.
-        self._base_pose, self._origin = pin.SE3.Identity(), np.zeros(3)
+        self._base_pose, self._push_origin = pin.SE3.Identity(), np.zeros(3)
         self._base, self._hand = (model.getFrameId(name) for name in frames[:2])
         self._sensor = model.getFrameId(frames[2]) if frames[2] else None
         self._requests: SimpleQueue[Request] = SimpleQueue()
         self._pictures = JointPictures(limits.names, limits, tau_max)
-        self._driving = self._dragging = self._pushing = self._framed = False
+        self._driving = self._dragging = self._pushing = self._camera_placed = False
         with redirect_stdout(io.StringIO()):  # its banner, even if not verbose
-            self._server = viser.ViserServer(host=host, port=port, label="arm", verbose=False)
-        self.address = f"http://{host}:{self._server.get_port()}"
+            self._server = viser.ViserServer(*address, label="arm", verbose=False)
+        self.address = f"http://{address[0]}:{self._server.get_port()}"
         self._make_scene(shapes)
         self._make_panel()
 
     def close(self) -> None:
-        """End the page."""
+        """Stop the server."""
         with redirect_stdout(io.StringIO()):
             self._server.stop()
 
@@ -144,24 +116,21 @@ class Page:
                 request = self._requests.get_nowait()
             except Empty:
                 return list(kept.values())
-            subject: Any = type(request)
-            if isinstance(request, PushAsked):
-                subject = request.link
-            elif isinstance(request, SettingAsked):
-                subject = request.node, request.name
+            subject = request.link if isinstance(request, PushAsked) else type(request)
             kept.pop(subject, None)
             kept[subject] = request
 
     def show(self, picture: Picture) -> None:
-        """Show it to all who look."""
-        if self._framed and not self._server.get_clients():
+        """Update the page; nothing to do while nobody has it open."""
+        if self._camera_placed and not self._server.get_clients():
             return
         pin.framesForwardKinematics(self._model, self._data, picture.joints.q)
-        if not self._framed:
-            self._frame_arm()
+        if not self._camera_placed:
+            self._place_camera()
         self._base_pose = self._data.oMf[self._base].copy()
         if self._link.value:
-            self._origin = self._frame(self._link.value).translation.copy()
+            link = self._data.oMf[self._model.getFrameId(self._link.value)]
+            self._push_origin = link.translation.copy()
         shares = usage(picture.joints, self._limits, self._tau_max)
         with self._server.atomic():
             for index, (frame, meshes) in self._bodies.items():
@@ -173,13 +142,12 @@ class Page:
             self._show_goal(picture.goal)
             self._show_forces(picture)
             self._joint_pictures.content = self._pictures.draw(picture.joints)
-            self.say(picture.state)
-            self._show_settings(picture)
+            self.show_text(picture.text)
 
-    def say(self, text: str) -> None:
-        """Show words alone, Markdown."""
-        if self._words.content != text:
-            self._words.content = text
+    def show_text(self, text: str) -> None:
+        """Show text alone, Markdown."""
+        if self._text.content != text:
+            self._text.content = text
 
     # The scene
 
@@ -187,27 +155,25 @@ class Page:
         scene = self._server.scene
         scene.set_up_direction("+z")
         scene.add_grid("/floor", width=3.0, height=3.0, cell_size=0.1, section_size=0.5)
-        frames: dict[int, viser.FrameHandle] = {}
-        meshes: dict[int, list[viser.MeshHandle]] = {}
+        self._bodies: dict[int, tuple[viser.FrameHandle, list[viser.MeshHandle]]] = {}
         for number, shape in enumerate(shapes):
             if not len(shape.triangles):
                 continue
-            at = shape.joint
-            if at not in frames:
-                frames[at] = scene.add_frame(f"/arm/{self._model.names[at]}", show_axes=False)
-            meshes.setdefault(at, []).append(
-                scene.add_mesh_simple(
-                    f"/arm/{self._model.names[at]}/{number}",
-                    shape.vertices,
-                    shape.triangles,
-                    color=_BASE if at == 0 else colour(0.0),
-                    side="double",
-                    # Half of the time of a picture where there is no graphics card.
-                    cast_shadow=False,
-                    receive_shadow=False,
-                )
+            at, name = shape.joint, f"/arm/{self._model.names[shape.joint]}"
+            if at and at not in self._bodies:
+                self._bodies[at] = scene.add_frame(name, show_axes=False), []
+            mesh = scene.add_mesh_simple(
+                f"{name}/{number}",
+                shape.vertices,
+                shape.triangles,
+                color=_BASE_COLOUR if at == 0 else colour(0.0),
+                side="double",
+                # Half of the time of a picture where there is no graphics card.
+                cast_shadow=False,
+                receive_shadow=False,
             )
-        self._bodies = {at: (frames[at], meshes[at]) for at in frames if at > 0}
+            if at:
+                self._bodies[at][1].append(mesh)
         self._arrows: dict[str, viser.ArrowsHandle] = {}
         self._goal = scene.add_transform_controls("/goal", scale=0.25, visible=False)
         self._handle = scene.add_transform_controls(
@@ -216,48 +182,43 @@ class Page:
         self._goal.on_update(self._on_goal)
         self._handle.on_update(self._on_push)
 
-    def _frame_arm(self) -> None:
-        """Put the camera where it sees all of the arm, beside the panel."""
-        self._framed = True
+    def _place_camera(self) -> None:
+        """Place the camera so that it sees all of the arm, beside the panel."""
+        self._camera_placed = True
         places = (self._data.oMf[self._hand], *list(self._data.oMi)[1:])
         points = np.array([place.translation for place in places])
         low, high = points.min(axis=0), points.max(axis=0)
         middle, size = 0.5 * (low + high), max(float(np.linalg.norm(high - low)), 0.5)
-        away = np.array([0.9, -1.1, 0.5])
-        self._server.initial_camera.position = tuple(middle + 1.3 * size * away)
+        camera = self._server.initial_camera
+        camera.position = tuple(middle + 1.3 * size * np.array([0.9, -1.1, 0.5]))
         # Aside, as the panel covers the right of the page.
-        self._server.initial_camera.look_at = tuple(
-            middle + 0.2 * size * np.array([1.0, 0.8, 0.0])
-        )
+        camera.look_at = tuple(middle + 0.2 * size * np.array([1.0, 0.8, 0.0]))
 
     def _show_goal(self, goal: pin.SE3 | None) -> None:
-        """Let the goal's handle be where the goal is; without one, at the hand."""
+        """Move the goal's handle to the goal, or to the hand where there is none."""
         self._goal.visible = self._driving or goal is not None
-        if self._dragging:
-            return
-        hand = self._data.oMf[self._hand]
-        _place(self._goal, hand if goal is None else self._base_pose * goal)
+        if not self._dragging:
+            hand = self._data.oMf[self._hand]
+            _place(self._goal, hand if goal is None else self._base_pose * goal)
 
     def _show_forces(self, picture: Picture) -> None:
         self._handle.visible = self._driving and bool(self._link.value)
         if not self._pushing:
-            self._handle.position = np.array(self._origin)
+            self._handle.position = np.array(self._push_origin)
+        frames, model = self._data.oMf, self._model
         forces = {
-            f"push {link}": (
-                self._data.oMf[self._model.getFrameId(link)].translation,
-                force,
-                _FORCE,
-            )
+            f"push {link}": (frames[model.getFrameId(link)].translation, force, _PUSH_COLOUR)
             for link, force in picture.pushes.items()
-            if self._model.existFrame(link)
+            if model.existFrame(link)
         }
-        if picture.felt is not None and self._sensor is not None:
-            sensor = self._data.oMf[self._sensor]
-            forces["felt"] = sensor.translation, sensor.rotation @ picture.felt, _FELT
+        if picture.measured_force is not None and self._sensor is not None:
+            sensor = frames[self._sensor]
+            force = sensor.rotation @ picture.measured_force
+            forces["measured"] = sensor.translation, force, _MEASURED_COLOUR
         for name in self._arrows.keys() - forces.keys():
             self._arrows.pop(name).remove()
         for name, (start, force, tone) in forces.items():
-            ends = np.array([[start, start + _FORCE_LENGTH * force]], dtype=np.float32)
+            ends = np.array([[start, start + _ARROW_LENGTH * force]], dtype=np.float32)
             if name in self._arrows:
                 self._arrows[name].points = ends
                 continue
@@ -275,64 +236,21 @@ class Page:
     def _make_panel(self) -> None:
         gui = self._server.gui
         gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
-        self._words = gui.add_markdown("")
+        self._text = gui.add_markdown("")
         self._drive = gui.add_checkbox(
             "drive the arm",
             initial_value=False,
-            hint="goals, joints and pushes are sent while this is on",
+            hint="goals and pushes are sent while this is on",
         )
         self._drive.on_update(self._on_drive)
-        tabs = gui.add_tab_group()
-        with tabs.add_tab("Joints"):
-            self._joint_pictures = gui.add_html("")
-        with tabs.add_tab("Drive"):
-            links = [
-                frame.name
-                for frame in self._model.frames
-                if frame.type == pin.FrameType.BODY and frame.parentJoint > 0
-            ] or [""]
-            self._link = gui.add_dropdown("push link", links, initial_value=links[len(links) // 2])
-            self._stiffness = gui.add_slider("push, N per metre of drag", 20.0, 500.0, 10.0, 200.0)
-            self._sliders = [self._add_slider(k) for k in range(len(self._limits))]
-        with tabs.add_tab("Settings"):
-            self._choices: dict[tuple[str, str], Any] = {
-                ("bounds_node", "method"): gui.add_dropdown("bounds", (UNKNOWN, *METHODS)),
-                ("controller_node", "safety_filter"): gui.add_dropdown(
-                    "safety filter", (UNKNOWN, "True", "False")
-                ),
-                ("controller_node", "integral_action"): gui.add_dropdown(
-                    "integral action", (UNKNOWN, *COMPLIANCE.values())
-                ),
-            }
-            for key, choice in self._choices.items():
-                choice.on_update(self._setting_asked(key, choice))
-            gui.add_markdown(
-                "*Stiff at the hand* is null-space compliance: the rest of the arm yields. With "
-                "*naive* bounds and no safety filter limits are passed."
-            )
-
-    def _add_slider(self, k: int) -> Any:
-        low, high = float(self._limits.q_min[k]), float(self._limits.q_max[k])
-        if not (np.isfinite(low) and np.isfinite(high)):
-            low, high = -2.0 * np.pi, 2.0 * np.pi
-        low, high = round(low, 3), round(high, 3)
-        slider = self._server.gui.add_slider(
-            self._limits.names[k], min=low, max=high, step=0.001, initial_value=0.5 * (low + high)
-        )
-        slider.on_update(self._on_slider)
-        return slider
-
-    def _show_settings(self, picture: Picture) -> None:
-        for key, choice in self._choices.items():
-            value = str(picture.settings.get(key, UNKNOWN))
-            value = COMPLIANCE.get(value, value)
-            if value not in choice.options:
-                choice.options = (*choice.options, value)
-            if choice.value != value:
-                choice.value = value
-        if not self._driving:
-            for slider, q in zip(self._sliders, picture.joints.q, strict=True):
-                slider.value = round(float(np.clip(q, slider.min, slider.max)), 3)
+        links = [
+            frame.name
+            for frame in self._model.frames
+            if frame.type == pin.FrameType.BODY and frame.parentJoint > 0
+        ] or [""]
+        self._link = gui.add_dropdown("push link", links, initial_value=links[len(links) // 2])
+        self._stiffness = gui.add_slider("push, N per metre of drag", 20.0, 500.0, 10.0, 200.0)
+        self._joint_pictures = gui.add_html("")
 
     # What the user does; in threads of the server
 
@@ -349,29 +267,9 @@ class Page:
     def _on_push(self, event: viser.TransformControlsEvent) -> None:
         self._pushing = event.phase != "end"
         if self._driving and self._link.value:
-            pull = np.array(self._handle.position) - self._origin
-            force = float(self._stiffness.value) * pull if self._pushing else np.zeros(3)
+            drag = np.array(self._handle.position) - self._push_origin
+            force = float(self._stiffness.value) * drag if self._pushing else np.zeros(3)
             self._requests.put(PushAsked(self._link.value, force))
-
-    def _on_slider(self, event: viser.GuiEvent) -> None:
-        # Without a client the page itself moved it.
-        if self._driving and event.client is not None:
-            q = np.array([float(slider.value) for slider in self._sliders])
-            self._requests.put(JointsAsked(q))
-
-    def _setting_asked(self, key: tuple[str, str], choice: Any) -> Callable[[Any], None]:
-        def ask(event: viser.GuiEvent) -> None:
-            if event.client is None or choice.value == UNKNOWN:
-                return
-            value: Any = choice.value
-            value = {"True": True, "False": False}.get(value, value)
-            value = {words: name for name, words in COMPLIANCE.items()}.get(value, value)
-            self._requests.put(SettingAsked(*key, value))
-
-        return ask
-
-    def _frame(self, name: str) -> pin.SE3:
-        return self._data.oMf[self._model.getFrameId(name)]
 
 
 def _place(node: viser.SceneNodeHandle, pose: pin.SE3) -> None:

@@ -17,7 +17,7 @@ from bullet_pairs import (
 )
 
 from sim_bridge.bullet.robot import BulletRobot
-from sim_bridge.urdf.preparation import prepare_urdf
+from sim_bridge.urdf import prepare_urdf
 from viability_bounds_pkg.robot.description import (
     RobotDescriptionError,
     read_urdf,

@@ -22,7 +22,7 @@ from talos_joints import (
     talos,
 )
 
-from sim_bridge.bullet.joint_friction import JointFriction
+from sim_bridge.bullet.friction import JointFriction
 from sim_bridge.bullet.robot import BulletRobot
 from viability_bounds_pkg.robot.description import (
     read_urdf,

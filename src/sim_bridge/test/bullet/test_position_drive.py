@@ -7,7 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from sim_bridge.bullet.joint_friction import JointFriction
+from sim_bridge.bullet.friction import JointFriction
 from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.bullet.robot import BulletRobot
 from viability_bounds_pkg.robot.description import build_model, read_urdf

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from stopped_robot import Stopped
 
-from sim_bridge.nodes.bullet_parameters import BulletConfiguration, make_stop
+from sim_bridge.node.bullet_parameters import BulletConfiguration, make_stop
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.testing.ros_harness import read_config

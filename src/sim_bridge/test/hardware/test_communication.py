@@ -3,13 +3,16 @@ from itertools import groupby
 
 import pytest
 
-from sim_bridge.hardware.communication import CommandPath, MissedDeadlines, Outages
-from sim_bridge.hardware.imperfections import Imperfections
+from sim_bridge.hardware import CommandPath, Imperfections
 
 
 def drawn(probability, longest, count=40_000, seed=0):
-    deadlines = MissedDeadlines(probability, longest, seed)
-    return [deadlines.next() for _ in range(count)]
+    """Return which of the commands are lost."""
+    given = Imperfections(
+        missed_probability=probability, missed_in_row=longest, imperfection_seed=seed
+    )
+    path = CommandPath(given)
+    return [path.arriving(k) is None for k in range(count)]
 
 
 @pytest.mark.parametrize(("probability", "longest"), [(0.05, 4), (0.3, 4), (0.3, 1), (0.9, 3)])
@@ -30,27 +33,6 @@ def test_none_is_missed_without_a_probability():
 def test_the_seed_decides_which():
     assert drawn(0.3, 4, 200) == drawn(0.3, 4, 200)
     assert drawn(0.3, 4, 200) != drawn(0.3, 4, 200, seed=1)
-
-
-def test_outages_have_all_lengths_up_to_the_longest():
-    outages = Outages(0.02, 10, seed=0)
-    lost = [outages.next() for _ in range(40_000)]
-    rows = [len(list(group)) for value, group in groupby(lost) if value]
-    single = [length for length in rows if length <= 10]  # others began as the last one ended
-    assert len(single) > 0.95 * len(rows)
-    assert set(single) == set(range(1, 11))
-    assert sum(single) / len(single) == pytest.approx(5.5, abs=0.4)
-
-
-def test_an_outage_leaves_the_missed_deadlines_as_they_were():
-    path = CommandPath(
-        Imperfections(missed_probability=0.3, outage_probability=0.1, outage_longest=9)
-    )
-    arrived = [path.arriving(k) for k in range(300)]
-    missed = {k for k, each in enumerate(drawn(0.3, 4, 300)) if each}
-    lost = {k for k, each in enumerate(arrived) if each is None}
-    assert lost > missed
-    assert path.missed == len(lost)
 
 
 @pytest.mark.parametrize("delay", [0, 1, 4])
@@ -82,10 +64,10 @@ def test_a_command_that_comes_late_acts_at_its_time_unless_that_is_over(ended):
     for k in range(5 + ended):
         path.arriving(k if k in (0, 1) else None)
     last = 4 - 2 + ended  # answered by what acts next
-    assert path.arrives_late("again", 5 - last, ended=ended)
-    assert not path.arrives_late("twice", 5 - last, ended=ended)
-    assert not path.arrives_late("over", 6 - last, ended=ended)
-    assert path.arrives_late("newest", 1, ended=ended)
+    assert path.insert_late("again", 5 - last, ended=ended)
+    assert not path.insert_late("twice", 5 - last, ended=ended)
+    assert not path.insert_late("over", 6 - last, ended=ended)
+    assert path.insert_late("newest", 1, ended=ended)
     acting = [path.arriving(None) for _ in range(3 - ended)]
     assert acting == ["again", None, "newest"] if not ended else ["again", "newest"]
     path.arriving(None)
@@ -96,7 +78,7 @@ def test_commands_that_come_late_are_lost_as_often():
     path = CommandPath(Imperfections(command_delay=2, missed_probability=0.4, missed_in_row=3))
     acted = []
     for k in range(300):
-        path.arrives_late(k, 1, ended=False)
+        path.insert_late(k, 1, ended=False)
         acted.append(path.arriving(None))
         assert not path.absent or k < 1
     missed = {k for k, each in enumerate(drawn(0.4, 3, 300)) if each}

@@ -8,8 +8,7 @@ import pytest
 
 from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.bullet.robot import BulletRobot
-from sim_bridge.hardware.imperfections import Imperfections
-from sim_bridge.hardware.motors import RIPPLE_PERIODS, Motors
+from sim_bridge.hardware import RIPPLE_PERIODS, Imperfections, Motors
 from viability_bounds_pkg.parameter import parameter_table
 from viability_bounds_pkg.robot.description import build_model, read_urdf
 

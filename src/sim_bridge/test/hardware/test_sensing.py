@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from sim_bridge.hardware.imperfections import Imperfections
-from sim_bridge.hardware.noise import ClippedNoise, Stream
-from sim_bridge.hardware.sensing import Encoders, Sensing
+from sim_bridge.hardware import Imperfections, Sensing
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import parameter_table
 
@@ -52,9 +51,10 @@ def test_without_imperfections_readings_are_the_truth():
 
 def test_encoders_report_whole_steps_at_most_half_a_step_off():
     resolution = np.array([1e-3, 0.0, 3e-4])
-    encoders = Encoders(resolution, ClippedNoise(ZERO, 0, Stream.POSITION))
+    given = replace(imperfections(), encoder_resolution=resolution)
+    encoders = Sensing(given, TORQUE_MAX, DT)
     q = np.random.default_rng(0).uniform(-3.0, 3.0, (5000, N))
-    read = np.array([encoders.read(each) for each in q])
+    read = np.array([encoders.encoders(each) for each in q])
     np.testing.assert_array_equal(read[:, 1], q[:, 1])
     for j in (0, 2):
         steps = read[:, j] / resolution[j]

@@ -16,8 +16,7 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint, MultiDOFJointTrajectory
 from visualization_msgs.msg import MarkerArray
 
-from sim_bridge.recording.mcap_file import McapFile
-from sim_bridge.recording.message_definition import message_definition
+from sim_bridge.mcap_file import McapFile, message_definition
 
 
 def filled():

@@ -13,10 +13,10 @@ from sim_bridge.scenario.events import (
     PostureGoal,
     Push,
     RemoveObstacle,
+    ScenarioError,
     TriggerCall,
     WrenchGoal,
 )
-from sim_bridge.scenario.fields import ScenarioError
 from sim_bridge.scenario.scenario import load_scenario
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "config" / "scenarios"
@@ -92,33 +92,22 @@ events:
     assert unload == PayloadChange(8.2, "a", 0.0, (0.0, 0.0, 0.0), 6 * (0.0,))
 
 
-def test_the_plane_of_a_circle_may_be_given_by_its_normal(tmp_path):
+def test_a_circle_starts_where_it_is_told_and_leads_around(tmp_path):
     text = """
 duration: 9
 events:
   - time: 0
     trajectory:
-      circle: {centre: [1, 2, 3], radius: 0.2, PLANE, period: 4, orientation: [0, 0, 0, 1]}
+      circle: {start: [1, 2, 3], diameter: 0.4, plane: [x, y], phase: 1.5707963267948966,
+        period: 4, orientation: [0, 0, 0, 1]}
 """
-    # About z, x points to where the angle is zero.
-    circles = [
-        load_scenario(write(tmp_path, text.replace("PLANE", plane))).events[0].trajectory.points
-        for plane in ("plane: [x, y]", "normal: [0, 0, 2]")
-    ]
-    for a, b in zip(*circles, strict=True):
-        np.testing.assert_allclose(a.pose.homogeneous, b.pose.homogeneous)
-        np.testing.assert_allclose(a.velocity, b.velocity, atol=1e-15)
-    np.testing.assert_allclose(circles[0][0].pose.translation, [1.2, 2.0, 3.0])
-    # A quarter of a turn later in angle, seen from where it begins.
-    later = text.replace("centre: [1, 2, 3]", "start: [1, 2, 3], phase: 1.5707963267948966")
-    points = load_scenario(write(tmp_path, later.replace("PLANE", "plane: [x, y]")))
-    points = points.events[0].trajectory.points
+    points = load_scenario(write(tmp_path, text)).events[0].trajectory.points
     np.testing.assert_allclose(points[0].pose.translation, [1.0, 2.0, 3.0], atol=1e-15)
     half = points[len(points) // 2].pose.translation
     np.testing.assert_allclose(half, [1.0, 1.6, 3.0], atol=1e-12)
 
 
-CIRCLE = "centre: [0, 0, 0], radius: 1, plane: [y, z], period: 1, orientation: [0, 0, 0, 1]"
+CIRCLE = "start: [0, 0, 0], diameter: 1, plane: [y, z], period: 1, orientation: [0, 0, 0, 1]"
 POINT = "position: [0, 0, 0], orientation: [0, 0, 0, 1]"
 OVAL = "sphere, size: [1, 1, 2]"
 BOX = "name: a, shape: box, size: [1, 1, 1], position: [0, 0, 0]"
@@ -146,12 +135,9 @@ BOX = "name: a, shape: box, size: [1, 1, 1], position: [0, 0, 0]"
         ),
         (
             "trajectory",
-            f"{{circle: {{{CIRCLE.replace('s: 1', 's: -1')}}}}}",
-            "circle.radius",
+            f"{{circle: {{{CIRCLE.replace('r: 1', 'r: -1')}}}}}",
+            "circle.diameter",
         ),
-        ("trajectory", f"{{circle: {{{CIRCLE}, diameter: 1}}}}", "radius and diameter"),
-        ("trajectory", f"{{circle: {{{CIRCLE}, start: [0, 0, 0]}}}}", "centre and start"),
-        ("trajectory", f"{{circle: {{{CIRCLE}, normal: [0, 0, 1]}}}}", "plane and normal"),
         ("trajectory", f"{{circle: {{{CIRCLE.replace('[y, z]', '[y, -y]')}}}}}", "circle.plane"),
         ("trajectory", f"{{circle: {{{CIRCLE.replace('[y, z]', '[y, w]')}}}}}", "two of x, y, z"),
         ("trajectory", f"{{circle: {{{CIRCLE}, turns: 0}}}}", "circle.turns"),

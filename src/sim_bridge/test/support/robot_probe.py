@@ -6,7 +6,7 @@ import pinocchio as pin
 from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import JointState
 
-from sim_bridge.nodes.bullet_node import BulletNode
+from sim_bridge.node.bullet_node import BulletNode
 from viability_bounds_pkg.robot.description import build_model, read_urdf
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp, stamp_to_ns
 from viability_bounds_pkg.testing.ros_harness import joint_state, read_config

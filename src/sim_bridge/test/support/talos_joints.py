@@ -6,7 +6,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from sim_bridge.bullet.joint_friction import JointFriction
+from sim_bridge.bullet.friction import JointFriction
 from sim_bridge.bullet.robot import BulletRobot
 from viability_bounds_pkg.robot.description import (
     build_model,

@@ -10,8 +10,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from sim_bridge.tools.excitation import PARTS, ROOM, ExcitationError, excitation
-from sim_bridge.tools.record_excitation import main
+from sim_bridge.tools.record_excitation import PARTS, ROOM, ExcitationError, excitation, main
 from viability_bounds_pkg.robot.configuration import LimitedRobotConfiguration
 from viability_bounds_pkg.testing.executables import called, started
 from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
@@ -94,7 +93,7 @@ def test_joints_without_limits_and_joints_without_room():
 @pytest.fixture
 def short(monkeypatch):
     """Makes the motion short: what is to be seen does not take its time."""
-    monkeypatch.setattr("sim_bridge.tools.excitation.PARTS", ((1.0, np.inf, 1.0),))
+    monkeypatch.setattr("sim_bridge.tools.record_excitation.PARTS", ((1.0, np.inf, 1.0),))
 
 
 @pytest.fixture
@@ -164,7 +163,7 @@ class InterruptedRobot(tool.BulletRobot):
     def move(self, *arguments):
         os.kill(os.getpid(), signal.SIGINT)
         super().move(*arguments)
-from sim_bridge.nodes import bullet_parameters
+from sim_bridge.node import bullet_parameters
 bullet_parameters.BulletRobot = InterruptedRobot
 sys.exit(tool.main())
 """

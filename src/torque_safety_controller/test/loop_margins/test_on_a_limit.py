@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from sim_bridge.nodes.bullet_parameters import BulletConfiguration, make_robot
+from sim_bridge.node.bullet_parameters import BulletConfiguration, make_robot
 from torque_safety_controller.loop_margins.gain_check import TORQUE_STEP
 from torque_safety_controller.node.assembly import make_controller
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration

@@ -1,0 +1,369 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The robot node: simulates an arm with torque- and position-controlled motors."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from array import array
+from collections import Counter
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import WrenchStamped
+from numpy.typing import NDArray
+from rclpy.clock import Clock, ClockType
+from rosgraph_msgs.msg import Clock as ClockMessage
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+
+from sim_bridge.bullet.limit_monitor import LimitMonitor
+from sim_bridge.bullet.sensor import ForceTorqueReading
+from sim_bridge.hardware import Sensing
+from sim_bridge.node.bullet_parameters import BulletConfiguration, make_robot, make_stop
+from sim_bridge.node.commands import CommandOutage, CommandStream
+from sim_bridge.node.topics import CLOCK, PAUSE, RESET
+from sim_bridge.node.world_subscriber import WorldSubscriber
+from viability_bounds_pkg.plausible import RESTART_GAP
+from viability_bounds_pkg.recent_values import RecentValues
+from viability_bounds_pkg.ros.arm_node import ArmNode
+from viability_bounds_pkg.ros.joint_command import PositionCommand, TorqueCommand
+from viability_bounds_pkg.ros.messages import Diagnostics
+from viability_bounds_pkg.ros.parameters import NodeParameters
+from viability_bounds_pkg.ros.program import run
+from viability_bounds_pkg.ros.robot_urdf import warn_of_unusual
+from viability_bounds_pkg.ros.runtime import set_stamp
+from viability_bounds_pkg.ros.topics import (
+    FT_WRENCH,
+    JOINT_COMMANDS,
+    JOINT_STATES,
+    ROBOT_DESCRIPTION,
+)
+
+Array = NDArray[np.float64]
+
+_RETRY_PERIOD = 0.05
+"""Shorter than the 75 ms after which a controller takes the robot for silent, s."""
+
+_CONTROL = {TorqueCommand: "torque", PositionCommand: "position"}
+
+
+class BulletNode(ArmNode):
+    """An arm that publishes ``joint_states`` and follows ``joint_commands``.
+
+    A command with efforts sets the torques of the motors. One without efforts sets the positions,
+    and optionally the velocities, that the motors' own drives control. Each command may be of
+    either kind.
+
+    With ``clock: real_time`` each control period has its duration on the wall clock. A command
+    that comes within the period of the state with its stamp acts during that period, or, with
+    ``command_delay``, so many periods later, when it also may come so much later; without one the
+    last command is held, and after ``command_timeout`` periods the robot stops itself. Where
+    acceleration limits are given, both keep all limits, and commands that return get their effect
+    back gradually; where not, the brakes stop it. With ``clock:
+    lockstep`` a period ends when the command with its stamp has come, without a limit of time.
+
+    The robot's brakes are on until the first command.
+
+    Imperfections that parameters switch on stand between the messages and the robot: states are
+    reported by `Sensing`, commands arrive by a `CommandPath`, torques are those of `Motors`.
+    """
+
+    NAME = "bullet_node"
+    PARAMETERS = BulletConfiguration
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__(**node_arguments)
+        with self.starting():
+            self._node_parameters = NodeParameters(self, BulletConfiguration)
+            config = self._node_parameters.configuration
+            warn_of_unusual(self, config, config.urdf)
+            self._robot = make_robot(config)
+            self._stop = make_stop(config)
+        if self._stop is None and 0 < config.missed_deadlines < config.command_timeout:
+            self.get_logger().warning(
+                f"parameter 'command_timeout' is {config.command_timeout}, but the bounds cover "
+                f"{config.missed_deadlines} missed periods (missed_deadlines): limits may be "
+                "passed in a longer row, as no acceleration_min is given to keep them by"
+            )
+        self._config = config
+        self._monitor = LimitMonitor(
+            config.position_min, config.position_max, config.velocity_max, config.torque_max
+        )
+        self._robot.monitor = self._monitor
+        self._dt_ns = round(1e9 * config.dt)
+        self._paused = config.start_paused
+        # In lockstep robot time starts at one period: a stamp of zero means "no stamp".
+        self._stamp = 0 if config.lockstep else self.get_clock().now().nanoseconds
+        self._has_moved = False
+        self._advanced = True
+        self._refused: Counter[str] = Counter()
+        self._world = WorldSubscriber(
+            self, self._robot, config.external_wrench_timeout, self._refused
+        )
+        self._ft_wrench = WrenchStamped()
+        self._ft_publisher = self.stream(FT_WRENCH) if self._robot.sensor else None
+        imperfect = config.imperfections
+        senses = imperfect.of_sensing or imperfect.of_motors
+        self._sensing = Sensing(imperfect, config.torque_max, config.dt) if senses else None
+        warn = self.get_logger().warning
+        self._commands = CommandStream(config, self._refused, warn)
+        self._restart()
+
+        # Joints that are locked, too: robot_state_publisher places no link without its joint.
+        locked = self._robot.locked
+        self._locked_at = array("d", locked.values())
+        self._at_rest = array("d", [0.0] * len(locked))
+        self._names = [*config.joints, *locked]
+        self._state_publisher = self.stream(JOINT_STATES)
+        self._clock_publisher = CLOCK.publisher(self) if config.publish_clock else None
+        description = ROBOT_DESCRIPTION.publisher(self)
+        description.publish(String(data=config.urdf))
+        self.listen(JOINT_COMMANDS, self._on_command)
+        RESET.serve(self, self._on_reset)
+        PAUSE.serve(self, self._on_pause)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        if not config.lockstep:
+            self.create_timer(config.dt, self._tick, clock=steady)
+        self.create_timer(_RETRY_PERIOD, self._retry, clock=steady)
+        if self._clock_publisher is not None:
+            self.publisher_watch.add(self._clock_publisher.topic_name)
+        self._diagnostics = Diagnostics(self, self._report, watch=self.publisher_watch)
+        self.announce(config.joints, config.rate_hz, f"simulated, clock {config.clock}")
+        self._next_state()
+
+    def _restart(self) -> None:
+        """Reset the robot and all counts; robot time continues."""
+        config = self._config
+        n = len(config.joints)
+        self._world.clear()
+        self._robot.reset(config.start_positions, np.zeros(n))
+        self._reading = self._sensing.reset(*self._true_state()) if self._sensing else None
+        sensor = self._robot.sensor
+        self._sensor = ForceTorqueReading(sensor, config.sensor) if sensor else None
+        self._monitor.reset()
+        self._commands.restart()
+        self._braked = 0
+        self._outage = CommandOutage(config.command_timeout, math.ceil(config.rate_hz))
+        self._periods = 0
+        self._plan_pause()
+        self._refused.clear()
+        self._period_errors = RecentValues()
+        self._ticked_at, self._late = math.nan, 0
+        self._started_at, self._played = time.monotonic(), 0
+
+    def _plan_pause(self) -> None:
+        """Compute the period at which to pause, `pause_after` from now."""
+        periods = round(self._node_parameters.configuration.pause_after / self._config.dt)
+        self._pause_at: float = self._periods + periods if periods else math.inf
+
+    @property
+    def true_positions(self) -> NDArray[np.float64]:
+        """Positions of the joints as they are, whatever is reported, shape (n,), rad."""
+        return self._robot.state().q
+
+    # Control periods
+
+    def _next_state(self) -> None:
+        """Begin a control period and publish the state at its start."""
+        self._stamp += self._dt_ns
+        self._advanced = False
+        q, v, tau = self._reading or self._robot.state()
+        # New messages: nodes of this process may keep the last ones, and others get theirs later.
+        state = self._state = JointState(
+            name=self._names,
+            position=array("d", q.tobytes()) + self._locked_at,
+            velocity=array("d", v.tobytes()) + self._at_rest,
+            effort=array("d", tau.tobytes()) + self._at_rest,
+        )
+        set_stamp(state.header.stamp, self._stamp)
+        if self._clock_publisher is not None:
+            self._clock_publisher.publish(ClockMessage(clock=state.header.stamp))
+        if self._ft_publisher and self._sensor:  # first: subscribers use it with the state
+            measured = self._ft_wrench = WrenchStamped()
+            measured.header.frame_id = self._config.sensor.ft_frame
+            set_stamp(measured.header.stamp, self._stamp)
+            force, torque = measured.wrench.force, measured.wrench.torque
+            wrench = self._sensor.read().tolist()
+            force.x, force.y, force.z, torque.x, torque.y, torque.z = wrench
+            self._ft_publisher.publish(measured)
+        self._published_at = time.monotonic()
+        self._state_publisher.publish(state)
+
+    def _true_state(self) -> tuple[Array, Array, Array]:
+        """Return the state of the joints, and the torques that the drives believe to give."""
+        q, v, _ = self._robot.state()
+        return q, v, self._robot.believed_torque
+
+    def _advance(self) -> None:
+        """Simulate the current period under the last command, or the robot's own law."""
+        config = self._config
+        self._world.apply_due(self._stamp)
+        commands = self._commands
+        command = commands.acting
+        if not self._robot.finite:  # after a push beyond all measure: no law stops that
+            self._robot.brake(config.substeps, config.torque_max)
+        elif command is None:
+            # No command can have arrived before the first one's delay.
+            self._braked += self._periods >= config.imperfections.command_delay
+            if self._stop is not None and self._outage.commanded:
+                self._robot.stop(self._stop, config.substeps)
+            else:
+                self._robot.brake(config.substeps, config.torque_max)
+        elif isinstance(command, TorqueCommand):
+            if self._stop is None or (commands.missed_in_row == 0 and not self._robot.returning):
+                self._robot.step(command.tau, config.substeps)
+            else:
+                self._robot.follow(self._stop, command.tau, config.substeps)
+        else:
+            self._robot.move(*command, config.torque_max, config.velocity_max, config.substeps)
+        if news := self._outage.count(command is None):
+            self.get_logger().warning(news)
+        if self._sensing is not None:
+            self._reading = self._sensing.read(*self._true_state())
+        self._periods += 1
+        self._has_moved = True
+        self._advanced = True
+        if self._periods >= self._pause_at:
+            self._pause_at = math.inf
+            self._pause()
+
+    def _tick(self) -> None:
+        """End a period in real time and begin the next."""
+        last, self._ticked_at = self._ticked_at, math.nan if self._paused else time.monotonic()
+        if self._paused:
+            return
+        if math.isfinite(last):
+            dt, took = self._config.dt, self._ticked_at - last
+            self._period_errors.note(abs(took - dt))
+            # A real robot would have gone on.
+            self._late += max(0, round(took / dt) - 1)
+        if not self._advanced:
+            self._commands.receive(None)
+            self._advance()
+        self._next_state()
+
+    def _pause(self) -> None:
+        self._paused = True
+        self._diagnostics.publish()
+
+    def _retry(self) -> None:
+        """Publish the state again: it may have been lost, or there was no subscriber yet."""
+        waiting = self._paused or (self._config.lockstep and not self._advanced)
+        if waiting and time.monotonic() - self._published_at > _RETRY_PERIOD:
+            if self._ft_publisher is not None:
+                self._ft_publisher.publish(self._ft_wrench)
+            self._state_publisher.publish(self._state)
+
+    # Commands
+
+    def _on_command(self, message: JointState) -> None:
+        if not self._commands.take(
+            message, self._stamp, self._published_at, ended=self._advanced, paused=self._paused
+        ):
+            return
+        self._advance()
+        # After a pause by itself the next state is not published: time stops for all nodes.
+        if self._config.lockstep and not self._paused:
+            self._next_state()
+
+    # Services
+
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._has_moved:
+            # As robots that start again: else the leap is taken for a state that cannot be. Also
+            # where it is at its start already: the controller may not have seen the last reset.
+            self._stamp += round(1e9 * RESTART_GAP)
+        self._restart()
+        self._next_state()
+        response.success = True
+        response.message = "at the start configuration, at rest"
+        return response
+
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        if self._paused and not request.data:
+            self._paused = False
+            self._started_at, self._played = time.monotonic(), self._periods
+            self._plan_pause()
+            # A new stamp: commands that came during the pause are for old goals. In real time it
+            # comes with the next tick, so that the first period is a whole one.
+            self._advanced = True
+            if self._config.lockstep:
+                self._next_state()
+        elif request.data:
+            self._pause()
+        response.success = True
+        response.message = "paused" if self._paused else "running"
+        return response
+
+    # Diagnostics
+
+    def _control(self) -> str:
+        """Return what moves or holds the robot."""
+        if self._commands.acting is not None:
+            return _CONTROL[type(self._commands.acting)]
+        if self._stop is None or not self._outage.commanded:
+            return "brakes"
+        return "stopped" if self._stop.at_rest else "stopping"
+
+    def _report(self) -> tuple[bytes, str, dict[str, Any]]:
+        monitor, commands = self._monitor, self._commands
+        latencies, errors = commands.latencies, self._period_errors
+        elapsed = time.monotonic() - self._started_at
+        obstacles, control = self._robot.obstacles, self._control()
+        values = {
+            "clock": "lockstep" if self._config.lockstep else "real_time",
+            "paused": self._paused,
+            "control": control,
+            "stamp_ns": self._stamp,
+            "period_s": self._config.dt,
+            "periods": self._periods,
+            "rate_hz": (self._periods - self._played) / elapsed,
+            "physics_steps_per_period": self._config.substeps,
+            "deadline_misses": commands.missed,
+            "late_periods": self._late,
+            "missed_deadlines_injected": commands.path.missed,
+            "imperfections": ", ".join(self._config.imperfections.names) or "none",
+            "braked_periods": self._braked,
+            "commands_refused": self._refused,
+            "world_changes_pending": len(self._world),
+            "contact_force_n": obstacles.force,
+            "contact_force_max_n": obstacles.force_max,
+            "latency_p50_us": 1e6 * latencies.percentile(50),
+            "latency_p99_us": 1e6 * latencies.percentile(99),
+            "period_error_p50_us": 1e6 * errors.percentile(50),
+            "period_error_p99_us": 1e6 * errors.percentile(99),
+            "period_error_max_us": 1e6 * errors.largest,
+            "commanded_torque_ratio_max": commands.torque_ratio,
+            "position_violation_rad": monitor.max_position_violation,
+            "velocity_violation_rad_s": monitor.max_velocity_violation,
+            "torque_ratio": monitor.max_torque_ratio,
+            "lower_clearance_rad": monitor.closest_to_q_min,
+            "upper_clearance_rad": monitor.closest_to_q_max,
+        }
+        if monitor.violated:
+            return DiagnosticStatus.ERROR, "a limit was broken", values
+        if self._paused:
+            return DiagnosticStatus.OK, "paused", values
+        if commands.acting is None:
+            doing = "braking" if control == "brakes" else control
+            return DiagnosticStatus.WARN, f"{doing}: no commands", values
+        return DiagnosticStatus.OK, "running", values
+
+    def destroy_node(self) -> None:
+        """Disconnect from the physics engine too."""
+        if hasattr(self, "_robot"):
+            self._robot.close()
+        super().destroy_node()
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the robot node until it is shut down."""
+    return run(BulletNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,270 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The robot node's parameters, and the robot made of them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_bridge.bullet.friction import DEFAULT_STRIBECK_VELOCITY, JointFriction
+from sim_bridge.bullet.obstacles import ContactMaterial
+from sim_bridge.bullet.robot import BulletRobot
+from sim_bridge.bullet.sensor import SensorConfiguration
+from sim_bridge.hardware import Imperfections, Motors
+from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
+from viability_bounds_pkg.parameter import (
+    FINITE,
+    NEGATIVE,
+    NOT_NEGATIVE,
+    POSITIVE,
+    Range,
+    above,
+    group,
+    joint_amounts,
+    joint_numbers,
+    number,
+    numbers,
+    periods,
+    switch,
+    text,
+    texts,
+    timeout,
+    whole_number,
+)
+from viability_bounds_pkg.robot.configuration import ControlRate, LimitedRobotConfiguration
+from viability_bounds_pkg.robot.description import (
+    RobotDescriptionError,
+    build_model,
+    kinematic_order,
+)
+from viability_bounds_pkg.stop import CoordinatedStop
+
+Array = NDArray[np.float64]
+
+CLOCKS = ("real_time", "lockstep")
+
+_OBSERVER_TIME = 0.002
+"""Of the drives' own stop, s: their velocities are exact, and they know their motors' torque."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BulletConfiguration(ControlRate, LimitedRobotConfiguration):
+    """Parameters of the robot node; arrays of shape (n,) in `joints` order.
+
+    Attributes:
+        urdf: text of the URDF.
+    """
+
+    start_positions: Array = joint_numbers("positions at start and after reset, rad", FINITE)
+    physics_step_max: float = number("longest physics step, s", above(0.0, 1.0), default=0.001)
+    clock: str = text(
+        "real_time: a period lasts its time on the wall clock; lockstep: until its command comes",
+        default="real_time",
+        choices=CLOCKS,
+    )
+    command_timeout: int = whole_number(
+        "control periods that the last command is held for before the robot stops itself",
+        Range(1, 1000),
+        default=5,
+    )
+    missed_deadlines: int = periods(
+        "longest such row that the bounds are declared to cover; where command_timeout is longer, "
+        "this is logged; 0: not declared"
+    )
+    acceleration_min: Array = joint_numbers(
+        "lower acceleration limits when the robot stops itself, rad/s^2; it brakes with all its "
+        "torque if empty",
+        NEGATIVE,
+        default=(),
+        note="together with acceleration_max",
+    )
+    acceleration_max: Array = joint_numbers(
+        "upper acceleration limits when the robot stops itself, rad/s^2",
+        POSITIVE,
+        default=(),
+        note="together with acceleration_min",
+    )
+    start_paused: bool = switch("wait for the pause service before moving", default=False)
+    pause_after: float = number(
+        "robot time after which it pauses by itself, s since it began to move; 0: never",
+        Range(0.0, 1e5),
+        default=0.0,
+        live=True,
+    )
+    publish_clock: bool = switch("publish /clock", default=False)
+    friction_coulomb: Array = joint_amounts("dry friction of moving joints, N m; none if empty")
+    friction_static: Array = joint_numbers(
+        "dry friction of joints at rest, N m; that of moving ones if empty",
+        NOT_NEGATIVE,
+        default=(),
+        note="at least friction_coulomb",
+    )
+    friction_viscous: Array = joint_amounts(
+        "friction that grows with speed, N m s/rad; none if empty"
+    )
+    stribeck_velocity: Array = joint_numbers(
+        "speed at which static has become Coulomb friction but for 1/e of the difference, rad/s; "
+        f"{DEFAULT_STRIBECK_VELOCITY} if empty",
+        POSITIVE,
+        if_empty=DEFAULT_STRIBECK_VELOCITY,
+    )
+    torque_bias: Array = joint_numbers(
+        "torque of the motors beyond what is commanded and reported, N m; none if empty",
+        FINITE,
+        if_empty=0.0,
+    )
+    mass_scale_links: tuple[str, ...] = texts(
+        "links with another mass than in the URDF", default=(), note="each once"
+    )
+    mass_scales: Array = numbers(
+        "factors for their masses and inertias",
+        POSITIVE,
+        default=(),
+        note="one for each of 'mass_scale_links'",
+    )
+    external_wrench_timeout: float = timeout("how long a push lasts, s of robot time", default=0.5)
+    material: ContactMaterial = group(ContactMaterial, "obstacle_")
+    sensor: SensorConfiguration = group(SensorConfiguration)
+    imperfections: Imperfections = group(Imperfections)
+    urdf: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Check what concerns several parameters, and read the URDF."""
+        super().__post_init__()
+        static = self.friction_static
+        if len(static) and not (static >= self.friction_coulomb).all():
+            raise SettingError("friction_static", static, "at least friction_coulomb everywhere")
+        if len(self.acceleration_min) != len(self.acceleration_max):
+            name = "acceleration_max" if len(self.acceleration_min) else "acceleration_min"
+            allowed = f"{len(self.joints)} numbers, because the other limit is given"
+            raise SettingError(name, getattr(self, name), allowed)
+        links, scales = self.mass_scale_links, self.mass_scales
+        if len(set(links)) != len(links):
+            raise SettingError("mass_scale_links", links, "links of the URDF, each once")
+        if len(links) != len(scales):
+            allowed = f"{len(links)} numbers, one for each of 'mass_scale_links'"
+            raise SettingError("mass_scales", scales, allowed)
+        self.imperfections.check_rate(self.rate_hz)
+        object.__setattr__(self, "urdf", self.read_urdf())
+
+    @property
+    def lockstep(self) -> bool:
+        """Whether a period lasts until its command comes."""
+        return self.clock == "lockstep"
+
+    @cached_property
+    def substeps(self) -> int:
+        """Physics steps of a control period."""
+        # The rounding keeps 1 kHz with steps of 1 ms from becoming two steps of 0.5 ms.
+        return max(1, math.ceil(self.dt / self.physics_step_max - 1e-9))
+
+    @property
+    def physics_dt(self) -> float:
+        """Physics step, s."""
+        return self.dt / self.substeps
+
+    @property
+    def scaled_links(self) -> dict[str, float]:
+        """Factors for masses and inertias by link."""
+        return dict(zip(self.mass_scale_links, map(float, self.mass_scales), strict=True))
+
+    @property
+    def joint_friction(self) -> JointFriction:
+        """Friction, bias and rotors of the joints."""
+        static = self.friction_static
+        return JointFriction(
+            len(self.joints),
+            friction_coulomb=self.friction_coulomb,
+            friction_static=static if len(static) else self.friction_coulomb,
+            friction_viscous=self.friction_viscous,
+            stribeck_velocity=self.stribeck_velocity,
+            torque_bias=self.torque_bias,
+            rotor_inertia=self.rotor_inertia,
+        )
+
+
+def make_robot(config: BulletConfiguration) -> BulletRobot:
+    """Return the robot that the parameters describe.
+
+    Raises:
+        SettingError: a URDF that does not load, or a joint or link that it does not have.
+    """
+    imperfections = config.imperfections
+    motors = Motors(imperfections, config.torque_max, config.physics_dt)
+    try:
+        return BulletRobot(
+            config.urdf,
+            config.joints,
+            locked_positions=config.locked,
+            physics_dt=config.physics_dt,
+            joint_friction=config.joint_friction,
+            motors=motors if imperfections.of_motors else None,
+            mass_scales=config.scaled_links,
+            material=config.material,
+            sensor_frame=config.sensor.ft_frame,
+        )
+    except RobotDescriptionError as error:
+        name, value, allowed = _culprit(config)
+        raise SettingError(name, value, f"{allowed} ({error})") from error
+
+
+def make_stop(config: BulletConfiguration) -> CoordinatedStop | None:
+    """Return the law by which the robot stops itself; None without acceleration limits.
+
+    It keeps the robot's positions clear of the limits by the way that a joint can make from rest
+    in a physics step: PyBullet's are that much ahead at most.
+
+    Raises:
+        SettingError: limits that a physics step is too long for.
+    """
+    if not len(config.acceleration_min):
+        return None
+    dt, order = config.dt / config.substeps, kinematic_order(config.urdf, config.joints)
+    inertia = config.rotor_inertia[[config.joints.index(name) for name in order]]
+    model = build_model(config.urdf, order, config.locked, inertia)
+    a_min, a_max = config.acceleration_min, config.acceleration_max
+    clearance = 0.5 * dt * dt * np.maximum(-a_min, a_max)
+    try:
+        limits = JointLimits(
+            config.joints,
+            config.position_min + clearance,
+            config.position_max - clearance,
+            config.velocity_max,
+            a_min,
+            a_max,
+        )
+        return CoordinatedStop(
+            model,
+            limits,
+            config.torque_max,
+            dt,
+            observer_time=_OBSERVER_TIME,
+            motor_lag=config.imperfections.motor_lag,
+        )
+    except JointLimitsError as error:
+        allowed = f"limits that can be kept in steps of {dt:g} s ({error})"
+        raise SettingError("acceleration_max", a_max, allowed) from error
+
+
+def _culprit(config: BulletConfiguration) -> tuple[str, Any, str]:
+    """Return the parameter that prevents the robot, its value, and what it may be."""
+    root = ElementTree.fromstring(config.urdf)
+    joints = {joint.get("name") for joint in root.iter("joint")}
+    if not joints >= set(config.joints):
+        return "joints", config.joints, "joints of the URDF"
+    if not joints - set(config.joints) >= set(config.locked_joints):
+        return "locked_joints", config.locked_joints, "other joints of the URDF"
+    if not {link.get("name") for link in root.iter("link")} >= set(config.mass_scale_links):
+        return "mass_scale_links", config.mass_scale_links, "links of the URDF"
+    carriers = {parent.get("link") for parent in root.iter("parent")}
+    if config.sensor.ft_frame and config.sensor.ft_frame not in carriers:
+        allowed = "a link of the URDF that carries others, or empty"
+        return "ft_frame", config.sensor.ft_frame, allowed
+    return "robot_description", config.robot_description, "a URDF that PyBullet can load"

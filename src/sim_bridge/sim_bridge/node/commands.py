@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The stream of commands: which one acts, and which are late or refused."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable
+
+import numpy as np
+from sensor_msgs.msg import JointState
+
+from sim_bridge.hardware import CommandPath
+from sim_bridge.node.bullet_parameters import BulletConfiguration
+from viability_bounds_pkg.recent_values import RecentValues
+from viability_bounds_pkg.ros.joint_command import JointCommand, TorqueCommand, accept_command
+from viability_bounds_pkg.ros.runtime import stamp_to_ns
+
+_STRAYS = 50
+
+
+class CommandStream:
+    """Commands from the messages of a robot's controller, on their way to the drives.
+
+    Args:
+        config: of the robot.
+        refused: counts messages that are dropped, by reason.
+        warn: told in words what is wrong with them.
+
+    Attributes:
+        acting: the command of the present period; None if the robot stops itself.
+        missed: periods for which none had come.
+        missed_in_row: periods since the last one that arrived.
+        torque_ratio: largest commanded torque, as a share of its limit.
+        path: their way.
+        latencies: from states to their commands, s.
+    """
+
+    def __init__(
+        self,
+        config: BulletConfiguration,
+        refused: Counter[str],
+        warn: Callable[[str], object],
+    ) -> None:
+        self._config, self._refused = config, refused
+        self._warn = warn
+        self._joints = list(config.joints)
+        self._dt_ns = round(1e9 * config.dt)
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget all commands, and count anew."""
+        self.path: CommandPath[JointCommand] = CommandPath(self._config.imperfections)
+        self.acting: JointCommand | None = None
+        self.missed_in_row = self.missed = self._strays = 0
+        self.torque_ratio = 0.0
+        self.latencies = RecentValues()
+
+    def take(
+        self, message: JointState, stamp: int, published_at: float, *, ended: bool, paused: bool
+    ) -> bool:
+        """Take a message.
+
+        Args:
+            message: that has come.
+            stamp: of the present period, ns.
+            published_at: when its state was published, s on the steady clock.
+            ended: whether the period has been simulated.
+            paused: whether none is obeyed.
+
+        Returns:
+            Whether it is the command for this period, which then acts.
+        """
+        own = stamp_to_ns(message.header.stamp)
+        age, rest = divmod(stamp - own, self._dt_ns)
+        late = 0 < age <= self._config.imperfections.command_delay and not self._config.lockstep
+        if rest or not (late or (age == 0 and not ended)):
+            if not paused:
+                self._note_stray(own, stamp)
+            return False
+        if paused:
+            return False
+        command = self._read(message)
+        if command is None:
+            return False
+        if late and not self.path.insert_late(command, age, ended=ended):
+            self._note_stray(own, stamp)
+            return False
+        self._strays = 0
+        self.latencies.note(time.monotonic() - published_at + age * self._config.dt)
+        if not late:
+            self.receive(command)
+        return not late
+
+    def receive(self, sent: JointCommand | None) -> None:
+        """Take the command that arrives in the present period, or hold the last one.
+
+        `sent` is the one that was sent in it; None if there is none.
+        """
+        arrived = self.path.arriving(sent)
+        if arrived is not None:
+            self.acting = arrived
+            self.missed_in_row = 0
+        elif self.acting is not None:
+            self.missed += self.path.absent
+            self.missed_in_row += 1
+            if self.missed_in_row > self._config.command_timeout:
+                self.acting = None
+
+    def _read(self, message: JointState) -> JointCommand | None:
+        command = accept_command(message, self._joints, self._refused, self._warn)
+        if isinstance(command, TorqueCommand):
+            tau, tau_max = command.tau, self._config.torque_max
+            self.torque_ratio = max(self.torque_ratio, float(np.max(np.abs(tau) / tau_max)))
+            # The motors do not exceed their limits, whatever the command.
+            command = TorqueCommand(np.clip(tau, -tau_max, tau_max))
+        return command
+
+    def _note_stray(self, own: int, stamp: int) -> None:
+        """Count a command that is not for this period; warn when no other comes."""
+        self._refused["not for this period"] += 1
+        self._strays += 1
+        if self._strays == _STRAYS:
+            self._warn(
+                f"joint_commands refused: {_STRAYS} in a row do not have the stamp of the present "
+                f"joint state; the last one has {1e-9 * own:.13g} s instead of "
+                f"{1e-9 * stamp:.13g} s"
+            )
+
+
+class CommandOutage:
+    """Counts the periods in which a robot stops or is stopped because its commands do not come.
+
+    On a busy machine commands stop and return many times a second: all of that is one outage.
+
+    Args:
+        timeout: periods without a command until the robot stops.
+        steady: periods under commands after which these count as back.
+
+    Attributes:
+        commanded: whether there has been a command.
+    """
+
+    def __init__(self, timeout: int, steady: int) -> None:
+        self._timeout, self._steady = timeout, steady
+        self.commanded = False
+        self._silent = self._good = 0
+
+    def count(self, silent: bool) -> str:
+        """Count a period; return what to log, empty if there is nothing new.
+
+        Periods before the first command do not count.
+        """
+        if not silent:
+            self.commanded = True
+            self._good += 1
+            if self._silent and self._good == self._steady:
+                periods, self._silent = self._silent, 0
+                return f"commands are back; the robot stopped itself for {periods} periods"
+        elif self.commanded:
+            self._good = 0
+            self._silent += 1
+            if self._silent == 1:
+                return f"no command for {self._timeout + 1} periods: stopping until they are back"
+        return ""

@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Subscribes to the topics of robot, bounds and controller, and records them."""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from trajectory_msgs.msg import JointTrajectory, MultiDOFJointTrajectory
+
+from sim_bridge.mcap_file import McapFile
+from sim_bridge.node.topics import EXTERNAL_WRENCH, OBSTACLES
+from sim_bridge.scenario.report import Array, RecordedRun
+from viability_bounds_pkg.ros.arm_node import ArmNode
+from viability_bounds_pkg.ros.messages import Arrival, JointStateReader
+from viability_bounds_pkg.ros.runtime import LATCHED_QOS, stamp_to_ns
+from viability_bounds_pkg.ros.topics import (
+    ACCELERATION_LIMITS,
+    DIAGNOSTICS,
+    FT_WRENCH,
+    JOINT_COMMANDS,
+    JOINT_STATES,
+    LIMIT_DISTANCES,
+    ROBOT_DESCRIPTION,
+)
+
+_RECORDING_QOS = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+_MANY = QoSProfile(depth=100)
+_FURTHER: tuple[tuple[str, type, QoSProfile], ...] = (
+    ("hand_pose", PoseStamped, _MANY),
+    (LIMIT_DISTANCES.name, LIMIT_DISTANCES.message, _MANY),
+    ("controller_mode", String, LATCHED_QOS),
+    (ROBOT_DESCRIPTION.name, ROBOT_DESCRIPTION.message, LATCHED_QOS),
+    ("target_pose", PoseStamped, _MANY),
+    ("target_posture", JointState, _MANY),
+    ("target_trajectory", MultiDOFJointTrajectory, _MANY),
+    ("target_wrench", WrenchStamped, _MANY),
+    (EXTERNAL_WRENCH.name, EXTERNAL_WRENCH.message, _MANY),
+    (OBSTACLES.name, OBSTACLES.message, _MANY),
+)
+"""What a file has besides, and the reports do not need."""
+
+
+def _stamp_of(serialized: bytes) -> int:
+    """Return the stamp, ns, of a serialized message that begins with a header."""
+    seconds, nanoseconds = struct.unpack_from("<iI", serialized, 4)
+    return int(seconds) * 1_000_000_000 + int(nanoseconds)
+
+
+class RunRecorder:
+    """Records the messages of robot, bounds and controller by their stamps, in any order.
+
+    Args:
+        node: subscribes.
+        joints: joints to record, in this order.
+        file: to which all messages go, too, as they came; None for none.
+
+    Attributes:
+        topics: names of those recorded.
+        stamp: of the last state, ns; -1 before the first.
+        q: positions in it, shape (n,), rad.
+        answered: stamp of the last command, ns; -1 before the first.
+        diagnostics: the last ones of each node in the namespace of `node`, values by key, by node
+            name.
+    """
+
+    def __init__(self, node: ArmNode, joints: Sequence[str], file: McapFile | None = None) -> None:
+        self._unfiled: list[tuple[str, bytes]] = []
+        self.stamp = self.answered = -1
+        self.q: Array = np.zeros(len(joints))
+        self.diagnostics: dict[str, dict[str, str]] = {
+            name: {} for name in ("bullet_node", "controller_node", "bounds_node")
+        }
+        namespace = node.get_namespace().strip("/")
+        self._senders = {
+            f"{namespace}/{name}" if namespace else name: name for name in self.diagnostics
+        }
+        self.topics: tuple[str, ...] = ()
+        self._joints = tuple(joints)
+        self._reader = JointStateReader(joints)
+        self._states: dict[int, tuple[Array, Array]] = {}
+        self._limits: dict[int, list[Sequence[float]]] = {}
+        self._torques: dict[int, Sequence[float]] = {}
+        self._wrenches: dict[int, Sequence[float]] = {}
+        for topic, take in (
+            (JOINT_STATES, self._on_state),
+            (ACCELERATION_LIMITS, self._on_limits),
+            (JOINT_COMMANDS, self._on_command),
+            (FT_WRENCH, self._on_wrench),
+        ):
+            self.topics += (topic.name,)
+            if file is None:
+                node.listen(topic, take, _RECORDING_QOS)
+            else:
+                self._keep(file, node, topic.message, topic.name, take, _RECORDING_QOS)
+                node.publisher_watch.add(node.resolve_topic_name(topic.name))
+        if file is None:
+            DIAGNOSTICS.subscription(node, self._on_diagnostics)
+            return
+        self._keep(file, node, DiagnosticArray, "/diagnostics", self._on_diagnostics, _MANY)
+        for name, kind, qos in _FURTHER:
+            self._keep(file, node, kind, name, None, qos)
+
+    def _keep(
+        self,
+        file: McapFile,
+        node: ArmNode,
+        kind: type,
+        name: str,
+        take: Callable[[Any], None] | None,
+        qos: QoSProfile,
+    ) -> None:
+        """Subscribe; what comes goes to the file and to `take`."""
+        path = node.resolve_topic_name(name)
+        file.add_topic(path, kind)
+
+        def keep(serialized: bytes) -> None:
+            if take is not None:
+                take(deserialize_message(serialized, kind))
+            stamp = _stamp_of(serialized)
+            if name not in self.topics:
+                # Without a stamp of robot time, or with one in the future.
+                self._unfiled.append((path, serialized))
+                stamp = self.stamp
+            else:
+                file.write(path, serialized, stamp)
+            if stamp >= 0:  # of the last state; before the first one there is none to file under
+                for each, content in self._unfiled:
+                    file.write(each, content, stamp)
+                self._unfiled.clear()
+
+        node.create_subscription(kind, name, keep, qos, raw=True)
+
+    def run(self, first: int) -> RecordedRun:
+        """Return the recording from the state with stamp `first` on."""
+        stamps = sorted(stamp for stamp in self._states if stamp >= first)
+        nan = [np.nan] * len(self._joints)
+        states = np.array([self._states[s] for s in stamps])
+        limits = np.array([self._limits.get(s, (nan, nan)) for s in stamps])
+        return RecordedRun(
+            joints=self._joints,
+            t=(np.array(stamps) - first) * 1e-9,
+            q=states[:, 0],
+            v=states[:, 1],
+            a_lower=limits[:, 0],
+            a_upper=limits[:, 1],
+            tau=np.array([self._torques.get(s) or nan for s in stamps]),
+            ft_wrench=np.array([self._wrenches.get(s, [np.nan] * 6) for s in stamps]),
+            answered=np.array([s in self._torques for s in stamps]),
+        )
+
+    def _on_state(self, message: JointState) -> None:
+        if self._reader.read(message, time.monotonic()) is Arrival.NEW:
+            self.stamp, self.q = self._reader.stamp, self._reader.q
+            self._states[self.stamp] = self.q, self._reader.v
+
+    def _on_limits(self, message: JointTrajectory) -> None:
+        limits = [point.accelerations for point in message.points]
+        self._limits[stamp_to_ns(message.header.stamp)] = limits
+
+    def _on_command(self, message: JointState) -> None:
+        self.answered = stamp_to_ns(message.header.stamp)
+        self._torques.setdefault(self.answered, message.effort)
+
+    def _on_wrench(self, message: WrenchStamped) -> None:
+        f, t = message.wrench.force, message.wrench.torque
+        self._wrenches[stamp_to_ns(message.header.stamp)] = f.x, f.y, f.z, t.x, t.y, t.z
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if sender := self._senders.get(status.name):
+                values = {value.key: value.value for value in status.values}
+                self.diagnostics[sender] = values

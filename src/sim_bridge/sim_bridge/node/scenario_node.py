@@ -1,0 +1,387 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The scenario node: plays a scenario over topics and services, and records the run."""
+
+from __future__ import annotations
+
+import math
+import signal
+import sys
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from rclpy.clock import Clock, ClockType
+from rclpy.executors import Executor, ExternalShutdownException
+from rclpy.task import Future
+
+from sim_bridge.mcap_file import McapFile
+from sim_bridge.node.run_recorder import RunRecorder
+from sim_bridge.node.scenario_messages import (
+    RESET,
+    ScheduledPublisher,
+    ServiceRequest,
+    change_parameters,
+    pause,
+    refusals,
+    to_controller,
+    to_robot,
+    to_service,
+)
+from sim_bridge.scenario.events import ServiceEvent
+from sim_bridge.scenario.report import RecordedRun, write_report
+from sim_bridge.scenario.scenario import ScenarioConfiguration
+from viability_bounds_pkg.cli.command_line import INTERRUPTED
+from viability_bounds_pkg.exceptions import ArmSafetyError
+from viability_bounds_pkg.ros.arm_node import ArmNode
+from viability_bounds_pkg.ros.parameters import NodeParameters
+from viability_bounds_pkg.ros.program import (
+    initialise,
+    leave,
+    node_parser,
+    report_refusal,
+)
+from viability_bounds_pkg.ros.runtime import make_executor
+
+_POLL_PERIOD = 0.02
+_SHOW_PERIOD = 0.5
+_WAIT_SHOWN_AFTER = 10.0
+_REFUSAL_COUNTS: dict[str, tuple[str, str | tuple[str, ...]]] = {
+    "controller_node": ("goals_refused", "target_"),
+    "bullet_node": ("commands_refused", ("external_wrench", "obstacles", "payload")),
+}
+"""By node, the diagnostics key that counts refusals by topic, and the topics of a scenario."""
+
+
+class Progress:
+    """Prints a line for each quarter of a scenario, and what it waits for if that lasts.
+
+    Args:
+        duration: of the scenario, s of robot time.
+    """
+
+    def __init__(self, duration: float) -> None:
+        self._duration, self._quarter = duration, 0
+        self._reason, self._waiting_since = "", time.monotonic()
+        print("waiting for the nodes", flush=True)
+
+    def wait(self, reason: str) -> None:
+        """Print why the scenario does not start, if that has lasted for a while."""
+        now = time.monotonic()
+        if reason != self._reason and now - self._waiting_since > _WAIT_SHOWN_AFTER:
+            self._reason, self._waiting_since = reason, now
+            print(reason, flush=True)
+
+    def show(self, played: float, state: str) -> None:
+        """Print the state of the run when a quarter is over.
+
+        Args:
+            played: robot time since the scenario began, s.
+            state: in one line.
+        """
+        if (quarter := int(4.0 * played / self._duration + 1e-6)) > self._quarter:
+            self._quarter = quarter
+            print(f"{played:6.2f} of {self._duration:g} s  {state}", flush=True)
+
+
+class ScenarioRefused(ArmSafetyError, RuntimeError):
+    """Another node refused a message or call of the scenario; the text says which and why."""
+
+
+class ScenarioNode(ArmNode):
+    """Resets a paused robot, plays a scenario on it, and records the run.
+
+    Goals, pushes, payloads and obstacles are sent before their time with the stamps at which they
+    take effect. In lockstep the robot is paused where a service must be called, until it has
+    answered; so a run in lockstep is the same each time.
+
+    Args:
+        file: to which all messages go as they come; None for none.
+
+    Attributes:
+        awaits: what it waits for.
+        ended: done when the scenario has ended.
+        failure: why it ended early; None if it did not.
+        listener: the recorded messages and diagnostics of the other nodes.
+    """
+
+    NAME = "scenario_node"
+    PARAMETERS = ScenarioConfiguration
+
+    def __init__(self, *, file: McapFile | None = None, **node_arguments: Any) -> None:
+        super().__init__(**node_arguments)
+        with self.starting():
+            config = NodeParameters(self, ScenarioConfiguration).configuration
+        self.config = config
+        self.awaits = ""
+        self.ended: Future[None] = Future()
+        self.failure: ScenarioRefused | None = None
+        self.listener = RunRecorder(self, config.joints, file)
+        self._first, self._period = 0, 1
+        self._refused: dict[str, list[str]] | None = None  # when the messages begin; else None
+        frames = config.base_frame, config.end_effectors[0]
+        self._goals = ScheduledPublisher(self, to_controller(config.plan, *frames))
+        self._world = ScheduledPublisher(self, to_robot(config.plan, config.base_frame))
+        self._due = deque(e for e in config.plan.events if isinstance(e, ServiceEvent))
+        own = RESET, pause(False), change_parameters("bullet_node", {})
+        self._service_clients = {
+            request.service: self.create_client(request.kind, request.service)
+            for request in (*own, *map(to_service, self._due))
+        }
+        self._course = self._play()
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(_POLL_PERIOD, self._proceed, clock=steady)
+
+    @property
+    def robot(self) -> dict[str, str]:
+        """The robot's last diagnostics, by key."""
+        return self.listener.diagnostics["bullet_node"]
+
+    def recorded_run(self) -> RecordedRun:
+        """Return the recording since the robot began to move."""
+        return self.listener.run(self._first)
+
+    # Course of the scenario
+
+    def _proceed(self) -> None:
+        try:
+            if self.failure is None:
+                self._check_publishers()
+            if self.failure is None and self._refused is not None:
+                self._check_refusals(self._refused)
+            self.awaits = next(self._course)
+        except StopIteration:
+            self.ended.set_result(None)
+        except ScenarioRefused as error:
+            self.failure, self._course = error, self._stop()
+
+    def _play(self) -> Iterator[str]:
+        """Play the scenario; yield what must happen before it proceeds."""
+        while missing := self._missing():
+            yield f"getting ready: there is no {', no '.join(missing)}"
+        before = self._first = self.listener.stamp
+        yield from self._call(RESET)
+        while not self.listener.answered == self.listener.stamp > before:
+            yield "resetting: there is no joint command for the start"
+        # Resuming begins a new period: the first state in motion is the next.
+        self._period = round(1e9 * float(self.robot["period_s"]))
+        self._first = self.listener.stamp + self._period
+        self._refused = {}
+        self._check_refusals(self._refused)  # those before the first message do not count
+        while not self._load():
+            yield "loading: there is no report that the messages of the scenario were received"
+        lockstep = self.robot["clock"] == "lockstep"
+        begin, end = 0, round(1e9 * self.config.plan.duration / self._period)
+        while begin < end:
+            yield from self._call_services(begin)
+            # In lockstep the robot pauses where a service is due.
+            halt = min(end, self._period_of(self._due[0])) if self._due and lockstep else end
+            left = 1e-9 * self._period * (halt - begin)
+            yield from self._call(change_parameters("bullet_node", {"pause_after": left}))
+            yield from self._call(pause(False))
+            while not self._is_paused_at(halt):
+                if not lockstep:
+                    now = (self.listener.stamp - self._first) // self._period
+                    yield from self._call_services(now)
+                yield "playing"
+            begin = halt
+
+    def _stop(self) -> Iterator[str]:
+        """Pause the robot if the scenario has begun, and end."""
+        if self._refused is not None:
+            yield from self._call(pause(True))
+
+    def _missing(self) -> list[str]:
+        """Return what is missing before the scenario can begin."""
+        clients = self._service_clients.items()
+        topics = self._goals.without_subscriber() + self._world.without_subscriber()
+        return (
+            ([] if self.robot.get("paused") == "True" else ["paused robot"])
+            + ([] if self.listener.answered >= 0 else ["joint commands"])
+            + [f"service {name}" for name, client in clients if not client.service_is_ready()]
+            + [f"subscriber of {topic}" for topic in topics]
+        )
+
+    def _call(self, request: ServiceRequest, when: str = "") -> Iterator[str]:
+        """Call a service and wait for its answer.
+
+        Raises:
+            ScenarioRefused: the call was refused; `when` is part of the text.
+        """
+        answer = self._service_clients[request.service].call_async(request.content)
+        while not answer.done():
+            yield f"calling: there is no answer of {request.service}"
+        if reasons := "; ".join(refusals(request, answer.result())):
+            raise ScenarioRefused(f"{when}{request.service} refused: {reasons}")
+
+    def _call_services(self, period: int) -> Iterator[str]:
+        """Call the services that are due when a period, counted from the first, begins."""
+        while self._due and self._period_of(self._due[0]) <= period:
+            event = self._due.popleft()
+            yield from self._call(to_service(event), f"at {event.time:g} s: ")
+
+    def _period_of(self, event: ServiceEvent) -> int:
+        """Return the first period that begins at or after the time of an event."""
+        return math.ceil(1e9 * event.time / self._period - 1e-6)
+
+    def _load(self) -> bool:
+        """Send scheduled messages; return whether all were received."""
+        goals = self.listener.diagnostics["controller_node"].get("goals_pending", 0)
+        loaded = self._goals.proceed(self._first, int(goals))
+        changes = int(self.robot["world_changes_pending"])
+        return self._world.proceed(self._first, changes) and loaded
+
+    def _is_paused_at(self, halt: int) -> bool:
+        """Return whether the robot reports that it has paused where period `halt` begins."""
+        last = self._first + (halt - 1) * self._period
+        return int(self.robot["stamp_ns"]) >= last and self.robot["paused"] == "True"
+
+    def _check_publishers(self) -> None:
+        """Refuse to record what several robots, bounds nodes or controllers publish."""
+        if trouble := self.publisher_watch.trouble:
+            raise ScenarioRefused(f"{trouble}; allowed: one")
+
+    def _check_refusals(self, known: dict[str, list[str]]) -> None:
+        for node, (key, topics) in _REFUSAL_COUNTS.items():
+            counts = self.listener.diagnostics[node].get(key, "").split("; ")
+            refused = [count for count in counts if count.startswith(topics)]
+            if refused != known.setdefault(node, refused):
+                raise ScenarioRefused(f"refused by {node}: {' '.join(refused)}")
+
+    # Output
+
+    def show(self, progress: Progress) -> None:
+        """Show the state of the run."""
+        if self._refused is None:
+            progress.wait(self.awaits)
+            return
+        distance = np.minimum(
+            self.listener.q - self.config.position_min, self.config.position_max - self.listener.q
+        )
+        nearest = int(np.argmin(distance))
+        controller = self.listener.diagnostics["controller_node"]
+        state = (
+            f"{controller.get('mode', '')}  "
+            f"nearest limit {self.config.joints[nearest]} {distance[nearest]:+.4f} rad"
+        )
+        error = float(controller.get("position_error_m", "nan"))
+        if np.isfinite(error):  # there is a goal
+            state += f"  pose error {1e3 * error:.2f} mm"
+        state += f"  {float(self.robot['rate_hz']):.0f} Hz"
+        # With the period that the last state begins.
+        played = 1e-9 * (self.listener.stamp - self._first + self._period)
+        progress.show(max(0.0, played), state)
+
+
+def play(
+    node: ScenarioNode,
+    others: Sequence[ArmNode] = (),
+    *,
+    signals: Sequence[int] = (),
+    quiet: bool = False,
+) -> None:
+    """Run the scenario to its end and print its state.
+
+    Args:
+        node: the scenario.
+        others: nodes to run in the same process.
+        signals: received so far; one more ends the run early.
+        quiet: print nothing.
+
+    Raises:
+        TimeoutError: the other nodes did not start, or stopped answering.
+        ScenarioRefused: another node refused a message or call of the scenario.
+        ExternalShutdownException: shut down, or a signal received, before the end.
+    """
+    executor = make_executor(node.context)
+    try:
+        for each in (node, *others):
+            executor.add_node(each)
+        _run(executor, node, signals, quiet)
+    finally:
+        # An error that is kept keeps this frame, and so the executor. One that is not shut down
+        # holds the nodes in C++: destroyed, they would stay in the graph and go on publishing.
+        executor.shutdown()
+    if node.failure is not None:
+        raise node.failure
+    if not node.ended.done():
+        raise ExternalShutdownException
+
+
+def _run(executor: Executor, node: ScenarioNode, signals: Sequence[int], quiet: bool) -> None:
+    """Run callbacks until the scenario has ended, one is to end it, or nothing moves any more."""
+    seen, moved_at, shown_at = None, time.monotonic(), -math.inf
+    progress = None if quiet else Progress(node.config.plan.duration)
+    while not (node.ended.done() or signals) and rclpy.ok(context=node.context):
+        # Many callbacks in a call: a tenth of the time of a period in lockstep would go into
+        # calls for one each.
+        executor.spin_until_future_complete(node.ended, timeout_sec=0.1)
+        now = time.monotonic()
+        if (node.listener.stamp, node.awaits) != seen:
+            seen, moved_at = (node.listener.stamp, node.awaits), now
+        elif now - moved_at > node.config.ready_timeout:
+            raise TimeoutError(
+                f"nothing has moved for {node.config.ready_timeout:g} s ({node.awaits})"
+            )
+        if progress and (node.ended.done() or now - shown_at > _SHOW_PERIOD):
+            shown_at = now
+            node.show(progress)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Play a scenario; with ``--out DIRECTORY`` also write its report.
+
+    Returns:
+        0 when no limit was broken, 1 when one was, 2 when the scenario could not be played.
+    """
+    node, file = None, None
+    try:
+        try:
+            parser = node_parser(ScenarioNode)
+            parser.add_argument("--out", type=Path, metavar="DIRECTORY", help="of the report")
+            parser.add_argument(
+                "--record", type=Path, metavar="FILE", help="all messages, as MCAP"
+            )
+            options = initialise(parser, args)
+            # An exception in a callback is more than the executor reports in one line.
+            signals: list[int] = []
+            for each in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(each, lambda number, _: signals.append(number))
+            if options.record is not None:
+                options.record.parent.mkdir(parents=True, exist_ok=True)
+                file = McapFile(options.record)
+            node = ScenarioNode(file=file)
+        except Exception as error:
+            report_refusal(error)
+            return 2
+        play(node, signals=signals)
+        for each in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(each, signal.default_int_handler)
+        if options.out is None:
+            return 0
+        told = node.listener.diagnostics
+        kept = write_report(
+            options.out,
+            node.config,
+            node.recorded_run(),
+            node.robot,
+            told["bounds_node"],
+            told["controller_node"],
+        )
+        return 0 if kept else 1
+    except (TimeoutError, ScenarioRefused, OSError) as error:
+        report_refusal(error)
+        return 2
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return INTERRUPTED
+    finally:
+        leave(*filter(None, [node]))
+        if file is not None:
+            file.close()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

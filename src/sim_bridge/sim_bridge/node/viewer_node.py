@@ -1,0 +1,376 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The viewer node: shows the arm on a page in the browser, and sends goals and pushes from it."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from numpy.typing import NDArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool
+from trajectory_msgs.msg import JointTrajectory
+
+from sim_bridge.node.topics import EXTERNAL_WRENCH
+from sim_bridge.viewer.joint_pictures import JointValues
+from sim_bridge.viewer.page import DrivingAsked, GoalAsked, Page, Picture, PushAsked, Request
+from sim_bridge.viewer.shapes import visual_shapes
+from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError
+from viability_bounds_pkg.joint_limits import JointLimits
+from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, limits_of
+from viability_bounds_pkg.parameter import Range, redeclared, text, whole_number
+from viability_bounds_pkg.robot.configuration import (
+    LimitedRobotConfiguration,
+    TaskFrames,
+    load_model,
+)
+from viability_bounds_pkg.robot.description import RobotDescriptionError
+from viability_bounds_pkg.ros.arm_node import ArmNode
+from viability_bounds_pkg.ros.messages import JointStateReader, pose_message
+from viability_bounds_pkg.ros.parameters import NodeParameters
+from viability_bounds_pkg.ros.program import (
+    initialise,
+    leave,
+    node_parser,
+    report_refusal,
+)
+from viability_bounds_pkg.ros.robot_urdf import robot_urdf
+from viability_bounds_pkg.ros.runtime import GOAL_QOS
+from viability_bounds_pkg.ros.topics import (
+    DIAGNOSTICS,
+    FT_WRENCH,
+    SLOW_ACCELERATION_LIMITS,
+    SLOW_JOINT_STATES,
+)
+
+Array = NDArray[np.float64]
+
+PERIOD = 0.05
+"""Time between two pictures, s."""
+_SILENT = 1.0
+"""Time without joint states after which the page says so, s."""
+_VIOLATIONS = {"position_violation_rad": "rad", "velocity_violation_rad_s": "rad/s"}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ViewerConfiguration(TaskFrames, LimitedRobotConfiguration):
+    """Parameters of the viewer.
+
+    Attributes:
+        limits: of the joints.
+    """
+
+    acceleration_min: Array = redeclared(BoundsConfiguration, "acceleration_min")
+    acceleration_max: Array = redeclared(BoundsConfiguration, "acceleration_max")
+    ft_frame: str = text("link that is a force/torque sensor; none if empty", default="")
+    viewer_host: str = text("address that the page is served on", default="127.0.0.1")
+    viewer_port: int = whole_number(
+        "port that the page is served on; the next free one if it is taken",
+        Range(1024, 65535),
+        default=8080,
+    )
+    limits: JointLimits = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Make the limits."""
+        super().__post_init__()
+        object.__setattr__(self, "limits", limits_of(self))
+
+
+class PageCommands:
+    """Publishes goals and pushes from the page; its publishers exist only while the user drives.
+
+    So another node may send goals before and after: the controller holds the arm where two do.
+
+    Args:
+        node: publishes.
+        base_frame: of goals.
+
+    Attributes:
+        robot_paused: whether there is a simulated robot that is paused.
+    """
+
+    def __init__(self, node: Node, base_frame: str) -> None:
+        self._node, self._base_frame = node, base_frame
+        self._poses: Publisher | None = None
+        self._wrenches: Publisher | None = None
+        self._pushed: set[str] = set()
+        self.robot_paused = self._resumed = False
+        self._pause = node.create_client(SetBool, "bullet_node/pause")
+
+    def start(self) -> None:
+        """Create the publishers; resume a simulated robot that is paused."""
+        if self._poses is None:
+            self._poses = self._node.create_publisher(PoseStamped, "target_pose", GOAL_QOS)
+            self._wrenches = EXTERNAL_WRENCH.publisher(self._node)
+        if self.robot_paused and not self._resumed and self._pause.service_is_ready():
+            self._resumed = True
+            self._pause.call_async(SetBool.Request(data=False))
+
+    def stop(self) -> None:
+        """End the pushes, destroy the publishers, and pause the robot if it was paused before."""
+        for link in list(self._pushed):
+            self._push(link, np.zeros(3))
+        for each in (self._poses, self._wrenches):
+            if each is not None:
+                self._node.destroy_publisher(each)
+        self._poses = self._wrenches = None
+        if self._resumed:
+            self._resumed = False
+            self._pause.call_async(SetBool.Request(data=True))
+
+    def send(self, request: Request) -> None:
+        """Do what was asked for; goals and pushes only while driving."""
+        if isinstance(request, DrivingAsked):
+            (self.start if request.drive else self.stop)()
+        elif isinstance(request, GoalAsked) and self._poses is not None:
+            self._poses.publish(pose_message(request.pose, self._base_frame))
+        elif isinstance(request, PushAsked):
+            self._push(request.link, request.force)
+
+    def _push(self, link: str, force: Array) -> None:
+        if self._wrenches is None:
+            return
+        message = WrenchStamped()
+        message.header.frame_id = link
+        f = message.wrench.force
+        f.x, f.y, f.z = force.tolist()
+        self._wrenches.publish(message)
+        (self._pushed.add if force.any() else self._pushed.discard)(link)
+
+
+class ViewerNode(ArmNode):
+    """Shows state, limits, goal and forces of the arm in a browser, and sends what the user asks.
+
+    It subscribes to slow copies of the streams, and shows 20 times a second what has come last, so
+    that neither its cost nor that of the control grows with the rate of the robot. It publishes
+    nothing before its user switches "drive the arm" on.
+
+    Attributes:
+        page: what is shown.
+    """
+
+    NAME = "viewer_node"
+    PARAMETERS = ViewerConfiguration
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__(**node_arguments)
+        self._commands: PageCommands | None = None
+        with self.starting():
+            config = NodeParameters(self, ViewerConfiguration).configuration
+            self.page = _make_page(config, robot_urdf(config, self))
+        self._reader = JointStateReader(config.joints)
+        self._unknown = np.full(len(config.joints), math.nan)
+        self._limits = self._unknown, self._unknown
+        self._before: tuple[int, Array] | None = None  # stamp, ns, and speeds in the last picture
+        self._acceleration = self._unknown
+        self._goal: pin.SE3 | None = None
+        self._pushes: dict[str, Array] = {}
+        self._measured_force: Array | None = None
+        self._status: dict[str, tuple[str, dict[str, str]]] = {}
+        self._commands = PageCommands(self, config.base_frame)
+        SLOW_JOINT_STATES.subscription(self, self._on_state)
+        SLOW_ACCELERATION_LIMITS.subscription(self, self._on_limits)
+        if config.ft_frame:
+            FT_WRENCH.subscription(self, self._on_wrench)
+        DIAGNOSTICS.subscription(self, self._on_diagnostics)
+        EXTERNAL_WRENCH.subscription(self, self._on_push)
+        self.create_subscription(PoseStamped, "target_pose", self._on_goal, GOAL_QOS)
+        self.get_logger().info(f"page at {self.page.address}")
+
+    def destroy_node(self) -> None:
+        """End the user's pushes and close the page, too."""
+        if self._commands is not None:
+            self._commands.stop()
+            self.page.close()
+        super().destroy_node()
+
+    def update_page(self) -> None:
+        """Send what the user asked for, and show what is known."""
+        for request in self.page.requests():
+            if self._commands is not None:
+                self._commands.send(request)
+        if self._reader.accepted == 0:
+            self.page.show_text(self._status_text())
+            return
+        tau = self._reader.effort()
+        joints = JointValues(
+            self._reader.q,
+            self._reader.v,
+            self._unknown if tau is None else tau,
+            self._mean_acceleration(),
+            *self._limits,
+        )
+        self.page.show(
+            Picture(joints, self._goal, self._pushes, self._measured_force, self._status_text())
+        )
+
+    def _mean_acceleration(self) -> Array:
+        """Return the change of the speeds since the last picture by robot time, rad/s^2."""
+        stamp, v = self._reader.stamp, self._reader.v
+        if self._before is not None and stamp > self._before[0]:
+            self._acceleration = (v - self._before[1]) / (1e-9 * (stamp - self._before[0]))
+        if self._before is None or stamp != self._before[0]:
+            self._before = stamp, v
+        return self._acceleration
+
+    def _status_text(self) -> str:
+        lines = []
+        if time.monotonic() - self._reader.heard_at > _SILENT:
+            if self._commands is not None and self._commands.robot_paused:
+                return "the simulated robot is paused"
+            lines.append("**`bounds_node` sends no joint states**")
+        message, controller = self._status.get("controller_node", ("not heard", {}))
+        lines.append(f"**controller**: {message}")
+        if (short := controller.get("short_of_goal", "none")) != "none":
+            lines.append(short)
+        _, robot = self._status.get("bullet_node", ("", {}))
+        beyond = [
+            f"{max(map(float, robot[key].split())):.2g} {unit}"
+            for key, unit in _VIOLATIONS.items()
+            if robot.get(key)
+        ]
+        if beyond:
+            lines.append("beyond a limit so far: " + ", ".join(beyond))
+        return "  \n".join(lines)
+
+    def _on_state(self, message: JointState) -> None:
+        self._reader.read(message, time.monotonic())
+
+    def _on_limits(self, message: JointTrajectory) -> None:
+        limits = [np.array(point.accelerations) for point in message.points]
+        if len(limits) == 2 and all(each.shape == self._unknown.shape for each in limits):
+            self._limits = limits[0], limits[1]
+
+    def _on_wrench(self, message: WrenchStamped) -> None:
+        self._measured_force = _force(message)
+
+    def _on_push(self, message: WrenchStamped) -> None:
+        force = _force(message)
+        if np.isfinite(force).all() and force.any():
+            self._pushes[message.header.frame_id] = force
+        else:
+            self._pushes.pop(message.header.frame_id, None)
+
+    def _on_goal(self, message: PoseStamped) -> None:
+        self._goal = _pose(message)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            name = status.name.rpartition("/")[2]
+            values = {value.key: value.value for value in status.values}
+            self._status[name] = status.message, values
+            if name == "bullet_node" and self._commands is not None:
+                self._commands.robot_paused = values.get("paused") == "True"
+
+
+def _force(message: WrenchStamped) -> Array:
+    f = message.wrench.force
+    return np.array([f.x, f.y, f.z])
+
+
+def _pose(message: PoseStamped) -> pin.SE3 | None:
+    """Return the pose in a message, None if it is invalid."""
+    p, o = message.pose.position, message.pose.orientation
+    numbers = np.array([p.x, p.y, p.z, o.x, o.y, o.z, o.w])
+    length = np.linalg.norm(numbers[3:])
+    if not np.isfinite(numbers).all() or length < 1e-6:
+        return None
+    numbers[3:] /= length
+    return pin.XYZQUATToSE3(numbers)
+
+
+def _make_page(config: ViewerConfiguration, urdf: str) -> Page:
+    model = load_model(config, urdf)
+    frames = config.base_frame, config.end_effectors[0], config.ft_frame
+    for name, frame in zip(("base_frame", "end_effector_frame", "ft_frame"), frames, strict=True):
+        if frame and not model.existFrame(frame):
+            raise SettingError(name, frame, "a frame of the URDF")
+    try:
+        shapes = visual_shapes(urdf, model, config.locked)
+    except RobotDescriptionError as error:
+        raise SettingError("robot_description", config.robot_description, str(error)) from error
+    logging.getLogger("websockets").setLevel(logging.ERROR)  # each browser that leaves
+    try:
+        # The server would wait for ever for an address that it cannot have.
+        socket.create_server((config.viewer_host, 0)).close()
+    except OSError as error:
+        allowed = f"an address of this machine ({error.strerror})"
+        raise SettingError("viewer_host", config.viewer_host, allowed) from error
+    return Page(
+        (config.viewer_host, config.viewer_port),
+        model,
+        shapes,
+        config.limits,
+        config.torque_max,
+        frames,
+    )
+
+
+def run(node: ViewerNode, ended: Callable[[], bool]) -> None:
+    """Read messages and show pictures until `ended`.
+
+    Between two pictures nothing is read, so that of each stream only the newest message counts.
+    """
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    while not ended() and rclpy.ok(context=node.context):
+        start = time.monotonic()
+        # Each call takes one message; goals and diagnostics of all nodes may wait.
+        for _ in range(len(list(node.subscriptions)) + 10):
+            executor.spin_once(timeout_sec=0.0)
+        node.update_page()
+        time.sleep(max(0.0, start + PERIOD - time.monotonic()))
+    executor.remove_node(node)
+
+
+def _lower_priority() -> None:
+    """Give all threads idle priority, so that the control has precedence.
+
+    A low priority is not enough: a picture that has begun would keep its processor for
+    milliseconds. Not before the page is there: on a busy machine it would never be.
+    """
+    for thread in map(int, os.listdir("/proc/self/task")):
+        with suppress(ProcessLookupError):  # one that has just ended
+            os.sched_setscheduler(thread, os.SCHED_IDLE, os.sched_param(0))
+
+
+def main(args: list[str] | None = None) -> int:
+    """Serve the page until SIGINT or SIGTERM comes; return the exit code."""
+    node = None
+    try:
+        initialise(node_parser(ViewerNode), args)
+        signals: list[int] = []
+        for each in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(each, lambda number, _: signals.append(number))
+        node = ViewerNode()
+        print(f"the arm is at {node.page.address}", flush=True)
+        _lower_priority()
+        run(node, lambda: bool(signals))
+    except ArmSafetyError as error:
+        report_refusal(error)
+        return 1
+    finally:
+        leave(*filter(None, [node]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
