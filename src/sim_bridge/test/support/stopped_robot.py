@@ -5,6 +5,7 @@ import numpy as np
 
 from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.node.bullet_parameters import BulletConfiguration, make_robot, make_stop
+from viability_bounds_pkg.bounds.torque_margin import tightened
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.testing.ros_harness import read_config
