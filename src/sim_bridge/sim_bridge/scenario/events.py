@@ -12,7 +12,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from sim_bridge.bullet.obstacles import Obstacle, ObstacleError
-from sim_bridge.scenario.events import (
+from sim_bridge.scenario.fields import (
     Check,
     ScenarioError,
     name,
