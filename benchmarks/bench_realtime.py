@@ -37,7 +37,6 @@ from live_robot import (
     goals,
     load,
     running,
-    scheduling_words,
 )
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -54,7 +53,6 @@ from torque_safety_controller.parts.whole_arm.safety_filter import SafetyFilter
 from torque_safety_controller.qp import InverseDynamicsQP
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.cli.command_line import Parser
-from viability_bounds_pkg.cli.scheduling import add_scheduling
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.node.estimator_node import EstimatorNode
 from viability_bounds_pkg.recent_values import RecentValues
@@ -91,7 +89,7 @@ def memory(programs: Programs) -> float:
 
 
 def measure(
-    robot: str, rate: float, way: str, seconds: float, imperfect: bool, scheduling: list[str]
+    robot: str, rate: float, way: str, seconds: float, imperfect: bool
 ) -> tuple[str, float]:
     """Run a robot by the wall clock for some seconds; return what came of it.
 
@@ -100,7 +98,7 @@ def measure(
     """
     arguments = configuration(robot, rate, imperfect=imperfect)
     run = ONE_PROCESS if way in (RECORDED, VIEWED) else way
-    with running(run, arguments, imperfect, scheduling) as programs, ExitStack() as recording:
+    with running(run, arguments, imperfect) as programs, ExitStack() as recording:
         user = User(goals(robot), "target_pose")
         try:
             if way == RECORDED:
@@ -323,9 +321,7 @@ def main() -> None:
     parser.add_argument("--case", action="append", choices=robots, help="repeatable; default: all")
     parser.add_argument("--imperfect", action="store_true", help="robots with all remedies")
     parser.add_argument("--only", choices=("ways", "stages"), help="a part of it (default: both)")
-    add_scheduling(parser)
     options = parser.parse_args()
-    scheduling = scheduling_words(options)
     for robot, rate in CASES:
         if options.case and f"{robot}@{rate:g}" not in options.case:
             continue
@@ -334,9 +330,7 @@ def main() -> None:
             print(HEAD)
             print(bare_loop(rate, options.seconds))
             for way in WAYS:
-                line, cpu = measure(
-                    robot, rate, way, options.seconds, options.imperfect, scheduling
-                )
+                line, cpu = measure(robot, rate, way, options.seconds, options.imperfect)
                 print(line, flush=True)
                 if way == ONE_PROCESS:
                     print(bare_loop(rate, options.seconds, min(cpu, 0.95)), flush=True)

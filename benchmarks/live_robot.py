@@ -3,11 +3,10 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import cycle
 from pathlib import Path
@@ -103,27 +102,14 @@ class User:
         return self.ros.diagnostics[node]
 
 
-def scheduling_words(options: argparse.Namespace) -> list[str]:
-    """Return the options of `add_scheduling` as words for the programs."""
-    words = ["--lock-memory"] * options.lock_memory
-    if options.priority is not None:
-        words += ["--priority", str(options.priority)]
-    if options.cpus:
-        words += ["--cpus", ",".join(map(str, options.cpus))]
-    return words
-
-
 @contextmanager
-def running(
-    way: str, arguments: list[str], imperfect: bool, scheduling: Sequence[str] = ()
-) -> Iterator[Programs]:
+def running(way: str, arguments: list[str], imperfect: bool) -> Iterator[Programs]:
     """Run the programs of a way; yield them by name.
 
     Args:
         way: one of `WAYS`, or `RELAYS`: the robot, and relays in place of bounds and controller.
         arguments: for ROS.
         imperfect: whether there is an estimator.
-        scheduling: options of the programs themselves.
     """
     commands: dict[str, list[Any]] = {RELAYS: [sys.executable, RELAY_PROGRAM]}
     if way != RELAYS:
@@ -136,7 +122,7 @@ def running(
         }
     started = {
         name: subprocess.Popen(
-            [*command, *scheduling, "--ros-args"]
+            [*command, "--ros-args"]
             + [*arguments, "--log-level", "error", "-p", "start_paused:=true"],
             preexec_fn=as_child,
         )

@@ -33,11 +33,9 @@ from live_robot import (
     configuration,
     load,
     running,
-    scheduling_words,
 )
 from sensor_msgs.msg import JointState
 
-from viability_bounds_pkg.cli.scheduling import add_scheduling
 from viability_bounds_pkg.testing.executables import as_child
 from viability_bounds_pkg.testing.ros_harness import joint_state, private_domain, read_config
 
@@ -135,7 +133,7 @@ def measure(robot: str, way: str, kind: str, seconds: float, options: Any) -> di
         arguments += ["-p", f"controller_node:{name}:={value}"]
     with private_domain() as domain:
         os.environ["ROS_DOMAIN_ID"] = str(domain)
-        with running(way, arguments, options.imperfect, scheduling_words(options)) as programs:
+        with running(way, arguments, options.imperfect) as programs:
             user = User(corners(robot, rng), "target_posture")
             try:
                 user.start(programs)
@@ -200,7 +198,6 @@ def main() -> int:
     parser.add_argument("--load", action="append", choices=kinds, help="repeatable")
     parser.add_argument("--imperfect", action="store_true", help="with config/imperfect")
     parser.add_argument("--seed", type=int, default=0, help="of goals and pauses")
-    add_scheduling(parser)
     parser.add_argument("--out", type=Path, default=ROOT / "results" / "overload")
     options = parser.parse_args()
     conditions = f"{options.seconds:g} s each; before: {load()}"

@@ -6,7 +6,7 @@ set -eu
 usage() {
     cat <<'USAGE'
 usage: bash scripts/overload.sh [--seconds N] [--robot NAME] [--way WAY] [--load LOAD]
-                                [--imperfect] [--priority N] [--seed N] [--out DIRECTORY]
+                                [--imperfect] [--seed N] [--out DIRECTORY]
 
   --seconds    of each run (default: 60, about 45 min in all)
   --robot      panda, talos_left_arm, baxter_left_arm; repeatable (default: all)
@@ -15,7 +15,6 @@ usage: bash scripts/overload.sh [--seconds N] [--robot NAME] [--way WAY] [--load
   --load       idle; busy: a process on each processor that computes without end; "pause NAME":
                a program, or all, paused for 5 to 500 ms at random; repeatable (default: all)
   --imperfect  with config/imperfect/<robot>.yaml
-  --priority   real-time priority of the programs, see docs/performance.md (default: none)
   --seed       of goals and pauses (default: 0)
   --out        where report.md and metrics.json go (default: results/overload)
 

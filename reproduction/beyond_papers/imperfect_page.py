@@ -109,9 +109,8 @@ last column has the largest distance left at the limits.
 
 {costs}
 
-`uncertainty_cost` prints for each joint what a set of declarations costs in range, speed and time
-([ros2_tools.md](ros2_tools.md)). `bash scripts/bench.sh chain --imperfect` measures the time from
-a state to its command, without and with the remedies.
+`bash scripts/bench.sh chain --imperfect` measures the time from a state to its command, without
+and with the remedies.
 """
 
 

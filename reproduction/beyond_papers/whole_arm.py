@@ -28,13 +28,13 @@ from direct import DirectLoop, column
 from figure import Figure, table, verdict
 from pieces import in_pieces
 
-from torque_safety_controller.parts.safety_filter import WholeArm
 from torque_safety_controller.parts.whole_arm.braking_plan import (
+    RESERVE,
     PlanLimits,
     PlanTorques,
     braking_periods,
 )
-from torque_safety_controller.parts.whole_arm.safety_filter import RESERVE
+from torque_safety_controller.parts.whole_arm.safety_filter import SafetyFilter
 
 POSTURE = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
 """Gains on the way to postures."""
@@ -185,7 +185,7 @@ def play(name: str, seed: int, limit: float, duration: float = 60.0) -> dict[str
             loop.change(**own)
             goal = random_goal(loop, rng, 0.5 if goals == "posture" else 0.0)
             times[goals].append(arrive(loop, goals, goal, limit))
-    monitor, keeper = loop.robot.monitor, loop.controller.find(WholeArm).filter
+    monitor, keeper = loop.robot.monitor, loop.controller.find(SafetyFilter)
     return {
         "position": float(monitor.max_position_violation.max()),
         "speed": float(monitor.max_velocity_violation.max()),

@@ -40,7 +40,6 @@ setup(
             "estimator_node = viability_bounds_pkg.cli.ros_program:estimator_node",
             "estimate_acceleration_limits = "
             "viability_bounds_pkg.cli.ros_program:estimate_acceleration_limits",
-            "uncertainty_cost = viability_bounds_pkg.cli.ros_program:uncertainty_cost",
         ],
     },
 )

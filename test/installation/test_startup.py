@@ -149,17 +149,3 @@ def test_nodes_end_when_told_to(ros, node, options, sent):
         process.kill()
     assert process.returncode == 0, errors
     assert not {word for word in ("Traceback", "Exception", "Error") if word in errors}, errors
-
-
-def test_what_the_system_refuses_to_schedule_is_said_and_the_node_runs(tmp_path):
-    cpu = 1000  # of no machine that runs tests
-    words = command(BOUNDS, "--params-file", parameter_file(tmp_path))
-    words[1:1] = ["--cpus", str(cpu)]
-    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True, preexec_fn=as_child) as node:
-        try:
-            line = next(line for line in node.stderr if "scheduling" in line)
-            assert node.poll() is None
-        finally:
-            node.kill()
-    assert f"processors {cpu} refused: " in line
-    assert "docs/performance.md" in line

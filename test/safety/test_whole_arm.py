@@ -7,7 +7,7 @@ import pytest
 from direct import DirectLoop, column
 from whole_arm import CLEAR, KEPT_FREE, arrive, random_goal
 
-from torque_safety_controller.parts.safety_filter import WholeArm
+from torque_safety_controller.parts.whole_arm.safety_filter import SafetyFilter
 
 STIFF = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
 """A posture task that drives each joint to its limits, whatever the hand does."""
@@ -73,7 +73,7 @@ def test_baxters_shoulder_keeps_its_limits_only_with_the_filter():
     assert without[1] > 0.1
     loop = race("baxter_left_arm", 30.0, 4, safety_filter=True)
     assert_kept(loop)
-    outcomes = loop.controller.find(WholeArm).filter.outcomes
+    outcomes = loop.controller.find(SafetyFilter).outcomes
     assert outcomes["outside"] == 0
     assert outcomes["as wanted"] > 0.9 * outcomes.total()
 
@@ -99,7 +99,7 @@ def test_a_posture_that_cannot_be_held_is_approached_as_far_as_one_that_can(gain
     assert 0.9 < load_at(loop, q[-1])[SHOULDER] <= 0.98
     assert np.abs(q[-1] - STRETCHED).max() < 0.8 * np.abs(start - STRETCHED).max()
     assert beyond(loop)[:2] == (0.0, 0.0)
-    assert loop.controller.find(WholeArm).filter.outcomes["outside"] == 0
+    assert loop.controller.find(SafetyFilter).outcomes["outside"] == 0
 
 
 def test_an_arm_that_starts_where_it_cannot_be_held_comes_down_slowly():
@@ -107,7 +107,7 @@ def test_an_arm_that_starts_where_it_cannot_be_held_comes_down_slowly():
     loop.robot.reset(STRETCHED, np.zeros(7))
     loop.begin()
     samples = loop.run(8.0)
-    assert loop.controller.find(WholeArm).filter.slack >= -1e-3
+    assert loop.controller.find(SafetyFilter).slack >= -1e-3
     assert np.abs(column(samples, "v")[-1]).max() < 0.1
     assert load_at(loop, samples[-1].q)[SHOULDER] < 0.98
     assert beyond(loop)[:2] == (0.0, 0.0)

@@ -9,7 +9,7 @@ from direct import DirectLoop, column
 from test_collision_avoidance import MARGIN, around_the_wall, play
 from test_whole_arm import STIFF, assert_kept, beyond
 
-from torque_safety_controller.parts.safety_filter import WholeArm
+from torque_safety_controller.parts.whole_arm.safety_filter import SafetyFilter
 
 pytestmark = pytest.mark.long
 
@@ -61,7 +61,7 @@ def test_a_constant_push_is_in_the_plans(robot, share, force):
     hand = loop.controller.robot.frame
     loop.robot.apply_wrench(hand, force, np.zeros(3))
     loop.run(1.0)
-    model, keeper = loop.controller.robot, loop.controller.find(WholeArm).filter
+    model, keeper = loop.controller.robot, loop.controller.find(SafetyFilter)
     gravity = pin.computeGeneralizedGravity(loop.model, loop.model.createData(), model.q)
     push = model.J[:3].T @ (model.pose.rotation.T @ force)
     assert np.abs(push).max() > 1.0
@@ -76,7 +76,7 @@ def test_an_arm_that_is_stretched_out_withstands_what_is_reserved_for(reserve):
     own = {"start_positions": [0.0, -1.2, 0.0, 2.0, 0.0, 0.0, 0.0]}
     own |= {} if reserve is None else {"torque_reserve": reserve}
     loop = DirectLoop("baxter_left_arm", STIFF | STRONG | own)
-    keeper, hand = loop.controller.find(WholeArm).filter, loop.controller.robot.frame
+    keeper, hand = loop.controller.find(SafetyFilter), loop.controller.robot.frame
     loop.controller.goals.set_posture(np.zeros(7))
     loop.run(4.0)
     np.testing.assert_allclose(abs(keeper.rest_torque[1]), keeper.usable[1], rtol=0.02)
@@ -123,7 +123,7 @@ def test_a_table_is_pressed_on_as_without_the_filter():
     pressing = run.force[round(2.0 / run.loop.dt) :, 2]
     np.testing.assert_allclose(pressing, FORCE, atol=1.5)
     assert_kept(run.loop)
-    outcomes = run.loop.controller.find(WholeArm).filter.outcomes
+    outcomes = run.loop.controller.find(SafetyFilter).outcomes
     assert outcomes["as wanted"] == outcomes.total()
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pinocchio as pin
 from numba import njit
 from numpy.typing import NDArray
 
@@ -183,15 +184,15 @@ def _narrowed(disturbance: Array, lower: Array, upper: Array) -> tuple[Array, Ar
     return low, high
 
 
-def joints_beyond(robot: RobotModel, torque: Array, most: Array) -> str:
+def joints_beyond(model: pin.Model, torque: Array, most: Array) -> str:
     """Return which joints need more torque than they have, in words; empty for none.
 
     Args:
-        robot: has the names of the n joints.
+        model: has the names of the n joints.
         torque: needed, shape (n,), N m.
         most: there is, shape (n,), N m.
     """
-    names = list(robot.model.names)[1:]
+    names = list(model.names)[1:]
     return ", ".join(
         f"{name} needs {needed:.1f} of {limit:.1f} N m"
         for name, needed, limit in zip(names, np.abs(torque), most, strict=True)

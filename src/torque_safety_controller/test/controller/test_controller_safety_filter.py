@@ -9,9 +9,9 @@ import pytest
 from arms import load_arm
 from controllers import posture_only
 
-from torque_safety_controller.parts.safety_filter import WholeArm
 from torque_safety_controller.parts.whole_arm.safety_filter import KEPT, SafetyFilter
 from torque_safety_controller.qp import AccelerationRange, LinearConstraints
+from torque_safety_controller.step import Part
 from torque_safety_controller.supervisor import REST
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import read_config
@@ -28,11 +28,11 @@ FOLDED = np.array([0.0, -0.8, 0.0, 2.2, 0.0, 0.5, 0.0])
 GAINS = posture_only(100.0, 20.0)
 
 
-def make(filtered=True, gains=GAINS, **arguments):
+def make(filtered=True, gains=GAINS, *more, **arguments):
     keeper = SafetyFilter(ARM.model, ARM.q_min, ARM.q_max, -A_MAX, A_MAX, ARM.tau_max, ARM.dt)
     robot = ARM.robot()
-    parts = [WholeArm(keeper, robot, ARM.tau_max)] if filtered else []
-    return controllers.make(ARM, *parts, robot=robot, gains=gains, **arguments)
+    parts = [keeper] if filtered else []
+    return controllers.make(ARM, *parts, *more, robot=robot, gains=gains, **arguments)
 
 
 def towards_stretched(controller, q=EDGE, v=ZERO, bounds=A_MAX):
@@ -93,7 +93,7 @@ def test_the_plan_is_allowed_where_the_bounds_ask_for_what_cannot_be_done():
     up = np.full(ARM.n, 8.0)
     output = controller.step(State(EDGE, ZERO), AccelerationRange(up, up))
     assert output.relaxation is None
-    assert (output.a >= controller.find(WholeArm).filter.plan - 1e-6).all()
+    assert (output.a >= controller.find(SafetyFilter).plan - 1e-6).all()
 
 
 def test_without_a_plan_the_arm_brakes():
@@ -112,14 +112,19 @@ def test_without_a_plan_the_arm_brakes():
     assert moved[1] < -5.0
 
 
-def test_rows_of_the_filter_are_not_told_as_distances():
-    class Impossible:
-        def constraint(self, robot, bounds, disturbance=None):
-            return LinearConstraints(np.eye(robot.n)[:1], np.full(1, 1e3), np.full(1, 1e3))
+def test_rows_of_the_filter_are_not_told_as_those_of_others():
+    class Impossible(Part):
+        def prepare(self, step):
+            far = np.full(1, 1e3)
+            step.rows[self] = LinearConstraints(np.eye(step.robot.n)[:1], far, far)
 
-    output = towards_stretched(make(constraints=[Impossible()]))
-    assert output.constraint_relaxation.shape == (1,)
-    assert output.constraint_relaxation[0] > 100.0
+        def learn(self, step):
+            self.relaxed = step.relaxation_of(self)
+
+    other = Impossible()
+    towards_stretched(make(True, GAINS, other))
+    assert other.relaxed.shape == (1,)
+    assert other.relaxed[0] > 100.0
 
 
 def test_without_a_qp_the_arm_brakes_as_the_filter_allows():
@@ -127,10 +132,10 @@ def test_without_a_qp_the_arm_brakes_as_the_filter_allows():
     v = np.array([0.1, 0.4, 0.0, 0.0, 0.0, 0.0, 0.0])
     controller.reset(FOLDED)
     output = controller.step(State(FOLDED, v), None, REST)
-    assert controller.find(WholeArm).filter.outcomes == {"as wanted": 1}
+    assert controller.find(SafetyFilter).outcomes == {"as wanted": 1}
     np.testing.assert_allclose(output.a, -GAINS.hold_kd * v)
     output = controller.step(State(EDGE, v), None, REST)
-    assert controller.find(WholeArm).filter.outcomes.total() == 2
+    assert controller.find(SafetyFilter).outcomes.total() == 2
     assert (np.abs(output.tau) <= ARM.tau_max).all()
 
 
@@ -146,7 +151,7 @@ def test_a_disturbance_that_is_known_counts():
             v[SHOULDER] += ARM.dt * fall
             controller.goals.posture = ARM.q_start
             controller.step(State(ARM.q_start, v), AccelerationRange(-A_MAX, A_MAX))
-        loads.append(controller.find(WholeArm).filter.rest_torque[SHOULDER])
+        loads.append(controller.find(SafetyFilter).rest_torque[SHOULDER])
     assert abs(loads[1] - loads[0]) > 0.5
 
 
@@ -160,8 +165,8 @@ def test_with_the_plan_the_qp_never_has_to_give_way(seed):
         if k % 60 == 0:
             controller.goals.set_posture(rng.uniform(ARM.q_min, ARM.q_max))
         output = controller.step(State(q, v), AccelerationRange(-A_MAX, A_MAX))
-        if controller.find(WholeArm).filter.slack >= KEPT:
+        if controller.find(SafetyFilter).slack >= KEPT:
             assert output.relaxation is None or output.relaxation.max() < 1e-3
         q, v = q + v * ARM.dt + 0.5 * output.a * ARM.dt**2, v + output.a * ARM.dt
         v = np.clip(v, -ARM.v_max, ARM.v_max)
-    assert controller.find(WholeArm).filter.outcomes["as wanted"] > 200
+    assert controller.find(SafetyFilter).outcomes["as wanted"] > 200

@@ -26,7 +26,6 @@ from torque_safety_controller.parts.friction import Friction
 from torque_safety_controller.parts.goals import Goals
 from torque_safety_controller.parts.integral import Integral, integral_arguments
 from torque_safety_controller.parts.joint_bounds import JointBounds
-from torque_safety_controller.parts.safety_filter import WholeArm
 from torque_safety_controller.parts.slow_down import SlowDown
 from torque_safety_controller.parts.whole_arm.safety_filter import SafetyFilter
 from torque_safety_controller.robot_model import RobotModel
@@ -118,7 +117,7 @@ def make_parts(
         make_disturbance(config),
         # All before can run while the limits are on their way; all after narrows their bounds.
         JointBounds(make_own_bounds(config, declared)),
-        make_whole_arm(config, robot),
+        make_safety_filter(config, robot.model),
         # A slowed arm is slowed inside of what the filter allows.
         SlowDown(config.position_min, config.position_max, config.dt),
         # It counts on no more braking than the bounds leave.
@@ -155,18 +154,18 @@ def make_disturbance(config: ControllerConfiguration) -> Disturbance | None:
     return None if time is None else Disturbance(len(config.joints), time)
 
 
-def make_whole_arm(config: ControllerConfiguration, robot: RobotModel) -> WholeArm | None:
+def make_safety_filter(config: ControllerConfiguration, model: pin.Model) -> SafetyFilter | None:
     """Return what keeps a plan in hand; None where that is off.
 
     Args:
         config: checked parameters.
-        robot: model of the arm.
+        model: of the arm.
     """
     if not config.safety_filter:
         return None
     limits = config.collision
-    safety_filter = SafetyFilter(
-        robot.model,
+    return SafetyFilter(
+        model,
         config.position_min,
         config.position_max,
         limits.acceleration_min,
@@ -175,7 +174,6 @@ def make_whole_arm(config: ControllerConfiguration, robot: RobotModel) -> WholeA
         config.dt,
         config.torque_reserve,
     )
-    return WholeArm(safety_filter, robot, config.torque_max)
 
 
 def make_own_bounds(

@@ -15,7 +15,7 @@ from torque_safety_controller.parameters.collision_parameters import CollisionCo
 from torque_safety_controller.parameters.friction_parameters import FrictionConfiguration
 from torque_safety_controller.parameters.integral_parameters import IntegralConfiguration
 from torque_safety_controller.parameters.interaction_parameters import InteractionConfiguration
-from torque_safety_controller.parts.whole_arm.safety_filter import RESERVE
+from torque_safety_controller.parts.whole_arm.braking_plan import RESERVE
 from torque_safety_controller.qp import SOLVERS
 from torque_safety_controller.tasks.gains import Gains
 from viability_bounds_pkg.exceptions import SettingError

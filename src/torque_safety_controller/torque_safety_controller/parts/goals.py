@@ -189,7 +189,7 @@ class Goals(Part):
         if goals.q is None or goals.pose is not None or goals.v is not None:
             return ""
         torque = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), goals.q)
-        heavy = joints_beyond(robot, torque, step.tau_max)
+        heavy = joints_beyond(robot.model, torque, step.tau_max)
         return heavy and f"the goal cannot be held: {heavy}"
 
     def _made_tasks(self, stiffness: Array | None) -> list[Task]:

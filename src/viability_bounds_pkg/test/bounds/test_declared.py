@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What follows from declarations, what they cost, and which leave no bounds."""
-
-import re
+"""What follows from declarations, and which leave no bounds."""
 
 import numpy as np
 import pytest
@@ -10,8 +8,7 @@ from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.state_estimation.observer import design_observer
-from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
-from viability_bounds_pkg.tools.uncertainty_cost import main, reach_of
+from viability_bounds_pkg.testing.ros_harness import read_config
 
 PANDA = read_config("panda", "bounds_node")
 DECLARED = {
@@ -30,6 +27,19 @@ def configured(**changed):
     return read(BoundsConfiguration, PANDA | changed)
 
 
+def reach(config):
+    """Speeds that the bounds keep, rad/s, and how far before its limits a joint rests, rad."""
+    loop, declared = config.loop, config.declared
+    margins, solver = loop.margins(declared), loop.bounds(declared)
+    w = loop.torque_margins.acceleration + declared.acceleration_disturbance
+    # What the errors may make of rest, or of the speed kept, by the end of a step.
+    gained = margins.velocity_error + solver.steps * w
+    away = margins.position_error + 0.5 * solver.steps * (margins.velocity_error + gained)
+    rest = (gained**2)[:, None] / (2.0 * solver.braking)
+    rest += (away + loop.torque_margins.position)[:, None]
+    return solver.limits.v_max - gained, rest
+
+
 @pytest.mark.parametrize("more", [{}, ESTIMATED])
 def test_nothing_declared_keeps_nothing_back(more):
     config = configured(**more)
@@ -41,14 +51,13 @@ def test_nothing_declared_keeps_nothing_back(more):
 @pytest.mark.parametrize("name", DECLARED)
 @pytest.mark.parametrize("more", [{}, ESTIMATED, {**ESTIMATED, "velocity_estimation": False}])
 def test_each_declaration_takes_something(name, more):
-    config = configured(**DECLARED, **more)
-    whole = reach_of(config.loop, config.declared)
-    less = configured(**{**DECLARED, name: 0 if isinstance(DECLARED[name], int) else []}, **more)
-    left = reach_of(less.loop, less.declared)
+    less = {**DECLARED, name: 0 if isinstance(DECLARED[name], int) else []}
+    _, whole = reach(configured(**DECLARED, **more))
+    _, left = reach(configured(**less, **more))
     if name == "velocity_error" and more == ESTIMATED:
-        np.testing.assert_array_equal(left.rest, whole.rest)
+        np.testing.assert_array_equal(left, whole)
     else:
-        assert (left.rest < whole.rest).all()
+        assert (left < whole).all()
 
 
 def test_observed_velocities_have_the_errors_of_the_observer():
@@ -77,18 +86,14 @@ def test_bounds_that_look_far_ahead_give_way_to_what_commands_act_for(missed):
 
 
 @pytest.mark.parametrize("more", [{}, ESTIMATED])
-def test_joints_rest_and_keep_a_speed_where_the_tool_says(more):
+def test_joints_rest_and_keep_a_speed_where_the_margins_say(more):
     config = configured(**DECLARED, **more)
-    bounds, reach = make_bounds(config), reach_of(config.loop, config.declared)
+    bounds, (speed, rest) = make_bounds(config), reach(config)
     limits, still = config.limits, np.zeros(7)
-    np.testing.assert_allclose(
-        bounds(limits.q_max - reach.rest[:, 0], still).upper, 0.0, atol=1e-7
-    )
-    np.testing.assert_allclose(
-        bounds(limits.q_min + reach.rest[:, 1], still).lower, 0.0, atol=1e-7
-    )
+    np.testing.assert_allclose(bounds(limits.q_max - rest[:, 0], still).upper, 0.0, atol=1e-7)
+    np.testing.assert_allclose(bounds(limits.q_min + rest[:, 1], still).lower, 0.0, atol=1e-7)
     middle = 0.5 * (limits.q_min + limits.q_max)
-    np.testing.assert_allclose(bounds(middle, reach.speed).upper, 0.0, atol=1e-9)
+    np.testing.assert_allclose(bounds(middle, speed).upper, 0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -121,63 +126,3 @@ def test_two_declarations_that_are_both_too_large():
         SettingError, match="less for 'panda_joint1' at 500 Hz, with velocity_error 3"
     ):
         make_bounds(configured(position_error=[3.0] * 7, velocity_error=[3.0] * 7))
-
-
-def overlay(tmp_path, text):
-    path = tmp_path / "more.yaml"
-    path.write_text("/**:\n  ros__parameters:\n" + "".join(f"    {line}\n" for line in text))
-    return ["--params-file", str(config_folder() / "panda.yaml"), "--params-file", str(path)]
-
-
-def test_the_tool_prints_what_each_joint_and_each_declaration_costs(tmp_path, capsys):
-    lines = [f"{name}: {value}" for name, value in DECLARED.items()]
-    assert main(overlay(tmp_path, lines)) == 0
-    shown, errors = capsys.readouterr()
-    assert errors == ""
-    for name in (*PANDA["joints"], *DECLARED):
-        assert re.search(rf"^{name} ", shown, re.MULTILINE), name
-    config = configured(**DECLARED)
-    reach = reach_of(config.loop, config.declared)
-    assert f"{reach.speed[6]:.3f}" in shown
-    assert f"look {1e3 * config.horizon:.3g} ms ahead, 4 ms without" in shown
-
-
-def test_the_tool_takes_files_without_parameters_of_the_bounds(tmp_path, capsys):
-    files = overlay(tmp_path, ["delay: 1"])
-    path = tmp_path / "robot.yaml"
-    path.write_text("/**/bullet_node:\n  ros__parameters:\n    clock: lockstep\n")
-    assert main([*files, "--params-file", str(path)]) == 0
-    assert "\ndelay " in capsys.readouterr().out
-
-
-def test_the_tool_without_declarations(capsys):
-    assert main(["--params-file", str(config_folder() / "panda.yaml")]) == 0
-    assert "nothing is declared" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("line", "said"),
-    [
-        (
-            "velocity_error: [1.2, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1]",
-            "'velocity_error' is 1.2; allowed",
-        ),
-        ("velocity_error: [0.1]", "'velocity_error' is [0.1]; allowed: 7 numbers"),
-        ("delay: 1.5", "'delay' is 1.5; allowed: a whole number"),
-        ("dealy: 1", "unknown parameter 'dealy'"),
-    ],
-)
-def test_the_tool_says_in_one_line_what_is_wrong(tmp_path, capsys, line, said):
-    assert main(overlay(tmp_path, [line])) == 1
-    shown, errors = capsys.readouterr()
-    assert shown == ""
-    assert errors.startswith("uncertainty_cost: ")
-    assert said in errors
-    assert errors.count("\n") == 1
-
-
-def test_the_tool_needs_a_file(capsys):
-    with pytest.raises(SystemExit) as end:
-        main([])
-    assert end.value.code == 2
-    assert "--params-file" in capsys.readouterr().err

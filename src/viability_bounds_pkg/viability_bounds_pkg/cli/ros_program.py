@@ -52,4 +52,3 @@ estimator_node = partial(run_program, "viability_bounds_pkg.node.estimator_node"
 estimate_acceleration_limits = partial(
     run_program, "viability_bounds_pkg.cli.estimate_acceleration_limits"
 )
-uncertainty_cost = partial(run_program, "viability_bounds_pkg.tools.uncertainty_cost")

@@ -19,7 +19,6 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from viability_bounds_pkg.cli.command_line import Parser
-from viability_bounds_pkg.cli.scheduling import add_scheduling, schedule
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.parameter import parameter_table
 from viability_bounds_pkg.parameter_files import read_sections
@@ -141,14 +140,13 @@ def run_together(
         raise KeyboardInterrupt
 
     try:
-        add_scheduling(parser)
-        options = initialise(parser, args)
+        initialise(parser, args)
         # What is raised while a callback of compiled code runs is lost.
         signal.signal(signal.SIGINT, interrupt)
         for node in make_nodes():
             nodes.append(node)
         connect(nodes)
-        executor = _prepare(nodes, options)
+        executor = _prepare(nodes)
         if not told:
             spin(executor, nodes[0])
     except (KeyboardInterrupt, ExternalShutdownException):
@@ -165,11 +163,11 @@ def run_together(
     return 0
 
 
-def _prepare(nodes: Sequence[ArmNode], options: argparse.Namespace) -> Executor:
-    """Return an executor with nodes; ask the system for what the options say."""
-    logger, executor = nodes[0].get_logger(), make_executor()
+def _prepare(nodes: Sequence[ArmNode]) -> Executor:
+    """Return an executor with nodes."""
+    executor = make_executor()
     if EventsExecutor is None:
-        logger.warning(
+        nodes[0].get_logger().warning(
             "rclpy has no EventsExecutor; the single-threaded one adds about 2 ms a cycle"
         )
     for node in nodes:
@@ -177,11 +175,6 @@ def _prepare(nodes: Sequence[ArmNode], options: argparse.Namespace) -> Executor:
     # What exists by now lives until the end: the collector need not visit it in the control loop.
     gc.collect()
     gc.freeze()
-    granted, refused = schedule(options)
-    if granted:
-        logger.info(f"scheduling: {'; '.join(granted)}")
-    if refused:
-        logger.warning(f"scheduling: {'; '.join(refused)}; see docs/performance.md")
     return executor
 
 

@@ -27,6 +27,10 @@ Array = NDArray[np.float64]
 UNIFORM = 20
 """Samples at equal distances in time, the first at the beginning."""
 
+RESERVE = 0.03
+"""Share of the torque limits that plans leave: for what lies between their samples, for steps of
+constant acceleration under held torque, and for small errors of the model."""
+
 _ROUNDING = 1e-9
 """Of numbers of periods."""
 

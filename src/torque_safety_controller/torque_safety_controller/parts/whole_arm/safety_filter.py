@@ -15,15 +15,16 @@ from __future__ import annotations
 
 from collections import Counter
 from math import inf, log, sqrt
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from torque_safety_controller.parts.whole_arm.braking_plan import (
     AT_REST,
     FIRST,
+    RESERVE,
     BrakingPlans,
     PlanLimits,
     PlanTorques,
@@ -31,14 +32,13 @@ from torque_safety_controller.parts.whole_arm.braking_plan import (
     narrow,
     torque_change,
 )
-from viability_bounds_pkg.joint_limits import JointLimitsError, joint_array
+from torque_safety_controller.qp import AccelerationRange, LinearConstraints
+from torque_safety_controller.robot_model import RobotModel
+from torque_safety_controller.step import Part, Step, joints_beyond
+from torque_safety_controller.tasks.rest_task import RestTask
 from viability_bounds_pkg.state import State
 
 Array = NDArray[np.float64]
-
-RESERVE = 0.03
-"""Share of the torque limits that plans leave: for what lies between their samples, for steps of
-constant acceleration under held torque, and for small errors of the model."""
 
 KEPT = 0.01
 """Further share that the constraints on a step leave, so that its trial seldom fails."""
@@ -93,21 +93,11 @@ DRIFT = 0.2
 """Share of the tolerance beyond which a plan in hand is repaired."""
 
 
-class Rows(NamedTuple):
-    """Linear constraints ``G a <= upper`` on the accelerations of a step, |G_i| = 1."""
-
-    G: Array
-    """Shape (k, n)."""
-    upper: Array
-    """Shape (k,), rad/s^2."""
-
-
-class SafetyFilter:
+class SafetyFilter(Part):
     """Keeps a braking plan of one arm in hand, and changes steps that would lose it.
 
-    Call `prepare` at the beginning of each control step, then `choose` with the accelerations that
-    are wanted: those that the arm is to have, disturbances included. Their torques must be within
-    the torque limits, as those of the plan are.
+    The torques of accelerations that are wanted must be within the torque limits, as those of the
+    plan are.
 
     Args:
         model: the arm, n joints with one coordinate each.
@@ -119,12 +109,12 @@ class SafetyFilter:
         tau_max: torque limits, shape (n,), N m.
         dt: control period, s.
         torque_reserve: torque that plans leave for what the model does not know, shape (n,), N m;
-            None for none.
+            less than what `RESERVE` leaves; None for none.
 
     Attributes:
         plan: acceleration with which the plan in hand goes on, shape (n,), rad/s^2.
-        lower: bounds of what may be wanted, shape (n,), rad/s^2: those given to `prepare`,
-            narrowed to that from which each joint by itself has a plan.
+        lower: bounds of what may be wanted, shape (n,), rad/s^2: those given, narrowed to that
+            from which each joint by itself has a plan.
         upper: shape (n,), rad/s^2.
         usable: torque that plans may use, shape (n,), N m.
         slack: least share that this plan leaves of it; negative where it needs more.
@@ -132,41 +122,29 @@ class SafetyFilter:
         rest_torque: what holds the arm where this plan ends, shape (n,), N m.
         outcomes: how many steps were "as wanted", "changed", "planned", the plan's own; and
             "outside", without a plan within the limits.
-
-    Raises:
-        JointLimitsError: not one value for each joint, or one that is not finite or of the wrong
-            sign.
     """
 
     def __init__(
         self,
         model: pin.Model,
-        position_min: ArrayLike,
-        position_max: ArrayLike,
-        acceleration_min: ArrayLike,
-        acceleration_max: ArrayLike,
-        tau_max: ArrayLike,
+        position_min: Array,
+        position_max: Array,
+        acceleration_min: Array,
+        acceleration_max: Array,
+        tau_max: Array,
         dt: float,
-        torque_reserve: ArrayLike | None = None,
+        torque_reserve: Array | None = None,
     ) -> None:
-        n, names = model.nv, tuple(model.names)[1:]
-        q_min = joint_array("position_min", position_min, names)
-        q_max = joint_array("position_max", position_max, names)
-        a_min = _finite("acceleration_min", acceleration_min, names, -1.0)
-        a_max = _finite("acceleration_max", acceleration_max, names, 1.0)
-        torques = _finite("tau_max", tau_max, names, 1.0)
-        reserve = joint_array(
-            "torque_reserve", np.zeros(n) if torque_reserve is None else torque_reserve, names
-        )
-        self.usable: Array = (1.0 - RESERVE) * torques - reserve
-        for name, value, left in zip(names, reserve.tolist(), self.usable.tolist(), strict=True):
-            if not (value >= 0.0 and left > 0.0):
-                allowed = f"must be >= 0 and less than {1.0 - RESERVE:g} of the torque limit"
-                raise JointLimitsError("torque_reserve", name, value, allowed)
-        self._reserve, self._of_limit = reserve, self.usable / torques
-        braking = np.minimum(-a_min, a_max)
+        n = model.nv
+        reserve = np.zeros(n) if torque_reserve is None else torque_reserve
+        self._tau_max = tau_max
+        self.usable: Array = (1.0 - RESERVE) * tau_max - reserve
+        self._reserve, self._of_limit = reserve, self.usable / tau_max
+        braking = np.minimum(-acceleration_min, acceleration_max)
         clear = CLEARANCE * dt * dt * braking
-        self._limits = PlanLimits(q_min + clear, q_max - clear, TOLERANCE * clear, braking, dt)
+        self._limits = PlanLimits(
+            position_min + clear, position_max - clear, TOLERANCE * clear, braking, dt
+        )
         self._plans = PlanTorques(model, self._limits, self.usable)
         self._model, self._data, self._dt = model, model.createData(), dt
         self._upper_triangle = np.triu(np.ones((n, n), dtype=bool))  # all that Pinocchio gives
@@ -185,11 +163,48 @@ class SafetyFilter:
         self.lost = False
         self.outcomes: Counter[str] = Counter()
 
-    def reset(self) -> None:
+    def reset(self, robot: RobotModel | None = None) -> None:
         """Forget the plan in hand."""
         self._time, self._periods, self._turn = USUAL_TIME, None, 0
 
-    def prepare(self, q: Array, v: Array, extra: Array, lower: Array, upper: Array) -> Rows | None:
+    def prepare(self, step: Step) -> None:
+        """Narrow the bounds, and add rows by which the plan keeps the torque limits."""
+        robot = step.robot
+        extra = step.torque - robot.M @ step.disturbance
+        rows = self.update(robot.q, robot.v, extra, *step.bounds)
+        step.bounds = AccelerationRange(self.lower, self.upper)
+        if rows is not None:
+            step.rows[self] = rows
+        step.planned = not self.lost
+        if self.lost:
+            step.tasks, step.tracking = [RestTask(step.rest)], False
+        else:
+            step.fallback = self.plan
+
+    def choose(self, step: Step, a: Array) -> Array:
+        """Return `a`, or what of it leaves a plan."""
+        return self.passed(a + step.disturbance) - step.disturbance
+
+    def report(self) -> dict[str, Any]:
+        """See `Part.report`."""
+        return {
+            "steps_by_plan": self.outcomes,
+            "plan_torque_left": self.slack,
+            "joints_too_weak_to_hold": self._too_weak() or "none",
+        }
+
+    @property
+    def trouble(self) -> str:
+        """Which joints cannot hold the arm where it would come to rest."""
+        weak = self._too_weak()
+        return weak and f"the arm cannot be held where it would come to rest: {weak}"
+
+    def _too_weak(self) -> str:
+        return joints_beyond(self._model, self.rest_torque, self._tau_max)
+
+    def update(
+        self, q: Array, v: Array, extra: Array, lower: Array, upper: Array
+    ) -> LinearConstraints | None:
         """Bring the plan to the present state; return the constraints on the step's accelerations.
 
         They are torque limits of the plan to first order, approached with `APPROACH_TIME`; None
@@ -223,11 +238,11 @@ class SafetyFilter:
         self.lost = not most <= 1.0 + LOST
         return self._rows(plans, chosen) if most <= 1.0 else None
 
-    def choose(self, a: Array) -> Array:
+    def passed(self, a: Array) -> Array:
         """Return `a`, or what is nearest to it of the trials on the way to the plan in hand.
 
         Args:
-            a: acceleration wanted, shape (n,), rad/s^2.
+            a: acceleration wanted, disturbances included, shape (n,), rad/s^2.
         """
         self._turn = (self._turn + 1) % len(FACTORS)
         other = self._time * FACTORS[self._turn]
@@ -282,7 +297,7 @@ class SafetyFilter:
         )
         return plans, int(better)
 
-    def _rows(self, plans: BrakingPlans, chosen: int) -> Rows | None:
+    def _rows(self, plans: BrakingPlans, chosen: int) -> LinearConstraints | None:
         """Return rows for joints of large torque: at first, when it is largest, and at rest."""
         loads, dt = plans.loads[chosen], self._dt
         # With fewer samples the largest torque would move to and fro between them.
@@ -308,7 +323,9 @@ class SafetyFilter:
                 share = min(dt / (APPROACH_TIME if left > 0.0 else RETURN_TIME), 1.0)
                 rows.append(row / size)
                 upper.append((share * left + float(row @ self.plan)) / size)
-        return Rows(np.array(rows), np.array(upper)) if rows else None
+        if not rows:
+            return None
+        return LinearConstraints(np.array(rows), np.full(len(rows), -np.inf), np.array(upper))
 
     def _keep_plan_after(self, a: Array, other: float) -> bool:
         """Keep the safe plan after a step of `a` that needs least; return whether there is one.
@@ -339,13 +356,3 @@ class SafetyFilter:
     def _safe(self, plans: BrakingPlans) -> NDArray[np.bool_]:
         """Return which plans are within the limits; not worse than the one in hand is enough."""
         return (plans.slack >= self._least_slack) & (plans.beyond <= self._most_beyond)
-
-
-def _finite(field: str, values: ArrayLike, names: tuple[str, ...], sign: float) -> Array:
-    """Return finite values of a sign, one for each joint."""
-    array = joint_array(field, values, names)
-    for name, value in zip(names, array.tolist(), strict=True):
-        if not (np.isfinite(value) and sign * value > 0.0):
-            allowed = f"must be finite and {'positive' if sign > 0.0 else 'negative'}"
-            raise JointLimitsError(field, name, value, allowed)
-    return array
