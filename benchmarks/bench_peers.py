@@ -61,8 +61,9 @@ REGULARISATION = 1e-8
 class TsidGoals(Goals):
     """Goals whose tasks are those that TSID has."""
 
-    def tasks(self, gains: Gains, stiffness: np.ndarray | None = None) -> list[Task]:
+    def tasks(self, stiffness: np.ndarray | None) -> list[Task]:
         """Return the pose task and the posture task."""
+        gains = self.gains
         posture = gains.posture_kp, gains.posture_kd, gains.posture_weight
         return [
             PoseTask(
@@ -96,9 +97,9 @@ class Ours:
             posture_weight=POSTURE_WEIGHT,
         )
         robot = RobotModel(self.model, FRAME, 0.0 if as_tsid else DT)
-        self.controller = Controller(robot, [Goals(robot.n, gains), JointBounds()], TAU_MAX)
+        goals = (TsidGoals if as_tsid else Goals)(robot.n, gains)
+        self.controller = Controller(robot, [goals, JointBounds()], TAU_MAX)
         if as_tsid:
-            self.controller.goals = TsidGoals(n)
             self.controller._qp = InverseDynamicsQP(n, REGULARISATION)
         self.qp = self.controller._qp
         self.controller.reset(0.5 * (self.low + self.high))

@@ -86,7 +86,7 @@ def qp_alone(controller: Controller, state: State) -> dict[str, Callable[[], Any
     wrench = contacts.wrench_task(0, np.array([0.0, 0.0, -10.0, 0.0, 0.0, 0.0]), 1e-3)
     robot.update(state, np.zeros(n))
     limits = robot.M, -controller.tau_max - robot.h, controller.tau_max - robot.h
-    terms = [task.term(robot) for task in controller.goals.tasks(controller.gains)]
+    terms = [task.term(robot) for task in controller.goals.tasks(None)]
     five, half = np.full(n, 5.0), np.full(n, 0.5)
     wide, tight = AccelerationRange(-five, five), AccelerationRange(-half, half)
     sides = [AccelerationRange(s * half - 0.1, s * half + 0.1) for s in (1.0, -1.0)]

@@ -18,12 +18,12 @@ from chain import load_node_values
 from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.bullet.sensor import ForceTorqueReading
 from sim_bridge.node.bullet_parameters import BulletConfiguration, make_robot
-from torque_safety_controller.contact.interaction import Interaction
-from torque_safety_controller.integral_feedback.action import FadingTorque
+from torque_safety_controller.integral_action import FadingTorque
 from torque_safety_controller.node import assembly
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parts.friction import Friction
 from torque_safety_controller.parts.integral import Integral
+from torque_safety_controller.parts.interaction import Interaction
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.step import Step
 from torque_safety_controller.supervisor import Order
@@ -105,7 +105,7 @@ class DirectLoop:
     def change(self, **parameters: Any) -> None:
         """Change live parameters of the controller, as a running node would."""
         self._changed |= parameters
-        self.controller.configure(self._controller_configuration())
+        self.controller.configure(self._controller_configuration().settings)
 
     def change_friction(self, **settings: Any) -> None:
         """Change settings of the friction compensation, also those that are no parameters."""
@@ -200,7 +200,7 @@ class DirectLoop:
         else:
             self.robot.step(tau, self.config.substeps)
 
-    def bumpless_transfer(self, q_des: np.ndarray) -> None:
+    def resume(self, q_des: np.ndarray) -> None:
         """Prepare torque control in a step that is still the drives'."""
         q, v, tau = self.robot.state()
         bounds = self.bounds(q, v)

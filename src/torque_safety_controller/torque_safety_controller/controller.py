@@ -21,6 +21,7 @@ from torque_safety_controller.qp import (
     stack_constraints,
 )
 from torque_safety_controller.robot_model import RobotModel
+from torque_safety_controller.settings import Settings
 from torque_safety_controller.step import Part, Step
 from torque_safety_controller.supervisor import Order
 from viability_bounds_pkg.state import State
@@ -71,11 +72,11 @@ class Controller:
         """Return the part of a class; None if that is off."""
         return next((part for part in self.parts if isinstance(part, kind)), None)
 
-    def configure(self, config: Any) -> None:
-        """Go by changed live parameters, `ControllerConfiguration`, from the next step on."""
-        self.hold_kd = config.gains.hold_kd
+    def configure(self, settings: Settings) -> None:
+        """Go by changed settings from the next step on."""
+        self.hold_kd = settings.gains.hold_kd
         for part in self.parts:
-            part.configure(config)
+            part.configure(settings)
 
     def reset(self, q: Array) -> None:
         """Forget the past; the null space is held at `q`, where the arm is, shape (n,), rad."""

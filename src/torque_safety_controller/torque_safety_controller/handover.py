@@ -4,7 +4,7 @@
 [Benallegue2021], IV-A: the position reference is captured and held while the QP computes its
 first torque for the present configuration; from the next step on torque is commanded. The
 integral action starts with the difference between the measured and the computed torque, so that
-the commanded torque is continuous (`Controller.bumpless_transfer`). The measured torque is an
+the commanded torque is continuous (`Controller.resume`). The measured torque is an
 average: positions are held until it is known well enough.
 
 Position-controlled drives stop a moving arm as hard as they can. On the way back the arm is

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -17,11 +17,9 @@ from torque_safety_controller.qp import (
     Solution,
 )
 from torque_safety_controller.robot_model import RobotModel
+from torque_safety_controller.settings import Settings
 from torque_safety_controller.supervisor import Order
 from torque_safety_controller.tasks.task import Task
-
-if TYPE_CHECKING:
-    from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 
 Array = NDArray[np.float64]
 
@@ -135,8 +133,8 @@ class Part:
     a part has only those that it needs.
     """
 
-    def configure(self, config: ControllerConfiguration) -> None:
-        """Go by changed parameters from the next step on; gains are live, switches are not."""
+    def configure(self, settings: Settings) -> None:
+        """Go by changed settings from the next step on."""
 
     def reset(self, robot: RobotModel) -> None:
         """Forget the past: the arm may be elsewhere. `robot` is updated to its state."""

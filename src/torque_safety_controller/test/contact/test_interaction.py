@@ -11,17 +11,17 @@ from controllers import GAINS as PLAIN
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torque_safety_controller.contact import interaction
 from torque_safety_controller.contact.admittance import AdmittanceGains, AdmittanceTask
 from torque_safety_controller.contact.contacts import Contacts, FrictionContact
-from torque_safety_controller.contact.interaction import (
+from torque_safety_controller.contact.wrench_sensor import SensorSettings, WrenchSensor
+from torque_safety_controller.controller import Controller
+from torque_safety_controller.parts import interaction
+from torque_safety_controller.parts.goals import Goals
+from torque_safety_controller.parts.interaction import (
     Compliance,
     Interaction,
     InteractionSettings,
 )
-from torque_safety_controller.contact.wrench_sensor import SensorSettings, WrenchSensor
-from torque_safety_controller.controller import Controller
-from torque_safety_controller.parts.goals import Goals
 from torque_safety_controller.parts.joint_bounds import JointBounds
 from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.state import State
@@ -167,7 +167,7 @@ def test_the_motors_give_what_the_contact_takes():
     np.testing.assert_allclose(free.tau, exact.torque(free.a), atol=1e-9)
     for _ in range(2000):
         pressing = hand.step(force(z=-10.0))
-    assert hand.interaction.forces(hand.controller.robot) is not None
+    assert pressing.forces is not None
     # The wrench task has a hundred thousandth of the others' weight, and gamma acts on it, too.
     np.testing.assert_allclose(hand.interaction.reference, force(z=-10.0), atol=2.5)
     model, data = ARM.model, ARM.model.createData()
@@ -197,8 +197,7 @@ def test_what_is_counted_on_exceeds_what_is_felt_by_a_step_at_most(monkeypatch):
     hand = SimulatedHand(contact=True, directions=Z)
     hand.interaction.set_target(-force(x=5.0, z=-10.0))
     for measured, counted in ((0.0, 2.0), (3.0, 5.0), (-7.0, 2.0), (9.0, 10.0), (40.0, 10.0)):
-        hand.step(force(z=-measured))
-        task = hand.interaction.forces(hand.controller.robot).tasks[0]
+        task = hand.step(force(z=-measured)).forces.tasks[0]
         # Smaller, and in the same direction.
         np.testing.assert_allclose(task.F_des, [0.5 * counted, 0.0, -counted], rtol=1e-9)
 
@@ -218,8 +217,7 @@ def test_what_a_contact_cannot_give_is_not_counted_on(goal, monkeypatch):
     hand = SimulatedHand(contact=True, directions=Z)
     hand.interaction.set_target(-goal)
     (contact,) = hand.interaction.contacts.contacts
-    hand.step(force())
-    (task,) = hand.interaction.forces(hand.controller.robot).tasks
+    (task,) = hand.step(force()).forces.tasks
     pressing = contact.normal @ task.F_des[:3]
     assert 0.0 <= pressing <= interaction.FORCE_STEP + 1e-9
     across = task.F_des[:3] - pressing * contact.normal
@@ -295,7 +293,7 @@ def test_a_sensor_that_falls_silent_ends_it_where_the_hand_is(pressing):
         step = hand.step(None, elsewhere)
     assert hand.state is Compliance.SILENT
     assert hand.controller.goals.pose_des.isApprox(hand.controller.robot.pose)
-    assert hand.interaction.forces(hand.controller.robot) is None
+    assert step.forces is None
     np.testing.assert_allclose(hand.hand_acceleration(step), 0.0, atol=1e-4)
     assert not hand.interaction.target.any()
     # Back again, nothing is pressed unasked.

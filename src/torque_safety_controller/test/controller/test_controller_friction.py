@@ -15,8 +15,8 @@ from controllers import make, posture_only
 
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.friction.settings import FrictionModel, FrictionSettings
+from torque_safety_controller.integral_action import make_integral
 from torque_safety_controller.integral_feedback import IntegralSettings
-from torque_safety_controller.integral_feedback.action import make_integral
 from torque_safety_controller.parameters.friction_parameters import FrictionConfiguration
 from torque_safety_controller.parts.friction import Friction
 from torque_safety_controller.parts.integral import Integral

@@ -18,7 +18,7 @@ from integral_loop import (
     settled,
 )
 
-from torque_safety_controller.integral_feedback.action import MODES, changed
+from torque_safety_controller.integral_action import MODES, changed
 from viability_bounds_pkg.state import State
 
 # No jumps

@@ -12,9 +12,9 @@ from controller_chain import NODE, ControllerChain, gains_of
 from controllers import make
 
 from torque_safety_controller.controller import Controller
+from torque_safety_controller.integral_action import changed as integral_with
+from torque_safety_controller.integral_action import make_integral
 from torque_safety_controller.integral_feedback import IntegralSettings
-from torque_safety_controller.integral_feedback.action import changed as integral_with
-from torque_safety_controller.integral_feedback.action import make_integral
 from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.parts.integral import Integral
 from torque_safety_controller.qp import AccelerationRange

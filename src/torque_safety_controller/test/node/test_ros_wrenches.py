@@ -12,11 +12,11 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from std_srvs.srv import Trigger
 
-from torque_safety_controller.contact import interaction
-from torque_safety_controller.contact.interaction import Interaction
 from torque_safety_controller.contact.wrench_sensor import STRONGEST
 from torque_safety_controller.node.assembly import make_controller
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
+from torque_safety_controller.parts import interaction
+from torque_safety_controller.parts.interaction import Interaction
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import parameter_table, read
 from viability_bounds_pkg.ros.messages import pose_message

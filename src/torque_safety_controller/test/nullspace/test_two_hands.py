@@ -12,8 +12,8 @@ import pytest
 from printed_law import FAST, LAMBDA, MU, SLOW, STEP, PrintedLaw
 
 from torque_safety_controller.controller import Controller
+from torque_safety_controller.integral_action import IntegralAction
 from torque_safety_controller.integral_feedback import IntegralSettings
-from torque_safety_controller.integral_feedback.action import IntegralAction
 from torque_safety_controller.nullspace.compliance import NullspaceCompliance, TaskShapeError
 from torque_safety_controller.parts.goals import Goals
 from torque_safety_controller.parts.joint_bounds import JointBounds

@@ -10,8 +10,8 @@ from hypothesis.extra.numpy import arrays
 
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.friction.compensation import FrictionCompensation
+from torque_safety_controller.integral_action import FadingTorque, make_integral
 from torque_safety_controller.integral_feedback import IntegralSettings
-from torque_safety_controller.integral_feedback.action import FadingTorque, make_integral
 from torque_safety_controller.parts.disturbance import Disturbance
 from torque_safety_controller.parts.friction import Friction
 from torque_safety_controller.parts.goals import Goals
@@ -64,7 +64,7 @@ def make(
     robot = arm.robot() if robot is None else robot
     parts = [Goals(robot.n, gains, len(robot.others))]
     if integral is not None:
-        parts.append(Integral(integral, robot))
+        parts.append(Integral(integral, robot, 2.0 * arm.tau_max))
     if friction is not None:
         parts.append(Friction(FrictionCompensation(friction)))
     if gains.disturbance_time is not None:

@@ -5,15 +5,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from torque_safety_controller.integral_feedback.settings import IntegralSettings
 from torque_safety_controller.loop_margins.joint_loop import Feedback, Link, open_loop
-from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
+from torque_safety_controller.tasks.gains import Gains
+from viability_bounds_pkg.joint_limits import JointLimits
+from viability_bounds_pkg.uncertainty import DeclaredUncertainty
 
 Array = NDArray[np.float64]
 
@@ -118,13 +121,40 @@ def limit_gains(horizon: float, disturbance: Array, braking: Array) -> tuple[Arr
     return 2.0 * flatter / horizon**2, (1.0 + flatter) / horizon
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ControlLoop:
+    """What of a robot and its controller decides which gains are stable.
+
+    Attributes:
+        model: of the arm, with n joints.
+        limits: of the joints.
+        tau_max: torque limits, shape (n,), N m.
+        dt: control period, s.
+        horizon: of the bounds, s.
+        declared: delays and errors of the robot.
+        estimates_velocity: whether velocities are estimated from positions.
+        predicts: whether states are predicted to when their command acts.
+        gains: of the tasks.
+        integral: of the integral action; None for none.
+    """
+
+    model: pin.Model
+    limits: JointLimits
+    tau_max: Array
+    dt: float
+    horizon: float
+    declared: DeclaredUncertainty
+    estimates_velocity: bool
+    predicts: bool
+    gains: Gains
+    integral: IntegralSettings | None
+
+
 class GainCheck:
     """Gains of a controller against the margins of its loops and the resolution of its encoders.
 
     Args:
-        config: of the controller.
-        robot: what is declared of the robot, and the horizon of the bounds.
-        model: of the arm.
+        loop: of the controller and the robot.
 
     Attributes:
         tasks: kp and kd by the beginning of their names, `pose`, `posture` and `hold`.
@@ -133,51 +163,47 @@ class GainCheck:
             controller knows, shape (n,) each.
     """
 
-    def __init__(
-        self, config: ControllerConfiguration, robot: BoundsConfiguration, model: pin.Model
-    ) -> None:
-        gains, declared = config.gains, robot.declared
-        self.inertia = ArmInertia(model, config.position_min, config.position_max)
+    def __init__(self, loop: ControlLoop) -> None:
+        gains, declared, integral = loop.gains, loop.declared, loop.integral
+        self._loop = loop
+        self.inertia = ArmInertia(loop.model, loop.limits.q_min, loop.limits.q_max)
         self.tasks = {
             "pose": (gains.pose_kp, gains.pose_kd if gains.pose_weight > 0.0 else 0.0),
             "posture": (gains.posture_kp, gains.posture_kd),
             "hold": (0.0, gains.hold_kd),
         }
         self.tasks = {name: pair for name, pair in self.tasks.items() if pair[1] > 0.0}
-        integral = config.integral_settings
-        self.integral = 0.0 if config.integral.integral_action == "none" else integral.gain
-        self._leak = integral.slow_leak_rate, integral.fast_leak_rate, integral.mu
-        self._disturbance_time = gains.disturbance_time
-        self._robot, self._tau_max = robot, config.torque_max
-        self._predicted = config.use_estimated_states
+        self.integral, self._leak = 0.0, (0.0, 0.0, 0.0)
+        if integral is not None:
+            self.integral = integral.gain
+            self._leak = integral.slow_leak_rate, integral.fast_leak_rate, integral.mu
         observers = None
-        if config.use_estimated_states and robot.velocity_estimation:
-            design = declared.observers(robot.dt)
+        if loop.predicts and loop.estimates_velocity:
+            design = declared.observers(loop.dt)
             observers = design.position_gain, design.velocity_gain
         self._links = self._all_links(observers)
         # A position that is off by up to E changes by 2 E at once.
         position, velocity = 2.0 * declared.position_error, 2.0 * declared.velocity_error
         if observers is not None:
             position, velocity = observers[0] * position, observers[1] * position
-        if self._predicted:
-            ahead = declared.delay * robot.dt + declared.motor_lag
-            position = position + ahead * velocity
+        if loop.predicts:
+            position = position + (declared.delay * loop.dt + declared.motor_lag) * velocity
         self.steps = position, velocity
 
     def _all_links(self, observers: tuple[Array, Array] | None) -> list[Link]:
         """Return loops with shortest and longest delay, slowest motor, both ends of observers."""
-        declared = self._robot.declared
+        declared = self._loop.declared
         ends: list[tuple[float, float] | None] = [None]
         if observers is not None:
             pairs = sorted(zip(*(each.tolist() for each in observers), strict=True))
             ends = list(dict.fromkeys((pairs[0], pairs[-1])))
         return [
             Link(
-                self._robot.dt,
+                self._loop.dt,
                 delay,
                 float(declared.motor_lag.max()),
                 observer,
-                declared.delay if self._predicted else None,
+                declared.delay if self._loop.predicts else None,
             )
             for delay in sorted({declared.delay, declared.delay + declared.delay_jitter})
             for observer in ends
@@ -202,7 +228,7 @@ class GainCheck:
             step = self._own(gain * self.steps[1])
             resolution = TORQUE_STEP / step if step > 0.0 else math.inf
             yield GainLimit("integral_lambda", gain, gain * margin, gain * resolution)
-        if (time := self._disturbance_time) is not None:
+        if (time := self._loop.gains.disturbance_time) is not None:
             yield GainLimit(OBSERVER, time, self._way(), self._fastest_observer())
         margin, resolution = (
             1.0 / scale if (scale := _last_good(good, 1.0 / _LONGEST, 1.0)) else math.inf
@@ -211,7 +237,7 @@ class GainCheck:
                 lambda s: self._calm_on_limits(1.0 / s),
             )
         )
-        yield GainLimit(HORIZON, self._robot.horizon / self._robot.dt, margin, resolution)
+        yield GainLimit(HORIZON, self._loop.horizon / self._loop.dt, margin, resolution)
 
     def margin(self, kp: float, kd: float, integral: float, observed: bool = False) -> float:
         """Return the least modulus margin, over delays, observers and postures.
@@ -222,7 +248,7 @@ class GainCheck:
             integral: lambda, 1/s.
             observed: whether the disturbance observer acts.
         """
-        time = self._disturbance_time if observed else None
+        time = self._loop.gains.disturbance_time if observed else None
         factors = self.inertia.factors if integral > 0.0 else (1.0,)
         return min(
             open_loop(link, Feedback(kp, kd, integral * f, self._leak, time)).modulus_margin()
@@ -241,9 +267,9 @@ class GainCheck:
         return self.margin(float(kp[steepest]), float(kd[steepest]), self.integral, observed=True)
 
     def _slopes(self, factor: float) -> tuple[Array, Array]:
-        robot = self._robot
-        braking = np.minimum(-robot.limits.a_min, robot.limits.a_max)
-        return limit_gains(factor * robot.dt, robot.declared.acceleration_disturbance, braking)
+        loop = self._loop
+        braking = np.minimum(-loop.limits.a_min, loop.limits.a_max)
+        return limit_gains(factor * loop.dt, loop.declared.acceleration_disturbance, braking)
 
     def _has_margin(self, scale: float, kp: float, kd: float) -> bool:
         return self.margin(kp * scale**2, kd * scale, 0.0) >= MARGIN
@@ -253,7 +279,7 @@ class GainCheck:
         position, velocity = self.steps
         accelerations = kp * scale**2 * position + kd * scale * velocity
         torque = np.abs(self.inertia.matrices) @ accelerations
-        return bool((torque.max(axis=0) <= TORQUE_STEP * self._tau_max).all())
+        return bool((torque.max(axis=0) <= TORQUE_STEP * self._loop.tau_max).all())
 
     def _calm_on_limits(self, factor: float) -> bool:
         (kp, kd), (position, velocity) = self._slopes(factor), self.steps
@@ -261,7 +287,7 @@ class GainCheck:
 
     def _own(self, acceleration: Array) -> float:
         """Return the largest torque of joints' accelerations one by one, of `torque_max`."""
-        return float((self.inertia.diagonal * acceleration / self._tau_max).max())
+        return float((self.inertia.diagonal * acceleration / self._loop.tau_max).max())
 
     def _way(self) -> float:
         """Return how long commands are under way that are predicted, s.
@@ -270,11 +296,12 @@ class GainCheck:
         by what they would have done in all that time: a so many times larger acceleration of one
         period. With at least this time constant the estimate is not larger than the change.
         """
-        return self._robot.declared.delay * self._robot.dt if self._predicted else 0.0
+        loop = self._loop
+        return loop.declared.delay * loop.dt if loop.predicts else 0.0
 
     def _fastest_observer(self) -> float:
         """Return the least time constant of the disturbance observer that leaves joints calm."""
-        dt = self._robot.dt
+        dt = self._loop.dt
         share = TORQUE_STEP / (self._own(self.steps[1] / dt) or math.inf)
         return 0.0 if share >= 1.0 or share == 0.0 else -dt / math.log1p(-share)
 

@@ -13,18 +13,18 @@ import pinocchio as pin
 from torque_safety_controller.collision.avoidance import CollisionAvoidance
 from torque_safety_controller.collision.model import build_collision_model
 from torque_safety_controller.contact.contacts import Contacts, FrictionContact
-from torque_safety_controller.contact.interaction import Interaction
 from torque_safety_controller.contact.wrench_sensor import WrenchSensor
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.friction.compensation import FrictionCompensation
-from torque_safety_controller.integral_feedback.action import make_integral, warm_up
+from torque_safety_controller.integral_action import make_integral, warm_up
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parameters.interaction_parameters import ContactPoint
 from torque_safety_controller.parts.collision import Collision
 from torque_safety_controller.parts.disturbance import Disturbance
 from torque_safety_controller.parts.friction import Friction
 from torque_safety_controller.parts.goals import Goals
-from torque_safety_controller.parts.integral import Integral, integral_arguments
+from torque_safety_controller.parts.integral import Integral
+from torque_safety_controller.parts.interaction import Interaction
 from torque_safety_controller.parts.joint_bounds import JointBounds
 from torque_safety_controller.parts.slow_down import SlowDown
 from torque_safety_controller.parts.whole_arm.safety_filter import SafetyFilter
@@ -52,6 +52,9 @@ if TYPE_CHECKING:
 
 HORIZON = 2.0
 """Control periods that an acceleration is assumed to last, as in the bounds: no chatter."""
+
+DISTURBANCE_MAX = 2.0
+"""Disturbances beyond this many torque limits are not integrated."""
 
 _BEYOND = 0.003  # m; beyond margin and reserve, pairs nearer than this are too near from the start
 _NEAR = 0.028  # m; beyond margin and reserve, pairs that never come nearer need no guard
@@ -111,7 +114,7 @@ def make_parts(
         make_interaction(config, robot, urdf, goals),
         goals,
         # What is added to the model's torque leaves less of it to the QP and to plans.
-        Integral(make_integral(*integral_arguments(config)), robot),
+        make_integral_part(config, robot),
         Friction(FrictionCompensation(config.friction_settings)),
         # A change of that torque disturbs before it can be measured.
         make_disturbance(config),
@@ -146,6 +149,13 @@ def make_plausibility_check(
         none if declared is None else declared.declared.position_error,
         none if declared is None else declared.declared.velocity_error,
     )
+
+
+def make_integral_part(config: ControllerConfiguration, robot: RobotModel) -> Integral:
+    """Return the integral action; a torque that is taken over fades where it is off."""
+    mode, settings = config.integral.integral_action, config.integral_settings
+    most = DISTURBANCE_MAX * config.torque_max
+    return Integral(make_integral(mode, settings, most, 1 + len(robot.others)), robot, most)
 
 
 def make_disturbance(config: ControllerConfiguration) -> Disturbance | None:

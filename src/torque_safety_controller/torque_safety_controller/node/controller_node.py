@@ -14,7 +14,6 @@ from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
 from torque_safety_controller.command_check import CommandCheck
-from torque_safety_controller.contact.interaction import Interaction
 from torque_safety_controller.handover import Handover, HandoverRefused
 from torque_safety_controller.modes import Control, Mode
 from torque_safety_controller.node.assembly import (
@@ -36,6 +35,7 @@ from torque_safety_controller.node.streams.states import UNSEEN, StateStream
 from torque_safety_controller.node.topics import ENABLE_TORQUE
 from torque_safety_controller.node.wrenches import WrenchSubscriber
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
+from torque_safety_controller.parts.interaction import Interaction
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.supervisor import Supervisor
 from viability_bounds_pkg.ros.arm_node import ArmNode
@@ -133,7 +133,7 @@ class ControllerNode(ArmNode):
 
     def _configure(self, config: ControllerConfiguration) -> None:
         self._config = config
-        self._controller.configure(config)
+        self._controller.configure(config.settings)
 
     # Streams
 

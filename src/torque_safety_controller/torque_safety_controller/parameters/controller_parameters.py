@@ -17,6 +17,7 @@ from torque_safety_controller.parameters.integral_parameters import IntegralConf
 from torque_safety_controller.parameters.interaction_parameters import InteractionConfiguration
 from torque_safety_controller.parts.whole_arm.braking_plan import RESERVE
 from torque_safety_controller.qp import SOLVERS
+from torque_safety_controller.settings import Settings
 from torque_safety_controller.tasks.gains import Gains
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import (
@@ -113,6 +114,18 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
     )
     integral_settings: IntegralSettings = field(init=False)
     friction_settings: FrictionSettings = field(init=False)
+
+    @property
+    def settings(self) -> Settings:
+        """What may change while the controller runs."""
+        return Settings(
+            self.gains,
+            self.integral.integral_action,
+            self.integral_settings,
+            self.friction_settings,
+            self.interaction.settings,
+            self.interaction.sensor,
+        )
 
     @property
     def clips_torque_rates(self) -> bool:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from torque_safety_controller.integral_feedback.action import MODES, TASKS
+from torque_safety_controller.integral_action import MODES, TASKS
 from torque_safety_controller.integral_feedback.settings import METHODS, IntegralSettings
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import (

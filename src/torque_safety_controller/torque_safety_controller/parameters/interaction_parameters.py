@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from torque_safety_controller.contact.interaction import InteractionSettings
+from torque_safety_controller.contact.settings import InteractionSettings
 from torque_safety_controller.contact.wrench_sensor import SensorSettings
 from torque_safety_controller.parameters.entries import read_entries
 from viability_bounds_pkg.exceptions import SettingError

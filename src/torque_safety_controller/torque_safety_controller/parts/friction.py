@@ -3,14 +3,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torque_safety_controller.friction.compensation import FrictionCompensation
 from torque_safety_controller.robot_model import RobotModel
+from torque_safety_controller.settings import Settings
 from torque_safety_controller.step import Part, Step
-
-if TYPE_CHECKING:
-    from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 
 
 class Friction(Part):
@@ -23,9 +21,9 @@ class Friction(Part):
     def __init__(self, compensation: FrictionCompensation) -> None:
         self.compensation = compensation
 
-    def configure(self, config: ControllerConfiguration) -> None:
+    def configure(self, settings: Settings) -> None:
         """See `Part.configure`."""
-        self.compensation.settings = config.friction_settings
+        self.compensation.settings = settings.friction
 
     def reset(self, robot: RobotModel) -> None:
         """See `Part.reset`."""

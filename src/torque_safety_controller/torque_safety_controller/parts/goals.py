@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
 from torque_safety_controller.robot_model import RobotModel
+from torque_safety_controller.settings import Settings
 from torque_safety_controller.step import Part, Step, joints_beyond
 from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.pose_task import (
@@ -23,9 +23,6 @@ from torque_safety_controller.tasks.pose_task import (
 from torque_safety_controller.tasks.posture_task import PostureTask
 from torque_safety_controller.tasks.rest_task import RestTask
 from torque_safety_controller.tasks.task import Task
-
-if TYPE_CHECKING:
-    from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 
 Array = NDArray[np.float64]
 
@@ -108,8 +105,9 @@ class Goals(Part):
                 one at rest.
             twist_rate: time derivative of `twist`, shape (6,); with `twist`.
         """
-        at_rest = twist is None or twist_rate is None
-        motion = None if at_rest else PoseMotion(twist, twist_rate)
+        motion = None
+        if twist is not None and twist_rate is not None:
+            motion = PoseMotion(twist, twist_rate)
         self.targets = replace(self.targets, pose=pose_des, motion=motion)
 
     def set_other_pose(self, hand: int, pose_des: pin.SE3) -> None:
@@ -161,9 +159,9 @@ class Goals(Part):
 
     # As a part
 
-    def configure(self, config: ControllerConfiguration) -> None:
+    def configure(self, settings: Settings) -> None:
         """See `Part.configure`."""
-        self.gains = config.gains
+        self.gains = settings.gains
 
     def reset(self, robot: RobotModel) -> None:
         """Keep the goals; where the arm is, the null space is held."""
@@ -175,7 +173,7 @@ class Goals(Part):
         if step.tracking:
             if self.targets is not self._made_of[0]:
                 self._trouble = self._too_heavy(step)
-            step.tasks += self._made_tasks(step.stiffness)
+            step.tasks += self.tasks(step.stiffness)
         else:
             step.tasks = [RestTask(step.rest)]
 
@@ -192,7 +190,12 @@ class Goals(Part):
         heavy = joints_beyond(robot.model, torque, step.tau_max)
         return heavy and f"the goal cannot be held: {heavy}"
 
-    def _made_tasks(self, stiffness: Array | None) -> list[Task]:
+    def tasks(self, stiffness: Array | None) -> list[Task]:
+        """Return the tasks that serve the goals.
+
+        Args:
+            stiffness: factors of the pose task's gains, shape (6,); None for ones.
+        """
         made_of = self.targets, self.gains, self.posture, stiffness
         # Mostly nothing has changed since the last step.
         if any(new is not old for new, old in zip(made_of, self._made_of, strict=True)):

@@ -4,27 +4,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from torque_safety_controller.integral_feedback.action import FadingTorque, changed
-from torque_safety_controller.integral_feedback.settings import IntegralSettings
+from torque_safety_controller.integral_action import FadingTorque, changed
 from torque_safety_controller.robot_model import RobotModel
+from torque_safety_controller.settings import Settings
 from torque_safety_controller.step import Array, Part, Step, joints_named
-
-if TYPE_CHECKING:
-    from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-
-
-DISTURBANCE_MAX = 2.0
-"""Disturbances beyond this many torque limits are not integrated."""
-
-
-def integral_arguments(
-    config: ControllerConfiguration,
-) -> tuple[str, IntegralSettings, Array, int]:
-    """Return the arguments of `make_integral` for the parameters of a controller."""
-    mode, hands = config.integral.integral_action, len(config.end_effectors)
-    return mode, config.integral_settings, DISTURBANCE_MAX * config.torque_max, hands
 
 
 class Integral(Part):
@@ -33,18 +18,26 @@ class Integral(Part):
     Args:
         action: in one of its modes.
         robot: of the arm; it has to give the rates of its matrices, if the action needs them.
+        disturbance_max: of actions of other modes; see `IntegralAction`.
 
     Attributes:
         action: as given, or as its parameters were changed since.
     """
 
-    def __init__(self, action: FadingTorque, robot: RobotModel) -> None:
+    def __init__(self, action: FadingTorque, robot: RobotModel, disturbance_max: Array) -> None:
         self.action, self._robot = action, robot
+        self._disturbance_max = disturbance_max
         robot.rates = action.rates
 
-    def configure(self, config: ControllerConfiguration) -> None:
+    def configure(self, settings: Settings) -> None:
         """See `Part.configure`."""
-        self.action = changed(self.action, *integral_arguments(config))
+        self.action = changed(
+            self.action,
+            settings.integral_action,
+            settings.integral,
+            self._disturbance_max,
+            1 + len(self._robot.others),
+        )
         self._robot.rates = self.action.rates
 
     def reset(self, robot: RobotModel) -> None:

@@ -17,6 +17,7 @@ from torque_safety_controller.loop_margins.gain_check import (
     LIMIT_MARGIN,
     MARGIN,
     TORQUE_STEP,
+    ControlLoop,
     GainCheck,
 )
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
@@ -41,10 +42,35 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
+def gain_check(config: ControllerConfiguration, robot: BoundsConfiguration) -> GainCheck:
+    """Return the check of a controller's gains.
+
+    Args:
+        config: of the controller.
+        robot: what is declared of the robot, and the horizon of the bounds.
+    """
+    return GainCheck(
+        ControlLoop(
+            model=load_model(config, config.read_urdf()),
+            limits=robot.limits,
+            tau_max=config.torque_max,
+            dt=robot.dt,
+            horizon=robot.horizon,
+            declared=robot.declared,
+            estimates_velocity=robot.velocity_estimation,
+            predicts=config.use_estimated_states,
+            gains=config.gains,
+            integral=None
+            if config.integral.integral_action == "none"
+            else config.integral_settings,
+        )
+    )
+
+
 def _run(options: argparse.Namespace) -> int:
     config = read_files(ControllerConfiguration, options.params_file, CONTROLLER)
     robot = read_files(BoundsConfiguration, options.params_file, NODE)
-    limits = list(GainCheck(config, robot, load_model(config, config.read_urdf())).limits())
+    limits = list(gain_check(config, robot).limits())
     print(f"{'':18}{'given':>10}{'by margin':>14}{'by resolution':>16}")
     for limit in limits:
         sign = ">=" if limit.smallest else "<="

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from torque_safety_controller.loop_margins.gain_check import (
     HORIZON,
     OBSERVER,
-    GainCheck,
     GainLimit,
 )
 from torque_safety_controller.new_robot.chain import Chain, NewRobotError, find_chain
@@ -41,12 +40,12 @@ from torque_safety_controller.new_robot.hardware import (
 from torque_safety_controller.new_robot.postures import SelfCollisions, find_postures
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.tools.fit_capsules import with_capsules
+from torque_safety_controller.tools.gain_limits import gain_check
 from viability_bounds_pkg.cli.command_line import Parser, positive, run_tool
 from viability_bounds_pkg.cli.limits_file import CONTROLLER, NODE, check_writable, write_whole
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
 from viability_bounds_pkg.parameter_files import read_files
-from viability_bounds_pkg.robot.configuration import load_model
 from viability_bounds_pkg.robot.description import (
     check_urdf,
     package_directories,
@@ -279,9 +278,8 @@ def _exceeded(paths: Sequence[Path]) -> list[GainLimit]:
     """
     config = read_files(ControllerConfiguration, paths, CONTROLLER)
     robot = read_files(BoundsConfiguration, paths, NODE)
-    model = load_model(config, config.read_urdf())
     make_bounds(robot)
-    return [each for each in GainCheck(config, robot, model).limits() if each.exceeded]
+    return [each for each in gain_check(config, robot).limits() if each.exceeded]
 
 
 def _lowered(gains: Gains, beyond: Sequence[GainLimit]) -> Gains:

@@ -13,26 +13,24 @@ and where the wrench ends is the new goal.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 from enum import Enum
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from torque_safety_controller.contact.admittance import AdmittanceGains, AdmittanceTask
+from torque_safety_controller.contact.admittance import AdmittanceTask
 from torque_safety_controller.contact.contacts import Contacts, FrictionContact
+from torque_safety_controller.contact.settings import InteractionSettings
 from torque_safety_controller.contact.wrench_sensor import WrenchSensor
 from torque_safety_controller.parts.goals import Goals
 from torque_safety_controller.qp import ContactForces
 from torque_safety_controller.robot_model import RobotModel
+from torque_safety_controller.settings import Settings
 from torque_safety_controller.step import Part, Step
 from torque_safety_controller.tasks.pose_task import shorten
 from torque_safety_controller.tasks.task import Task
-
-if TYPE_CHECKING:
-    from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 
 Array = NDArray[np.float64]
 
@@ -63,24 +61,6 @@ class Compliance(Enum):
     """A wrench is exerted in the directions set for it."""
     SILENT = "sensor silent"
     """As OFF, for want of measurements."""
-
-
-@dataclass(frozen=True, eq=False)
-class InteractionSettings:
-    """What may change while the controller runs.
-
-    Attributes:
-        directions: of the end effector's axes, those in which force is controlled, shape (6,),
-            bool.
-        gains: of the admittance task when a wrench is exerted.
-        yield_threshold: force and moment above which the hand yields, N and N m; None never.
-        yielding_gains: of the admittance task when it does.
-    """
-
-    directions: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(6, dtype=bool))
-    gains: AdmittanceGains = AdmittanceGains()
-    yield_threshold: tuple[float, float] | None = None
-    yielding_gains: AdmittanceGains = AdmittanceGains((0.1, 1.0), (0.0, 0.0), (0.25, 1.0))
 
 
 class Interaction(Part):
@@ -162,10 +142,10 @@ class Interaction(Part):
 
     # Each step
 
-    def configure(self, config: ControllerConfiguration) -> None:
+    def configure(self, settings: Settings) -> None:
         """See `Part.configure`."""
-        self.settings = config.interaction.settings
-        self.sensor.settings = config.interaction.sensor
+        self.settings = settings.interaction
+        self.sensor.settings = settings.sensor
 
     def reset(self, robot: RobotModel) -> None:
         """Forget the past and the target."""
