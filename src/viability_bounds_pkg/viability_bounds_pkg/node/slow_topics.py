@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What tools show: distances to the limits, and slow copies of the streams."""
+"""Publishes distances to the limits, and slow copies of the streams."""
 
 from __future__ import annotations
 

@@ -89,10 +89,11 @@ class PublisherWatch:
         known = topic in self.rivals
         if len(names) > 1:
             self.rivals[topic] = tuple(names)
-        if len(names) > 1 and not known:
-            self._node.get_logger().warning(
-                f"'{topic}' has {len(names)} publishers: {', '.join(names)}; stop all but one, or "
-                "keep them apart by namespace or ROS_DOMAIN_ID"
-            )
-        elif len(names) < 2 and self.rivals.pop(topic, None):
+            if not known:
+                self._node.get_logger().warning(
+                    f"'{topic}' has {len(names)} publishers: {', '.join(names)}; stop all but "
+                    "one, or keep them apart by namespace or ROS_DOMAIN_ID"
+                )
+        elif known:
+            del self.rivals[topic]
             self._node.get_logger().info(f"'{topic}' has no second publisher any more")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every node here needs from ROS: quality of service, an executor, stamps, DDS settings."""
+"""Quality of service, executor, stamps, and settings of DDS."""
 
 from __future__ import annotations
 
