@@ -256,8 +256,10 @@ class RosHarness:
         return heard
 
     def talk(self, kind: Any, topic: str, qos: QoSProfile = CONTROL_QOS) -> Any:
-        """Return a publisher that has been found by its subscribers."""
-        publisher = self.probe.create_publisher(kind, topic, qos)
+        """Return the probe's publisher of a topic, which has been found by subscribers."""
+        name = self.probe.resolve_topic_name(topic)
+        own = (each for each in self.probe.publishers if each.topic_name == name)
+        publisher = next(own, None) or self.probe.create_publisher(kind, topic, qos)
         self.wait_until(publisher.get_subscription_count, f"a subscriber of {topic}")
         return publisher
 
