@@ -61,7 +61,7 @@ TARGET_JOINT_TRAJECTORY = Topic(
     "target_joint_trajectory",
     JointTrajectory,
     GOAL_QOS,
-    (USER, "viewer_node", "moveit_node"),
+    (USER, "moveit_node"),
     (_NODE,),
     "positions of all joints over time, rad, perhaps with velocities and accelerations, matched "
     "by name; a goal for the pose is given up; without points: the joints come to rest",
