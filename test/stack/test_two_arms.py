@@ -138,10 +138,10 @@ def test_each_arm_does_what_it_does_alone(ros, tmp_path, alone, robot, happens):
     )
     assert left.controller.get_parameter("posture_kp").value == 40.0
     assert right.controller.get_parameter("posture_kp").value == happens["values"]["posture_kp"]
-    start, end = load_values("panda")["start_positions"], right.player.listener.q
+    start, end = load_values("panda")["start_positions"], right.player.recorder.q
     assert ros.call(Trigger, "/left/bullet_node/reset", Trigger.Request()).success
-    ros.wait_until(lambda: np.allclose(left.player.listener.q, start), "the start")
-    np.testing.assert_array_equal(right.player.listener.q, end)
+    ros.wait_until(lambda: np.allclose(left.player.recorder.q, start), "the start")
+    np.testing.assert_array_equal(right.player.recorder.q, end)
 
 
 def test_no_topic_or_service_of_two_arms_is_shared(ros, tmp_path):

@@ -135,25 +135,11 @@ class Imperfections:
         return value != "exact" if isinstance(value, str) else bool(np.any(value))
 
     @property
-    def of_sensing(self) -> bool:
-        """Whether readings differ from the true state."""
-        return any(map(self._is_on, _SENSING))
-
-    @property
     def of_motors(self) -> bool:
         """Whether torques differ from those asked for."""
         return any(map(self._is_on, _MOTORS))
 
 
-_SENSING = (
-    "encoder_resolution",
-    "position_noise",
-    "velocity_source",
-    "velocity_filter_hz",
-    "velocity_noise",
-    "state_delay",
-    "current_noise",
-)
 _MOTORS = "motor_bandwidth", "torque_constant_error", "torque_ripple", "current_noise"
 
 

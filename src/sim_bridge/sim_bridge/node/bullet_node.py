@@ -24,7 +24,7 @@ from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.bullet.sensor import ForceTorqueReading
 from sim_bridge.hardware import Sensing
 from sim_bridge.node.bullet_parameters import BulletConfiguration, make_robot, make_stop
-from sim_bridge.node.commands import CommandOutage, CommandStream
+from sim_bridge.node.commands import CommandStream
 from sim_bridge.node.topics import CLOCK, PAUSE, RESET
 from sim_bridge.node.world_subscriber import WorldSubscriber
 from viability_bounds_pkg.plausible import RESTART_GAP
@@ -46,7 +46,7 @@ from viability_bounds_pkg.ros.topics import (
 Array = NDArray[np.float64]
 
 _RETRY_PERIOD = 0.05
-"""Shorter than the 75 ms after which a controller takes the robot for silent, s."""
+"""Shorter than the 75 ms after which a controller counts the robot as silent, s."""
 
 _CONTROL = {TorqueCommand: "torque", PositionCommand: "position"}
 
@@ -83,12 +83,6 @@ class BulletNode(ArmNode):
             warn_of_unusual(self, config, config.urdf)
             self._robot = make_robot(config)
             self._stop = make_stop(config)
-        if self._stop is None and 0 < config.missed_deadlines < config.command_timeout:
-            self.get_logger().warning(
-                f"parameter 'command_timeout' is {config.command_timeout}, but the bounds cover "
-                f"{config.missed_deadlines} missed periods (missed_deadlines): limits may be "
-                "passed in a longer row, as no acceleration_min is given to keep them by"
-            )
         self._config = config
         self._monitor = LimitMonitor(
             config.position_min, config.position_max, config.velocity_max, config.torque_max
@@ -106,13 +100,16 @@ class BulletNode(ArmNode):
         )
         self._ft_wrench = WrenchStamped()
         self._ft_publisher = self.stream(FT_WRENCH) if self._robot.sensor else None
-        imperfect = config.imperfections
-        senses = imperfect.of_sensing or imperfect.of_motors
-        self._sensing = Sensing(imperfect, config.torque_max, config.dt) if senses else None
-        warn = self.get_logger().warning
-        self._commands = CommandStream(config, self._refused, warn)
+        self._sensing = Sensing(config.imperfections, config.torque_max, config.dt)
+        self._commands = CommandStream(config, self._refused, self.get_logger().warning)
         self._restart()
+        self._make_interface()
+        self.announce(config.joints, config.rate_hz, f"simulated, clock {config.clock}")
+        self._next_state()
 
+    def _make_interface(self) -> None:
+        """Create publishers, subscriptions, services and timers."""
+        config = self._config
         # Joints that are locked, too: robot_state_publisher places no link without its joint.
         locked = self._robot.locked
         self._locked_at = array("d", locked.values())
@@ -132,8 +129,6 @@ class BulletNode(ArmNode):
         if self._clock_publisher is not None:
             self.publisher_watch.add(self._clock_publisher.topic_name)
         self._diagnostics = Diagnostics(self, self._report, watch=self.publisher_watch)
-        self.announce(config.joints, config.rate_hz, f"simulated, clock {config.clock}")
-        self._next_state()
 
     def _restart(self) -> None:
         """Reset the robot and all counts; robot time continues."""
@@ -141,13 +136,12 @@ class BulletNode(ArmNode):
         n = len(config.joints)
         self._world.clear()
         self._robot.reset(config.start_positions, np.zeros(n))
-        self._reading = self._sensing.reset(*self._true_state()) if self._sensing else None
+        self._reading = self._sensing.reset(*self._true_state())
         sensor = self._robot.sensor
         self._sensor = ForceTorqueReading(sensor, config.sensor) if sensor else None
         self._monitor.reset()
         self._commands.restart()
         self._braked = 0
-        self._outage = CommandOutage(config.command_timeout, math.ceil(config.rate_hz))
         self._periods = 0
         self._plan_pause()
         self._refused.clear()
@@ -168,10 +162,10 @@ class BulletNode(ArmNode):
     # Control periods
 
     def _next_state(self) -> None:
-        """Begin a control period and publish the state at its start."""
+        """Start a control period and publish its state."""
         self._stamp += self._dt_ns
         self._advanced = False
-        q, v, tau = self._reading or self._robot.state()
+        q, v, tau = self._reading
         # New messages: nodes of this process may keep the last ones, and others get theirs later.
         state = self._state = JointState(
             name=self._names,
@@ -183,15 +177,18 @@ class BulletNode(ArmNode):
         if self._clock_publisher is not None:
             self._clock_publisher.publish(ClockMessage(clock=state.header.stamp))
         if self._ft_publisher and self._sensor:  # first: subscribers use it with the state
-            measured = self._ft_wrench = WrenchStamped()
-            measured.header.frame_id = self._config.sensor.ft_frame
-            set_stamp(measured.header.stamp, self._stamp)
-            force, torque = measured.wrench.force, measured.wrench.torque
-            wrench = self._sensor.read().tolist()
-            force.x, force.y, force.z, torque.x, torque.y, torque.z = wrench
-            self._ft_publisher.publish(measured)
+            self._ft_wrench = self._wrench_message(self._sensor.read())
+            self._ft_publisher.publish(self._ft_wrench)
         self._published_at = time.monotonic()
         self._state_publisher.publish(state)
+
+    def _wrench_message(self, wrench: Array) -> WrenchStamped:
+        message = WrenchStamped()
+        message.header.frame_id = self._config.sensor.ft_frame
+        set_stamp(message.header.stamp, self._stamp)
+        f, t = message.wrench.force, message.wrench.torque
+        f.x, f.y, f.z, t.x, t.y, t.z = wrench.tolist()
+        return message
 
     def _true_state(self) -> tuple[Array, Array, Array]:
         """Return the state of the joints, and the torques that the drives believe to give."""
@@ -209,7 +206,7 @@ class BulletNode(ArmNode):
         elif command is None:
             # No command can have arrived before the first one's delay.
             self._braked += self._periods >= config.imperfections.command_delay
-            if self._stop is not None and self._outage.commanded:
+            if self._stop is not None and commands.commanded:
                 self._robot.stop(self._stop, config.substeps)
             else:
                 self._robot.brake(config.substeps, config.torque_max)
@@ -220,10 +217,7 @@ class BulletNode(ArmNode):
                 self._robot.follow(self._stop, command.tau, config.substeps)
         else:
             self._robot.move(*command, config.torque_max, config.velocity_max, config.substeps)
-        if news := self._outage.count(command is None):
-            self.get_logger().warning(news)
-        if self._sensing is not None:
-            self._reading = self._sensing.read(*self._true_state())
+        self._reading = self._sensing.read(*self._true_state())
         self._periods += 1
         self._has_moved = True
         self._advanced = True
@@ -261,7 +255,7 @@ class BulletNode(ArmNode):
     # Commands
 
     def _on_command(self, message: JointState) -> None:
-        if not self._commands.take(
+        if not self._commands.accept(
             message, self._stamp, self._published_at, ended=self._advanced, paused=self._paused
         ):
             return
@@ -305,7 +299,7 @@ class BulletNode(ArmNode):
         """Return what moves or holds the robot."""
         if self._commands.acting is not None:
             return _CONTROL[type(self._commands.acting)]
-        if self._stop is None or not self._outage.commanded:
+        if self._stop is None or not self._commands.commanded:
             return "brakes"
         return "stopped" if self._stop.at_rest else "stopping"
 

@@ -31,7 +31,6 @@ from viability_bounds_pkg.parameter import (
     joint_numbers,
     number,
     numbers,
-    periods,
     switch,
     text,
     texts,
@@ -73,10 +72,6 @@ class BulletConfiguration(ControlRate, LimitedRobotConfiguration):
         "control periods that the last command is held for before the robot stops itself",
         Range(1, 1000),
         default=5,
-    )
-    missed_deadlines: int = periods(
-        "longest such row that the bounds are declared to cover; where command_timeout is longer, "
-        "this is logged; 0: not declared"
     )
     acceleration_min: Array = joint_numbers(
         "lower acceleration limits when the robot stops itself, rad/s^2; it brakes with all its "

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -17,23 +18,27 @@ from viability_bounds_pkg.ros.joint_command import JointCommand, TorqueCommand, 
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 
 _STRAYS = 50
+"""Commands in a row for other periods after which a warning is logged."""
+_WARNING_PERIOD = 10.0
+"""Least time between two warnings that commands have stopped, s."""
 
 
 class CommandStream:
-    """Commands from the messages of a robot's controller, on their way to the drives.
+    """Selects the command that acts in each period; counts missed, late and refused ones.
 
     Args:
         config: of the robot.
         refused: counts messages that are dropped, by reason.
-        warn: told in words what is wrong with them.
+        warn: logs a warning.
 
     Attributes:
         acting: the command of the present period; None if the robot stops itself.
+        commanded: whether there has been a command.
         missed: periods for which none had come.
         missed_in_row: periods since the last one that arrived.
         torque_ratio: largest commanded torque, as a share of its limit.
-        path: their way.
-        latencies: from states to their commands, s.
+        path: delays and drops commands.
+        latencies: times from states to their commands, s.
     """
 
     def __init__(
@@ -46,27 +51,29 @@ class CommandStream:
         self._warn = warn
         self._joints = list(config.joints)
         self._dt_ns = round(1e9 * config.dt)
+        self._warned_at = -math.inf
         self.restart()
 
     def restart(self) -> None:
         """Forget all commands, and count anew."""
         self.path: CommandPath[JointCommand] = CommandPath(self._config.imperfections)
         self.acting: JointCommand | None = None
+        self.commanded = False
         self.missed_in_row = self.missed = self._strays = 0
         self.torque_ratio = 0.0
         self.latencies = RecentValues()
 
-    def take(
+    def accept(
         self, message: JointState, stamp: int, published_at: float, *, ended: bool, paused: bool
     ) -> bool:
-        """Take a message.
+        """Check a message, and let its command act if it is for this period.
 
         Args:
             message: that has come.
             stamp: of the present period, ns.
             published_at: when its state was published, s on the steady clock.
             ended: whether the period has been simulated.
-            paused: whether none is obeyed.
+            paused: whether no command is obeyed.
 
         Returns:
             Whether it is the command for this period, which then acts.
@@ -76,7 +83,7 @@ class CommandStream:
         late = 0 < age <= self._config.imperfections.command_delay and not self._config.lockstep
         if rest or not (late or (age == 0 and not ended)):
             if not paused:
-                self._note_stray(own, stamp)
+                self._count_stray(own, stamp)
             return False
         if paused:
             return False
@@ -84,7 +91,7 @@ class CommandStream:
         if command is None:
             return False
         if late and not self.path.insert_late(command, age, ended=ended):
-            self._note_stray(own, stamp)
+            self._count_stray(own, stamp)
             return False
         self._strays = 0
         self.latencies.note(time.monotonic() - published_at + age * self._config.dt)
@@ -93,19 +100,29 @@ class CommandStream:
         return not late
 
     def receive(self, sent: JointCommand | None) -> None:
-        """Take the command that arrives in the present period, or hold the last one.
+        """Apply the command that arrives in the present period, or hold the last one.
 
-        `sent` is the one that was sent in it; None if there is none.
+        Args:
+            sent: the command that was sent in it; None if there is none.
         """
         arrived = self.path.arriving(sent)
         if arrived is not None:
-            self.acting = arrived
+            self.acting, self.commanded = arrived, True
             self.missed_in_row = 0
         elif self.acting is not None:
             self.missed += self.path.absent
             self.missed_in_row += 1
             if self.missed_in_row > self._config.command_timeout:
                 self.acting = None
+                self._warn_of_silence()
+
+    def _warn_of_silence(self) -> None:
+        now = time.monotonic()
+        if now - self._warned_at > _WARNING_PERIOD:
+            self._warned_at = now
+            self._warn(
+                f"no command for {self.missed_in_row} periods: stopping until they are back"
+            )
 
     def _read(self, message: JointState) -> JointCommand | None:
         command = accept_command(message, self._joints, self._refused, self._warn)
@@ -116,7 +133,7 @@ class CommandStream:
             command = TorqueCommand(np.clip(tau, -tau_max, tau_max))
         return command
 
-    def _note_stray(self, own: int, stamp: int) -> None:
+    def _count_stray(self, own: int, stamp: int) -> None:
         """Count a command that is not for this period; warn when no other comes."""
         self._refused["not for this period"] += 1
         self._strays += 1
@@ -126,40 +143,3 @@ class CommandStream:
                 f"joint state; the last one has {1e-9 * own:.13g} s instead of "
                 f"{1e-9 * stamp:.13g} s"
             )
-
-
-class CommandOutage:
-    """Counts the periods in which a robot stops or is stopped because its commands do not come.
-
-    On a busy machine commands stop and return many times a second: all of that is one outage.
-
-    Args:
-        timeout: periods without a command until the robot stops.
-        steady: periods under commands after which these count as back.
-
-    Attributes:
-        commanded: whether there has been a command.
-    """
-
-    def __init__(self, timeout: int, steady: int) -> None:
-        self._timeout, self._steady = timeout, steady
-        self.commanded = False
-        self._silent = self._good = 0
-
-    def count(self, silent: bool) -> str:
-        """Count a period; return what to log, empty if there is nothing new.
-
-        Periods before the first command do not count.
-        """
-        if not silent:
-            self.commanded = True
-            self._good += 1
-            if self._silent and self._good == self._steady:
-                periods, self._silent = self._silent, 0
-                return f"commands are back; the robot stopped itself for {periods} periods"
-        elif self.commanded:
-            self._good = 0
-            self._silent += 1
-            if self._silent == 1:
-                return f"no command for {self._timeout + 1} periods: stopping until they are back"
-        return ""

@@ -48,7 +48,7 @@ _FURTHER: tuple[tuple[str, type, QoSProfile], ...] = (
     (EXTERNAL_WRENCH.name, EXTERNAL_WRENCH.message, _MANY),
     (OBSTACLES.name, OBSTACLES.message, _MANY),
 )
-"""What a file has besides, and the reports do not need."""
+"""Further topics that are written to a file; the report does not need them."""
 
 
 def _stamp_of(serialized: bytes) -> int:
@@ -92,7 +92,7 @@ class RunRecorder:
         self._limits: dict[int, list[Sequence[float]]] = {}
         self._torques: dict[int, Sequence[float]] = {}
         self._wrenches: dict[int, Sequence[float]] = {}
-        for topic, take in (
+        for topic, callback in (
             (JOINT_STATES, self._on_state),
             (ACCELERATION_LIMITS, self._on_limits),
             (JOINT_COMMANDS, self._on_command),
@@ -100,9 +100,9 @@ class RunRecorder:
         ):
             self.topics += (topic.name,)
             if file is None:
-                node.listen(topic, take, _RECORDING_QOS)
+                node.listen(topic, callback, _RECORDING_QOS)
             else:
-                self._keep(file, node, topic.message, topic.name, take, _RECORDING_QOS)
+                self._keep(file, node, topic.message, topic.name, callback, _RECORDING_QOS)
                 node.publisher_watch.add(node.resolve_topic_name(topic.name))
         if file is None:
             DIAGNOSTICS.subscription(node, self._on_diagnostics)
@@ -117,16 +117,16 @@ class RunRecorder:
         node: ArmNode,
         kind: type,
         name: str,
-        take: Callable[[Any], None] | None,
+        callback: Callable[[Any], None] | None,
         qos: QoSProfile,
     ) -> None:
-        """Subscribe; what comes goes to the file and to `take`."""
+        """Subscribe; each message is written to the file and passed to `callback`."""
         path = node.resolve_topic_name(name)
         file.add_topic(path, kind)
 
         def keep(serialized: bytes) -> None:
-            if take is not None:
-                take(deserialize_message(serialized, kind))
+            if callback is not None:
+                callback(deserialize_message(serialized, kind))
             stamp = _stamp_of(serialized)
             if name not in self.topics:
                 # Without a stamp of robot time, or with one in the future.

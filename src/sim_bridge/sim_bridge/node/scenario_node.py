@@ -105,7 +105,7 @@ class ScenarioNode(ArmNode):
         awaits: what it waits for.
         ended: done when the scenario has ended.
         failure: why it ended early; None if it did not.
-        listener: the recorded messages and diagnostics of the other nodes.
+        recorder: the recorded messages and diagnostics of the other nodes.
     """
 
     NAME = "scenario_node"
@@ -119,7 +119,7 @@ class ScenarioNode(ArmNode):
         self.awaits = ""
         self.ended: Future[None] = Future()
         self.failure: ScenarioRefused | None = None
-        self.listener = RunRecorder(self, config.joints, file)
+        self.recorder = RunRecorder(self, config.joints, file)
         self._first, self._period = 0, 1
         self._refused: dict[str, list[str]] | None = None  # when the messages begin; else None
         frames = config.base_frame, config.end_effectors[0]
@@ -138,11 +138,11 @@ class ScenarioNode(ArmNode):
     @property
     def robot(self) -> dict[str, str]:
         """The robot's last diagnostics, by key."""
-        return self.listener.diagnostics["bullet_node"]
+        return self.recorder.diagnostics["bullet_node"]
 
     def recorded_run(self) -> RecordedRun:
         """Return the recording since the robot began to move."""
-        return self.listener.run(self._first)
+        return self.recorder.run(self._first)
 
     # Course of the scenario
 
@@ -162,13 +162,13 @@ class ScenarioNode(ArmNode):
         """Play the scenario; yield what must happen before it proceeds."""
         while missing := self._missing():
             yield f"getting ready: there is no {', no '.join(missing)}"
-        before = self._first = self.listener.stamp
+        before = self._first = self.recorder.stamp
         yield from self._call(RESET)
-        while not self.listener.answered == self.listener.stamp > before:
+        while not self.recorder.answered == self.recorder.stamp > before:
             yield "resetting: there is no joint command for the start"
         # Resuming begins a new period: the first state in motion is the next.
         self._period = round(1e9 * float(self.robot["period_s"]))
-        self._first = self.listener.stamp + self._period
+        self._first = self.recorder.stamp + self._period
         self._refused = {}
         self._check_refusals(self._refused)  # those before the first message do not count
         while not self._load():
@@ -184,7 +184,7 @@ class ScenarioNode(ArmNode):
             yield from self._call(pause(False))
             while not self._is_paused_at(halt):
                 if not lockstep:
-                    now = (self.listener.stamp - self._first) // self._period
+                    now = (self.recorder.stamp - self._first) // self._period
                     yield from self._call_services(now)
                 yield "playing"
             begin = halt
@@ -200,7 +200,7 @@ class ScenarioNode(ArmNode):
         topics = self._goals.without_subscriber() + self._world.without_subscriber()
         return (
             ([] if self.robot.get("paused") == "True" else ["paused robot"])
-            + ([] if self.listener.answered >= 0 else ["joint commands"])
+            + ([] if self.recorder.answered >= 0 else ["joint commands"])
             + [f"service {name}" for name, client in clients if not client.service_is_ready()]
             + [f"subscriber of {topic}" for topic in topics]
         )
@@ -229,7 +229,7 @@ class ScenarioNode(ArmNode):
 
     def _load(self) -> bool:
         """Send scheduled messages; return whether all were received."""
-        goals = self.listener.diagnostics["controller_node"].get("goals_pending", 0)
+        goals = self.recorder.diagnostics["controller_node"].get("goals_pending", 0)
         loaded = self._goals.proceed(self._first, int(goals))
         changes = int(self.robot["world_changes_pending"])
         return self._world.proceed(self._first, changes) and loaded
@@ -246,7 +246,7 @@ class ScenarioNode(ArmNode):
 
     def _check_refusals(self, known: dict[str, list[str]]) -> None:
         for node, (key, topics) in _REFUSAL_COUNTS.items():
-            counts = self.listener.diagnostics[node].get(key, "").split("; ")
+            counts = self.recorder.diagnostics[node].get(key, "").split("; ")
             refused = [count for count in counts if count.startswith(topics)]
             if refused != known.setdefault(node, refused):
                 raise ScenarioRefused(f"refused by {node}: {' '.join(refused)}")
@@ -259,10 +259,10 @@ class ScenarioNode(ArmNode):
             progress.wait(self.awaits)
             return
         distance = np.minimum(
-            self.listener.q - self.config.position_min, self.config.position_max - self.listener.q
+            self.recorder.q - self.config.position_min, self.config.position_max - self.recorder.q
         )
         nearest = int(np.argmin(distance))
-        controller = self.listener.diagnostics["controller_node"]
+        controller = self.recorder.diagnostics["controller_node"]
         state = (
             f"{controller.get('mode', '')}  "
             f"nearest limit {self.config.joints[nearest]} {distance[nearest]:+.4f} rad"
@@ -272,7 +272,7 @@ class ScenarioNode(ArmNode):
             state += f"  pose error {1e3 * error:.2f} mm"
         state += f"  {float(self.robot['rate_hz']):.0f} Hz"
         # With the period that the last state begins.
-        played = 1e-9 * (self.listener.stamp - self._first + self._period)
+        played = 1e-9 * (self.recorder.stamp - self._first + self._period)
         progress.show(max(0.0, played), state)
 
 
@@ -320,8 +320,8 @@ def _run(executor: Executor, node: ScenarioNode, signals: Sequence[int], quiet: 
         # calls for one each.
         executor.spin_until_future_complete(node.ended, timeout_sec=0.1)
         now = time.monotonic()
-        if (node.listener.stamp, node.awaits) != seen:
-            seen, moved_at = (node.listener.stamp, node.awaits), now
+        if (node.recorder.stamp, node.awaits) != seen:
+            seen, moved_at = (node.recorder.stamp, node.awaits), now
         elif now - moved_at > node.config.ready_timeout:
             raise TimeoutError(
                 f"nothing has moved for {node.config.ready_timeout:g} s ({node.awaits})"
@@ -362,14 +362,14 @@ def main(args: list[str] | None = None) -> int:
             signal.signal(each, signal.default_int_handler)
         if options.out is None:
             return 0
-        told = node.listener.diagnostics
+        diagnostics = node.recorder.diagnostics
         kept = write_report(
             options.out,
             node.config,
             node.recorded_run(),
             node.robot,
-            told["bounds_node"],
-            told["controller_node"],
+            diagnostics["bounds_node"],
+            diagnostics["controller_node"],
         )
         return 0 if kept else 1
     except (TimeoutError, ScenarioRefused, OSError) as error:

@@ -298,15 +298,15 @@ def verdict(metrics: Metrics) -> str:
     return said + "."
 
 
+_LIMIT = {"color": "tab:red", "linestyle": "--", "linewidth": 1.2}
+
+
 def _draw(
     path: Path, config: ScenarioConfiguration, run: RecordedRun, errors: Array, metrics: Metrics
 ) -> None:
     """Draw the joint nearest to a limit in detail, and all joints relative to their limits."""
     from matplotlib.figure import Figure  # takes a second to import
 
-    clearance = np.minimum(run.q - config.position_min, config.position_max - run.q).min(axis=0)
-    j = int(np.argmin(clearance))
-    t = run.t
     figure = Figure(figsize=(12, 10), layout="constrained")
     axes = figure.subplots(4, 2, sharex=True)
     outcome = "no limit broken" if metrics["limits_kept"] else "LIMITS BROKEN"
@@ -314,47 +314,51 @@ def _draw(
         f"{config.robot_name}: {metrics['bounds_method']} bounds, {metrics['rate_hz']:g} Hz, "
         f"{metrics['clock']}: {outcome}"
     )
-    one, every = axes[:, 0], axes[:, 1]
-    limit = {"color": "tab:red", "linestyle": "--", "linewidth": 1.2}
-
-    one[0].plot(t, run.q[:, j])
-    for value in (config.position_min[j], config.position_max[j]):
-        one[0].axhline(value, **limit)
-    one[0].set(title=f"{run.joints[j]}, the joint nearest to a limit", ylabel="position [rad]")
-    one[1].plot(t, run.v[:, j])
-    for sign in (-1, 1):
-        one[1].axhline(sign * config.velocity_max[j], **limit)
-        one[3].axhline(sign * config.torque_max[j], **limit)
-        for axis in every[:3]:
-            axis.axhline(sign, **limit)
-    one[1].set(ylabel="velocity [rad/s]")
-    dt = 1.0 / metrics["rate_hz"]
-    one[2].fill_between(t, run.a_lower[:, j], run.a_upper[:, j], alpha=0.25, label="allowed")
-    one[2].plot(t[:-1], np.diff(run.v[:, j]) / dt, linewidth=1.0, label="measured")
-    one[2].set(ylabel="acceleration [rad/s$^2$]")
-    one[2].legend(loc="upper right")
-    one[3].plot(t, run.tau[:, j])
-    one[3].set(ylabel="torque [N m]", xlabel="time [s]")
-
-    middle, half = (
-        0.5 * (config.position_max + config.position_min),
-        0.5 * (config.position_max - config.position_min),
-    )
-    for i, name in enumerate(run.joints):
-        every[0].plot(t, (run.q[:, i] - middle[i]) / half[i], label=name)
-        every[1].plot(t, run.v[:, i] / config.velocity_max[i])
-        every[2].plot(t, run.tau[:, i] / config.torque_max[i])
-    every[0].set(title="all joints, limits at -1 and 1", ylabel="position / limit")
-    every[0].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize="small")
-    every[1].set(ylabel="velocity / limit")
-    every[2].set(ylabel="torque / limit")
-    every[3].semilogy(t, np.maximum(1e3 * errors[:, 0], 1e-3), label="position [mm]")
-    every[3].semilogy(t, np.maximum(1e3 * errors[:, 1], 1e-3), label="orientation [mrad]")
-    every[3].set(ylabel="error of the pose goal", xlabel="time [s]")
-    every[3].legend(loc="upper right")
+    clearance = np.minimum(run.q - config.position_min, config.position_max - run.q).min(axis=0)
+    _draw_joint(axes[:, 0], config, run, int(np.argmin(clearance)), 1.0 / metrics["rate_hz"])
+    _draw_all(axes[:, 1], config, run, errors)
     for axis in axes.flat:
         axis.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
 
 
-Array = NDArray[np.float64]
+def _draw_joint(
+    axes: Any, config: ScenarioConfiguration, run: RecordedRun, j: int, dt: float
+) -> None:
+    position, velocity, acceleration, torque = axes
+    t, v_max, tau_max = run.t, config.velocity_max[j], config.torque_max[j]
+    acceleration.fill_between(t, run.a_lower[:, j], run.a_upper[:, j], alpha=0.25, label="allowed")
+    acceleration.plot(t[:-1], np.diff(run.v[:, j]) / dt, linewidth=1.0, label="measured")
+    acceleration.set(ylabel="acceleration [rad/s$^2$]")
+    acceleration.legend(loc="upper right")
+    for axis, values, limits, label in (
+        (position, run.q, (config.position_min[j], config.position_max[j]), "position [rad]"),
+        (velocity, run.v, (-v_max, v_max), "velocity [rad/s]"),
+        (torque, run.tau, (-tau_max, tau_max), "torque [N m]"),
+    ):
+        axis.plot(t, values[:, j])
+        axis.set(ylabel=label)
+        for limit in limits:
+            axis.axhline(limit, **_LIMIT)
+    position.set(title=f"{run.joints[j]}, the joint nearest to a limit")
+    torque.set(xlabel="time [s]")
+
+
+def _draw_all(axes: Any, config: ScenarioConfiguration, run: RecordedRun, errors: Array) -> None:
+    middle = 0.5 * (config.position_max + config.position_min)
+    half = 0.5 * (config.position_max - config.position_min)
+    for axis, shares, name in (
+        (axes[0], (run.q - middle) / half, "position"),
+        (axes[1], run.v / config.velocity_max, "velocity"),
+        (axes[2], run.tau / config.torque_max, "torque"),
+    ):
+        axis.plot(run.t, shares, label=run.joints)
+        axis.set(ylabel=f"{name} / limit")
+        for sign in (-1, 1):
+            axis.axhline(sign, **_LIMIT)
+    axes[0].set(title="all joints, limits at -1 and 1")
+    axes[0].legend(run.joints, loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize="small")
+    for values, label in zip(errors.T, ("position [mm]", "orientation [mrad]"), strict=True):
+        axes[3].semilogy(run.t, np.maximum(1e3 * values, 1e-3), label=label)
+    axes[3].set(ylabel="error of the pose goal", xlabel="time [s]")
+    axes[3].legend(loc="upper right")

@@ -134,11 +134,11 @@ class JointPictures:
         across, down = place(q, v)
         name = escape(self._joints[k])
         distance = min(q - float(limits.q_min[k]), float(limits.q_max[k]) - q)
-        told = f"{distance:+.3f} rad" if math.isfinite(distance) else "no limit"
+        room = f"{distance:+.3f} rad" if math.isfinite(distance) else "no limit"
         return [
             f'<text x="{left}" y="12" font-size="9.5" fill="#333">{name}</text>',
             f'<text x="{left + width}" y="12" font-size="9.5" fill="{fill}" '
-            f'text-anchor="end">{told}</text>',
+            f'text-anchor="end">{room}</text>',
             f'<polygon points="{points(box)}" fill="#f4f4f4" stroke="#888"/>',
             f'<polygon points="{points(kernel if kernel is not None else box)}" fill="#cfe3f5" '
             'stroke="#3b76af" stroke-width="0.8"/>',

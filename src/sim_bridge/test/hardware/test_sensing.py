@@ -141,9 +141,7 @@ def test_what_is_on_is_told_by_name():
     assert not imperfections(missed_in_row=9, imperfection_seed=4).names
     some = imperfections(velocity_source="encoder", state_delay=1, torque_constant_error=-0.02)
     assert some.names == ("velocity_source", "state_delay", "torque_constant_error")
-    assert some.of_sensing
     assert some.of_motors
-    assert not imperfections(command_delay=1, missed_probability=0.1).of_sensing
     assert not imperfections(command_delay=1, encoder_resolution=1e-4).of_motors
 
 

@@ -177,18 +177,3 @@ def test_a_bad_time_to_pause_is_refused_while_it_runs(ros):
     assert names_parameter(ros.refuses("bullet_node", pause_after=-1.0), "pause_after")
     assert "read-only" in ros.refuses("bullet_node", rate_hz=100.0)
     robot.step(times=3)
-
-
-@pytest.mark.parametrize(
-    ("declared", "law", "warns"),
-    [(0, False, False), (3, False, True), (3, True, False), (4, False, False)],
-)
-def test_it_says_that_it_goes_on_for_longer_than_the_bounds_cover(
-    ros, capfd, declared, law, warns
-):
-    without = {} if law else {"acceleration_min": None, "acceleration_max": None}
-    RobotProbe(ros, command_timeout=4, missed_deadlines=declared, **without)
-    said = (
-        "'command_timeout' is 4, but the bounds cover 3 missed periods" in capfd.readouterr().err
-    )
-    assert said == warns

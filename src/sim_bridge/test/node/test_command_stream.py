@@ -26,7 +26,7 @@ class Robot:
 
     def takes(self, stamp, tau=TAU, *, ended=False, paused=False):
         message = joint_state(JOINTS, stamp, tau=tau)
-        return self.stream.take(message, NOW, 0.0, ended=ended, paused=paused)
+        return self.stream.accept(message, NOW, 0.0, ended=ended, paused=paused)
 
 
 def test_the_command_of_the_period_acts_and_is_clipped():
@@ -94,6 +94,7 @@ def test_the_last_one_is_held_for_the_time_out():
     robot.stream.receive(None)
     assert robot.stream.acting is None
     assert (robot.stream.missed, robot.stream.missed_in_row) == (4, 4)
+    assert robot.said == ["no command for 4 periods: stopping until they are back"]
     robot.stream.restart()
     assert (robot.stream.missed, robot.stream.missed_in_row) == (0, 0)
 
@@ -102,5 +103,5 @@ def test_positions_are_commands_too():
     robot = Robot()
     message = joint_state(JOINTS, NOW, Q)
     message.velocity = []
-    assert robot.stream.take(message, NOW, 0.0, ended=False, paused=False)
+    assert robot.stream.accept(message, NOW, 0.0, ended=False, paused=False)
     np.testing.assert_array_equal(robot.stream.acting.q, Q)

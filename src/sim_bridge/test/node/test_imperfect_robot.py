@@ -94,7 +94,6 @@ NAMES = ("position", "velocity", "effort")
 
 def test_without_imperfections_the_motion_is_the_same_bit_for_bit(ros):
     robot = RobotProbe(ros, missed_in_row=7, imperfection_seed=5)
-    assert robot.node._sensing is None
     assert robot.node._robot._motors is None
     commands = torques(60)
     for got, true in zip(play(robot, commands), truth(commands), strict=True):
@@ -220,7 +219,7 @@ def test_the_files_of_imperfect_robots_describe_one(name):
     }
     assert set(given.names) >= expected
     assert 1 <= given.state_delay + given.command_delay <= 2
-    assert given.missed_in_row == config.command_timeout == config.missed_deadlines
+    assert given.missed_in_row == config.command_timeout == own["missed_deadlines"]
     # The arm can be held under gravity with what remains of its torque.
     motors = Motors(given, config.torque_max, config.physics_dt)
     n = len(config.joints)

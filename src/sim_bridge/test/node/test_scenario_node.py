@@ -123,7 +123,7 @@ def test_without_a_goal_no_pose_error_is_shown(ros, tmp_path, reported, shown):
     assert screen.text == node.awaits
     assert "there is no paused robot, no joint commands" in screen.text
     node._refused = {}
-    node.listener.diagnostics |= {"bullet_node": {"rate_hz": "500"}, "controller_node": reported}
+    node.recorder.diagnostics |= {"bullet_node": {"rate_hz": "500"}, "controller_node": reported}
     node.show(screen)
     assert screen.text.startswith(f"{reported.get('mode', '')}  nearest limit panda_joint")
     assert screen.text.endswith(f" rad{shown}  500 Hz")

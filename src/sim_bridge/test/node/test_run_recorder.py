@@ -5,6 +5,7 @@ from rclpy.node import Node
 
 from sim_bridge.node.run_recorder import RunRecorder
 from viability_bounds_pkg.ros.messages import Diagnostics
+from viability_bounds_pkg.ros.streams import StreamNode
 
 NAMESPACES = ("", "left", "left/wrist", "right")
 
@@ -15,11 +16,11 @@ def test_diagnostics_of_arms_in_other_namespaces_are_ignored(ros, own):
         robot = ros.add(Node("bullet_node", context=ros.context, namespace=namespace))
         report = DiagnosticStatus.OK, "", {"arm": namespace}
         Diagnostics(robot, lambda report=report: report)
-    node = ros.add(Node("player", context=ros.context, namespace=own))
-    listener, told = RunRecorder(node, ["x"]), []
+    node = ros.add(StreamNode("player", context=ros.context, namespace=own))
+    recorder, told = RunRecorder(node, ["x"]), []
 
     def all_told():
-        told.append(listener.diagnostics["bullet_node"].get("arm"))
+        told.append(recorder.diagnostics["bullet_node"].get("arm"))
         return len(ros.diagnostics) == len(NAMESPACES) and told[-1] is not None
 
     ros.wait_until(all_told)
