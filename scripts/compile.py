@@ -10,21 +10,16 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-import numpy as np
 import yaml
 from direct import DirectLoop
 
-from sim_bridge.bullet.obstacles import Obstacle
 from viability_bounds_pkg.exceptions import ArmSafetyError
 
 CONFIG = Path(__file__).resolve().parent.parent / "config"
 
-TABLE = Obstacle("table", "box", (0.2, 0.6, 0.1), (0.30702, 0.0, 0.42237), (0.0, 0.0, 0.0, 1.0))
-"""5 mm below Panda's fingertips at its start."""
-
 
 def main() -> None:
-    """Play a few steps of each robot, one of them beside a wall, and touch something."""
+    """Play a few steps of each robot, one of them beside a wall."""
     for path in sorted(CONFIG.glob("*.yaml")):
         try:
             loop = DirectLoop(path.stem)
@@ -36,15 +31,6 @@ def main() -> None:
     (wall,) = yaml.safe_load((CONFIG / "obstacles" / "panda_wall.yaml").read_text()).values()
     loop = DirectLoop("panda", wall["ros__parameters"])
     loop.run(2.0 * loop.dt)
-    touch()
-
-
-def touch() -> None:
-    """Let an arm without torque fall on a table: friction of contacts is compiled at the first."""
-    loop = DirectLoop("panda")
-    loop.robot.obstacles.add(TABLE)
-    for _ in range(100):
-        loop.robot.step(np.zeros(loop.model.nv), loop.config.substeps)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes serialized messages to an MCAP file."""
+"""Writes serialized messages to an MCAP file, with the definitions of their types.
+
+The definitions are made from the Python classes, because the .msg files are elsewhere in each
+installation. Comments, constants and defaults are not in them; readers need the fields alone.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from mcap.writer import Writer
+
+_PRIMITIVES = {"double": "float64", "float": "float32", "boolean": "bool", "octet": "byte"}
+"""Where the names of the interface definition language differ from those of .msg files."""
+
+_RULE = "=" * 80
 
 
 class McapFile:
@@ -65,12 +74,6 @@ class McapFile:
         """Complete the file: without its end it can be read only in part."""
         self._writer.finish()
         self._file.close()
-
-
-_PRIMITIVES = {"double": "float64", "float": "float32", "boolean": "bool", "octet": "byte"}
-"""Where the names of the interface definition language differ from those of .msg files."""
-
-_RULE = "=" * 80
 
 
 def message_definition(kind: Any) -> tuple[str, str]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rewrites a URDF so that its dynamics in PyBullet equal Pinocchio's reduced model.
+"""Rewrites a URDF so that its dynamics in PyBullet equal Pinocchio's reduced model; payloads.
 
 PyBullet reads a URDF in ways that silently change the dynamics. Each is prevented here:
 
@@ -20,7 +20,7 @@ On request it adds what a URDF cannot express: rotors that gears will couple to 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -37,11 +37,14 @@ from viability_bounds_pkg.robot.description import (
     unknown_name,
 )
 
+Array = NDArray[np.float64]
+
 _MOVABLE = ("revolute", "continuous", "prismatic")
 # PyBullet makes no stop where lower > upper.
 _NO_STOP = {"lower": "1", "upper": "-1", "effort": "0", "velocity": "0"}
 # The caller sets the moments of inertia after loading.
 _STAND_IN = {"ixx": "1", "ixy": "0", "ixz": "0", "iyy": "1", "iyz": "0", "izz": "1"}
+_ROUNDING = 1e-9  # share of the largest moment of inertia of a payload
 
 
 class FramePlacement(NamedTuple):
@@ -112,82 +115,101 @@ def prepare_urdf(
     except ParseError as error:
         raise RobotDescriptionError(f"URDF is not well-formed XML ({error})") from error
     locked = dict(locked_positions or {})
-    _check_joints(root, joints, locked)
+    types = {joint.get("name", ""): joint.get("type", "") for joint in root.findall("joint")}
+    _check_joints(types, joints, locked)
     scale_masses(root, mass_scales or {})
-    apart = (
-        {link_at(joint, "child") for joint in joints_on(root, sensor_frame)}
-        if sensor_frame
-        else set()
-    )
+    mounts = joints_on(root, sensor_frame) if sensor_frame else []
+    apart = {link_at(joint, "child") for joint in mounts}
 
     output = Element("robot", name=root.get("name", "robot"))
     output.extend(deepcopy(root.findall("material")))
-    links = {link.get("name", ""): link for link in root.findall("link")}
-    outgoing: dict[str, list[Element]] = {}
-    children = []
-    for joint in root.findall("joint"):
-        outgoing.setdefault(_linked(joint, "parent", links), []).append(joint)
-        children.append(_linked(joint, "child", links))
-    roots = [name for name in links if name not in children]
-    if len(roots) != 1 or len(set(children)) != len(children):
-        raise RobotDescriptionError(f"the links do not form one tree; roots: {roots}")
-
-    missing: list[str] = []
-    bodies = [_Body(roots[0])]
-    placed: dict[str, tuple[_Body, pin.SE3]] = {}
-    pending = [(roots[0], bodies[0], pin.SE3.Identity())]
-    while pending:
-        name, body, placement = pending.pop()
-        placed[name] = body, placement
-        body.inertia += _inertia(links[name], placement)
-        if visuals:
-            body.shapes += _placed_shapes(links[name], "visual", placement, missing)
-        elif body is not bodies[0]:  # what stands still meets nothing
-            body.shapes += _placed_shapes(links[name], "collision", placement, missing)
-        for joint in outgoing.get(name, ()):
-            child = _linked(joint, "child", links)
-            origin = placement * transform_of(joint.find("origin"))
-            moves = joint.get("name") in joints
-            if not moves:
-                origin = origin * _locked_motion(joint, locked.get(joint.get("name", ""), 0.0))
-            if moves or child in apart:
-                output.append(_joint_between(joint, moves, body.name, child, origin))
-                bodies.append(_Body(child))
-                pending.append((child, bodies[-1], pin.SE3.Identity()))
-            else:
-                pending.append((child, body, origin))
-
-    if visuals and missing:
-        raise RobotDescriptionError("; ".join(missing))
-    # What stands on the ground takes no part in the dynamics; its frame stays where it is.
-    bodies[0] = _Body(roots[0], shapes=bodies[0].shapes)
-    principal = {body.name: _append_link(output, body) for body in bodies}
+    merged = _merge_links(_Tree(root), joints, locked, apart, visuals, output)
+    if visuals and merged.missing:
+        raise RobotDescriptionError("; ".join(merged.missing))
+    principal = {body.name: _append_link(output, body) for body in merged.bodies}
     frames = {
         name: FramePlacement(body.name, principal[body.name][0].actInv(placement))
-        for name, (body, placement) in placed.items()
+        for name, (body, placement) in merged.placed.items()
     }
     inertias = {name: moments for name, (_, moments) in principal.items()}
-    rotors = {}
-    for joint_name, inertia in (rotor_inertias or {}).items():
-        rotors[joint_name] = rotor = f"{joint_name} rotor"
-        _append_rotor(output, bodies[0].name, rotor)
-        inertias[rotor] = np.full(3, inertia)
+    rotors = {name: f"{name} rotor" for name in rotor_inertias or {}}
+    for name, inertia in (rotor_inertias or {}).items():
+        _append_rotor(output, merged.bodies[0].name, rotors[name])
+        inertias[rotors[name]] = np.full(3, inertia)
     others = {
         name: locked.get(name, 0.0)
-        for name, kind in _joint_types(root).items()
+        for name, kind in types.items()
         if kind in _MOVABLE and name not in joints
     }
     text = tostring(output, encoding="unicode")
-    return PreparedUrdf(text, frames, inertias, rotors, missing, others)
+    return PreparedUrdf(text, frames, inertias, rotors, merged.missing, others)
 
 
-def _joint_types(root: Element) -> dict[str, str]:
-    return {joint.get("name", ""): joint.get("type", "") for joint in root.findall("joint")}
+class _Tree:
+    """The links of a URDF by name, the joints on each, and the name of the root link."""
+
+    def __init__(self, root: Element) -> None:
+        self.links = {link.get("name", ""): link for link in root.findall("link")}
+        self.joints: dict[str, list[Element]] = {name: [] for name in self.links}
+        children = []
+        for joint in root.findall("joint"):
+            self.joints[_linked(joint, "parent", self.links)].append(joint)
+            children.append(_linked(joint, "child", self.links))
+        roots = [name for name in self.links if name not in children]
+        if len(roots) != 1 or len(set(children)) != len(children):
+            raise RobotDescriptionError(f"the links do not form one tree; roots: {roots}")
+        self.root = roots[0]
 
 
-def _check_joints(root: Element, joints: Sequence[str], locked: Mapping[str, float]) -> None:
+class _Merged(NamedTuple):
+    """Bodies made of links that move as one, and where each link is on its body."""
+
+    bodies: list[_Body]  # the first one stands on the ground
+    placed: dict[str, tuple[_Body, pin.SE3]]
+    missing: list[str]  # meshes that cannot be found
+
+
+def _merge_links(
+    tree: _Tree,
+    joints: Sequence[str],
+    locked: Mapping[str, float],
+    apart: Collection[str],
+    visuals: bool,
+    output: Element,
+) -> _Merged:
+    """Merge links that move as one; append the joints between the bodies to `output`."""
+    ground = _Body(tree.root)
+    merged = _Merged([ground], {}, [])
+    pending = [(tree.root, ground, pin.SE3.Identity())]
+    while pending:
+        name, body, placement = pending.pop()
+        merged.placed[name] = body, placement
+        link = tree.links[name]
+        if body is not ground:  # what stands on the ground takes no part in the dynamics
+            body.inertia += _inertia(link, placement)
+        if visuals:
+            body.shapes += _placed_shapes(link, "visual", placement, merged.missing)
+        elif body is not ground:  # what stands still meets nothing
+            body.shapes += _placed_shapes(link, "collision", placement, merged.missing)
+        for joint in tree.joints[name]:
+            joint_name, child = joint.get("name", ""), link_at(joint, "child")
+            origin = placement * transform_of(joint.find("origin"))
+            moves = joint_name in joints
+            if not moves:
+                origin = origin * _locked_motion(joint, locked.get(joint_name, 0.0))
+            if moves or child in apart:
+                output.append(_joint_between(joint, moves, body.name, child, origin))
+                merged.bodies.append(_Body(child))
+                pending.append((child, merged.bodies[-1], pin.SE3.Identity()))
+            else:
+                pending.append((child, body, origin))
+    return merged
+
+
+def _check_joints(
+    types: Mapping[str, str], joints: Sequence[str], locked: Mapping[str, float]
+) -> None:
     """Raise `RobotDescriptionError` unless each joint named exists and can do its part."""
-    types = _joint_types(root)
     for name in (*joints, *locked):
         if name not in types:
             movable = (str(each) for each, kind in types.items() if kind != "fixed")
@@ -302,9 +324,6 @@ def _locked_motion(joint: Element, position: float) -> pin.SE3:
     return pin.SE3(pin.exp3(motion), np.zeros(3))
 
 
-Array = NDArray[np.float64]
-
-
 def joint_axis(joint: Element) -> Array:
     """Return the unit axis of `joint`, shape (3,); URDF's default is x."""
     element = joint.find("axis")
@@ -381,11 +400,6 @@ def scale_masses(root: Element, scales: Mapping[str, float]) -> None:
             for part in (*inertial.findall("mass"), *inertial.findall("inertia")):
                 for key in part.attrib:
                     part.set(key, number_text(scale * read_numbers(part, key, 1)))
-
-
-Array = NDArray[np.float64]
-
-_ROUNDING = 1e-9  # share of the largest moment
 
 
 class PayloadError(ArmSafetyError, ValueError):

@@ -123,9 +123,6 @@ class ForceTorqueSensor:
         self.wrench = measured.vector
 
 
-Array = NDArray[np.float64]
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SensorConfiguration:
     """Parameters of a force/torque sensor."""
