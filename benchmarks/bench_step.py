@@ -16,8 +16,8 @@ import numpy as np
 import pinocchio as pin
 import yaml
 
-from torque_safety_controller.contact.contacts import Contacts, FrictionContact
 from torque_safety_controller.controller import Controller
+from torque_safety_controller.parts.contact.contacts import FrictionContact
 from torque_safety_controller.parts.goals import Goals
 from torque_safety_controller.parts.joint_bounds import JointBounds
 from torque_safety_controller.qp import (
@@ -80,10 +80,8 @@ def qp_alone(controller: Controller, state: State) -> dict[str, Callable[[], Any
     data = robot.model.createData()
     pin.computeJointJacobians(robot.model, data, state.q)
     pin.forwardKinematics(robot.model, data, state.q, state.v, np.zeros(n))
-    contacts = Contacts(
-        robot.model, [FrictionContact(robot.frame, np.zeros(3), [0.0, 0.0, -1.0], 0.5, 4)]
-    )
-    wrench = contacts.wrench_task(0, np.array([0.0, 0.0, -10.0, 0.0, 0.0, 0.0]), 1e-3)
+    contact = FrictionContact(robot.frame, np.zeros(3), [0.0, 0.0, -1.0], 0.5, 4)
+    pressing = np.array([0.0, 0.0, -10.0, 0.0, 0.0, 0.0])
     robot.update(state, np.zeros(n))
     limits = robot.M, -controller.tau_max - robot.h, controller.tau_max - robot.h
     terms = [task.term(robot) for task in controller.goals.tasks(None)]
@@ -96,8 +94,7 @@ def qp_alone(controller: Controller, state: State) -> dict[str, Callable[[], Any
     too_much = rows._replace(lower=np.abs(G @ half) + 0.2)
 
     def with_contact() -> tuple[Any, Any]:
-        contacts.update(data)
-        return None, contacts.forces([wrench])
+        return None, contact.forces(robot.model, data, pressing, 1e-3)
 
     timed: dict[str, Callable[[], Any]] = {}
     for name, extra in {

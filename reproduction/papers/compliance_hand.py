@@ -15,7 +15,7 @@ from direct import DirectLoop, within_limits
 from figure import Figure, verdict
 
 from sim_bridge.bullet.obstacles import Obstacle
-from torque_safety_controller.parts.interaction import Interaction
+from torque_safety_controller.parts.contact.interaction import Interaction
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory, TrajectoryPoint
 
 DUAL = {"integral_action": "task", "yield_threshold": [10.0, 2.0]}

@@ -20,7 +20,7 @@ from chain import ROOT
 from direct import DirectLoop, column, distance, hand_places
 from figure import Figure, reproduce, table
 
-from torque_safety_controller.parts.interaction import Interaction
+from torque_safety_controller.parts.contact.interaction import Interaction
 
 ROBOT = "talos_left_arm"
 ELBOW = 5

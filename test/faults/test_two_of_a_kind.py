@@ -17,7 +17,7 @@ from std_msgs.msg import Float64MultiArray
 from sim_bridge.node.bullet_node import BulletNode
 from sim_bridge.node.scenario_node import ScenarioNode, ScenarioRefused, play
 from torque_safety_controller.node.controller_node import ControllerNode
-from torque_safety_controller.parts.interaction import Interaction
+from torque_safety_controller.parts.contact.interaction import Interaction
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, stamp_to_ns
 from viability_bounds_pkg.ros.topics import (

@@ -10,7 +10,7 @@ from direct import DirectLoop, column
 
 from sim_bridge.scenario.events import AddObstacle, PoseGoal
 from sim_bridge.scenario.scenario import load_scenario
-from torque_safety_controller.parts.collision import Collision
+from torque_safety_controller.parts.collision.avoidance import Collision
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.supervisor import REST
 from viability_bounds_pkg.robot.description import load_geometry, read_urdf
@@ -77,7 +77,7 @@ def play(loop, duration, events=()):
                 loop.controller.goals.set_pose(goal)
         loop.step()
         if loop.controller.find(Collision):
-            distances.append(loop.controller.find(Collision).avoidance.closest()[0])
+            distances.append(loop.controller.find(Collision).closest()[0])
         contacts = max(contacts, len(loop.robot.obstacles.contacts()))
     return np.array(distances), contacts
 
@@ -103,7 +103,7 @@ def test_goals_behind_obstacles_and_inside_the_arm_end_at_rest_at_the_margin():
     assert distances.min() > MARGIN + RESERVE - 1e-5
     obstacles = [e.obstacle for e in scenario.events if isinstance(e, AddObstacle)]
     meshes = Meshes(loop.model, read_urdf(URDF), obstacles)
-    pairs = set(loop.controller.find(Collision).avoidance.model.names)
+    pairs = set(loop.controller.find(Collision).model.names)
     q, v = column(loop.samples, "q"), column(loop.samples, "v")
     nearest = np.argsort(distances)[:: len(distances) // 40]
     assert min(meshes.least(q[k], pairs) for k in nearest) > MARGIN
@@ -177,7 +177,7 @@ def test_a_push_into_the_wall_is_countered():
 
 def rows_of(loop, q, v, bounds):
     """The rows of a state, as the controller gets them, in their own scale."""
-    found = loop.controller.find(Collision).avoidance.rows(q, v, -bounds, bounds)
+    found = loop.controller.find(Collision).rows(q, v, -bounds, bounds)
     return found.G.copy(), found.lower.copy()
 
 
@@ -188,7 +188,7 @@ def test_every_way_to_solve_has_the_rows_and_none_has_a_nan():
     # The hand 5 mm before the limit of its distance to the wall, on its way in.
     play(loop, 1.0, [PoseGoal(0.0, (0.75, 0.0, 0.45), (1.0, 0.0, 0.0, 0.0))])
     q = loop.robot.state().q
-    distance = controller.find(Collision).avoidance.closest()[0]
+    distance = controller.find(Collision).closest()[0]
     assert distance < 0.03
     v, wide = np.array([0.0, 0.3, 0.0, 0.3, 0.0, 0.0, 0.0]), np.full(7, 15.0)
     G, lower = rows_of(loop, q, v, wide)

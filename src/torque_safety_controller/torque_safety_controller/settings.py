@@ -5,10 +5,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torque_safety_controller.contact.settings import InteractionSettings
-from torque_safety_controller.contact.wrench_sensor import SensorSettings
 from torque_safety_controller.friction.settings import FrictionSettings
 from torque_safety_controller.integral_feedback.settings import IntegralSettings
+from torque_safety_controller.parts.contact.admittance import InteractionSettings
+from torque_safety_controller.parts.contact.wrench_sensor import SensorSettings
 from torque_safety_controller.tasks.gains import Gains
 
 

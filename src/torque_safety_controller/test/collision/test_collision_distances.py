@@ -18,8 +18,8 @@ from collision_arm import (
     wide_rows,
 )
 
-from torque_safety_controller.collision.shapes import capsule
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
+from torque_safety_controller.parts.collision.shapes import capsule
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.testing.ros_harness import read_config
 

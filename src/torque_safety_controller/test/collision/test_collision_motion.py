@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from collision_arm import Journey, box, panda, sphere, two_links
 
-from torque_safety_controller.collision.avoidance import CollisionAvoidance
-from torque_safety_controller.collision.rows import RESERVE
+from torque_safety_controller.parts.collision.avoidance import Collision
+from torque_safety_controller.parts.collision.rows import RESERVE
 from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.state import State
@@ -17,7 +17,7 @@ TOLERANCE = 5e-4  # m; of the reserve of 2 mm, what may be used in these motions
 
 def journey(dt=2e-3, obstacles=True, move=None):
     arm, limits, collision = panda(obstacles)
-    avoidance = CollisionAvoidance(collision, limits.a_min, limits.a_max, 2.0 * dt)
+    avoidance = Collision(collision, limits.a_min, limits.a_max, 2.0 * dt)
     return arm, Journey(avoidance, limits, dt, move)
 
 

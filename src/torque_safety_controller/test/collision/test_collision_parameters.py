@@ -5,10 +5,10 @@ import pytest
 import yaml
 from collision_arm import panda
 
-from torque_safety_controller.collision.avoidance import CollisionSettings
-from torque_safety_controller.node.assembly import load_collision
+from torque_safety_controller.node.assembly import make_collision
 from torque_safety_controller.parameters.collision_parameters import CollisionConfiguration
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
+from torque_safety_controller.parts.collision.avoidance import CollisionSettings
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import parameter_table, read
 from viability_bounds_pkg.testing.ros_harness import read_config
@@ -33,7 +33,7 @@ def configuration(**changes):
 def load(**changes):
     arm = panda()[0]
     config = controller_configuration(**changes)
-    return load_collision(config, arm.model)
+    return make_collision(config, arm.model)
 
 
 def test_off_by_default_and_then_nothing_is_loaded():
@@ -68,18 +68,15 @@ def test_obstacles_become_shapes_in_the_base_frame():
     assert {"panda_hand - table", "panda_hand - ball"} <= set(avoidance.model.names)
 
 
-def test_pairs_are_those_listed_or_those_chosen_at_the_posture_given():
+def test_pairs_are_those_listed_or_those_chosen():
     listed = load(collision_pairs=["panda_hand panda_link1"])
     assert set(listed.model.names) == {"panda_hand - panda_link1"}
     chosen = load()
     assert "panda_hand - panda_link1" in chosen.model.names
-    assert chosen.model.left_out["near at start"] == ["panda_link7 - panda_link5"]
-    # In the middle of the limits, the default, the hand is bent back to the forearm.
-    middle = load(collision_posture=None)
-    assert "panda_hand - panda_link5" in middle.model.left_out["near at start"]
+    assert chosen.model.left_out["near mostly"] == ["panda_link7 - panda_link5"]
     # What is asked to be kept further apart is left out sooner.
     wide = load(collision_margin=0.08)
-    assert len(wide.model.left_out["near at start"]) > 1
+    assert len(wide.model.left_out["near mostly"]) > 1
 
 
 def test_acceleration_limits_arrive():
@@ -102,8 +99,6 @@ def test_what_an_arm_is_mounted_on_is_left_out_and_said_to_be():
         ({"collision_margin": 0.6}, "collision_margin"),
         ({"collision_margin": float("nan")}, "collision_margin"),
         ({"collision_pairs": ["panda_hand"]}, "collision_pairs"),
-        ({"collision_posture": [0.0] * 6}, "collision_posture"),
-        ({"collision_posture": [9.0] * 7}, "collision_posture"),
         ({"acceleration_min": None}, "acceleration_min"),
     ],
 )

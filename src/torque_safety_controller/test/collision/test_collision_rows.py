@@ -17,9 +17,9 @@ from collision_arm import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torque_safety_controller.collision.avoidance import (
+from torque_safety_controller.parts.collision.avoidance import (
     ROW_SCALE,
-    CollisionAvoidance,
+    Collision,
     CollisionSettings,
 )
 from torque_safety_controller.qp import AccelerationRange
@@ -166,7 +166,7 @@ _cache = []
 def _near():
     if not _cache:
         _, limits, collision = panda()
-        _cache.append(CollisionAvoidance(collision, limits.a_min, limits.a_max, 2e-3))
+        _cache.append(Collision(collision, limits.a_min, limits.a_max, 2e-3))
     return _cache[0]
 
 
@@ -222,8 +222,15 @@ def test_constraints_for_the_qp_are_finite_whatever_it_is_given():
     G, lower = rows.G.copy(), rows.lower.copy()
 
     def constraint(q, v, bounds):
-        robot = SimpleNamespace(q=q, v=v)  # all that it looks at
-        return avoidance.constraint(robot, AccelerationRange(-bounds, bounds))
+        step = SimpleNamespace(  # all that it reads
+            robot=SimpleNamespace(q=q, v=v),
+            disturbance=np.zeros(2),
+            bounds=AccelerationRange(-bounds, bounds),
+            commanded=lambda bounds: bounds,
+            rows={},
+        )
+        avoidance.prepare(step)
+        return step.rows.get(avoidance)
 
     scaled = constraint(q, v, wide)
     np.testing.assert_allclose(scaled.G, ROW_SCALE * G)

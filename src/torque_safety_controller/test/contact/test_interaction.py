@@ -11,17 +11,17 @@ from controllers import GAINS as PLAIN
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torque_safety_controller.contact.admittance import AdmittanceGains, AdmittanceTask
-from torque_safety_controller.contact.contacts import Contacts, FrictionContact
-from torque_safety_controller.contact.wrench_sensor import SensorSettings, WrenchSensor
 from torque_safety_controller.controller import Controller
-from torque_safety_controller.parts import interaction
-from torque_safety_controller.parts.goals import Goals
-from torque_safety_controller.parts.interaction import (
+from torque_safety_controller.parts.contact import interaction
+from torque_safety_controller.parts.contact.admittance import AdmittanceGains, AdmittanceTask
+from torque_safety_controller.parts.contact.contacts import FrictionContact
+from torque_safety_controller.parts.contact.interaction import (
     Compliance,
     Interaction,
     InteractionSettings,
 )
+from torque_safety_controller.parts.contact.wrench_sensor import SensorSettings, WrenchSensor
+from torque_safety_controller.parts.goals import Goals
 from torque_safety_controller.parts.joint_bounds import JointBounds
 from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.state import State
@@ -47,13 +47,11 @@ class SimulatedHand:
             np.zeros(3),
             SensorSettings(filter_hz=1e9, timeout=0.005),
         )
-        contacts = None
-        if contact:
-            contacts = Contacts(ARM.model, [FrictionContact(ARM.frame, np.zeros(3), NORMAL, 0.5)])
+        touching = FrictionContact(ARM.frame, np.zeros(3), NORMAL, 0.5) if contact else None
         robot = ARM.robot(DT)
         goals = Goals(robot.n, gains)
         self.interaction = Interaction(
-            goals, sensor, contacts, settings=InteractionSettings(**settings)
+            goals, sensor, touching, settings=InteractionSettings(**settings)
         )
         parts = [self.interaction, goals, JointBounds()]
         self.controller = Controller(robot, parts, tau_max, hold_kd=gains.hold_kd)
@@ -197,7 +195,7 @@ def test_what_is_counted_on_exceeds_what_is_felt_by_a_step_at_most(monkeypatch):
     hand = SimulatedHand(contact=True, directions=Z)
     hand.interaction.set_target(-force(x=5.0, z=-10.0))
     for measured, counted in ((0.0, 2.0), (3.0, 5.0), (-7.0, 2.0), (9.0, 10.0), (40.0, 10.0)):
-        task = hand.step(force(z=-measured)).forces.tasks[0]
+        (task,) = hand.step(force(z=-measured)).forces.tasks
         # Smaller, and in the same direction.
         np.testing.assert_allclose(task.F_des, [0.5 * counted, 0.0, -counted], rtol=1e-9)
 
@@ -216,7 +214,7 @@ def test_what_a_contact_cannot_give_is_not_counted_on(goal, monkeypatch):
     monkeypatch.setattr(interaction, "WRENCH_TIME", 1e-6)
     hand = SimulatedHand(contact=True, directions=Z)
     hand.interaction.set_target(-goal)
-    (contact,) = hand.interaction.contacts.contacts
+    contact = hand.interaction.contact
     (task,) = hand.step(force()).forces.tasks
     pressing = contact.normal @ task.F_des[:3]
     assert 0.0 <= pressing <= interaction.FORCE_STEP + 1e-9

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torque_safety_controller.contact.wrench_sensor import (
+from torque_safety_controller.parts.contact.wrench_sensor import (
     SensorSettings,
     WrenchError,
     WrenchSensor,

@@ -52,7 +52,7 @@ def test_an_overlap_is_reported_and_countered_and_a_nan_stays_outside(ros):
     robot = ARM.robot()
     robot.update(State(ARM.q_start, np.zeros(ARM.n)), np.zeros(ARM.n))
     assert np.abs(tau - robot.h).max() > 0.1, "it does not move out"
-    ros.wait_until(lambda: "less than the margin" in ros.reported(NODE, "message"), "a report")
+    ros.wait_until(lambda: "nearer than" in ros.reported(NODE, "message"), "a report")
     report = ros.diagnostics[NODE]
     assert report["level"] == DiagnosticStatus.WARN
     assert report["closest_pair"] == "panda_link7 - ball"
@@ -69,15 +69,12 @@ def test_an_overlap_is_reported_and_countered_and_a_nan_stays_outside(ros):
     assert np.isfinite(tau).all()
     ros.wait_until(lambda: ros.reported(NODE, "closest_pair") != "panda_link7 - ball", "a report")
     report = ros.diagnostics[NODE]
-    assert "less than the margin" not in report["message"]
+    assert "nearer than" not in report["message"]
     assert report["collision_viable"] == "True"
     text = " ".join(message.msg for message in talk.said)
     for part in (
         f"collision avoidance keeps {report['collision_pairs']} pairs of shapes 0.02 m apart",
-        "not kept apart, as they are near each other in collision_posture: "
-        "panda_link7 - panda_link5",
-        "panda_link7 - ball: -0.034 m apart, less than the margin; moving out",
-        "all pairs are 0.02 m apart again",
+        "not kept apart, as they are near each other in most postures: panda_link7 - panda_link5",
     ):
         assert part in text, text
 

@@ -12,11 +12,11 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from std_srvs.srv import Trigger
 
-from torque_safety_controller.contact.wrench_sensor import STRONGEST
 from torque_safety_controller.node.assembly import make_controller
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.parts import interaction
-from torque_safety_controller.parts.interaction import Interaction
+from torque_safety_controller.parts.contact import interaction
+from torque_safety_controller.parts.contact.interaction import Interaction
+from torque_safety_controller.parts.contact.wrench_sensor import STRONGEST
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import parameter_table, read
 from viability_bounds_pkg.ros.messages import pose_message
@@ -293,7 +293,7 @@ def test_points_of_one_link_are_one_contact():
     controller = build(
         contacts=[contact(point=corner) for corner in corners],
     )
-    (hand,) = controller.find(Interaction).contacts.contacts
+    hand = controller.find(Interaction).contact
     np.testing.assert_array_equal(hand.points, corners)
     assert hand.friction == 0.5
 

@@ -10,15 +10,15 @@ import pinocchio as pin
 from arms import Arm, load_arm
 from proxsuite import proxqp
 
-from torque_safety_controller.collision.avoidance import (
-    CollisionAvoidance,
+from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
+from torque_safety_controller.parts.collision.avoidance import (
+    Collision,
     CollisionRows,
     CollisionSettings,
 )
-from torque_safety_controller.collision.link_capsules import link_capsules
-from torque_safety_controller.collision.model import CollisionModel, build_collision_model
-from torque_safety_controller.collision.shapes import Shape, capsule, make_obstacle
-from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
+from torque_safety_controller.parts.collision.model import CollisionModel, build_collision_model
+from torque_safety_controller.parts.collision.shapes import Shape, capsule, make_obstacle
+from torque_safety_controller.tools.link_capsules import link_capsules
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.robot.description import build_model, load_geometry
@@ -69,7 +69,7 @@ _TWO_LINKS = """<robot name="two_links">
 
 def two_links(
     shape: str, reach: float, obstacles, kind="revolute", axis="0 0 1", **settings
-) -> tuple[CollisionAvoidance, pin.Model]:
+) -> tuple[Collision, pin.Model]:
     """Return an arm in the x-y plane whose forearm has one collision shape, 20 rad/s^2 a joint."""
     urdf = _TWO_LINKS.format(shape=shape, reach=reach, kind=kind, axis=axis)
     model = build_model(urdf, ["shoulder", "elbow"])
@@ -77,7 +77,6 @@ def two_links(
     collision = build_collision_model(
         model,
         [capsule("fore", *each) for each in capsules["fore"]],
-        np.zeros(2),
         obstacles,
         samples=10,
         near=10.0,
@@ -85,11 +84,11 @@ def two_links(
     limit = np.full(2, 20.0)
     dt = settings.pop("dt", 1e-3)
     constants = {k: settings.pop(k) for k in ("influence", "speed_max") if k in settings}
-    avoidance = CollisionAvoidance(collision, -limit, limit, dt, CollisionSettings(**settings))
+    avoidance = Collision(collision, -limit, limit, dt, CollisionSettings(**settings))
     return with_constants(avoidance, **constants), model
 
 
-def with_constants(avoidance: CollisionAvoidance, **constants: float) -> CollisionAvoidance:
+def with_constants(avoidance: Collision, **constants: float) -> Collision:
     """Change what no setting reaches, to see more in a test."""
     for name, value in constants.items():
         setattr(avoidance, name, value)
@@ -111,18 +110,18 @@ def panda(obstacles: bool = True) -> tuple[Arm, JointLimits, CollisionModel]:
     )
     surroundings = SURROUNDINGS if obstacles else ()
     capsules = read(ControllerConfiguration, config).collision.capsules
-    collision = build_collision_model(arm.model, capsules, arm.q_start, surroundings, samples=3000)
+    collision = build_collision_model(arm.model, capsules, surroundings, samples=3000)
     return arm, limits, collision
 
 
-def everything() -> CollisionAvoidance:
+def everything() -> Collision:
     """Panda among all obstacles, near and far."""
     return with_constants(panda_avoidance(1000), influence=5.0)
 
 
-def panda_avoidance(rows_max: int) -> CollisionAvoidance:
+def panda_avoidance(rows_max: int) -> Collision:
     _, limits, collision = panda()
-    avoidance = CollisionAvoidance(collision, limits.a_min, limits.a_max, 2e-3)
+    avoidance = Collision(collision, limits.a_min, limits.a_max, 2e-3)
     return with_constants(avoidance, rows_max=rows_max)
 
 

@@ -10,21 +10,20 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from torque_safety_controller.collision.avoidance import CollisionAvoidance
-from torque_safety_controller.collision.model import build_collision_model
-from torque_safety_controller.contact.contacts import Contacts, FrictionContact
-from torque_safety_controller.contact.wrench_sensor import WrenchSensor
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.friction.compensation import FrictionCompensation
 from torque_safety_controller.integral_action import make_integral, warm_up
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parameters.interaction_parameters import ContactPoint
-from torque_safety_controller.parts.collision import Collision
+from torque_safety_controller.parts.collision.avoidance import Collision
+from torque_safety_controller.parts.collision.model import build_collision_model
+from torque_safety_controller.parts.contact.contacts import FrictionContact
+from torque_safety_controller.parts.contact.interaction import Interaction
+from torque_safety_controller.parts.contact.wrench_sensor import WrenchSensor
 from torque_safety_controller.parts.disturbance import Disturbance
 from torque_safety_controller.parts.friction import Friction
 from torque_safety_controller.parts.goals import Goals
 from torque_safety_controller.parts.integral import Integral
-from torque_safety_controller.parts.interaction import Interaction
 from torque_safety_controller.parts.joint_bounds import JointBounds
 from torque_safety_controller.parts.slow_down import SlowDown
 from torque_safety_controller.parts.whole_arm.safety_filter import SafetyFilter
@@ -124,7 +123,7 @@ def make_parts(
         # A slowed arm is slowed inside of what the filter allows.
         SlowDown(config.position_min, config.position_max, config.dt),
         # It counts on no more braking than the bounds leave.
-        load_collision(config, robot.model),
+        make_collision(config, robot.model),
     ]
     return [part for part in parts if part is not None]
 
@@ -263,7 +262,7 @@ def _base_placement(model: pin.Model, frame: str) -> pin.SE3:
     return found.placement
 
 
-def load_collision(config: ControllerConfiguration, model: pin.Model) -> Collision | None:
+def make_collision(config: ControllerConfiguration, model: pin.Model) -> Collision | None:
     """Return the collision avoidance of an arm; None where that is off.
 
     Args:
@@ -286,11 +285,10 @@ def load_collision(config: ControllerConfiguration, model: pin.Model) -> Collisi
     limited.lowerPositionLimit = config.position_min
     limited.upperPositionLimit = config.position_max
     kept = collision.settings.kept
-    avoidance = CollisionAvoidance(
+    return Collision(
         build_collision_model(
             limited,
             collision.capsules,
-            collision.posture(config),
             collision.bodies,
             collision.pairs,
             config.base_frame,
@@ -302,7 +300,6 @@ def load_collision(config: ControllerConfiguration, model: pin.Model) -> Collisi
         HORIZON * config.dt,
         collision.settings,
     )
-    return Collision(avoidance)
 
 
 def make_interaction(
@@ -326,8 +323,7 @@ def make_interaction(
     if contact is None:
         return Interaction(goals, sensor, settings=config.interaction.settings)
     placement = _between(robot.model, robot.frame, contact.frame)
-    contacts = Contacts(robot.model, [contact])
-    return Interaction(goals, sensor, contacts, placement, config.interaction.settings)
+    return Interaction(goals, sensor, contact, placement, config.interaction.settings)
 
 
 def _sensor(config: ControllerConfiguration, robot: RobotModel, urdf: str) -> WrenchSensor | None:

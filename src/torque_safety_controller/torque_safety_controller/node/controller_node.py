@@ -35,7 +35,7 @@ from torque_safety_controller.node.streams.states import UNSEEN, StateStream
 from torque_safety_controller.node.topics import ENABLE_TORQUE
 from torque_safety_controller.node.wrenches import WrenchSubscriber
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.parts.interaction import Interaction
+from torque_safety_controller.parts.contact.interaction import Interaction
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.supervisor import Supervisor
 from viability_bounds_pkg.ros.arm_node import ArmNode

@@ -12,11 +12,15 @@ from geometry_msgs.msg import WrenchStamped
 from numpy.typing import NDArray
 from std_srvs.srv import Trigger
 
-from torque_safety_controller.contact.wrench_sensor import STRONGEST, WrenchError, WrenchSensor
 from torque_safety_controller.node.goals import GoalRefused, GoalSubscriber
 from torque_safety_controller.node.topics import TARE_FT_SENSOR, TARGET_WRENCH
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.parts.interaction import Compliance, Interaction
+from torque_safety_controller.parts.contact.interaction import Compliance, Interaction
+from torque_safety_controller.parts.contact.wrench_sensor import (
+    STRONGEST,
+    WrenchError,
+    WrenchSensor,
+)
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.topics import FT_WRENCH
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from torque_safety_controller.contact.settings import InteractionSettings
-from torque_safety_controller.contact.wrench_sensor import SensorSettings
 from torque_safety_controller.parameters.entries import read_entries
+from torque_safety_controller.parts.contact.admittance import InteractionSettings
+from torque_safety_controller.parts.contact.wrench_sensor import SensorSettings
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import (
     FINITE,

@@ -13,7 +13,7 @@ from viability_bounds_pkg.robot.configuration import RobotConfiguration, urdf_jo
 _TURNS_MAX = 2.0
 """Turns of a joint with limits from which on its angles are surely degrees."""
 
-_ANGLES = ("position_min", "position_max", "start_positions", "collision_posture")
+_ANGLES = ("position_min", "position_max", "start_positions")
 _LIMITS = (("velocity_max", "velocity"), ("torque_max", "effort"))
 _SLACK = 1e-3
 """Relative excess over limits of the URDF that rounding explains."""

@@ -13,12 +13,11 @@ from rclpy.node import Node
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.modes import Mode
 from torque_safety_controller.node.goals import GoalSubscriber
-from torque_safety_controller.node.reports.collision_report import log_pairs
 from torque_safety_controller.node.streams.limits import LimitsReader
 from torque_safety_controller.node.streams.states import StateStream
 from torque_safety_controller.node.wrenches import WrenchSubscriber
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.parts.collision import Collision
+from torque_safety_controller.parts.collision.avoidance import Collision
 from torque_safety_controller.step import Step, joints_named
 from torque_safety_controller.supervisor import Supervisor
 from viability_bounds_pkg.recent_values import RecentValues
@@ -78,7 +77,11 @@ class ControllerReport:
         self._goals, self._wrenches = goals, wrenches
         config = parameters.configuration
         if collision := controller.find(Collision):
-            log_pairs(node.get_logger(), collision)
+            logger, margin = node.get_logger(), collision.settings.margin
+            pairs = len(collision.model.names)
+            logger.info(f"collision avoidance keeps {pairs} pairs of shapes {margin:g} m apart")
+            for text in collision.left_out():
+                logger.warning(text)
         self._shortfall = Shortfall(config.position_min, config.position_max)
         self._period = PeriodCheck(config.dt, node.get_logger().warning)
         self._steps = self._relaxed_steps = self._failures = 0

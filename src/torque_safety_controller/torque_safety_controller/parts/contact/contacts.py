@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Contacts of links with the environment: friction cones, wrenches, Jacobians.
+"""Contact of a link with the environment: friction cones, wrenches, joint torques.
 
 A contact is one or more points of a link at which the environment pushes, along a normal and,
 by friction, across it. The force at a point is a combination of the edges of a pyramid with
@@ -16,7 +16,6 @@ edges on the cone, lie inside it: they give up, between two edges, up to a share
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -107,74 +106,35 @@ class FrictionContact:
         object.__setattr__(self, "lever", float(np.linalg.norm(points, axis=1).max()))
         object.__setattr__(self, "W", np.ascontiguousarray(W))
 
+    @property
+    def exerts_moments(self) -> bool:
+        """Whether there is more than one point."""
+        return len(self.points) > 1
 
-class Contacts:
-    """All contacts of an arm, as the QP needs them.
-
-    Args:
-        model: of the arm, n joints with one coordinate each.
-        contacts: at least one.
-
-    Attributes:
-        contacts: as given.
-        r: number of force coefficients of all contacts.
-
-    Raises:
-        SettingError: none, or an unknown frame.
-    """
-
-    def __init__(self, model: pin.Model, contacts: Sequence[FrictionContact]) -> None:
-        if not contacts:
-            raise SettingError("contacts", [], "at least one")
-        for contact in contacts:
-            if not model.existFrame(contact.frame):
-                known = ", ".join(f.name for f in model.frames)
-                raise SettingError("frame of a contact", contact.frame, f"one of: {known}")
-        self.contacts = tuple(contacts)
-        ends = np.cumsum([contact.W.shape[1] for contact in contacts])
-        self.r = int(ends[-1])
-        self._model = model
-        self._frames = [model.getFrameId(contact.frame) for contact in contacts]
-        self._slices = [
-            slice(int(end) - contact.W.shape[1], int(end))
-            for contact, end in zip(contacts, ends, strict=True)
-        ]
-        self._exerted = [c.W[:3] if len(c.points) == 1 else c.W for c in contacts]
-        self._B = np.zeros((model.nv, self.r))
-        self._rho_max = np.full(self.r, np.inf)
-
-    def update(self, data: pin.Data) -> None:
-        """Compute what depends on the state.
+    def wrench(self, rho: Array) -> Array:
+        """Return the environment's wrench on the link, shape (6,), N and N m.
 
         Args:
-            data: of the model, with its joint Jacobians.
+            rho: force coefficients, as the QP returned them, shape (p * facets,), N.
         """
-        for frame, part, contact in zip(self._frames, self._slices, self.contacts, strict=True):
-            J = pin.getFrameJacobian(self._model, data, frame, pin.ReferenceFrame.LOCAL)
-            self._B[:, part] = J.T @ contact.W
+        wrench: Array = self.W @ rho
+        return wrench
 
-    def forces(self, tasks: Sequence[WrenchTerm] = ()) -> ContactForces:
-        """Return the forces for the QP, with what they should be; the next update changes them."""
-        return ContactForces(self._B, self._rho_max, tasks)
-
-    def wrench_task(self, index: int, F_des: Array, weight: float) -> WrenchTerm:
-        """Let the environment exert a wrench on a link: [Benallegue2021], III-E (a).
+    def forces(
+        self, model: pin.Model, data: pin.Data, F_des: Array, weight: float
+    ) -> ContactForces:
+        """Return what the contact may exert, and should: [Benallegue2021], III-E (a).
 
         Args:
-            index: of the contact.
+            model: of the arm.
+            data: with its joint Jacobians.
             F_des: desired wrench on the link, shape (6,), N and N m; the arm exerts its negative.
                 A single point can only exert its force.
             weight: of the squared error.
         """
-        W = self._exerted[index]
-        return WrenchTerm(W, F_des[: len(W)], weight, self._slices[index].start)
-
-    def wrench(self, index: int, rho: Array) -> Array:
-        """Return the environment's wrench on a link, shape (6,), N and N m.
-
-        Args:
-            index: of the contact.
-            rho: as the QP returned it, shape (r,), N.
-        """
-        wrench: Array = self.contacts[index].W @ rho[self._slices[index]]
-        return wrench
+        J = pin.getFrameJacobian(
+            model, data, model.getFrameId(self.frame), pin.ReferenceFrame.LOCAL
+        )
+        W = self.W if self.exerts_moments else self.W[:3]
+        rho_max = np.full(W.shape[1], np.inf)
+        return ContactForces(J.T @ self.W, rho_max, [WrenchTerm(W, F_des[: len(W)], weight, 0)])

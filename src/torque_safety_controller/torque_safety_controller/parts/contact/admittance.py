@@ -14,7 +14,7 @@ what it is to touch, and from running away when what it leans on gives way.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -62,6 +62,24 @@ class AdmittanceGains:
     @cached_property
     def _by_axis(self) -> tuple[Array, Array]:
         return np.repeat(self.kp, 3), np.repeat(self.kd, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class InteractionSettings:
+    """What is done about forces at the hand; it may change while the controller runs.
+
+    Attributes:
+        directions: of the end effector's axes, those in which force is controlled, shape (6,),
+            bool.
+        gains: of the admittance task when a wrench is exerted.
+        yield_threshold: force and moment above which the hand yields, N and N m; None never.
+        yielding_gains: of the admittance task when it does.
+    """
+
+    directions: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(6, dtype=bool))
+    gains: AdmittanceGains = AdmittanceGains()
+    yield_threshold: tuple[float, float] | None = None
+    yielding_gains: AdmittanceGains = AdmittanceGains((0.1, 1.0), (0.0, 0.0), (0.25, 1.0))
 
 
 @dataclass(slots=True)

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from torque_safety_controller.collision.capsule_fit import Capsule, fitted_capsule
+from torque_safety_controller.tools.capsule_fit import Capsule, fitted_capsule
 from viability_bounds_pkg.robot.description import RobotDescriptionError
 
 Array = NDArray[np.float64]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Collision avoidance: constraints on joint accelerations that keep distances for ever.
+"""Keeps links apart from each other and from obstacles, by constraints on joint accelerations.
 
 `docs/collision_avoidance.md` derives the rows, and says what they promise and what not.
 """
@@ -8,17 +8,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from torque_safety_controller.collision.distances import Features, find_features, move_segments
-from torque_safety_controller.collision.model import CollisionModel
-from torque_safety_controller.collision.rows import BRAKING, RESERVE, SPEED_MAX, write_rows
-from torque_safety_controller.qp import AccelerationRange, LinearConstraints
+from torque_safety_controller.parts.collision.distances import (
+    Features,
+    find_features,
+    move_segments,
+)
+from torque_safety_controller.parts.collision.model import CollisionModel
+from torque_safety_controller.parts.collision.rows import BRAKING, RESERVE, SPEED_MAX, write_rows
+from torque_safety_controller.qp import LinearConstraints
 from torque_safety_controller.robot_model import RobotModel
+from torque_safety_controller.step import Part, Step
 from viability_bounds_pkg.parameter import Range, check, number
 
 Array = NDArray[np.float64]
@@ -35,6 +40,12 @@ ROWS_MAX = 40
 obstacles have more, and a QP needs an end."""
 
 _UNBOUNDED = 1e6  # rad/s^2; more than anything has
+_SLIGHT = 1e-3  # m; violations of the margin below this are not reported
+
+_LEFT_OUT = {
+    "near mostly": "as they are near each other in most postures",
+    "near always": "as they are near each other in all postures",
+}
 
 
 @dataclass(frozen=True)
@@ -82,8 +93,8 @@ class CollisionRows(NamedTuple):
     viable: NDArray[np.bool_]
 
 
-class CollisionAvoidance:
-    """Rows that keep the pairs of a collision model apart.
+class Collision(Part):
+    """Adds rows to a step that keep the pairs of a collision model apart for ever.
 
     Args:
         model: shapes and pairs.
@@ -139,6 +150,42 @@ class CollisionAvoidance:
         self._G, self._lower = np.zeros((most + 1, n)), np.zeros(most + 1)
         self._source = np.zeros(most + 1, dtype=np.int64)
         self._viable = np.zeros(most + 1, dtype=bool)
+        self._relaxed_steps = self._not_viable_steps = 0
+        self._trouble = ""
+
+    def reset(self, robot: RobotModel) -> None:
+        """Count steps from here on."""
+        self._relaxed_steps = self._not_viable_steps = 0
+        self._trouble = ""
+
+    def prepare(self, step: Step) -> None:
+        """Add rows to a step, in a scale in which bounds are dearer.
+
+        A disturbance makes them only stricter. There are none in a state that is not finite, which
+        the QP refuses.
+        """
+        q, v, e = step.robot.q, step.robot.v, step.disturbance
+        if not math.isfinite(q.dot(q) + v.dot(v)):
+            return
+        bounds = step.commanded(step.bounds)  # infinite, or for the QP to refuse
+        lower, upper = np.nan_to_num(bounds, posinf=_UNBOUNDED, neginf=-_UNBOUNDED)
+        rows = self.rows(q, v, lower, upper, e)
+        if k := len(rows.lower):
+            G = ROW_SCALE * rows.G
+            step.rows[self] = LinearConstraints(
+                G, ROW_SCALE * rows.lower + G @ e, np.full(k, np.inf)
+            )
+
+    def learn(self, step: Step) -> None:
+        """Count steps whose distances gave way, or cannot be kept for ever."""
+        relaxed = step.relaxation_of(self)
+        self._relaxed_steps += relaxed is not None and bool(relaxed.any())
+        self._not_viable_steps += not self.viable
+        (distance, pair), margin = self.closest(), self.settings.margin
+        if distance < margin - _SLIGHT:
+            self._trouble = f"{pair}: nearer than {margin:g} m, moving out"
+        elif distance >= margin:
+            self._trouble = ""
 
     def rows(
         self,
@@ -194,28 +241,6 @@ class CollisionAvoidance:
             viable=self._viable[chosen],
         )
 
-    def constraint(
-        self, robot: RobotModel, bounds: AccelerationRange, disturbance: Array | None = None
-    ) -> LinearConstraints | None:
-        """Return the rows of one step for the QP, in a scale in which bounds are dearer.
-
-        Args:
-            robot: updated to the current state, which may be not finite.
-            bounds: of the accelerations, may be infinite.
-            disturbance: as in `rows`, finite.
-
-        Returns:
-            None in a state that is not finite, which the QP refuses.
-        """
-        q, v = robot.q, robot.v
-        if not math.isfinite(q.dot(q) + v.dot(v)):
-            return None
-        # Infinite, or for the QP to refuse.
-        lower, upper = np.nan_to_num(bounds, posinf=_UNBOUNDED, neginf=-_UNBOUNDED)
-        rows = self.rows(q, v, lower, upper, disturbance)
-        k = len(rows.lower)
-        return LinearConstraints(ROW_SCALE * rows.G, ROW_SCALE * rows.lower, np.full(k, np.inf))
-
     @property
     def viable(self) -> bool:
         """Whether all rows of the last step were viable."""
@@ -227,3 +252,30 @@ class CollisionAvoidance:
         if distance == math.inf:
             return distance, ""
         return distance, self.model.names[int(self.distances.argmin())]
+
+    @property
+    def trouble(self) -> str:
+        """Which pair is nearer than the margin."""
+        return self._trouble
+
+    def report(self) -> dict[str, Any]:
+        """See `Part.report`."""
+        distance, pair = self.closest()
+        return {
+            "closest_distance_m": distance,
+            "closest_pair": pair or "none",
+            "collision_pairs": len(self.model.names),
+            "collision_rows": self.count,
+            "collision_viable": self.viable,
+            "collision_not_viable_steps": self._not_viable_steps,
+            "collision_relaxed_steps": self._relaxed_steps,
+        }
+
+    def left_out(self) -> list[str]:
+        """Return which pairs are not kept apart, and why, a sentence for each reason."""
+        found = self.model.left_out
+        return [
+            f"not kept apart, {why}: {', '.join(sorted(set(found[reason])))}"
+            for reason, why in _LEFT_OUT.items()
+            if reason in found
+        ]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Forces at the hand: exerting a target wrench, and yielding to external ones.
 
-One object puts together the sensor, the contacts of the QP with their wrench tasks, the
+One part puts together the sensor, the contact of the QP with its wrench task, the
 admittance task (27) and dual compliance: [Benallegue2021], III-E and IV-C. Wrenches are those of
 the environment on the arm, about the end effector's origin and in its axes; what the arm is to
 exert is the negative.
@@ -20,12 +20,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from torque_safety_controller.contact.admittance import AdmittanceTask
-from torque_safety_controller.contact.contacts import Contacts, FrictionContact
-from torque_safety_controller.contact.settings import InteractionSettings
-from torque_safety_controller.contact.wrench_sensor import WrenchSensor
+from torque_safety_controller.parts.contact.admittance import AdmittanceTask, InteractionSettings
+from torque_safety_controller.parts.contact.contacts import FrictionContact
+from torque_safety_controller.parts.contact.wrench_sensor import WrenchSensor
 from torque_safety_controller.parts.goals import Goals
-from torque_safety_controller.qp import ContactForces
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.settings import Settings
 from torque_safety_controller.step import Part, Step
@@ -71,12 +69,12 @@ class Interaction(Part):
     Args:
         goals: of the arm.
         sensor: at the hand.
-        contacts: the hand's, with which a wrench is exerted; None for none.
+        contact: the hand's, with which a wrench is exerted; None for none.
         placement: of the contact's frame in the end effector's.
         settings: may be replaced between steps.
 
     Attributes:
-        sensor, contacts, settings: as given.
+        sensor, contact, settings: as given.
         state: what is done at present.
         reason: why.
         changes: how often the state has changed.
@@ -87,13 +85,13 @@ class Interaction(Part):
         self,
         goals: Goals,
         sensor: WrenchSensor,
-        contacts: Contacts | None = None,
+        contact: FrictionContact | None = None,
         placement: pin.SE3 | None = None,
         settings: InteractionSettings | None = None,
     ) -> None:
         self._goals = goals
         self.sensor = sensor
-        self.contacts = contacts
+        self.contact = contact
         placement = pin.SE3.Identity() if placement is None else placement
         self._to_hand = placement.toDualActionMatrix()  # from the contact's frame
         self._to_contact = np.ascontiguousarray(placement.inverse().toDualActionMatrix())
@@ -159,14 +157,16 @@ class Interaction(Part):
         step.tasks += self._tasks()
         if self.state is Compliance.FORCE:
             step.stiffness = self._shares
-            step.forces = self._forces(step.robot)
+            if self.contact is not None:
+                model, data = step.robot.model, step.robot.data
+                step.forces = self.contact.forces(model, data, self._counted, WRENCH_WEIGHT)
 
     def learn(self, step: Step) -> None:
         """Remember what the QP counts on at the contact less than is wanted."""
-        if step.forces is None or step.solution is None or self.contacts is None:
+        if step.forces is None or step.solution is None or self.contact is None:
             return
-        missing = self._counted - self.contacts.wrench(0, step.solution.rho)
-        if len(self.contacts.contacts[0].points) == 1:
+        missing = self._counted - self.contact.wrench(step.solution.rho)
+        if not self.contact.exerts_moments:
             missing[3:] = 0.0  # a point exerts no moment; none was asked of it
         self._missing = self._to_hand @ missing
 
@@ -250,18 +250,8 @@ class Interaction(Part):
         self._goal_rate = (self._goal - before) / elapsed if elapsed > 0.0 else np.zeros(6)
         # What the QP says that limits allow is what is to be felt: III-E (b), one step late.
         self.reference = self._goal - self._missing
-        self._count_on(measured)
-
-    def _count_on(self, measured: Array) -> None:
-        """Find how much of the goal the QP may count on at the hand, given what is measured.
-
-        Along the normal hardly more than is felt; across it, and as a moment, what a contact that
-        presses so can give: the QP would press harder for the sake of it, on nothing perhaps.
-        """
-        if self.contacts is None:
-            return
-        (contact,) = self.contacts.contacts
-        self._counted = _counted(self._goal, measured, self._to_contact, contact)
+        if self.contact is not None:
+            self._counted = _counted(self._goal, measured, self._to_contact, self.contact)
 
     def _tasks(self) -> list[Task]:
         """Return the admittance task, (27), if there is one in this state."""
@@ -280,14 +270,6 @@ class Interaction(Part):
         a = settings.gains.acceleration(mask * error, mask * error_rate, gains.pose_kd)
         return [AdmittanceTask(a, weight, self._rows)]
 
-    def _forces(self, robot: RobotModel) -> ContactForces | None:
-        """Return what the contact may exert in this step, with its wrench task."""
-        contacts = self.contacts
-        if contacts is None:
-            return None
-        contacts.update(robot.data)
-        return contacts.forces([contacts.wrench_task(0, self._counted, WRENCH_WEIGHT)])
-
     def _enter(self, state: Compliance, reason: str) -> None:
         if state is not self.state:
             self.state, self.reason = state, reason
@@ -297,7 +279,9 @@ class Interaction(Part):
 def _counted(goal: Array, measured: Array, to_contact: Array, contact: FrictionContact) -> Array:
     """Return the wrench that the QP may count on at a contact, in its axes, shape (6,).
 
-    Along the normal it exceeds what is felt by `FORCE_STEP` at most.
+    Along the normal it exceeds what is felt by `FORCE_STEP` at most; across it, and as a moment,
+    it is what a contact that presses so can give: the QP would press harder for the sake of it, on
+    nothing perhaps.
 
     Args:
         goal: wrench on the arm that is wanted, in the end effector's axes, shape (6,).
