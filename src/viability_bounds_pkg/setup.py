@@ -22,7 +22,6 @@ setup(
         "pin>=3",
         "PyYAML>=6",
         "scipy>=1.11",
-        "tqdm>=4",
     ],
     extras_require={"test": ["pytest", "hypothesis"]},
     zip_safe=True,

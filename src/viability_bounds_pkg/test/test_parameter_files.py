@@ -15,7 +15,7 @@ from viability_bounds_pkg.parameter_files import (
     read_sections,
     unknown_parameters,
 )
-from viability_bounds_pkg.robot.urdf_check import check_with_urdf
+from viability_bounds_pkg.robot.configuration import check_with_urdf
 
 
 @pytest.mark.parametrize(

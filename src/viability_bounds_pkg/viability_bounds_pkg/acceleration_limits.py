@@ -83,20 +83,6 @@ class EmptyIntervalError(LimitEstimateError):
         super().__init__(message)
 
 
-def available_torque(tau_max: ArrayLike, torque_reserve: ArrayLike) -> Array:
-    """Return `tau_max` less the torque kept back, shape (n,), N m.
-
-    Raises:
-        LimitEstimateError: the reserve is negative, or leaves nothing.
-    """
-    tau_max = np.asarray(tau_max, dtype=np.float64)
-    reserve = np.broadcast_to(np.asarray(torque_reserve, dtype=float), tau_max.shape)
-    if not np.all((reserve >= 0) & (reserve < tau_max)):
-        raise LimitEstimateError("torque_reserve must be at least zero and below tau_max")
-    left: Array = tau_max - reserve
-    return left
-
-
 def estimate_acceleration_limits(
     model: pin.Model,
     q_min: ArrayLike,
@@ -144,33 +130,31 @@ def estimate_acceleration_limits(
         raise LimitEstimateError(f"method must be one of {', '.join(SEARCHES)}, is {method!r}")
     if samples is None:
         samples = DEFAULT_SAMPLES[method]
-    space = StateSpace.of(model, q_min, q_max, v_max, available_torque(tau_max, torque_reserve))
-    check_adjustments(model, overrides, cap)
+    tau_max, reserve = np.broadcast_arrays(np.asarray(tau_max, dtype=float), torque_reserve)
+    if not ((reserve >= 0.0) & (reserve < tau_max)).all():
+        raise LimitEstimateError("torque_reserve must be at least zero and below tau_max")
+    space = StateSpace.of(model, q_min, q_max, v_max, tau_max - reserve)
+    _check_adjustments(model, overrides or {}, cap)
     worst = SEARCHES[method](model, space, samples, seed)
     return limits_from_worst_cases(model, space, worst, overrides, cap)
 
 
-def check_adjustments(
-    model: pin.Model,
-    overrides: Mapping[str, tuple[float, float]] | None,
-    cap: ArrayLike | None,
+def _check_adjustments(
+    model: pin.Model, overrides: Mapping[str, tuple[float, float]], cap: ArrayLike | None
 ) -> None:
-    """Raise `LimitEstimateError` unless `overrides` and `cap` make sense for `model`."""
     names = list(model.names)[1:]
-    for joint, (low, high) in (overrides or {}).items():
+    for joint, (low, high) in overrides.items():
         if joint not in names:
-            raise LimitEstimateError(
-                f"override of unknown joint {joint!r}; there are: {', '.join(names)}"
-            )
+            known = ", ".join(names)
+            raise LimitEstimateError(f"override of unknown joint {joint!r}; there are: {known}")
         if not (np.isfinite([low, high]).all() and low < 0 < high):
             raise LimitEstimateError(
                 f"joint {joint}: override must be finite with min < 0 < max, "
                 f"is ({low:g}, {high:g}) rad/s^2"
             )
-    if cap is not None:
-        values = np.asarray(cap, dtype=float)
-        if values.shape not in ((), (len(names),)) or not np.all(values > 0):
-            raise LimitEstimateError(f"cap must be positive, one value or {len(names)}")
+    values = np.asarray(np.inf if cap is None else cap, dtype=float)
+    if values.shape not in ((), (len(names),)) or not np.all(values > 0):
+        raise LimitEstimateError(f"cap must be positive, one value or {len(names)}")
 
 
 def limits_from_worst_cases(
@@ -184,8 +168,8 @@ def limits_from_worst_cases(
 
     Arguments and errors as of `estimate_acceleration_limits`.
     """
-    check_adjustments(model, overrides, cap)
     overrides = dict(overrides or {})
+    _check_adjustments(model, overrides, cap)
     names = tuple(model.names)[1:]
     for j, joint in enumerate(names):
         if joint not in overrides and not worst.a_min[j] < 0 < worst.a_max[j]:
@@ -202,30 +186,27 @@ def _empty_interval(
 ) -> EmptyIntervalError:
     """Return the error for joint j: the state that leaves it no interval, and what would help."""
     joint = model.names[1 + j]
-    side = 0 if worst.a_max[j] <= 0 else 1
-    suggestion = largest_velocity_scale(model, space, ignore=overrides)
-    if suggestion.scale == 0.0:
+    side, limit, value = 1, "a_min", worst.a_min[j]
+    if worst.a_max[j] <= 0:
+        side, limit, value = 0, "a_max", worst.a_max[j]
+    found = largest_velocity_scale(model, space, ignore=overrides)
+    remedy = (
+        f"velocity limits scaled by {found.scale:.3f}, to {_text(found.scale * space.v_max)} "
+        f"rad/s, leave every joint {USEFUL_ACCELERATION:g} rad/s^2 either way; else"
+    )
+    if found.scale == 0.0:
         remedy = (
-            f"lower velocities do not help: joint {suggestion.joint} takes "
-            f"{abs(suggestion.static_torque):.3g} N m just to hold still at "
-            f"q = {_text(suggestion.q)}; narrow the position limits or override "
+            f"lower velocities do not help: joint {found.joint} takes "
+            f"{abs(found.static_torque):.3g} N m just to hold still at q = {_text(found.q)};"
         )
-    else:
-        remedy = (
-            f"velocity limits scaled by {suggestion.scale:.3f}, to "
-            f"{_text(suggestion.scale * space.v_max)} rad/s, leave every joint "
-            f"{USEFUL_ACCELERATION:g} rad/s^2 either way; else narrow the position limits or "
-            "override "
-        )
-    limit, value = (("a_max", worst.a_max[j]), ("a_min", worst.a_min[j]))[side]
     message = (
         f"joint {joint}: its torque of {space.tau_max[j]:.4g} N m leaves no acceleration "
         f"interval: {limit} = {value:.3g} rad/s^2 at q = {_text(worst.q[side, j])}, "
-        f"v = {_text(worst.v[side, j])}; {remedy}the joint's acceleration limits (--override "
-        f"{joint}=MIN,MAX), or take those of most states, with the controller's safety_filter "
-        "(--share)"
+        f"v = {_text(worst.v[side, j])}; {remedy} narrow the position limits or override the "
+        f"joint's acceleration limits (--override {joint}=MIN,MAX), or take those of most states, "
+        "with the controller's safety_filter (--share)"
     )
-    return EmptyIntervalError(message, joint, suggestion.scale)
+    return EmptyIntervalError(message, joint, found.scale)
 
 
 def _text(values: Array) -> str:
@@ -266,14 +247,10 @@ def largest_velocity_scale(
     Args:
         model: the robot.
         space: limits; velocities of the result are multiples of its `v_max`.
-        required: acceleration that each joint must be able to reach up and down, rad/s^2.
+        required: acceleration that each joint must be able to reach up and down, at least 0,
+            rad/s^2.
         ignore: names of joints that need not (those overridden).
-
-    Raises:
-        LimitEstimateError: `required` is negative.
     """
-    if not required >= 0:
-        raise LimitEstimateError(f"required must be at least zero, is {required}")
     counted = np.array([name not in ignore for name in list(model.names)[1:]])
     q, v = space.states(np.random.default_rng(0).random((SCALE_SAMPLES, 2 * space.n)))
     nothing = np.full(space.n, np.nan)

@@ -43,7 +43,7 @@ def test_limits_are_written_as_an_overlay(write_robot, tmp_path, method):
     inertia, weight = 2.0 * 0.25 + 0.5 * 0.36, 9.81 * (2.0 * 0.5 + 0.5 * 0.6)
     at_rest = (30.0 - weight) / inertia
     assert 0.6 * at_rest < written["acceleration_max"][0] <= 1.01 * at_rest
-    for word in ("shoulder: torque leaves", "worst a_min at q = [", "after N", "evaluations"):
+    for word in ("shoulder: torque leaves", "worst a_min at q = [", "evaluations"):
         assert word in ended.stdout
 
 

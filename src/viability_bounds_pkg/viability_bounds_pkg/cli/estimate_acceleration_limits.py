@@ -14,14 +14,11 @@ from decimal import ROUND_DOWN, ROUND_UP
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from viability_bounds_pkg.acceleration_limits import (
     DEFAULT_SAMPLES,
     SEARCHES,
     AccelerationLimits,
-    available_torque,
-    check_adjustments,
     limits_from_worst_cases,
     limits_in_share,
     unavailable_share,
@@ -44,8 +41,6 @@ from viability_bounds_pkg.estimate.worst_case import (
     WorstCases,
 )
 from viability_bounds_pkg.parameter_files import ParameterFileError
-
-HISTORY_COLUMNS = 9
 
 
 def _count(text: str) -> int:
@@ -156,19 +151,6 @@ def _caps(options: argparse.Namespace, names: Sequence[str]) -> Array:
     return caps
 
 
-def _search(robot: Robot, space: StateSpace, options: argparse.Namespace) -> WorstCases:
-    # With no terminal to draw on there is no bar.
-    with tqdm(total=options.samples, unit=" evaluations", disable=None) as bar:
-        search = SEARCHES[options.method]
-        return search(
-            robot.model,
-            space,
-            options.samples,
-            options.seed,
-            lambda done: bar.update(done - bar.n),
-        )
-
-
 def _in_share(
     robot: Robot, space: StateSpace, worst: WorstCases, share: float
 ) -> dict[str, tuple[float, float]]:
@@ -190,10 +172,10 @@ def _run(options: argparse.Namespace) -> int:
     robot = read_robot(options.parameters)
     names = list(robot.model.names)[1:]
     caps, overrides = _caps(options, names), dict(options.override)
-    check_adjustments(robot.model, overrides, caps)
-    torque = available_torque(robot.tau_max, options.torque_reserve * robot.tau_max)
+    torque = (1.0 - options.torque_reserve) * robot.tau_max
     space = StateSpace.of(robot.model, robot.q_min, robot.q_max, robot.v_max, torque)
-    worst = _search(robot, space, options)
+    search = SEARCHES[options.method]
+    worst = search(robot.model, space, options.samples, options.seed)
     _report_search(names, worst)
     if options.share > 0.0:
         overrides = _in_share(robot, space, worst, options.share) | overrides
@@ -225,19 +207,12 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _report_search(names: Sequence[str], worst: WorstCases) -> None:
-    """Print the worst states of each joint and how the estimate came to be."""
-    count = len(worst.history)
-    picked = np.unique(np.linspace(0, count - 1, min(HISTORY_COLUMNS, count)).round().astype(int))
-    history = [worst.history[i] for i in picked]
+    """Print the worst states of each joint."""
     for j, name in enumerate(names):
         print(f"{name}: torque leaves [{worst.a_min[j]:.4g}, {worst.a_max[j]:.4g}] rad/s^2")
         for side, limit in ((1, "a_min"), (0, "a_max")):
             q, v = worst.q[side, j], worst.v[side, j]
             print(f"  worst {limit} at q = {_vector(q)}, v = {_vector(v)}")
-        print("  after N " + "".join(f"{entry.evaluations:>10}" for entry in history))
-        for limit in ("a_min", "a_max"):
-            row = "".join(f"{getattr(entry, limit)[j]:>10.4g}" for entry in history)
-            print(f"  {limit}   {row}")
     print(f"{worst.evaluations} evaluations of the dynamics\n")
 
 

@@ -73,8 +73,7 @@ def discretisation_margin(
     dimensions stays far below the supremum (by a factor of two and more for seven joints), so
     that a coordinate search goes on from the worst ones: first on the jerk, to which the error
     is proportional for a short `dt` and which costs a tenth, then on the errors themselves. The
-    result still bounds the true supremum from below; other seeds and more `starts` show how
-    firm it is (a few percent for the arms tried).
+    result still bounds the true supremum from below.
 
     Args:
         model: the robot, one degree of freedom a joint, n of them.

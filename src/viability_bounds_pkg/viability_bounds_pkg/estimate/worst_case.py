@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -21,8 +21,6 @@ from scipy.optimize import minimize
 from viability_bounds_pkg.exceptions import ArmSafetyError
 
 Array = NDArray[np.float64]
-Progress = Callable[[int], object]
-"""Told the evaluations so far, now and then."""
 
 CHUNK = 2**13
 """States evaluated at once; a power of two, as are the entries of the history."""
@@ -92,18 +90,20 @@ class StateSpace:
         low, high = arrays["q_min"], arrays["q_max"]
         turning = np.isneginf(low) & np.isposinf(high)
         low[turning], high[turning] = -math.pi, math.pi
-        for j, name in enumerate(list(model.names)[1:]):
-            if not (math.isfinite(low[j]) and math.isfinite(high[j]) and low[j] <= high[j]):
+        finite = np.isfinite(low) & np.isfinite(high) & (low <= high)
+        for key, fine, allowed in (
+            ("q_min", finite, "position limits must be finite and in order, or both infinite"),
+            *(
+                (key, np.isfinite(each) & (each > 0.0), f"{key} must be positive and finite")
+                for key, each in arrays.items()
+                if key in ("v_max", "tau_max")
+            ),
+        ):
+            if not fine.all():
+                j = int(np.argmin(fine))
                 raise LimitEstimateError(
-                    f"joint {name}: position limits must be finite and in order, or both "
-                    f"infinite; they are {low[j]:g} and {high[j]:g} rad"
+                    f"joint {model.names[1 + j]}: {allowed}; {key} is {arrays[key][j]:g}"
                 )
-            for key, unit in (("v_max", "rad/s"), ("tau_max", "N m")):
-                value = arrays[key][j]
-                if not (math.isfinite(value) and value > 0):
-                    raise LimitEstimateError(
-                        f"joint {name}: {key} must be positive and finite, is {value:g} {unit}"
-                    )
         return cls(**arrays)
 
     def states(self, unit: Array) -> tuple[Array, Array]:
@@ -220,13 +220,7 @@ def _chunks(samples: int) -> Iterator[int]:
         done += size
 
 
-def search_by_sampling(
-    model: pin.Model,
-    space: StateSpace,
-    samples: int,
-    seed: int,
-    progress: Progress | None = None,
-) -> WorstCases:
+def search_by_sampling(model: pin.Model, space: StateSpace, samples: int, seed: int) -> WorstCases:
     """Evaluate uniformly random states: Algorithm 4 of [DelPrete2018].
 
     The states of a shorter run with the same seed are the first ones of a longer run.
@@ -236,7 +230,6 @@ def search_by_sampling(
         space: where states are drawn, and the torque limits.
         samples: how many states (the paper's N).
         seed: of the random generator.
-        progress: told the evaluations so far.
 
     Raises:
         LimitEstimateError: fewer than one sample, or a joint that moves no inertia.
@@ -249,18 +242,10 @@ def search_by_sampling(
         worst.update(acceleration_room(model, data, space, q, v), q, v)
         if worst.evaluations == samples or worst.evaluations.bit_count() == 1:
             worst.record()
-        if progress:
-            progress(worst.evaluations)
     return worst
 
 
-def search_refined(
-    model: pin.Model,
-    space: StateSpace,
-    evaluations: int,
-    seed: int,
-    progress: Progress | None = None,
-) -> WorstCases:
+def search_refined(model: pin.Model, space: StateSpace, evaluations: int, seed: int) -> WorstCases:
     """Sample, then descend to a local minimum from the worst states of each limit.
 
     Every other sample has all velocities at their limits, because h is quadratic in v and its
@@ -294,8 +279,6 @@ def search_refined(
         before = worst.room.copy()
         for limit, start in enumerate(ranks):
             _descend(model, data, space, worst, unit[start], *divmod(limit, n), evaluations)
-        if progress:
-            progress(worst.evaluations)
         if worst.evaluations >= 1.2 * worst.history[-1].evaluations:
             worst.record()
         idle = 0 if np.any(worst.room < before - 1e-6 * np.abs(before)) else idle + 1
