@@ -70,7 +70,7 @@ def test_all_get_the_same_object_once_and_others_get_it_too(ros):
     process = Process(ros)
     outside = ros.listen(JointState, "joint_states")
     ros.wait_until(lambda: ros.probe.count_publishers("joint_states"))
-    ros.wait_until(lambda: process.robot.states._publisher.get_subscription_count() == 1)
+    ros.wait_until(lambda: process.robot.states.subscribers == 1)
     message = state(1)
     process.robot.states.publish(message)
     ros.wait_until(lambda: outside and process.all_heard(1))
@@ -85,7 +85,7 @@ def test_others_get_a_message_when_the_command_has_come(ros, monkeypatch):
     process = Process(ros, on_command=lambda _: course.append("command"))
     outside = [ros.listen(JointState, name) for name in ("joint_states", "joint_commands")]
     for stream in (process.robot.states, process.controller.commands):
-        ros.wait_until(stream._publisher.get_subscription_count)
+        ros.wait_until(lambda stream=stream: stream.subscribers)
     publish = Publisher.publish
 
     def noted(publisher, message):

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
@@ -31,13 +32,20 @@ class Stream:
 
     Attributes:
         listeners: callbacks of this process that get each message as the same object.
+        subscribers: how many subscribe in ROS.
         queue: takes messages to the listeners; None while there are none.
     """
 
     def __init__(self, node: Node, message: type, name: str, qos: QoSProfile) -> None:
-        self._publisher = node.create_publisher(message, name, qos)
+        # To count at each message takes longer than to deliver it.
+        events = PublisherEventCallbacks(matched=self._on_matched)
+        self._publisher = node.create_publisher(message, name, qos, event_callbacks=events)
+        self.subscribers = 0
         self.listeners: list[Listener] = []
         self.queue: Queue | None = None
+
+    def _on_matched(self, info: Any) -> None:
+        self.subscribers = info.current_count
 
     @property
     def topic_name(self) -> str:
@@ -53,8 +61,7 @@ class Stream:
 
     def publish_outside(self, message: Any) -> None:
         """Send a message to other processes, if any of them subscribes."""
-        # To count takes a sixth of the time of publishing to nobody.
-        if self._publisher.get_subscription_count():
+        if self.subscribers:
             self._publisher.publish(message)
 
 
@@ -123,8 +130,9 @@ class Queue:
         self._schedule()
 
     def _schedule(self) -> None:
-        executor = self._node.executor
-        if self._messages and not self._scheduled and executor is not None:
+        if self._scheduled or not self._messages:
+            return
+        if (executor := self._node.executor) is not None:
             self._scheduled = True
             executor.create_task(self._deliver)
 
