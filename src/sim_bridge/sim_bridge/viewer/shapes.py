@@ -35,7 +35,7 @@ def visual_shapes(
 
     Args:
         urdf: text of the URDF.
-        model: made of it by `robot_description.build_model`, other joints locked.
+        model: made of it by `build_model`, other joints locked.
         locked_positions: as given to it, rad.
 
     Raises:

@@ -26,7 +26,7 @@ def capsule_entries(model: pin.Model, geometry: pin.GeometryModel) -> list[str]:
 
     Args:
         model: with the joints that the geometry hangs on.
-        geometry: of `robot_description.load_geometry`.
+        geometry: of `load_geometry`.
 
     Raises:
         RobotDescriptionError: a kind of geometry that a URDF does not have.

@@ -10,13 +10,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Context
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from viability_bounds_pkg.parameter_files import ParameterFileError, read_files
+from viability_bounds_pkg.parameter_files import read_files
 from viability_bounds_pkg.robot.configuration import LimitedRobotConfiguration
 from viability_bounds_pkg.robot.description import build_model
 
@@ -67,24 +66,10 @@ def read_robot(path: Path) -> Robot:
         RobotDescriptionError: it cannot be loaded, or lacks a joint; a rotor inertia is negative.
     """
     config = read_files(LimitedRobotConfiguration, [path], NODE)
-    urdf = config.read_urdf()
-    _check_limits(urdf, config.robot_description)
-    model = build_model(urdf, config.joints, config.locked, config.rotor_inertia)
-
+    model = build_model(config.read_urdf(), config.joints, config.locked, config.rotor_inertia)
     return Robot(
         model, config.position_min, config.position_max, config.velocity_max, config.torque_max
     )
-
-
-def _check_limits(urdf: str, source: str) -> None:
-    """Raise where a URDF lacks an effort or velocity limit: Pinocchio does not name the joint."""
-    for joint in ElementTree.fromstring(urdf).iter("joint"):
-        if joint.get("type") not in ("revolute", "prismatic"):
-            continue
-        limit = joint.find("limit")
-        for key in ("effort", "velocity"):
-            if limit is None or limit.get(key) is None:
-                raise ParameterFileError(f"{source}: joint {joint.get('name')} has no {key} limit")
 
 
 def overlay(parameters: Mapping[str, Array], notes: Sequence[str], node: str = NODE) -> str:

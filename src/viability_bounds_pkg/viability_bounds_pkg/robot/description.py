@@ -255,7 +255,7 @@ def load_geometry(
     locked_positions: Mapping[str, float] | None = None,
     kind: str = "collision",
 ) -> pin.GeometryModel:
-    """Return the geometry for a model of `robot_description.build_model`.
+    """Return the geometry for a model of `build_model`.
 
     Args:
         urdf: text of the URDF.
