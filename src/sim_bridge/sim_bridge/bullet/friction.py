@@ -24,7 +24,6 @@ link that a gear constraint couples to its joint; docs/simulated_robot.md has th
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,15 +37,6 @@ DEFAULT_STRIBECK_VELOCITY = 0.01
 
 _STIFFNESS_MASS = 0.02  # k h^2, kg
 _DAMPING_MASS = 0.05  # d h, kg
-
-CONTACT_POINT = np.dtype(
-    [
-        ("position", np.float64, 3),  # on the link, m
-        ("normal", np.float64, 3),  # from the obstacle to the link
-        ("pressure", np.float64),  # normal force, N
-    ]
-)
-"""A point where a link touches an obstacle."""
 
 
 class JointFriction:
@@ -139,7 +129,8 @@ class ContactFriction:
         stiffness: of the obstacle, which k does not exceed, N/m.
 
     Attributes:
-        points: where the link is touched, shape (m,), of `CONTACT_POINT`.
+        points: where the link is touched, shape (m, 7): position on the link, m; normal, from the
+            obstacle to the link; normal force, N.
         force: on the link in the next step, shape (3,), N.
         point: where it acts, the centre of pressure, shape (3,), m.
     """
@@ -149,7 +140,7 @@ class ContactFriction:
         self._stiffness = min(stiffness, _STIFFNESS_MASS / physics_dt**2)
         self._damping = _DAMPING_MASS / physics_dt
         self._deflection = np.zeros(3)
-        self.points: NDArray[Any] = np.zeros(0, CONTACT_POINT)
+        self.points = np.zeros((0, 7))
         self.force, self.point = np.zeros((2, 3))
 
     def update(self, centre: Array, velocity: Array, angular_velocity: Array) -> None:
@@ -160,12 +151,13 @@ class ContactFriction:
             velocity: of that centre, shape (3,), m/s.
             angular_velocity: of the link, shape (3,), rad/s.
         """
-        pressure = self.points["pressure"]
+        pressure = self.points[:, 6]
         total = float(pressure.sum())
-        self.point = pressure @ self.points["position"] / total
-        normal = pressure @ self.points["normal"]
+        weighted = pressure @ self.points[:, :6]
+        self.point, normal = weighted[:3] / total, weighted[3:]
         normal /= math.sqrt(normal @ normal)
-        v = velocity + np.cross(angular_velocity, self.point - centre)
+        (x, y, z), (a, b, c) = (self.point - centre).tolist(), angular_velocity.tolist()
+        v = velocity + (b * z - c * y, c * x - a * z, a * y - b * x)
         v -= (v @ normal) * normal
         s = self._deflection
         s = s - (s @ normal) * normal + self._dt * v  # the surface may have turned

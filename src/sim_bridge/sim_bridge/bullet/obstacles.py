@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim_bridge.bullet.client import BulletClient, finite_vector, pybullet
-from sim_bridge.bullet.friction import CONTACT_POINT, ContactFriction
+from sim_bridge.bullet.friction import ContactFriction
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.parameter import Range, above, check, number
 from viability_bounds_pkg.robot.description import RobotDescriptionError
@@ -334,8 +334,8 @@ class BulletObstacles:
             for key in found
         }
         for key, friction in self._touching.items():
-            points = friction.points = np.array(found[key]).view(CONTACT_POINT)[:, 0]
-            total[key.body] = total.get(key.body, 0.0) + points["pressure"] @ points["normal"]
+            points = friction.points = np.array(found[key])
+            total[key.body] = total.get(key.body, 0.0) + points[:, 6] @ points[:, 3:6]
             self._by_body[key.body].moved = True
         for key, wrench in self._friction.items():
             total[key.body] = total.get(key.body, 0.0) + wrench.force
@@ -352,9 +352,9 @@ class BulletObstacles:
     def wrenches(self) -> list[LinkWrench]:
         """Return all wrenches of obstacles on the robot in the last physics step."""
         contacts = [
-            LinkWrench(self._links[key.link], position, pressure * normal)
+            LinkWrench(self._links[key.link], point[:3], point[6] * point[3:6])
             for key, friction in self._touching.items()
-            for position, normal, pressure in friction.points
+            for point in friction.points
         ]
         return contacts + list(self._friction.values())
 
@@ -366,8 +366,9 @@ class BulletObstacles:
             friction = self._friction.get(key)
             along = np.zeros(3) if friction is None else friction.force
             # The friction acts at the centre of pressure, as if distributed like this.
-            whole = touching.points["pressure"].sum()
-            for position, normal, pressure in touching.points:
+            whole = touching.points[:, 6].sum()
+            for point in touching.points:
+                normal, pressure = point[3:6], point[6]
                 force = pressure * normal + pressure / whole * along
-                found.append(Contact(link, name, position, normal, force))
+                found.append(Contact(link, name, point[:3], normal, force))
         return found

@@ -15,13 +15,10 @@ from sim_bridge.scenario.events import (
     PostureGoal,
     Push,
     RemoveObstacle,
-    ScenarioError,
     WrenchGoal,
-    positive,
     read_event,
-    read_fields,
-    refuse,
 )
+from sim_bridge.scenario.fields import ScenarioError, positive, read_fields, refuse
 from viability_bounds_pkg.exceptions import SettingError, did_you_mean
 from viability_bounds_pkg.parameter import text, timeout
 from viability_bounds_pkg.parameter_files import YamlError, read_yaml
