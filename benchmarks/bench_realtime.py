@@ -47,8 +47,8 @@ from sim_bridge.node import command_stream
 from sim_bridge.node.bullet_node import BulletNode
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.node.controller_node import ControllerNode
+from torque_safety_controller.node.periodic import LimitsReader
 from torque_safety_controller.node.safety_stack import make_nodes
-from torque_safety_controller.node.streams.limits import LimitsReader
 from torque_safety_controller.parts.whole_arm.safety_filter import SafetyFilter
 from torque_safety_controller.qp import InverseDynamicsQP
 from torque_safety_controller.robot_model import RobotModel

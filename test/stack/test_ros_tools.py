@@ -161,7 +161,7 @@ def test_the_controller_notices_silence_although_simulated_time_stands_still(ros
 
 def test_a_leap_of_simulated_time_times_out_nothing(ros):
     tell = clock(ros)
-    chain = NodeChain(ros, use_sim_time=True, goal_timeout=30.0)
+    chain = NodeChain(ros, use_sim_time=True)
     stamp = give_goal(chain)
     ros.wait_until(lambda: is_at(chain.node, 7200.0), "the leap", each=lambda: tell(7200.0))
     chain.answer(stamp)

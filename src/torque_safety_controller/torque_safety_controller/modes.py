@@ -110,7 +110,6 @@ CAUSES = {
         Goals.SLOWED,
         "several nodes publish goals",
     ),
-    "old goal": Cause("no goal for goal_timeout", "a goal", Mode.HOLD, Goals.ASIDE, "goal lost"),
     "no goal": Cause("there is no goal", "a goal", Mode.HOLD, Goals.ASIDE, "no goal"),
     "moves": Cause(
         "one of the above has set the share to 0; states were missing, or not answered for "

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from torque_safety_controller.friction.settings import FrictionSettings
 from torque_safety_controller.integral_feedback.settings import IntegralSettings
 from torque_safety_controller.parts.contact.admittance import InteractionSettings
-from torque_safety_controller.parts.contact.wrench_sensor import SensorSettings
 from torque_safety_controller.tasks.gains import Gains
 
 
@@ -22,7 +21,6 @@ class Settings:
         integral: of the integral action.
         friction: of the friction compensation.
         interaction: of forces at the hand.
-        sensor: at the hand.
     """
 
     gains: Gains
@@ -30,4 +28,3 @@ class Settings:
     integral: IntegralSettings
     friction: FrictionSettings
     interaction: InteractionSettings
-    sensor: SensorSettings

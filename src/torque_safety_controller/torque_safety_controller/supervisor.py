@@ -154,7 +154,7 @@ class Supervisor:
             goal: cause not to serve goals; empty for none.
         """
         causes = self._causes
-        for ended in ("silent", "refused", "rival", "old goal", "no goal", "stale"):
+        for ended in ("silent", "refused", "rival", "no goal", "stale"):
             causes.pop(ended, None)
         if goal:
             self._raise(goal)

@@ -6,7 +6,7 @@ import yaml
 from collision_arm import panda
 
 from torque_safety_controller.node.assembly import make_collision
-from torque_safety_controller.parameters.collision_parameters import CollisionConfiguration
+from torque_safety_controller.parameters.contact_parameters import CollisionConfiguration
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parts.collision.avoidance import CollisionSettings
 from viability_bounds_pkg.exceptions import SettingError

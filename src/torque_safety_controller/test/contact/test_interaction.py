@@ -20,7 +20,7 @@ from torque_safety_controller.parts.contact.interaction import (
     Interaction,
     InteractionSettings,
 )
-from torque_safety_controller.parts.contact.wrench_sensor import SensorSettings, WrenchSensor
+from torque_safety_controller.parts.contact.wrench_sensor import WrenchSensor
 from torque_safety_controller.parts.goals import Goals
 from torque_safety_controller.parts.joint_bounds import JointBounds
 from torque_safety_controller.qp import AccelerationRange
@@ -45,7 +45,8 @@ class SimulatedHand:
             pin.SE3.Identity(),
             pin.Inertia.Zero(),
             np.zeros(3),
-            SensorSettings(filter_hz=1e9, timeout=0.005),
+            filter_hz=1e9,
+            timeout=0.005,
         )
         touching = FrictionContact(ARM.frame, np.zeros(3), NORMAL, 0.5) if contact else None
         robot = ARM.robot(DT)

@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torque_safety_controller.parts.contact.wrench_sensor import (
-    SensorSettings,
     WrenchError,
     WrenchSensor,
 )
@@ -23,12 +22,15 @@ from viability_bounds_pkg.testing.ros_harness import read_config
 DT = 1e-3
 GRAVITY = np.array([0.0, 0.0, -9.81])
 TOOL = pin.Inertia(0.7, np.array([0.01, -0.02, 0.1]), np.eye(3) * 1e-3)
-UNFILTERED = SensorSettings(filter_hz=1e9, timeout=0.05)
+UNFILTERED = {"filter_hz": 1e9}
 
 
-def sensor(placement=None, tool=TOOL, settings=UNFILTERED) -> WrenchSensor:
+def sensor(placement=None, tool=TOOL, **changed) -> WrenchSensor:
     return WrenchSensor(
-        pin.SE3.Identity() if placement is None else placement, tool, GRAVITY, settings
+        pin.SE3.Identity() if placement is None else placement,
+        tool,
+        GRAVITY,
+        **UNFILTERED | changed,
     )
 
 
@@ -59,7 +61,7 @@ def test_the_weight_of_the_tool_is_not_felt_in_any_orientation(seed):
 
 def test_the_bias_is_what_a_tare_finds():
     rng = np.random.default_rng(0)
-    here = sensor(settings=SensorSettings())
+    here = sensor(filter_hz=30.0)
     bias = np.array([3.0, -2.0, 1.0, 0.1, 0.2, -0.3])
     weight = np.array([*(TOOL.mass * GRAVITY), *np.cross(TOOL.lever, TOOL.mass * GRAVITY)])
     for _ in range(1500):
@@ -73,7 +75,7 @@ def test_the_bias_is_what_a_tare_finds():
 @pytest.mark.parametrize("every", [1, 3])
 def test_the_filter_has_the_time_constant_of_its_cut_off(every):
     """Measured each step, or each third only."""
-    here = sensor(tool=pin.Inertia.Zero(), settings=SensorSettings(filter_hz=10.0))
+    here = sensor(tool=pin.Inertia.Zero(), filter_hz=10.0)
     step(here, np.zeros(6))
     constant = 1.0 / (2.0 * math.pi * 10.0)
     total, done = np.zeros(6), 0
@@ -90,7 +92,7 @@ def test_the_filter_has_the_time_constant_of_its_cut_off(every):
 
 
 def test_a_silent_sensor_says_so_and_comes_back_without_a_kick():
-    here = sensor(tool=pin.Inertia.Zero(), settings=SensorSettings(timeout=0.0105))
+    here = sensor(tool=pin.Inertia.Zero(), filter_hz=30.0, timeout=0.0105)
     assert here.silent
     step(here, np.full(6, 5.0))
     assert not here.silent

@@ -17,7 +17,7 @@ from torque_safety_controller.controller import Controller
 from torque_safety_controller.friction.settings import FrictionModel, FrictionSettings
 from torque_safety_controller.integral_action import make_integral
 from torque_safety_controller.integral_feedback import IntegralSettings
-from torque_safety_controller.parameters.friction_parameters import FrictionConfiguration
+from torque_safety_controller.parameters.controller_parameters import FrictionConfiguration
 from torque_safety_controller.parts.friction import Friction
 from torque_safety_controller.parts.integral import Integral
 from torque_safety_controller.qp import AccelerationRange

@@ -179,15 +179,6 @@ def test_goals_take_effect_at_their_stamps(ros):
     assert chain.reported("mode") == "TRACKING"
 
 
-def test_a_goal_that_is_not_renewed_is_given_up(ros):
-    chain = NodeChain(ros, goal_timeout=0.2)
-    stamp = give_goal(chain)
-    stamps = iter(range(stamp, stamp + 5000))
-    chain.await_mode("HOLD", "goal lost", each=lambda: chain.both(next(stamps)))
-    chain.poses.publish(pose_message(GOAL))
-    chain.await_mode("TRACKING", "goal", each=lambda: chain.both(next(stamps)))
-
-
 def test_a_publisher_of_goals_that_cannot_be_heard_is_refused_and_counted(ros, capfd):
     chain = NodeChain(ros)
     for topic in (TARGET_POSE, TARGET_POSTURE, TARGET_TRAJECTORY, TARGET_WRENCH):

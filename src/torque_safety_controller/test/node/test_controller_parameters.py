@@ -47,7 +47,7 @@ def test_gains_change_while_it_runs(ros, changed, gains):
         before, core.step(State(Q, V), AccelerationRange(-wide, wide)).tau, atol=1e-4
     )
     ros.accepts(NODE, **changed)
-    core.gains = replace(core.gains, **gains)
+    core.goals.gains = replace(core.goals.gains, **gains)
     after = chain.answer(20, lower=-wide, upper=wide)
     np.testing.assert_allclose(
         after, core.step(State(Q, V), AccelerationRange(-wide, wide)).tau, atol=1e-4
@@ -144,7 +144,6 @@ BROKEN_URDF = __file__
         ({"posture_weight": 0.0}, "posture_weight", "> 0"),
         ({"bounds_timeout": 0.0}, "bounds_timeout", "> 0"),
         ({"state_timeout": -1.0}, "state_timeout", "-1"),
-        ({"goal_timeout": -1.0}, "goal_timeout", ">= 0"),
     ],
 )
 def test_it_does_not_start_with_bad_parameters(shared_ros, changed, name, shown):

@@ -223,7 +223,6 @@ def contact(**changed):
         ({"ft_tool": [-2.0, 0.0, 0.0, 0.0]}, "ft_tool"),
         ({"ft_tool": [1.0, 0.0, 1.0]}, "ft_tool"),
         ({"ft_tool": [1.0, 0.0, 1.0, math.nan]}, "ft_tool"),
-        ({"ft_filter_hz": 0.0}, "ft_filter_hz"),
         ({"force_directions": [1.0] * 5}, "force_directions"),
         ({"force_directions": [0.5] * 6}, "force_directions"),
         ({"admittance_kp": [-1.0, 0.1]}, "admittance_kp"),
@@ -256,22 +255,20 @@ def test_each_parameter_reaches_the_settings():
         admittance_kp=[0.2, 0.03],
         admittance_speed_max=[0.1, 0.4],
         yield_threshold=[3.0, 4.0],
-        ft_filter_hz=9.0,
-    ).interaction
+    ).find(Interaction)
     settings = interaction.settings
     gains = settings.gains
     assert (gains.kp, gains.speed_max) == ((0.2, 0.03), (0.1, 0.4))
     assert settings.yield_threshold == (3.0, 4.0)
     np.testing.assert_array_equal(settings.directions, [0, 0, 1, 0, 0, 0])
-    assert interaction.sensor.settings.filter_hz == 9.0
-    assert build(yield_threshold=[]).interaction.settings.yield_threshold is None
+    assert build(yield_threshold=[]).find(Interaction).settings.yield_threshold is None
 
 
 def test_what_a_tool_weighs_is_that_of_the_parameter_or_of_the_urdf():
     """At rest, a sensor that feels the tool's weight measures no wrench of the environment."""
 
     def left(tool, mass, lever):
-        controller = build(ft_tool=tool, ft_filter_hz=1e4)
+        controller = build(ft_tool=tool)
         robot, sensor = controller.robot, controller.find(Interaction).sensor
         robot.update(State(ARM.q_start, np.zeros(ARM.n)), np.zeros(ARM.n))
         rotation = robot.pose.rotation @ sensor.placement.rotation

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from torque_safety_controller.node.streams.states import StateStream
+from torque_safety_controller.node.periodic import StateStream
 from viability_bounds_pkg.ros.messages import Arrival
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.testing.ros_harness import joint_state

@@ -70,7 +70,6 @@ ROWS = {
     ),
     "no plan": (lambda c: c.answer(planned=False), lambda c: c.answer()),
     "rival": (lambda c: c.answer(goal="rival"), lambda c: c.answer()),
-    "old goal": (lambda c: c.answer(goal="old goal"), lambda c: c.answer()),
     "no goal": (lambda c: c.answer(goal="no goal"), lambda c: c.answer()),
     "moves": (
         lambda c: (c.supervisor.begin("why"), c.answer(None, v=MOVES)),
@@ -285,7 +284,7 @@ class Events(RuleBasedStateMachine):
         moves=st.booleans(),
         effort=st.sampled_from([None, TAU, TAU, -TAU]),
         limits=st.booleans(),
-        goal=st.sampled_from(["", "", "", "no goal", "old goal", "rival"]),
+        goal=st.sampled_from(["", "", "", "no goal", "rival"]),
         failure=st.sampled_from(["", "", "", "why"]),
         planned=st.booleans(),
         count=st.sampled_from([1, 1, 60, 120]),

@@ -13,8 +13,8 @@ import pinocchio as pin
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.friction.compensation import FrictionCompensation
 from torque_safety_controller.integral_action import make_integral, warm_up
+from torque_safety_controller.parameters.contact_parameters import ContactPoint
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.parameters.interaction_parameters import ContactPoint
 from torque_safety_controller.parts.collision.avoidance import Collision
 from torque_safety_controller.parts.collision.model import build_collision_model
 from torque_safety_controller.parts.contact.contacts import FrictionContact
@@ -345,7 +345,7 @@ def _sensor(config: ControllerConfiguration, robot: RobotModel, urdf: str) -> Wr
         except RobotDescriptionError as error:
             raise SettingError("ft_frame", frame, f"a link of the URDF ({error})") from error
     placement = _between(model, robot.frame, frame)
-    return WrenchSensor(placement, inertia, model.gravity.linear, settings.sensor)
+    return WrenchSensor(placement, inertia, model.gravity.linear)
 
 
 def _contact(points: Sequence[ContactPoint], robot: RobotModel) -> FrictionContact | None:

@@ -27,11 +27,8 @@ from torque_safety_controller.node.declared import (
 )
 from torque_safety_controller.node.driving import Driving
 from torque_safety_controller.node.goals import GoalSubscriber
-from torque_safety_controller.node.reports.controller_report import ControllerReport
-from torque_safety_controller.node.reports.state_publisher import StatePublisher
-from torque_safety_controller.node.streams.joint_commands import JointCommands
-from torque_safety_controller.node.streams.limits import LimitsReader
-from torque_safety_controller.node.streams.states import UNSEEN, StateStream
+from torque_safety_controller.node.periodic import UNSEEN, JointCommands, LimitsReader, StateStream
+from torque_safety_controller.node.reports import ControllerReport, StatePublisher
 from torque_safety_controller.node.topics import ENABLE_TORQUE
 from torque_safety_controller.node.wrenches import WrenchSubscriber
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
@@ -234,7 +231,6 @@ class ControllerNode(ArmNode):
         except HandoverRefused as error:
             self._supervisor.change("failed", f"handover failed: {error}")
             return
-        self._goals.renew()
         self._handover.release()
         self._supervisor.change("torque known", "enable_torque")
         self.get_logger().info(

@@ -22,7 +22,7 @@ from torque_safety_controller.driving.trajectory import (
     JointTrajectoryError,
 )
 from torque_safety_controller.node.goals import GoalRefused, GoalSubscriber, vector_of
-from torque_safety_controller.node.streams.states import StateStream
+from torque_safety_controller.node.periodic import StateStream
 from torque_safety_controller.node.topics import JOG_HAND, JOG_JOINTS, TARGET_JOINT_TRAJECTORY
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from viability_bounds_pkg.exceptions import did_you_mean

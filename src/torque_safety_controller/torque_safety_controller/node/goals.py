@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -184,7 +183,6 @@ class GoalSubscriber:
         self.listen(TARGET_TRAJECTORY, self._on_trajectory)
         self.motion: Motion | None = None
         self._taken = controller.goals.held
-        self.renew()
 
     def __len__(self) -> int:
         return len(self._pending)
@@ -196,14 +194,7 @@ class GoalSubscriber:
             self._contested = {name for name in self._contested if not self._watch.admits(name)}
             if self._contested:
                 return "rival"
-        timeout = self._config.goal_timeout
-        if timeout > 0.0 and time.monotonic() - self._renewed_at > timeout:
-            return "old goal"
         return "" if self._controller.goals.any else "no goal"
-
-    def renew(self) -> None:
-        """Count the age of the last goal from now on."""
-        self._renewed_at = time.monotonic()
 
     def listen(self, topic: Topic, callback: Callable[[Any], None]) -> None:
         """Subscribe to a topic of goals; `callback` gets those of a node that is alone with it.
@@ -251,8 +242,6 @@ class GoalSubscriber:
         while self._pending and self._pending[0][0] <= stamp:
             self._pending.pop(0)[1]()
             due = True
-        if due or self.motion is not None:
-            self.renew()
         if self.motion is None:
             return due
         if not self.motion.advance(self._controller, state, stamp):

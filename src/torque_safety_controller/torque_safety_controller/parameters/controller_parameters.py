@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller node's parameters."""
+"""Parameters of the controller node."""
 
 from __future__ import annotations
 
@@ -8,25 +8,32 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from torque_safety_controller.friction.settings import FrictionSettings
-from torque_safety_controller.integral_feedback.settings import IntegralSettings
+from torque_safety_controller.friction.settings import (
+    DEFAULT_STRIBECK_VELOCITY,
+    FrictionModel,
+    FrictionSettings,
+)
+from torque_safety_controller.integral_action import MODES, TASKS
+from torque_safety_controller.integral_feedback.settings import METHODS, IntegralSettings
 from torque_safety_controller.modes import CONTROLS
-from torque_safety_controller.parameters.collision_parameters import CollisionConfiguration
-from torque_safety_controller.parameters.friction_parameters import FrictionConfiguration
-from torque_safety_controller.parameters.integral_parameters import IntegralConfiguration
-from torque_safety_controller.parameters.interaction_parameters import InteractionConfiguration
+from torque_safety_controller.parameters.contact_parameters import (
+    CollisionConfiguration,
+    InteractionConfiguration,
+)
 from torque_safety_controller.parts.whole_arm.braking_plan import RESERVE
 from torque_safety_controller.qp import SOLVERS
 from torque_safety_controller.settings import Settings
 from torque_safety_controller.tasks.gains import Gains
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import (
+    NOT_NEGATIVE,
     POSITIVE,
     Range,
     group,
     joint_amounts,
     joint_numbers,
     number,
+    numbers,
     switch,
     text,
     timeout,
@@ -39,6 +46,153 @@ from viability_bounds_pkg.robot.configuration import (
 )
 
 Array = NDArray[np.float64]
+
+INTEGRAL_BUDGET = 0.1
+"""Default budget in torque limits: the paper's tau_m."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class IntegralConfiguration:
+    """Parameters of the integral action."""
+
+    integral_action: str = text(
+        "none; joints: all joints stiff; task, position: the end effector's pose, or its "
+        "position, stiff and the null space compliant",
+        default="none",
+        live=True,
+        choices=MODES,
+    )
+    integral_budget: Array = joint_numbers(
+        f"limits of the additional torque, N m; {INTEGRAL_BUDGET:g} of torque_max if empty",
+        NOT_NEGATIVE,
+        default=(),
+        live=True,
+        note="at most torque_max",
+    )
+    integral_lambda: float = number(
+        "gain, K = lambda diag(M), 1/s; less is used in postures where it would be unstable",
+        Range(1.0, 1e3),
+        default=2.0,
+        live=True,
+    )
+    integral_leak: Array = numbers(
+        "leak rates theta_s and theta_f of the slow and the fast integrator, 1/s, the share mu of "
+        "the fast one, and, for task or position with qp, the leak rate theta_null in the null "
+        "space, 1/s, theta_f if left out",
+        NOT_NEGATIVE,
+        default=(0.1, 100.0, 0.5),
+        live=True,
+        note="[theta_s, theta_f, mu] or [theta_s, theta_f, mu, theta_null] with theta_f >= "
+        "theta_s, mu <= 1 and theta_null >= theta_s",
+    )
+    integral_anti_windup: str = text(
+        "qp limits the whole torque and the integrators; paper and scaling limit the torque of "
+        "the gains only, by eq. (11) and (10), and the law is as printed, that of task and "
+        "position with (16), (21) and (26)",
+        default="qp",
+        live=True,
+        choices=METHODS,
+    )
+
+    def settings(self, tau_max: Array, hands: int = 1) -> IntegralSettings:
+        """Return the settings of the integral action.
+
+        Args:
+            tau_max: torque limits, shape (n,), N m.
+            hands: number of end effectors.
+
+        Raises:
+            SettingError: values that do not fit together.
+        """
+        rows = TASKS.get(self.integral_action)
+        if rows is not None and hands * rows.stop >= len(tau_max):
+            allowed = (
+                f"'none' or 'joints': {len(tau_max)} joints have no null space left of the task"
+            )
+            raise SettingError("integral_action", self.integral_action, allowed)
+        budget = self.integral_budget if len(self.integral_budget) else INTEGRAL_BUDGET * tau_max
+        if (budget > tau_max).any():
+            raise SettingError("integral_budget", budget, "at most torque_max")
+        if len(self.integral_leak) not in (3, 4):
+            raise SettingError("integral_leak", self.integral_leak, "3 or 4 finite numbers")
+        slow, fast, mu, *null = self.integral_leak.tolist()
+        if fast < slow or mu > 1.0 or min(null, default=slow) < slow:
+            allowed = "theta_f >= theta_s, mu <= 1 and theta_null >= theta_s"
+            raise SettingError("integral_leak", self.integral_leak, allowed)
+        return IntegralSettings(
+            budget,
+            gain=self.integral_lambda,
+            slow_leak_rate=slow,
+            fast_leak_rate=fast,
+            mu=mu,
+            anti_windup=self.integral_anti_windup,
+            null_leak_rate=null[0] if null else None,
+        )
+
+
+FRICTION_BUDGET = 0.2
+"""Largest torque that is compensated, in torque limits."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FrictionConfiguration:
+    """Parameters of the friction compensation; `identify_friction` finds the model."""
+
+    friction_compensation: float = number(
+        "share of the friction model that is compensated; 0: off",
+        Range(0.0, 1.0),
+        default=0.0,
+        live=True,
+    )
+    friction_model_coulomb: Array = joint_numbers(
+        "dry friction of moving joints, N m; none if empty", NOT_NEGATIVE, default=(), live=True
+    )
+    friction_model_static: Array = joint_numbers(
+        "dry friction of joints at rest, N m; that of moving ones if empty",
+        NOT_NEGATIVE,
+        default=(),
+        live=True,
+    )
+    friction_model_viscous: Array = joint_numbers(
+        "friction that grows with speed, N m s/rad; none if empty",
+        NOT_NEGATIVE,
+        default=(),
+        live=True,
+    )
+    friction_model_stribeck_velocity: Array = joint_numbers(
+        "speed at which static has become Coulomb friction but for 1/e of the difference, rad/s; "
+        f"{DEFAULT_STRIBECK_VELOCITY:g} if empty",
+        POSITIVE,
+        if_empty=DEFAULT_STRIBECK_VELOCITY,
+        live=True,
+    )
+
+    def settings(self, tau_max: Array) -> FrictionSettings:
+        """Return the settings of the friction compensation.
+
+        Args:
+            tau_max: torque limits, shape (n,), N m.
+
+        Raises:
+            SettingError: values that do not fit together.
+        """
+        given = (
+            self.friction_model_coulomb,
+            self.friction_model_static,
+            self.friction_model_viscous,
+        )
+        scale = self.friction_compensation
+        if scale > 0.0 and not any(map(len, given)):
+            allowed = "0 as long as no friction_model_coulomb, _static or _viscous is given"
+            raise SettingError("friction_compensation", scale, allowed)
+        coulomb, static, viscous = (row if len(row) else 0.0 * tau_max for row in given)
+        if not len(self.friction_model_static):
+            static = coulomb
+        if (static < coulomb).any():
+            allowed = "at least friction_model_coulomb everywhere"
+            raise SettingError("friction_model_static", static, allowed)
+        model = FrictionModel(coulomb, static, viscous, self.friction_model_stribeck_velocity)
+        return FrictionSettings(model, FRICTION_BUDGET * tau_max, scale)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -100,9 +254,6 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
         "with the next one, s",
         default=0.5,
     )
-    goal_timeout: float = number(
-        "age of a goal before HOLD, s; 0: never", Range(0.0, 1e5), default=0.0
-    )
     effort_tolerance: float = number(
         "by how much torques of joint states may differ from those that were commanded, share of "
         "torque_max; beyond, commands count as not acting, and the arm is slowed; 0: not compared",
@@ -124,7 +275,6 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
             self.integral_settings,
             self.friction_settings,
             self.interaction.settings,
-            self.interaction.sensor,
         )
 
     @property

@@ -143,7 +143,6 @@ class Interaction(Part):
     def configure(self, settings: Settings) -> None:
         """See `Part.configure`."""
         self.settings = settings.interaction
-        self.sensor.settings = settings.sensor
 
     def reset(self, robot: RobotModel) -> None:
         """Forget the past and the target."""

@@ -14,39 +14,29 @@ that of the filtered wrench, the finite difference that [Benallegue2021] takes, 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from viability_bounds_pkg.exceptions import ArmSafetyError
-from viability_bounds_pkg.parameter import above, number
 
 Array = NDArray[np.float64]
 
 STRONGEST = 1e5
 """Largest force or moment that is taken for one, N or N m: no arm bears more."""
 
+FILTER_HZ = 30.0
+"""Cut-off frequency of the wrench's filter."""
+
+TIMEOUT = 0.05
+"""How long without a measurement before force control ends, s."""
+
 _TARE_TIME = 0.2  # s, of the mean that becomes the bias
 
 
 class WrenchError(ArmSafetyError, ValueError):
     """A measurement, or a property of the sensor or the tool, that cannot be used."""
-
-
-@dataclass(frozen=True)
-class SensorSettings:
-    """How measurements are taken.
-
-    Attributes:
-        timeout: how long without a wrench before force control ends, s; not a parameter.
-    """
-
-    filter_hz: float = number(
-        "cut-off frequency of the wrench's filter, Hz", above(0.0, 1e4), default=30.0, live=True
-    )
-    timeout: float = 0.05
 
 
 class WrenchSensor:
@@ -56,10 +46,10 @@ class WrenchSensor:
         placement: of the sensor's frame in the end effector's.
         tool: inertia of what is beyond the sensor, in the sensor's axes.
         gravity: in the URDF's root frame, shape (3,), m/s^2.
-        settings: may be replaced between steps.
+        filter_hz: cut-off frequency of the filter, Hz.
+        timeout: how long without a measurement before the sensor counts as silent, s.
 
     Attributes:
-        settings: as given.
         placement: as given.
         bias: of the sensor, in its axes, shape (6,), N and N m; see `tare`.
         wrench: of the environment on the arm, about the end effector's origin and in its axes,
@@ -73,9 +63,10 @@ class WrenchSensor:
         placement: pin.SE3,
         tool: pin.Inertia,
         gravity: ArrayLike,
-        settings: SensorSettings | None = None,
+        filter_hz: float = FILTER_HZ,
+        timeout: float = TIMEOUT,
     ) -> None:
-        self.settings = settings or SensorSettings()
+        self._cut_off, self._timeout = 2.0 * math.pi * filter_hz, timeout
         self.placement = placement
         self.bias = np.zeros(6)
         self._action = np.ascontiguousarray(placement.toDualActionMatrix())
@@ -115,15 +106,14 @@ class WrenchSensor:
         """
         self._age += elapsed
         if self._raw is None:
-            if self._age > self.settings.timeout and not self.silent:
+            if self._age > self._timeout and not self.silent:
                 self.start()
             return
         time, self._age = self._age, 0.0
         if self.silent or not time > 0.0:
             time = math.inf
-        cut_off = 2.0 * math.pi * self.settings.filter_hz
         found = self._raw - self._weight @ self._gravity.dot(rotation)
-        change = -math.expm1(-cut_off * time) * (found - self._filtered)
+        change = -math.expm1(-self._cut_off * time) * (found - self._filtered)
         self._filtered = self._filtered + change
         self._mean = self._mean - math.expm1(-time / _TARE_TIME) * (found - self._mean)
         self.wrench = self._action @ (self._filtered - self.bias)

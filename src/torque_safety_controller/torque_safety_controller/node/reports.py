@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Statistics of the control steps for /diagnostics."""
+"""What the controller node reports: diagnostics, the pose of the hand and its errors, the mode."""
 
 from __future__ import annotations
 
@@ -8,21 +8,33 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import Vector3Stamped
+from numpy.typing import NDArray
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from std_msgs.msg import Header, String
 
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.modes import Mode
 from torque_safety_controller.node.goals import GoalSubscriber
-from torque_safety_controller.node.streams.limits import LimitsReader
-from torque_safety_controller.node.streams.states import StateStream
+from torque_safety_controller.node.periodic import LimitsReader, StateStream
+from torque_safety_controller.node.topics import (
+    CONTROLLER_MODE,
+    HAND_ORIENTATION_ERROR,
+    HAND_POSE,
+    HAND_POSITION_ERROR,
+)
 from torque_safety_controller.node.wrenches import WrenchSubscriber
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parts.collision.avoidance import Collision
 from torque_safety_controller.step import Step, joints_named
 from torque_safety_controller.supervisor import Supervisor
+from torque_safety_controller.tasks.pose_task import pose_difference
 from viability_bounds_pkg.recent_values import RecentValues
-from viability_bounds_pkg.ros.messages import PeriodCheck
+from viability_bounds_pkg.ros.messages import JointStateReader, PeriodCheck, pose_message
 from viability_bounds_pkg.ros.parameters import NodeParameters
+
+Array = NDArray[np.float64]
 
 LEVELS = {
     Mode.TRACKING: DiagnosticStatus.OK,
@@ -31,8 +43,8 @@ LEVELS = {
     Mode.STOPPED: DiagnosticStatus.ERROR,
 }
 
+_PERIOD = 0.05  # s; between messages of the hand's pose
 _SLIGHT = 1e-3  # rad/s^2; smaller relaxations of bounds come with those of distances
-
 
 _STANDS = 1.0
 """How long the arm stands before it is told, s."""
@@ -185,3 +197,70 @@ class Shortfall:
         near = np.minimum(robot.q - self._q_min, self._q_max - robot.q) < _NEAR
         text = f"stands {1e3 * left[0]:.0f} mm and {left[1]:.2f} rad short of its goal"
         return text + (f", on limits of {joints_named(robot, near)}" if near.any() else "")
+
+
+class StatePublisher:
+    """Publishes the pose of the hand and its errors, by a timer of its own, and the mode.
+
+    Control steps do no work for it, and what has no subscriber costs nothing. The pose is computed
+    from the last joint state here, so that it is there in all modes.
+
+    Args:
+        node: publishes.
+        controller: has the goals.
+        config: names the base frame.
+        base: placement of the base frame in the URDF's root frame.
+        states: has the last joint state.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        controller: Controller,
+        config: ControllerConfiguration,
+        base: pin.SE3,
+        states: JointStateReader,
+    ) -> None:
+        self._controller, self._states = controller, states
+        self._base_frame, self._base = config.base_frame, base
+        robot = controller.robot
+        self._model, self._data = robot.model, robot.model.createData()
+        self._frame = robot.model.getFrameId(robot.frame)
+        self._pose = HAND_POSE.publisher(node)
+        self._position_error = HAND_POSITION_ERROR.publisher(node)
+        self._orientation_error = HAND_ORIENTATION_ERROR.publisher(node)
+        self._mode = CONTROLLER_MODE.publisher(node)
+        self._last: Mode | None = None
+        self.mode(Mode.STOPPED)
+        # The steady clock, as with use_sim_time the other one may be slower than the robot.
+        node.create_timer(_PERIOD, self._publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def mode(self, mode: Mode) -> None:
+        """Publish the mode if it is new; the other topics are silent while it is STOPPED."""
+        if mode is not self._last:
+            self._last = mode
+            self._mode.publish(String(data=mode.value))
+
+    def _publish(self) -> None:
+        publishers = self._pose, self._position_error, self._orientation_error
+        if self._last is Mode.STOPPED or not any(
+            each.get_subscription_count() for each in publishers
+        ):
+            return
+        pin.forwardKinematics(self._model, self._data, self._states.q)
+        pose = pin.updateFramePlacement(self._model, self._data, self._frame)
+        pose = self._base.actInv(pose)
+        message = pose_message(pose, self._base_frame, self._states.stamp)
+        self._pose.publish(message)
+        goal = self._controller.goals.pose_des
+        if goal is None:
+            return
+        difference = pose_difference(pose, self._base.actInv(goal))
+        self._position_error.publish(_vector(message.header, difference.translation))
+        self._orientation_error.publish(_vector(message.header, difference.rotation))
+
+
+def _vector(header: Header, values: Array) -> Vector3Stamped:
+    message = Vector3Stamped(header=header)
+    message.vector.x, message.vector.y, message.vector.z = values.tolist()
+    return message

@@ -1,17 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joint states as a stream: which can be used, which were answered, where the robot restarted."""
+"""What the controller node reads and answers each control period: states, limits, commands."""
 
 from __future__ import annotations
 
 import math
+from array import array
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+from trajectory_msgs.msg import JointTrajectory
 
+from torque_safety_controller.node.topics import ROS2_CONTROL_EFFORTS
+from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.plausible import RESTART_GAP, PlausibilityCheck
+from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import Arrival, JointStateReader
+from viability_bounds_pkg.ros.runtime import stamp_to_ns
+from viability_bounds_pkg.ros.topics import JOINT_COMMANDS
 
 UNSEEN = 3
 """Refused states in a row after which nothing is known of the arm."""
@@ -115,3 +124,97 @@ class StateStream(JointStateReader):
     def why_refused(self) -> str:
         """Why states were dropped since the start, in words."""
         return "joint states are refused: " + ", ".join(self.refused)
+
+
+class LimitsReader:
+    """Reads ``acceleration_limits`` into arrays in the order of `joints`.
+
+    Args:
+        joints: names of the n joints.
+        warn: told in words when a message is dropped for a reason for the first time.
+
+    Attributes:
+        range: of the last accepted message, shape (n,) each, rad/s^2.
+        stamp: of the state that they belong to, ns.
+        refused: how many messages were dropped, by reason.
+    """
+
+    def __init__(self, joints: Sequence[str], warn: Callable[[str], object] | None = None) -> None:
+        self._warn = warn
+        self.range = AccelerationRange(np.zeros(len(joints)), np.zeros(len(joints)))
+        self.stamp = -1
+        self.refused: Counter[str] = Counter()
+        self._joints = list(joints)
+
+    def read(self, message: JointTrajectory) -> bool:
+        """Take a message; return whether it was accepted."""
+        if len(message.points) != 2:
+            return self._refuse("wrong number of points")
+        first, second = message.points
+        lower, upper = np.array(first.accelerations), np.array(second.accelerations)
+        if not len(lower) == len(upper) == len(message.joint_names):
+            return self._refuse("wrong size")
+        if message.joint_names != self._joints:
+            where = {name: i for i, name in enumerate(message.joint_names)}
+            if missing := next((joint for joint in self._joints if joint not in where), ""):
+                return self._refuse("missing joint", f": there is no '{missing}'")
+            index = [where[joint] for joint in self._joints]
+            lower, upper = lower[index], upper[index]
+        limits = AccelerationRange(lower, upper)
+        if fault := limits.fault:
+            return self._refuse(fault)
+        self.range = limits
+        self.stamp = stamp_to_ns(message.header.stamp)
+        return True
+
+    def _refuse(self, reason: str, detail: str = "") -> bool:
+        self.refused[reason] += 1
+        if self._warn is not None and self.refused[reason] == 1:
+            self._warn(f"acceleration_limits refused: {reason}{detail}")
+        return False
+
+
+class JointCommands:
+    """Publishes ``joint_commands``, and torques for ros2_control where that is asked for.
+
+    Args:
+        node: the publishing node.
+        joints: names of the n joints.
+        ros2_control_topic: of the torques in `joints` order; empty for none.
+    """
+
+    def __init__(self, node: ArmNode, joints: Sequence[str], ros2_control_topic: str) -> None:
+        self._torques = JointState(name=list(joints))
+        self._positions = JointState(
+            name=list(joints), velocity=array("d", np.zeros(len(joints)).tobytes())
+        )
+        self._last = self._torques
+        self._commands = node.stream(JOINT_COMMANDS)
+        self._efforts = None
+        if ros2_control_topic:
+            self._efforts = ROS2_CONTROL_EFFORTS.publisher(node, ros2_control_topic)
+            node.publisher_watch.add(self._efforts.topic_name)
+
+    @property
+    def stamp(self) -> int:
+        """Stamp of the state answered last, ns."""
+        return stamp_to_ns(self._last.header.stamp)
+
+    def torque(self, tau: np.ndarray, stamp: Any) -> None:
+        """Send torques, shape (n,), N m, for the state with `stamp`."""
+        self._torques.effort = array("d", tau.tobytes())
+        self._last = self._torques
+        self.again(stamp)
+
+    def position(self, q: np.ndarray, stamp: Any) -> None:
+        """Have the drives hold positions, shape (n,), rad, from the state with `stamp` on."""
+        self._positions.position = array("d", q.tobytes())
+        self._last = self._positions
+        self.again(stamp)
+
+    def again(self, stamp: Any) -> None:
+        """Send the last command again, torques or positions, because a state was repeated."""
+        self._last.header.stamp = stamp
+        self._commands.publish(self._last)
+        if self._efforts is not None and self._last is self._torques:
+            self._efforts.publish(Float64MultiArray(data=self._torques.effort))

@@ -1,0 +1,311 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of what the arm touches and must not touch: forces at the hand, collisions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import TypeVar
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from torque_safety_controller.parts.collision.avoidance import CollisionSettings
+from torque_safety_controller.parts.collision.shapes import SHAPES, Shape, capsule, make_obstacle
+from torque_safety_controller.parts.contact.admittance import InteractionSettings
+from viability_bounds_pkg.exceptions import SettingError, did_you_mean
+from viability_bounds_pkg.parameter import (
+    FINITE,
+    NEGATIVE,
+    NOT_NEGATIVE,
+    POSITIVE,
+    check_per_joint,
+    group,
+    joint_numbers,
+    number,
+    numbers,
+    parameter_table,
+    read,
+    switch,
+    text,
+    texts,
+)
+from viability_bounds_pkg.parameter_files import YamlError, load_yaml
+from viability_bounds_pkg.robot.configuration import RobotConfiguration
+
+Entry = TypeVar("Entry")
+
+
+@lru_cache(maxsize=16)  # other parameters change while a control loop waits
+def read_entries(kind: type[Entry], parameter: str, entries: tuple[str, ...]) -> tuple[Entry, ...]:
+    """Return what the entries of a parameter say.
+
+    Args:
+        kind: dataclass whose fields are declared as parameters.
+        parameter: name of the list of strings.
+        entries: YAML mappings in flow style.
+
+    Raises:
+        SettingError: an entry is no mapping, has another field, or a value is not allowed.
+    """
+    return tuple(_read(kind, f"{parameter}[{i}]", text) for i, text in enumerate(entries))
+
+
+def _read(kind: type[Entry], label: str, text: str) -> Entry:
+    fields = [row.name for row in parameter_table(kind)]
+    reason = ""
+    try:
+        values = load_yaml(text)
+    except YamlError as error:
+        values, reason = None, f" ({error})"
+    if not isinstance(values, dict) or not set(values) <= set(fields):
+        for name in values if isinstance(values, dict) else ():
+            reason = reason or ("" if name in fields else did_you_mean(str(name), fields))
+        allowed = f"a YAML mapping with the fields {', '.join(fields)}{reason}"
+        raise SettingError(label, text, allowed)
+    try:
+        return read(kind, values)
+    except SettingError as error:
+        raise SettingError(f"{label}.{error.name}", error.value, error.allowed) from error
+
+
+Array = NDArray[np.float64]
+
+_AXES = "x, y, z and about x, y, z of the end effector's axes"
+
+_DEFAULTS = InteractionSettings()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ContactPoint:
+    """One entry of ``contacts``."""
+
+    frame: str = text("name of the link")
+    point: Array = numbers("in its axes, m", FINITE, length=3, default=(0.0, 0.0, 0.0))
+    normal: Array = numbers("direction in which the environment pushes", FINITE, length=3)
+    friction: float = number("Coulomb's coefficient", NOT_NEGATIVE, default=0.0)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class InteractionConfiguration:
+    """Parameters of forces.
+
+    Attributes:
+        points: of contacts.
+        settings: what is done about forces.
+    """
+
+    ft_frame: str = text("link of the wrist's force/torque sensor; none if empty", default="")
+    ft_tool: Array = numbers(
+        "mass beyond the sensor, kg, and its centre in the sensor's axes, m; as the URDF says if "
+        "empty",
+        length=4,
+        default=(),
+        note="[mass, x, y, z] with mass >= 0",
+    )
+    force_directions: Array = numbers(
+        f"1 where target_wrench is exerted, 0 elsewhere: {_AXES}; nowhere if empty",
+        length=6,
+        if_empty=0.0,
+        live=True,
+        note="zeros and ones",
+    )
+    admittance_kp: Array = numbers(
+        "gains Kp of (27) for forces, m/s^2 per N, and moments, rad/s^2 per N m",
+        NOT_NEGATIVE,
+        length=2,
+        default=_DEFAULTS.gains.kp,
+        live=True,
+    )
+    admittance_speed_max: Array = numbers(
+        "speeds at which the hand approaches what it is to press on, m/s and rad/s",
+        POSITIVE,
+        length=2,
+        default=(0.01, 0.05),
+        live=True,
+    )
+    yield_threshold: Array = numbers(
+        "force, N, and moment, N m, above which the hand yields; below half of both it stops, and "
+        "stays where it is then; it never yields if empty",
+        POSITIVE,
+        length=2,
+        default=(),
+        live=True,
+    )
+    contacts: tuple[str, ...] = texts(
+        "points at which the hand touches while it exerts target_wrench, on one link fixed to it "
+        "and in its axes: point, m, its origin if left out; normal, direction in which the "
+        "environment pushes; friction, Coulomb's coefficient, 0 if left out",
+        default=(),
+        note="each a YAML mapping '{frame: link, point: [x, y, z], normal: [x, y, z], "
+        "friction: 0.3}'; all have the same frame, normal and friction",
+    )
+    points: tuple[ContactPoint, ...] = field(init=False)
+    settings: InteractionSettings = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Check all that does not depend on the URDF, and make the settings."""
+        tool = self.ft_tool
+        if len(tool) and not (np.isfinite(tool).all() and tool[0] >= 0.0):
+            raise SettingError("ft_tool", tool, "4 finite numbers [mass, x, y, z] with mass >= 0")
+        object.__setattr__(self, "points", _contact_points(self.contacts))
+        for name in ("force_directions", "yield_threshold"):
+            if np.any(getattr(self, name)) and not self.ft_frame:
+                allowed = "only with a force/torque sensor, 'ft_frame'"
+                raise SettingError(name, getattr(self, name), allowed)
+        if not np.isin(self.force_directions, (0.0, 1.0)).all():
+            raise SettingError("force_directions", self.force_directions, "zeros and ones")
+        object.__setattr__(self, "settings", self._settings())
+
+    def _settings(self) -> InteractionSettings:
+        threshold = tuple(self.yield_threshold.tolist()) or None
+        return InteractionSettings(
+            directions=self.force_directions == 1.0,
+            gains=replace(
+                _DEFAULTS.gains,
+                kp=tuple(self.admittance_kp.tolist()),
+                speed_max=tuple(self.admittance_speed_max.tolist()),
+            ),
+            yield_threshold=threshold,
+        )
+
+
+def _contact_points(entries: tuple[str, ...]) -> tuple[ContactPoint, ...]:
+    points = read_entries(ContactPoint, "contacts", entries)
+    for index, point in enumerate(points):
+        allowed = "the same at all points"
+        if np.abs(point.normal).max() <= 1e-9:
+            raise SettingError(f"contacts[{index}].normal", point.normal, "a direction, not zero")
+        if not np.array_equal(points[0].normal, point.normal):
+            raise SettingError(f"contacts[{index}].normal", point.normal, allowed)
+        if points[0].friction != point.friction:
+            raise SettingError(f"contacts[{index}].friction", point.friction, allowed)
+    return points
+
+
+_EQUAL = {"cylinder": 2, "sphere": 3}  # of the numbers of a size, how many are one diameter
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ObstacleEntry:
+    """One entry of ``obstacles``."""
+
+    name: str = text("what no other obstacle is called")
+    shape: str = text("what it is", choices=SHAPES)
+    size: Array = numbers("as in a Marker, m", POSITIVE, length=3, default=())
+    position: Array = numbers("of its centre, m", FINITE, length=3)
+    rpy: Array = numbers("about the axes x, y, z, rad", FINITE, length=3, default=(0.0, 0.0, 0.0))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CapsuleEntry:
+    """One entry of ``collision_capsules``."""
+
+    link: str = text("link that it is around")
+    start: Array = numbers("one end of its axis in the link's frame, m", FINITE, length=3)
+    end: Array = numbers("other end, m", FINITE, length=3)
+    radius: float = number("distance from the axis, m", POSITIVE)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CollisionConfiguration:
+    """Parameters of the collision avoidance; arrays of shape (n,) in `joints` order.
+
+    Attributes:
+        capsules: around the links, in their frames.
+        bodies: the obstacles, in the base frame.
+        pairs: of links to keep apart; None to choose them automatically.
+    """
+
+    collision_avoidance: bool = switch(
+        "whether links keep away from each other and from the obstacles below", default=False
+    )
+    settings: CollisionSettings = group(CollisionSettings, "collision_")
+    collision_capsules: tuple[str, ...] = texts(
+        "capsules around the links, which are kept apart in place of these, from the tool "
+        "fit_capsules: ends of the axis in the link's frame and radius, m",
+        default=(),
+        note="each a YAML mapping '{link: hand, start: [x, y, z], end: [x, y, z], radius: r}'",
+    )
+    collision_pairs: tuple[str, ...] = texts(
+        "pairs of links to keep apart; chosen automatically if empty",
+        default=(),
+        note="each two links, as in 'link_a link_b'",
+    )
+    acceleration_min: Array = joint_numbers(
+        "for collision_avoidance, safety_filter, and HOLD without bounds: lower acceleration "
+        "limits, rad/s^2",
+        NEGATIVE,
+        default=(),
+    )
+    acceleration_max: Array = joint_numbers(
+        "for collision_avoidance, safety_filter, and HOLD without bounds: upper acceleration "
+        "limits, rad/s^2",
+        POSITIVE,
+        default=(),
+    )
+    obstacles: tuple[str, ...] = texts(
+        "obstacles to keep away from, fixed in base_frame: position of the centre, of a "
+        "half_space a point on its surface, m; rpy, rotations about the fixed axes x, y, z, rad, "
+        "0 if left out, a half_space is where z < 0; size, m, as in a Marker: edges of a box, "
+        "diameter three times of a sphere, diameter, diameter and height along z of a cylinder, "
+        "nothing of a half_space",
+        default=(),
+        note="each a YAML mapping '{name: wall, shape: box, size: [x, y, z], position: "
+        f"[x, y, z], rpy: [r, p, y]}}' with another name; shape is one of {', '.join(SHAPES)}",
+    )
+    capsules: tuple[Shape, ...] = field(init=False)
+    bodies: tuple[Shape, ...] = field(init=False)
+    pairs: tuple[tuple[str, str], ...] | None = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Read capsules, obstacles and pairs."""
+        entries = read_entries(CapsuleEntry, "collision_capsules", self.collision_capsules)
+        capsules = [capsule(each.link, each.start, each.end, each.radius) for each in entries]
+        object.__setattr__(self, "capsules", tuple(capsules))
+        object.__setattr__(self, "bodies", _obstacles(self.obstacles))
+        object.__setattr__(self, "pairs", tuple(map(_pair, self.collision_pairs)) or None)
+
+    def check(self, robot: RobotConfiguration) -> None:
+        """Check what depends on the robot.
+
+        Raises:
+            SettingError: no limits of acceleration.
+        """
+        if self.collision_avoidance:
+            self.check_accelerations(robot)
+
+    def check_accelerations(self, robot: RobotConfiguration) -> None:
+        """Check that there are acceleration limits.
+
+        Raises:
+            SettingError: none.
+        """
+        check_per_joint("acceleration_min", self.acceleration_min, robot.joints)
+        check_per_joint("acceleration_max", self.acceleration_max, robot.joints)
+
+
+def _obstacles(entries: tuple[str, ...]) -> tuple[Shape, ...]:
+    obstacles: dict[str, Shape] = {}
+    for index, entry in enumerate(read_entries(ObstacleEntry, "obstacles", entries)):
+        label, name, size = f"obstacles[{index}]", entry.name, entry.size
+        if not name or name in obstacles:
+            raise SettingError(f"{label}.name", name, "a name that no other obstacle has")
+        if entry.shape == "half_space":
+            size = np.zeros(3)
+        elif not len(size):
+            raise SettingError(f"{label}.size", None, "3 finite numbers > 0")
+        if len(set(size[: _EQUAL.get(entry.shape, 1)])) > 1:
+            allowed = f"the same diameter {_EQUAL[entry.shape]} times"
+            raise SettingError(f"{label}.size", size, allowed)
+        orientation = pin.Quaternion(pin.rpy.rpyToMatrix(entry.rpy)).coeffs()
+        obstacles[name] = make_obstacle(name, entry.shape, size, entry.position, orientation)
+    return tuple(obstacles.values())
+
+
+def _pair(text: str) -> tuple[str, str]:
+    links = text.split()
+    if len(links) != 2:
+        raise SettingError("collision_pairs", text, "two links, as in 'link_a link_b'")
+    return links[0], links[1]
