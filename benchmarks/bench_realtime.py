@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Robot, bounds and controller by the wall clock: one process, separate ones, a bare loop.
 
-Each robot plays its demo's goals by turns in the ways to run it, without and with another process
-that records; diagnostics of the robot tell what was missed: periods without their command in time,
-and those that passed while the simulated robot was late itself, whose motion would have gone on.
+Each robot plays its demo's goals by turns in the ways to run it; diagnostics of the robot tell what
+was missed: periods without their command in time, and those that passed while the simulated robot
+was late itself, whose motion would have gone on.
 "both" is what a real robot would miss. A bare loop, which sleeps until the next period and does
 nothing else, shows what the machine itself can do; a busy loop, which in each period computes for
 as long as the one process, what it leaves to programs that compute; relays in place of bounds and
@@ -18,13 +18,10 @@ import itertools
 import math
 import time
 from collections import defaultdict
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench_recorder import Recorder
-from bench_viewer import Viewer
 from geometry_msgs.msg import PoseStamped
 from live_robot import (
     ONE_PROCESS,
@@ -43,8 +40,8 @@ from rclpy.publisher import Publisher
 from rclpy.task import Future
 
 from sim_bridge.bullet.robot import BulletRobot
-from sim_bridge.node import command_stream
 from sim_bridge.node.bullet_node import BulletNode
+from sim_bridge.node.commands import CommandStream
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.node.periodic import LimitsReader
@@ -70,10 +67,7 @@ CASES = (
     ("talos_left_arm", 1000.0),
     ("baxter_left_arm", 100.0),
 )
-RECORDED = "recorded"
-VIEWED = "viewed"
-WAYS = RELAYS, ONE_PROCESS, RECORDED, VIEWED, PROCESSES
-"""`RECORDED` and `VIEWED` are one process as well."""
+WAYS = RELAYS, ONE_PROCESS, PROCESSES
 SETTLING = 1.0
 """How long a robot moves before it is measured, s."""
 LONG_ENOUGH = 6.0
@@ -97,14 +91,9 @@ def measure(
         the row, and the share of a processor that was used.
     """
     arguments = configuration(robot, rate, imperfect=imperfect)
-    run = ONE_PROCESS if way in (RECORDED, VIEWED) else way
-    with running(run, arguments, imperfect) as programs, ExitStack() as recording:
+    with running(way, arguments, imperfect) as programs:
         user = User(goals(robot), "target_pose")
         try:
-            if way == RECORDED:
-                recording.callback(Recorder(robot).end)
-            if way == VIEWED:
-                recording.callback(Viewer(arguments).end)
             user.start(programs)
             user.use(SETTLING)
             before, used, begin = user.report(), cpu_seconds(programs), time.monotonic()
@@ -214,7 +203,7 @@ STAGES = (
     (BulletRobot, "step", "robot: physics"),
     (BulletNode, "_next_state", "robot: state to message"),
     (BulletNode, "_on_command", "robot: rest"),
-    (command_stream, "read_command", "robot: command from message"),
+    (CommandStream, "receive", "robot: command from message"),
     (JointStateReader, "read", "states from messages"),
     (EstimatorNode, "_on_state", "estimator: rest"),
     (EstimatorNode, "_on_command", "estimator: rest"),

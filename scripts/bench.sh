@@ -10,8 +10,8 @@ Ratios compare programs that run in turns in one process. NAME --help lists opti
 
   chain       from state to command through both nodes, against empty relays; with --imperfect
               also with estimator, prediction and margins
-  realtime    all nodes by the wall clock: one process, with a recorder, separate ones, relays, and
-              what the machine itself can do; where the time of a period goes
+  realtime    all nodes by the wall clock: one process, separate ones, relays, and what the
+              machine itself can do; where the time of a period goes
   peers       the step beside TSID's, the QPs by solvers of qpsolvers; both are installed into
               .venv-tsid and .venv-qpsolvers
   step        one controller step, part by part

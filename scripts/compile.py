@@ -7,6 +7,7 @@ is called with, and Numba keeps the results beside the sources.
 
 from __future__ import annotations
 
+import argparse
 import sys
 from pathlib import Path
 
@@ -20,6 +21,7 @@ CONFIG = Path(__file__).resolve().parent.parent / "config"
 
 def main() -> None:
     """Play a few steps of each robot, one of them beside a wall."""
+    argparse.ArgumentParser(prog="compile.py", description=__doc__).parse_args()
     for path in sorted(CONFIG.glob("*.yaml")):
         try:
             loop = DirectLoop(path.stem)

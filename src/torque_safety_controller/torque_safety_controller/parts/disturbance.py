@@ -147,8 +147,8 @@ def _observe(
 @njit(cache=True)
 def _expect(estimate: Array, torque: Array, tau_max: Array, M: Array) -> Array:
     """Return the estimate with M^-1 torque added, within what motors can give."""
-    change = np.linalg.solve(M, torque)
+    change: Array = estimate + np.linalg.solve(M, torque)
     for j in range(estimate.size):
         largest = tau_max[j] / M[j, j]
-        change[j] = min(max(estimate[j] + change[j], -largest), largest)
+        change[j] = min(max(change[j], -largest), largest)
     return change
