@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Robot, bounds and controller by the wall clock: one process, separate ones, a bare loop.
 
-Each robot plays its demo's goals by turns in the ways to run it; diagnostics of the robot tell what
-was missed: periods without their command in time, and those that passed while the simulated robot
-was late itself, whose motion would have gone on.
+Each robot plays its demo's goals by turns in the ways to run it; diagnostics of the robot tell
+what was missed: periods without their command in time, and those that passed while the simulated
+robot was late itself, whose motion would have gone on.
 "both" is what a real robot would miss. A bare loop, which sleeps until the next period and does
 nothing else, shows what the machine itself can do; a busy loop, which in each period computes for
 as long as the one process, what it leaves to programs that compute; relays in place of bounds and
