@@ -7,12 +7,11 @@ import pytest
 import yaml
 from collision_arm import box, half_space, panda, sphere
 
+from torque_safety_controller.new_robot.capsules import fitted_capsule, link_capsules
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parts.collision.model import build_collision_model
 from torque_safety_controller.parts.collision.shapes import capsule
-from torque_safety_controller.tools.capsule_fit import fitted_capsule
 from torque_safety_controller.tools.fit_capsules import main, with_capsules
-from torque_safety_controller.tools.link_capsules import link_capsules
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.parameter_files import ParameterFileError

@@ -10,6 +10,7 @@ import pinocchio as pin
 from arms import Arm, load_arm
 from proxsuite import proxqp
 
+from torque_safety_controller.new_robot.capsules import link_capsules
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parts.collision.avoidance import (
     Collision,
@@ -18,7 +19,6 @@ from torque_safety_controller.parts.collision.avoidance import (
 )
 from torque_safety_controller.parts.collision.model import CollisionModel, build_collision_model
 from torque_safety_controller.parts.collision.shapes import Shape, capsule, make_obstacle
-from torque_safety_controller.tools.link_capsules import link_capsules
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.robot.description import build_model, load_geometry

@@ -9,7 +9,7 @@ import pytest
 from torque_safety_controller.tasks.gains import Gains, critical_damping
 from torque_safety_controller.tasks.pose_task import PoseMotion, PoseTask, pose_error
 from torque_safety_controller.tasks.posture_task import PostureTask
-from torque_safety_controller.tasks.rest_task import RestTask
+from torque_safety_controller.tasks.task import RestTask
 from viability_bounds_pkg.state import State
 
 KP, KD, WEIGHT = 30.0, 7.0, 2.5

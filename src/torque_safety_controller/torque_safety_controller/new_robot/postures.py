@@ -11,8 +11,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from torque_safety_controller.new_robot.capsules import capsule_entries
 from torque_safety_controller.new_robot.chain import Chain, NewRobotError
-from torque_safety_controller.tools.link_capsules import capsule_entries
 from viability_bounds_pkg.robot.description import RobotDescriptionError, load_geometry
 
 Array = NDArray[np.float64]

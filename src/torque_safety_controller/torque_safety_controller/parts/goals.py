@@ -21,8 +21,7 @@ from torque_safety_controller.tasks.pose_task import (
     pose_error,
 )
 from torque_safety_controller.tasks.posture_task import PostureTask
-from torque_safety_controller.tasks.rest_task import RestTask
-from torque_safety_controller.tasks.task import Task
+from torque_safety_controller.tasks.task import RestTask, Task
 
 Array = NDArray[np.float64]
 

@@ -4,8 +4,7 @@
 from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.pose_task import PoseMotion, PoseTask
 from torque_safety_controller.tasks.posture_task import PostureTask
-from torque_safety_controller.tasks.rest_task import RestTask
-from torque_safety_controller.tasks.task import Task
+from torque_safety_controller.tasks.task import RestTask, Task
 
 __all__ = [
     "RestTask",

@@ -12,8 +12,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from torque_safety_controller.new_robot.capsules import capsule_entries
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.tools.link_capsules import capsule_entries
 from viability_bounds_pkg.cli.command_line import Parser, run_tool
 from viability_bounds_pkg.cli.limits_file import CONTROLLER, check_writable, write_whole
 from viability_bounds_pkg.parameter_files import ParameterFileError, read_files

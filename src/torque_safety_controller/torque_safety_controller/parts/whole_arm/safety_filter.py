@@ -35,7 +35,7 @@ from torque_safety_controller.parts.whole_arm.braking_plan import (
 from torque_safety_controller.qp import AccelerationRange, LinearConstraints
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.step import Part, Step, joints_beyond
-from torque_safety_controller.tasks.rest_task import RestTask
+from torque_safety_controller.tasks.task import RestTask
 from viability_bounds_pkg.state import State
 
 Array = NDArray[np.float64]
