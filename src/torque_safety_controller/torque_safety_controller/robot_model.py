@@ -16,13 +16,13 @@ Array = NDArray[np.float64]
 
 
 class HandModel:
-    """Kinematics of one end effector at the current state.
+    """Kinematics of one frame, such as an end effector, at the current state.
 
     Attributes:
         frame: its name.
         v: velocity of the joints, shape (n,), rad/s.
         a_last: acceleration of the joints commanded last, shape (n,), rad/s^2.
-        pose: placement in the base frame.
+        pose: placement in the root frame of the URDF.
         J: its Jacobian in its own axes, shape (6, n), linear rows first.
         drift: its acceleration at zero joint acceleration, J' v, shape (6,).
         J_dot: time derivative of J, shape (6, n).
@@ -75,9 +75,9 @@ class RobotModel(HandModel):
     Attributes:
         q: position, shape (n,), rad.
         others: the further end effectors.
-        M: mass matrix, shape (n, n), kg m^2.
-        h: Coriolis, centrifugal and gravity torques, shape (n,), N m.
-        C: Coriolis matrix with M' - 2 C skew-symmetric, shape (n, n), N m s; with `rates`.
+        M: mass matrix in the middle of the step, shape (n, n), kg m^2.
+        h: Coriolis, centrifugal and gravity torques there, shape (n,), N m.
+        C: Coriolis matrix there, M' - 2 C skew-symmetric, shape (n, n), N m s; with `rates`.
         rates: whether `update` computes C and J_dot; else they are old.
         data: Pinocchio's; after `update` with the kinematics and joint Jacobians of the current
             state, at zero acceleration.

@@ -51,7 +51,8 @@ class Step:
         bounds: of the accelerations; they are only ever narrowed.
         eased: narrower bounds of the commanded accelerations, kept where they have a solution;
             estimates of disturbances are not to shake a slowed arm; None for none.
-        rows: further constraints on the accelerations, by the part that asks for them.
+        rows: further constraints on the accelerations, by the part that asks for them. Where there
+            is no solution, those with an upper limit give way to `fallback`.
         forces: what contacts may exert; None for nothing.
         fallback: acceleration that is allowed if bounds and rows have no solution; None for none.
         planned: whether a plan within all limits is known; it is where nobody looks for one.
