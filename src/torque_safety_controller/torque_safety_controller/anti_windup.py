@@ -14,7 +14,10 @@ For the K of the control step, lambda diag(M), (11) is the clip of each componen
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
@@ -81,18 +84,20 @@ def scale_factor(u: Array, u_max: Array) -> float:
     return float((u_max[beyond] / np.abs(u[beyond])).min(initial=1.0))
 
 
+@njit(cache=True)
 def clip(u: Array, u_max: Array) -> Array:
     """Return `u` with each component cut to its limit, shape (n,)."""
     return np.minimum(np.maximum(u, -u_max), u_max)
 
 
+@njit(cache=True)
 def nearest_dissipating(u: Array, s: Array, u_max: Array, level: float) -> Array:
     """Return the point nearest to `u` with |x| <= u_max and s'x >= level, shape (n,).
 
     It is ``x(nu) = clip(u + nu s)`` for the least nu >= 0 with s'x(nu) >= level. s'x(nu) never
     falls, and is linear between the values of nu at which a component leaves one limit or
-    arrives at the other. Between the two of those values next to the solution the components
-    that are free move together.
+    arrives at the other. The two of those values next to the solution are found by trying them
+    all; between them the components that are free move together.
 
     Args:
         u: shape (n,).
@@ -104,15 +109,18 @@ def nearest_dissipating(u: Array, s: Array, u_max: Array, level: float) -> Array
     if s @ x >= level:
         return x
     leaves, arrives = np.full(len(u), np.inf), np.full(len(u), -np.inf)
-    moved = s != 0.0
-    end = np.copysign(u_max, s)[moved]
-    leaves[moved] = (-end - u[moved]) / s[moved]
-    arrives[moved] = (end - u[moved]) / s[moved]
-    points = np.concatenate((leaves, arrives))
-    points = points[(points > 0.0) & (points < np.inf)]
-    reached = clip(u + np.outer(points, s), u_max) @ s >= level
-    nu = points[~reached].max(initial=0.0)
-    enough = points[reached & (points > nu)].min(initial=np.inf)
+    for i in range(len(u)):
+        if s[i] != 0.0:
+            end = np.copysign(u_max[i], s[i])
+            leaves[i] = (-end - u[i]) / s[i]
+            arrives[i] = (end - u[i]) / s[i]
+    nu, enough = 0.0, np.inf
+    for point in np.concatenate((leaves, arrives)):
+        if nu < point < enough:
+            if s @ clip(u + point * s, u_max) < level:
+                nu = point
+            else:
+                enough = point
     x = clip(u + nu * s, u_max)
     missing = level - s @ x
     push = np.where((leaves <= nu) & (nu < arrives), s, 0.0)
@@ -124,6 +132,70 @@ def nearest_dissipating(u: Array, s: Array, u_max: Array, level: float) -> Array
         rest = clip(u + enough * s, u_max) - x
         return clip(x + missing / (s @ rest) * rest, u_max)
     return x
+
+
+@njit(cache=True)
+def nearest_with_leak(M: Array, s: Array, u: Array, limit: Array, w: Array) -> tuple[Array, float]:
+    """Return the torque y of (11) extended by a leak eta of s, and eta, 1/s.
+
+        minimise |y - u|^2 + |eta M s|^2   subject to  |y| <= limit,  s'y + eta s'M s >= s'w.
+
+    A leak damps as the torque eta M s does, without a limit: a solution always exists. In the
+    variable f = eta |M s| the leak is one more component of the vector.
+    """
+    n, largest = len(s), np.abs(s).max()
+    direction, wish, limits = np.zeros(n + 1), np.zeros(n + 1), np.full(n + 1, np.inf)
+    wish[:n], limits[:n], size = u, limit, 0.0
+    if largest > 0.0:
+        direction[:n] = s / largest
+        momentum = M @ direction[:n]
+        size = math.sqrt(momentum @ momentum)
+        power = direction[:n] @ momentum
+        if size > 0.0 and power > 0.0:
+            direction[n] = power / size
+    result = nearest_dissipating(wish, direction, limits, direction[:n] @ w)
+    leak = result[n] / (size * largest) if size * largest > 0.0 else 0.0
+    if not (np.isfinite(result).all() and math.isfinite(leak)):
+        return clip(u, limit), 0.0
+    return result[:n].copy(), leak
+
+
+@njit(cache=True)
+def limited_feedback(
+    fast: Array, slow: Array, mu: float, M: Array, C: Array, K: Array, limit: Array
+) -> tuple[Array, float]:
+    """Return (11) extended to the whole torque (C + K) s; see `nearest_with_leak`.
+
+    Integrators of joints that are limited shrink before, until they ask for what they get. Only
+    what contributes to s shrinks, and s not beyond zero, so that no integrator grows or changes
+    sign: it is a leak of this joint, just as fast as it must be.
+
+    Args:
+        fast: integrator, shape (n,), rad/s, changed in place.
+        slow: likewise.
+        mu: weight of the fast integrator.
+        M: mass matrix, shape (n, n), kg m^2.
+        C: Coriolis matrix, shape (n, n), N m s.
+        K: diagonal of the gain, shape (n,), N m s.
+        limit: shape (n,), N m.
+    """
+    s = mu * fast + (1.0 - mu) * slow
+    u = C @ s + K * s
+    for i in range(len(s)):
+        outward, excess = math.copysign(1.0, s[i]), abs(u[i]) - limit[i]
+        own = K[i] + max(C[i, i], 0.0)  # torque that the joint asks for by its own s
+        from_fast = max(outward * mu * fast[i], 0.0)
+        from_slow = max(outward * (1.0 - mu) * slow[i], 0.0)
+        if excess > 0.0 and outward * u[i] > 0.0 and own > 0.0 and from_fast + from_slow > 0.0:
+            shift = min(excess / own, abs(s[i]))
+            kept = max(1.0 - shift / (from_fast + from_slow), 0.0)
+            if from_fast > 0.0:
+                fast[i] *= kept
+            if from_slow > 0.0:
+                slow[i] *= kept
+    s = mu * fast + (1.0 - mu) * slow
+    Cs, Ks = C @ s, K * s
+    return nearest_with_leak(M, s, Cs + Ks, limit, Cs + clip(Ks, limit))
 
 
 def _checked(u_max: ArrayLike, **vectors: ArrayLike) -> list[Array]:

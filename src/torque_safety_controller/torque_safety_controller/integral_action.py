@@ -38,6 +38,9 @@ _MOST = {"joints": 1.0} | dict.fromkeys(TASKS, 0.5)
 
 It is less with a null space: loops of P K P are unstable earlier in some postures."""
 
+_EACH = 5
+"""Control steps after which it is checked whether the gain is stable in the posture."""
+
 _BACK = 0.5
 """Steps by which the gain could be higher before it is raised."""
 
@@ -91,7 +94,8 @@ class FadingTorque:
             a_last: acceleration commanded in the last step, shape (n,), rad/s^2.
             elapsed: time since the last step, s.
         """
-        self.last = self._faded(elapsed, robot.dt)
+        if self._fading is not self._zero:
+            self.last = self._faded(elapsed, robot.dt)
         return self.last
 
     def resume(self, robot: RobotModel, v: Array, torque: Array) -> None:
@@ -151,7 +155,7 @@ class IntegralAction(FadingTorque):
     def reset(self) -> None:
         """See `FadingTorque`."""
         super().reset()
-        self._lowered = 0
+        self._lowered = self._checked = 0
         self._use(self.settings)
         self._started = self._lost = self._resuming = self._due = False
         self._q_last = self._v_last = self._zero
@@ -183,7 +187,8 @@ class IntegralAction(FadingTorque):
     def resume(self, robot: RobotModel, v: Array, torque: Array) -> None:
         """See `FadingTorque`."""
         self._started = False
-        self._use(self._stable(np.ascontiguousarray(robot.M), robot.dt))
+        self._checked = 0
+        self._use(self._stable(robot.M, robot.dt))
         self._hold(robot, v, torque)
         self.last = torque
 
@@ -210,6 +215,7 @@ class IntegralAction(FadingTorque):
         )
         if jumped or not known:
             law.skip(arm, elapsed if 0.0 <= elapsed < math.inf else 0.0)
+            self._checked = 0  # the posture may be any
         self._lost = False
         self._q_last, self._v_last = robot.q.copy(), v.copy()
         if jumped:
@@ -232,9 +238,14 @@ class IntegralAction(FadingTorque):
     def _stable(self, M: Array, period: float) -> IntegralSettings:
         """Return the settings with a gain that is stable here.
 
-        It is lowered by powers of sqrt(2), so that it changes seldom.
+        It is lowered by powers of sqrt(2), so that it changes seldom, and is the same for `_EACH`
+        steps, as the posture is nearly.
         """
         asked, used = self.settings, self.law.settings
+        self._checked -= 1
+        if self._checked >= 0 and asked is self._asked:
+            return used
+        self._checked = _EACH - 1
         share = asked.gain * period * coupling(M) / self._most
         if 0.0 < share < math.inf:
             steps = 2.0 * math.log2(share)
@@ -270,11 +281,13 @@ class IntegralAction(FadingTorque):
 
     def _arm(self, robot: RobotModel, v: Array) -> ArmTerms:
         """Return what the law needs to know of the arm."""
-        hands, rows = (robot, *robot.others), self._rows
-        J = np.concatenate([hand.J[rows] for hand in hands])
-        J_dot = np.concatenate([hand.J_dot[rows] for hand in hands])
-        M, C = np.ascontiguousarray(robot.M), np.ascontiguousarray(robot.C)
-        return ArmTerms(M, C, J, J_dot, v)
+        rows = self._rows
+        J, J_dot = robot.J[rows], robot.J_dot[rows]
+        if robot.others and self.mode in TASKS:
+            hands = (robot, *robot.others)
+            J = np.concatenate([hand.J[rows] for hand in hands])
+            J_dot = np.concatenate([hand.J_dot[rows] for hand in hands])
+        return ArmTerms(robot.M, robot.C, J, J_dot, v)
 
 
 @njit(cache=True)
@@ -310,11 +323,13 @@ def _jumped(
 
     At most `disturbance_max`, shape (n,), N m, acts on a joint's own inertia besides `a_last`.
     """
-    impulse = np.diag(M) * np.abs(a_last * elapsed - (v - v_last))
-    way = np.abs(q - q_last) - elapsed * (np.abs(v) + np.abs(v_last))
-    # A NaN is not within its limits.
-    possible = (impulse <= disturbance_max * elapsed) & (way <= _POSITION_JUMP)
-    return not possible.all()
+    for j in range(v.size):
+        impulse = M[j, j] * abs(a_last[j] * elapsed - (v[j] - v_last[j]))
+        way = abs(q[j] - q_last[j]) - elapsed * (abs(v[j]) + abs(v_last[j]))
+        # A NaN is not within its limits.
+        if not (impulse <= disturbance_max[j] * elapsed and way <= _POSITION_JUMP):
+            return True
+    return False
 
 
 def make_integral(

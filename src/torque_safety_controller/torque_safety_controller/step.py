@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -86,7 +87,7 @@ class Step:
         self.torque: Array = nothing
         self.integral_change: Array = nothing
         self.disturbance: Array = nothing
-        self.bounds = AccelerationRange(nothing - np.inf, nothing + np.inf)
+        self.bounds = _unbounded(robot.n)
         self.eased: AccelerationRange | None = None
         self.rows: dict[Part, LinearConstraints] = {}
         self.forces: ContactForces | None = None
@@ -114,7 +115,7 @@ class Step:
         For one upwards the upper bound is lowered, and else the lower one raised; if they cross,
         the other one follows.
         """
-        return AccelerationRange(*_narrowed(self.disturbance, *bounds))
+        return AccelerationRange(*_narrowed(self.disturbance, bounds.lower, bounds.upper))
 
     def relaxation_of(self, part: Part) -> Array | None:
         """Return by how much the QP relaxed the rows of a part, in their units; None for not."""
@@ -166,6 +167,11 @@ class Part:
     def trouble(self) -> str:
         """What is wrong at present, in words; empty for nothing."""
         return ""
+
+
+@lru_cache
+def _unbounded(n: int) -> AccelerationRange:
+    return AccelerationRange(np.full(n, -np.inf), np.full(n, np.inf))
 
 
 @njit(cache=True)

@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from torque_safety_controller.friction.compensation import FrictionCompensation
 from torque_safety_controller.friction.settings import (
     GAIN,
     FrictionModel,
     FrictionSettings,
     no_friction,
 )
+from torque_safety_controller.parts.friction import FrictionCompensation
 from viability_bounds_pkg.exceptions import SettingError
 
 DT = 1e-3

@@ -14,9 +14,9 @@ from torque_safety_controller.integral_feedback import (
 from torque_safety_controller.nullspace.compliance import (
     NullspaceCompliance,
     TaskShapeError,
-    energy_product,
+    fast_weight,
 )
-from torque_safety_controller.nullspace.kernels import THRESHOLD, torque_matrix
+from torque_safety_controller.nullspace.kernels import THRESHOLD, energy_product, torque_matrix
 
 # What it is for
 
@@ -193,4 +193,4 @@ def test_energy_is_a_norm_of_the_memory():
     a, x = np.array([1.0, -2.0, 0.5]), np.array([0.2, 0.4, -1.0])
     weight = 0.5 * 2.0 / (100.0 - 0.1)
     expected = a @ M @ a + weight * x @ np.diag(np.diag(M)) @ x
-    assert energy_product(law, M, a, x, a, x) == pytest.approx(expected, rel=1e-14)
+    assert energy_product(M, fast_weight(law), a, x, a, x) == pytest.approx(expected, rel=1e-14)

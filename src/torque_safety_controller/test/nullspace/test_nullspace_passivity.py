@@ -7,8 +7,12 @@ from task_arm import TaskArm, arm_terms
 
 from torque_safety_controller.integral_feedback import IntegralSettings
 from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors
-from torque_safety_controller.nullspace.compliance import NullspaceCompliance, energy_product
-from torque_safety_controller.nullspace.kernels import THRESHOLD, dynamically_consistent_inverse
+from torque_safety_controller.nullspace.compliance import NullspaceCompliance, fast_weight
+from torque_safety_controller.nullspace.kernels import (
+    THRESHOLD,
+    dynamically_consistent_inverse,
+    energy_product,
+)
 
 NEVER_FORGETS = dict(slow_leak_rate=0.0, fast_leak_rate=0.0)
 """(23) to the letter: a alone decides, and does not leak."""
@@ -64,7 +68,7 @@ class PassivityLoop:
     def energy(self):
         """W of the documentation."""
         a, x = self.compliance.memory.a, self.forgotten()
-        return 0.5 * energy_product(self.settings, self.terms.M, a, x, a, x)
+        return 0.5 * energy_product(self.terms.M, fast_weight(self.settings), a, x, a, x)
 
     def power(self):
         """What the energy should change by, W: the terms of the proof in the documentation."""

@@ -8,7 +8,8 @@ from torque_safety_controller.integral_feedback import (
     ArmTerms,
     IntegralSettings,
 )
-from torque_safety_controller.nullspace.compliance import NullspaceCompliance, energy_product
+from torque_safety_controller.nullspace.compliance import NullspaceCompliance, fast_weight
+from torque_safety_controller.nullspace.kernels import energy_product
 
 DT = 2e-3
 
@@ -20,7 +21,7 @@ def unlimited(n, **changes) -> IntegralSettings:
 def energy(compliance, M) -> float:
     """What the memory stores, J."""
     a, x = compliance.memory.a, compliance.memory.root / np.sqrt(np.diag(M))
-    return 0.5 * energy_product(compliance.settings, M, a, x, a, x)
+    return 0.5 * energy_product(M, fast_weight(compliance.settings), a, x, a, x)
 
 
 class ComplianceRun:

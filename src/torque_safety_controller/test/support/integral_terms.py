@@ -3,11 +3,11 @@
 
 import numpy as np
 
+from torque_safety_controller.anti_windup import nearest_with_leak
 from torque_safety_controller.integral_feedback import (
     ArmTerms,
     IntegralFeedback,
 )
-from torque_safety_controller.integral_feedback.joints import nearest_with_leak
 
 N = 5
 DT = 1e-3

@@ -78,7 +78,7 @@ def no_friction(n: int) -> FrictionModel:
 
 @dataclass(frozen=True, eq=False)
 class FrictionSettings:
-    """Settings of `FrictionCompensation`.
+    """Settings of `parts.friction.FrictionCompensation`.
 
     Attributes:
         model: of the joints' friction.

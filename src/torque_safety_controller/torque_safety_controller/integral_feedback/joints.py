@@ -20,7 +20,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from torque_safety_controller.anti_windup import clip, nearest_dissipating, scale_factor
+from torque_safety_controller.anti_windup import clip, limited_feedback, scale_factor
 from torque_safety_controller.integral_feedback.law import WIDENING_TIME, ArmTerms, IntegralLaw
 from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors, mix
 from torque_safety_controller.integral_feedback.settings import IntegralSettings
@@ -81,27 +81,25 @@ class IntegralFeedback(IntegralLaw):
     def torque(self, arm: ArmTerms, a_last: Array, dt: float) -> Array:
         """See `IntegralLaw`; s increases by ``a_last dt - (v - v_last)``: (12), (13)."""
         settings, memory = self.settings, self.memory
-        fast, slow, torque = _advance(
-            memory.fast,
-            memory.slow,
-            memory.v,
+        torque, saturated, beyond, usable = _advance(
+            *memory,
             arm.M,
             arm.C,
             arm.v,
             a_last,
+            settings.budget,
             dt,
             settings.gain,
             settings.mu,
             *leak_factors(settings.fast_leak_rate + self.leak, dt, settings.as_printed),
             *leak_factors(settings.slow_leak_rate + self.leak, dt, settings.as_printed),
+            math.exp(-dt / WIDENING_TIME),
+            settings.as_printed,
         )
-        if not np.isfinite(torque).all() and not all(
-            np.isfinite(each).all() for each in (arm.M, arm.C, arm.v, a_last)
-        ):
+        if not usable:
             raise ValueError("dynamics, velocity and acceleration must be finite")
-        widening = math.exp(-dt / WIDENING_TIME) * memory.widening
-        self.memory = Memory(fast, slow, widening, arm.v.copy())
-        return self._limited(arm.M, arm.C, torque)
+        self.leak, self.saturated = 0.0, saturated
+        return self._limited(arm.M, arm.C, torque) if beyond else torque
 
     def skip(self, arm: ArmTerms, dt: float) -> None:
         """See `IntegralLaw`."""
@@ -136,11 +134,14 @@ class IntegralFeedback(IntegralLaw):
         limited = K * s if settings.as_printed else torque
         widening = np.maximum(np.abs(limited) - settings.budget, 0.0)
         self.memory = Memory(fast, slow, widening, arm.v.copy())
-        s = self.s
-        return self._limited(arm.M, arm.C, arm.C @ s + K * s)
+        u, limit = arm.C @ self.s + K * self.s, settings.budget + widening
+        self.saturated = np.abs(K * self.s if settings.as_printed else u) > limit
+        self.leak = 0.0
+        beyond = self.saturated.any() or not np.isfinite(u).all()
+        return self._limited(arm.M, arm.C, u) if beyond else u
 
     def _limited(self, M: Array, C: Array, u: Array) -> Array:
-        """Return the torque of the integrators, limited: (10), (11).
+        """Return the torque of integrators that ask for more than their limits: (10), (11).
 
         With anti-windup ``qp`` the integrators shrink where joints are limited.
 
@@ -150,43 +151,34 @@ class IntegralFeedback(IntegralLaw):
             u: torque (C + K) s, shape (n,), N m: (3), (4), (14).
         """
         settings, memory = self.settings, self.memory
-        limit = settings.budget + memory.widening
-        self.leak = 0.0
+        limit, K = settings.budget + memory.widening, settings.gain * np.diagonal(M)
         if not np.isfinite(u).all():  # beyond floating-point numbers: forget it all
             memory.fast.fill(0.0)
             memory.slow.fill(0.0)
             self.saturated = np.zeros_like(self.saturated)
             return np.zeros_like(u)
         if not settings.as_printed:
-            self.saturated = np.abs(u) > limit
-            return self._qp(M, C, u, limit) if self.saturated.any() else u
-        s = self.s
-        Cs, Ks = C @ s, settings.gain * np.diagonal(M) * s
-        self.saturated = np.abs(Ks) > limit
+            torque, self.leak = limited_feedback(
+                memory.fast, memory.slow, settings.mu, M, C, K, limit
+            )
+            return torque
+        Cs, Ks = C @ self.s, K * self.s
         if settings.anti_windup == "scaling":
             return Cs + clip(scale_factor(Ks, limit) * Ks, limit)
         return Cs + clip(Ks, limit)  # which (11) is for a K that is diagonal
-
-    def _qp(self, M: Array, C: Array, u: Array, limit: Array) -> Array:
-        """Return (11) extended to the whole torque; see `nearest_with_leak`."""
-        K = self.settings.gain * np.diagonal(M)
-        own = K + np.maximum(np.diagonal(C), 0.0)
-        _shrink(self.memory, self.settings.mu, self.s, u - clip(u, limit), own)
-        s = self.s
-        Cs, Ks = C @ s, K * s
-        torque, self.leak = nearest_with_leak(M, s, Cs + Ks, limit, Cs + clip(Ks, limit))
-        return torque
 
 
 @njit(cache=True)
 def _advance(
     fast: Array,
     slow: Array,
+    widening: Array,
     v_last: Array,
     M: Array,
     C: Array,
     v: Array,
     a_last: Array,
+    budget: Array,
     dt: float,
     gain: float,
     mu: float,
@@ -194,62 +186,37 @@ def _advance(
     fast_gain: float,
     slow_kept: float,
     slow_gain: float,
-) -> tuple[Array, Array, Array]:
-    """Return both integrators after a step, and the torque (C + K) s, shape (n,) each."""
-    increment = a_last * dt - (v - v_last)
-    fast = fast_kept * fast + fast_gain * increment
-    slow = slow_kept * slow + slow_gain * increment
-    s = mu * fast + (1.0 - mu) * slow
-    return fast, slow, C @ s + gain * np.diag(M) * s
+    widening_kept: float,
+    as_printed: bool,
+) -> tuple[Array, NDArray[np.bool_], bool, bool]:
+    """Advance the memory in place, unless something is not finite.
 
-
-def nearest_with_leak(M: Array, s: Array, u: Array, limit: Array, w: Array) -> tuple[Array, float]:
-    """Return the torque y of (11) extended by a leak eta of s, and eta, 1/s.
-
-        minimise |y - u|^2 + |eta M s|^2   subject to  |y| <= limit,  s'y + eta s'M s >= s'w.
-
-    A leak damps as the torque eta M s does, without a limit: a solution always exists. In the
-    variable f = eta |M s| the leak is one more component of the vector.
+    Returns:
+        The torque (C + K) s, which joints are beyond their budgets, shape (n,) each; whether any
+        is, or is not finite; whether all that was given is finite.
     """
-    largest = float(np.abs(s).max())
-    direction, size, damping = np.zeros_like(s), 0.0, 0.0
-    if largest > 0.0:
-        direction = s / largest
-        momentum = M @ direction
-        size = math.sqrt(momentum @ momentum)
-        power = direction @ momentum
-        damping = float(power / size) if size > 0.0 and power > 0.0 else 0.0
-    result = nearest_dissipating(
-        np.append(u, 0.0),
-        np.append(direction, damping),
-        np.append(limit, np.inf),
-        float(direction @ w),
-    )
-    leak = float(result[-1] / (size * largest)) if size * largest > 0.0 else 0.0
-    if not (np.isfinite(result).all() and math.isfinite(leak)):
-        return clip(u, limit), 0.0
-    return result[:-1], leak
-
-
-def _shrink(memory: Memory, mu: float, s: Array, excess: Array, own: Array) -> None:
-    """Shrink the integrators of each limited joint, until it asks for what it got.
-
-    Only what contributes to s shrinks, and s not beyond zero, so that no integrator grows or
-    changes sign: it is a leak of this joint, just as fast as it must be.
-
-    Args:
-        memory: changed in place.
-        mu: weight of the fast integrator.
-        s: shape (n,), rad/s.
-        excess: by how much the torque asked for is beyond the limit, shape (n,), N m.
-        own: torque that a joint asks for by its own s, shape (n,), N m s/rad.
-    """
-    outward = np.copysign(1.0, s)
-    fast = np.maximum(outward * mu * memory.fast, 0.0)
-    slow = np.maximum(outward * (1.0 - mu) * memory.slow, 0.0)
-    limited = np.flatnonzero((outward * excess > 0.0) & (own > 0.0) & (fast + slow > 0.0))
-    shift = np.minimum(np.abs(excess[limited]) / own[limited], np.abs(s[limited]))
-    kept = np.ones_like(s)
-    kept[limited] = np.maximum(1.0 - shift / (fast + slow)[limited], 0.0)
-    memory.fast[:] *= np.where(fast > 0.0, kept, 1.0)
-    memory.slow[:] *= np.where(slow > 0.0, kept, 1.0)
+    n = v.size
+    u, beyond, any_beyond = np.zeros(n), np.zeros(n, dtype=np.bool_), False
+    for i in range(n):
+        usable = math.isfinite(v[i]) and math.isfinite(a_last[i])
+        for j in range(n):
+            usable = usable and math.isfinite(M[i, j]) and math.isfinite(C[i, j])
+        if not usable:
+            return u, beyond, False, False
+    s = np.empty(n)
+    for i in range(n):
+        increment = a_last[i] * dt - (v[i] - v_last[i])
+        fast[i] = fast_kept * fast[i] + fast_gain * increment
+        slow[i] = slow_kept * slow[i] + slow_gain * increment
+        widening[i] *= widening_kept
+        v_last[i] = v[i]
+        s[i] = mu * fast[i] + (1.0 - mu) * slow[i]
+    for i in range(n):
+        Ks = gain * M[i, i] * s[i]
+        for j in range(n):
+            u[i] += C[i, j] * s[j]
+        u[i] += Ks
+        limited, limit = Ks if as_printed else u[i], budget[i] + widening[i]
+        beyond[i] = abs(limited) > limit
+        any_beyond = any_beyond or beyond[i] or not math.isfinite(u[i])
+    return u, beyond, any_beyond, True

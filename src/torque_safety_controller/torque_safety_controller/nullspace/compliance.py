@@ -24,15 +24,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torque_safety_controller.anti_windup import clip, scale_factor
 from torque_safety_controller.integral_feedback.law import WIDENING_TIME, ArmTerms, IntegralLaw
 from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors
 from torque_safety_controller.integral_feedback.settings import IntegralSettings
 from torque_safety_controller.nullspace.kernels import (
+    SINGULAR,
     THRESHOLD,
     advance,
     dynamically_consistent_inverse,
+    limited,
     torque_matrix,
+    write,
 )
 from viability_bounds_pkg.exceptions import ArmSafetyError
 
@@ -42,8 +44,6 @@ FADING_TIME = 0.2
 """Time constant with which that part of an initial torque fades that the memory cannot hold, s."""
 
 _AT_LIMIT = 1.0 - 1e-9
-
-_SINGULAR = 1e-12  # relative; smaller pivots are rounding
 
 
 class TaskShapeError(ArmSafetyError, ValueError):
@@ -122,7 +122,7 @@ class TaskLaw(IntegralLaw):
         """
         K = self.settings.gain * np.diagonal(arm.M)
         B = (1.0 - self.settings.mu) * (J_plus.T * K) @ J_plus
-        return J_plus @ (np.linalg.pinv(B, _SINGULAR) @ (J_plus.T @ torque))
+        return J_plus @ (np.linalg.pinv(B, SINGULAR) @ (J_plus.T @ torque))
 
 
 class NullspaceCompliance(TaskLaw):
@@ -142,6 +142,7 @@ class NullspaceCompliance(TaskLaw):
 
     def __init__(self, settings: IntegralSettings, m: int) -> None:
         super().__init__(settings, m, Memory)
+        self._none = np.zeros_like(self.saturated)
 
     def skip(self, arm: ArmTerms, dt: float) -> None:
         """See `IntegralLaw`."""
@@ -157,120 +158,57 @@ class NullspaceCompliance(TaskLaw):
 
     def torque(self, arm: ArmTerms, a_last: Array, dt: float) -> Array:
         """See `IntegralLaw`."""
-        self._check(arm, a_last)
-        M, C, J, J_dot, v = arm
-        settings, memory = self.settings, self.memory
+        settings = self.settings
         slow, null = settings.slow_leak_rate, settings.null_leak_rate
-        a, x, own, J_plus, H = advance(
-            memory.a,
-            memory.s,
-            memory.integral,
-            memory.root,
-            memory.J,
-            J,
-            J_dot,
-            M,
-            C,
-            a_last * dt - (v - memory.v),
+        torque, cut, usable = advance(
+            *self.memory,
+            arm.J,
+            arm.J_dot,
+            arm.M,
+            arm.C,
+            arm.v,
+            a_last,
+            dt,
+            settings.budget,
             settings.gain,
             settings.mu,
+            fast_weight(settings),
             *leak_factors(slow, dt, False),
             *leak_factors(settings.fast_leak_rate, dt, False),
             math.exp((slow - (settings.fast_leak_rate if null is None else null)) * dt),
+            math.exp(-dt / FADING_TIME),
+            math.exp(-dt / WIDENING_TIME),
         )
-        widening = math.exp(-dt / WIDENING_TIME) * memory.widening
-        offset = math.exp(-dt / FADING_TIME) * memory.offset
-        a, x, own = self._limited(M, H, settings.budget + widening, a, x, own)
-        return self._finish(arm, J_plus, a, x, own, offset, widening)
+        return self._checked(torque, usable, cut)
 
     def initialise(self, torque: Array, arm: ArmTerms) -> Array:
         """See `IntegralLaw`; the slow memory takes what the task feels of it."""
         self._check(arm, torque)
-        M, C, J, J_dot, _ = arm
-        gain, mu = self.settings.gain, self.settings.mu
+        M, C, J, J_dot, v = arm
+        settings, gain, mu = self.settings, self.settings.gain, self.settings.mu
         inverse = dynamically_consistent_inverse(J, J_dot, M, C + C.T, THRESHOLD)
         a = self._initial(arm, inverse[0], torque)
-        forgets = self.settings.fast_leak_rate > self.settings.slow_leak_rate
+        forgets = settings.fast_leak_rate > settings.slow_leak_rate
         x = a if forgets else np.zeros_like(a)
         H = torque_matrix(J, J_dot, M, C, gain, mu, *inverse)
-        widening = np.maximum(np.abs(torque) - self.settings.budget, 0.0)
+        widening = np.maximum(np.abs(torque) - settings.budget, 0.0)
         own = H @ a - mu * gain * np.diagonal(M) * x
-        a, x, own = self._limited(M, H, self.settings.budget + widening, a, x, own)
-        return self._finish(arm, inverse[0], a, x, own, torque - own, widening)
+        limit = settings.budget + widening
+        a, x, own, cut = limited(M, H, limit, a, x, own, fast_weight(settings))
+        rest, memory = torque - own, tuple(self.memory)
+        given = memory, J, inverse[0], M, v, settings.budget, a, x, own, rest, widening
+        return self._checked(*write(*given), cut)
 
-    def _limited(
-        self, M: Array, H: Array, limit: Array, a: Array, x: Array, torque: Array
-    ) -> tuple[Array, Array, Array]:
-        """Return a memory and its torque with |torque| <= limit that stores no more energy.
-
-        Scaling all of the memory by (10) does both, but weakens every joint for the sake of one.
-        So a is changed such that only the torques beyond their limits change, to the limits. If
-        that stores more energy than before, it is done in part: the memory is the furthest point
-        on the way from the scaled one that does not. Both ends are within the limits, and with
-        them the way.
-
-        Args:
-            M: mass matrix, shape (n, n).
-            H: of `torque_matrix`.
-            limit: shape (n,), >= 0, may be infinite.
-            a: shape (n,).
-            x: shape (n,).
-            torque: that they give, shape (n,).
-        """
-        settings, scale = self.settings, scale_factor(torque, limit)
-        self._cut = scale < 1.0
-        if not self._cut:
-            return a, x, torque
-        cut = clip(torque, limit) - torque
-        regular = H + _SINGULAR * (np.abs(H).max() + 1e-300) * np.eye(len(H))
-        shift, way = np.linalg.solve(regular, cut), 0.0
-        if np.abs(H @ shift - cut).max() <= 1e-6 * np.abs(cut).max():
-            way = _way(settings, M, a, x, scale, shift)
-        else:
-            shift = np.zeros_like(a)
-        keep = scale + way * (1.0 - scale)
-        return keep * a + way * shift, keep * x, clip(keep * torque + way * cut, limit)
-
-    def _finish(
-        self,
-        arm: ArmTerms,
-        J_plus: Array,
-        a: Array,
-        x: Array,
-        own: Array,
-        offset: Array,
-        widening: Array,
-    ) -> Array:
-        """Write the memory; return the torque, which is its own and the offset within limits."""
-        integral, budget = -(arm.J @ a), self.settings.budget
-        torque = clip(own + offset, budget + widening)
-        if not math.isfinite(torque.sum() + a.sum() + x.sum() + integral.sum()):
-            raise ValueError("all numbers must be finite")
-        s, root = a + J_plus @ integral, np.sqrt(np.diagonal(arm.M)) * x
-        self.memory = Memory(a, s, integral, root, offset, widening, arm.v.copy(), arm.J.copy())
-        self.saturated = self._cut & (np.abs(torque) >= _AT_LIMIT * budget)
+    def _checked(self, torque: Array, usable: bool, cut: bool) -> Array:
+        """Return a torque, and note which joints are at their limits."""
+        if not usable:
+            raise ValueError("M must be positive definite, and all numbers finite")
+        self.saturated = np.abs(torque) >= _AT_LIMIT * self.settings.budget if cut else self._none
         return torque
 
 
-def energy_product(
-    settings: IntegralSettings, M: Array, a: Array, x: Array, b: Array, y: Array
-) -> float:
-    """Return the inner product of (a, x) and (b, y) whose square is twice the energy, J."""
-    weight = 0.0
+def fast_weight(settings: IntegralSettings) -> float:
+    """Return the weight of the fast memory in the energy, see `kernels.energy_product`."""
     if settings.fast_leak_rate > settings.slow_leak_rate:
-        weight = settings.mu * settings.gain / (settings.fast_leak_rate - settings.slow_leak_rate)
-    return float(a @ (M @ b) + weight * (x @ (np.diagonal(M) * y)))
-
-
-def _way(
-    settings: IntegralSettings, M: Array, a: Array, x: Array, scale: float, shift: Array
-) -> float:
-    """Return how far from (scale a, scale x) to (a + shift, x) the energy is that of (a, x)."""
-    da, dx = (1.0 - scale) * a + shift, (1.0 - scale) * x
-    spare = (1.0 - scale * scale) * energy_product(settings, M, a, x, a, x)
-    linear = scale * energy_product(settings, M, a, x, da, dx)
-    square = energy_product(settings, M, da, dx, da, dx)
-    if square + 2.0 * linear <= spare:
-        return 1.0
-    root = math.sqrt(linear * linear + square * spare)
-    return spare / (linear + root) if linear > 0.0 else (root - linear) / square
+        return settings.mu * settings.gain / (settings.fast_leak_rate - settings.slow_leak_rate)
+    return 0.0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiled parts of null-space compliance: a task's inverse with its rate, and a step.
+"""Compiled parts of null-space compliance: a task's inverse with its rate, a step, and limits.
 
 The dynamically consistent inverse of a task Jacobian is
 
@@ -29,6 +29,8 @@ cancellation.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -37,6 +39,9 @@ Array = NDArray[np.float64]
 
 THRESHOLD = 0.03
 """Singular value of J below which its direction is damped."""
+
+SINGULAR = 1e-12
+"""Relative size of pivots that are rounding."""
 
 
 @njit(cache=True)
@@ -60,10 +65,10 @@ def dynamically_consistent_inverse(
     X = M_inv @ J.T
     M_dot_X, J_dot_X = M_dot @ X, J_dot @ X
     Y, Y_dot = J @ X, J_dot_X + J_dot_X.T - X.T @ M_dot_X
-    half = J_dot @ J.T
-    D, D_dot = damping(J @ J.T, half + half.T, threshold)
-    if D.any():
-        trace = np.trace(M)
+    G = J @ J.T
+    if not _all_above(G, threshold * threshold):
+        half, trace = J_dot @ J.T, np.trace(M)
+        D, D_dot = damping(G, half + half.T, threshold)
         scale = len(M) / trace
         Y += scale * D
         Y_dot += scale * (D_dot - np.trace(M_dot) / trace * D)
@@ -71,6 +76,25 @@ def dynamically_consistent_inverse(
     J_plus = X @ Y_inv
     X_dot = M_inv @ (J_dot.T - M_dot_X)
     return J_plus, (X_dot - J_plus @ Y_dot) @ Y_inv
+
+
+@njit(cache=True)
+def _all_above(G: Array, level: float) -> bool:
+    """Return whether all eigenvalues of G, shape (m, m), are above a level, by elimination.
+
+    The eigenvalues themselves take ten times as long, and mostly nothing is near singular.
+    """
+    A = G.copy()
+    for i in range(len(A)):
+        A[i, i] -= level
+    for i in range(len(A)):
+        if not A[i, i] > 0.0:
+            return False
+        for j in range(i + 1, len(A)):
+            factor = A[j, i] / A[i, i]
+            for k in range(i + 1, len(A)):
+                A[j, k] -= factor * A[i, k]
+    return True
 
 
 @njit(cache=True)
@@ -122,55 +146,176 @@ def torque_matrix(
 
 @njit(cache=True)
 def advance(
-    a_old: Array,
-    s_old: Array,
-    integral_old: Array,
+    a_last: Array,
+    s_last: Array,
+    integral: Array,
     root: Array,
-    J_old: Array,
+    offset: Array,
+    widening: Array,
+    v_last: Array,
+    J_last: Array,
     J: Array,
     J_dot: Array,
     M: Array,
     C: Array,
-    increment: Array,
+    v: Array,
+    reference: Array,
+    dt: float,
+    budget: Array,
     gain: float,
     mu: float,
+    weight: float,
     slow: float,
     slow_gain: float,
     fast: float,
     fast_gain: float,
     null: float,
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Return a, x and the torque after a step, shape (n,) each, J^+ and `torque_matrix`.
+    offset_kept: float,
+    widening_kept: float,
+) -> tuple[Array, bool, bool]:
+    """Advance the memory in place, unless something is not finite.
 
     Args:
-        a_old: memory of the last step, as the next four; see `NullspaceCompliance`.
-        s_old: shape (n,), rad/s.
-        integral_old: shape (m,).
+        a_last: memory of the last step, as the next seven; see `compliance.Memory`.
+        s_last: shape (n,), rad/s.
+        integral: shape (m,).
         root: shape (n,).
-        J_old: shape (m, n).
+        offset: shape (n,), N m.
+        widening: shape (n,), N m.
+        v_last: shape (n,), rad/s.
+        J_last: shape (m, n).
         J: Jacobian of the task, shape (m, n).
         J_dot: its time derivative.
         M: mass matrix, shape (n, n).
         C: Coriolis matrix, shape (n, n).
-        increment: of s, shape (n,), rad/s.
+        v: velocity, shape (n,), rad/s.
+        reference: acceleration commanded in the last step, shape (n,), rad/s^2.
+        dt: time since, s.
+        budget: shape (n,), N m.
         gain: lambda, 1/s.
         mu: weight of the fast memory.
+        weight: of its energy.
         slow: what a step leaves of the slow memory.
-        slow_gain: what it takes of the increment.
+        slow_gain: what it takes of the increment of s.
         fast: the same of the fast memory.
         fast_gain: likewise.
         null: what is left in the null space of what the slow memory keeps.
+        offset_kept: what the step leaves of the offset.
+        widening_kept: likewise.
+
+    Returns:
+        As `write`.
     """
+    total = M.sum() + C.sum() + J.sum() + J_dot.sum() + v.sum() + reference.sum()
+    if not (math.isfinite(total) and (np.diag(M) > 0.0).all()):
+        return v_last, False, False
     J_plus, J_plus_dot = dynamically_consistent_inverse(J, J_dot, M, C + C.T, THRESHOLD)
     ratio = fast_gain / slow_gain
-    left = slow * s_old
-    s = left + slow_gain * increment
+    left = slow * s_last
+    s = left + slow_gain * (reference * dt - (v - v_last))
     # With the middle of s the product rule is exact: J a grows by the middle of J times the
     # increment of s.
-    integral = slow * integral_old + (J - J_old) @ (0.5 * (left + s))
-    a = s - J_plus @ integral
+    a = s - J_plus @ (slow * integral + (J - J_last) @ (0.5 * (left + s)))
     # The fast memory takes fast_gain of what a gained, of which slow_gain is seen.
-    x = (1.0 - ratio) * a + (ratio * slow - fast) * a_old + fast * root / np.sqrt(np.diag(M))
+    x = (1.0 - ratio) * a + (ratio * slow - fast) * a_last + fast * root / np.sqrt(np.diag(M))
     a = a - (1.0 - null) * (a - J_plus @ (J @ a))
     H = torque_matrix(J, J_dot, M, C, gain, mu, J_plus, J_plus_dot)
-    return a, x, H @ a - mu * gain * np.diag(M) * x, J_plus, H
+    own = H @ a - mu * gain * np.diag(M) * x
+    kept = widening_kept * widening
+    a, x, own, cut = limited(M, H, budget + kept, a, x, own, weight)
+    memory = a_last, s_last, integral, root, offset, widening, v_last, J_last
+    rest = offset_kept * offset
+    torque, usable = write(memory, J, J_plus, M, v, budget, a, x, own, rest, kept)
+    return torque, cut, usable
+
+
+@njit(cache=True)
+def limited(
+    M: Array, H: Array, limit: Array, a: Array, x: Array, torque: Array, weight: float
+) -> tuple[Array, Array, Array, bool]:
+    """Return a memory and its torque with |torque| <= limit that stores no more energy.
+
+    Scaling all of the memory by (10) does both, but weakens every joint for the sake of one.
+    So a is changed such that only the torques beyond their limits change, to the limits. If
+    that stores more energy than before, it is done in part: the memory is the furthest point
+    on the way from the scaled one that does not. Both ends are within the limits, and with
+    them the way.
+
+    Args:
+        M: mass matrix, shape (n, n).
+        H: of `torque_matrix`.
+        limit: shape (n,), >= 0, may be infinite.
+        a: shape (n,).
+        x: shape (n,).
+        torque: that they give, shape (n,).
+        weight: of the fast memory's energy, see `energy_product`.
+
+    Returns:
+        a, x and their torque, shape (n,) each, and whether they had to be changed.
+    """
+    scale = 1.0
+    for i in range(len(limit)):
+        if abs(torque[i]) > limit[i]:
+            scale = min(scale, limit[i] / abs(torque[i]))
+    if not scale < 1.0:
+        return a, x, torque, False
+    cut = np.minimum(np.maximum(torque, -limit), limit) - torque
+    regular = H + SINGULAR * (np.abs(H).max() + 1e-300) * np.eye(len(H))
+    shift, way = np.linalg.solve(regular, cut), 0.0
+    if np.abs(H @ shift - cut).max() <= 1e-6 * np.abs(cut).max():
+        # How far from (scale a, scale x) to (a + shift, x) the energy is that of (a, x).
+        da, dx = (1.0 - scale) * a + shift, (1.0 - scale) * x
+        spare = (1.0 - scale * scale) * energy_product(M, weight, a, x, a, x)
+        linear = scale * energy_product(M, weight, a, x, da, dx)
+        square = energy_product(M, weight, da, dx, da, dx)
+        if square + 2.0 * linear <= spare:
+            way = 1.0
+        else:
+            root = math.sqrt(linear * linear + square * spare)
+            way = spare / (linear + root) if linear > 0.0 else (root - linear) / square
+    else:
+        shift = np.zeros_like(a)
+    keep = scale + way * (1.0 - scale)
+    torque = np.minimum(np.maximum(keep * torque + way * cut, -limit), limit)
+    return keep * a + way * shift, keep * x, torque, True
+
+
+@njit(cache=True)
+def energy_product(M: Array, weight: float, a: Array, x: Array, b: Array, y: Array) -> float:
+    """Return the inner product of (a, x) and (b, y) whose square is twice the energy, J."""
+    return a @ (M @ b) + weight * (x @ (np.diag(M) * y))
+
+
+@njit(cache=True)
+def write(
+    memory: tuple[Array, ...],
+    J: Array,
+    J_plus: Array,
+    M: Array,
+    v: Array,
+    budget: Array,
+    a: Array,
+    x: Array,
+    own: Array,
+    offset: Array,
+    widening: Array,
+) -> tuple[Array, bool]:
+    """Write the memory, in place, unless something is not finite.
+
+    Returns:
+        The torque, which is its own and the offset within limits, shape (n,), N m, and whether
+        all is finite.
+    """
+    integral, limit = -(J @ a), budget + widening
+    torque = np.minimum(np.maximum(own + offset, -limit), limit)
+    if not math.isfinite(torque.sum() + a.sum() + x.sum() + integral.sum()):
+        return torque, False
+    memory[0][:] = a
+    memory[1][:] = a + J_plus @ integral
+    memory[2][:] = integral
+    memory[3][:] = np.sqrt(np.diag(M)) * x
+    memory[4][:] = offset
+    memory[5][:] = widening
+    memory[6][:] = v
+    memory[7][:] = J
+    return torque, True

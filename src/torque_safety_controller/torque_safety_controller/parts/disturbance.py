@@ -88,7 +88,7 @@ class DisturbanceObserver:
         if not (torque.any() and math.isfinite(torque.dot(torque))):
             return
         with suppress(ValueError):  # of NumPy's, where M is no mass matrix
-            self.estimate = _expect(self.estimate, torque, tau_max, np.ascontiguousarray(M))
+            self.estimate = _expect(self.estimate, torque, tau_max, M)
 
 
 class Disturbance(Part):

@@ -204,9 +204,14 @@ def build_program(
         raise NoSolutionFound("no task with a weight above 0")
     r, k = len(rho_max), len(G)
     size = n + r
-    H, g, C = np.empty((size, size)), np.empty(size), np.empty((n + k, size))
-    lower, upper = np.empty(size + n + k), np.empty(size + n + k)
-    write_plain(H, g, C, lower, upper, gamma, *bounds, M, tau_lower, tau_upper)
+    # Mostly one task is of the joints: it is written at once.
+    joints = next((task for task in tasks if task.A is None), None)
+    b, share = (tau_lower, 0.0) if joints is None else (joints.b, joints.weight / greatest)
+    a_lower, a_upper = bounds
+    program = QuadraticProgram(
+        *_plain(r, k, gamma, a_lower, a_upper, M, tau_lower, tau_upper, b, share)
+    )
+    H, g, C, lower, upper = program
     if r:
         C[:n, n:] = -B
         upper[n:size] = rho_max
@@ -214,72 +219,73 @@ def build_program(
         C[n:, :n] = G
         lower[size + n :] = row_lower
         upper[size + n :] = row_upper
-    for A, b, weight in tasks:
-        if A is None:
-            add_identity(H, g, b, weight / greatest)
-        else:
-            add_least_squares(H, g, A, b, weight / greatest, 0)
+    for task in tasks:
+        if task.A is not None:
+            _add_least_squares(H, g, task.A, task.b, task.weight / greatest, 0)
+        elif task is not joints:
+            H[range(n), range(n)] += task.weight / greatest
+            g[:n] -= task.weight / greatest * task.b
     for W, F_des, weight, first in wrench_tasks:
         rows, columns = W.shape
         if F_des.shape != (rows,) or not 0 <= first <= r - columns:
             raise ValueError(
                 f"wrench task with W {W.shape} from force {first} of {r} on, F_des {F_des.shape}"
             )
-        add_least_squares(H, g, W, F_des, weight / greatest, n + first)
-    return QuadraticProgram(H, g, C, lower, upper)
+        _add_least_squares(H, g, W, F_des, weight / greatest, n + first)
+    return program
 
 
 # Compiled, because they are called at every step and NumPy takes several times as long.
 
 
 @njit(cache=True)
-def write_plain(
-    H: Array,
-    g: Array,
-    C: Array,
-    lower: Array,
-    upper: Array,
+def _plain(
+    r: int,
+    k: int,
     gamma: float,
     a_lower: Array,
     a_upper: Array,
     M: Array,
     tau_lower: Array,
     tau_upper: Array,
-) -> None:
-    """Write a program in x = (a, rho) with C = (M, 0; 0, 0) and the cost gamma |x|^2 / 2.
+    b: Array,
+    weight: float,
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return H, g, C, lower, upper of a program in x = (a, rho) with C = (M, 0; 0, 0).
+
+    Its cost is ``gamma |x|^2 / 2 + weight |a - b|^2 / 2``.
 
     Args:
-        H: shape (n + r, n + r), written, like the next four.
-        g: shape (n + r,).
-        C: shape (n + k, n + r).
-        lower: of a, rho, M a and k more, shape (n + r + n + k,); zero but for a and M a.
-        upper: same shape.
+        r: number of rho, with limits 0.
+        k: number of rows below M, with limits 0.
         gamma: weight of |x|^2.
         a_lower: limits of a, shape (n,).
         a_upper: shape (n,).
         M: shape (n, n).
         tau_lower: limits of M a, shape (n,).
         tau_upper: shape (n,).
+        b: shape (n,).
+        weight: of the difference of a and b.
     """
-    n, size = len(a_lower), len(g)
+    n = len(a_lower)
+    size = n + r
+    H, g, C = np.zeros((size, size)), np.zeros(size), np.zeros((n + k, size))
+    lower, upper = np.zeros(size + n + k), np.zeros(size + n + k)
     for i in range(size):
-        for j in range(size):
-            H[i, j] = 0.0
         H[i, i] = gamma
-        g[i] = lower[i] = upper[i] = 0.0
-    for i in range(len(C)):
-        for j in range(size):
-            C[i, j] = 0.0
-        lower[size + i] = upper[size + i] = 0.0
     for i in range(n):
+        if weight > 0.0:
+            H[i, i] += weight
+            g[i] = -weight * b[i]
         for j in range(n):
             C[i, j] = M[i, j]
         lower[i], upper[i] = a_lower[i], a_upper[i]
         lower[size + i], upper[size + i] = tau_lower[i], tau_upper[i]
+    return H, g, C, lower, upper
 
 
 @njit(cache=True)
-def add_least_squares(H: Array, g: Array, A: Array, b: Array, weight: float, first: int) -> None:
+def _add_least_squares(H: Array, g: Array, A: Array, b: Array, weight: float, first: int) -> None:
     """Add ``weight * |A z - b|^2 / 2`` to the cost ``x'Hx / 2 + g'x``, in place.
 
     z are as many of x as A has columns, from index `first` on.
@@ -298,11 +304,3 @@ def add_least_squares(H: Array, g: Array, A: Array, b: Array, weight: float, fir
         for k in range(m):
             s += A[k, i] * b[k]
         g[first + i] -= weight * s
-
-
-@njit(cache=True)
-def add_identity(H: Array, g: Array, b: Array, weight: float) -> None:
-    """Add ``weight * |z - b|^2 / 2`` to the cost ``x'Hx / 2 + g'x``, z the first of x."""
-    for i in range(len(b)):
-        H[i, i] += weight
-        g[i] -= weight * b[i]

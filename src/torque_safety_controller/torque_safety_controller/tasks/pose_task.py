@@ -19,12 +19,17 @@ from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
+from numba import njit
 from numpy.typing import NDArray
 
 from torque_safety_controller.qp import TaskTerm
 from torque_safety_controller.robot_model import HandModel, RobotModel
 
 Array = NDArray[np.float64]
+
+
+_ALL = np.ones(6)
+_UNLIMITED = (math.inf, math.inf)
 
 
 class PoseMotion(NamedTuple):
@@ -65,20 +70,19 @@ class PoseTask:
 
     def term(self, robot: HandModel) -> TaskTerm:
         """Return ``J a = kp error - kd J v - J' v + feedforward`` as a term of the cost."""
-        if self.separate:
-            error = separate_error(robot.pose, self.pose_des)
-        else:
-            error = pose_error(robot.pose, self.pose_des)
-        if self.error_max is not None:
-            shorten(error[:3], self.error_max[0])
-            shorten(error[3:], self.error_max[1])
-        if self.stiffness is not None:
-            error = self.stiffness * error
-        twist = robot.J @ robot.v
-        b = self.kp * error - self.kd * twist - robot.drift
-        if self.separate:
-            # The rows of J a + J' v are in axes that turn with w: the origin has w x v more.
-            b[:3] -= pin.skew(twist[3:]) @ twist[:3]
+        pose, goal = robot.pose, self.pose_des
+        error = separate_error(pose, goal) if self.separate else pose_error(pose, goal)
+        twist, b = _spring_and_damper(
+            error,
+            self.kp,
+            self.kd,
+            _ALL if self.stiffness is None else self.stiffness,
+            self.error_max or _UNLIMITED,
+            robot.J,
+            robot.v,
+            robot.drift,
+            self.separate,
+        )
         if self.motion is not None and self.separate:
             b += self._separate_feedforward(robot.pose, self.motion)
         elif self.motion is not None:
@@ -123,6 +127,37 @@ class OtherHandTask:
     def term(self, robot: RobotModel) -> TaskTerm:
         """See `PoseTask.term`."""
         return self.task.term(robot.others[self.hand])
+
+
+@njit(cache=True)
+def _spring_and_damper(
+    error: Array,
+    kp: float,
+    kd: float,
+    stiffness: Array,
+    error_max: tuple[float, float],
+    J: Array,
+    v: Array,
+    drift: Array,
+    separate: bool,
+) -> tuple[Array, Array]:
+    """Return the twist J v and ``kp error - kd J v - J' v``, shape (6,) each, see `PoseTask`."""
+    twist, b = np.zeros(6), np.empty(6)
+    for i in range(6):
+        for j in range(v.size):
+            twist[i] += J[i, j] * v[j]
+    for first in (0, 3):
+        x, y, z = error[first], error[first + 1], error[first + 2]
+        size, largest = math.sqrt(x * x + y * y + z * z), error_max[first // 3]
+        share = largest / size if size > largest else 1.0
+        for i in range(first, first + 3):
+            b[i] = kp * stiffness[i] * share * error[i] - kd * twist[i] - drift[i]
+    if separate:
+        # The rows of J a + J' v are in axes that turn with w: the origin has w x v more.
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            b[i] -= twist[3 + j] * twist[k] - twist[3 + k] * twist[j]
+    return twist, b
 
 
 def shorten(vector: Array, largest: float) -> None:
