@@ -12,9 +12,9 @@ from direct import DirectLoop, column
 
 from sim_bridge.node.bullet_parameters import BulletConfiguration, make_robot
 from sim_bridge.tools.record_excitation import excitation, record
-from torque_safety_controller.friction.settings import GAIN
 from torque_safety_controller.friction.identification import friction_model, identify
 from torque_safety_controller.friction.joint_recording import Recording
+from torque_safety_controller.friction.settings import GAIN
 from torque_safety_controller.parts.friction import Friction
 from torque_safety_controller.tasks.gains import critical_damping
 from viability_bounds_pkg.cli.limits_file import read_robot

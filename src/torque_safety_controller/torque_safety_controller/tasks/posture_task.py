@@ -64,10 +64,11 @@ class PostureTask:
 def _in_null_space(J: Array, a: Array) -> Array:
     """Return what of accelerations moves no hand, ``a - J' (J J' + r I)^-1 J a``, shape (n,).
 
-    All of `a` where J, shape (m, n), is not finite. Compiled, because NumPy takes four times as
-    long.
+    All of `a` where it or J, shape (m, n), is not finite. Compiled, because NumPy takes
+    four times as long.
     """
     inner = J @ J.T + _RANK_REGULARISATION * np.eye(len(J))
-    if not np.isfinite(inner).all():
+    moved = J @ a
+    if not (np.isfinite(inner).all() and np.isfinite(moved).all()):
         return a
-    return a - J.T @ np.linalg.solve(inner, J @ a)
+    return a - J.T @ np.linalg.solve(inner, moved)
