@@ -29,43 +29,6 @@ _PIECE = 1e-3  # m; half the length of an edge that stands for it around a point
 _BEHIND = 1.0  # m; how far behind a face its reference point is, so that the normal is exact
 
 
-class Segments(NamedTuple):
-    """Segments and boxes.
-
-    Attributes:
-        joint: that moves a segment, shape (s,), int; 0 for what does not move.
-        ends: of the segments in the joint's axes, shape (s, 2, 3), m.
-        radius: of the segments, shape (s,), m; written where a segment is the point of a box.
-        boxes: centre, half the edges, and axes as rows, in the root frame, shape (b, 5, 3), m.
-    """
-
-    joint: Integers
-    ends: Array
-    radius: Array
-    boxes: Array
-
-
-class Candidates(NamedTuple):
-    """Distances that may matter, pair by pair.
-
-    Of two segments they are that of their closest points, and those of each end from the other
-    segment; of a segment and a box those of the ends, that of the chord inside, and those of the
-    edges. So the closest points may jump from one to the other, as they do between parallel
-    segments: each of these distances is smooth there.
-
-    Attributes:
-        start: index of the first of each pair, shape (p + 1,), int.
-        bodies: the segment that moves, the other segment, and the box that this is a point of or
-            -1, shape (c, 3), int.
-        share: which part of either segment counts: from and to, in shares of its length, shape
-            (c, 4).
-    """
-
-    start: Integers
-    bodies: Integers
-    share: Array
-
-
 class Features(NamedTuple):
     """Distances that matter in a state; only the first ones, as many as were found, are valid.
 
@@ -96,8 +59,8 @@ def move_segments(
         J: spatial velocity of each joint about the root's origin for a unit joint velocity, linear
             first, shape (n, 6).
         dJ: its time derivative, shape (n, 6).
-        joint: see `Segments`.
-        ends: see `Segments`.
+        joint: see `model.Segments`.
+        ends: see `model.Segments`.
         twists: written: spatial velocity of each joint, and its rate, shape (n + 1, 2, 6).
         points: written: position, velocity, and acceleration at zero joint acceleration, of both
             ends of each segment, shape (s, 2, 3, 3), m, m/s, m/s^2.
@@ -135,9 +98,9 @@ def find_features(
     """Write the distances that matter in a state, and return how many there are.
 
     Args:
-        radius: see `Segments`, like `boxes`.
+        radius: see `model.Segments`, like `boxes`.
         boxes: likewise.
-        start: see `Candidates`, like `bodies` and `share`.
+        start: see `model.Candidates`, like `bodies` and `share`.
         bodies: likewise.
         share: likewise.
         points: of `move_segments`.

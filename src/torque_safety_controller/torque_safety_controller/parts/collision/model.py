@@ -5,20 +5,58 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from torque_safety_controller.parts.collision.distances import Candidates, Segments
 from torque_safety_controller.parts.collision.shapes import Shape
 from viability_bounds_pkg.exceptions import SettingError, did_you_mean
 
 Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
 _MOSTLY = 0.5  # links that are near each other in more than this share of postures are left out
 _POSTURES = 200  # from which it is told
 _WHOLE, _ENDS = (0.0, 1.0), ((0.0, 0.0), (1.0, 1.0))  # shares of a segment
+
+
+class Segments(NamedTuple):
+    """Segments and boxes.
+
+    Attributes:
+        joint: that moves a segment, shape (s,), int; 0 for what does not move.
+        ends: of the segments in the joint's axes, shape (s, 2, 3), m.
+        radius: of the segments, shape (s,), m; written where a segment is the point of a box.
+        boxes: centre, half the edges, and axes as rows, in the root frame, shape (b, 5, 3), m.
+    """
+
+    joint: Integers
+    ends: Array
+    radius: Array
+    boxes: Array
+
+
+class Candidates(NamedTuple):
+    """Distances that may matter, pair by pair.
+
+    Of two segments they are that of their closest points, and those of each end from the other
+    segment; of a segment and a box those of the ends, that of the chord inside, and those of the
+    edges. So the closest points may jump from one to the other, as they do between parallel
+    segments: each of these distances is smooth there.
+
+    Attributes:
+        start: index of the first of each pair, shape (p + 1,), int.
+        bodies: the segment that moves, the other segment, and the box that this is a point of or
+            -1, shape (c, 3), int.
+        share: which part of either segment counts: from and to, in shares of its length, shape
+            (c, 4).
+    """
+
+    start: Integers
+    bodies: Integers
+    share: Array
 
 
 @dataclass(frozen=True)
