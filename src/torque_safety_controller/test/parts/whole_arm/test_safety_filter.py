@@ -212,7 +212,7 @@ def test_constraints_leave_the_plan_as_it_is(arm):
     keeper, zero, seen = arm.filter(), np.zeros(arm.n), 0
     for q, v in states[::7]:
         lower, upper, _ = arm.solver.bounds(q, v)
-        keeper.reset()
+        keeper.forget_plan()
         rows = keeper.update(q, v, zero, lower, upper)
         if rows is None or keeper.slack < KEPT:
             continue

@@ -163,9 +163,15 @@ class SafetyFilter(Part):
         self.lost = False
         self.outcomes: Counter[str] = Counter()
 
-    def reset(self, robot: RobotModel | None = None) -> None:
-        """Forget the plan in hand."""
-        self._time, self._periods, self._turn = USUAL_TIME, None, 0
+    def reset(self, robot: RobotModel) -> None:
+        """Forget the plan in hand, and count steps from here on."""
+        self.forget_plan()
+        self._turn = 0
+        self.outcomes.clear()
+
+    def forget_plan(self) -> None:
+        """Begin with a new plan in the next step."""
+        self._time, self._periods = USUAL_TIME, None
 
     def prepare(self, step: Step) -> None:
         """Narrow the bounds, and add rows by which the plan keeps the torque limits."""
@@ -251,7 +257,7 @@ class SafetyFilter(Part):
             return a
         if self.lost and np.isfinite(a).all():
             self.outcomes["outside"] += 1
-            self.reset()
+            self.forget_plan()
             return a
         plan, low, high = self.plan, 0.0, 1.0
         for _ in range(HALVINGS):
