@@ -153,7 +153,7 @@ def nearest_with_leak(M: Array, s: Array, u: Array, limit: Array, w: Array) -> t
         power = direction[:n] @ momentum
         if size > 0.0 and power > 0.0:
             direction[n] = power / size
-    result = nearest_dissipating(wish, direction, limits, direction[:n] @ w)
+    result = nearest_dissipating(wish, direction, limits, float(direction[:n] @ w))
     leak = result[n] / (size * largest) if size * largest > 0.0 else 0.0
     if not (np.isfinite(result).all() and math.isfinite(leak)):
         return clip(u, limit), 0.0

@@ -283,7 +283,7 @@ def limited(
 @njit(cache=True)
 def energy_product(M: Array, weight: float, a: Array, x: Array, b: Array, y: Array) -> float:
     """Return the inner product of (a, x) and (b, y) whose square is twice the energy, J."""
-    return a @ (M @ b) + weight * (x @ (np.diag(M) * y))
+    return float(a @ (M @ b) + weight * (x @ (np.diag(M) * y)))
 
 
 @njit(cache=True)
