@@ -227,8 +227,8 @@ def test_distances_that_contradict_each_other_give_way_before_the_joints_bounds(
     relaxed = 0
     for _ in range(500):
         step = loop.step()
-        if step.constraint_relaxation is not None:
-            relaxed += step.constraint_relaxation.max() > 0.0
+        if step.solution.constraint_relaxation is not None:
+            relaxed += step.solution.constraint_relaxation.max() > 0.0
             assert step.relaxation.max() < 1e-3  # rad/s^2
     assert relaxed > 100
     assert_no_limit_broken(loop)

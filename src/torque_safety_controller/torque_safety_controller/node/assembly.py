@@ -288,6 +288,7 @@ def make_collision(config: ControllerConfiguration, model: pin.Model) -> Collisi
         build_collision_model(
             limited,
             collision.capsules,
+            collision.posture(config),
             collision.bodies,
             collision.pairs,
             config.base_frame,

@@ -233,6 +233,12 @@ class CollisionConfiguration:
         default=(),
         note="each two links, as in 'link_a link_b'",
     )
+    collision_posture: Array = joint_numbers(
+        "for the automatic choice, a posture free of collisions, rad: what is nearer there than "
+        "the margin is not kept apart; the middle of the position limits if empty",
+        default=(),
+        note="within the position limits",
+    )
     acceleration_min: Array = joint_numbers(
         "for collision_avoidance, safety_filter, and HOLD without bounds: lower acceleration "
         "limits, rad/s^2",
@@ -271,8 +277,11 @@ class CollisionConfiguration:
         """Check what depends on the robot.
 
         Raises:
-            SettingError: no limits of acceleration.
+            SettingError: a posture beyond the position limits, or no limits of acceleration.
         """
+        q, low, high = self.collision_posture, robot.position_min, robot.position_max
+        if len(q) and not ((low <= q) & (q <= high) & np.isfinite(q)).all():
+            raise SettingError("collision_posture", q, "within the position limits")
         if self.collision_avoidance:
             self.check_accelerations(robot)
 
@@ -284,6 +293,14 @@ class CollisionConfiguration:
         """
         check_per_joint("acceleration_min", self.acceleration_min, robot.joints)
         check_per_joint("acceleration_max", self.acceleration_max, robot.joints)
+
+    def posture(self, robot: RobotConfiguration) -> Array:
+        """Return the posture that is free of collisions, shape (n,), rad."""
+        if len(self.collision_posture):
+            return self.collision_posture
+        low, high = robot.position_min, robot.position_max
+        limited = np.isfinite(low) & np.isfinite(high)
+        return np.where(limited, 0.5 * (np.where(limited, low, 0.0) + high), 0.0)
 
 
 def _obstacles(entries: tuple[str, ...]) -> tuple[Shape, ...]:

@@ -43,6 +43,7 @@ _UNBOUNDED = 1e6  # rad/s^2; more than anything has
 _SLIGHT = 1e-3  # m; violations of the margin below this are not reported
 
 _LEFT_OUT = {
+    "near at start": "as they are near each other in collision_posture",
     "near mostly": "as they are near each other in most postures",
     "near always": "as they are near each other in all postures",
 }

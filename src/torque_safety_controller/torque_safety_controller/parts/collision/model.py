@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from torque_safety_controller.parts.collision.shapes import Shape
 from viability_bounds_pkg.exceptions import SettingError, did_you_mean
@@ -70,8 +70,8 @@ class CollisionModel:
         moves: 1 for joints that move the first shape of a pair only, -1 the second only, shape
             (p, n).
         names: of the two shapes of each pair, ``link - link`` or ``link - obstacle``.
-        left_out: pairs that are not kept apart, by reason: ``far``, ``near mostly``; with
-            obstacles ``near always``, as what the arm is mounted on.
+        left_out: pairs that are not kept apart, by reason: ``far``, ``near at start``,
+            ``near mostly``; with obstacles ``near always``, as what the arm is mounted on.
     """
 
     arm: pin.Model
@@ -85,6 +85,7 @@ class CollisionModel:
 def build_collision_model(
     model: pin.Model,
     capsules: Sequence[Shape],
+    q_start: ArrayLike,
     obstacles: Sequence[Shape] = (),
     pairs: Sequence[tuple[str, str]] | None = None,
     base_frame: str | None = None,
@@ -97,12 +98,14 @@ def build_collision_model(
     Args:
         model: n joints with one coordinate each.
         capsules: around the links, whose names they have, in the links' frames.
+        q_start: a configuration free of collisions, shape (n,), rad: of the pairs chosen
+            automatically, those that are near each other there are left out.
         obstacles: that every link is kept away from which can move.
         pairs: of links to be kept apart; None chooses them automatically: all that are not
             neighbours, less those left out by `near` and `clearance`.
         base_frame: that obstacles are given in, fixed to the base; None: the URDF's root.
         near: pairs that never come nearer than this are left out, m.
-        clearance: pairs that are nearer than this in most samples are left out, m: more than the
+        clearance: pairs that are nearer than this at the start, or in most samples, are left out, m: more than the
             margin to be kept. Their capsules, not the links, are in each other's way. So are
             obstacles that a link cannot get away from.
         samples: random configurations within the position limits; +-pi where there are none.
@@ -130,6 +133,7 @@ def build_collision_model(
     for pair in chosen:
         geometry.addCollisionPair(pin.CollisionPair(*pair))
     survey = _Survey(model, geometry, samples)
+    at_start = survey.near(np.asarray(q_start, dtype=np.float64), clearance)
     share, comes_near = survey.share(clearance), survey.comes_nearer(near)
     kept: list[int] = []
     left_out: dict[str, list[str]] = {}
@@ -140,6 +144,8 @@ def build_collision_model(
             reason = "near always" if share[k] == 1.0 else "" if comes_near[k] else "far"
         elif pairs is None and not comes_near[k]:
             reason = "far"
+        elif pairs is None and at_start[k]:
+            reason = "near at start"
         elif pairs is None and share[k] > _MOSTLY:
             reason = "near mostly"
         if reason:
@@ -217,13 +223,16 @@ class _Survey:
         high = np.where(np.isfinite(model.upperPositionLimit), model.upperPositionLimit, np.pi)
         self._q = np.random.default_rng(0).uniform(low, high, size=(samples, model.nq))
 
+    def near(self, q: Array, clearance: float) -> NDArray[np.bool_]:
+        """Return which pairs are nearer than `clearance` in a configuration, shape (p,)."""
+        self._nearest(q)
+        distances = np.array([each.min_distance for each in self._found.distanceResults])
+        near: NDArray[np.bool_] = distances < clearance
+        return near
+
     def share(self, clearance: float) -> Array:
         """Return in which share of some configurations each pair is nearer than `clearance`."""
-        found = []
-        for q in self._q[:_POSTURES]:
-            self._nearest(q)
-            found.append([each.min_distance < clearance for each in self._found.distanceResults])
-        share: Array = np.mean(found, axis=0)
+        share: Array = np.mean([self.near(q, clearance) for q in self._q[:_POSTURES]], axis=0)
         return share
 
     def comes_nearer(self, near: float) -> NDArray[np.bool_]:
