@@ -150,12 +150,12 @@ def test_neighbours_and_distant_pairs_are_left_out_and_what_is_always_near():
     for name in ("panda_link2 - panda_link1", "panda_hand - panda_link7", "panda_link0 - table"):
         assert name not in collision.names
     assert "panda_link2 - panda_link0" in collision.left_out["far"]
-    assert collision.left_out["near mostly"] == ["panda_link7 - panda_link5"]
+    assert collision.left_out["near at start"] == ["panda_link7 - panda_link5"]
 
 
 def build(**changes):
     arm, capsules = panda()[0], read(ControllerConfiguration, PANDA).collision.capsules
-    given = {"capsules": capsules, "samples": FEW, **changes}
+    given = {"capsules": capsules, "q_start": arm.q_start, "samples": FEW, **changes}
     return build_collision_model(given.pop("model", arm.model), **given)
 
 

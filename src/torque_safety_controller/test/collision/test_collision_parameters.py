@@ -73,10 +73,13 @@ def test_pairs_are_those_listed_or_those_chosen():
     assert set(listed.model.names) == {"panda_hand - panda_link1"}
     chosen = load()
     assert "panda_hand - panda_link1" in chosen.model.names
-    assert chosen.model.left_out["near mostly"] == ["panda_link7 - panda_link5"]
+    assert chosen.model.left_out["near at start"] == ["panda_link7 - panda_link5"]
+    # In the middle of the limits, the default, the hand is bent back to the forearm.
+    middle = load(collision_posture=None)
+    assert "panda_hand - panda_link5" in middle.model.left_out["near at start"]
     # What is asked to be kept further apart is left out sooner.
     wide = load(collision_margin=0.08)
-    assert len(wide.model.left_out["near mostly"]) > 1
+    assert len(wide.model.left_out["near at start"]) > 1
 
 
 def test_acceleration_limits_arrive():
@@ -99,6 +102,8 @@ def test_what_an_arm_is_mounted_on_is_left_out_and_said_to_be():
         ({"collision_margin": 0.6}, "collision_margin"),
         ({"collision_margin": float("nan")}, "collision_margin"),
         ({"collision_pairs": ["panda_hand"]}, "collision_pairs"),
+        ({"collision_posture": [0.0] * 6}, "collision_posture"),
+        ({"collision_posture": [9.0] * 7}, "collision_posture"),
         ({"acceleration_min": None}, "acceleration_min"),
     ],
 )

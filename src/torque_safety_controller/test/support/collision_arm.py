@@ -77,6 +77,7 @@ def two_links(
     collision = build_collision_model(
         model,
         [capsule("fore", *each) for each in capsules["fore"]],
+        np.zeros(2),
         obstacles,
         samples=10,
         near=10.0,
@@ -110,7 +111,7 @@ def panda(obstacles: bool = True) -> tuple[Arm, JointLimits, CollisionModel]:
     )
     surroundings = SURROUNDINGS if obstacles else ()
     capsules = read(ControllerConfiguration, config).collision.capsules
-    collision = build_collision_model(arm.model, capsules, surroundings, samples=3000)
+    collision = build_collision_model(arm.model, capsules, arm.q_start, surroundings, samples=3000)
     return arm, limits, collision
 
 

@@ -44,7 +44,7 @@ LIMITS_OF_URDF = {
 _TURNS_MAX = 2.0
 """Turns of a joint with limits from which on its angles are surely degrees."""
 
-_ANGLES = ("position_min", "position_max", "start_positions")
+_ANGLES = ("position_min", "position_max", "start_positions", "collision_posture")
 _LIMITS = (("velocity_max", "velocity"), ("torque_max", "effort"))
 _SLACK = 1e-3
 """Relative excess over limits of the URDF that rounding explains."""

@@ -105,9 +105,9 @@ def build_collision_model(
             neighbours, less those left out by `near` and `clearance`.
         base_frame: that obstacles are given in, fixed to the base; None: the URDF's root.
         near: pairs that never come nearer than this are left out, m.
-        clearance: pairs that are nearer than this at the start, or in most samples, are left out, m: more than the
-            margin to be kept. Their capsules, not the links, are in each other's way. So are
-            obstacles that a link cannot get away from.
+        clearance: pairs that are nearer than this at the start, or in most samples, are left
+            out, m: more than the margin to be kept. Their capsules, not the links, are in each
+            other's way. So are obstacles that a link cannot get away from.
         samples: random configurations within the position limits; +-pi where there are none.
 
     Raises:
