@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pinocchio as pin
+from numba import njit
 from numpy.typing import NDArray
 
 from viability_bounds_pkg.robot.description import unknown_name
@@ -142,6 +143,7 @@ class RobotModel(HandModel):
         return tau
 
 
+@njit(cache=True)
 def _middle_of_step(q: Array, v: Array, a: Array, dt: float) -> tuple[Array, Array]:
     """Return position and velocity after dt / 2 at acceleration `a`, shape (n,) each."""
     half = 0.5 * dt

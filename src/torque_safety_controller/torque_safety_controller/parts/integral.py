@@ -52,7 +52,8 @@ class Integral(Part):
         before, time = action.last, step.elapsed if step.order.obeyed else math.inf
         torque = action.torque(step.robot, step.robot.v, step.a_last, time)
         step.torque = step.torque + torque
-        step.integral_change = torque - before
+        if torque is not before:
+            step.integral_change = torque - before
 
     def resume(self, step: Step, torque: Array) -> None:
         """See `Part.resume`."""
