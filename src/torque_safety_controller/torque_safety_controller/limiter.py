@@ -23,7 +23,7 @@ class TorqueLimiter:
     """
 
     def __init__(self, tau_max: ArrayLike, tau_rate_max: ArrayLike | None, dt: float) -> None:
-        self.tau_max = np.asarray(tau_max, dtype=float)
+        self.tau_max = np.array(tau_max, dtype=float)
         self._tau_min = -self.tau_max
         rate = np.asarray(math.inf if tau_rate_max is None else tau_rate_max, dtype=np.float64)
         self._step = np.where(np.isinf(rate), np.inf, rate * dt)

@@ -188,21 +188,24 @@ def build_program(
         NoSolutionFound: no task with a weight.
         ValueError: constraints or contacts of the wrong shape.
     """
-    n = len(M)
-    G, row_lower, row_upper = constraints or (np.zeros((0, n)), np.zeros(0), np.zeros(0))
-    B, rho_max, wrench_tasks = contacts or (np.zeros((n, 0)), np.zeros(0), ())
-    if G.shape != (len(row_lower), n) or row_lower.shape != row_upper.shape:
-        raise ValueError(
-            f"constraints on {n} joints with G {G.shape}, lower {row_lower.shape}, "
-            f"upper {row_upper.shape}"
-        )
-    if B.shape != (n, len(rho_max)):
-        raise ValueError(f"forces on {n} joints with B {B.shape}, rho_max {rho_max.shape}")
-    weights = [task.weight for task in tasks] + [task.weight for task in wrench_tasks]
-    greatest = max((weight for weight in weights if weight > 0.0), default=0.0)
+    n, r, k = len(M), 0, 0
+    wrench_tasks: Sequence[WrenchTerm] = ()
+    if constraints is not None:
+        G, row_lower, row_upper = constraints
+        k = len(G)
+        if G.shape != (len(row_lower), n) or row_lower.shape != row_upper.shape:
+            raise ValueError(
+                f"constraints on {n} joints with G {G.shape}, lower {row_lower.shape}, "
+                f"upper {row_upper.shape}"
+            )
+    if contacts is not None:
+        B, rho_max, wrench_tasks = contacts
+        r = len(rho_max)
+        if B.shape != (n, r):
+            raise ValueError(f"forces on {n} joints with B {B.shape}, rho_max {rho_max.shape}")
+    greatest = max([0.0, *(task.weight for task in (*tasks, *wrench_tasks))])
     if greatest == 0.0:
         raise NoSolutionFound("no task with a weight above 0")
-    r, k = len(rho_max), len(G)
     size = n + r
     # Mostly one task is of the joints: it is written at once.
     joints = next((task for task in tasks if task.A is None), None)
