@@ -102,9 +102,14 @@ def draw(tree: Path, picture: Path) -> None:
     figure.savefig(picture, dpi=90)
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Draw the rooms of this checkout, or of another one."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--tree", type=Path, default=ROOT, help="checkout to draw")
     parser.add_argument("--picture", type=Path, default=ROOT / "docs" / "images" / "rooms.png")
     options = parser.parse_args()
     draw(options.tree, options.picture)
+
+
+if __name__ == "__main__":
+    main()

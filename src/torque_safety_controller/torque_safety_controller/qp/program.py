@@ -203,7 +203,8 @@ def build_program(
         r = len(rho_max)
         if B.shape != (n, r):
             raise ValueError(f"forces on {n} joints with B {B.shape}, rho_max {rho_max.shape}")
-    greatest = max([0.0, *(task.weight for task in (*tasks, *wrench_tasks))])
+    weights = [task.weight for task in tasks] + [task.weight for task in wrench_tasks]
+    greatest = max([0.0, *weights])
     if greatest == 0.0:
         raise NoSolutionFound("no task with a weight above 0")
     size = n + r
