@@ -37,15 +37,15 @@ def copied(folder, package):
     ("package", "files", "least"),
     [
         # With a node, and with the package's own support.
-        ("viability_bounds_pkg", ["node/test_bounds_node.py", "kernel/test_baselines.py"], 40),
+        ("viability_bounds_pkg", ["node/test_bounds_node.py", "bounds/test_baselines.py"], 40),
         # With a robot's parameter file, and with the executable.
-        ("sim_bridge", ["nodes/test_scenario_node.py", "nodes/test_command_outage.py"], 8),
+        ("sim_bridge", ["node/test_scenario_node.py", "node/test_command_stream.py"], 8),
     ],
 )
 def test_colcon_tests_a_copy_of_a_package(tmp_path, package, files, least):
     workspace = copied(tmp_path, package)
     tests = [f"test/{file}" for file in files]
-    some = ["-k", "parameter or answers or scenario or outage or baselines"]
+    some = ["-k", "parameter or answers or scenario or command or baselines"]
     colcon(workspace, "test", "--packages-select", package, "--pytest-args", *tests, *some)
     summary = colcon(workspace, "test-result")
     number = int(summary.split("Summary: ")[1].split(" tests")[0])
