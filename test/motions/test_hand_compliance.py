@@ -70,7 +70,7 @@ def test_a_start_with_a_stretched_elbow_and_a_goal_beyond_reach(mode):
     """J has lost rank; the arm stays within its limits, comes to rest, and gets away again."""
     straight = [0.0, 0.15, -0.3, 0.5, -0.3, -0.02, 0.0, 0.0, 0.0]
     loop = DirectLoop(ROBOT, {"start_positions": np.array(straight), "integral_action": mode})
-    assert np.linalg.svd(loop.controller.robot.J)[1][-1] < 0.05
+    assert np.linalg.svd(loop.controller.robot.J)[1][-1] < 0.08
     start = loop.pose()
     away = start.translation / np.linalg.norm(start.translation)
     loop.controller.goals.set_pose(pin.SE3(start.rotation, start.translation + 0.2 * away))

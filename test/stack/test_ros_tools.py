@@ -91,15 +91,6 @@ def test_live_parameters_are_set_and_others_refused(ros, kind):
     assert node.get_parameter(live).value == 2.5
 
 
-@pytest.mark.parametrize("kind", LIVE)
-def test_a_misspelt_parameter_is_refused_by_its_name(ros, kind):
-    start(ros, kind)
-    live = LIVE[kind]
-    misspelt = live[:-1]
-    expected = f"unknown parameter '{misspelt}'; did you mean '{live}'?"
-    assert ros.refuses(kind.NAME, **{misspelt: 1.0}) == expected
-
-
 # -r
 
 

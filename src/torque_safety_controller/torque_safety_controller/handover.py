@@ -47,7 +47,7 @@ class MotorTorque(NamedTuple):
     """Torque of the motors as it is known.
 
     Attributes:
-        mean: shape (n,), N m.
+        mean: without noise, shape (n,), N m.
         error: how far it may be off, shape (n,), share of the torque limits.
         samples: how many say so.
     """
@@ -138,13 +138,24 @@ class Handover:
         return None
 
     def _average(self) -> MotorTorque:
-        """Return the mean, off by its drift and by three of its standard deviations."""
+        """Return where a line through as many of the last samples ends as say it best.
+
+        It is off by three standard deviations of that end: many samples take noise out, and few
+        of them know nothing of what moved the torque before.
+        """
         seen, count = np.array(self._samples), len(self._samples)
-        mean, error = seen.mean(axis=0), np.full(self._tau_max.size, math.inf)
-        if count >= FEWEST:
-            drift = np.abs(seen[count // 2 :].mean(axis=0) - seen[: count // 2].mean(axis=0))
-            error = (drift + 3.0 * seen.std(axis=0) / math.sqrt(count)) / self._tau_max
-        return MotorTorque(mean, error, count)
+        best = MotorTorque(seen[-1], np.full(self._tau_max.size, math.inf), count)
+        size = FEWEST
+        while size <= count:
+            last, time = seen[-size:], np.arange(size) - 0.5 * (size - 1)
+            mean, slope = last.mean(axis=0), time @ last / (time @ time)
+            noise = (last - mean - np.outer(time, slope)).std(axis=0)
+            end = math.sqrt(1.0 / size + time[-1] ** 2 / (time @ time))
+            error = 3.0 * end * noise / self._tau_max
+            if error.max() < best.error.max():
+                best = MotorTorque(mean + slope * time[-1], error, size)
+            size *= 2
+        return best
 
     def _measured(self, q: Array, tau: Array | None) -> Array:
         outside = (q < self._q_min) | (q > self._q_max)

@@ -98,7 +98,7 @@ def test_the_handover_is_not_felt(ros, robot, changed, load):
     arm.run(100)
     if load:
         arm.push(PUSHED[robot], FORCE[robot])  # for half a second
-        arm.run(750 if load == "friction" else 200)
+        arm.run(750 if load == "friction" else 180)
     arm.enable(True)
     arm.run(200)
     arm.enable(False)

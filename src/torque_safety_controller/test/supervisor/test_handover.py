@@ -76,11 +76,14 @@ def test_noise_is_averaged_until_the_mean_is_known_well_enough():
     assert max(off) < 2.0
 
 
-def test_a_torque_that_drifts_is_not_known():
+def test_a_torque_that_drifts_is_known_as_it_is_now():
     handover = make()
     handover.begin(Q, 0.0 * TAU)
-    for k in range(100):
-        assert handover.torque(Q, 0.002 * k * TAU_MAX) is None
+    known = None
+    for k in range(FEWEST):
+        assert known is None
+        known = handover.torque(Q, 0.002 * k * TAU_MAX)
+    np.testing.assert_allclose(known.mean, 0.002 * (FEWEST - 1) * TAU_MAX)
 
 
 def test_a_torque_that_stays_unknown_is_refused_after_some_time():

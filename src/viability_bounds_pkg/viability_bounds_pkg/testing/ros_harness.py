@@ -190,6 +190,9 @@ class RosHarness:
         """Take a node down before the test ends."""
         self._nodes.remove(node)
         self.executor.remove_node(node)
+        # The events executor still holds what has come for the node.
+        for _ in range(10):
+            self.spin()
         node.destroy_node()
 
     def close(self) -> None:
