@@ -144,7 +144,7 @@ stage "set-up again" set_up
 stage "NumPy and consistency" check_environment
 cat "$log"
 stage "tests of the nodes" bash scripts/test.sh -q -n "$(nproc)" -p no:cacheprovider \
-    src/*/test/node src/*/test/nodes src/*/test/ros test/installation/test_startup.py
+    src/*/test/node src/*/test/ros test/installation/test_startup.py
 tail -n 1 "$log"
 stage "demo in lockstep" bash scripts/demo.sh --lockstep --out "$work/demo"
 stage "NumPy after all" check_environment
