@@ -172,7 +172,8 @@ def main() -> None:
             nodes.append(kind(namespace="remedies", parameter_overrides=own))
         probes["remedies"] = Probe(joints, make_robot(), namespace="remedies")
     executor = make_executor()
-    for node in (*nodes, *probes.values()):
+    running: list[Node] = [*nodes, *probes.values()]
+    for node in running:
         executor.add_node(node)
     for name, probe in probes.items():
         deadline = time.monotonic() + 20.0
@@ -196,7 +197,7 @@ def main() -> None:
     if options.imperfect:
         ratio = found["remedies"][0] / found["real, middleware"][0]
         print(f"remedies / real, middleware: {ratio:.2f}")
-    for node in (*nodes, *probes.values()):
+    for node in running:
         node.destroy_node()
     rclpy.try_shutdown()
 
