@@ -81,6 +81,7 @@ class Case:
         spoilt: how many times the imperfections of the file are simulated: 0, 1 or 2.
         overlay: nodes that get the file of the imperfect robot.
         changed: parameters that differ, by node.
+        outages: whether all commands fail for up to 0.2 s, some 1.5 times a second.
         filtered: whether the safety filter is on, also where the file does without it.
         torque: share of the torque limits that the motors have.
     """
@@ -89,6 +90,7 @@ class Case:
     spoilt: int
     overlay: tuple[str, ...] = ("bounds_node", "controller_node", "estimator_node")
     changed: Mapping[str, Mapping[str, Any]] | None = None
+    outages: bool = False
     filtered: bool = False
     torque: float = 1.0
 
@@ -126,6 +128,13 @@ CASES = {
     ),
     "all": Case("spoilt, all done", 1),
     "twice": Case("spoilt twice as much as declared, all done", 2),
+    "outage_brake": Case(
+        "spoilt, all done; commands fail for up to 0.2 s; brakes",
+        1,
+        changed={"bullet_node": {"acceleration_min": [], "acceleration_max": []}},
+        outages=True,
+    ),
+    "outage_stop": Case("spoilt, all done; commands fail for up to 0.2 s; stop", 1, outages=True),
     "filter": Case("spoilt, all done; safety filter", 1, filtered=True),
     "filter_weak": Case(
         "spoilt, all done; safety filter, 60% of its torque", 1, filtered=True, torque=0.6
@@ -181,6 +190,9 @@ def node_values(robot: str, case: Case, seed: int) -> Values:
             chosen = own | scaled(
                 {k: v for k, v in imperfect[node].items() if own.get(k) != v}, case.spoilt
             )
+            if case.outages:
+                rate = chosen["rate_hz"]
+                chosen |= {"outage_probability": 1.5 / rate, "outage_longest": round(0.2 * rate)}
         of_robot = {name: imperfect[node][name] for name in OF_ROBOT if name in imperfect[node]}
         changed = dict((case.changed or {}).get(node, {}))
         values[node] = chosen | of_robot | changed

@@ -15,7 +15,7 @@ from chain import ROOT
 from figure import RESULTS, Figure, table
 
 NAME = "imperfect"
-WITHIN_DECLARED = ("all", "filter", "filter_weak")
+WITHIN_DECLARED = ("all", "outage_stop", "filter", "filter_weak")
 """Cases in which no limit may be passed: what is spoilt is within what is declared."""
 STEP_AT_REST = 0.05  # of torque_max
 HAND_FACTOR = 3.0

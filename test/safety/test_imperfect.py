@@ -58,6 +58,9 @@ def test_each_case_differs_as_its_title_says(robot):
         values["no_margins"]["bounds_node"]["delay"] == 0 < values["all"]["bounds_node"]["delay"]
     )
     assert not values["no_observer"]["estimator_node"]["velocity_estimation"]
+    stopping = robots["outage_stop"]
+    assert stopping["outage_longest"] > stopping["command_timeout"]
+    assert "outage_longest" not in robots["all"]
     # One robot and one model of it in all cases.
     for node in ("bullet_node", "bounds_node", "controller_node"):
         rotors = [each[node].get("rotor_inertia") for each in values.values()]
@@ -81,7 +84,7 @@ def test_verdicts():
     ideal = 1e-3
     assert imperfect_page.verdict("nothing", outcome(BROKEN), ideal) == ""
     assert imperfect_page.verdict("all", outcome(KEPT), ideal) == "kept"
-    assert "limit" in imperfect_page.verdict("filter", outcome(KEPT, BROKEN), ideal)
+    assert "limit" in imperfect_page.verdict("outage_stop", outcome(KEPT, BROKEN), ideal)
     assert "hand" in imperfect_page.verdict("all", outcome(KEPT, hands=[3.1e-3]), ideal)
     assert imperfect_page.verdict("all", outcome(KEPT, hands=[4e-3], near=5e-3), ideal) == "kept"
 

@@ -38,8 +38,8 @@ def play(robot, case, duration, seed=1):
 @pytest.mark.parametrize(
     ("robot", "case", "duration"),
     [
-        pytest.param("panda", "all", 4.0, marks=pytest.mark.long),
-        pytest.param("talos_left_arm", "all", 3.0, marks=pytest.mark.long),
+        pytest.param("panda", "outage_stop", 4.0, marks=pytest.mark.long),
+        pytest.param("talos_left_arm", "outage_stop", 3.0, marks=pytest.mark.long),
         ("baxter_left_arm", "all", 4.0),
     ],
 )
@@ -56,7 +56,7 @@ def test_no_limit_is_passed_by_a_robot_as_bad_as_declared(robot, case, duration)
     assert (np.minimum(*nearest) < 0.05 * reach).any(), "no joint came near a limit"
     assert int(result.robot["missed_deadlines_injected"]) > 5
     stopped = int(result.robot["braked_periods"])
-    assert stopped == 0
+    assert stopped > 50 if case == "outage_stop" else stopped == 0
     assert result.refused == 0, "states that can be were taken for others"
 
 

@@ -152,6 +152,41 @@ def test_commands_held_in_rows_of_missed_periods_pass_no_limit(ros):
     assert not arm._monitor.violated
 
 
+@pytest.mark.parametrize(
+    "robot", ["panda", pytest.param("talos_left_arm", marks=pytest.mark.long)]
+)
+def test_commands_that_return_after_outages_make_no_jolt(ros, robot):
+    """Outages of up to 100 periods begin with 1 % of the commands; goals are at the limits."""
+    outages = {"outage_probability": 0.01, "outage_longest": 100, "imperfection_seed": 3}
+    arm = chain(ros, robot, effort_tolerance=0.0, **outages)  # the controller does not help
+    tau_max, stop = arm._config.torque_max, arm._stop
+    sent, given, last = [], [], np.zeros(len(tau_max))
+    follow, update = stop.follow, arm._monitor.update
+    first = False
+
+    def watched_follow(q, v, command, motor_torque):
+        nonlocal first
+        first = stop._resting
+        if first:
+            sent.append(np.abs((command - last) / tau_max).max())
+        return follow(q, v, command, motor_torque)
+
+    def watched_update(q, v, tau):
+        nonlocal first
+        if first:
+            given.append(np.abs((tau - last) / tau_max).max())
+        first = False
+        last[:] = tau
+        update(q, v, tau)
+
+    stop.follow, arm._monitor.update = watched_follow, watched_update
+    send_to_limits(ros, arm, 6, 300, seed=2)
+    assert len(given) > 5
+    assert max(sent) > 0.3, "there was no jolt to avoid"
+    assert max(given) < 0.1
+    assert not arm._monitor.violated
+
+
 @pytest.mark.parametrize("robot", ["panda", "talos_left_arm", "baxter_left_arm"])
 def test_no_limit_is_passed_in_hold_without_acceleration_limits(robot):
     rng = np.random.default_rng(5)

@@ -103,6 +103,16 @@ class Imperfections:
         default=0.0,
     )
     missed_in_row: int = whole_number("longest row of such periods", Range(1, 1000), default=4)
+    outage_probability: float = number(
+        "probability of each command that an outage starts with it, in which all are lost",
+        Range(0.0, 1.0, without=1.0),
+        default=0.0,
+    )
+    outage_longest: int = whole_number(
+        "longest outage, control periods; each length up to it is as likely",
+        Range(1, 10_000),
+        default=100,
+    )
     imperfection_seed: int = whole_number(
         "seed of all these random numbers", Range(0, 2**31 - 1), default=0
     )
@@ -130,7 +140,7 @@ class Imperfections:
 
     def _is_on(self, name: str) -> bool:
         value = getattr(self, name)
-        if name in ("missed_in_row", "imperfection_seed"):
+        if name in ("missed_in_row", "outage_longest", "imperfection_seed"):
             return False
         return value != "exact" if isinstance(value, str) else bool(np.any(value))
 
@@ -151,6 +161,7 @@ class RandomStream(IntEnum):
     REPORTED_CURRENT = 2
     MOTOR_CURRENT = 3
     MISSED_DEADLINES = 4
+    OUTAGES = 5
 
 
 class ClippedNoise:
@@ -319,14 +330,14 @@ class CommandPath(Generic[Command]):
     """
 
     def __init__(self, imperfections: Imperfections) -> None:
-        given = imperfections
-        self._probability, self._longest = given.missed_probability, given.missed_in_row
-        self._random = np.random.default_rng(
-            [given.imperfection_seed, RandomStream.MISSED_DEADLINES]
+        given = self._given = imperfections
+        self._missing, self._outages = (
+            np.random.default_rng([given.imperfection_seed, stream])
+            for stream in (RandomStream.MISSED_DEADLINES, RandomStream.OUTAGES)
         )
         # None where no command has come yet.
         self._queue: deque[Command | _Lost | None] = deque([None] * given.command_delay)
-        self._lost_in_row = self.missed = 0
+        self._missed_in_row = self._outage_left = self.missed = 0
         self.absent = True
 
     def arriving(self, sent: Command | None) -> Command | None:
@@ -362,13 +373,29 @@ class CommandPath(Generic[Command]):
         return True
 
     def _send(self, command: Command) -> Command | _Lost:
-        """Return a command, or `_Lost` where it misses its period, never too many in a row."""
-        if self._probability == 0.0:
-            return command
-        drawn = self._random.random() < self._probability
-        lost = drawn and self._lost_in_row < self._longest
-        self._lost_in_row = self._lost_in_row + 1 if lost else 0
-        if not lost:
+        """Return a command, or `_Lost` where it misses its period or falls into an outage."""
+        missed, in_outage = self._misses_period(), self._in_outage()
+        if not (missed or in_outage):
             return command
         self.missed += 1
         return _Lost()
+
+    def _misses_period(self) -> bool:
+        """Return whether the next command misses its period, never too many in a row."""
+        given = self._given
+        if given.missed_probability == 0.0:
+            return False
+        drawn = self._missing.random() < given.missed_probability
+        missed = drawn and self._missed_in_row < given.missed_in_row
+        self._missed_in_row = self._missed_in_row + 1 if missed else 0
+        return missed
+
+    def _in_outage(self) -> bool:
+        """Return whether the next command falls into an outage, of a length drawn at its start."""
+        given = self._given
+        if given.outage_probability == 0.0:
+            return False
+        if self._outage_left == 0 and self._outages.random() < given.outage_probability:
+            self._outage_left = 1 + int(self._outages.integers(given.outage_longest))
+        inside, self._outage_left = self._outage_left > 0, max(0, self._outage_left - 1)
+        return inside

@@ -35,6 +35,26 @@ def test_the_seed_decides_which():
     assert drawn(0.3, 4, 200) != drawn(0.3, 4, 200, seed=1)
 
 
+def test_outages_have_all_lengths_up_to_the_longest():
+    path = CommandPath(Imperfections(outage_probability=0.02, outage_longest=10))
+    lost = [path.arriving(k) is None for k in range(40_000)]
+    rows = [len(list(group)) for value, group in groupby(lost) if value]
+    single = [length for length in rows if length <= 10]  # others started as the last one ended
+    assert len(single) > 0.95 * len(rows)
+    assert set(single) == set(range(1, 11))
+    assert sum(single) / len(single) == pytest.approx(5.5, abs=0.4)
+
+
+def test_an_outage_leaves_the_missed_deadlines_as_they_were():
+    path = CommandPath(
+        Imperfections(missed_probability=0.3, outage_probability=0.1, outage_longest=9)
+    )
+    lost = {k for k in range(300) if path.arriving(k) is None}
+    missed = {k for k, each in enumerate(drawn(0.3, 4, 300)) if each}
+    assert lost > missed
+    assert path.missed == len(lost)
+
+
 @pytest.mark.parametrize("delay", [0, 1, 4])
 def test_a_command_arrives_so_many_periods_later(delay):
     path = CommandPath(Imperfections(command_delay=delay))
