@@ -83,7 +83,7 @@ An arm that moves by more than 20 mrad in that second is still on its way, as th
 it round what it cannot hold; then that second does not count.
 
 A row of which something is promised ends with a verdict. Where what is spoilt is within what is
-declared ("all done", and with the
+declared ("all done", also while commands fail and the drives stop by themselves, and with the
 safety filter), position and speed must be 0 and torque at most 1. With "all done" alone, the step
 at rest must also be at most {step:g}, and the median distance of the hand at most {factor:g} times
 that of the same robot with nothing spoilt and nothing done, or what a step of all encoders is at
