@@ -130,7 +130,6 @@ class TriggerCall(NamedTuple):
 
     time: float
     service: str
-    type: str = "trigger"
 
 
 Goal = PoseGoal | PostureGoal | TrajectoryGoal | WrenchGoal
@@ -199,12 +198,6 @@ def _obstacle(content: Any, where: str) -> Obstacle:
 def _true_or_false(value: Any, where: str) -> bool:
     if not isinstance(value, bool):
         raise refuse(where, value, "true or false")
-    return value
-
-
-def _trigger(value: Any, where: str) -> str:
-    if value != "trigger":
-        raise refuse(where, value, "trigger")
     return value
 
 
@@ -330,6 +323,6 @@ _KINDS: dict[str, tuple[Any, Check | Mapping[str, Check]]] = {
     "remove_obstacle": (RemoveObstacle, {"name": name}),
     "enable_torque": (EnableTorque, _true_or_false),
     "parameters": (ParameterChange, {"node": _node, "values": _parameters}),
-    "call": (TriggerCall, {"service": name, "type": _trigger}),
+    "call": (TriggerCall, {"service": name}),
 }
 """By the entry's name: the event, and its fields or a function that reads its only field."""

@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 
 _BASE_COLOUR = (150, 150, 155)
 _PUSH_COLOUR, _MEASURED_COLOUR = (220, 60, 40), (40, 90, 200)
+_PUSH_STIFFNESS = 200.0
+"""Force of a push by how far its handle is dragged, N/m."""
 _ARROW_LENGTH = 0.01
 """m/N."""
 
@@ -249,7 +251,6 @@ class Page:
             if frame.type == pin.FrameType.BODY and frame.parentJoint > 0
         ] or [""]
         self._link = gui.add_dropdown("push link", links, initial_value=links[len(links) // 2])
-        self._stiffness = gui.add_slider("push, N per metre of drag", 20.0, 500.0, 10.0, 200.0)
         self._joint_pictures = gui.add_html("")
 
     # What the user does; in threads of the server
@@ -268,7 +269,7 @@ class Page:
         self._pushing = event.phase != "end"
         if self._driving and self._link.value:
             drag = np.array(self._handle.position) - self._push_origin
-            force = float(self._stiffness.value) * drag if self._pushing else np.zeros(3)
+            force = _PUSH_STIFFNESS * drag if self._pushing else np.zeros(3)
             self._requests.put(PushAsked(self._link.value, force))
 
 

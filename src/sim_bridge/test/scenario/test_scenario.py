@@ -67,7 +67,7 @@ events:
   - {time: 2, remove_obstacle: {name: pole}}
   - {time: 3, enable_torque: false}
   - {time: 4, parameters: {node: n, values: {a: 1, b: [1, 2.5], c: x, d: true, e: [x, y]}}}
-  - {time: 5, call: {service: controller_node/tare_ft_sensor, type: trigger}}
+  - {time: 5, call: {service: controller_node/tare_ft_sensor}}
   - {time: 6, push: {link: a, duration: 2, force: [0, 0, 1]}}
   - {time: 6.5, push: {link: b, duration: 2, force: [0, 0, 1]}}
   - {time: 8, push: {link: a, duration: 2, force: [0, 0, 1]}}
@@ -167,8 +167,8 @@ BOX = "name: a, shape: box, size: [1, 1, 1], position: [0, 0, 0]"
         ("parameters", "{node: n, values: {}}", "parameters.values"),
         ("parameters", "{node: n, values: {a: [1, x]}}", "values.a"),
         ("parameters", "{node: n, values: {a: [true]}}", "values.a"),
-        ("call", "{type: trigger}", "call.service"),
-        ("call", "{service: a, type: reboot}", "allowed: trigger"),
+        ("call", "{}", "call.service"),
+        ("call", "{service: a, type: reboot}", "has type; allowed: service"),
     ],
 )
 def test_an_event_that_cannot_be_is_named(tmp_path, kind, content, names):
