@@ -79,8 +79,6 @@ def two_links(
         [capsule("fore", *each) for each in capsules["fore"]],
         np.zeros(2),
         obstacles,
-        samples=10,
-        near=10.0,
     )
     limit = np.full(2, 20.0)
     dt = settings.pop("dt", 1e-3)
@@ -111,7 +109,7 @@ def panda(obstacles: bool = True) -> tuple[Arm, JointLimits, CollisionModel]:
     )
     surroundings = SURROUNDINGS if obstacles else ()
     capsules = read(ControllerConfiguration, config).collision.capsules
-    collision = build_collision_model(arm.model, capsules, arm.q_start, surroundings, samples=3000)
+    collision = build_collision_model(arm.model, capsules, arm.q_start, surroundings)
     return arm, limits, collision
 
 

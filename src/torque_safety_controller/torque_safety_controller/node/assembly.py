@@ -55,7 +55,6 @@ DISTURBANCE_MAX = 2.0
 """Disturbances beyond this many torque limits are not integrated."""
 
 _BEYOND = 0.003  # m; beyond margin and reserve, pairs nearer than this are too near from the start
-_NEAR = 0.028  # m; beyond margin and reserve, pairs that never come nearer need no guard
 
 
 def make_controller(
@@ -283,7 +282,6 @@ def make_collision(config: ControllerConfiguration, model: pin.Model) -> Collisi
     limited = model.copy()
     limited.lowerPositionLimit = config.position_min
     limited.upperPositionLimit = config.position_max
-    kept = collision.settings.kept
     return Collision(
         build_collision_model(
             limited,
@@ -292,8 +290,7 @@ def make_collision(config: ControllerConfiguration, model: pin.Model) -> Collisi
             collision.bodies,
             collision.pairs,
             config.base_frame,
-            near=kept + _NEAR,
-            clearance=kept + _BEYOND,
+            clearance=collision.settings.kept + _BEYOND,
         ),
         collision.acceleration_min,
         collision.acceleration_max,

@@ -70,8 +70,8 @@ class CollisionModel:
         moves: 1 for joints that move the first shape of a pair only, -1 the second only, shape
             (p, n).
         names: of the two shapes of each pair, ``link - link`` or ``link - obstacle``.
-        left_out: pairs that are not kept apart, by reason: ``far``, ``near at start``,
-            ``near mostly``; with obstacles ``near always``, as what the arm is mounted on.
+        left_out: pairs that are not kept apart, by reason: ``near at start``, ``near mostly``;
+            with obstacles ``near always``, as what the arm is mounted on.
     """
 
     arm: pin.Model
@@ -89,9 +89,7 @@ def build_collision_model(
     obstacles: Sequence[Shape] = (),
     pairs: Sequence[tuple[str, str]] | None = None,
     base_frame: str | None = None,
-    near: float = 0.05,
     clearance: float = 0.025,
-    samples: int = 20_000,
 ) -> CollisionModel:
     """Return the collision model of an arm.
 
@@ -102,13 +100,11 @@ def build_collision_model(
             automatically, those that are near each other there are left out.
         obstacles: that every link is kept away from which can move.
         pairs: of links to be kept apart; None chooses them automatically: all that are not
-            neighbours, less those left out by `near` and `clearance`.
+            neighbours, less those left out by `clearance`.
         base_frame: that obstacles are given in, fixed to the base; None: the URDF's root.
-        near: pairs that never come nearer than this are left out, m.
-        clearance: pairs that are nearer than this at the start, or in most samples, are left
-            out, m: more than the margin to be kept. Their capsules, not the links, are in each
-            other's way. So are obstacles that a link cannot get away from.
-        samples: random configurations within the position limits; +-pi where there are none.
+        clearance: pairs that are nearer than this at the start, or in most of some random
+            postures, are left out, m: more than the margin to be kept. Their capsules, not the
+            links, are in each other's way. So are obstacles that a link cannot get away from.
 
     Raises:
         SettingError: an unknown link, or nothing to keep apart in a pair asked for; named as the
@@ -132,18 +128,18 @@ def build_collision_model(
         geometry.addGeometryObject(shape.geometry(frame.parentJoint, frame.placement))
     for pair in chosen:
         geometry.addCollisionPair(pin.CollisionPair(*pair))
-    survey = _Survey(model, geometry, samples)
-    at_start = survey.near(np.asarray(q_start, dtype=np.float64), clearance)
-    share, comes_near = survey.share(clearance), survey.comes_nearer(near)
+    low = np.where(np.isfinite(model.lowerPositionLimit), model.lowerPositionLimit, -np.pi)
+    high = np.where(np.isfinite(model.upperPositionLimit), model.upperPositionLimit, np.pi)
+    postures = np.random.default_rng(0).uniform(low, high, size=(_POSTURES, model.nq))
+    share = _near(model, geometry, clearance, postures).mean(axis=0)
+    at_start = _near(model, geometry, clearance, np.array([q_start], dtype=np.float64))[0]
     kept: list[int] = []
     left_out: dict[str, list[str]] = {}
     names = [f"{shapes[i].name} - {shapes[j].name}" for i, j in chosen]
     for k, name in enumerate(names):
         reason = ""
         if k >= own:
-            reason = "near always" if share[k] == 1.0 else "" if comes_near[k] else "far"
-        elif pairs is None and not comes_near[k]:
-            reason = "far"
+            reason = "near always" if share[k] == 1.0 else ""
         elif pairs is None and at_start[k]:
             reason = "near at start"
         elif pairs is None and share[k] > _MOSTLY:
@@ -207,51 +203,16 @@ def _link_pairs(
     ]
 
 
-class _Survey:
-    """Distances of pairs in random configurations, by coal.
-
-    Args:
-        model: of the arm.
-        geometry: its shapes and pairs.
-        samples: how many configurations.
-    """
-
-    def __init__(self, model: pin.Model, geometry: pin.GeometryModel, samples: int) -> None:
-        self._model, self._data = model, model.createData()
-        self._geometry, self._found = geometry, geometry.createData()
-        low = np.where(np.isfinite(model.lowerPositionLimit), model.lowerPositionLimit, -np.pi)
-        high = np.where(np.isfinite(model.upperPositionLimit), model.upperPositionLimit, np.pi)
-        self._q = np.random.default_rng(0).uniform(low, high, size=(samples, model.nq))
-
-    def near(self, q: Array, clearance: float) -> NDArray[np.bool_]:
-        """Return which pairs are nearer than `clearance` in a configuration, shape (p,)."""
-        self._nearest(q)
-        distances = np.array([each.min_distance for each in self._found.distanceResults])
-        near: NDArray[np.bool_] = distances < clearance
-        return near
-
-    def share(self, clearance: float) -> Array:
-        """Return in which share of some configurations each pair is nearer than `clearance`."""
-        share: Array = np.mean([self.near(q, clearance) for q in self._q[:_POSTURES]], axis=0)
-        return share
-
-    def comes_nearer(self, near: float) -> NDArray[np.bool_]:
-        """Return for each pair whether it is nearer than `near` in any configuration."""
-        nearer = np.zeros(len(self._geometry.collisionPairs), dtype=bool)
-        for q in self._q:
-            while not nearer.all():
-                pair = self._nearest(q)
-                if self._found.distanceResults[pair].min_distance >= near:
-                    break
-                nearer[pair] = True
-                self._found.deactivateCollisionPair(pair)
-        return nearer
-
-    def _nearest(self, q: Array) -> int:
-        """Return the pair of least distance among those that are active."""
-        if not len(self._geometry.collisionPairs):
-            return 0
-        return int(pin.computeDistances(self._model, self._data, self._geometry, self._found, q))
+def _near(
+    model: pin.Model, geometry: pin.GeometryModel, clearance: float, postures: Array
+) -> NDArray[np.bool_]:
+    """Return which pairs are nearer than `clearance` in each posture, by coal, shape (k, p)."""
+    data, found = model.createData(), geometry.createData()
+    near = np.zeros((len(postures), len(geometry.collisionPairs)), dtype=bool)
+    for row, q in zip(near, postures, strict=True):
+        pin.computeDistances(model, data, geometry, found, q)
+        row[:] = [result.min_distance < clearance for result in found.distanceResults]
+    return near
 
 
 def _tables(
