@@ -118,10 +118,8 @@ def find_features(
         i, j, box = bodies[start[pair], 0], bodies[start[pair], 1], bodies[start[pair], 2]
         if box >= 0:
             _place_foot(i, 0.5, boxes, box, radius, j, points)
-        _relative(i, 0.5, j, 0.5, points, rel)
-        # The balls around the bodies are not nearer to each other than this.
-        gap = _size(rel, 0) - 0.5 * (_size(rel, 3) + _size(rel, 5)) - radius[i] - radius[j]
-        speed = _approach(i, j, points)
+        gap, speed = _apart(i, j, points)
+        gap -= radius[i] + radius[j]
         limit = max(near, kept + dt * speed + speed * speed / braking)
         distances[pair] = inf
         if gap > limit:
@@ -143,26 +141,21 @@ def find_features(
             if edge and not 0.0 < s < 1.0:
                 continue  # the ends have distances of their own
             _relative(i, s, j, t, points, rel)
-            d = _size(rel, 0)
-            gap = d - radius[i] - radius[j]
+            d = _write_feature(
+                i, s, t, box >= 0 and radius[j] > 0.0, points, rel, line[count], motion[count]
+            )
+            gap = motion[count, 0] = d - radius[i] - radius[j]
             distances[pair] = min(distances[pair], gap)
-            if gap > limit:
-                continue
-            _write_line(i, s, d, points, rel, line[count])
-            motion[count, 0] = gap
-            if _is_known(line, motion, first, count):
-                continue
-            flat = box >= 0 and radius[j] > 0.0
-            rate, bias = _derivatives(line[count], d, 0.0 < s < 1.0, 0.0 < t < 1.0, flat, rel)
-            motion[count, 1], motion[count, 2], pair_of[count] = rate, bias, pair
-            count += 1
+            known = gap > limit
+            for other in range(first, count):
+                off = abs(motion[other, 0] - gap)
+                for k in range(6):
+                    off = max(off, abs(line[other, k] - line[count, k]))
+                known = known or off < _SAME
+            if not known:
+                pair_of[count] = pair
+                count += 1
     return count
-
-
-@njit(cache=True)
-def _size(vectors: Array, k: int) -> float:
-    """Return the length of row `k`."""
-    return sqrt(vectors[k, 0] ** 2 + vectors[k, 1] ** 2 + vectors[k, 2] ** 2)
 
 
 @njit(cache=True)
@@ -183,16 +176,29 @@ def _relative(i: int, s: float, j: int, t: float, points: Array, rel: Array) -> 
 
 
 @njit(cache=True)
-def _approach(i: int, j: int, points: Array) -> float:
-    """Return the highest speed of points of segment i relative to points of segment j."""
-    most = 0.0
+def _apart(i: int, j: int, points: Array) -> tuple[float, float]:
+    """Return a distance that two axes are not nearer than, m, and their highest speed, m/s.
+
+    The distance is that of the balls around them; the speed, of a point of one relative to a point
+    of the other.
+    """
+    between, u, w, fastest = 0.0, 0.0, 0.0, 0.0
+    for k in range(3):
+        p, p_end, o, o_end = (
+            points[i, 0, 0, k],
+            points[i, 1, 0, k],
+            points[j, 0, 0, k],
+            points[j, 1, 0, k],
+        )
+        between += 0.25 * (p + p_end - o - o_end) ** 2
+        u, w = u + (p_end - p) ** 2, w + (o_end - o) ** 2
     for e in range(2):
         for f in range(2):
             square = 0.0
             for k in range(3):
                 square += (points[i, e, 1, k] - points[j, f, 1, k]) ** 2
-            most = max(most, square)
-    return sqrt(most)
+            fastest = max(fastest, square)
+    return sqrt(between) - 0.5 * (sqrt(u) + sqrt(w)), sqrt(fastest)
 
 
 @njit(cache=True)
@@ -268,11 +274,24 @@ def _chord(i: int, boxes: Array, box: int, points: Array) -> float:
 
 
 @njit(cache=True)
-def _write_line(i: int, s: float, d: float, points: Array, rel: Array, line: Array) -> None:
-    """Write the unit vector along the distance d, and its moment about the origin.
+def _write_feature(
+    i: int, s: float, t: float, flat: bool, points: Array, rel: Array, line: Array, motion: Array
+) -> float:
+    """Write line, rate and acceleration of a distance; return that of the axes, m.
 
-    Where the axes meet it is across both, or any.
+    Where the axes meet, the line is across both, or any.
+
+    Args:
+        i: the first segment.
+        s: share of it at which its closest point is.
+        t: likewise, of the second.
+        flat: whether the second is a face.
+        points: of `move_segments`.
+        rel: of `_relative`.
+        line: written, see `Features`.
+        motion: rate and acceleration are written.
     """
+    d = sqrt(rel[0, 0] ** 2 + rel[0, 1] ** 2 + rel[0, 2] ** 2)
     if d > _MET:
         for k in range(3):
             line[k] = rel[0, k] / d
@@ -283,54 +302,26 @@ def _write_line(i: int, s: float, d: float, points: Array, rel: Array, line: Arr
         size = sqrt(line[0] ** 2 + line[1] ** 2 + line[2] ** 2)
         for k in range(3):
             line[k] /= size
+    rate, bias, square, w_s, w_t, a, b, e = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(3):
         y, z = (k + 1) % 3, (k + 2) % 3
         p_y = (1.0 - s) * points[i, 0, 0, y] + s * points[i, 1, 0, y]
         p_z = (1.0 - s) * points[i, 0, 0, z] + s * points[i, 1, 0, z]
         line[3 + k] = p_y * line[z] - p_z * line[y]
-
-
-@njit(cache=True)
-def _is_known(line: Array, motion: Array, first: int, count: int) -> bool:
-    """Return whether the distance at `count` is one of those from `first` on."""
-    for c in range(first, count):
-        off = abs(motion[c, 0] - motion[count, 0])
-        for k in range(6):
-            off = max(off, abs(line[c, k] - line[count, k]))
-        if off < _SAME:
-            return True
-    return False
-
-
-@njit(cache=True)
-def _derivatives(
-    line: Array, d: float, s_slides: bool, t_slides: bool, flat: bool, rel: Array
-) -> tuple[float, float]:
-    """Return the rate of a distance, and its acceleration at zero joint acceleration.
-
-    Args:
-        line: unit vector along the distance.
-        d: distance of the axes, m.
-        s_slides: whether the closest point may slide along the first segment.
-        t_slides: whether it may along the second.
-        flat: whether the second is a face.
-        rel: of `_relative`.
-    """
-    rate, bias, square, w_s, w_t, a, b, e = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for k in range(3):
         v, u, w = rel[1, k], rel[3, k], rel[5, k]
         rate, bias, square = rate + line[k] * v, bias + line[k] * rel[2, k], square + v * v
         w_s += v * u + d * line[k] * rel[4, k]
         w_t += v * w + d * line[k] * rel[6, k]
         a, b, e = a + u * u, b + u * w, e + w * w
-    if flat or d < _BLUNT:
-        return rate, bias
-    # What sliding leaves of the curvature, less w' H^-1 w, by elimination.
-    curved, pivot = square - rate * rate, a
-    if t_slides and e > 0.0:
-        curved -= w_t * w_t / e
-        w_s -= b / e * w_t
-        pivot = max(a - b * b / e, _PARALLEL * a)
-    if s_slides and a > 0.0:
-        curved -= w_s * w_s / pivot
-    return rate, bias + curved / d
+    if not flat and d >= _BLUNT:
+        # What sliding leaves of the curvature, less w' H^-1 w, by elimination.
+        curved, pivot = square - rate * rate, a
+        if 0.0 < t < 1.0 and e > 0.0:
+            curved -= w_t * w_t / e
+            w_s -= b / e * w_t
+            pivot = max(a - b * b / e, _PARALLEL * a)
+        if 0.0 < s < 1.0 and a > 0.0:
+            curved -= w_s * w_s / pivot
+        bias += curved / d
+    motion[1], motion[2] = rate, bias
+    return d
