@@ -121,7 +121,7 @@ def bare_loop(rate: float, seconds: float, busy: float = 0.0) -> str:
     while last < begin + seconds:
         time.sleep(max(0.0, due - time.monotonic()))
         now = time.monotonic()
-        errors.note(abs(now - last - dt))
+        errors.add(abs(now - last - dt))
         late = max(0, math.floor((now - due) / dt))
         lost += late
         periods += 1

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-ENOUGH = 100
+TRUSTED_AFTER = 100
 """States in a row that must agree before one that does not counts: some robots report torques of
 other units or places, or zeros."""
 
-IGNORED = 3
+IGNORED_AFTER = 3
 """States in a row that do not agree after which commands count as ignored."""
 
 
@@ -46,7 +46,7 @@ class CommandCheck:
     @property
     def ignored(self) -> bool:
         """Whether the commands do not act."""
-        return self._in_row >= IGNORED
+        return self._in_row >= IGNORED_AFTER
 
     def sent(self, tau: Array) -> None:
         """Record the command that answers a state, shape (n,), N m."""
@@ -69,9 +69,9 @@ class CommandCheck:
             self._agreed += 1
             self._in_row = 0
             return True
-        if self._agreed < ENOUGH:
+        if self._agreed < TRUSTED_AFTER:
             self._agreed = 0
             return True
         self._in_row += 1
-        self.times += self._in_row == IGNORED
+        self.times += self._in_row == IGNORED_AFTER
         return False

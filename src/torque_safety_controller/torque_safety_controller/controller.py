@@ -136,7 +136,7 @@ class Controller:
             self.goals.targets, self.goals.posture = before
             return step
         self._command(step)
-        beyond = self._limiter.go_on_from(tau) - step.tau
+        beyond = self._limiter.continue_from(tau) - step.tau
         for part in self.parts:
             part.resume(step, beyond)
         return step

@@ -97,7 +97,7 @@ class Handover:
         """Forget the position that is held: the arm moves, or may have been put elsewhere."""
         self._q_hold = None
 
-    def begin(self, q: Array, tau: Array | None) -> None:
+    def start(self, q: Array, tau: Array | None) -> None:
         """Begin to average the torque of the motors.
 
         Args:

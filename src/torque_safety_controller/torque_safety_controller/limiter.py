@@ -34,7 +34,7 @@ class TorqueLimiter:
         """Forget the last torque; the next is not rate-limited."""
         self.last = None
 
-    def go_on_from(self, tau: np.ndarray) -> np.ndarray:
+    def continue_from(self, tau: np.ndarray) -> np.ndarray:
         """Set the last torque to `tau`, shape (n,), N m, clipped to the limits; return it."""
         self.last = np.clip(tau, self._tau_min, self.tau_max)
         return self.last

@@ -16,7 +16,7 @@ from viability_bounds_pkg.state import State
 Array = NDArray[np.float64]
 
 
-class HandModel:
+class FrameModel:
     """Kinematics of one frame, such as an end effector, at the current state.
 
     Attributes:
@@ -54,7 +54,7 @@ class HandModel:
         self.J_dot = pin.getFrameJacobianTimeVariation(model, data, self._frame_id, local)
 
 
-class RobotModel(HandModel):
+class RobotModel(FrameModel):
     """Kinematics of the end effectors and dynamics of the arm at the current state.
 
     The dynamics are those in the middle of the control step that the torque will be held for,
@@ -91,7 +91,7 @@ class RobotModel(HandModel):
         self, model: pin.Model, frame: str, dt: float, others: Sequence[str] = ()
     ) -> None:
         super().__init__(model, frame)
-        self.others = tuple(HandModel(model, each) for each in others)
+        self.others = tuple(FrameModel(model, each) for each in others)
         self.model = model
         self.dt = dt
         self.n = model.nv

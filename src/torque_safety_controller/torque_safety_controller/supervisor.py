@@ -121,7 +121,7 @@ class Supervisor:
 
     # States and their answers
 
-    def begin(self, reason: str) -> None:
+    def robot_returned(self, reason: str) -> None:
         """The robot has started, or was away; `reason` to rest before goals count, or empty."""
         self.put_elsewhere()
         if self._commands is not None:

@@ -22,8 +22,8 @@ class RecentValues:
         self._values = np.empty(_KEPT)
         self._count = 0
 
-    def note(self, value: float) -> None:
-        """Take a value."""
+    def add(self, value: float) -> None:
+        """Add a value."""
         self._values[self._count % _KEPT] = value
         self._count += 1
         if not value <= self.largest:

@@ -232,7 +232,7 @@ class BulletNode(ArmNode):
             return
         if math.isfinite(last):
             dt, took = self._config.dt, self._ticked_at - last
-            self._period_errors.note(abs(took - dt))
+            self._period_errors.add(abs(took - dt))
             # A real robot would have gone on.
             self._late += max(0, round(took / dt) - 1)
         if not self._advanced:

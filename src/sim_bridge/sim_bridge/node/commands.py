@@ -94,7 +94,7 @@ class CommandStream:
             self._count_stray(own, stamp)
             return False
         self._strays = 0
-        self.latencies.note(time.monotonic() - published_at + age * self._config.dt)
+        self.latencies.add(time.monotonic() - published_at + age * self._config.dt)
         if not late:
             self.receive(command)
         return not late

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from torque_safety_controller.command_check import ENOUGH, IGNORED, CommandCheck
+from torque_safety_controller.command_check import IGNORED_AFTER, TRUSTED_AFTER, CommandCheck
 
 TOLERANCE = np.array([1.0, 2.0])
 TAU = np.array([5.0, -3.0])
@@ -15,7 +15,7 @@ TAU = np.array([5.0, -3.0])
 def agreed(reach=3) -> CommandCheck:
     """Return a check after enough states that agree."""
     check = CommandCheck(TOLERANCE, reach)
-    for _ in range(ENOUGH):
+    for _ in range(TRUSTED_AFTER):
         check.sent(TAU)
         assert check.agrees(TAU)
     return check
@@ -23,9 +23,9 @@ def agreed(reach=3) -> CommandCheck:
 
 def test_from_the_third_state_in_a_row_on_commands_are_ignored():
     check = agreed()
-    for in_row in range(1, IGNORED + 3):
+    for in_row in range(1, IGNORED_AFTER + 3):
         assert not check.agrees(TAU + [0.0, 2.1])
-        assert check.ignored == (in_row >= IGNORED)
+        assert check.ignored == (in_row >= IGNORED_AFTER)
         check.sent(TAU)
     assert check.times == 1
     assert check.agrees(TAU + [0.9, -1.9])
@@ -48,7 +48,7 @@ def test_what_is_not_finite_agrees_with_nothing(value):
 
 def test_torques_that_never_agreed_are_of_another_kind():
     check = CommandCheck(TOLERANCE, 3)
-    for _ in range(3 * ENOUGH):
+    for _ in range(3 * TRUSTED_AFTER):
         check.sent(TAU)
         assert check.agrees(np.zeros(2))
     assert not check.ignored

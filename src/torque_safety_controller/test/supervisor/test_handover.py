@@ -28,7 +28,7 @@ def test_the_position_is_captured_once_and_copied():
     handover.hold(q)
     q += 1.0
     np.testing.assert_array_equal(handover.hold(q), Q)
-    handover.begin(Q, TAU)
+    handover.start(Q, TAU)
     np.testing.assert_array_equal(handover.hold(q), Q)
     handover.release()
     np.testing.assert_array_equal(handover.hold(q), q)
@@ -46,13 +46,13 @@ def test_the_position_is_captured_once_and_copied():
 def test_torque_is_refused_with_the_reason(q, tau, reason):
     handover = make()
     with pytest.raises(HandoverRefused, match=reason):
-        handover.begin(q, tau)
-    handover.begin(Q, 1.005 * TAU)  # what a sensor adds to full torque is tolerated
+        handover.start(q, tau)
+    handover.start(Q, 1.005 * TAU)  # what a sensor adds to full torque is tolerated
 
 
 def test_a_torque_without_noise_is_known_from_a_few_states():
     handover = make()
-    handover.begin(Q, TAU)
+    handover.start(Q, TAU)
     for _ in range(FEWEST - 1):
         assert handover.torque(Q, TAU) is None
     known = handover.torque(Q, TAU)
@@ -66,7 +66,7 @@ def test_noise_is_averaged_until_the_mean_is_known_well_enough():
     off = []
     for seed in range(50):
         random, handover, known = np.random.default_rng(seed), make(), None
-        handover.begin(Q, TAU)
+        handover.start(Q, TAU)
         while known is None:
             known = handover.torque(Q, TAU + 0.005 * TAU_MAX * random.standard_normal(3))
         assert FEWEST <= known.samples < 100
@@ -78,7 +78,7 @@ def test_noise_is_averaged_until_the_mean_is_known_well_enough():
 
 def test_a_torque_that_drifts_is_known_as_it_is_now():
     handover = make()
-    handover.begin(Q, 0.0 * TAU)
+    handover.start(Q, 0.0 * TAU)
     known = None
     for k in range(FEWEST):
         assert known is None
@@ -88,7 +88,7 @@ def test_a_torque_that_drifts_is_known_as_it_is_now():
 
 def test_a_torque_that_stays_unknown_is_refused_after_some_time():
     random, handover, periods = np.random.default_rng(1), make(), 0
-    handover.begin(Q, 0.5 * TAU + 1.0)
+    handover.start(Q, 0.5 * TAU + 1.0)
     with pytest.raises(HandoverRefused, match=r"torque of b is known to \d+\.\d+% of torque_max"):
         while periods < 10_000:
             noise = np.array([0.0, 5.0, 0.0]) * random.standard_normal(3)
@@ -100,7 +100,7 @@ def test_a_torque_that_stays_unknown_is_refused_after_some_time():
 def test_a_handover_asked_for_again_begins_to_average_anew():
     handover = make()
     for tau in (TAU, -TAU):
-        handover.begin(Q, tau)
+        handover.start(Q, tau)
         for _ in range(FEWEST):
             known = handover.torque(Q, tau)
         np.testing.assert_allclose(known.mean, tau)

@@ -7,7 +7,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from torque_safety_controller.command_check import ENOUGH, CommandCheck
+from torque_safety_controller.command_check import TRUSTED_AFTER, CommandCheck
 from torque_safety_controller.modes import CAUSES, CHANGES, Control, Goals, Mode
 from torque_safety_controller.ramp import FALL_TIME, RISE_TIME
 from torque_safety_controller.supervisor import REST_PATIENCE, Supervisor
@@ -52,7 +52,7 @@ def test_it_is_stopped_until_the_first_state():
     assert chain.now == (Mode.STOPPED, "no joint state yet")
     chain.supervisor.silent("no joint state")
     assert chain.now == (Mode.STOPPED, "no joint state yet")
-    chain.supervisor.begin("")
+    chain.supervisor.robot_returned("")
     assert chain.answer(None).share == 1.0
     assert chain.now == (Mode.TRACKING, "goal")
     assert chain.told == [(Mode.TRACKING, "goal")]
@@ -72,7 +72,7 @@ ROWS = {
     "rival": (lambda c: c.answer(goal="rival"), lambda c: c.answer()),
     "no goal": (lambda c: c.answer(goal="no goal"), lambda c: c.answer()),
     "moves": (
-        lambda c: (c.supervisor.begin("why"), c.answer(None, v=MOVES)),
+        lambda c: (c.supervisor.robot_returned("why"), c.answer(None, v=MOVES)),
         lambda c: c.run(3),
     ),
     "drives": (
@@ -108,9 +108,9 @@ def test_what_must_not_change_by_accident():
 def test_each_cause_gives_its_mode_and_its_share_and_ends(name):
     begins, ends = ROWS[name]
     cause, chain = CAUSES[name], Chain(commands=CommandCheck(0.1 * TAU, 1))
-    chain.supervisor.begin("")
+    chain.supervisor.robot_returned("")
     chain.answer(None)
-    chain.run(ENOUGH)
+    chain.run(TRUSTED_AFTER)
     begins(chain)
     mode, reason = chain.now
     assert mode is (cause.mode or Mode.TRACKING)
@@ -185,7 +185,7 @@ def test_a_pause_in_which_the_robot_stops_itself_holds_the_arm_until_it_rests():
 def test_nothing_is_learned_and_the_integral_fades_while_commands_do_not_act():
     chain = Chain(commands=CommandCheck(0.1 * TAU, 1))
     chain.answer(None)
-    chain.run(ENOUGH)
+    chain.run(TRUSTED_AFTER)
     orders = [chain.answer(tau=-TAU) for _ in range(60)]
     assert not any(order.obeyed for order in orders)
     assert [order.forget_disturbance for order in orders[:4]] == [False, False, True, True]
@@ -196,7 +196,7 @@ def test_nothing_is_learned_and_the_integral_fades_while_commands_do_not_act():
 
 def test_the_share_waits_for_a_goal():
     chain = Chain()
-    chain.supervisor.begin("the motors held the arm before")
+    chain.supervisor.robot_returned("the motors held the arm before")
     assert chain.answer(None, goal="no goal").share == 0.0
     assert not any(chain.run(100, goal="no goal"))
     assert 0.0 < chain.answer().share < 0.01
@@ -230,7 +230,7 @@ def test_control_changes_by_its_table_and_not_else(control, event):
 def test_a_robot_that_was_away_does_not_get_torque_unasked(start, control, after):
     chain = Chain(start)
     chain.supervisor._set_control(control, "")
-    chain.supervisor.begin("")
+    chain.supervisor.robot_returned("")
     assert chain.supervisor.control is after
 
 
@@ -311,7 +311,7 @@ class Events(RuleBasedStateMachine):
     @rule(reason=st.sampled_from(["", "the motors held the arm before"]))
     def begin(self, reason):
         """The robot begins anew."""
-        self.supervisor.begin(reason)
+        self.supervisor.robot_returned(reason)
 
     @rule(event=st.sampled_from(["silent", "refused"]))
     def stop(self, event):

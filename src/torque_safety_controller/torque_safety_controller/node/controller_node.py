@@ -146,7 +146,7 @@ class ControllerNode(ArmNode):
                 self._commands.again(stamp)
             return
         if arrival is not Arrival.NEW:
-            self._begin(arrival)
+            self._start_over(arrival)
         elif states.unseen and self._supervisor.by_drives:
             # They would jump to where the arm was held before, from where it has been put.
             self._put_elsewhere()
@@ -174,7 +174,7 @@ class ControllerNode(ArmNode):
         elif in_row == UNSEEN:
             self._supervisor.refused(states.why_refused)
 
-    def _begin(self, arrival: Arrival) -> None:
+    def _start_over(self, arrival: Arrival) -> None:
         """Start anew: the robot was silent, or restarted."""
         states, reason = self._states, ""
         if arrival is Arrival.RESTARTED and self._limits.stamp == states.answered_stamp:
@@ -186,7 +186,7 @@ class ControllerNode(ArmNode):
             reason = "joint states were missing"
         states.forget_answers()
         self._controller.reset(states.q)
-        self._supervisor.begin(reason)
+        self._supervisor.robot_returned(reason)
         self._handover.release()
 
     def _put_elsewhere(self) -> None:
@@ -269,7 +269,7 @@ class ControllerNode(ArmNode):
         if self._limits.stamp < 0 or apart > config.bounds_timeout:
             raise HandoverRefused("no acceleration limits, or only old ones")
         if control is Control.POSITION:
-            self._handover.begin(states.q, states.effort())
+            self._handover.start(states.q, states.effort())
 
     # Watchdogs
 

@@ -277,9 +277,9 @@ class GoalSubscriber:
         q_des = posture_from_message(
             message, config.joints, config.position_min, config.position_max
         )
-        self.add(message, lambda: self._take_posture(q_des))
+        self.add(message, lambda: self._set_posture(q_des))
 
-    def _take_posture(self, q_des: np.ndarray) -> None:
+    def _set_posture(self, q_des: np.ndarray) -> None:
         if not isinstance(self.motion, TrajectoryMotion):  # which leaves the posture to others
             self.motion = None
         self._controller.goals.set_posture(q_des)

@@ -103,7 +103,7 @@ class ControllerReport:
 
     def add(self, step: Step, latency: float) -> None:
         """Count a step that was answered `latency` seconds after its state came."""
-        self._latencies.note(latency)
+        self._latencies.add(latency)
         self._last = step
         self._steps += 1
         self._failures += bool(step.failure)

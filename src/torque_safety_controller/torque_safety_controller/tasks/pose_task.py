@@ -23,7 +23,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from torque_safety_controller.qp import TaskTerm
-from torque_safety_controller.robot_model import HandModel, RobotModel
+from torque_safety_controller.robot_model import FrameModel, RobotModel
 
 Array = NDArray[np.float64]
 
@@ -68,7 +68,7 @@ class PoseTask:
     error_max: tuple[float, float] | None = None
     separate: bool = False
 
-    def term(self, robot: HandModel) -> TaskTerm:
+    def term(self, robot: FrameModel) -> TaskTerm:
         """Return ``J a = kp error - kd J v - J' v + feedforward`` as a term of the cost."""
         pose, goal = robot.pose, self.pose_des
         error = separate_error(pose, goal) if self.separate else pose_error(pose, goal)

@@ -96,7 +96,7 @@ class ArmNode(StreamNode):
         """Warn once if nothing publishes ``/clock``: stamps of what is published stay zero."""
         steady = Clock(clock_type=ClockType.STEADY_TIME)
 
-        def look() -> None:
+        def warn_without_clock() -> None:
             timer.cancel()
             if not self.count_publishers("/clock"):
                 self.get_logger().warning(
@@ -104,7 +104,7 @@ class ArmNode(StreamNode):
                     " s: set it to false, or start the simulation that publishes it"
                 )
 
-        timer = self.create_timer(CLOCK_TIMEOUT, look, clock=steady)
+        timer = self.create_timer(CLOCK_TIMEOUT, warn_without_clock, clock=steady)
 
     def _watch_types(self, name: str, namespace: str) -> None:
         """Warn of topics that others use with another type: the middleware keeps them apart."""
@@ -117,7 +117,7 @@ class ArmNode(StreamNode):
             for topic, types in topics
         }
 
-        def look() -> None:
+        def warn_of_types() -> None:
             for topic, types in self.get_topic_names_and_types():
                 others = [each for each in types if each != own.get(topic, each)]
                 if others:
@@ -128,4 +128,4 @@ class ArmNode(StreamNode):
                     )
 
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(_TYPE_PERIOD, look, clock=steady)
+        self.create_timer(_TYPE_PERIOD, warn_of_types, clock=steady)

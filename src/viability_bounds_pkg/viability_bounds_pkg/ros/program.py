@@ -50,12 +50,12 @@ def spin(executor: Executor, node: Node) -> None:
         signal.signal(each, lambda number, _: signals.append(number))
     told: Future = Future()
 
-    def look() -> None:
+    def end_wait() -> None:
         if signals:
             told.set_result(None)
 
     steady = Clock(clock_type=ClockType.STEADY_TIME)
-    node.create_timer(_SIGNAL_CHECK_PERIOD, look, clock=steady)
+    node.create_timer(_SIGNAL_CHECK_PERIOD, end_wait, clock=steady)
     while rclpy.ok(context=node.context) and not told.done():
         executor.spin_until_future_complete(told, timeout_sec=_SIGNAL_CHECK_PERIOD)
 
