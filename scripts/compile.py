@@ -20,19 +20,18 @@ CONFIG = Path(__file__).resolve().parent.parent / "config"
 
 
 def main() -> None:
-    """Play a few steps of each robot, one of them beside a wall."""
+    """Play a few steps of each robot, and of one beside a wall in each mode of integral action."""
     argparse.ArgumentParser(prog="compile.py", description=__doc__).parse_args()
     for path in sorted(CONFIG.glob("*.yaml")):
         try:
             loop = DirectLoop(path.stem)
-            for mode in ("task", "none", "joints"):
-                loop.change(integral_action=mode)
-                loop.run(2.0 * loop.dt)
+            loop.run(2.0 * loop.dt)
         except ArmSafetyError as error:  # a file of the user's; its nodes will say so, too
             print(f"setup: nothing is compiled for {path.name}: {error}", file=sys.stderr)
     (wall,) = yaml.safe_load((CONFIG / "obstacles" / "panda_wall.yaml").read_text()).values()
-    loop = DirectLoop("panda", wall["ros__parameters"])
-    loop.run(2.0 * loop.dt)
+    for mode in ("joints", "task"):
+        loop = DirectLoop("panda", wall["ros__parameters"] | {"integral_action": mode})
+        loop.run(2.0 * loop.dt)
 
 
 if __name__ == "__main__":

@@ -75,6 +75,9 @@ fi
 folder="$(dirname "$config")"
 scenarios="$folder/scenarios"
 if [ -f "$scenarios/${robot}_$scenario.yaml" ]; then
+    # What its nodes need from their start on.
+    own="$scenarios/start/${robot}_$scenario.yaml"
+    [ ! -f "$own" ] || params=("$own" "${params[@]}")
     scenario="$scenarios/${robot}_$scenario.yaml"
 elif [ ! -f "$scenario" ] && [ "$scenario" = demo ]; then
     scenario=hold

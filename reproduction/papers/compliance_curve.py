@@ -81,7 +81,6 @@ def draw(
     poles: Sequence[Obstacle] = (),
     turns: int = TURNS,
     period: float = PERIOD,
-    switches: Mapping[float, str] | None = None,
 ) -> Drawn:
     """Draw the curve with the arm.
 
@@ -90,7 +89,6 @@ def draw(
         poles: that stand in the way.
         turns: how often.
         period: mean duration of a turn, s.
-        switches: which integral action to go over to, by time, s.
     """
     loop = DirectLoop(ROBOT, {"start_positions": START, **changed})
     for pole in poles:
@@ -100,12 +98,9 @@ def draw(
         circle(loop.pose(), 0.5 * DIAMETER, PLANE, period=period, turns=turns)
     )
     begin = loop.t
-    due = sorted((switches or {}).items())
     goals, forces, touched = [], [], set()
 
     def each(t: float) -> None:
-        while due and t - begin >= due[0][0] - 0.5 * loop.dt:
-            loop.change(integral_action=due.pop(0)[1])
         pose, twist, twist_rate = trajectory.sample(t - begin)
         loop.controller.goals.set_pose(pose, twist, twist_rate)
         goals.append(pose.translation)
@@ -145,26 +140,8 @@ def judge(run: Drawn) -> dict[str, float]:
     return result
 
 
-def steps_at(run: Drawn, switches: Mapping[float, str]) -> list[tuple[float, float]]:
-    """Return the torque's steps at switches, and the largest beside them, in torque limits.
-
-    A switch acts in the step after the one that brings it; three steps are counted as its own,
-    those within 0.2 s before and after as beside it.
-    """
-    tau = column(run.samples, "tau") / run.loop.config.torque_max
-    steps = np.abs(np.diff(tau, axis=0)).max(axis=1)
-    wide, result = round(0.2 / run.loop.dt), []
-    for time in sorted(switches):
-        k = round(time / run.loop.dt)
-        beside = np.concatenate([steps[k - 1 - wide : k - 1], steps[k + 2 : k + 2 + wide]])
-        result.append((float(steps[k - 1 : k + 2].max()), float(beside.max())))
-    return result
-
-
 SPRING = {"posture_kp": 1.0}
 """1/s^2: barely felt, but brings the null space back to the poles in every turn."""
-SWITCHES = {1.5: "task", 2.5: "joints", 3.2: "task", 4.0: "joints", 4.6: "task"}
-"""In the middle of a turn of 6 s, where the hand is fastest."""
 
 
 @cache
@@ -300,48 +277,3 @@ def _picture(free: Mapping[str, Drawn], poles: Mapping[str, Drawn]) -> plt.Figur
         for axis in column_of[1:]:
             axis.grid(alpha=0.3)
     return picture
-
-
-def switching() -> Figure:
-    """Null-space compliance switched on and off while the hand draws the curve."""
-    figure = Figure("paper1-switching")
-    run = draw({"integral_action": "joints"}, turns=1, period=6.0, switches=SWITCHES)
-    found = steps_at(run, SWITCHES)
-    place, _ = hand_errors(run.samples)
-    at, beside = (max(values) for values in zip(*found, strict=True))
-    figure.metrics = {
-        "largest_step_share": at,
-        "largest_step_beside_share": beside,
-        "hand_m": float(place.max()),
-        "within_limits": float(within_limits(run.loop)),
-    }
-    tau = column(run.samples, "tau") / run.loop.config.torque_max
-    figure.data = {"t": run.t, "tau": column(run.samples, "tau"), "hand": place}
-    picture, axes = plt.subplots(3, 1, figsize=(10, 9), sharex=True, layout="constrained")
-    axes[0].plot(run.t, tau, lw=1, label=run.loop.config.joints)
-    axes[0].set(ylabel="torque [torque limits]", title="switched in motion")
-    axes[0].legend(fontsize="x-small", ncols=3)
-    steps = np.abs(np.diff(tau, axis=0)).max(axis=1)
-    axes[1].semilogy(run.t[1:], np.maximum(1e2 * steps, 1e-4), color="black", lw=0.7)
-    axes[1].set(ylabel="largest step of a torque\n[% of its limit a period]")
-    axes[2].plot(run.t, 1e3 * place, color="tab:red", lw=1)
-    axes[2].set(xlabel="time [s]", ylabel="hand off its reference [mm]")
-    spans = [0.0, *SWITCHES, run.t[-1]]
-    for k, axis in enumerate(axes):
-        axis.grid(alpha=0.3)
-        for index, (begin, end) in enumerate(zip(spans, spans[1:], strict=False)):
-            if index % 2 == 1:
-                label = "null-space compliance" if k == 2 and index == 1 else None
-                axis.axvspan(begin, end, color="tab:blue", alpha=0.12, label=label)
-    axes[2].legend(loc="upper right")
-    figure.rows.append(
-        (
-            f"Switched on and off {len(SWITCHES)} times in motion",
-            "-",
-            f"largest step of a torque at a switch {at:.3%} of its limit, within 0.2 s beside "
-            f"one {beside:.3%}; hand within {1e3 * place.max():.1f} mm",
-            "no jump" if at <= 1.5 * beside else "DIFFERS",
-        )
-    )
-    figure.save(picture)
-    return figure

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from chain import ROOT
-from compliance_curve import adverse, figure_10, switching
+from compliance_curve import adverse, figure_10
 from compliance_hand import dual, pressing
 from compliance_push import figure_6, forces
 from compliance_stills import embed, figure_10_stills, figures_7_and_8
@@ -54,7 +54,6 @@ PARTS: dict[str, Callable[[], Figure]] = {
     "fig10": figure_10,
     "stills": figure_10_stills,
     "adverse": adverse,
-    "switching": switching,
     "press": press,
 }
 PAGE = """# Results beside the paper: compliance

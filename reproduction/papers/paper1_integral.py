@@ -385,7 +385,6 @@ class Disturbed:
             loop.change(
                 integral_lambda=float(rng.choice([2.0, 10.0, 100.0])),
                 integral_leak=[float(rng.choice([0.0, 0.1, 1.0])), 100.0, float(rng.uniform())],
-                integral_action=str(rng.choice(["none", "joints", "joints", "task"])),
                 integral_budget=(rng.uniform(0.05, 0.3) * loop.config.torque_max).tolist(),
             )
 

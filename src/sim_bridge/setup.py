@@ -11,6 +11,7 @@ FOLDERS = (
     "layouts",
     "obstacles",
     "scenarios",
+    "scenarios/start",
     "two_hands",
 )
 CONFIG = ("config", *(f"config/{folder}" for folder in FOLDERS))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""TALOS with friction, stiff at the hand and free in the null space: pushes, poles, switching.
+"""TALOS with friction, stiff at the hand and free in the null space: pushes and poles.
 
 Shorter runs of what `scripts/reproduce.sh paper1-compliance` plays.
 """
@@ -8,7 +8,6 @@ import compliance_curve as curve
 import compliance_push as pushing
 import numpy as np
 import pytest
-from direct import column
 
 pytestmark = pytest.mark.long
 
@@ -56,12 +55,3 @@ def test_unknown_poles_are_given_way_to_and_the_curve_is_drawn():
     assert found[COMPLIANT]["within_limits"]
     assert found[COMPLIANT]["force_n"] < found[LACKING]["force_n"]
     assert found[COMPLIANT]["impulse_n_s"] < found[LACKING]["impulse_n_s"]
-
-
-def test_switched_in_motion_the_torque_does_not_jump():
-    switches = {1.2: "task", 2.0: "joints", 2.7: "task"}
-    run = curve.draw({"integral_action": "joints"}, turns=1, period=4.0, switches=switches)
-    for at, beside in curve.steps_at(run, switches):
-        assert at <= 1.5 * beside
-    assert pushing.hand_errors(run.samples)[0].max() < 0.02
-    assert np.isfinite(column(run.samples, "tau")).all()

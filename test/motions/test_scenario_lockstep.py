@@ -93,15 +93,15 @@ def test_the_nodes_play_what_a_loop_without_messages_plays():
 
 @pytest.mark.long
 def test_a_hand_presses_on_a_table_as_hard_as_it_is_told():
-    """The beginning of the scenario that is shipped: a table, parameters, tare, a wrench."""
-    scenario = yaml.safe_load(
-        (config_folder() / "scenarios" / "panda_press_on_table.yaml").read_text()
-    )
+    """The beginning of the scenario that is shipped: a table, tare, a wrench."""
+    name, folder = "panda_press_on_table.yaml", config_folder() / "scenarios"
+    scenario = yaml.safe_load((folder / name).read_text())
+    (own,) = yaml.safe_load((folder / "start" / name).read_text()).values()
     scenario = {
         "duration": 2.5,
         "events": [event for event in scenario["events"] if event["time"] < 2.5],
     }
-    result = run_chain(load_values(ROBOT), scenario, {})
+    result = run_chain(load_values(ROBOT) | own["ros__parameters"], scenario, {})
     run = result.run
     tared, pressing = run.t < 0.5, run.t > 2.2
     force = run.ft_wrench[:, :3] - run.ft_wrench[tared, :3].mean(axis=0)

@@ -154,6 +154,7 @@ class Controller:
             self.goals.hold_here(self.robot)
             self.step(state, AccelerationRange(zero - width, zero + width))
         self.step(state, None)
+        self.resume(state, AccelerationRange(zero - 1e3, zero + 1e3), zero)
         self.goals.targets = before
         self.reset(zero)
 

@@ -111,10 +111,6 @@ class FadingTorque:
         """
         self.last = self._fading = torque
 
-    def go_on_from(self, torque: Array) -> None:
-        """Let the next step continue what another action added, shape (n,), N m."""
-        self.last = self._fading = torque
-
     def _faded(self, elapsed: float, period: float) -> Array:
         """Let the time pass for what fades, and return it; infinite time is a period."""
         gap = min(elapsed, LONGEST_GAP * period) if elapsed > 0.0 else 0.0  # also for a NaN
@@ -128,7 +124,7 @@ class IntegralAction(FadingTorque):
 
     Args:
         mode: one of `MODES` but ``none``.
-        settings: may be replaced between steps: the torque does not jump.
+        settings: their numbers may be replaced between steps: the torque does not jump.
         disturbance_max: largest disturbance of each joint that is integrated, shape (n,), N m;
             what friction and a wrong model never are, but a sensor's glitch or a blow may be.
         hands: end effectors whose rows are stacked to one task.
@@ -157,7 +153,7 @@ class IntegralAction(FadingTorque):
         super().reset()
         self._lowered = self._checked = 0
         self._use(self.settings)
-        self._started = self._lost = self._resuming = self._due = False
+        self._started = self._lost = self._resuming = False
         self._q_last = self._v_last = self._zero
 
     def forget(self) -> None:
@@ -167,10 +163,6 @@ class IntegralAction(FadingTorque):
 
     def torque(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> Array:
         """See `FadingTorque`."""
-        if self._due:
-            self._due = False
-            self.resume(robot, v, self.last)
-            return self.last
         try:
             torque = self._next(robot, v, a_last, elapsed)
         except ValueError:  # numbers that are not finite, or no mass matrix
@@ -191,11 +183,6 @@ class IntegralAction(FadingTorque):
         self._use(self._stable(robot.M, robot.dt))
         self._hold(robot, v, torque)
         self.last = torque
-
-    def go_on_from(self, torque: Array) -> None:
-        """See `FadingTorque`; the memory holds what it can of it from then on."""
-        super().go_on_from(torque)
-        self._due = True
 
     def _next(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> Array | None:
         """Return the torque of this step; None where the state jumped."""
@@ -339,37 +326,6 @@ def make_integral(
     if mode == "none":
         return FadingTorque(settings)
     return IntegralAction(mode, settings, disturbance_max, hands)
-
-
-def warm_up(settings: IntegralSettings, hands: int = 1) -> None:
-    """Use every law once, so that a change of mode has nothing to compile in a control loop."""
-    n = len(settings.budget)
-    one, zero = np.eye(n), np.zeros(n)
-    coupling(one)
-    _jumped(one, zero, zero, zero, zero, zero, 0.0, zero)
-    for mode in MODES[1:]:
-        m = hands * TASKS[mode].stop if mode in TASKS else 1
-        if m < n:
-            J = np.eye(m, n)
-            arm, law = ArmTerms(one, 0.0 * one, J, 0.0 * J, zero), _make_law(mode, settings, hands)
-            law.torque(arm, zero, 0.0)
-            law.initialise(zero, arm)
-
-
-def changed(
-    action: FadingTorque,
-    mode: str,
-    settings: IntegralSettings,
-    disturbance_max: Array,
-    hands: int = 1,
-) -> FadingTorque:
-    """Return an action with other settings, or one of another law, which continues its torque."""
-    if (mode, settings.as_printed) == (action.mode, action.settings.as_printed):
-        action.settings = settings
-        return action
-    other = make_integral(mode, settings, disturbance_max, hands)
-    other.go_on_from(action.last)
-    return other
 
 
 def _make_law(mode: str, settings: IntegralSettings, hands: int) -> IntegralLaw:

@@ -17,14 +17,12 @@ class Settings:
 
     Attributes:
         gains: of the tasks.
-        integral_action: mode of the integral action, one of `integral_action.MODES`.
         integral: of the integral action.
         friction: of the friction compensation.
         interaction: of forces at the hand.
     """
 
     gains: Gains
-    integral_action: str
     integral: IntegralSettings
     friction: FrictionSettings
     interaction: InteractionSettings

@@ -18,32 +18,10 @@ from integral_loop import (
     settled,
 )
 
-from torque_safety_controller.integral_action import MODES, changed
+from torque_safety_controller.integral_action import MODES
 from viability_bounds_pkg.state import State
 
 # No jumps
-
-
-@pytest.mark.parametrize("before", MODES)
-@pytest.mark.parametrize("after", MODES)
-def test_modes_change_without_a_jump(before, after):
-    loop = settled(before)
-    loop.action = changed(loop.action, after, make_settings(), 2.0 * ARM.tau_max)
-    loop.step()
-    assert loop.steps(1) < (5e-4 if after == "none" else 2e-4)  # what is left fades at once
-    loop.run(0.2)
-    # What a mode cannot take over fades with 0.2 s: 0.5% a period of less than the budget. A
-    # stiffer mode has more error to integrate.
-    assert loop.steps(200) < (1e-3 if after in ("none", before) else 5e-3)
-    assert loop.action.skipped == 0
-
-
-def test_a_mode_that_is_left_fades():
-    loop = settled("joints")
-    loop.action = changed(loop.action, "none", make_settings(), 2.0 * ARM.tau_max)
-    torques = np.array(loop.run(1.0).torques[-1000:])
-    assert (np.diff(np.abs(torques), axis=0) <= 1e-12).all()
-    np.testing.assert_allclose(torques[-1], torques[0] * math.exp(-0.999 / 0.2), rtol=1e-6)
 
 
 @pytest.mark.parametrize("mode", MODES[1:])

@@ -63,7 +63,7 @@ def make(
     robot = arm.robot() if robot is None else robot
     parts = [Goals(robot.n, gains, len(robot.others))]
     if integral is not None:
-        parts.append(Integral(integral, robot, 2.0 * arm.tau_max))
+        parts.append(Integral(integral, robot))
     if friction is not None:
         parts.append(Friction(FrictionCompensation(friction)))
     if gains.disturbance_time is not None:

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from torque_safety_controller.controller import Controller
-from torque_safety_controller.integral_action import make_integral, warm_up
+from torque_safety_controller.integral_action import make_integral
 from torque_safety_controller.parameters.contact_parameters import ContactPoint
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parts.collision.avoidance import Collision
@@ -81,7 +81,6 @@ def make_controller(
         config.qp_solver,
         config.gains.hold_kd,
     )
-    warm_up(config.integral_settings, len(config.end_effectors))
     controller.warm_up()
     return controller, base
 
@@ -152,7 +151,7 @@ def make_integral_part(config: ControllerConfiguration, robot: RobotModel) -> In
     """Return the integral action; a torque that is taken over fades where it is off."""
     mode, settings = config.integral.integral_action, config.integral_settings
     most = DISTURBANCE_MAX * config.torque_max
-    return Integral(make_integral(mode, settings, most, 1 + len(robot.others)), robot, most)
+    return Integral(make_integral(mode, settings, most, 1 + len(robot.others)), robot)
 
 
 def make_disturbance(config: ControllerConfiguration) -> Disturbance | None:

@@ -59,7 +59,6 @@ class IntegralConfiguration:
         "none; joints: all joints stiff; task, position: the end effector's pose, or its "
         "position, stiff and the null space compliant",
         default="none",
-        live=True,
         choices=MODES,
     )
     integral_budget: Array = joint_numbers(
@@ -90,7 +89,6 @@ class IntegralConfiguration:
         "the gains only, by eq. (11) and (10), and the law is as printed, that of task and "
         "position with (16), (21) and (26)",
         default="qp",
-        live=True,
         choices=METHODS,
     )
 
@@ -271,7 +269,6 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
         """What may change while the controller runs."""
         return Settings(
             self.gains,
-            self.integral.integral_action,
             self.integral_settings,
             self.friction_settings,
             self.interaction.settings,

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from torque_safety_controller.integral_action import FadingTorque, changed
+from torque_safety_controller.integral_action import FadingTorque
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.settings import Settings
 from torque_safety_controller.step import Array, Part, Step, joints_named
@@ -18,27 +18,18 @@ class Integral(Part):
     Args:
         action: in one of its modes.
         robot: of the arm; it has to give the rates of its matrices, if the action needs them.
-        disturbance_max: of actions of other modes; see `IntegralAction`.
 
     Attributes:
-        action: as given, or as its parameters were changed since.
+        action: as given.
     """
 
-    def __init__(self, action: FadingTorque, robot: RobotModel, disturbance_max: Array) -> None:
+    def __init__(self, action: FadingTorque, robot: RobotModel) -> None:
         self.action, self._robot = action, robot
-        self._disturbance_max = disturbance_max
         robot.rates = action.rates
 
     def configure(self, settings: Settings) -> None:
         """See `Part.configure`."""
-        self.action = changed(
-            self.action,
-            settings.integral_action,
-            settings.integral,
-            self._disturbance_max,
-            1 + len(self._robot.others),
-        )
-        self._robot.rates = self.action.rates
+        self.action.settings = settings.integral
 
     def reset(self, robot: RobotModel) -> None:
         """See `Part.reset`."""
