@@ -75,9 +75,6 @@ fi
 folder="$(dirname "$config")"
 scenarios="$folder/scenarios"
 if [ -f "$scenarios/${robot}_$scenario.yaml" ]; then
-    # What its nodes need from their start on.
-    own="$scenarios/start/${robot}_$scenario.yaml"
-    [ ! -f "$own" ] || params=("$own" "${params[@]}")
     scenario="$scenarios/${robot}_$scenario.yaml"
 elif [ ! -f "$scenario" ] && [ "$scenario" = demo ]; then
     scenario=hold
@@ -86,6 +83,10 @@ elif [ ! -f "$scenario" ]; then
     known="$(sed "s/^${robot}_//; s/.yaml$//" <<<"$known" | tr '\n' ' ')"
     refuse "unknown scenario '$scenario' of $robot; there are: $known"
 fi
+
+# What its nodes need from their start on.
+own="$(dirname "$scenario")/start/$(basename "$scenario")"
+[ ! -f "$own" ] || params=("$own" "${params[@]}")
 
 [ -z "$imperfect" ] || imperfect="$folder/imperfect/$robot.yaml"
 [ -z "$imperfect" ] || [ -f "$imperfect" ] || refuse "there is no $imperfect"

@@ -66,7 +66,11 @@ class IntegralFeedback(IntegralLaw):
 
     def __init__(self, settings: IntegralSettings) -> None:
         self.leak = 0.0
-        super().__init__(settings, Memory(*np.zeros((4, len(settings.budget)))))
+        n = len(settings.budget)
+        super().__init__(settings, Memory(*np.zeros((4, n))))
+        # The first joint beyond its limit must not find it to be compiled.
+        zero, one = np.zeros(n), np.ones(n)
+        limited_feedback(zero, zero, settings.mu, np.eye(n), np.zeros((n, n)), one, one)
 
     @property
     def s(self) -> Array:

@@ -38,7 +38,6 @@ class WrenchSubscriber:
 
     Args:
         node: listens and logs what is refused.
-        watch: tells whether several nodes publish ``ft_wrench``: then none is obeyed.
         interaction: receives measurements and targets; None for an arm that handles no forces.
         goals: keeps targets until they are due.
         config: names the frames.

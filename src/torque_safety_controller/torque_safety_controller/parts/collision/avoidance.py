@@ -168,8 +168,8 @@ class Collision(Part):
         q, v, e = step.robot.q, step.robot.v, step.disturbance
         if not math.isfinite(q.dot(q) + v.dot(v)):
             return
-        bounds = step.commanded(step.bounds)  # infinite, or for the QP to refuse
-        lower, upper = np.nan_to_num(bounds, posinf=_UNBOUNDED, neginf=-_UNBOUNDED)
+        # Infinite, or NaN, which is for the QP to refuse.
+        lower, upper = np.fmin(np.fmax(step.commanded(step.bounds), -_UNBOUNDED), _UNBOUNDED)
         rows = self.rows(q, v, lower, upper, e)
         if k := len(rows.lower):
             G = ROW_SCALE * rows.G
