@@ -27,12 +27,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from viability_bounds_pkg.state import State
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_] | np.bool_
 
 WINDOW = 0.2
 """Over which positions are compared with velocities, and how long they must agree again, s."""
@@ -101,6 +101,26 @@ class _Past(NamedTuple):
     way: Array
 
 
+class _Tolerances(NamedTuple):
+    """What is plausible, arrays of shape (n,).
+
+    Attributes:
+        position: what positions may be wrong by, rad.
+        velocity: what velocities may be wrong by, rad/s.
+        fastest: speed of a joint that is pushed, rad/s.
+        drift: by which positions may contradict velocities, rad.
+        way_of_same: way of a joint whose position and velocity stay the same, rad.
+        way: way of a joint whose position stays the same, rad.
+    """
+
+    position: Array
+    velocity: Array
+    fastest: Array
+    drift: Array
+    way_of_same: Array
+    way: Array
+
+
 class PlausibilityCheck:
     """Checks the states of an arm, one after the other.
 
@@ -125,23 +145,28 @@ class PlausibilityCheck:
     ) -> None:
         fastest = np.where(np.isfinite(velocity_max), velocity_max, NO_SPEED_LIMIT)
         width = position_max - position_min
-        low = np.maximum(position_min - width, -FARTHEST)
-        high = np.minimum(position_max + width, FARTHEST)
-        self._middle, self._half = 0.5 * (low + high), 0.5 * (high - low)
+        self._low = np.maximum(position_min - width, -FARTHEST)
+        self._high = np.minimum(position_max + width, FARTHEST)
         self._v_max, self._gap = fastest, max(GAP, 3.0 * dt)
-        self._fastest, self._zero = FAST * fastest, np.zeros_like(fastest)
+        self._zero = np.zeros_like(fastest)
         self._uses_velocities = velocity_error is not None
         self._position = POSITION_ERROR + 2.0 * position_error
-        self._velocity = FAST_ENOUGH * fastest + position_error / dt
-        self._impossible = np.inf if velocity_error is None else IMPOSSIBLE * fastest
+        velocity = FAST_ENOUGH * fastest + position_error / dt
         if velocity_error is not None:
-            self._velocity = VELOCITY_ERROR * fastest + velocity_error
-        # An impact, at any moment of a period, changes a speed from one limit to the other.
-        self._drift = self._position + WINDOW * self._velocity + 2.0 * dt * fastest
-        # A robot may repeat a position once, and a filter let velocities fade after a hit.
-        self._way_of_same = self._position + dt * fastest
-        self._way = self._position + max(dt, FILTER) * fastest
+            velocity = VELOCITY_ERROR * fastest + velocity_error
+        self._tolerances = _Tolerances(
+            self._position,
+            velocity,
+            FAST * fastest,
+            # An impact, at any moment of a period, changes a speed from one limit to the other.
+            self._position + WINDOW * velocity + 2.0 * dt * fastest,
+            # A robot may repeat a position once, and a filter let velocities fade after a hit.
+            self._position + dt * fastest,
+            self._position + max(dt, FILTER) * fastest,
+        )
         self._dt = dt
+        rest = State(self._zero, self._zero)
+        self._compare(self._first(rest, 0.0), rest, dt, 0.0)  # compiled before states come
         self.reset()
 
     def reset(self) -> None:
@@ -202,9 +227,10 @@ class PlausibilityCheck:
         return bool((moved <= self._position + STOPPING * self._v_max).all())
 
     def _out_of_range(self, state: State) -> str:
-        outside = np.abs(state.q - self._middle) > self._half
-        if (outside | (np.abs(state.v) > self._impossible)).any():
-            return OUTSIDE if outside.any() else TOO_FAST
+        if not ((self._low <= state.q) & (state.q <= self._high)).all():
+            return OUTSIDE
+        if self._uses_velocities and (np.abs(state.v) > IMPOSSIBLE * self._v_max).any():
+            return TOO_FAST
         return ""
 
     def _compare(self, past: _Past, state: State, time: float, unseen: float) -> tuple[str, _Past]:
@@ -216,38 +242,62 @@ class PlausibilityCheck:
             time: its stamp, s.
             unseen: time between both of which nothing is known, s.
         """
-        (q0, v0), (q, v), h = past.state, state, time - past.time
-        moved, fastest, drift = q - q0, self._fastest, self._zero
-        same = moved == 0.0
-        if self._uses_velocities:
-            mean = 0.5 * (v0 + v)
-            fastest = np.maximum(fastest, np.abs(v))
-            drift = math.exp(-h / WINDOW) * past.drift + moved - h * mean
+        found, v, drift, way = _compared(
+            *past.state, past.drift, past.way, *state, time - past.time, max(unseen, 0.0),
+            self._uses_velocities, self._tolerances,
+        )  # fmt: skip
+        reason = _REASONS[found]
+        if reason == JUMP:
+            return reason, self._first(state, time)
+        return reason, _Past(State(state.q, v), time, self._zero if reason else drift, way)
+
+
+_REASONS = ("", CONTRADICTION, FROZEN, JUMP)
+
+
+@njit(cache=True)
+def _compared(
+    q0: Array, v0: Array, drift0: Array, way0: Array, q: Array, v: Array, h: float, unseen: float,
+    uses_velocities: bool, most: _Tolerances,
+) -> tuple[int, Array, Array, Array]:  # fmt: skip
+    """Compare a state with an earlier one.
+
+    Args:
+        q0: earlier positions, shape (n,), rad.
+        v0: earlier velocities, shape (n,), rad/s.
+        drift0: see `_Past`, like `way0`.
+        way0: likewise.
+        q: positions, shape (n,), rad.
+        v: velocities, shape (n,), rad/s.
+        h: time between both, s.
+        unseen: part of it of which nothing is known, s.
+        uses_velocities: whether velocities count; else they are found from positions.
+        most: what is plausible.
+
+    Returns:
+        Index of the worst reason in `_REASONS`; velocities, drift and way now.
+    """
+    v, drift, way = v.copy(), np.zeros_like(q), np.zeros_like(q)
+    none_moves, worst = not uses_velocities and (q == q0).all(), 0
+    for j in range(q.size):
+        moved, fastest, same = q[j] - q0[j], most.fastest[j], none_moves
+        if uses_velocities:
+            mean, same = 0.5 * (v0[j] + v[j]), moved == 0.0
+            fastest = max(fastest, abs(v[j]))
+            drift[j] = math.exp(-h / WINDOW) * drift0[j] + moved - h * mean
         else:
-            same = np.logical_and.reduce(same)
-            mean = v = v0 if same else v0 + SMOOTHING * (moved / h - v0)
-        way = self._way_since(past, same, h, mean)
-        jumps = np.abs(moved) > self._position + h * fastest
-        frozen = np.abs(way) > np.where(v == v0, self._way_of_same, self._way)
-        room = self._drift if unseen <= 0.0 else self._drift + unseen * self._fastest
-        contradicts = np.abs(drift) > room
-        if not (jumps | frozen | contradicts).any():
-            if unseen > 0.0:
-                drift = _limited(drift, self._drift)
-            return "", _Past(State(q, v), time, drift, way)
-        if jumps.any():
-            return JUMP, self._first(state, time)
-        reason = FROZEN if frozen.any() else CONTRADICTION
-        return reason, _Past(State(q, v), time, self._zero, way)
-
-    def _way_since(self, past: _Past, same: Mask, h: float, mean: Array) -> Array:
-        """Return the way by velocities since positions changed, shape (n,), rad."""
-        if not np.any(same):
-            return self._zero
-        way = math.exp(-h / FORGETTING) * past.way
-        way = way + h * np.where(np.abs(mean) > self._velocity, mean, 0.0)
-        return np.where(same, _limited(way, 2.0 * self._way), 0.0)
-
-
-def _limited(x: Array, limit: Array) -> Array:
-    return np.minimum(np.maximum(x, -limit), limit)
+            v[j] = v0[j] if same else v0[j] + SMOOTHING * (moved / h - v0[j])
+            mean = v[j]
+        if same:
+            fast = mean if abs(mean) > most.velocity[j] else 0.0
+            way[j] = math.exp(-h / FORGETTING) * way0[j] + h * fast
+            way[j] = min(max(way[j], -2.0 * most.way[j]), 2.0 * most.way[j])
+        if abs(moved) > most.position[j] + h * fastest:
+            worst = 3
+        elif abs(way[j]) > (most.way_of_same[j] if v[j] == v0[j] else most.way[j]):
+            worst = max(worst, 2)
+        elif abs(drift[j]) > most.drift[j] + unseen * most.fastest[j]:
+            worst = max(worst, 1)
+        if unseen > 0.0:
+            drift[j] = min(max(drift[j], -most.drift[j]), most.drift[j])
+    return worst, v, drift, way

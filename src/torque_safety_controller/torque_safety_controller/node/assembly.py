@@ -93,8 +93,8 @@ def make_parts(
 ) -> list[Part]:
     """Return the parts of a controller that its parameters ask for, in their order.
 
-    A part reads only what parts before it have written. Frames and points of tasks and limits are in
-    the root frame of the URDF; `LoadedRobot.base` converts what is in `base_frame`.
+    A part reads only what parts before it have written. Tasks and limits are in the root frame of
+    the URDF; `LoadedRobot.base` converts what is in `base_frame`.
 
     Args:
         config: checked parameters.
