@@ -78,7 +78,7 @@ def hurried(tmp_path_factory):
     """A tree like this one, with scenarios of half a second; see also `DEMO`."""
     tree = make_tree(tmp_path_factory.mktemp("tree"))
     shutil.copytree(ROOT / "config", tree / "config")
-    for path in (tree / "config" / "scenarios").iterdir():
+    for path in (tree / "config" / "scenarios").glob("*.yaml"):
         scenario = yaml.safe_load(path.read_text())
         factor = 0.5 / scenario["duration"]
         for entry in (scenario, *scenario["events"]):
