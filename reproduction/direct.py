@@ -117,11 +117,9 @@ class DirectLoop:
         """Budget of the integral action by the parameters, shape (n,), N m."""
         return self._controller_configuration().integral_settings.budget
 
-    def unlimit_integral(self) -> None:
-        """Take the budgets of the integral action away, so that no anti-windup acts."""
-        integral = self.integral
-        budget = np.full(len(integral.settings.budget), np.inf)
-        integral.settings = replace(integral.settings, budget=budget)
+    def change_integral(self, **settings: Any) -> None:
+        """Change settings of the integral action, also those that are no parameters."""
+        self.integral.settings = replace(self.integral.settings, **settings)
 
     @property
     def integral(self) -> FadingTorque:

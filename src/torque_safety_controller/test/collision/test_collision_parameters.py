@@ -6,11 +6,9 @@ import yaml
 from collision_arm import panda
 
 from torque_safety_controller.node.assembly import make_collision
-from torque_safety_controller.parameters.contact_parameters import CollisionConfiguration
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.parts.collision.avoidance import CollisionSettings
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.parameter import parameter_table, read
+from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.testing.ros_harness import read_config
 
 PANDA = read_config("panda", "controller_node")
@@ -42,18 +40,6 @@ def test_off_by_default_and_then_nothing_is_loaded():
     assert not configuration(collision_avoidance=None).collision_avoidance
 
 
-def test_defaults_are_those_of_the_settings():
-    assert configuration().settings == CollisionSettings()
-
-
-@pytest.mark.parametrize(
-    "name", [row.name for row in parameter_table(CollisionConfiguration) if row.kind is float]
-)
-def test_each_setting_arrives(name):
-    settings = configuration(**{name: 0.07}).settings
-    assert getattr(settings, name.removeprefix("collision_")) == 0.07
-
-
 def test_obstacles_become_shapes_in_the_base_frame():
     avoidance = load(obstacles=THINGS)
     segments = avoidance.model.segments
@@ -68,18 +54,13 @@ def test_obstacles_become_shapes_in_the_base_frame():
     assert {"panda_hand - table", "panda_hand - ball"} <= set(avoidance.model.names)
 
 
-def test_pairs_are_those_listed_or_those_chosen():
-    listed = load(collision_pairs=["panda_hand panda_link1"])
-    assert set(listed.model.names) == {"panda_hand - panda_link1"}
+def test_pairs_near_in_the_given_posture_are_left_out():
     chosen = load()
     assert "panda_hand - panda_link1" in chosen.model.names
     assert chosen.model.left_out["near at start"] == ["panda_link7 - panda_link5"]
     # In the middle of the limits, the default, the hand is bent back to the forearm.
     middle = load(collision_posture=None)
     assert "panda_hand - panda_link5" in middle.model.left_out["near at start"]
-    # What is asked to be kept further apart is left out sooner.
-    wide = load(collision_margin=0.08)
-    assert len(wide.model.left_out["near at start"]) > 1
 
 
 def test_acceleration_limits_arrive():
@@ -98,10 +79,6 @@ def test_what_an_arm_is_mounted_on_is_left_out_and_said_to_be():
 @pytest.mark.parametrize(
     ("changes", "name"),
     [
-        ({"collision_margin": -0.1}, "collision_margin"),
-        ({"collision_margin": 0.6}, "collision_margin"),
-        ({"collision_margin": float("nan")}, "collision_margin"),
-        ({"collision_pairs": ["panda_hand"]}, "collision_pairs"),
         ({"collision_posture": [0.0] * 6}, "collision_posture"),
         ({"collision_posture": [9.0] * 7}, "collision_posture"),
         ({"acceleration_min": None}, "acceleration_min"),
@@ -162,8 +139,6 @@ def test_the_diameters_of_a_round_obstacle_are_the_same():
 @pytest.mark.parametrize(
     ("changes", "name"),
     [
-        ({"collision_pairs": ["panda_hand nowhere"]}, "collision_pairs"),
-        ({"collision_pairs": ["panda_hand panda_link7"]}, "collision_pairs"),
         ({"acceleration_max": [-1.0] * 7}, "acceleration_max"),
         ({"obstacles": [THINGS[1].replace("ball", "panda_hand")]}, "obstacles[0].name"),
         ({"collision_capsules": None}, "collision_capsules"),

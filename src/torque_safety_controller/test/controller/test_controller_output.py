@@ -229,7 +229,7 @@ def test_where_the_motors_cannot_let_it_rest_the_bounds_count_alone(arm):
 def test_nothing_is_learned_from_a_motion_that_was_not_commanded():
     """Neither of disturbances nor by the integral action; the torque does not jump."""
     arm = load_arm("panda")
-    gains = replace(GAINS, disturbance_time=0.0)
+    gains = replace(GAINS, disturbance_time=1e-6)
     controller = make(arm, integral=integral(arm, "joints"), gains=gains)
     controller.reset(arm.q_start)
     controller.goals.set_posture(arm.q_start + 0.1)

@@ -51,7 +51,7 @@ def simulated(link, gains, steps=400, factor=1.0):
             [s], DT
         )
         a_ref = -gains.kp * ahead[0] - gains.kd * ahead[1]
-        if gains.disturbance_time is not None:
+        if gains.disturbance_time:
             e += filter_share(gains.disturbance_time, DT) * (-increment / DT - e)
             a_ref -= e
         v_before = ahead[1]

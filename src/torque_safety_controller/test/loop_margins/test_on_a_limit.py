@@ -95,7 +95,7 @@ def largest_step(robot, joint, seconds, delay=0, **changed) -> float:
         ({"integral_lambda": 100.0}, 0.3, 1.0),
         ({"integral_lambda": 50.0}, 0.0, 0.01),
         ({"integral_lambda": 100.0, "bounds_dt_factor": 6.0}, 0.0, 0.01),
-        ({"integral_lambda": 100.0, "disturbance_time": -1.0}, 0.0, 0.01),
+        ({"integral_lambda": 100.0, "disturbance_time": 0.0}, 0.0, 0.01),
     ],
     ids=["100", "50", "longer horizon", "no observer"],
 )

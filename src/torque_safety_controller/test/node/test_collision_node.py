@@ -8,8 +8,6 @@ from controller_chain import MS, NODE, ControllerChain
 from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import Log
 
-from torque_safety_controller.node.controller_node import ControllerNode
-from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import joint_state, read_config
 
@@ -78,8 +76,3 @@ def test_an_overlap_is_reported_and_countered_and_a_nan_stays_outside(ros):
         "panda_link7 - panda_link5",
     ):
         assert part in text, text
-
-
-def test_a_link_that_there_is_not_ends_the_node_with_one_line(ros):
-    with pytest.raises(SettingError, match="'collision_pairs'.*gripper"):
-        ros.start(ControllerNode, VALUES | {"collision_pairs": ["panda_hand gripper"]})

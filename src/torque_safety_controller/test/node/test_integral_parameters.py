@@ -26,7 +26,7 @@ PERIOD = round(1e3 * ARM.dt)  # ms
 VALUES = read_config("panda", NODE) | {
     "bounds_timeout": 20.0,
     "state_timeout": 40.0,
-    "disturbance_time": -1.0,
+    "disturbance_time": 0.0,
     "integral_action": "joints",
 }
 JOINTS = VALUES["joints"]
@@ -97,9 +97,6 @@ TASK = {"mode": "task"}
         ({"integral_action": "position"}, {"mode": "position"}, TASK),
         ({"integral_budget": SMALL}, SMALL_BUDGET, {}),
         ({"integral_lambda": 8.0}, {"gain": 8.0}, {}),
-        ({"integral_leak": [20.0, 100.0, 0.5]}, {"slow_leak_rate": 20.0}, {}),
-        ({"integral_leak": [0.1, 10.0, 0.5]}, {"fast_leak_rate": 10.0}, {}),
-        ({"integral_leak": [0.1, 100.0, 0.1]}, {"mu": 0.1}, {}),
         (
             {"integral_anti_windup": "scaling", "integral_budget": SMALL},
             SMALL_BUDGET | {"anti_windup": "scaling"},
@@ -109,11 +106,6 @@ TASK = {"mode": "task"}
         (
             {"integral_action": "task", "integral_anti_windup": "paper"},
             TASK | {"anti_windup": "paper"},
-            TASK,
-        ),
-        (
-            {"integral_action": "task", "integral_leak": [0.1, 100.0, 0.5, 1.0]},
-            TASK | {"null_leak_rate": 1.0},
             TASK,
         ),
     ],
@@ -135,10 +127,7 @@ def test_parameters_change_while_it_runs_and_the_torque_goes_on(ros):
     for changed, by_hand in (
         ({"integral_lambda": 8.0}, {"gain": 8.0}),
         ({"integral_budget": SMALL}, {"budget": np.array(SMALL)}),
-        ({"integral_leak": [1.0, 40.0, 0.5]},
-         {"slow_leak_rate": 1.0, "fast_leak_rate": 40.0}),
-        ({"integral_leak": [1.0, 40.0, 0.2]}, {"mu": 0.2}),
-    ):  # fmt: skip
+    ):
         ros.accepts(NODE, **changed)
         common |= by_hand
         controller.find(Integral).action.settings = make_settings(**common)
@@ -168,17 +157,6 @@ BAD = [
     ("integral_lambda", -2.0, ">= 1"),
     ("integral_lambda", math.inf, "<= 1000"),
     ("integral_lambda", "much", "a number"),
-    ("integral_leak", [-0.1, 100.0, 0.5], ">= 0"),
-    ("integral_leak", [math.nan, 100.0, 0.5], ">= 0"),
-    ("integral_leak", [0.1, -1.0, 0.5], ">= 0"),
-    ("integral_leak", [0.1, math.inf, 0.5], "finite"),
-    ("integral_leak", [0.1, 0.05, 0.5], "theta_f >= theta_s"),
-    ("integral_leak", [0.1, 100.0, -0.01], ">= 0"),
-    ("integral_leak", [0.1, 100.0, 1.01], "mu <= 1"),
-    ("integral_leak", [0.1, 100.0, math.nan], ">= 0"),
-    ("integral_leak", [0.1, 100.0], "3 or 4 finite numbers"),
-    ("integral_leak", [0.1, 100.0, 0.5, 0.05], "theta_null >= theta_s"),
-    ("integral_leak", [0.1, 100.0, 0.5, 9.0, 9.0], "3 or 4 finite numbers"),
     ("integral_anti_windup", "qp2", "one of qp, paper, scaling"),
 ]
 

@@ -19,7 +19,7 @@ VALUES = read_config("two_hands/talos_arms", NODE) | {
     "bounds_timeout": 20.0,
     "state_timeout": 40.0,
     "integral_action": "none",
-    "disturbance_time": -1.0,
+    "disturbance_time": 0.0,
 }
 Q = np.array(read_config("two_hands/talos_arms", "bullet_node")["start_positions"])
 FRAMES = VALUES["end_effector_frame"].split()

@@ -6,15 +6,20 @@ import math
 import numpy as np
 import pytest
 
-from torque_safety_controller.command_check import IGNORED_AFTER, TRUSTED_AFTER, CommandCheck
+from torque_safety_controller.command_check import (
+    IGNORED_AFTER,
+    TOLERANCE,
+    TRUSTED_AFTER,
+    CommandCheck,
+)
 
-TOLERANCE = np.array([1.0, 2.0])
+LIMITS = np.array([1.0, 2.0]) / TOLERANCE
 TAU = np.array([5.0, -3.0])
 
 
 def agreed(reach=3) -> CommandCheck:
     """Return a check after enough states that agree."""
-    check = CommandCheck(TOLERANCE, reach)
+    check = CommandCheck(LIMITS, reach)
     for _ in range(TRUSTED_AFTER):
         check.sent(TAU)
         assert check.agrees(TAU)
@@ -47,7 +52,7 @@ def test_what_is_not_finite_agrees_with_nothing(value):
 
 
 def test_torques_that_never_agreed_are_of_another_kind():
-    check = CommandCheck(TOLERANCE, 3)
+    check = CommandCheck(LIMITS, 3)
     for _ in range(3 * TRUSTED_AFTER):
         check.sent(TAU)
         assert check.agrees(np.zeros(2))

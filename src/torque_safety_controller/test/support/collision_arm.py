@@ -15,7 +15,6 @@ from torque_safety_controller.parameters.controller_parameters import Controller
 from torque_safety_controller.parts.collision.avoidance import (
     Collision,
     CollisionRows,
-    CollisionSettings,
 )
 from torque_safety_controller.parts.collision.model import CollisionModel, build_collision_model
 from torque_safety_controller.parts.collision.shapes import Shape, capsule, make_obstacle
@@ -68,7 +67,7 @@ _TWO_LINKS = """<robot name="two_links">
 
 
 def two_links(
-    shape: str, reach: float, obstacles, kind="revolute", axis="0 0 1", **settings
+    shape: str, reach: float, obstacles, kind="revolute", axis="0 0 1", dt=1e-3, **constants
 ) -> tuple[Collision, pin.Model]:
     """Return an arm in the x-y plane whose forearm has one collision shape, 20 rad/s^2 a joint."""
     urdf = _TWO_LINKS.format(shape=shape, reach=reach, kind=kind, axis=axis)
@@ -81,10 +80,7 @@ def two_links(
         obstacles,
     )
     limit = np.full(2, 20.0)
-    dt = settings.pop("dt", 1e-3)
-    constants = {k: settings.pop(k) for k in ("influence", "speed_max") if k in settings}
-    avoidance = Collision(collision, -limit, limit, dt, CollisionSettings(**settings))
-    return with_constants(avoidance, **constants), model
+    return with_constants(Collision(collision, -limit, limit, dt), **constants), model
 
 
 def with_constants(avoidance: Collision, **constants: float) -> Collision:

@@ -66,7 +66,7 @@ def make(
         parts.append(Integral(integral, robot))
     if friction is not None:
         parts.append(Friction(FrictionCompensation(friction)))
-    if gains.disturbance_time is not None:
+    if gains.disturbance_time:
         parts.append(Disturbance(robot.n, gains.disturbance_time))
     return Controller(
         robot,

@@ -23,7 +23,7 @@ ARM = load_arm("baxter_left_arm")
 VALUES = read_config("baxter_left_arm", NODE) | {
     "bounds_timeout": 20.0,
     "state_timeout": 40.0,
-    "disturbance_time": -1.0,
+    "disturbance_time": 0.0,
     "safety_filter": False,  # which has tests of its own
 }
 JOINTS = VALUES["joints"]

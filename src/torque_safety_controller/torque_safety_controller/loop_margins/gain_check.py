@@ -228,7 +228,7 @@ class GainCheck:
             step = self._own(gain * self.steps[1])
             resolution = TORQUE_STEP / step if step > 0.0 else math.inf
             yield GainLimit("integral_lambda", gain, gain * margin, gain * resolution)
-        if (time := self._loop.gains.disturbance_time) is not None:
+        if time := self._loop.gains.disturbance_time:
             yield GainLimit(OBSERVER, time, self._way(), self._fastest_observer())
         margin, resolution = (
             1.0 / scale if (scale := _last_good(good, 1.0 / _LONGEST, 1.0)) else math.inf
@@ -248,7 +248,7 @@ class GainCheck:
             integral: lambda, 1/s.
             observed: whether the disturbance observer acts.
         """
-        time = self._loop.gains.disturbance_time if observed else None
+        time = self._loop.gains.disturbance_time if observed else 0.0
         factors = self.inertia.factors if integral > 0.0 else (1.0,)
         return min(
             open_loop(link, Feedback(kp, kd, integral * f, self._leak, time)).modulus_margin()

@@ -54,14 +54,14 @@ class Feedback(NamedTuple):
         integral: lambda of the integral action, times what the inertia makes of it, 1/s.
         leak: its rates theta_s and theta_f, 1/s, and the share mu of the fast one.
         disturbance_time: time constant of the disturbance observer whose estimate is taken off,
-            s; None for none.
+            s; 0 for none.
     """
 
     kp: float
     kd: float
     integral: float = 0.0
     leak: tuple[float, float, float] = (0.1, 100.0, 0.5)
-    disturbance_time: float | None = None
+    disturbance_time: float = 0.0
 
 
 class OpenLoop(NamedTuple):
@@ -147,7 +147,7 @@ def open_loop(link: Link, gains: Feedback) -> OpenLoop:
         new[name] = decay * x[name] + share * increment
     a_ref = -gains.kp * ahead[0] - gains.kd * ahead[1]
     new["disturbance"] = x["disturbance"]
-    if gains.disturbance_time is not None:
+    if gains.disturbance_time:
         share = filter_share(gains.disturbance_time, dt)
         new["disturbance"] = (1.0 - share) * x["disturbance"] - share * increment / dt
         a_ref = a_ref - new["disturbance"]

@@ -54,8 +54,6 @@ HORIZON = 2.0
 DISTURBANCE_MAX = 2.0
 """Disturbances beyond this many torque limits are not integrated."""
 
-_BEYOND = 0.003  # m; beyond margin and reserve, pairs nearer than this are too near from the start
-
 
 def make_controller(
     config: ControllerConfiguration,
@@ -158,7 +156,7 @@ def make_integral_part(config: ControllerConfiguration, robot: RobotModel) -> In
 def make_disturbance(config: ControllerConfiguration) -> Disturbance | None:
     """Return what estimates disturbances; None where that is off."""
     time = config.gains.disturbance_time
-    return None if time is None else Disturbance(len(config.joints), time)
+    return Disturbance(len(config.joints), time) if time else None
 
 
 def make_safety_filter(config: ControllerConfiguration, model: pin.Model) -> SafetyFilter | None:
@@ -288,14 +286,11 @@ def make_collision(config: ControllerConfiguration, model: pin.Model) -> Collisi
             collision.capsules,
             collision.posture(config),
             collision.bodies,
-            collision.pairs,
             config.base_frame,
-            clearance=collision.settings.kept + _BEYOND,
         ),
         collision.acceleration_min,
         collision.acceleration_max,
         HORIZON * config.dt,
-        collision.settings,
     )
 
 
@@ -325,7 +320,7 @@ def make_interaction(
 
 def _sensor(config: ControllerConfiguration, robot: RobotModel, urdf: str) -> WrenchSensor | None:
     settings, model = config.interaction, robot.model
-    frame, tool = settings.ft_frame, settings.ft_tool
+    frame = settings.ft_frame
     if not frame:
         return None
     if not model.existFrame(frame, pin.FrameType.BODY):
@@ -334,13 +329,10 @@ def _sensor(config: ControllerConfiguration, robot: RobotModel, urdf: str) -> Wr
         raise SettingError("ft_frame", frame, allowed)
     if _joint_of(model, frame) != _joint_of(model, robot.frame):
         raise SettingError("ft_frame", frame, f"a link fixed to {robot.frame!r}")
-    if len(tool):
-        inertia = pin.Inertia(tool[0], tool[1:], np.zeros((3, 3)))
-    else:
-        try:
-            inertia = inertia_beyond(urdf, frame, config.locked)
-        except RobotDescriptionError as error:
-            raise SettingError("ft_frame", frame, f"a link of the URDF ({error})") from error
+    try:
+        inertia = inertia_beyond(urdf, frame, config.locked)
+    except RobotDescriptionError as error:
+        raise SettingError("ft_frame", frame, f"a link of the URDF ({error})") from error
     placement = _between(model, robot.frame, frame)
     return WrenchSensor(placement, inertia, model.gravity.linear)
 

@@ -77,16 +77,12 @@ class ControllerNode(ArmNode):
             self, self._controller.find(Interaction), self._goals, config, base
         )
         self._driving = Driving(self, self._goals, self._controller, config, base, self._states)
-        commands = None
-        if config.effort_tolerance > 0.0:
-            tolerance = config.effort_tolerance * config.torque_max
-            commands = CommandCheck(tolerance, commands_in_flight(declared))
         self._supervisor = Supervisor(
             config.dt,
             config.start_control,
             covered_misses(declared),
             config.bounds_timeout,
-            commands,
+            CommandCheck(config.torque_max, commands_in_flight(declared)),
             self._on_mode,
             lambda line: self._later(self._warn, line),
         )

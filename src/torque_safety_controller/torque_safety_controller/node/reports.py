@@ -89,7 +89,7 @@ class ControllerReport:
         self._goals, self._wrenches = goals, wrenches
         config = parameters.configuration
         if collision := controller.find(Collision):
-            logger, margin = node.get_logger(), collision.settings.margin
+            logger, margin = node.get_logger(), collision.margin
             pairs = len(collision.model.names)
             logger.info(f"collision avoidance keeps {pairs} pairs of shapes {margin:g} m apart")
             for text in collision.left_out():

@@ -11,7 +11,6 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from torque_safety_controller.parts.collision.avoidance import CollisionSettings
 from torque_safety_controller.parts.collision.shapes import SHAPES, Shape, capsule, make_obstacle
 from torque_safety_controller.tasks.admittance_task import InteractionSettings
 from viability_bounds_pkg.exceptions import SettingError, did_you_mean
@@ -21,7 +20,6 @@ from viability_bounds_pkg.parameter import (
     NOT_NEGATIVE,
     POSITIVE,
     check_per_joint,
-    group,
     joint_numbers,
     number,
     numbers,
@@ -97,13 +95,6 @@ class InteractionConfiguration:
     """
 
     ft_frame: str = text("link of the wrist's force/torque sensor; none if empty", default="")
-    ft_tool: Array = numbers(
-        "mass beyond the sensor, kg, and its centre in the sensor's axes, m; as the URDF says if "
-        "empty",
-        length=4,
-        default=(),
-        note="[mass, x, y, z] with mass >= 0",
-    )
     force_directions: Array = numbers(
         f"1 where target_wrench is exerted, 0 elsewhere: {_AXES}; nowhere if empty",
         length=6,
@@ -146,9 +137,6 @@ class InteractionConfiguration:
 
     def __post_init__(self) -> None:
         """Check all that does not depend on the URDF, and make the settings."""
-        tool = self.ft_tool
-        if len(tool) and not (np.isfinite(tool).all() and tool[0] >= 0.0):
-            raise SettingError("ft_tool", tool, "4 finite numbers [mass, x, y, z] with mass >= 0")
         object.__setattr__(self, "points", _contact_points(self.contacts))
         for name in ("force_directions", "yield_threshold"):
             if np.any(getattr(self, name)) and not self.ft_frame:
@@ -215,27 +203,20 @@ class CollisionConfiguration:
     Attributes:
         capsules: around the links, in their frames.
         bodies: the obstacles, in the base frame.
-        pairs: of links to keep apart; None to choose them automatically.
     """
 
     collision_avoidance: bool = switch(
         "whether links keep away from each other and from the obstacles below", default=False
     )
-    settings: CollisionSettings = group(CollisionSettings, "collision_")
     collision_capsules: tuple[str, ...] = texts(
         "capsules around the links, which are kept apart in place of these, from the tool "
         "fit_capsules: ends of the axis in the link's frame and radius, m",
         default=(),
         note="each a YAML mapping '{link: hand, start: [x, y, z], end: [x, y, z], radius: r}'",
     )
-    collision_pairs: tuple[str, ...] = texts(
-        "pairs of links to keep apart; chosen automatically if empty",
-        default=(),
-        note="each two links, as in 'link_a link_b'",
-    )
     collision_posture: Array = joint_numbers(
-        "for the automatic choice, a posture free of collisions, rad: what is nearer there than "
-        "the margin is not kept apart; the middle of the position limits if empty",
+        "a posture free of collisions, rad: what is nearer there than the margin is not kept "
+        "apart; the middle of the position limits if empty",
         default=(),
         note="within the position limits",
     )
@@ -263,15 +244,13 @@ class CollisionConfiguration:
     )
     capsules: tuple[Shape, ...] = field(init=False)
     bodies: tuple[Shape, ...] = field(init=False)
-    pairs: tuple[tuple[str, str], ...] | None = field(init=False)
 
     def __post_init__(self) -> None:
-        """Read capsules, obstacles and pairs."""
+        """Read capsules and obstacles."""
         entries = read_entries(CapsuleEntry, "collision_capsules", self.collision_capsules)
         capsules = [capsule(each.link, each.start, each.end, each.radius) for each in entries]
         object.__setattr__(self, "capsules", tuple(capsules))
         object.__setattr__(self, "bodies", _obstacles(self.obstacles))
-        object.__setattr__(self, "pairs", tuple(map(_pair, self.collision_pairs)) or None)
 
     def check(self, robot: RobotConfiguration) -> None:
         """Check what depends on the robot.
@@ -319,10 +298,3 @@ def _obstacles(entries: tuple[str, ...]) -> tuple[Shape, ...]:
         orientation = pin.Quaternion(pin.rpy.rpyToMatrix(entry.rpy)).coeffs()
         obstacles[name] = make_obstacle(name, entry.shape, size, entry.position, orientation)
     return tuple(obstacles.values())
-
-
-def _pair(text: str) -> tuple[str, str]:
-    links = text.split()
-    if len(links) != 2:
-        raise SettingError("collision_pairs", text, "two links, as in 'link_a link_b'")
-    return links[0], links[1]

@@ -33,7 +33,6 @@ from viability_bounds_pkg.parameter import (
     joint_amounts,
     joint_numbers,
     number,
-    numbers,
     switch,
     text,
     timeout,
@@ -74,16 +73,6 @@ class IntegralConfiguration:
         default=2.0,
         live=True,
     )
-    integral_leak: Array = numbers(
-        "leak rates theta_s and theta_f of the slow and the fast integrator, 1/s, the share mu of "
-        "the fast one, and, for task or position with qp, the leak rate theta_null in the null "
-        "space, 1/s, theta_f if left out",
-        NOT_NEGATIVE,
-        default=(0.1, 100.0, 0.5),
-        live=True,
-        note="[theta_s, theta_f, mu] or [theta_s, theta_f, mu, theta_null] with theta_f >= "
-        "theta_s, mu <= 1 and theta_null >= theta_s",
-    )
     integral_anti_windup: str = text(
         "qp limits the whole torque and the integrators; paper and scaling limit the torque of "
         "the gains only, by eq. (11) and (10), and the law is as printed, that of task and "
@@ -111,20 +100,10 @@ class IntegralConfiguration:
         budget = self.integral_budget if len(self.integral_budget) else INTEGRAL_BUDGET * tau_max
         if (budget > tau_max).any():
             raise SettingError("integral_budget", budget, "at most torque_max")
-        if len(self.integral_leak) not in (3, 4):
-            raise SettingError("integral_leak", self.integral_leak, "3 or 4 finite numbers")
-        slow, fast, mu, *null = self.integral_leak.tolist()
-        if fast < slow or mu > 1.0 or min(null, default=slow) < slow:
-            allowed = "theta_f >= theta_s, mu <= 1 and theta_null >= theta_s"
-            raise SettingError("integral_leak", self.integral_leak, allowed)
         return IntegralSettings(
             budget,
             gain=self.integral_lambda,
-            slow_leak_rate=slow,
-            fast_leak_rate=fast,
-            mu=mu,
             anti_windup=self.integral_anti_windup,
-            null_leak_rate=null[0] if null else None,
         )
 
 
@@ -251,12 +230,6 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
         "how long without a usable joint state until the arm may be elsewhere and all begins anew "
         "with the next one, s",
         default=0.5,
-    )
-    effort_tolerance: float = number(
-        "by how much torques of joint states may differ from those that were commanded, share of "
-        "torque_max; beyond, commands count as not acting, and the arm is slowed; 0: not compared",
-        Range(0.0, 2.0),
-        default=0.03,
     )
     ros2_control_topic: str = text(
         "where to publish efforts as std_msgs/Float64MultiArray too; empty: nowhere", default=""

@@ -20,9 +20,6 @@ POSE_ERRORS = ("separate", "logarithm")
 CRITICAL = -1.0
 """Of ``pose_kd`` and ``posture_kd``: critical damping."""
 
-OFF = -1.0
-"""Of ``disturbance_time``: disturbances are not estimated."""
-
 
 def _damping(task: str) -> Any:
     return number(
@@ -37,7 +34,7 @@ def _damping(task: str) -> Any:
 class Gains:
     """What may change while the controller runs.
 
-    `CRITICAL` damping becomes a number and `OFF` becomes None when the gains are made.
+    `CRITICAL` damping becomes a number when the gains are made.
     """
 
     pose_kp: float = number("stiffness of the pose task, 1/s^2", Range(0.0, 1e5), live=True)
@@ -66,11 +63,11 @@ class Gains:
         "weight of the posture task", above(0.0, 1e5), default=1e-3, live=True
     )
     hold_kd: float = number("damping in HOLD, 1/s", Range(0.0, 1e4), default=20.0, live=True)
-    disturbance_time: float | None = number(
+    disturbance_time: float = number(
         "time constant with which the error of the accelerations is estimated, to tighten the "
-        "bounds by it, s; -1: not at all",
-        Range(0.0, 0.1, special=OFF),
-        default=OFF,
+        "bounds by it, s; 0: not at all",
+        Range(0.0, 0.1),
+        default=0.0,
     )
 
     def __post_init__(self) -> None:
@@ -79,8 +76,6 @@ class Gains:
             object.__setattr__(self, "pose_kd", critical_damping(self.pose_kp))
         if self.posture_kd == CRITICAL:
             object.__setattr__(self, "posture_kd", critical_damping(self.posture_kp))
-        if self.disturbance_time == OFF:
-            object.__setattr__(self, "disturbance_time", None)
 
     @property
     def pose_error_max(self) -> tuple[float, float] | None:

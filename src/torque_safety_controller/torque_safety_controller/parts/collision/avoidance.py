@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,13 +23,15 @@ from torque_safety_controller.parts.collision.rows import BRAKING, RESERVE, SPEE
 from torque_safety_controller.qp import LinearConstraints
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.step import Part, Step
-from viability_bounds_pkg.parameter import Range, check, number
 
 Array = NDArray[np.float64]
 
 ROW_SCALE = 0.01
 """Of rows in the QP: where they, the torques and the joints' bounds have no common solution, a
 distance gives way at a ten thousandth of what joints cost, so that the joints keep theirs."""
+
+MARGIN = 0.02
+"""Distance kept between links and to obstacles, m."""
 
 INFLUENCE = 0.08
 """Distance beyond the margin within which pairs matter that do not approach fast, m."""
@@ -47,27 +48,6 @@ _LEFT_OUT = {
     "near mostly": "as they are near each other in most postures",
     "near always": "as they are near each other in all postures",
 }
-
-
-@dataclass(frozen=True)
-class CollisionSettings:
-    """What distances are kept.
-
-    Raises:
-        SettingError: a value is out of range; named as the node's parameters.
-    """
-
-    margin: float = number(
-        "distance kept between links and to obstacles, m", Range(0.0, 0.5), default=0.02
-    )
-
-    def __post_init__(self) -> None:
-        check(self, "collision_")
-
-    @property
-    def kept(self) -> float:
-        """Margin and reserve, m."""
-        return self.margin + RESERVE
 
 
 class CollisionRows(NamedTuple):
@@ -103,10 +83,10 @@ class Collision(Part):
         a_max: shape (n,), rad/s^2, positive.
         dt: how long an acceleration is held, s; more than the control period gives gentler
             rows, as with the joints' bounds.
-        settings: distances.
 
     Attributes:
-        model, dt, settings: as given.
+        model, dt: as given.
+        margin: distance that is kept, m.
         influence: distance within which pairs matter that do not approach fast, m.
         speed_max: largest speed of approach, m/s.
         rows_max: rows that a step returns at most.
@@ -120,11 +100,9 @@ class Collision(Part):
         a_min: ArrayLike,
         a_max: ArrayLike,
         dt: float,
-        settings: CollisionSettings | None = None,
     ) -> None:
-        self.model, self.dt = model, dt
-        self.settings = settings = settings or CollisionSettings()
-        self.influence, self.speed_max = settings.margin + INFLUENCE, SPEED_MAX
+        self.model, self.dt, self.margin = model, dt, MARGIN
+        self.influence, self.speed_max = MARGIN + INFLUENCE, SPEED_MAX
         self.rows_max, self.count = ROWS_MAX, 0
         self.distances = np.full(len(model.names), np.inf)
         n, joints, most = model.arm.nv, model.arm.njoints, len(model.candidates.bodies)
@@ -182,7 +160,7 @@ class Collision(Part):
         relaxed = step.relaxation_of(self)
         self._relaxed_steps += relaxed is not None and bool(relaxed.any())
         self._not_viable_steps += not self.viable
-        (distance, pair), margin = self.closest(), self.settings.margin
+        (distance, pair), margin = self.closest(), self.margin
         if distance < margin - _SLIGHT:
             self._trouble = f"{pair}: nearer than {margin:g} m, moving out"
         elif distance >= margin:
@@ -209,7 +187,7 @@ class Collision(Part):
         Values that are not finite are the caller's to refuse.
         """
         arm, segments, features = self.model.arm, self.model.segments, self._features
-        kept, dt = self.settings.kept, self.dt
+        kept, dt = self.margin + RESERVE, self.dt
         pin.computeJointJacobiansTimeVariation(arm, self._data, q, v)
         np.concatenate(self._views, out=self._placements.reshape(-1, 3))
         move_segments(

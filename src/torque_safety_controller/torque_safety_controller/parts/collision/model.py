@@ -87,7 +87,6 @@ def build_collision_model(
     capsules: Sequence[Shape],
     q_start: ArrayLike,
     obstacles: Sequence[Shape] = (),
-    pairs: Sequence[tuple[str, str]] | None = None,
     base_frame: str | None = None,
     clearance: float = 0.025,
 ) -> CollisionModel:
@@ -96,26 +95,23 @@ def build_collision_model(
     Args:
         model: n joints with one coordinate each.
         capsules: around the links, whose names they have, in the links' frames.
-        q_start: a configuration free of collisions, shape (n,), rad: of the pairs chosen
-            automatically, those that are near each other there are left out.
+        q_start: a configuration free of collisions, shape (n,), rad: pairs that are near each
+            other there are left out.
         obstacles: that every link is kept away from which can move.
-        pairs: of links to be kept apart; None chooses them automatically: all that are not
-            neighbours, less those left out by `clearance`.
         base_frame: that obstacles are given in, fixed to the base; None: the URDF's root.
         clearance: pairs that are nearer than this at the start, or in most of some random
             postures, are left out, m: more than the margin to be kept. Their capsules, not the
             links, are in each other's way. So are obstacles that a link cannot get away from.
 
     Raises:
-        SettingError: an unknown link, or nothing to keep apart in a pair asked for; named as the
-            node's parameters.
+        SettingError: an unknown link; named as the node's parameter.
     """
     frames = [_link_frame(model, shape.name) for shape in capsules]
     root = model.frames[model.getFrameId(base_frame)] if base_frame else model.frames[0]
     frames += [root] * len(obstacles)
     shapes = [*capsules, *obstacles]
     joints = [int(frame.parentJoint) for frame in frames]
-    chosen = _link_pairs(model, [c.name for c in capsules], joints, pairs)
+    chosen = _link_pairs(model, joints[: len(capsules)])
     own = len(chosen)
     chosen += [
         (i, j)
@@ -140,9 +136,9 @@ def build_collision_model(
         reason = ""
         if k >= own:
             reason = "near always" if share[k] == 1.0 else ""
-        elif pairs is None and at_start[k]:
+        elif at_start[k]:
             reason = "near at start"
-        elif pairs is None and share[k] > _MOSTLY:
+        elif share[k] > _MOSTLY:
             reason = "near mostly"
         if reason:
             left_out.setdefault(reason, []).append(name)
@@ -170,34 +166,12 @@ def _link_frame(model: pin.Model, link: str) -> pin.Frame:
     raise SettingError("collision_capsules", link, f"links of the URDF{did_you_mean(link, links)}")
 
 
-def _link_pairs(
-    model: pin.Model,
-    links: Sequence[str],
-    joints: Sequence[int],
-    pairs: Sequence[tuple[str, str]] | None,
-) -> list[tuple[int, int]]:
-    """Return the pairs of capsules of the links asked for, or of all that are not neighbours."""
-    joint_of = dict(zip(links, joints, strict=False))
-    for pair in pairs or ():
-        for link in pair:
-            if link not in joint_of:
-                allowed = f"links with capsules: {', '.join(sorted(joint_of))}"
-                allowed += did_you_mean(link, joint_of)
-                raise SettingError("collision_pairs", link, allowed)
-        if joint_of[pair[0]] == joint_of[pair[1]]:
-            raise SettingError("collision_pairs", pair, "two links that move to each other")
-    if pairs is not None:
-        wanted = {frozenset(pair) for pair in pairs}
-        return [
-            (i, j)
-            for i in range(len(links))
-            for j in range(i)
-            if frozenset((links[i], links[j])) in wanted
-        ]
+def _link_pairs(model: pin.Model, joints: Sequence[int]) -> list[tuple[int, int]]:
+    """Return the pairs of the arm's capsules, on `joints`, that are not neighbours."""
     parents = model.parents
     return [
         (i, j)
-        for i in range(len(links))
+        for i in range(len(joints))
         for j in range(i)
         if joints[j] not in (joints[i], parents[joints[i]]) and joints[i] != parents[joints[j]]
     ]
