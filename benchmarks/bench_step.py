@@ -80,7 +80,7 @@ def qp_alone(controller: Controller, state: State) -> dict[str, Callable[[], Any
     data = robot.model.createData()
     pin.computeJointJacobians(robot.model, data, state.q)
     pin.forwardKinematics(robot.model, data, state.q, state.v, np.zeros(n))
-    contact = FrictionContact(robot.frame, np.zeros(3), [0.0, 0.0, -1.0], 0.5, 4)
+    contact = FrictionContact(robot.frame, np.zeros((1, 3)), [0.0, 0.0, -1.0], 0.5)
     pressing = np.array([0.0, 0.0, -10.0, 0.0, 0.0, 0.0])
     robot.update(state, np.zeros(n))
     limits = robot.M, -controller.tau_max - robot.h, controller.tau_max - robot.h

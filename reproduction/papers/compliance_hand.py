@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
@@ -101,8 +100,7 @@ def lead(
     loop = DirectLoop(ROBOT, DUAL | dict(changed or {}))
     interaction = loop.controller.find(Interaction)
     if admittance is not None:
-        gains = replace(interaction.settings.yielding_gains, kp=(admittance, admittance))
-        interaction.settings = replace(interaction.settings, yielding_gains=gains)
+        interaction.yield_kp = (admittance, admittance)
     start = loop.pose()
     rows = []
 

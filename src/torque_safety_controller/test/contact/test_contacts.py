@@ -7,7 +7,11 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog, nnls
 from task_arm import TaskArm
 
-from torque_safety_controller.parts.contact.contacts import FrictionContact, friction_pyramid
+from torque_safety_controller.parts.contact.contacts import (
+    FACETS,
+    FrictionContact,
+    friction_pyramid,
+)
 from torque_safety_controller.qp import (
     AccelerationRange,
     InverseDynamicsQP,
@@ -15,7 +19,6 @@ from torque_safety_controller.qp import (
     TaskTerm,
     stack_constraints,
 )
-from viability_bounds_pkg.exceptions import SettingError
 
 SOLE = np.array([[0.05, 0.03, 0.1], [0.05, -0.03, 0.1], [-0.05, -0.03, 0.1], [-0.05, 0.03, 0.1]])
 HAND = "panda_hand_tcp"
@@ -23,7 +26,6 @@ ELBOW = "panda_link4"
 
 directions = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda x: np.linalg.norm(x) > 0.1)
 frictions = st.floats(0.0, 3.0)
-facet_numbers = st.integers(3, 40)
 
 
 def parts(force, normal):
@@ -33,11 +35,15 @@ def parts(force, normal):
     return np.linalg.norm(force - along * normal), along
 
 
-@given(directions, frictions, facet_numbers, st.integers(0, 1000))
+def unit(normal):
+    return np.array(normal) / np.linalg.norm(normal)
+
+
+@given(directions, frictions, st.integers(0, 1000))
 @settings(max_examples=200, deadline=None)
-def test_forces_in_an_inscribed_pyramid_do_not_slip(normal, friction, facets, seed):
-    edges = friction_pyramid(np.array(normal), friction, facets)
-    rho = np.random.default_rng(seed).exponential(size=facets) ** 3
+def test_forces_in_an_inscribed_pyramid_do_not_slip(normal, friction, seed):
+    edges = friction_pyramid(unit(normal), friction)
+    rho = np.random.default_rng(seed).exponential(size=FACETS) ** 3
     across, along = parts(edges @ rho, normal)
     assert across <= friction * along + 1e-9 * rho.sum()
     assert along == pytest.approx(rho.sum())
@@ -46,49 +52,26 @@ def test_forces_in_an_inscribed_pyramid_do_not_slip(normal, friction, facets, se
         assert across == pytest.approx(friction * along, abs=1e-12)
 
 
-@given(directions, st.floats(0.05, 3.0), facet_numbers, st.floats(0.0, 2 * np.pi))
+@given(directions, st.floats(0.05, 3.0), st.floats(0.0, 2 * np.pi))
 @settings(max_examples=100, deadline=None)
-def test_what_a_pyramid_spans(normal, friction, facets, angle):
+def test_what_a_pyramid_spans(normal, friction, angle):
     """All of a cone cos(pi / facets) as wide."""
-    wide = friction_pyramid(np.array(normal), friction, 5000).T[int(angle * 5000 / 6.3)]
-    unit = np.array(normal) / np.linalg.norm(normal)
-    edges = friction_pyramid(np.array(normal), friction, facets)
-    force = unit + np.cos(np.pi / facets) * (1.0 - 1e-9) * (wide - unit)
+    normal = unit(normal)
+    edges = friction_pyramid(normal, friction)
+    across = pin.exp3(angle * normal) @ (edges[:, 0] - normal)
+    force = normal + np.cos(np.pi / FACETS) * (1.0 - 1e-9) * across
     assert nnls(edges, force)[1] < 1e-7
 
 
-def test_more_facets_fill_the_cone():
-    normal = np.array([0.0, 0.0, 1.0])
-    rng = np.random.default_rng(1)
-    reached = []
-    for facets in (3, 4, 8, 64, 512):
-        edges = friction_pyramid(normal, 0.7, facets)
-        t = rng.normal(size=(200, 2))
-        t /= np.linalg.norm(t, axis=1)[:, None]
-        # The furthest along each direction across the normal, at a normal force of 1.
-        least = min(
-            -linprog(
-                -np.r_[np.zeros(facets), 1.0],
-                A_eq=np.c_[np.vstack([edges]), np.r_[-x, 0.0]],
-                b_eq=[0.0, 0.0, 1.0],
-            ).fun
-            for x in t[:20]
-        )
-        reached.append(least / 0.7)
-        assert least / 0.7 >= np.cos(np.pi / facets) - 1e-6
-    assert np.all(np.diff(reached) > 0.0)
-    assert reached[-1] > 0.9999
-
-
 def test_a_patch_exerts_moments_with_the_centre_of_pressure_inside():
-    contact = FrictionContact(HAND, SOLE, np.array([0.0, 0.0, -2.0]), 0.5, 6)
-    assert contact.W.shape == (6, 24)
+    contact = FrictionContact(HAND, SOLE, np.array([0.0, 0.0, -2.0]), 0.5)
+    assert contact.W.shape == (6, 16)
     rng = np.random.default_rng(2)
     for _ in range(50):
-        rho = rng.exponential(size=24) ** 3
+        rho = rng.exponential(size=16) ** 3
         force, moment = contact.W[:3] @ rho, contact.W[3:] @ rho
         expected = sum(
-            np.cross(point, friction_pyramid([0, 0, -1.0], 0.5, 6) @ rho[6 * i : 6 * i + 6])
+            np.cross(point, friction_pyramid(np.array([0, 0, -1.0]), 0.5) @ rho[4 * i : 4 * i + 4])
             for i, point in enumerate(SOLE)
         )
         np.testing.assert_allclose(moment, expected, atol=1e-12)
@@ -96,43 +79,21 @@ def test_a_patch_exerts_moments_with_the_centre_of_pressure_inside():
         centre = np.array([-moment[1], moment[0]]) / force[2]
         assert (np.abs(centre) <= [0.05 + 1e-12, 0.03 + 1e-12]).all()
     assert np.linalg.matrix_rank(contact.W) == 6
-    assert np.linalg.matrix_rank(FrictionContact(HAND, SOLE[0], [0, 0, 1.0], 0.5).W) == 3
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"facets": 2}, "facets of a contact' is 2"),
-        ({"friction": -0.1}, "friction of a contact' is -0.1"),
-        ({"friction": np.nan}, "friction of a contact' is nan"),
-        ({"friction": np.inf}, "friction of a contact' is inf"),
-        ({"normal": [0.0, 0.0, 0.0]}, "normal"),
-        ({"normal": [0.0, np.nan, 1.0]}, "normal"),
-        ({"normal": [0.0, 1.0]}, "normal"),
-        ({"points": np.zeros((0, 3))}, "points"),
-        ({"points": np.zeros((2, 2))}, "points"),
-        ({"points": [0.0, 0.0, np.inf]}, "points"),
-    ],
-)
-def test_what_cannot_be_is_refused(change, words):
-    values = {"frame": HAND, "points": SOLE, "normal": [0.0, 0.0, 1.0], "friction": 0.5}
-    FrictionContact(**values)
-    with pytest.raises(SettingError, match=words):
-        FrictionContact(**{**values, **change})
+    assert np.linalg.matrix_rank(FrictionContact(HAND, SOLE[:1], [0, 0, 1.0], 0.5).W) == 3
 
 
 SOLE_CONTACT = (HAND, SOLE, [0.0, 0.0, -1.0], 0.6)
-POINT_CONTACT = (ELBOW, [0.02, 0.1, -0.03], [0.3, 1.0, 0.0], 0.4)
+POINT_CONTACT = (ELBOW, [[0.02, 0.1, -0.03]], [0.3, 1.0, 0.0], 0.4)
 
 
 class ContactArm:
     """Panda with a contact, a sole on its hand or a point on its elbow, at a state."""
 
-    def __init__(self, contact=SOLE_CONTACT, seed=3, speed=1.0, facets=4):
+    def __init__(self, contact=SOLE_CONTACT, seed=3, speed=1.0):
         rng = np.random.default_rng(seed)
         self.model = TaskArm("panda").model
         self.data = self.model.createData()
-        self.contact = FrictionContact(*contact, facets)
+        self.contact = FrictionContact(*contact)
         self.q = TaskArm("panda").posture + 0.1 * rng.normal(size=7)
         self.v = speed * rng.normal(size=7)
         pin.computeJointJacobians(self.model, self.data, self.q)
@@ -166,7 +127,7 @@ def test_joint_torques_do_the_work_of_the_forces(contact):
     arm = ContactArm(contact)
     B, step = arm.forces(np.zeros(6)).B, 1e-6
     contact, (_, rotation) = arm.contact, arm.points(arm.q)
-    edges = rotation @ friction_pyramid(contact.normal, contact.friction, contact.facets)
+    edges = rotation @ friction_pyramid(contact.normal, contact.friction)
     moved = [
         (arm.points(arm.q + step * e)[0] - arm.points(arm.q - step * e)[0]) / (2.0 * step)
         for e in np.eye(7)
@@ -223,7 +184,7 @@ def test_pressing_in_motion_serves_both_tasks():
 
 def test_the_force_ends_where_the_torque_does():
     """Nearly the greatest normal force that torques at rest can give, by a linear programme."""
-    arm = ContactArm(speed=0.0, facets=16)
+    arm = ContactArm(speed=0.0)
     h, tau_max = arm.dynamics()[1], np.full(7, 40.0)
     F_des = np.array([0.0, 0.0, -1000.0, 0.0, 0.0, 0.0])
     solution, tau = press(arm, F_des, tau_max, posture_weight=1e7)
@@ -278,7 +239,7 @@ def test_the_force_on_a_springy_table_becomes_the_one_that_is_asked_for():
     model, frame = arm.model, arm.model.getFrameId(HAND)
     up = np.array([0.0, 0.0, 1.0])
     normal = arm.points(arm.q)[1].T @ up
-    contact = FrictionContact(HAND, np.zeros(3), normal, 0.5)
+    contact = FrictionContact(HAND, np.zeros((1, 3)), normal, 0.5)
     F_des = np.r_[10.0 * normal, 0.0, 0.0, 0.0]
     across = np.eye(6)
     across[:3, :3] -= np.outer(normal, normal)

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.parts.contact import interaction
+from torque_safety_controller.parts.contact.admittance import KV, AdmittanceTask, admittance
 from torque_safety_controller.parts.contact.contacts import FrictionContact
 from torque_safety_controller.parts.contact.interaction import (
     Compliance,
@@ -23,16 +24,15 @@ from torque_safety_controller.parts.contact.wrench_sensor import WrenchSensor
 from torque_safety_controller.parts.goals import Goals
 from torque_safety_controller.parts.joint_bounds import JointBounds
 from torque_safety_controller.qp import AccelerationRange
-from torque_safety_controller.tasks.admittance_task import AdmittanceGains, AdmittanceTask
 from viability_bounds_pkg.state import State
 
 GAINS = replace(PLAIN, posture_weight=1e-6)  # so little that the hand does what its tasks want
 WIDE = np.full(7, 1e3)  # rad/s^2; bounds that no one feels
 DT = 1e-3
-Z = np.array([0, 0, 1, 0, 0, 0], dtype=bool)
+Z = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 ARM = load_arm("panda")
 Q, REST = ARM.q_start, np.zeros(7)
-PAPER = AdmittanceGains()
+PAPER_KP = 5e-3
 NORMAL = np.array([0.0, 0.0, -1.0])
 """A table below a hand that points down pushes against the hand's z axis."""
 
@@ -48,7 +48,7 @@ class SimulatedHand:
             filter_hz=1e9,
             timeout=0.005,
         )
-        touching = FrictionContact(ARM.frame, np.zeros(3), NORMAL, 0.5) if contact else None
+        touching = FrictionContact(ARM.frame, np.zeros((1, 3)), NORMAL, 0.5) if contact else None
         robot = ARM.robot(DT)
         goals = Goals(robot.n, gains)
         self.interaction = Interaction(
@@ -90,10 +90,10 @@ def test_the_task_asks_for_what_equation_27_says(seed):
     q, v = ARM.random_state(rng)
     robot.update(State(q, v), REST)
     F_ref, F, F_ref_rate, F_rate = rng.normal(size=(4, 6)) * 10.0
-    gains = AdmittanceGains(*rng.uniform(0.0, 1.0, size=(2, 2)))
-    Kp, Kv = np.diag(np.repeat(gains.kp, 3)), np.diag(np.repeat(gains.kd, 3))
-    expected = -Kp @ (F_ref - F) - Kv @ (F_ref_rate - F_rate)
-    g = gains.acceleration(F_ref - F, F_ref_rate - F_rate, 50.0)
+    kp, any_speed = rng.uniform(0.0, 1.0, size=2), (np.inf, np.inf)
+    Kp = np.diag(np.repeat(kp, 3))
+    expected = -Kp @ (F_ref - F) - KV * (F_ref_rate - F_rate)
+    g = admittance(F_ref - F, F_ref_rate - F_rate, kp, any_speed, 50.0)
     task = AdmittanceTask(g, 2.0, np.arange(6)).term(robot)
     a = np.linalg.lstsq(task.A, task.b, rcond=None)[0]
     np.testing.assert_allclose(robot.J @ a + robot.drift, expected, atol=1e-6)
@@ -106,22 +106,21 @@ def test_the_task_asks_for_what_equation_27_says(seed):
 @pytest.mark.parametrize("push", [0.1, 3.0, 100.0])
 def test_the_hand_does_not_rush(push):
     """It settles at the speed of (27) against the damping, or at the limit."""
-    gains = AdmittanceGains((0.1, 0.2), (0.0, 0.0), (0.02, 0.1))
     direction = np.array([2.0, -1.0, 2.0]) / 3.0
     wrench = push * np.concatenate([direction, direction])
-    g = gains.acceleration(-wrench, np.zeros(6), 50.0)
+    g = admittance(-wrench, np.zeros(6), (0.1, 0.2), (0.02, 0.1), 50.0)
     np.testing.assert_allclose(g[:3] / 50.0, min(0.1 * push / 50.0, 0.02) * direction)
     np.testing.assert_allclose(g[3:] / 50.0, min(0.2 * push / 50.0, 0.1) * direction)
 
 
 def test_a_hand_that_feels_too_little_moves_on_and_too_much_back():
     """The paper's weights: the mean of what the two tasks want, in the direction of force only."""
-    hand = SimulatedHand(directions=Z)
+    hand = SimulatedHand(force_directions=Z, admittance_speed_max=np.full(2, 10.0))
     hand.interaction.set_target(-force(z=-10.0))  # press along z: the table pushes with -10
     for _ in range(3000):
         free = hand.step(force())
     assert hand.state is Compliance.FORCE
-    wanted = 0.5 * PAPER.kp[0] * 10.0
+    wanted = 0.5 * PAPER_KP * 10.0
     assert hand.hand_acceleration(free)[2] == pytest.approx(wanted, rel=1e-3)
     np.testing.assert_allclose(np.delete(hand.hand_acceleration(free), 2), 0.0, atol=1e-4)
     hand.step(force(z=-30.0))  # in which the derivative acts, too
@@ -133,7 +132,7 @@ def test_a_hand_that_feels_too_little_moves_on_and_too_much_back():
 
 
 def test_no_stiffness_is_left_where_force_is_controlled():
-    hand = SimulatedHand(directions=Z)
+    hand = SimulatedHand(force_directions=Z)
     goal = hand.pose.pose * pin.SE3(np.eye(3), np.array([0.01, 0.0, 0.02]))
     hand.controller.goals.set_pose(goal)
     hand.interaction.set_target(np.zeros(6))
@@ -143,7 +142,7 @@ def test_no_stiffness_is_left_where_force_is_controlled():
 
 
 def test_a_target_in_the_base_frame_turns_with_the_hand():
-    hand = SimulatedHand(directions=np.ones(6, dtype=bool))
+    hand = SimulatedHand(force_directions=np.ones(6))
     R = hand.pose.pose.rotation
     pressed = np.array([1.0, 2.0, -3.0, 0.1, 0.2, 0.3])
     hand.interaction.set_target(pressed, np.eye(3))
@@ -158,7 +157,7 @@ def test_a_target_in_the_base_frame_turns_with_the_hand():
 
 def test_the_motors_give_what_the_contact_takes():
     """Against inverse dynamics with the force as Pinocchio's external one; and only in contact."""
-    hand = SimulatedHand(contact=True, directions=Z, tau_max=np.full(7, 1e3))
+    hand = SimulatedHand(contact=True, force_directions=Z, tau_max=np.full(7, 1e3))
     free = hand.step(force())
     hand.interaction.set_target(-force(z=-10.0))
     exact = ARM.robot(DT)
@@ -181,7 +180,7 @@ def test_the_motors_give_what_the_contact_takes():
 def test_torque_limits_hold_with_the_contact_counted_in(monkeypatch):
     monkeypatch.setattr(interaction, "WRENCH_WEIGHT", 1e6)
     monkeypatch.setattr(interaction, "WRENCH_TIME", 1e-3)
-    hand = SimulatedHand(contact=True, directions=Z)
+    hand = SimulatedHand(contact=True, force_directions=Z)
     hand.interaction.set_target(-force(z=-2000.0))
     steps = [hand.step(force(z=-2000.0), bounds=np.full(7, 0.5)) for _ in range(50)]
     assert all((np.abs(step.tau) <= ARM.tau_max).all() for step in steps)
@@ -193,7 +192,7 @@ def test_torque_limits_hold_with_the_contact_counted_in(monkeypatch):
 def test_what_is_counted_on_exceeds_what_is_felt_by_a_step_at_most(monkeypatch):
     monkeypatch.setattr(interaction, "FORCE_STEP", 2.0)
     monkeypatch.setattr(interaction, "WRENCH_TIME", 1e-6)
-    hand = SimulatedHand(contact=True, directions=Z)
+    hand = SimulatedHand(contact=True, force_directions=Z)
     hand.interaction.set_target(-force(x=5.0, z=-10.0))
     for measured, counted in ((0.0, 2.0), (3.0, 5.0), (-7.0, 2.0), (9.0, 10.0), (40.0, 10.0)):
         (task,) = hand.step(force(z=-measured)).forces.tasks
@@ -213,7 +212,7 @@ def test_what_is_counted_on_exceeds_what_is_felt_by_a_step_at_most(monkeypatch):
 )
 def test_what_a_contact_cannot_give_is_not_counted_on(goal, monkeypatch):
     monkeypatch.setattr(interaction, "WRENCH_TIME", 1e-6)
-    hand = SimulatedHand(contact=True, directions=Z)
+    hand = SimulatedHand(contact=True, force_directions=Z)
     hand.interaction.set_target(-goal)
     contact = hand.interaction.contact
     (task,) = hand.step(force()).forces.tasks
@@ -228,7 +227,7 @@ def test_what_a_contact_cannot_give_is_not_counted_on(goal, monkeypatch):
 
 
 def test_yielding_has_hysteresis():
-    hand = SimulatedHand(yield_threshold=(10.0, 1.0))
+    hand = SimulatedHand(yield_threshold=np.array([10.0, 1.0]))
     before = False
     for value in np.random.default_rng(0).uniform(-20.0, 20.0, 200):
         hand.step(force(y=value))
@@ -243,7 +242,7 @@ def test_yielding_has_hysteresis():
 
 
 def test_a_moment_is_yielded_to_as_well():
-    hand = SimulatedHand(yield_threshold=(10.0, 2.0))
+    hand = SimulatedHand(yield_threshold=np.array([10.0, 2.0]))
     hand.step(np.array([0, 0, 0, 0, 2.1, 0.0]))
     assert hand.state is Compliance.YIELDING
     hand.step(np.array([0, 0, 0, 0, 0.9, 0.0]))
@@ -251,19 +250,19 @@ def test_a_moment_is_yielded_to_as_well():
 
 
 def test_the_hand_is_held_below_the_threshold_and_led_above():
-    settings = {"yield_threshold": (10.0, 2.0)}
+    settings = {"yield_threshold": np.array([10.0, 2.0])}
     hand = SimulatedHand(**settings)
     held = hand.step(force(x=9.0))
     assert hand.state is Compliance.HOLDING
     np.testing.assert_allclose(hand.hand_acceleration(held), 0.0, atol=1e-4)
     led = hand.step(force(x=12.0))
     assert hand.state is Compliance.YIELDING
-    gain = InteractionSettings().yielding_gains.kp[0]
+    gain = interaction.YIELD_KP[0]
     assert hand.hand_acceleration(led)[0] == pytest.approx(0.5 * gain * 12.0, rel=1e-2)
 
 
 def test_where_the_hand_is_let_go_is_its_new_goal():
-    hand = SimulatedHand(yield_threshold=(10.0, 2.0))
+    hand = SimulatedHand(yield_threshold=np.array([10.0, 2.0]))
     hand.step(force(x=20.0))
     elsewhere = Q + 0.05
     hand.step(force(x=20.0), elsewhere)
@@ -282,7 +281,7 @@ def test_where_the_hand_is_let_go_is_its_new_goal():
 
 @pytest.mark.parametrize("pressing", [False, True])
 def test_a_sensor_that_falls_silent_ends_it_where_the_hand_is(pressing):
-    hand = SimulatedHand(contact=True, directions=Z, yield_threshold=(10.0, 2.0))
+    hand = SimulatedHand(contact=True, force_directions=Z, yield_threshold=np.array([10.0, 2.0]))
     if pressing:
         hand.interaction.set_target(-force(z=-10.0))
     hand.step(force(z=-20.0))
@@ -294,7 +293,7 @@ def test_a_sensor_that_falls_silent_ends_it_where_the_hand_is(pressing):
     assert hand.controller.goals.pose_des.isApprox(hand.controller.robot.pose)
     assert step.forces is None
     np.testing.assert_allclose(hand.hand_acceleration(step), 0.0, atol=1e-4)
-    assert not hand.interaction.target.any()
+    assert not hand.interaction.report()["target_wrench"].any()
     # Back again, nothing is pressed unasked.
     step = hand.step(force(z=-5.0), elsewhere)
     assert hand.state is Compliance.HOLDING
@@ -302,13 +301,11 @@ def test_a_sensor_that_falls_silent_ends_it_where_the_hand_is(pressing):
 
 
 def test_directions_taken_back_end_the_pressing_where_the_hand_is():
-    hand = SimulatedHand(directions=Z)
+    hand = SimulatedHand(force_directions=Z)
     hand.interaction.set_target(force(z=10.0))
     hand.step(force())
     elsewhere = Q + 0.05
-    hand.interaction.settings = replace(
-        hand.interaction.settings, directions=np.zeros(6, dtype=bool)
-    )
+    hand.interaction.settings = replace(hand.interaction.settings, force_directions=np.zeros(6))
     hand.step(force(), elsewhere)
     assert hand.state is Compliance.OFF
     assert hand.controller.goals.pose_des.isApprox(hand.controller.robot.pose)
@@ -316,13 +313,13 @@ def test_directions_taken_back_end_the_pressing_where_the_hand_is():
 
 def test_directions_exchanged_while_pressing_hold_the_hand_where_it_is():
     """Else what was pressed along would spring back to a goal that the hand has left."""
-    hand = SimulatedHand(directions=Z)
+    hand = SimulatedHand(force_directions=Z)
     hand.interaction.set_target(force(z=10.0))
     hand.step(force())
     elsewhere = Q + 0.05
     hand.step(force(), elsewhere)
     assert hand.controller.goals.pose_des.isApprox(hand.pose.pose)
-    hand.interaction.settings = replace(hand.interaction.settings, directions=np.roll(Z, -1))
+    hand.interaction.settings = replace(hand.interaction.settings, force_directions=np.roll(Z, -1))
     hand.step(force(), elsewhere)
     assert hand.state is Compliance.FORCE
     assert hand.controller.goals.pose_des.isApprox(hand.controller.robot.pose)
@@ -332,15 +329,17 @@ def test_directions_exchanged_while_pressing_hold_the_hand_where_it_is():
 
 
 def test_settings_that_change_do_not_let_go_of_a_hand_that_is_led():
-    hand = SimulatedHand(yield_threshold=(10.0, 2.0))
+    hand = SimulatedHand(yield_threshold=np.array([10.0, 2.0]))
     hand.step(force(x=20.0))
-    hand.interaction.settings = replace(hand.interaction.settings, yield_threshold=(11.0, 2.0))
+    hand.interaction.settings = replace(
+        hand.interaction.settings, yield_threshold=np.array([11.0, 2.0])
+    )
     hand.step(force(x=8.0))
     assert hand.state is Compliance.YIELDING
 
 
 def test_starting_anew_presses_nothing():
-    hand = SimulatedHand(directions=Z)
+    hand = SimulatedHand(force_directions=Z)
     hand.interaction.set_target(force(z=10.0))
     hand.step(force())
     hand.controller.reset(Q)

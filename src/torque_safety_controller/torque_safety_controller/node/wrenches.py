@@ -101,7 +101,7 @@ class WrenchSubscriber:
         self._goals.add(message, lambda: self._apply(interaction, wrench, rotation))
 
     def _apply(self, interaction: Interaction, wrench: Array, rotation: Array | None) -> None:
-        if not interaction.settings.directions.any():
+        if not interaction.settings.force_directions.any():
             self._goals.refuse(TARGET_WRENCH, "no direction of 'force_directions' is set")
             return
         interaction.set_target(wrench, rotation)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TypeVar
 
@@ -12,7 +12,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from torque_safety_controller.parts.collision.shapes import SHAPES, Shape, capsule, make_obstacle
-from torque_safety_controller.tasks.admittance_task import InteractionSettings
+from torque_safety_controller.parts.contact.admittance import InteractionSettings
 from viability_bounds_pkg.exceptions import SettingError, did_you_mean
 from viability_bounds_pkg.parameter import (
     FINITE,
@@ -20,6 +20,7 @@ from viability_bounds_pkg.parameter import (
     NOT_NEGATIVE,
     POSITIVE,
     check_per_joint,
+    group,
     joint_numbers,
     number,
     numbers,
@@ -70,10 +71,6 @@ def _read(kind: type[Entry], label: str, text: str) -> Entry:
 
 Array = NDArray[np.float64]
 
-_AXES = "x, y, z and about x, y, z of the end effector's axes"
-
-_DEFAULTS = InteractionSettings()
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ContactPoint:
@@ -91,39 +88,10 @@ class InteractionConfiguration:
 
     Attributes:
         points: of contacts.
-        settings: what is done about forces.
     """
 
     ft_frame: str = text("link of the wrist's force/torque sensor; none if empty", default="")
-    force_directions: Array = numbers(
-        f"1 where target_wrench is exerted, 0 elsewhere: {_AXES}; nowhere if empty",
-        length=6,
-        if_empty=0.0,
-        live=True,
-        note="zeros and ones",
-    )
-    admittance_kp: Array = numbers(
-        "gains Kp of (27) for forces, m/s^2 per N, and moments, rad/s^2 per N m",
-        NOT_NEGATIVE,
-        length=2,
-        default=_DEFAULTS.gains.kp,
-        live=True,
-    )
-    admittance_speed_max: Array = numbers(
-        "speeds at which the hand approaches what it is to press on, m/s and rad/s",
-        POSITIVE,
-        length=2,
-        default=(0.01, 0.05),
-        live=True,
-    )
-    yield_threshold: Array = numbers(
-        "force, N, and moment, N m, above which the hand yields; below half of both it stops, and "
-        "stays where it is then; it never yields if empty",
-        POSITIVE,
-        length=2,
-        default=(),
-        live=True,
-    )
+    settings: InteractionSettings = group(InteractionSettings)
     contacts: tuple[str, ...] = texts(
         "points at which the hand touches while it exerts target_wrench, on one link fixed to it "
         "and in its axes: point, m, its origin if left out; normal, direction in which the "
@@ -133,30 +101,14 @@ class InteractionConfiguration:
         "friction: 0.3}'; all have the same frame, normal and friction",
     )
     points: tuple[ContactPoint, ...] = field(init=False)
-    settings: InteractionSettings = field(init=False)
 
     def __post_init__(self) -> None:
-        """Check all that does not depend on the URDF, and make the settings."""
+        """Check all that does not depend on the URDF."""
         object.__setattr__(self, "points", _contact_points(self.contacts))
         for name in ("force_directions", "yield_threshold"):
-            if np.any(getattr(self, name)) and not self.ft_frame:
-                allowed = "only with a force/torque sensor, 'ft_frame'"
-                raise SettingError(name, getattr(self, name), allowed)
-        if not np.isin(self.force_directions, (0.0, 1.0)).all():
-            raise SettingError("force_directions", self.force_directions, "zeros and ones")
-        object.__setattr__(self, "settings", self._settings())
-
-    def _settings(self) -> InteractionSettings:
-        threshold = tuple(self.yield_threshold.tolist()) or None
-        return InteractionSettings(
-            directions=self.force_directions == 1.0,
-            gains=replace(
-                _DEFAULTS.gains,
-                kp=tuple(self.admittance_kp.tolist()),
-                speed_max=tuple(self.admittance_speed_max.tolist()),
-            ),
-            yield_threshold=threshold,
-        )
+            value = getattr(self.settings, name)
+            if value.any() and not self.ft_frame:
+                raise SettingError(name, value, "only with a force/torque sensor, 'ft_frame'")
 
 
 def _contact_points(entries: tuple[str, ...]) -> tuple[ContactPoint, ...]:

@@ -1,13 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Forces at the hand: exerting a target wrench, and yielding to external ones.
 
-One part puts together the sensor, the contact of the QP with its wrench task, the
-admittance task (27) and dual compliance: [Benallegue2021], III-E and IV-C. Wrenches are those of
-the environment on the arm, about the end effector's origin and in its axes; what the arm is to
-exert is the negative.
-
-Dual compliance holds the pose while the wrench is below a threshold; above it the hand yields,
-and where the wrench ends is the new goal.
+[Benallegue2021], III-E and IV-C. Wrenches are those of the environment on the arm, about the end
+effector's origin and in its axes; what the arm is to exert is the negative. Dual compliance holds
+the pose while the wrench is below a threshold; above it the hand yields, and where the wrench ends
+is the new goal.
 """
 
 from __future__ import annotations
@@ -20,13 +17,17 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from torque_safety_controller.parts.contact.admittance import (
+    AdmittanceTask,
+    InteractionSettings,
+    admittance,
+)
 from torque_safety_controller.parts.contact.contacts import FrictionContact
 from torque_safety_controller.parts.contact.wrench_sensor import WrenchSensor
 from torque_safety_controller.parts.goals import Goals
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.settings import Settings
 from torque_safety_controller.step import Part, Step
-from torque_safety_controller.tasks.admittance_task import AdmittanceTask, InteractionSettings
 from torque_safety_controller.tasks.pose_task import shorten
 from torque_safety_controller.tasks.task import Task
 
@@ -45,6 +46,12 @@ contact's normal, N: the hand neither rushes at what it is to touch, nor presses
 YIELD_RELEASE = 0.5
 """Share of the thresholds of dual compliance below which the hand stops to yield."""
 
+YIELD_KP = (0.1, 1.0)
+"""Kp of (27) for a hand that yields, m/s^2 per N and rad/s^2 per N m."""
+
+YIELD_SPEED_MAX = (0.25, 1.0)
+"""Speeds at which it yields at most, m/s and rad/s."""
+
 
 class Compliance(Enum):
     """What is done about the wrench at the hand."""
@@ -62,9 +69,7 @@ class Compliance(Enum):
 
 
 class Interaction(Part):
-    """Exerts wrenches at the hand, and yields to them.
-
-    Where the hand yields or presses, its pose becomes the goal of `goals`.
+    """Exerts wrenches at the hand, and yields to them: there its pose becomes the goal.
 
     Args:
         goals: of the arm.
@@ -78,6 +83,7 @@ class Interaction(Part):
         state: what is done at present.
         reason: why.
         changes: how often the state has changed.
+        yield_kp: Kp of (27) for a hand that yields, for forces and moments.
         reference: wrench that (27) goes by, F_ref, shape (6,).
     """
 
@@ -89,10 +95,9 @@ class Interaction(Part):
         placement: pin.SE3 | None = None,
         settings: InteractionSettings | None = None,
     ) -> None:
-        self._goals = goals
-        self.sensor = sensor
-        self.contact = contact
-        placement = pin.SE3.Identity() if placement is None else placement
+        self._goals, self.sensor, self.contact = goals, sensor, contact
+        self.yield_kp = YIELD_KP
+        placement = placement or pin.SE3.Identity()
         self._to_hand = placement.toDualActionMatrix()  # from the contact's frame
         self._to_contact = np.ascontiguousarray(placement.inverse().toDualActionMatrix())
         self._target: tuple[Array, Array | None] | None = None
@@ -109,16 +114,17 @@ class Interaction(Part):
     @settings.setter
     def settings(self, settings: InteractionSettings) -> None:
         # What was pressed along is to be held where it is, not where a goal was meanwhile.
-        self._turned |= not np.array_equal(settings.directions, self._settings.directions)
+        directions = settings.force_directions
+        self._turned |= not np.array_equal(directions, self._settings.force_directions)
         self._settings = settings
-        self._rows = np.flatnonzero(settings.directions)
-        self._shares = np.where(settings.directions, 0.0, 1.0)
+        self._rows = np.flatnonzero(directions)
+        self._shares: Array = 1.0 - directions
 
     def _clear(self) -> None:
         self._target = None
         self._goal = self._goal_rate = self.reference = np.zeros(6)
-        self._counted = np.zeros(6)  # on, at the contact of the hand, in its axes
-        self._missing = np.zeros(6)  # of that, in the QP, in the end effector's axes
+        self._counted = np.zeros(6)  # on in the QP, at the contact, in its axes
+        self._missing = np.zeros(6)  # of that, in the end effector's axes
         self._enter(Compliance.OFF, "at start")
         self.sensor.start()
 
@@ -132,13 +138,6 @@ class Interaction(Part):
                 end effector's axes.
         """
         self._target = (-np.asarray(wrench, dtype=float), rotation)
-
-    @property
-    def target(self) -> Array:
-        """Wrench that the arm is to exert, as `set_target` was given it, shape (6,)."""
-        return np.zeros(6) if self._target is None else -self._target[0]
-
-    # Each step
 
     def configure(self, settings: Settings) -> None:
         """See `Part.configure`."""
@@ -176,77 +175,66 @@ class Interaction(Part):
             "compliance_reason": self.reason,
             "compliance_changes": self.changes,
             "hand_wrench": self.sensor.wrench,
-            "target_wrench": self.target,
+            "target_wrench": np.zeros(6) if self._target is None else -self._target[0],
             "ft_bias": self.sensor.bias,
         }
 
     @property
     def trouble(self) -> str:
-        """Whether the sensor says nothing, though it is needed."""
-        silent = self.state is Compliance.SILENT
-        return "the force/torque sensor is silent" if silent else ""
+        """See `Part.trouble`."""
+        return "the force/torque sensor is silent" if self.state is Compliance.SILENT else ""
 
     def _change_state(self, robot: RobotModel, elapsed: float) -> None:
         """Choose what is done, and make the pose of a hand that yields its goal."""
-        sensor, goals = self.sensor, self._goals
+        sensor, goals, threshold = self.sensor, self._goals, self._settings.yield_threshold
         sensor.update(robot.pose.rotation, elapsed)
-        active = self.state in (Compliance.FORCE, Compliance.YIELDING)
+        wrench = sensor.wrench
         if sensor.silent:
-            if active:
+            wanted = self._target is not None or len(threshold) > 0
+            if self.state in (Compliance.FORCE, Compliance.YIELDING):
                 # Nothing is known of what touches the hand: stop, and stay.
                 goals.hold(robot.pose)
-                self._target = None
-            threshold = self._settings.yield_threshold
-            wanted = self._target is not None or threshold is not None
-            state = Compliance.SILENT if active or wanted else Compliance.OFF
+                self._target, wanted = None, True
             if self.state is not Compliance.SILENT:
-                self._enter(state, "no measurement")
+                self._enter(Compliance.SILENT if wanted else Compliance.OFF, "no measurement")
             return
         if self._target is not None and self._rows.size:
-            self._exert(*self._target, sensor.wrench, robot, elapsed)
+            self._exert(*self._target, robot, elapsed)
             return
         if self.state is Compliance.FORCE:
             goals.hold(robot.pose)
             self._target = None
-        if self._settings.yield_threshold is None or goals.pose_des is None:
+        if not len(threshold) or goals.pose_des is None:
             self._enter(Compliance.OFF, "no target wrench")
-        elif self._yields(sensor.wrench, *self._settings.yield_threshold):
+            return
+        share = YIELD_RELEASE if self.state is Compliance.YIELDING else 1.0
+        force, moment = (share * threshold).tolist()
+        if math.hypot(*wrench[:3]) > force or math.hypot(*wrench[3:]) > moment:
             # The goal follows the hand, so that no stiffness acts against the motion.
             goals.hold(robot.pose)
             self._enter(Compliance.YIELDING, "wrench above the threshold")
         else:
             self._enter(Compliance.HOLDING, "wrench below the threshold")
 
-    def _yields(self, wrench: Array, force: float, moment: float) -> bool:
-        """Return whether the hand is to yield, with hysteresis."""
-        share = YIELD_RELEASE if self.state is Compliance.YIELDING else 1.0
-        return math.hypot(*wrench[:3]) > share * force or math.hypot(*wrench[3:]) > share * moment
-
     def _exert(
-        self,
-        wrench: Array,
-        rotation: Array | None,
-        measured: Array,
-        robot: RobotModel,
-        elapsed: float,
+        self, wrench: Array, rotation: Array | None, robot: RobotModel, elapsed: float
     ) -> None:
-        goals = self._goals
+        """Bring what is to be felt nearer to a wrench, see `set_target`."""
+        goals, measured = self._goals, self.sensor.wrench
         if rotation is not None:
-            turn = robot.pose.rotation.T @ rotation
-            wrench = np.concatenate([turn @ wrench[:3], turn @ wrench[3:]])
+            wrench = (wrench.reshape(2, 3) @ rotation.T @ robot.pose.rotation).ravel()
         if self.state is not Compliance.FORCE:
             self._enter(Compliance.FORCE, "target wrench")
             if goals.pose_des is None:
                 goals.hold(robot.pose)  # its damping is needed
-            self._goal = measured
-            self._missing = np.zeros(6)
+            self._goal, self._missing = measured, np.zeros(6)
         elif self._turned:
             goals.hold(robot.pose)
         self._turned = False
-        before = self._goal
-        share = -math.expm1(-elapsed / WRENCH_TIME) if elapsed > 0.0 else 0.0
-        self._goal = before + share * (wrench - before)
-        self._goal_rate = (self._goal - before) / elapsed if elapsed > 0.0 else np.zeros(6)
+        before, self._goal_rate = self._goal, np.zeros(6)
+        if elapsed > 0.0:
+            self._goal = before - math.expm1(-elapsed / WRENCH_TIME) * (wrench - before)
+            self._goal_rate = (self._goal - before) / elapsed
         # What the QP says that limits allow is what is to be felt: III-E (b), one step late.
         self.reference = self._goal - self._missing
         if self.contact is not None:
@@ -255,19 +243,23 @@ class Interaction(Part):
     def _tasks(self) -> list[Task]:
         """Return the admittance task, (27), if there is one in this state."""
         settings, sensor, gains = self._settings, self.sensor, self._goals.gains
-        weight = gains.pose_weight
-        if weight == 0.0:
-            return []
-        if self.state not in (Compliance.FORCE, Compliance.YIELDING):
+        if gains.pose_weight == 0.0:
             return []
         F, rate = sensor.wrench, sensor.rate
         if self.state is Compliance.YIELDING:
-            a = settings.yielding_gains.acceleration(-F, -rate, gains.pose_kd)
-            return [AdmittanceTask(a, weight, np.arange(6))]
-        error, error_rate = self.reference - F, self._goal_rate - rate
-        mask = settings.directions
-        a = settings.gains.acceleration(mask * error, mask * error_rate, gains.pose_kd)
-        return [AdmittanceTask(a, weight, self._rows)]
+            g = admittance(-F, -rate, self.yield_kp, YIELD_SPEED_MAX, gains.pose_kd)
+            return [AdmittanceTask(g, gains.pose_weight, np.arange(6))]
+        if self.state is not Compliance.FORCE:
+            return []
+        mask = settings.force_directions
+        g = admittance(
+            mask * (self.reference - F),
+            mask * (self._goal_rate - rate),
+            settings.admittance_kp.tolist(),
+            settings.admittance_speed_max.tolist(),
+            gains.pose_kd,
+        )
+        return [AdmittanceTask(g, gains.pose_weight, self._rows)]
 
     def _enter(self, state: Compliance, reason: str) -> None:
         if state is not self.state:
