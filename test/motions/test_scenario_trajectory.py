@@ -8,7 +8,7 @@ import pytest
 from sim_bridge.node.scenario_messages import to_controller
 from sim_bridge.scenario.events import TrajectoryGoal, read_trajectory
 from sim_bridge.scenario.scenario import Scenario
-from torque_safety_controller.node.goals import trajectory_from_message
+from torque_safety_controller.node.goal_messages import trajectory_from_message
 
 
 def received(trajectory, base):

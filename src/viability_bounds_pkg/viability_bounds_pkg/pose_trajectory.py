@@ -117,8 +117,8 @@ class _Segment:
             back = np.linalg.inv(pin.Jexp3(phi))
             rate = back @ omega
             ends.append((phi, rate, back @ (alpha - _jacobian_rate(phi, rate) @ rate)))
-        self._turning = _quintic(T, *ends)
-        self._moving = _quintic(
+        self._turning = quintic(T, *ends)
+        self._moving = quintic(
             T,
             *(
                 (point.pose.translation, point.velocity[:3], point.acceleration[:3])
@@ -152,8 +152,14 @@ def _jacobian_rate(phi: Array, phi_dot: Array) -> Array:
     return rate
 
 
-def _quintic(T: float, start: tuple[Array, ...], end: tuple[Array, ...]) -> Array:
-    """Return coefficients, shape (6, 3), lowest power first, from values and two derivatives."""
+def quintic(T: float | Array, start: tuple[Array, ...], end: tuple[Array, ...]) -> Array:
+    """Return coefficients of polynomials, lowest power first, shape (6, ...).
+
+    Args:
+        T: duration, s.
+        start: values at time 0 and their first two derivatives, shape (...) each.
+        end: likewise at `T`.
+    """
     (x0, v0, a0), (x1, v1, a1) = start, end
     dx = x1 - (x0 + v0 * T + 0.5 * a0 * T * T)
     dv, da = v1 - (v0 + a0 * T), a1 - a0

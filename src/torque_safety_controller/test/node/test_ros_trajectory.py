@@ -16,7 +16,7 @@ from trajectory_msgs.msg import (
 )
 
 from torque_safety_controller.node.controller_node import ControllerNode
-from torque_safety_controller.node.goals import GoalRefused, trajectory_from_message
+from torque_safety_controller.node.goal_messages import GoalRefused, trajectory_from_message
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory, circle
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp
 from viability_bounds_pkg.state import State

@@ -14,7 +14,7 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from std_srvs.srv import Trigger
 
 from torque_safety_controller.node.assembly import make_controller
-from torque_safety_controller.node.wrenches import wrench_of
+from torque_safety_controller.node.goal_messages import numbers_of
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parts.contact import interaction
 from torque_safety_controller.parts.contact.interaction import Interaction
@@ -84,7 +84,7 @@ class WrenchChain(ControllerChain):
 
         def send() -> None:
             if self.feels is not None:
-                values = wrench_of(self.feels) + WEIGHT
+                values = numbers_of(self.feels.wrench.force, self.feels.wrench.torque) + WEIGHT
                 self.measured.publish(wrench(values[:3], values[3:], self.feels.header.frame_id))
             self.send_limits(self.stamp, -wide, wide)
             self.send_state(self.stamp, ARM.q_start, np.zeros(ARM.n))

@@ -1,23 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Hand and mode as plain topics."""
 
-import numpy as np
-import pinocchio as pin
-import pytest
 from controller_chain import MS
-from geometry_msgs.msg import PoseStamped, Vector3Stamped
+from geometry_msgs.msg import PoseStamped
 from node_chain import (
     ARM,
-    GOAL,
     NodeChain,
     Q,
     give_goal,
     pose_at,
-    pose_message,
 )
 from std_msgs.msg import String
 
-from torque_safety_controller.node.goals import pose_from_message
+from torque_safety_controller.node.goal_messages import pose_from_message
 from viability_bounds_pkg.ros.runtime import LATCHED_QOS, STATUS_QOS
 
 
@@ -27,8 +22,6 @@ class Tools(NodeChain):
     def __init__(self, ros, **changed):
         super().__init__(ros, **changed)
         self.hand = ros.listen(PoseStamped, "hand_pose", STATUS_QOS)
-        self.translation = ros.listen(Vector3Stamped, "hand_position_error", STATUS_QOS)
-        self.rotation = ros.listen(Vector3Stamped, "hand_orientation_error", STATUS_QOS)
 
     def shown(self, messages, stamp):
         """Wait for a message from now on with a stamp, ms."""
@@ -36,42 +29,23 @@ class Tools(NodeChain):
         self.ros.wait_until(lambda: stamp * MS in messages.stamps, f"what is shown for {stamp}")
         return messages[messages.stamps.index(stamp * MS)]
 
-    def error(self, stamp):
-        """Wait for the errors under a stamp, ms; return both."""
-        both = self.shown(self.translation, stamp), self.shown(self.rotation, stamp)
-        assert {message.header.frame_id for message in both} == {"base"}
-        return [np.array([m.vector.x, m.vector.y, m.vector.z]) for m in both]
 
-
-def test_the_hand_is_shown_with_its_error_where_it_has_a_goal(ros):
+def test_the_hand_is_shown_in_the_base_frame(ros):
     chain = Tools(ros)
     chain.answer(1)
     message = chain.shown(chain.hand, 1)
     here = pose_at(Q)
     assert message.header.frame_id == "base"
     assert pose_from_message(message, "base").isApprox(here, 1e-9)
-    assert not chain.translation and not chain.rotation  # there is no goal
-    stamp = give_goal(chain, first=2)
-    chain.answer(stamp)
-    translation, rotation = chain.error(stamp)
-    np.testing.assert_allclose(translation, GOAL.translation - here.translation, atol=1e-9)
-    np.testing.assert_allclose(pin.exp3(rotation) @ here.rotation, GOAL.rotation, atol=1e-9)
-    assert np.linalg.norm(rotation) > 0.05
 
 
 def test_the_hand_is_shown_in_a_base_frame_that_is_not_the_root(ros):
     frame = "left_arm_mount"
     base = ARM.model.frames[ARM.model.getFrameId(frame)].placement
     chain = Tools(ros, base_frame=frame)
-    goal = base.actInv(GOAL)
-    stamp = give_goal(chain, pose_message(goal, frame))
-    chain.answer(stamp)
-    here = pose_from_message(chain.shown(chain.hand, stamp), frame)
+    chain.answer(1)
+    here = pose_from_message(chain.shown(chain.hand, 1), frame)
     assert here.isApprox(base.actInv(pose_at(Q)), 1e-9)
-    error = chain.shown(chain.translation, stamp)
-    assert error.header.frame_id == frame
-    wanted = (goal.translation - here.translation).tolist()
-    assert [error.vector.x, error.vector.y, error.vector.z] == pytest.approx(wanted)
 
 
 def test_nothing_is_shown_once_the_robot_is_silent(ros):

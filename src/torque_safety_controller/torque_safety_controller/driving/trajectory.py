@@ -17,7 +17,7 @@ from scipy.interpolate import CubicHermiteSpline, PchipInterpolator, PPoly
 
 from torque_safety_controller.controller import Controller
 from viability_bounds_pkg.exceptions import ArmSafetyError
-from viability_bounds_pkg.pose_trajectory import PoseTrajectory
+from viability_bounds_pkg.pose_trajectory import PoseTrajectory, quintic
 from viability_bounds_pkg.state import State
 
 Array = NDArray[np.float64]
@@ -153,16 +153,9 @@ def _curves(
     if a is None:
         curve = CubicHermiteSpline(times, q, v)
     else:
-        T = np.diff(times)[:, None]
-        dx = q[1:] - (q[:-1] + v[:-1] * T + 0.5 * a[:-1] * T**2)
-        dv, da = v[1:] - (v[:-1] + a[:-1] * T), a[1:] - a[:-1]
-        rows = [
-            (6.0 * dx - 3.0 * dv * T + 0.5 * da * T**2) / T**5,
-            (-15.0 * dx + 7.0 * dv * T - da * T**2) / T**4,
-            (10.0 * dx - 4.0 * dv * T + 0.5 * da * T**2) / T**3,
-            *(0.5 * a[:-1], v[:-1], q[:-1]),
-        ]
-        curve = PPoly(np.stack(rows), times)
+        T, first, last = np.diff(times)[:, None], slice(None, -1), slice(1, None)
+        rows = quintic(T, *((q[part], v[part], a[part]) for part in (first, last)))
+        curve = PPoly(rows[::-1], times)
     return curve, curve.derivative(), curve.derivative(2)
 
 

@@ -25,7 +25,6 @@ from torque_safety_controller.node.declared import (
     covered_misses,
     declared_robot,
 )
-from torque_safety_controller.node.driving import Driving
 from torque_safety_controller.node.goals import GoalSubscriber
 from torque_safety_controller.node.periodic import UNSEEN, JointCommands, LimitsReader, StateStream
 from torque_safety_controller.node.reports import ControllerReport, StatePublisher
@@ -72,11 +71,10 @@ class ControllerNode(ArmNode):
         check = make_plausibility_check(config, declared)
         self._states = StateStream(config.joints, config.state_timeout, self._warn, check)
         self._limits = LimitsReader(config.joints, self._warn)
-        self._goals = GoalSubscriber(self, self._controller, config, base)
+        self._goals = GoalSubscriber(self, self._controller, config, base, self._states)
         self._wrenches = WrenchSubscriber(
             self, self._controller.find(Interaction), self._goals, config, base
         )
-        self._driving = Driving(self, self._goals, self._controller, config, base, self._states)
         self._supervisor = Supervisor(
             config.dt,
             config.start_control,
@@ -97,7 +95,7 @@ class ControllerNode(ArmNode):
             self._wrenches,
         )
         self._commands = JointCommands(self, config.joints, config.ros2_control_topic)
-        self._published = StatePublisher(self, self._controller, config, base, self._states)
+        self._published = StatePublisher(self, self._controller.robot, config, base, self._states)
         ENABLE_TORQUE.serve(self, self._on_enable_torque)
         self.listen_to_states(config.use_estimated_states, self._on_state)
         self.listen(ACCELERATION_LIMITS, self._on_limits)

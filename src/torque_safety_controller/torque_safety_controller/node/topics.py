@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from geometry_msgs.msg import PoseStamped, TwistStamped, Vector3Stamped, WrenchStamped
+from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
@@ -103,24 +103,6 @@ HAND_POSE = Topic(
     "pose of the end effector in `base_frame`, 20 times a second unless the mode is STOPPED; "
     "stamp of the joint state",
 )
-HAND_POSITION_ERROR = Topic(
-    "hand_position_error",
-    Vector3Stamped,
-    STATUS_QOS,
-    (_NODE,),
-    (USER,),
-    "from the end effector to its goal, m, in the axes of `base_frame`; silent without a goal for "
-    "the pose; stamp as of `hand_pose`",
-)
-HAND_ORIENTATION_ERROR = Topic(
-    "hand_orientation_error",
-    Vector3Stamped,
-    STATUS_QOS,
-    (_NODE,),
-    (USER,),
-    "rotation from the end effector to its goal: axis times angle, rad, in the axes of "
-    "`base_frame`; silent and with a stamp as `hand_position_error`",
-)
 CONTROLLER_MODE = Topic(
     "controller_mode",
     String,
@@ -145,8 +127,6 @@ TOPICS = (
     *GOALS,
     ROS2_CONTROL_EFFORTS,
     HAND_POSE,
-    HAND_POSITION_ERROR,
-    HAND_ORIENTATION_ERROR,
     CONTROLLER_MODE,
 )
 

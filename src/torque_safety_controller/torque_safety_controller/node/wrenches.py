@@ -12,7 +12,8 @@ from geometry_msgs.msg import WrenchStamped
 from numpy.typing import NDArray
 from std_srvs.srv import Trigger
 
-from torque_safety_controller.node.goals import GoalRefused, GoalSubscriber
+from torque_safety_controller.node.goal_messages import GoalRefused, check_frame, numbers_of
+from torque_safety_controller.node.goals import GoalSubscriber
 from torque_safety_controller.node.topics import TARE_FT_SENSOR, TARGET_WRENCH
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parts.contact.interaction import Compliance, Interaction
@@ -25,12 +26,6 @@ from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.topics import FT_WRENCH
 
 Array = NDArray[np.float64]
-
-
-def wrench_of(message: WrenchStamped) -> Array:
-    """Return the numbers of a message, shape (6,), N and N m."""
-    force, torque = message.wrench.force, message.wrench.torque
-    return np.array([force.x, force.y, force.z, torque.x, torque.y, torque.z])
 
 
 class WrenchSubscriber:
@@ -68,35 +63,31 @@ class WrenchSubscriber:
         TARE_FT_SENSOR.serve(node, partial(self._on_tare, interaction, sensor))
 
     def _on_measured(self, sensor: WrenchSensor, message: WrenchStamped) -> None:
-        frame, wanted = message.header.frame_id, self._config.interaction.ft_frame
-        if frame not in ("", wanted):
+        try:
+            check_frame(message.header.frame_id, self._config.interaction.ft_frame)
+            sensor.receive(_wrench(message))
+        except GoalRefused as error:
             # Counted together, whatever the frame: senders do not make the report longer.
-            detail = f"frame_id is '{frame}'; allowed: '{wanted}' or empty"
-            self._refuse("another frame_id", detail)
-        else:
-            try:
-                sensor.receive(wrench_of(message))
-            except WrenchError as error:
-                self._refuse(str(error))
+            self._refuse("another frame_id", str(error))
+        except WrenchError as error:
+            self._refuse(str(error), str(error))
 
-    def _refuse(self, reason: str, detail: str = "") -> None:
+    def _refuse(self, reason: str, detail: str) -> None:
         self.refused[reason] += 1
         if self.refused[reason] == 1:
-            self._logger.warning(f"ft_wrench refused: {detail or reason}")
+            self._logger.warning(f"ft_wrench refused: {detail}")
 
     def _on_target(self, message: WrenchStamped) -> None:
         config, interaction = self._config, self._interaction
         if interaction is None:
             raise GoalRefused("there is no force/torque sensor, 'ft_frame'")
-        wrench = wrench_of(message)
+        wrench = _wrench(message)
         if not np.isfinite(wrench).all():
             raise GoalRefused("wrench is not finite")
         if (strong := np.abs(wrench).max()) > STRONGEST:
             raise GoalRefused(f"wrench has {strong:g}; allowed: up to {STRONGEST:g} N or N m")
         frame = message.header.frame_id
-        hand, base = config.end_effectors[0], config.base_frame
-        if frame not in ("", hand, base):
-            raise GoalRefused(f"frame_id is '{frame}'; allowed: '{hand}', '{base}' or empty")
+        check_frame(frame, config.end_effectors[0], config.base_frame)
         rotation = self._base.rotation if frame == config.base_frame else None
         self._goals.add(message, lambda: self._apply(interaction, wrench, rotation))
 
@@ -137,3 +128,8 @@ class WrenchSubscriber:
             self._logger.warning(text)
         else:
             self._logger.info(text)
+
+
+def _wrench(message: WrenchStamped) -> Array:
+    """Return the numbers of a message, shape (6,), N and N m."""
+    return numbers_of(message.wrench.force, message.wrench.torque)

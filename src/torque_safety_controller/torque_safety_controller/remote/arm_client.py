@@ -7,6 +7,8 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
+from os import PathLike
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,16 +23,16 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from torque_safety_controller.node.topics import HAND_POSE, TARGET_JOINT_TRAJECTORY, TARGET_POSE
-from torque_safety_controller.remote.state_recording import StateRecording
 from viability_bounds_pkg.exceptions import ArmSafetyError
-from viability_bounds_pkg.ros.messages import pose_message
-from viability_bounds_pkg.ros.runtime import GOAL_QOS, make_executor
+from viability_bounds_pkg.ros.messages import Arrival, JointStateReader, pose_message
+from viability_bounds_pkg.ros.runtime import GOAL_QOS, make_executor, set_stamp
 from viability_bounds_pkg.ros.topics import DIAGNOSTICS, JOINT_STATES, LIMIT_DISTANCES, Topic
 
 Array = NDArray[np.float64]
 
 _RECORDING_QOS = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
 """States wait here until a method waits."""
+_STATE = JOINT_STATES, HAND_POSE, LIMIT_DISTANCES
 _SETTLED = 2.0
 """After which diagnostics are about the goal that was sent, s; they come twice a second, and the
 arm stands for 1 s before it counts as short of its goal."""
@@ -53,6 +55,56 @@ class ArmState(NamedTuple):
     """Pose of the hand in the base frame."""
     margins: tuple[Array, Array, Array]
     """Distances to the limits of position, rad, speed, rad/s, and torque, N m; shape (n,) each."""
+
+
+class StateRecording:
+    """States of an arm in the order of their stamps; N of n joints. Some may be lost.
+
+    Args:
+        joints: names of the n joints.
+    """
+
+    def __init__(self, joints: Sequence[str]) -> None:
+        self._reader, self._n = JointStateReader(joints), len(joints)
+        self._stamps: list[int] = []
+        self._states: list[tuple[Array, Array, Array]] = []
+
+    def add(self, message: JointState) -> None:
+        """Keep the state in a message that has come, if it can be used."""
+        reader = self._reader
+        if reader.read(message, time.monotonic()) is Arrival.NEW:
+            tau = reader.effort()
+            self._stamps.append(reader.stamp)
+            unknown = np.full(self._n, math.nan)
+            self._states.append((reader.q, reader.v, unknown if tau is None else tau))
+
+    @property
+    def t(self) -> Array:
+        """Time of the robot since the first state, shape (N,), s."""
+        stamps = np.array(self._stamps, dtype=np.int64)
+        return 1e-9 * (stamps - stamps[:1]).astype(float)
+
+    @property
+    def q(self) -> Array:
+        """Positions, shape (N, n), rad."""
+        return self._column(0)
+
+    @property
+    def v(self) -> Array:
+        """Velocities, shape (N, n), rad/s."""
+        return self._column(1)
+
+    @property
+    def tau(self) -> Array:
+        """Torques of the motors, shape (N, n), N m; NaN where the robot does not tell."""
+        return self._column(2)
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write t, q, v and tau to an ``npz`` file."""
+        np.savez_compressed(path, t=self.t, q=self.q, v=self.v, tau=self.tau)
+
+    def _column(self, which: int) -> Array:
+        return np.array([state[which] for state in self._states]).reshape(-1, self._n)
 
 
 class ArmClient:
@@ -78,8 +130,8 @@ class ArmClient:
         self._node = Node("arm_client", context=self._context, start_parameter_services=False)
         self._executor = make_executor(self._context)
         self._executor.add_node(self._node)
-        for topic in (JOINT_STATES, HAND_POSE, LIMIT_DISTANCES):
-            self._listen(topic)
+        for topic in _STATE:
+            topic.subscription(self._node, partial(self._heard.__setitem__, topic.name))
         DIAGNOSTICS.subscription(self._node, self._on_diagnostics)
         self._poses = TARGET_POSE.publisher(self._node)
         self._trajectories = TARGET_JOINT_TRAJECTORY.publisher(self._node)
@@ -107,21 +159,10 @@ class ArmClient:
     def state(self) -> ArmState:
         """Return the next state that comes."""
         self._heard.clear()
-        wanted = {topic.name for topic in (JOINT_STATES, HAND_POSE, LIMIT_DISTANCES)}
+        wanted = {topic.name for topic in _STATE}
         self._wait(lambda: wanted <= self._heard.keys(), self._timeout, "the robot is silent")
-        states: JointState = self._heard[JOINT_STATES.name]
-        inside: JointState = self._heard[LIMIT_DISTANCES.name]
-        return ArmState(
-            self._of(states, states.position),
-            self._of(states, states.velocity),
-            self._of(states, states.effort),
-            self._hand(),
-            (
-                self._of(inside, inside.position),
-                self._of(inside, inside.velocity),
-                self._of(inside, inside.effort),
-            ),
-        )
+        (q, v, tau), margins = map(self._by_joint, (JOINT_STATES, LIMIT_DISTANCES))
+        return ArmState(q, v, tau, self._hand(), margins)
 
     def move_to(
         self,
@@ -170,14 +211,12 @@ class ArmClient:
         """
         target = np.asarray(q, dtype=float)
         point = JointTrajectoryPoint(positions=target.tolist())
-        nanoseconds = round(1e9 * duration)
-        point.time_from_start.sec, point.time_from_start.nanosec = divmod(nanoseconds, 10**9)
+        set_stamp(point.time_from_start, round(1e9 * duration))
 
         def there() -> bool:
-            states = self._heard.get(JOINT_STATES.name)
-            if states is None:
+            if JOINT_STATES.name not in self._heard:
                 return False
-            return bool(np.abs(self._of(states, states.position) - target).max() < near)
+            return bool(np.abs(self._by_joint(JOINT_STATES)[0] - target).max() < near)
 
         self._trajectories.publish(JointTrajectory(joint_names=self._joints, points=[point]))
         self._arrive(there, timeout)
@@ -202,10 +241,7 @@ class ArmClient:
         """Keep the states that come while methods of this client wait, in a ``with`` statement."""
         recording = StateRecording(self._joints)
         subscription = self._node.create_subscription(
-            JointState,
-            JOINT_STATES.name,
-            lambda message: recording.add(message, time.monotonic()),
-            _RECORDING_QOS,
+            JointState, JOINT_STATES.name, recording.add, _RECORDING_QOS
         )
         try:
             yield recording
@@ -243,21 +279,20 @@ class ArmClient:
                 raise NotReachedError(f"after {timeout:g} s: {otherwise}")
             self._executor.spin_once(timeout_sec=0.02)
 
-    def _listen(self, topic: Topic) -> None:
-        def hear(message: Any) -> None:
-            self._heard[topic.name] = message
-
-        topic.subscription(self._node, hear)
-
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if status.name.endswith("controller_node"):
                 self._status = {pair.key: pair.value for pair in status.values}
                 self._status["message"] = status.message
 
-    def _of(self, message: JointState, values: Sequence[float]) -> Array:
-        where = dict(zip(message.name, values, strict=False))
-        return np.array([where.get(joint, math.nan) for joint in self._joints])
+    def _by_joint(self, topic: Topic) -> tuple[Array, Array, Array]:
+        """Return positions, velocities and efforts heard last, shape (n,) each; NaN if missing."""
+        message: JointState = self._heard[topic.name]
+        parts = []
+        for values in (message.position, message.velocity, message.effort):
+            where = dict(zip(message.name, values, strict=False))
+            parts.append(np.array([where.get(joint, math.nan) for joint in self._joints]))
+        return parts[0], parts[1], parts[2]
 
     def _hand(self) -> pin.SE3:
         pose = self._heard[HAND_POSE.name].pose

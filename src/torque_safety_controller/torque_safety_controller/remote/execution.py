@@ -19,14 +19,10 @@ Array = NDArray[np.float64]
 class Progress(Enum):
     """Where an execution is."""
 
-    MOVING = 0
-    """It has not ended."""
-    REACHED = 1
-    """The arm is at the end of the trajectory."""
-    OFF_PATH = 2
-    """A joint is farther from the trajectory than is allowed on the way."""
-    NOT_REACHED = 3
-    """The arm was not near enough to the end in time."""
+    MOVING = "it has not ended"
+    REACHED = "the arm is at the end of the trajectory"
+    OFF_PATH = "a joint is farther from the trajectory than is allowed on the way"
+    NOT_REACHED = "the arm was not near enough to the end in time"
 
 
 @dataclass(frozen=True, eq=False)

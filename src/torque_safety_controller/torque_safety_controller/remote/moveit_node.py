@@ -26,8 +26,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from torque_safety_controller.node.driving import joint_trajectory_from_message
-from torque_safety_controller.node.goals import GoalRefused
+from torque_safety_controller.node.goal_messages import GoalRefused, joint_trajectory_from_message
 from torque_safety_controller.node.topics import (
     CONTROLLER_MODE,
     JOG_JOINTS,
@@ -225,9 +224,7 @@ class MoveitNode(ArmNode):
             raise Refused("multi_dof_trajectory is given; allowed: trajectory")
         if goal.component_path_tolerance or goal.component_goal_tolerance:
             raise Refused("tolerances of components are given; allowed: those of joints")
-        trajectory = joint_trajectory_from_message(
-            message, joints, config.position_min, config.position_max
-        )
+        trajectory = joint_trajectory_from_message(message, config)
         path = tolerances_from_message(goal.path_tolerance, joints, math.inf)
         near = config.trajectory_goal_tolerance
         end = tolerances_from_message(goal.goal_tolerance, joints, near)

@@ -167,22 +167,6 @@ def shorten(vector: Array, largest: float) -> None:
         vector *= largest / length
 
 
-class PoseDifference(NamedTuple):
-    """How far a pose is from a goal, in the axes of the frame that both are given in."""
-
-    translation: Array
-    """From the pose to the goal, shape (3,), m."""
-    rotation: Array
-    """From the pose to the goal, axis times angle, shape (3,), rad."""
-
-
-def pose_difference(pose: pin.SE3, pose_des: pin.SE3) -> PoseDifference:
-    """Return how far `pose` is from `pose_des`."""
-    return PoseDifference(
-        pose_des.translation - pose.translation, pin.log3(pose_des.rotation @ pose.rotation.T)
-    )
-
-
 def separate_error(pose: pin.SE3, pose_des: pin.SE3) -> Array:
     """Return ``(R'(p_d - p), log(R'R_d))``, shape (6,), m and rad, in the hand's axes."""
     between = pose.actInv(pose_des)
