@@ -5,7 +5,7 @@ set -eu
 usage() {
     cat <<'USAGE'
 usage: bash scripts/new_robot.sh URDF TIP [--base LINK] [--name NAME] [--rate HZ] [--out DIRECTORY]
-                                 [--force] [--ideal]
+                                 [--force]
        bash scripts/new_robot.sh --topic TIP [options]
        bash scripts/new_robot.sh --table [ARM...]
 
@@ -17,12 +17,11 @@ usage: bash scripts/new_robot.sh URDF TIP [--base LINK] [--name NAME] [--rate HZ
   --rate      control rate in Hz (default: chosen)
   --out       folder of the files (default: config)
   --force     replace files of this name
-  --ideal     play only the ideal robot, not the imperfect one
   --table     play arms of installed packages, in results/new_robot, and write the table in
               docs/new_robot.md; rows of arms that are not named stay
 
-Writes <name>.yaml, scenarios/<name>_demo.yaml and imperfect/<name>.yaml, with a comment to each
-number, and plays the scenario in lockstep: into limits and back. docs/new_robot.md has more.
+Writes <name>.yaml, with a comment to each number, and scenarios/<name>_demo.yaml, and plays the
+scenario in lockstep: into limits and back. docs/new_robot.md has more.
 Exits with 0 when no limit was violated, 1 when one was or no files can be made, 2 when it could
 not run.
 USAGE
@@ -30,11 +29,10 @@ USAGE
 root="$(cd "$(dirname "$0")/.." && pwd)"
 # shellcheck source=scripts/options.sh
 source "$root/scripts/options.sh"
-arguments=() ideal='' out="$root/config" table=''
+arguments=() out="$root/config" table=''
 while [ $# -gt 0 ]; do
     case "$1" in
     -h | --help) usage; exit 0 ;;
-    --ideal) ideal=yes ;;
     --table) table=yes ;;
     --out) out="$(value "$@")"; out="$(realpath -m "$out")"; shift ;;
     *) arguments+=("$1") ;;
@@ -58,16 +56,10 @@ name="$(basename "$config" .yaml)"
 [ -n "$config" ] || exit 0 # it said what it is for
 
 results="$root/results/new_robot/$name"
-worst=0
-play() {
-    local status=0
-    echo
-    echo "$1, in lockstep:"
-    bash "$root/scripts/demo.sh" "$config" demo --out "$results/$2" "${@:3}" || status=$?
-    [ "$status" -le "$worst" ] || worst="$status"
-}
-play "the ideal robot" ideal
-[ -n "$ideal" ] || play "the imperfect robot" imperfect --imperfect
+echo
+echo "the scenario, in lockstep:"
+status=0
+bash "$root/scripts/demo.sh" "$config" demo --out "$results" || status=$?
 echo
 echo "figures and data: $results; again: bash scripts/demo.sh ${config/#"$root/config/$name.yaml"/$name}"
-exit "$worst"
+exit "$status"

@@ -27,13 +27,12 @@ def arm(tmp_path_factory):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("options", [[], ["--imperfect"]], ids=["ideal", "imperfect"])
-def test_an_arm_of_six_joints_is_driven_into_limits_and_keeps_them(arm, tmp_path, options):
+def test_an_arm_of_six_joints_is_driven_into_limits_and_keeps_them(arm, tmp_path):
     scenario = yaml.safe_load((arm.parent / "scenarios" / "my_arm_demo.yaml").read_text())
     back = scenario["events"][2]["time"]
     path = tmp_path / "first_goal.yaml"
     path.write_text(yaml.safe_dump({"duration": back, "events": scenario["events"][:2]}))
-    done = demo(arm, path, "--out", tmp_path, *options)
+    done = demo(arm, path, "--out", tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "VERDICT: no limit was broken" in done.stdout
     metrics = json.loads((tmp_path / "metrics.json").read_text())

@@ -11,14 +11,9 @@ import yaml
 
 from torque_safety_controller.new_robot.chain import NewRobotError, find_chain
 from torque_safety_controller.new_robot.estimates import CAP, LEAST, SHARE, USEFUL, estimate
-from torque_safety_controller.new_robot.hardware import (
-    GRADES,
-    acceleration_errors,
-    with_rotors,
-)
 from torque_safety_controller.new_robot.postures import SelfCollisions, find_postures
 from torque_safety_controller.tools.new_robot import main
-from viability_bounds_pkg.robot.description import read_urdf
+from viability_bounds_pkg.robot.description import load_geometry, read_urdf
 
 ROBOTS = "package://example-robot-data/robots/"
 UR5 = ROBOTS + "ur_description/urdf/ur5_robot.urdf"
@@ -109,8 +104,8 @@ def test_two_arms_are_one_chain():
 
 def test_start_and_goals_are_free_of_collisions_and_can_be_held():
     chain = chain_of("ur5")
-    touches = SelfCollisions(chain, read_urdf(UR5), None)
-    assert (touches.trouble, touches.pairs > 5) == ("", True)
+    touches = SelfCollisions(chain, load_geometry(read_urdf(UR5), chain.model))
+    assert touches.pairs > 5
     postures = find_postures(chain, touches)
     assert postures.reached.sum() >= 6
     for q in (postures.start, *postures.goals):
@@ -119,21 +114,6 @@ def test_start_and_goals_are_free_of_collisions_and_can_be_held():
         assert (np.abs(gravity) <= 0.9 * chain.tau_max).all()
     folded = np.array([0.0, -1.5, np.pi, 0.0, 0.0, 0.0])  # the forearm in the upper arm
     assert touches(folded)
-
-
-def test_errors_of_accelerations_hold_in_nearly_all_states():
-    chain, estimates, grade = with_rotors(chain_of("ur5")), estimates_of("ur5"), GRADES[0]
-    declared, data = acceleration_errors(chain, estimates, grade), chain.model.createData()
-    rng = np.random.default_rng(2)
-    beyond = 0
-    for _ in range(500):
-        q, v = rng.uniform(chain.q_min, chain.q_max), rng.uniform(-1.0, 1.0, 6) * estimates.v_max
-        tau = pin.rnea(chain.model, data, q, v, rng.uniform(estimates.a_min, estimates.a_max))
-        constants = 1.0 + grade.constant_error * np.array([-1, 1, -1, 1, -1, 1])
-        a, wrong = (pin.aba(chain.model, data, q, v, each) for each in (tau, constants * tau))
-        beyond += (np.abs(wrong - a) > declared).any()
-    assert beyond < 0.01 * 500
-    assert (declared < 5.0).all()
 
 
 def test_missing_limits_come_from_the_urdf(tmp_path):
@@ -269,6 +249,5 @@ def test_files_are_not_replaced_unasked_and_say_where_numbers_come_from(tmp_path
     for name in ("rate_hz", "start_positions", "acceleration_min", "acceleration_drift"):
         index = next(i for i, line in enumerate(lines) if line.strip().startswith(f"{name}:"))
         assert lines[index - 1].strip().startswith("#"), name
-    for folder in ("scenarios", "imperfect"):
-        (file,) = (tmp_path / folder).iterdir()
-        assert yaml.safe_load(file.read_text())
+    (file,) = (tmp_path / "scenarios").iterdir()
+    assert yaml.safe_load(file.read_text())

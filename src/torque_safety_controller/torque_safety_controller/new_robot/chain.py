@@ -79,17 +79,11 @@ def find_chain(urdf: str, tips: Sequence[str], base: str = "") -> Chain:
             ends = ", ".join(link for link in links if link not in parents)
             hint = did_you_mean(link, links) or f"; links at the ends: {ends}"
             raise NewRobotError(f"the URDF has no link '{link}'{hint}")
-    elements: dict[str, Element] = {}
+    moving: dict[str, Element] = {}
     for tip in tips:
-        elements |= _way(above, tip, base)
-    moving = {name: each for name, each in elements.items() if each.get("type") in _MOVING}
-    for tip in tips:
-        way = _way(above, tip, "")
-        _check_kinds(
-            root,
-            {name: each for name, each in elements.items() if name in way},
-            {name: each for name, each in moving.items() if name in way},
-        )
+        way = _way(above, tip, base)
+        _check_kinds(root, way)
+        moving |= {name: each for name, each in way.items() if each.get("type") in _MOVING}
     if not moving:
         raise NewRobotError(
             f"no joint moves between '{base or 'the root'}' and {', '.join(tips)}; the tip must "
@@ -155,60 +149,52 @@ def _way(above: Mapping[str, Element], tip: str, base: str) -> dict[str, Element
     return {each.get("name", ""): each for each in reversed(way)}
 
 
-def _check_kinds(
-    root: Element, elements: Mapping[str, Element], moving: Mapping[str, Element]
-) -> None:
+def _check_kinds(root: Element, way: Mapping[str, Element]) -> None:
     """Refuse joints without a motor of their own, and grippers."""
     followers = {
         mimic.get("joint", ""): joint.get("name", "")
         for joint in root.findall("joint")
         if (mimic := joint.find("mimic")) is not None
     }
-    for name, each in elements.items():
-        parent, kind = _link(each, "parent"), each.get("type")
-        before = f"end the arm before it, with the tip {parent}"
+    moving = [name for name, joint in way.items() if joint.get("type") in _MOVING]
+    for name, joint in reversed(way.items()):
+        kind = joint.get("type")
         if kind in ("floating", "planar"):
             raise NewRobotError(
-                f"joint '{name}' is {kind}, which no motor moves; --base {_link(each, 'child')} "
+                f"joint '{name}' is {kind}, which no motor moves; --base {_link(joint, 'child')} "
                 "leaves it out"
             )
-        if each.find("mimic") is not None and kind in _MOVING:
-            raise NewRobotError(
-                f"joint '{name}' mimics another, as a gripper's do: it has no motor of its own; "
-                f"{before}"
-            )
-    for name in filter(followers.get, elements):
+        if joint.find("mimic") is not None and kind in _MOVING:
+            why = "mimics another"
+        elif name in followers:
+            why = f"is one that '{followers[name]}' mimics"
+        elif kind == "prismatic" and len(moving) > 1 and name == moving[-1]:
+            why = "is the last and slides"
+        else:
+            continue
         raise NewRobotError(
-            f"joint '{name}' is one that '{followers[name]}' mimics, as a gripper's are; end the "
-            f"arm before it, with the tip {_link(elements[name], 'parent')}"
+            f"joint '{name}' {why}, as in a gripper; end the arm before it, with the tip "
+            f"{_link(joint, 'parent')}"
         )
-    if len(moving) > 1:
-        name, last = list(moving.items())[-1]
-        if last.get("type") == "prismatic":
-            raise NewRobotError(
-                f"joint '{name}', the last, slides, as a gripper's do; end the arm before it, "
-                f"with the tip {_link(last, 'parent')}"
-            )
 
 
 def _limits(name: str, joint: Element) -> tuple[float, float, float, float]:
     """Return position limits, speed and effort of a joint."""
     limit = joint.find("limit")
-    values = {key: math.nan for key in ("lower", "upper", "velocity", "effort")}
-    if limit is not None:
-        for key in values:
-            try:
-                values[key] = float(limit.get(key, "nan"))
-            except ValueError:
-                raise NewRobotError(
-                    f"joint '{name}' has {key}=\"{limit.get(key)}\", not a number; correct its "
-                    "<limit> in the URDF"
-                ) from None
+    given = {} if limit is None else limit.attrib
+    try:
+        values = {
+            key: float(given.get(key, "nan")) for key in ("lower", "upper", "velocity", "effort")
+        }
+    except ValueError as error:
+        raise NewRobotError(
+            f"joint '{name}': {error}, not a number; correct its <limit> in the URDF"
+        ) from None
     for key, what in (("effort", "torque"), ("velocity", "speed")):
         if not (math.isfinite(values[key]) and values[key] > 0.0):
-            given = "no" if math.isnan(values[key]) else f"{values[key]:g} as"
+            found = "no" if math.isnan(values[key]) else f"{values[key]:g} as"
             raise NewRobotError(
-                f"joint '{name}' has {given} {key} limit: nothing is known of its {what}; write "
+                f"joint '{name}' has {found} {key} limit: nothing is known of its {what}; write "
                 f'{key}="..." into its <limit> in the URDF, from the data sheet'
             )
     low, high = values["lower"], values["upper"]

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from decimal import ROUND_DOWN, ROUND_UP
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
 from torque_safety_controller.new_robot.chain import Chain, NewRobotError
@@ -112,7 +111,7 @@ def estimate(chain: Chain, rate_hz: float | None = None) -> Estimates:
     """
     model = chain.model
     space = _space(chain, chain.v_max)
-    worst = _search(model, space)
+    worst = search_refined(model, space, SEARCH, 0)
     scale, why = 1.0, "Those of the URDF: the torque limits leave accelerations at these speeds."
     filtered = np.zeros(len(chain.joints), dtype=bool)
     for required in (USEFUL, LEAST):
@@ -126,7 +125,7 @@ def estimate(chain: Chain, rate_hz: float | None = None) -> Estimates:
                 f"accelerate by {required:g} rad/s^2 either way."
             )
             space = _space(chain, rounded(scale * chain.v_max, ROUND_DOWN))
-            worst = _search(model, space)
+            worst = search_refined(model, space, SEARCH, 0)
             break
     else:
         filtered = _room(worst) < LEAST
@@ -147,7 +146,7 @@ def estimate(chain: Chain, rate_hz: float | None = None) -> Estimates:
                 raise
             slower = f" Speeds are {scale:g} of the URDF's because of the drift at this rate."
             space = _space(chain, rounded(scale * chain.v_max, ROUND_DOWN))
-            worst = _search(model, space)
+            worst = search_refined(model, space, SEARCH, 0)
     return Estimates(
         v_max=space.v_max,
         speed_scale=scale,
@@ -166,11 +165,6 @@ def estimate(chain: Chain, rate_hz: float | None = None) -> Estimates:
 def _space(chain: Chain, v_max: Array) -> StateSpace:
     torque = (1.0 - RESERVE) * chain.tau_max
     return StateSpace.of(chain.model, chain.q_min, chain.q_max, v_max, torque)
-
-
-def _search(model: pin.Model, space: StateSpace) -> WorstCases:
-    worst = search_refined(model, space, SEARCH, 0)
-    return worst
 
 
 def _room(worst: WorstCases) -> Array:

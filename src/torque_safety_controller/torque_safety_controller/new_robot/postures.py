@@ -3,17 +3,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from xml.etree import ElementTree
+from itertools import combinations
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from torque_safety_controller.new_robot.capsules import capsule_entries
 from torque_safety_controller.new_robot.chain import Chain, NewRobotError
-from viability_bounds_pkg.robot.description import RobotDescriptionError, load_geometry
 
 Array = NDArray[np.float64]
 
@@ -30,68 +28,55 @@ _SEED = 0
 class SelfCollisions:
     """Which postures make links of the arm touch each other or the rest of the robot.
 
+    Neighbours, which touch at their joint, are left out, and pairs of shapes that overlap nearly
+    anywhere, as those of a wrist often do.
+
     Args:
         chain: the arm.
-        urdf: text of its URDF.
-        folder: of the URDF, where relative names of meshes begin; None if it came from a topic.
+        geometry: collision shapes of its links; perhaps none.
 
     Attributes:
-        trouble: why shapes are not looked at; empty if they are.
-        pairs: how many pairs of shapes are looked at.
-        capsules: around the links, entries of ``collision_capsules``.
+        pairs: how many pairs of shapes are checked.
     """
 
-    def __init__(self, chain: Chain, urdf: str, folder: Path | None) -> None:
-        self.trouble, self.pairs = "", 0
-        self.capsules: list[str] = []
+    def __init__(self, chain: Chain, geometry: pin.GeometryModel) -> None:
         self._model, self._data = chain.model, chain.model.createData()
-        try:
-            geometry = load_geometry(_with_absolute_meshes(urdf, folder), chain.model)
-        except RobotDescriptionError as error:
-            self.trouble = str(error).splitlines()[0]
-            return
-        self.capsules = capsule_entries(chain.model, geometry)
-        shapes = geometry.geometryObjects
-        parents = list(chain.model.parents)
-        for first in range(len(shapes)):
-            for second in range(first + 1, len(shapes)):
-                joints = sorted((shapes[first].parentJoint, shapes[second].parentJoint))
-                # Neighbours touch at their joint.
-                if joints[0] != joints[1] and parents[joints[1]] != joints[0]:
-                    geometry.addCollisionPair(pin.CollisionPair(first, second))
         self._geometry = geometry
-        self._drop_pairs_in_touch(chain)
+        parents = list(chain.model.parents)
+        joints = [shape.parentJoint for shape in geometry.geometryObjects]
+        moving = [
+            pin.CollisionPair(i, j)
+            for i, j in combinations(range(len(joints)), 2)
+            if joints[i] != joints[j]
+            and joints[i] != parents[joints[j]]
+            and joints[j] != parents[joints[i]]
+        ]
+        self._check(moving)
+        random = np.random.default_rng(_SEED)
+        postures = _middle_postures(chain, random.random((40, len(chain.joints))))
+        touching = np.zeros(len(moving))
+        for q in postures:
+            self._collide(q, stop_at_first=False)
+            touching += [each.isCollision() for each in self._found.collisionResults]
+        often = _ALWAYS * len(postures)
+        self._check([pair for pair, n in zip(moving, touching, strict=True) if n < often])
         self.pairs = len(geometry.collisionPairs)
-        if not shapes:
-            self.trouble = "the URDF has no collision shapes"
 
     def __call__(self, q: Array) -> bool:
         """Return whether anything touches in a posture, shape (n,), rad."""
-        if not self.pairs:
-            return False
-        self._update(q)
-        return bool(pin.computeCollisions(self._geometry, self._found, True))
+        return self.pairs > 0 and self._collide(q, stop_at_first=True)
 
-    def _update(self, q: Array) -> None:
-        pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._found, q)
+    def _check(self, pairs: Sequence[pin.CollisionPair]) -> None:
+        self._geometry.removeAllCollisionPairs()
+        for pair in pairs:
+            self._geometry.addCollisionPair(pair)
+        self._found = self._geometry.createData()
 
-    def _drop_pairs_in_touch(self, chain: Chain) -> None:
-        """Leave out pairs that overlap nearly anywhere, as shapes of a wrist often do."""
-        self._found = self._geometry.createData()
-        # Copies: removing one moves what Pinocchio's own refer to.
-        pairs = [(each.first, each.second) for each in self._geometry.collisionPairs]
-        touching = np.zeros(len(pairs))
-        random = np.random.default_rng(_SEED)
-        unit = 0.5 + _MIDDLE * (random.random((40, len(chain.joints))) - 0.5)
-        postures = _within(chain, unit)
-        for q in postures:
-            self._update(q)
-            pin.computeCollisions(self._geometry, self._found, False)
-            touching += [each.isCollision() for each in self._found.collisionResults]
-        for pair, count in zip(pairs, touching, strict=True):
-            if count >= _ALWAYS * len(postures):
-                self._geometry.removeCollisionPair(pin.CollisionPair(*pair))
-        self._found = self._geometry.createData()
+    def _collide(self, q: Array, stop_at_first: bool) -> bool:
+        geometry, found = self._geometry, self._found
+        return bool(
+            pin.computeCollisions(self._model, self._data, geometry, found, q, stop_at_first)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,13 +120,15 @@ def find_postures(chain: Chain, touches: SelfCollisions) -> Postures:
     return Postures(start, _held(chain, start), tuple(goals), reached)
 
 
-def _within(chain: Chain, unit: Array) -> Array:
-    """Return positions to look among, by numbers from 0 to 1; no more than a turn of them."""
+def _middle_postures(chain: Chain, unit: Array) -> Array:
+    """Return postures in the middle of the ranges by numbers from 0 to 1, shape (k, n).
+
+    Continuous joints, and those of wider ranges, are kept within a turn.
+    """
     low, high = np.maximum(chain.q_min, -1e3), np.minimum(chain.q_max, 1e3)
     middle = np.where(chain.continuous, 0.0, 0.5 * (low + high))
     half = np.minimum(0.5 * (high - low), np.pi)
-    low, high = middle - half, middle + half
-    return np.asarray(low + unit * (high - low))
+    return np.asarray(middle + _MIDDLE * (2.0 * unit - 1.0) * half)
 
 
 def _held(chain: Chain, q: Array) -> float:
@@ -153,14 +140,15 @@ def _held(chain: Chain, q: Array) -> float:
 def _start(chain: Chain, touches: SelfCollisions, random: np.random.Generator) -> Array:
     """Return the posture with the best mix of bent joints, middle of ranges and little torque."""
     data, frame = chain.model.createData(), chain.model.getFrameId(chain.tips[0])
-    unit = 0.5 + _MIDDLE * (random.random((_STARTS, len(chain.joints))) - 0.5)
+    unit = random.random((_STARTS, len(chain.joints)))
     ranked = []
-    for q, part in zip(_within(chain, unit), unit, strict=True):
+    for q, part in zip(_middle_postures(chain, unit), unit, strict=True):
         held = _held(chain, q)
         J = pin.computeFrameJacobian(chain.model, data, q, frame)
         # A hand that can move in all directions: its least singular value.
         agile = np.linalg.svd(J, compute_uv=False).min()
-        ranked.append((held + float(np.mean(np.abs(part - 0.5))) - 2.0 * min(agile, 0.2), held, q))
+        off_middle = _MIDDLE * float(np.mean(np.abs(part - 0.5)))
+        ranked.append((held + off_middle - 2.0 * min(agile, 0.2), held, q))
     for _, held, q in sorted(ranked, key=lambda each: each[0]):
         if held <= _HELD_AT_START and not touches(q):
             return np.round(q, 3)
@@ -205,13 +193,3 @@ def _leads_straight(chain: Chain, touches: SelfCollisions, start: Array, q: Arra
     way = [start + share * (q - start) for share in np.linspace(1.0, 0.0, _STEPS)[:-1]]
     held = all(_held(chain, each) <= _HELD_AT_GOAL for each in way)
     return held and not any(map(touches, way))
-
-
-def _with_absolute_meshes(urdf: str, folder: Path | None) -> str:
-    """Return the URDF with names of meshes that are relative to it made absolute."""
-    root = ElementTree.fromstring(urdf)
-    for mesh in root.iter("mesh"):
-        name = mesh.get("filename", "")
-        if folder is not None and "://" not in name and (folder / name).is_file():
-            mesh.set("filename", str(folder / name))
-    return ElementTree.tostring(root, encoding="unicode")

@@ -2,7 +2,7 @@
 """Command line tool that makes the parameter files of an arm from its URDF.
 
 Finds joints, limits, a start posture, and gains; estimates acceleration limits, drift and margins;
-writes the robot's file, one of an imperfect robot, and a scenario that drives it into its limits.
+writes the robot's file, and a scenario that drives it into its limits.
 """
 
 from __future__ import annotations
@@ -14,46 +14,32 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from xml.etree import ElementTree
 
-import numpy as np
-from numpy.typing import NDArray
+import pinocchio as pin
 
-from torque_safety_controller.loop_margins.gain_check import (
-    HORIZON,
-    OBSERVER,
-    GainLimit,
-)
+from torque_safety_controller.loop_margins.gain_check import OBSERVER, GainLimit
+from torque_safety_controller.new_robot.capsules import capsule_entries
 from torque_safety_controller.new_robot.chain import Chain, NewRobotError, find_chain
 from torque_safety_controller.new_robot.estimates import Estimates, estimate
-from torque_safety_controller.new_robot.files import (
-    imperfect_file,
-    parameter_file,
-    scenario_file,
-)
-from torque_safety_controller.new_robot.hardware import (
-    GRADES,
-    Grade,
-    acceleration_errors,
-    with_rotors,
-)
+from torque_safety_controller.new_robot.files import parameter_file, scenario_file
 from torque_safety_controller.new_robot.postures import SelfCollisions, find_postures
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.tools.fit_capsules import with_capsules
 from torque_safety_controller.tools.gain_limits import gain_check
 from viability_bounds_pkg.cli.command_line import Parser, positive, run_tool
 from viability_bounds_pkg.cli.limits_file import CONTROLLER, NODE, check_writable, write_whole
-from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
 from viability_bounds_pkg.parameter_files import read_files
 from viability_bounds_pkg.robot.description import (
+    RobotDescriptionError,
     check_urdf,
+    load_geometry,
     package_directories,
     read_urdf,
     resolve_uri,
 )
 
-Array = NDArray[np.float64]
 Gains = dict[str, float]
 
 GAINS = {
@@ -69,9 +55,6 @@ GAINS = {
 
 OBSERVER_PERIODS = 2.5
 """Time constant of the disturbance observer, control periods, as of the shipped Panda."""
-
-IMPERFECT_GAINS = {"integral_lambda": 30.0, "disturbance_time": 0.012}
-"""To begin with: those of config/imperfect/panda.yaml."""
 
 _ROUNDS = 8
 _INSIDE = 0.9  # of what a gain may be at most
@@ -160,7 +143,6 @@ def _run(options: argparse.Namespace) -> int:
     files = {
         "robot": out / f"{chain.name}.yaml",
         "scenario": out / "scenarios" / f"{chain.name}_demo.yaml",
-        "imperfect": out / "imperfect" / f"{chain.name}.yaml",
     }
     if not source:
         files["urdf"] = out / f"{chain.name}.urdf"
@@ -174,10 +156,13 @@ def _run(options: argparse.Namespace) -> int:
     print("estimating acceleration limits ...", flush=True)
     estimates = estimate(chain, options.rate)
     _tell_estimates(chain, estimates)
-    touches = SelfCollisions(chain, urdf, folder)
+    geometry, trouble = _shapes(urdf, folder, chain.model)
+    touches = SelfCollisions(chain, geometry)
+    checked = f"{touches.pairs} pairs of shapes checked"
+    if trouble:
+        checked = f"not checked for collisions ({trouble})"
+        print(f"collisions of the arm with itself are not checked: {trouble}")
     postures = find_postures(chain, touches)
-    if touches.trouble:
-        print(f"collisions of the arm with itself are not looked at: {touches.trouble}")
     bounded = ~chain.continuous
     print(
         f"scenario: {len(postures.goals)} goals, with {int(postures.reached[bounded].sum())} of "
@@ -188,80 +173,60 @@ def _run(options: argparse.Namespace) -> int:
 
     def robot_text(gains: Gains) -> str:
         return parameter_file(
-            chain, estimates, postures, touches, source=source, base=options.base, gains=gains
-        )
+            chain, estimates, postures, checked=checked, source=source, base=options.base,
+            gains=gains,
+        )  # fmt: skip
 
-    begin = GAINS | {OBSERVER: OBSERVER_PERIODS / estimates.rate_hz}
-    text, gains = _with_gains_that_suit(robot_text, begin, [])
-    if touches.capsules:
-        text = with_capsules(text, touches.capsules)
+    text = _with_suitable_gains(
+        robot_text, GAINS | {OBSERVER: OBSERVER_PERIODS / estimates.rate_hz}
+    )
+    if capsules := capsule_entries(chain.model, geometry):
+        text = with_capsules(text, capsules)
     write_whole(files["robot"], text)
     write_whole(files["scenario"], scenario_file(chain, estimates, postures))
-    write_whole(files["imperfect"], _imperfect(chain, estimates, gains, files["robot"]))
     for name, path in files.items():
         print(f"written: {path} ({name})")
     return 0
 
 
-def _imperfect(chain: Chain, ideal: Estimates, gains: Gains, robot: Path) -> str:
-    """Return the file of the imperfect robot, with the first grade of hardware that leaves bounds.
+def _shapes(urdf: str, folder: Path | None, model: pin.Model) -> tuple[pin.GeometryModel, str]:
+    """Return the collision shapes of a robot; without them, why.
 
     Args:
-        chain: the arm.
-        ideal: its limits, without rotors and imperfections.
-        gains: in its own file.
-        robot: that file.
-
-    Raises:
-        NewRobotError: no hardware leaves bounds.
+        urdf: text of its URDF.
+        folder: of the URDF, where relative names of meshes begin; None if it came from a topic.
+        model: of its joints.
     """
-    real = with_rotors(chain)
-    estimates = estimate(real, ideal.rate_hz)
-    reason = ""
-    for grade in GRADES:
-        disturbance = acceleration_errors(real, estimates, grade)
-
-        def text(own: Gains, grade: Grade = grade, disturbance: Array = disturbance) -> str:
-            longer = replace(grade, horizon=own[HORIZON])
-            changed: dict[str, Any] = {"integral_action": "joints"} | {
-                name: value
-                for name, value in own.items()
-                if name != HORIZON and gains.get(name) != value
-            }
-            return imperfect_file(real, ideal, estimates, longer, disturbance, changed)
-
-        try:
-            begin = {**gains, **IMPERFECT_GAINS, HORIZON: grade.horizon}
-            return _with_gains_that_suit(text, begin, [robot])[0]
-        except ArmSafetyError as error:  # it leaves no bounds, or no gains suit
-            reason = str(error).partition(": ")[2]
-    raise NewRobotError(
-        f"no assumed hardware leaves this arm bounds at {ideal.rate_hz:g} Hz: {reason}; a higher "
-        "--rate, or a file of your own like those in config/imperfect"
-    )
+    root = ElementTree.fromstring(urdf)
+    for mesh in root.iter("mesh"):
+        name = mesh.get("filename", "")
+        if folder is not None and "://" not in name and (folder / name).is_file():
+            mesh.set("filename", str(folder / name))
+    try:
+        geometry = load_geometry(ElementTree.tostring(root, encoding="unicode"), model)
+    except RobotDescriptionError as error:
+        return pin.GeometryModel(), str(error).splitlines()[0]
+    return geometry, "" if geometry.ngeoms else "the URDF has no collision shapes"
 
 
-def _with_gains_that_suit(
-    make: Callable[[Gains], str], gains: Gains, before: Sequence[Path]
-) -> tuple[str, Gains]:
-    """Return a parameter file, and gains in it that the robot bears: lowered until it does.
+def _with_suitable_gains(make: Callable[[Gains], str], gains: Gains) -> str:
+    """Return a parameter file with gains lowered until its delay and rate allow them.
 
     Args:
         make: returns the file with gains.
         gains: to begin with.
-        before: files that are given before it.
 
     Raises:
-        ArmSafetyError: the files leave no bounds, or no gains suit.
+        ArmSafetyError: the file leaves no bounds, or no gains suit.
     """
     for _ in range(_ROUNDS):
         text = make(gains)
         with tempfile.NamedTemporaryFile("w", suffix=".yaml") as trial:
             trial.write(text)
             trial.flush()
-            beyond = _exceeded([*before, Path(trial.name)])
+            beyond = _exceeded(Path(trial.name))
         if not beyond:
-            return text, gains
+            return text
         gains = _lowered(gains, beyond)
     worst = beyond[0]
     raise NewRobotError(
@@ -270,14 +235,14 @@ def _with_gains_that_suit(
     )
 
 
-def _exceeded(paths: Sequence[Path]) -> list[GainLimit]:
-    """Return the gains of parameter files that are too large for the robot.
+def _exceeded(path: Path) -> list[GainLimit]:
+    """Return the gains of a parameter file that are beyond their limits.
 
     Raises:
-        ArmSafetyError: the files leave no bounds.
+        ArmSafetyError: the file leaves no bounds.
     """
-    config = read_files(ControllerConfiguration, paths, CONTROLLER)
-    robot = read_files(BoundsConfiguration, paths, NODE)
+    config = read_files(ControllerConfiguration, [path], CONTROLLER)
+    robot = read_files(BoundsConfiguration, [path], NODE)
     make_bounds(robot)
     return [each for each in gain_check(config, robot).limits() if each.exceeded]
 
@@ -288,13 +253,11 @@ def _lowered(gains: Gains, beyond: Sequence[GainLimit]) -> Gains:
     for each in beyond:
         task, _, kind = each.name.rpartition("_")
         share = _INSIDE * each.limit / each.value if each.value else 0.0
-        if each.name == HORIZON and HORIZON in gains and np.isfinite(each.limit):
-            changed[HORIZON] = float(np.ceil(each.limit / _INSIDE))
-        elif each.name == OBSERVER:
+        if each.name == OBSERVER:
             changed[OBSERVER] = float(f"{each.limit / _INSIDE:.3g}")
         elif kind == "kd" and f"{task}_kp" in gains:
             changed[f"{task}_kp"] = float(f"{gains[f'{task}_kp'] * share**2:.3g}")
-        elif each.name in gains and each.name != HORIZON:
+        elif each.name in gains:
             changed[each.name] = float(f"{gains[each.name] * share:.3g}")
     return changed
 
