@@ -12,7 +12,6 @@ from torque_safety_controller.loop_margins.gain_check import (
 )
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parts.disturbance import DisturbanceObserver
-from torque_safety_controller.tools.gain_limits import gain_check
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.robot.configuration import load_model
@@ -32,7 +31,7 @@ def check(predicted=False, gains=None, **declared) -> GainCheck:
     calm = {"acceleration_disturbance": [5.0] * N}
     robot = read(BoundsConfiguration, BOUNDS | calm | declared | given)
     config = read(ControllerConfiguration, CONTROLLER | (gains or {}) | given)
-    return gain_check(config, robot)
+    return GainCheck(config, robot)
 
 
 def limits(**changed):

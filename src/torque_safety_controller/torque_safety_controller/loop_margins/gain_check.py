@@ -1,22 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compares gains with the largest that delay, motors and encoders of a robot allow."""
+"""Compares gains with the largest that delay, motors and encoders of a robot allow.
+
+`docs/gains.md` derives the limits.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from torque_safety_controller.integral_feedback.settings import IntegralSettings
 from torque_safety_controller.loop_margins.joint_loop import Feedback, Link, open_loop
-from torque_safety_controller.tasks.gains import Gains
-from viability_bounds_pkg.joint_limits import JointLimits
-from viability_bounds_pkg.uncertainty import DeclaredUncertainty
+from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
+from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
+from viability_bounds_pkg.robot.configuration import load_model
 
 Array = NDArray[np.float64]
 
@@ -121,90 +122,61 @@ def limit_gains(horizon: float, disturbance: Array, braking: Array) -> tuple[Arr
     return 2.0 * flatter / horizon**2, (1.0 + flatter) / horizon
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ControlLoop:
-    """What of a robot and its controller decides which gains are stable.
-
-    Attributes:
-        model: of the arm, with n joints.
-        limits: of the joints.
-        tau_max: torque limits, shape (n,), N m.
-        dt: control period, s.
-        horizon: of the bounds, s.
-        declared: delays and errors of the robot.
-        estimates_velocity: whether velocities are estimated from positions.
-        predicts: whether states are predicted to when their command acts.
-        gains: of the tasks.
-        integral: of the integral action; None for none.
-    """
-
-    model: pin.Model
-    limits: JointLimits
-    tau_max: Array
-    dt: float
-    horizon: float
-    declared: DeclaredUncertainty
-    estimates_velocity: bool
-    predicts: bool
-    gains: Gains
-    integral: IntegralSettings | None
-
-
 class GainCheck:
     """Gains of a controller against the margins of its loops and the resolution of its encoders.
 
     Args:
-        loop: of the controller and the robot.
+        config: of the controller.
+        robot: what is declared of the robot, and the horizon of the bounds.
 
     Attributes:
+        inertia: of the arm.
         tasks: kp and kd by the beginning of their names, `pose`, `posture` and `hold`.
         integral: lambda, 1/s; 0 for no integral action.
         steps: of position, rad, and velocity, rad/s, that the resolution makes of what the
             controller knows, shape (n,) each.
     """
 
-    def __init__(self, loop: ControlLoop) -> None:
-        gains, declared, integral = loop.gains, loop.declared, loop.integral
-        self._loop = loop
-        self.inertia = ArmInertia(loop.model, loop.limits.q_min, loop.limits.q_max)
-        self.tasks = {
+    def __init__(self, config: ControllerConfiguration, robot: BoundsConfiguration) -> None:
+        gains, declared, dt = config.gains, robot.declared, robot.dt
+        model = load_model(config, config.read_urdf())
+        self._limits, self._tau_max = robot.limits, config.torque_max
+        self._dt, self._horizon, self._declared = dt, robot.horizon, declared
+        self._predicts = config.use_estimated_states
+        self._observer_time = gains.disturbance_time
+        self.inertia = ArmInertia(model, robot.limits.q_min, robot.limits.q_max)
+        tasks = {
             "pose": (gains.pose_kp, gains.pose_kd if gains.pose_weight > 0.0 else 0.0),
             "posture": (gains.posture_kp, gains.posture_kd),
             "hold": (0.0, gains.hold_kd),
         }
-        self.tasks = {name: pair for name, pair in self.tasks.items() if pair[1] > 0.0}
-        self.integral, self._leak = 0.0, (0.0, 0.0, 0.0)
-        if integral is not None:
-            self.integral = integral.gain
-            self._leak = integral.slow_leak_rate, integral.fast_leak_rate, integral.mu
+        self.tasks = {name: pair for name, pair in tasks.items() if pair[1] > 0.0}
+        integral, acts = config.integral_settings, config.integral.integral_action != "none"
+        self.integral = integral.gain if acts else 0.0
+        self._leak = integral.slow_leak_rate, integral.fast_leak_rate, integral.mu
         observers = None
-        if loop.predicts and loop.estimates_velocity:
-            design = declared.observers(loop.dt)
+        if self._predicts and robot.velocity_estimation:
+            design = declared.observers(dt)
             observers = design.position_gain, design.velocity_gain
         self._links = self._all_links(observers)
         # A position that is off by up to E changes by 2 E at once.
         position, velocity = 2.0 * declared.position_error, 2.0 * declared.velocity_error
         if observers is not None:
             position, velocity = observers[0] * position, observers[1] * position
-        if loop.predicts:
-            position = position + (declared.delay * loop.dt + declared.motor_lag) * velocity
+        if self._predicts:
+            position = position + (declared.delay * dt + declared.motor_lag) * velocity
         self.steps = position, velocity
 
     def _all_links(self, observers: tuple[Array, Array] | None) -> list[Link]:
         """Return loops with shortest and longest delay, slowest motor, both ends of observers."""
-        declared = self._loop.declared
+        declared = self._declared
         ends: list[tuple[float, float] | None] = [None]
         if observers is not None:
             pairs = sorted(zip(*(each.tolist() for each in observers), strict=True))
             ends = list(dict.fromkeys((pairs[0], pairs[-1])))
+        lag, predicted = float(declared.motor_lag.max()), declared.delay
         return [
-            Link(
-                self._loop.dt,
-                delay,
-                float(declared.motor_lag.max()),
-                observer,
-                declared.delay if self._loop.predicts else None,
-            )
+            Link(self._dt, delay, lag, observer, predicted if self._predicts else None)
             for delay in sorted({declared.delay, declared.delay + declared.delay_jitter})
             for observer in ends
         ]
@@ -228,8 +200,12 @@ class GainCheck:
             step = self._own(gain * self.steps[1])
             resolution = TORQUE_STEP / step if step > 0.0 else math.inf
             yield GainLimit("integral_lambda", gain, gain * margin, gain * resolution)
-        if time := self._loop.gains.disturbance_time:
-            yield GainLimit(OBSERVER, time, self._way(), self._fastest_observer())
+        if time := self._observer_time:
+            # Where commands under way did not act, as the robot stopped itself, the predicted
+            # velocity changes at once by what they would have done in all that time. With at least
+            # this time constant the estimate is not larger than the change.
+            way = self._declared.delay * self._dt if self._predicts else 0.0
+            yield GainLimit(OBSERVER, time, way, self._fastest_observer())
         margin, resolution = (
             1.0 / scale if (scale := _last_good(good, 1.0 / _LONGEST, 1.0)) else math.inf
             for good in (
@@ -237,7 +213,7 @@ class GainCheck:
                 lambda s: self._calm_on_limits(1.0 / s),
             )
         )
-        yield GainLimit(HORIZON, self._loop.horizon / self._loop.dt, margin, resolution)
+        yield GainLimit(HORIZON, self._horizon / self._dt, margin, resolution)
 
     def margin(self, kp: float, kd: float, integral: float, observed: bool = False) -> float:
         """Return the least modulus margin, over delays, observers and postures.
@@ -248,7 +224,7 @@ class GainCheck:
             integral: lambda, 1/s.
             observed: whether the disturbance observer acts.
         """
-        time = self._loop.gains.disturbance_time if observed else 0.0
+        time = self._observer_time if observed else 0.0
         factors = self.inertia.factors if integral > 0.0 else (1.0,)
         return min(
             open_loop(link, Feedback(kp, kd, integral * f, self._leak, time)).modulus_margin()
@@ -267,9 +243,9 @@ class GainCheck:
         return self.margin(float(kp[steepest]), float(kd[steepest]), self.integral, observed=True)
 
     def _slopes(self, factor: float) -> tuple[Array, Array]:
-        loop = self._loop
-        braking = np.minimum(-loop.limits.a_min, loop.limits.a_max)
-        return limit_gains(factor * loop.dt, loop.declared.acceleration_disturbance, braking)
+        braking = np.minimum(-self._limits.a_min, self._limits.a_max)
+        disturbance = self._declared.acceleration_disturbance
+        return limit_gains(factor * self._dt, disturbance, braking)
 
     def _has_margin(self, scale: float, kp: float, kd: float) -> bool:
         return self.margin(kp * scale**2, kd * scale, 0.0) >= MARGIN
@@ -279,7 +255,7 @@ class GainCheck:
         position, velocity = self.steps
         accelerations = kp * scale**2 * position + kd * scale * velocity
         torque = np.abs(self.inertia.matrices) @ accelerations
-        return bool((torque.max(axis=0) <= TORQUE_STEP * self._loop.tau_max).all())
+        return bool((torque.max(axis=0) <= TORQUE_STEP * self._tau_max).all())
 
     def _calm_on_limits(self, factor: float) -> bool:
         (kp, kd), (position, velocity) = self._slopes(factor), self.steps
@@ -287,21 +263,11 @@ class GainCheck:
 
     def _own(self, acceleration: Array) -> float:
         """Return the largest torque of joints' accelerations one by one, of `torque_max`."""
-        return float((self.inertia.diagonal * acceleration / self._loop.tau_max).max())
-
-    def _way(self) -> float:
-        """Return how long commands are under way that are predicted, s.
-
-        Where they did not act, as the robot stopped itself, the predicted velocity changes at once
-        by what they would have done in all that time: a so many times larger acceleration of one
-        period. With at least this time constant the estimate is not larger than the change.
-        """
-        loop = self._loop
-        return loop.declared.delay * loop.dt if loop.predicts else 0.0
+        return float((self.inertia.diagonal * acceleration / self._tau_max).max())
 
     def _fastest_observer(self) -> float:
         """Return the least time constant of the disturbance observer that leaves joints calm."""
-        dt = self._loop.dt
+        dt = self._dt
         share = TORQUE_STEP / (self._own(self.steps[1] / dt) or math.inf)
         return 0.0 if share >= 1.0 or share == 0.0 else -dt / math.log1p(-share)
 

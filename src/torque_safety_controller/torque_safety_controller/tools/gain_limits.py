@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -17,7 +18,6 @@ from torque_safety_controller.loop_margins.gain_check import (
     LIMIT_MARGIN,
     MARGIN,
     TORQUE_STEP,
-    ControlLoop,
     GainCheck,
 )
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
@@ -25,7 +25,6 @@ from viability_bounds_pkg.cli.command_line import Parser, run_tool
 from viability_bounds_pkg.cli.limits_file import CONTROLLER, NODE
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 from viability_bounds_pkg.parameter_files import read_files
-from viability_bounds_pkg.robot.configuration import load_model
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -42,35 +41,14 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
-def gain_check(config: ControllerConfiguration, robot: BoundsConfiguration) -> GainCheck:
-    """Return the check of a controller's gains.
-
-    Args:
-        config: of the controller.
-        robot: what is declared of the robot, and the horizon of the bounds.
-    """
-    return GainCheck(
-        ControlLoop(
-            model=load_model(config, config.read_urdf()),
-            limits=robot.limits,
-            tau_max=config.torque_max,
-            dt=robot.dt,
-            horizon=robot.horizon,
-            declared=robot.declared,
-            estimates_velocity=robot.velocity_estimation,
-            predicts=config.use_estimated_states,
-            gains=config.gains,
-            integral=None
-            if config.integral.integral_action == "none"
-            else config.integral_settings,
-        )
-    )
+def gain_check(files: Sequence[Path]) -> GainCheck:
+    """Return the check of the gains in a robot's parameter files."""
+    config = read_files(ControllerConfiguration, files, CONTROLLER)
+    return GainCheck(config, read_files(BoundsConfiguration, files, NODE))
 
 
 def _run(options: argparse.Namespace) -> int:
-    config = read_files(ControllerConfiguration, options.params_file, CONTROLLER)
-    robot = read_files(BoundsConfiguration, options.params_file, NODE)
-    limits = list(gain_check(config, robot).limits())
+    limits = list(gain_check(options.params_file).limits())
     print(f"{'':18}{'given':>10}{'by margin':>14}{'by resolution':>16}")
     for limit in limits:
         sign = ">=" if limit.smallest else "<="

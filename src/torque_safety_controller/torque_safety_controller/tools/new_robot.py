@@ -24,11 +24,10 @@ from torque_safety_controller.new_robot.chain import Chain, NewRobotError, find_
 from torque_safety_controller.new_robot.estimates import Estimates, estimate
 from torque_safety_controller.new_robot.files import parameter_file, scenario_file
 from torque_safety_controller.new_robot.postures import SelfCollisions, find_postures
-from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.tools.fit_capsules import with_capsules
 from torque_safety_controller.tools.gain_limits import gain_check
 from viability_bounds_pkg.cli.command_line import Parser, positive, run_tool
-from viability_bounds_pkg.cli.limits_file import CONTROLLER, NODE, check_writable, write_whole
+from viability_bounds_pkg.cli.limits_file import NODE, check_writable, write_whole
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
 from viability_bounds_pkg.parameter_files import read_files
 from viability_bounds_pkg.robot.description import (
@@ -241,10 +240,8 @@ def _exceeded(path: Path) -> list[GainLimit]:
     Raises:
         ArmSafetyError: the file leaves no bounds.
     """
-    config = read_files(ControllerConfiguration, [path], CONTROLLER)
-    robot = read_files(BoundsConfiguration, [path], NODE)
-    make_bounds(robot)
-    return [each for each in gain_check(config, robot).limits() if each.exceeded]
+    make_bounds(read_files(BoundsConfiguration, [path], NODE))
+    return [each for each in gain_check([path]).limits() if each.exceeded]
 
 
 def _lowered(gains: Gains, beyond: Sequence[GainLimit]) -> Gains:
