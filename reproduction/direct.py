@@ -18,12 +18,11 @@ from chain import load_node_values
 from sim_bridge.bullet.limit_monitor import LimitMonitor
 from sim_bridge.bullet.sensor import ForceTorqueReading
 from sim_bridge.node.bullet_parameters import BulletConfiguration, make_robot
-from torque_safety_controller.integral_action import FadingTorque
 from torque_safety_controller.node import assembly
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parts.contact.interaction import Interaction
 from torque_safety_controller.parts.friction import Friction
-from torque_safety_controller.parts.integral import Integral
+from torque_safety_controller.parts.integral import FadingTorque, Integral
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.step import Step
 from torque_safety_controller.supervisor import Order

@@ -17,7 +17,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
@@ -64,11 +63,6 @@ def project_to_limits(u: ArrayLike, s: ArrayLike, u_max: ArrayLike) -> Array:
         ValueError: wrong shapes, u or s not finite, or limits negative or NaN.
     """
     u, s, u_max = _checked(u_max, u=u, s=s)
-    return project(u, s, u_max)
-
-
-def project(u: Array, s: Array, u_max: Array) -> Array:
-    """Solve the QP of eq. (11); see `project_to_limits`, which checks the arguments first."""
     # Scaled to about 1, products of very large or small numbers stay numbers.
     unit = max(float(np.abs(u).max()), _TINY)
     s = np.where(u_max > 0.0, s, 0.0)  # it has no say where x is 0
@@ -84,20 +78,19 @@ def scale_factor(u: Array, u_max: Array) -> float:
     return float((u_max[beyond] / np.abs(u[beyond])).min(initial=1.0))
 
 
-@njit(cache=True)
 def clip(u: Array, u_max: Array) -> Array:
     """Return `u` with each component cut to its limit, shape (n,)."""
-    return np.minimum(np.maximum(u, -u_max), u_max)
+    limited: Array = np.minimum(np.maximum(u, -u_max), u_max)
+    return limited
 
 
-@njit(cache=True)
 def nearest_dissipating(u: Array, s: Array, u_max: Array, level: float) -> Array:
     """Return the point nearest to `u` with |x| <= u_max and s'x >= level, shape (n,).
 
     It is ``x(nu) = clip(u + nu s)`` for the least nu >= 0 with s'x(nu) >= level. s'x(nu) never
     falls, and is linear between the values of nu at which a component leaves one limit or
-    arrives at the other. The two of those values next to the solution are found by trying them
-    all; between them the components that are free move together.
+    arrives at the other; between the two of those next to the solution the components that are
+    free move together.
 
     Args:
         u: shape (n,).
@@ -108,19 +101,15 @@ def nearest_dissipating(u: Array, s: Array, u_max: Array, level: float) -> Array
     x = clip(u, u_max)
     if s @ x >= level:
         return x
-    leaves, arrives = np.full(len(u), np.inf), np.full(len(u), -np.inf)
-    for i in range(len(u)):
-        if s[i] != 0.0:
-            end = np.copysign(u_max[i], s[i])
-            leaves[i] = (-end - u[i]) / s[i]
-            arrives[i] = (end - u[i]) / s[i]
-    nu, enough = 0.0, np.inf
-    for point in np.concatenate((leaves, arrives)):
-        if nu < point < enough:
-            if s @ clip(u + point * s, u_max) < level:
-                nu = point
-            else:
-                enough = point
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        end = np.copysign(u_max, s)
+        leaves = np.where(s == 0.0, np.inf, (-end - u) / s)
+        arrives = np.where(s == 0.0, -np.inf, (end - u) / s)
+        points = np.concatenate((leaves, arrives))
+        points = points[(points > 0.0) & (points < np.inf)]
+        short = clip(u + points[:, None] * s, u_max) @ s < level
+    enough = points[~short].min(initial=np.inf)
+    nu = points[short & (points < enough)].max(initial=0.0)
     x = clip(u + nu * s, u_max)
     missing = level - s @ x
     push = np.where((leaves <= nu) & (nu < arrives), s, 0.0)
@@ -134,7 +123,6 @@ def nearest_dissipating(u: Array, s: Array, u_max: Array, level: float) -> Array
     return x
 
 
-@njit(cache=True)
 def nearest_with_leak(M: Array, s: Array, u: Array, limit: Array, w: Array) -> tuple[Array, float]:
     """Return the torque y of (11) extended by a leak eta of s, and eta, 1/s.
 
@@ -143,35 +131,31 @@ def nearest_with_leak(M: Array, s: Array, u: Array, limit: Array, w: Array) -> t
     A leak damps as the torque eta M s does, without a limit: a solution always exists. In the
     variable f = eta |M s| the leak is one more component of the vector.
     """
-    n, largest = len(s), np.abs(s).max()
-    direction, wish, limits = np.zeros(n + 1), np.zeros(n + 1), np.full(n + 1, np.inf)
-    wish[:n], limits[:n], size = u, limit, 0.0
-    if largest > 0.0:
-        direction[:n] = s / largest
-        momentum = M @ direction[:n]
-        size = math.sqrt(momentum @ momentum)
-        power = direction[:n] @ momentum
-        if size > 0.0 and power > 0.0:
-            direction[n] = power / size
-    result = nearest_dissipating(wish, direction, limits, float(direction[:n] @ w))
-    leak = result[n] / (size * largest) if size * largest > 0.0 else 0.0
+    largest = np.abs(s).max()
+    direction = s / max(largest, _TINY)
+    momentum = M @ direction
+    size, power = math.sqrt(momentum @ momentum), direction @ momentum
+    damping = power / size if size > 0.0 and power > 0.0 else 0.0
+    result = nearest_dissipating(
+        np.append(u, 0.0), np.append(direction, damping), np.append(limit, np.inf), direction @ w
+    )
+    leak = float(result[-1] / (size * largest)) if size * largest > 0.0 else 0.0
     if not (np.isfinite(result).all() and math.isfinite(leak)):
         return clip(u, limit), 0.0
-    return result[:n].copy(), leak
+    return result[:-1], leak
 
 
-@njit(cache=True)
 def limited_feedback(
     fast: Array, slow: Array, mu: float, M: Array, C: Array, K: Array, limit: Array
-) -> tuple[Array, float]:
-    """Return (11) extended to the whole torque (C + K) s; see `nearest_with_leak`.
+) -> tuple[Array, float, Array, Array]:
+    """Return (11) extended to the whole torque (C + K) s, its leak, and both integrators.
 
     Integrators of joints that are limited shrink before, until they ask for what they get. Only
     what contributes to s shrinks, and s not beyond zero, so that no integrator grows or changes
     sign: it is a leak of this joint, just as fast as it must be.
 
     Args:
-        fast: integrator, shape (n,), rad/s, changed in place.
+        fast: integrator, shape (n,), rad/s.
         slow: likewise.
         mu: weight of the fast integrator.
         M: mass matrix, shape (n, n), kg m^2.
@@ -181,21 +165,20 @@ def limited_feedback(
     """
     s = mu * fast + (1.0 - mu) * slow
     u = C @ s + K * s
-    for i in range(len(s)):
-        outward, excess = math.copysign(1.0, s[i]), abs(u[i]) - limit[i]
-        own = K[i] + max(C[i, i], 0.0)  # torque that the joint asks for by its own s
-        from_fast = max(outward * mu * fast[i], 0.0)
-        from_slow = max(outward * (1.0 - mu) * slow[i], 0.0)
-        if excess > 0.0 and outward * u[i] > 0.0 and own > 0.0 and from_fast + from_slow > 0.0:
-            shift = min(excess / own, abs(s[i]))
-            kept = max(1.0 - shift / (from_fast + from_slow), 0.0)
-            if from_fast > 0.0:
-                fast[i] *= kept
-            if from_slow > 0.0:
-                slow[i] *= kept
+    outward, excess = np.copysign(1.0, s), np.abs(u) - limit
+    own = K + np.maximum(np.diagonal(C), 0.0)  # torque that the joint asks for by its own s
+    from_fast = np.maximum(outward * mu * fast, 0.0)
+    from_slow = np.maximum(outward * (1.0 - mu) * slow, 0.0)
+    contributes = from_fast + from_slow
+    shrinks = (excess > 0.0) & (outward * u > 0.0) & (own > 0.0) & (contributes > 0.0)
+    shift = np.minimum(excess[shrinks] / own[shrinks], np.abs(s[shrinks]))
+    kept = np.ones_like(s)
+    kept[shrinks] = np.maximum(1.0 - shift / contributes[shrinks], 0.0)
+    fast = np.where(from_fast > 0.0, kept * fast, fast)
+    slow = np.where(from_slow > 0.0, kept * slow, slow)
     s = mu * fast + (1.0 - mu) * slow
     Cs, Ks = C @ s, K * s
-    return nearest_with_leak(M, s, Cs + Ks, limit, Cs + clip(Ks, limit))
+    return *nearest_with_leak(M, s, Cs + Ks, limit, Cs + clip(Ks, limit)), fast, slow
 
 
 def _checked(u_max: ArrayLike, **vectors: ArrayLike) -> list[Array]:

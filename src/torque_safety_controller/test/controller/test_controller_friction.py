@@ -15,11 +15,10 @@ from controllers import make, posture_only
 
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.friction.settings import FrictionModel, FrictionSettings
-from torque_safety_controller.integral_action import make_integral
 from torque_safety_controller.integral_feedback import IntegralSettings
 from torque_safety_controller.parameters.controller_parameters import FrictionConfiguration
 from torque_safety_controller.parts.friction import Friction
-from torque_safety_controller.parts.integral import Integral
+from torque_safety_controller.parts.integral import Integral, make_integral
 from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import group, read

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from controllers import EXACT, KHZ, assert_may_be_sent, gravity, pose_at, wide, with_integral
 
-from torque_safety_controller.integral_action import MODES
+from torque_safety_controller.integral_feedback import MODES
 from torque_safety_controller.parts.integral import Integral
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.supervisor import REST

@@ -19,7 +19,7 @@ from controllers import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torque_safety_controller.integral_action import MODES
+from torque_safety_controller.integral_feedback import MODES
 from torque_safety_controller.parts.integral import Integral
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.supervisor import REST

@@ -15,8 +15,8 @@ from arms import load_arm
 from controllers import make
 from general_solver import nearest
 
-from torque_safety_controller.integral_action import IntegralAction
 from torque_safety_controller.integral_feedback import IntegralSettings
+from torque_safety_controller.parts.integral import IntegralAction
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.tasks.gains import Gains
 from viability_bounds_pkg.state import State

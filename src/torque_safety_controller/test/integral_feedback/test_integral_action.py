@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from integral_loop import (
     ARM,
-    BUDGET,
     DT,
     LAMBDA,
     REST,
@@ -18,7 +17,7 @@ from integral_loop import (
     settled,
 )
 
-from torque_safety_controller.integral_action import MODES
+from torque_safety_controller.integral_feedback import MODES
 from viability_bounds_pkg.state import State
 
 # No jumps
@@ -67,7 +66,6 @@ def test_a_budget_that_shrinks_is_kept_soon(mode):
     loop.action.settings = make_settings(budget=small)
     for _ in range(1000):
         loop.step()
-        # Until then it is widened, and returns with 1 s; what cannot be in it fades with 0.2 s.
         assert relative(loop.action.last) < 1.05 * begin
     loop.run(5.0)
     assert (np.abs(loop.action.last) <= 1.02 * small).all()
@@ -87,21 +85,7 @@ def test_it_begins_with_the_torque_it_is_told(mode):
         loop.action.resume(loop.robot, REST, torque)
         np.testing.assert_array_equal(loop.action.last, torque)
         after = loop.action.torque(loop.robot, REST, REST, DT)
-        # 1 / 0.2 s of what cannot be kept, 1 / 1 s of what is beyond the budget.
         assert relative(after - torque) <= 0.01
-
-
-def test_a_joint_s_budget_is_widened_only_where_it_must():
-    loop = IntegralLoop("joints")
-    loop.robot.update(State(loop.q, REST), REST)
-    torque = 0.5 * BUDGET
-    torque[3] = 2.0 * BUDGET[3]
-    loop.action.resume(loop.robot, REST, torque)
-    np.testing.assert_allclose(
-        loop.action.law.memory.widening,
-        [0, 0, 0, BUDGET[3], 0, 0, 0],
-        atol=1e-12,
-    )
 
 
 def test_what_cannot_be_initialised_fades():

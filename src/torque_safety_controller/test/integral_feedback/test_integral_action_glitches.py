@@ -21,7 +21,8 @@ from integral_loop import (
     settled,
 )
 
-from torque_safety_controller.integral_action import MODES, make_integral
+from torque_safety_controller.integral_feedback import MODES
+from torque_safety_controller.parts.integral import make_integral
 from viability_bounds_pkg.state import State
 
 # Time that jumps

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from torque_safety_controller.integral_feedback import LeakyIntegrator
-from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors, mix
+from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors
 
 SHARP = 1e-12
 
@@ -99,16 +99,6 @@ def test_longest_and_shortest_steps():
         integrator = LeakyIntegrator(theta, 1)
         integrator.update([1.0], 0.0)
         assert integrator.update([2.0], dt)[0] == pytest.approx(left, rel=1e-6)
-
-
-def test_two_rates_are_mixed_as_equation_14_says():
-    fast, slow = LeakyIntegrator(100.0, 2), LeakyIntegrator(0.1, 2)
-    s = np.array([2.0, -4.0])
-    for integrator in (fast, slow):
-        integrator.update(s, 0.0)
-        integrator.update(s, 0.1)
-    expected = (0.25 * math.exp(-10.0) + 0.75 * math.exp(-0.01)) * s
-    np.testing.assert_allclose(mix(fast.value, slow.value, 0.25), expected, rtol=SHARP)
 
 
 def test_refuses_what_it_cannot_use_and_keeps_what_it_has():

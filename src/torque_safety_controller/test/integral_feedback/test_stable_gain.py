@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from arms import load_arm
 
-from torque_safety_controller.integral_action import IntegralAction, coupling
 from torque_safety_controller.integral_feedback import IntegralSettings
+from torque_safety_controller.parts.integral import IntegralAction, coupling
 from viability_bounds_pkg.state import State
 
 DT = 0.002

@@ -12,10 +12,9 @@ from controller_chain import NODE, ControllerChain, gains_of
 from controllers import make
 
 from torque_safety_controller.controller import Controller
-from torque_safety_controller.integral_action import make_integral
 from torque_safety_controller.integral_feedback import IntegralSettings
 from torque_safety_controller.node.controller_node import ControllerNode
-from torque_safety_controller.parts.integral import Integral
+from torque_safety_controller.parts.integral import Integral, make_integral
 from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.state import State

@@ -7,7 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from task_arm import TaskArm
 
-from torque_safety_controller.nullspace.kernels import damping, dynamically_consistent_inverse
+from torque_safety_controller.integral_feedback.nullspace_step import (
+    damping,
+    dynamically_consistent_inverse,
+)
 
 NEVER = 1e-9
 ARMS = ("panda", "baxter_left_arm", "talos")

@@ -11,12 +11,11 @@ from task_arm import TaskArm
 from torque_safety_controller.integral_feedback import (
     IntegralFeedback,
 )
-from torque_safety_controller.nullspace.compliance import (
+from torque_safety_controller.integral_feedback.nullspace import (
     NullspaceCompliance,
     TaskShapeError,
-    fast_weight,
 )
-from torque_safety_controller.nullspace.kernels import THRESHOLD, energy_product, torque_matrix
+from torque_safety_controller.integral_feedback.nullspace_step import THRESHOLD, torque_matrix
 
 # What it is for
 
@@ -185,12 +184,3 @@ def test_any_task_with_a_null_space_is_served(m):
     run.go(compliance, 0.1, push=[0.0, 30.0, 0.0])
     assert np.abs(run.terms.J @ compliance.memory.a).max() > 1e-4
     assert np.isfinite(run.torques).all()
-
-
-def test_energy_is_a_norm_of_the_memory():
-    law = unlimited(3)
-    M = np.array([[2.0, 0.3, 0.0], [0.3, 1.0, 0.1], [0.0, 0.1, 0.5]])
-    a, x = np.array([1.0, -2.0, 0.5]), np.array([0.2, 0.4, -1.0])
-    weight = 0.5 * 2.0 / (100.0 - 0.1)
-    expected = a @ M @ a + weight * x @ np.diag(np.diag(M)) @ x
-    assert energy_product(M, fast_weight(law), a, x, a, x) == pytest.approx(expected, rel=1e-14)

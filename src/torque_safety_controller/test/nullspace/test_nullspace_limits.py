@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Null-space compliance: the torque's limits, and changes of mode and settings without jumps."""
+"""Null-space compliance: the torque's limits, and changes of settings without jumps."""
 
 from dataclasses import replace
 
@@ -11,11 +11,9 @@ from hypothesis import strategies as st
 
 from torque_safety_controller.integral_feedback import (
     ArmTerms,
-    IntegralFeedback,
     IntegralSettings,
 )
-from torque_safety_controller.integral_feedback.law import WIDENING_TIME
-from torque_safety_controller.nullspace.compliance import FADING_TIME, NullspaceCompliance
+from torque_safety_controller.integral_feedback.nullspace import NullspaceCompliance
 
 # Limits
 
@@ -50,14 +48,13 @@ def test_always_finite_and_within_the_budget(rng, m, budget):
 
 
 def with_memory(seed, budget=np.inf):
-    """A moving arm and a memory from a random torque, of which the offset has gone."""
+    """A moving arm and a memory from a random torque."""
     run, rng = ComplianceRun("talos"), np.random.default_rng(seed)
     run.v = 0.5 * rng.normal(size=9)
     run.terms = run.arm.terms(run.q, run.v)
     run.a_ref = run.v.copy()
     compliance = NullspaceCompliance(unlimited(9), 6)
     compliance.initialise(np.diag(run.terms.M) * rng.normal(size=9), run.now)
-    compliance.memory.offset[:] = 0.0
     compliance.settings = replace(compliance.settings, budget=np.full(9, budget))
     return run, compliance, rng
 
@@ -110,52 +107,17 @@ def test_it_leaves_its_limits_at_once():
     assert swings[1] < 0.4 * swings[0]
 
 
-# Going over from one mode to another
+# Initialising
 
 
-def test_from_the_plain_mode_and_back_without_a_jump():
-    run = ComplianceRun()
-    n, weight = 9, 3.0 * np.sin(np.arange(9) + 1.0)
-    law = IntegralSettings(np.full(n, 20.0))
-    plain, free = IntegralFeedback(law), NullspaceCompliance(law, 6)
-    plain.reset(run.now)
-
-    def plain_step():
-        run.move(plain.torque(*run.arguments()), weight, [0.0, 20.0, 0.0])
-
-    for _ in range(400):
-        plain_step()
-    last = plain.torque(*run.arguments())
-    assert np.abs(last).max() > 1.0
-    np.testing.assert_allclose(free.initialise(last, run.now), last, atol=1e-12)
-    run.move(last, weight, [0.0, 20.0, 0.0])
-    run.go(free, 1.0, disturbance=weight, push=[0.0, 20.0, 0.0])
-    last = free.torque(*run.arguments())
-    plain.reset(run.now)
-    np.testing.assert_allclose(plain.initialise(last, run.now), last, atol=1e-9)
-    run.move(last, weight, [0.0, 20.0, 0.0])
-    for _ in range(200):
-        plain_step()
-
-    jumps = np.abs(np.diff(run.torques, axis=0)).max(axis=1)
-    usual = jumps[5:395].max()
-    fading = np.abs(run.torques[400]).max() * DT / FADING_TIME
-    assert fading < 0.002 * 20.0
-    for change in (400, 901):
-        assert jumps[change - 2 : change + 4].max() < usual + fading
-    # The hand hardly notices.
-    errors = hand_errors(run)
-    assert errors[400:500].max() < 1.5 * errors[300:400].max()
-
-
-def test_the_task_keeps_its_torque_and_the_rest_fades():
+def test_the_task_keeps_its_torque():
     run = ComplianceRun("talos")
     compliance = NullspaceCompliance(unlimited(9), 6)
     torque = 5.0 * np.cos(np.arange(9))
     J, M = run.terms.J, run.terms.M
     felt = J @ np.linalg.solve(M, torque)
     first = compliance.initialise(torque, run.now)
-    np.testing.assert_allclose(first, torque, atol=1e-12)
+    np.testing.assert_allclose(J @ np.linalg.solve(M, first), felt, atol=1e-9)
     for _ in range(round(2.0 / DT)):  # nothing moves, nothing is asked for
         later = compliance.torque(*run.arguments())
     left = np.exp(-0.1 * 2.0)  # the slow memory leaks
@@ -163,22 +125,6 @@ def test_the_task_keeps_its_torque_and_the_rest_fades():
     task = J.T @ np.linalg.solve(J @ np.linalg.solve(M, J.T), felt)
     np.testing.assert_allclose(later, left * task, atol=0.02)
     assert np.abs(torque - task).max() > 1.0
-
-
-def test_a_budget_is_widened_as_far_as_needed_and_returns():
-    run = ComplianceRun("talos")
-    budget = np.full(9, 2.0)
-    compliance = NullspaceCompliance(IntegralSettings(budget), 6)
-    torque = np.array([5.0, -1.0, 0.0, 3.0, 0.0, 0.0, 1.0, 0.0, -2.5])
-    np.testing.assert_allclose(compliance.initialise(torque, run.now), torque, atol=1e-12)
-    last = np.abs(torque)
-    for k in range(1, 400):
-        tau = np.abs(compliance.torque(run.now, run.a_ref, 0.01))
-        widening = np.maximum(np.abs(torque) - budget, 0.0) * np.exp(-k * 0.01 / WIDENING_TIME)
-        assert (tau <= budget + widening + 1e-12).all()
-        assert np.abs(tau - last).max() < 0.3
-        last = tau
-    assert (tau <= budget + 0.1).all()
 
 
 @pytest.mark.parametrize(
@@ -201,7 +147,13 @@ def test_settings_change_without_a_jump_when_initialised(changes):
     usual = np.abs(np.diff(run.torques, axis=0)).max()
     last = compliance.torque(*run.arguments())
     compliance.settings = replace(compliance.settings, **changes)
-    np.testing.assert_allclose(compliance.initialise(last, run.now), last, atol=1e-12)
+    held = compliance.initialise(last, run.now)
+    if "budget" in changes:
+        assert (np.abs(held) <= 0.1).all()
+    else:
+        # The task feels the same, but for what the motion adds.
+        felt, lost = (run.terms.J @ np.linalg.solve(run.terms.M, x) for x in (last, held - last))
+        assert np.linalg.norm(lost) < 0.1 * np.linalg.norm(felt)
     run.move(last, **push)
     run.go(compliance, 0.02, **push)
-    assert np.abs(np.diff(run.torques[-12:], axis=0)).max() < 2.0 * usual + 0.05
+    assert np.abs(np.diff([held, *run.torques[-10:]], axis=0)).max() < 2.0 * usual + 0.05

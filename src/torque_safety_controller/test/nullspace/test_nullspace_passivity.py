@@ -7,11 +7,10 @@ from task_arm import TaskArm, arm_terms
 
 from torque_safety_controller.integral_feedback import IntegralSettings
 from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors
-from torque_safety_controller.nullspace.compliance import NullspaceCompliance, fast_weight
-from torque_safety_controller.nullspace.kernels import (
+from torque_safety_controller.integral_feedback.nullspace import NullspaceCompliance, fast_weight
+from torque_safety_controller.integral_feedback.nullspace_step import (
     THRESHOLD,
     dynamically_consistent_inverse,
-    energy_product,
 )
 
 NEVER_FORGETS = dict(slow_leak_rate=0.0, fast_leak_rate=0.0)
@@ -36,8 +35,6 @@ class PassivityLoop:
         self.disturbance = disturbance * weights * np.sin(1.0 + np.arange(n))
         torque = weights * np.cos(2.0 * np.arange(n))
         self.torque = self.compliance.initialise(torque, arm_terms(self.terms, self.v))
-        # What the memory cannot hold of that torque is gone in the next step.
-        self.compliance.memory.offset[:] = 0.0
         self.act()
         self.step()
 
@@ -68,7 +65,8 @@ class PassivityLoop:
     def energy(self):
         """W of the documentation."""
         a, x = self.compliance.memory.a, self.forgotten()
-        return 0.5 * energy_product(self.terms.M, fast_weight(self.settings), a, x, a, x)
+        M = self.terms.M
+        return 0.5 * (a @ M @ a + fast_weight(self.settings) * x @ (np.diag(M) * x))
 
     def power(self):
         """What the energy should change by, W: the terms of the proof in the documentation."""

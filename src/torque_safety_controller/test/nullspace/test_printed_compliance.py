@@ -15,8 +15,8 @@ from printed_law import FAST, LAMBDA, MU, SLOW, STEP, PrintedLaw
 from task_arm import TaskArm, arm_terms
 
 from torque_safety_controller.integral_feedback import IntegralSettings
-from torque_safety_controller.nullspace.compliance import NullspaceCompliance
-from torque_safety_controller.nullspace.printed import PrintedCompliance
+from torque_safety_controller.integral_feedback.nullspace import NullspaceCompliance
+from torque_safety_controller.integral_feedback.printed import PrintedCompliance
 
 SMALL = 1e-5  # s; of differences
 
@@ -117,10 +117,9 @@ def test_energy_falls_at_the_rate_of_the_paper_s_proof():
 
 @pytest.mark.parametrize("method", LIMITED)
 def test_a_torque_is_taken_over_as_far_as_the_task_feels_it(method):
-    """And one within the range of the task's inverse goes on, budgets widened."""
+    """And one within the range of the task's inverse goes on."""
     run = ComplianceRun("panda")
     compliance = PrintedCompliance(replace(unlimited(7), anti_windup=method), 6)
-    compliance.settings = replace(compliance.settings, budget=np.full(7, 0.01))
     torque = run.terms.J.T @ np.array([3.0, -2.0, 4.0, 0.3, 0.1, -0.2])
     np.testing.assert_allclose(compliance.initialise(torque, run.now), torque, rtol=1e-9)
     after = compliance.torque(run.now, np.zeros(7), DT)

@@ -12,10 +12,13 @@ import pytest
 from printed_law import FAST, LAMBDA, MU, SLOW, STEP, PrintedLaw
 
 from torque_safety_controller.controller import Controller
-from torque_safety_controller.integral_action import IntegralAction
 from torque_safety_controller.integral_feedback import IntegralSettings
-from torque_safety_controller.nullspace.compliance import NullspaceCompliance, TaskShapeError
+from torque_safety_controller.integral_feedback.nullspace import (
+    NullspaceCompliance,
+    TaskShapeError,
+)
 from torque_safety_controller.parts.goals import Goals
+from torque_safety_controller.parts.integral import IntegralAction
 from torque_safety_controller.parts.joint_bounds import JointBounds
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.robot_model import RobotModel

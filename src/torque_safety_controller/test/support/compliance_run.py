@@ -8,8 +8,7 @@ from torque_safety_controller.integral_feedback import (
     ArmTerms,
     IntegralSettings,
 )
-from torque_safety_controller.nullspace.compliance import NullspaceCompliance, fast_weight
-from torque_safety_controller.nullspace.kernels import energy_product
+from torque_safety_controller.integral_feedback.nullspace import NullspaceCompliance, fast_weight
 
 DT = 2e-3
 
@@ -21,7 +20,8 @@ def unlimited(n, **changes) -> IntegralSettings:
 def energy(compliance, M) -> float:
     """What the memory stores, J."""
     a, x = compliance.memory.a, compliance.memory.root / np.sqrt(np.diag(M))
-    return 0.5 * energy_product(M, fast_weight(compliance.settings), a, x, a, x)
+    weight = fast_weight(compliance.settings)
+    return 0.5 * (a @ M @ a + weight * x @ (np.diag(M) * x))
 
 
 class ComplianceRun:

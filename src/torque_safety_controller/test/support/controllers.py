@@ -9,12 +9,11 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from torque_safety_controller.controller import Controller
-from torque_safety_controller.integral_action import FadingTorque, make_integral
 from torque_safety_controller.integral_feedback import IntegralSettings
 from torque_safety_controller.parts.disturbance import Disturbance
 from torque_safety_controller.parts.friction import Friction, FrictionCompensation
 from torque_safety_controller.parts.goals import Goals
-from torque_safety_controller.parts.integral import Integral
+from torque_safety_controller.parts.integral import FadingTorque, Integral, make_integral
 from torque_safety_controller.parts.joint_bounds import JointBounds
 from torque_safety_controller.parts.slow_down import SlowDown
 from torque_safety_controller.qp import AccelerationRange

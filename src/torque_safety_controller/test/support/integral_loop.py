@@ -7,8 +7,8 @@ from functools import cache
 import numpy as np
 from arms import load_arm
 
-from torque_safety_controller.integral_action import make_integral
 from torque_safety_controller.integral_feedback import IntegralSettings
+from torque_safety_controller.parts.integral import make_integral
 from viability_bounds_pkg.state import State
 
 ARM = load_arm("panda")

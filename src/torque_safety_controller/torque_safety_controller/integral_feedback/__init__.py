@@ -7,10 +7,17 @@ from torque_safety_controller.integral_feedback.joints import (
 )
 from torque_safety_controller.integral_feedback.law import ArmTerms, IntegralLaw
 from torque_safety_controller.integral_feedback.leaky_integrator import LeakyIntegrator
-from torque_safety_controller.integral_feedback.settings import METHODS, IntegralSettings
+from torque_safety_controller.integral_feedback.settings import (
+    METHODS,
+    MODES,
+    TASKS,
+    IntegralSettings,
+)
 
 __all__ = [
     "METHODS",
+    "MODES",
+    "TASKS",
     "ArmTerms",
     "InitialisationError",
     "IntegralFeedback",

@@ -14,9 +14,6 @@ from torque_safety_controller.integral_feedback.settings import IntegralSettings
 
 Array = NDArray[np.float64]
 
-WIDENING_TIME = 1.0
-"""Time constant with which a budget widened by a handover returns to what it should be, s."""
-
 
 class ArmTerms(NamedTuple):
     """Dynamics, task and velocity of an arm in one step, in contiguous arrays.
@@ -41,11 +38,11 @@ class IntegralLaw(ABC):
 
     Args:
         settings: their number of joints stays.
-        memory: named tuple of arrays, with at least `v` and `widening`.
+        memory: named tuple of arrays, one of which is `v`.
 
     Attributes:
         settings: after a change of them `initialise` keeps the torque continuous.
-        memory: errors and budgets; the torque continues from it.
+        memory: what the torque continues from.
         saturated: which joints were at their limits in the last step, shape (n,).
     """
 
@@ -75,6 +72,23 @@ class IntegralLaw(ABC):
             ValueError: unusable terms of the arm; nothing has changed then.
         """
 
+    @abstractmethod
+    def initialise(self, torque: Array, arm: ArmTerms) -> Array:
+        """Choose the memory so that it gives `torque`, and return what it gives of it.
+
+        Args:
+            torque: shape (n,), N m.
+            arm: as it is now.
+
+        Raises:
+            ValueError: it cannot be done.
+        """
+
+    @property
+    @abstractmethod
+    def leak_rates(self) -> dict[str, float]:
+        """Rates at which arrays of the memory are forgotten, 1/s, by name."""
+
     def skip(self, arm: ArmTerms, dt: float) -> None:
         """Let a time pass of which nothing is known: the memory leaks and takes no increment.
 
@@ -87,20 +101,8 @@ class IntegralLaw(ABC):
         """
         if not np.isfinite(arm.v).all():
             raise ValueError(f"v must be finite, is {arm.v}")
-        widening = math.exp(-dt / WIDENING_TIME) * self.memory.widening
-        self.memory = self.memory._replace(v=arm.v.copy(), widening=widening)
-
-    @abstractmethod
-    def initialise(self, torque: Array, arm: ArmTerms) -> Array:
-        """Choose the memory so that the additional torque is `torque`, and return that of it.
-
-        A budget that it exceeds is widened, only as far as it must, and returns to what it
-        should be with `WIDENING_TIME`.
-
-        Args:
-            torque: shape (n,), N m.
-            arm: as it is now.
-
-        Raises:
-            ValueError: it cannot be done.
-        """
+        left = {
+            name: math.exp(-rate * dt) * getattr(self.memory, name)
+            for name, rate in self.leak_rates.items()
+        }
+        self.memory = self.memory._replace(v=arm.v.copy(), **left)

@@ -36,11 +36,6 @@ def leak_factors(theta: float, dt: float, paper_form: bool) -> tuple[float, floa
     return decay, -math.expm1(-x) / x
 
 
-def mix(fast: Array, slow: Array, mu: float) -> Array:
-    """Return ``mu fast + (1 - mu) slow``, eq. (14), shape (n,)."""
-    return mu * fast + (1.0 - mu) * slow
-
-
 class LeakyIntegrator:
     """Leaky integral of s', from samples of s; starts at zero, as s does.
 
@@ -59,11 +54,11 @@ class LeakyIntegrator:
     def __init__(self, theta: float, n: int) -> None:
         if n < 1:
             raise ValueError(f"n must be at least 1, is {n}")
-        if not (math.isfinite(theta) and theta >= 0.0):
+        if not 0.0 <= theta < math.inf:
             raise ValueError(f"theta must be a finite number >= 0, is {theta}")
+        self._theta = theta
         self.value: Array = np.zeros(n)
-        self._theta = float(theta)
-        self._s_last = np.zeros(n)
+        self._s_last: Array = np.zeros(n)
 
     def update(self, s: ArrayLike, dt: float) -> Array:
         """Take a new sample and return the leaky integral, shape (n,).
@@ -80,7 +75,7 @@ class LeakyIntegrator:
             raise ValueError(f"s must be {len(self.value)} finite numbers, is {s}")
         if not 0.0 <= dt < math.inf:
             raise ValueError(f"dt must be a finite number >= 0, is {dt}")
-        decay, gain = leak_factors(self._theta, dt, False)
+        decay, gain = leak_factors(self._theta, dt, paper_form=False)
         self.value = decay * self.value + gain * (s - self._s_last)
         self._s_last = s
         return self.value.copy()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of the integral action, checked in one place."""
+"""Modes and settings of the integral action, checked in one place."""
 
 from __future__ import annotations
 
@@ -12,6 +12,11 @@ from numpy.typing import NDArray
 from viability_bounds_pkg.exceptions import SettingError
 
 Array = NDArray[np.float64]
+
+TASKS = {"task": slice(0, 6), "position": slice(0, 3)}
+"""Rows of the pose's Jacobian that are stiff in each mode that has a null space."""
+
+MODES = ("none", "joints", *TASKS)
 
 METHODS = ("qp", "paper", "scaling")
 """Anti-windup: of the whole torque, integrators included; or (11) or (10) as [Benallegue2021]
@@ -52,16 +57,15 @@ class IntegralSettings:
             raise SettingError("budget", self.budget, "a number >= 0 for each joint")
         budget.flags.writeable = False
         object.__setattr__(self, "budget", budget)
-        if not (math.isfinite(self.gain) and self.gain > 0.0):
+        if not 0.0 < self.gain < math.inf:
             raise SettingError("gain", self.gain, "a finite number > 0")
-        slow, fast = self.slow_leak_rate, self.fast_leak_rate
-        if not (math.isfinite(slow) and slow >= 0.0):
+        slow = self.slow_leak_rate
+        if not 0.0 <= slow < math.inf:
             raise SettingError("slow_leak_rate", slow, "a finite number >= 0")
-        if not (math.isfinite(fast) and fast >= slow):
-            raise SettingError("fast_leak_rate", fast, f"a finite number >= the slow one, {slow}")
-        null = self.null_leak_rate
-        if null is not None and not (math.isfinite(null) and null >= slow):
-            raise SettingError("null_leak_rate", null, f"a finite number >= the slow one, {slow}")
+        for name in ("fast_leak_rate", "null_leak_rate"):
+            rate = getattr(self, name)
+            if rate is not None and not slow <= rate < math.inf:
+                raise SettingError(name, rate, f"a finite number >= the slow one, {slow}")
         if not 0.0 <= self.mu <= 1.0:
             raise SettingError("mu", self.mu, "a number from 0 to 1")
         if self.anti_windup not in METHODS:

@@ -11,7 +11,6 @@ import numpy as np
 import pinocchio as pin
 
 from torque_safety_controller.controller import Controller
-from torque_safety_controller.integral_action import make_integral
 from torque_safety_controller.parameters.contact_parameters import ContactPoint
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parts.collision.avoidance import Collision
@@ -22,7 +21,7 @@ from torque_safety_controller.parts.contact.wrench_sensor import WrenchSensor
 from torque_safety_controller.parts.disturbance import Disturbance
 from torque_safety_controller.parts.friction import Friction, FrictionCompensation
 from torque_safety_controller.parts.goals import Goals
-from torque_safety_controller.parts.integral import Integral
+from torque_safety_controller.parts.integral import Integral, make_integral
 from torque_safety_controller.parts.joint_bounds import JointBounds
 from torque_safety_controller.parts.slow_down import SlowDown
 from torque_safety_controller.parts.whole_arm.safety_filter import SafetyFilter

@@ -13,7 +13,7 @@ from torque_safety_controller.friction.settings import (
     FrictionModel,
     FrictionSettings,
 )
-from torque_safety_controller.integral_action import MODES, TASKS
+from torque_safety_controller.integral_feedback import MODES, TASKS
 from torque_safety_controller.integral_feedback.settings import METHODS, IntegralSettings
 from torque_safety_controller.modes import CONTROLS
 from torque_safety_controller.parameters.contact_parameters import (

@@ -1,15 +1,273 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Integral action: torque of the errors of past accelerations, or what is taken over and fades."""
+"""Integral action of one arm: extra torque on top of inverse dynamics, continuous whatever comes.
+
+Modes are ``joints``, every joint stiff, (3)-(14) of [Benallegue2021]; and ``task`` and
+``position``, the end effectors' poses or positions stiff and their null space free, (15)-(26),
+which are as printed where the anti-windup is. The torque does not jump when settings change, or
+when a state is missing or unusable.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
-from torque_safety_controller.integral_action import FadingTorque
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from torque_safety_controller.integral_feedback import (
+    TASKS,
+    ArmTerms,
+    IntegralFeedback,
+    IntegralLaw,
+    IntegralSettings,
+)
+from torque_safety_controller.integral_feedback.nullspace import NullspaceCompliance
+from torque_safety_controller.integral_feedback.printed import PrintedCompliance
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.settings import Settings
-from torque_safety_controller.step import Array, Part, Step, joints_named
+from torque_safety_controller.step import LONGEST_GAP, Part, Step, joints_named
+
+Array = NDArray[np.float64]
+
+_CHECK_EVERY = 5
+"""Control steps after which it is checked whether the gain is stable in the posture."""
+
+_ROOM_TO_RAISE = 0.5
+"""Steps by which the gain could be higher before it is raised."""
+
+_POSITION_JUMP = 0.05  # rad or m; beyond what the velocities account for
+_FADING_TIME = 0.2  # s; of what the memory cannot hold
+
+
+class FadingTorque:
+    """Torque taken over at a handover, which fades; what there is without integral action.
+
+    Args:
+        settings: as of `IntegralAction`.
+
+    Attributes:
+        settings: as they are set.
+        last: torque of the last step, shape (n,), N m.
+        skipped: steps that were not integrated over: time jumped, or the state did.
+        gain: lambda that is used, 1/s; what is set, or what is stable; 0 for none.
+        saturated: which joints are at their budget, shape (n,).
+        rates: whether the robot's matrices are needed with their rates.
+    """
+
+    rates = False
+    gain = 0.0
+
+    def __init__(self, settings: IntegralSettings) -> None:
+        self.settings = settings
+        self.skipped = 0
+        self._zero = np.zeros(len(settings.budget))
+        self.saturated = np.zeros(len(settings.budget), dtype=bool)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past: the next step begins with nothing added."""
+        self.last = self._fading = self._zero
+
+    def forget(self) -> None:
+        """Let the integral begin anew: what it gives now fades."""
+
+    def torque(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> Array:
+        """Return what to add in this step, shape (n,), N m; finite whatever comes.
+
+        After a jump in time, or of the state, the torque goes on from the last one, and the
+        difference to what the memory asks for fades.
+
+        Args:
+            robot: of the arm, updated with rates.
+            v: velocity, shape (n,), rad/s.
+            a_last: acceleration commanded in the last step, shape (n,), rad/s^2.
+            elapsed: time since the last step, s.
+        """
+        if self._fading is not self._zero:
+            self.last = self._faded(elapsed, robot.dt)
+        return self.last
+
+    def resume(self, robot: RobotModel, v: Array, torque: Array) -> None:
+        """Begin so that the torque is `torque` now.
+
+        The memory holds what it can of it within the budgets; the rest fades.
+
+        Args:
+            robot: of the arm, updated with rates.
+            v: velocity, shape (n,), rad/s.
+            torque: shape (n,), N m, finite.
+        """
+        self.last = self._fading = torque
+
+    def _faded(self, elapsed: float, period: float) -> Array:
+        """Let the time pass for what fades, and return it; infinite time is a period."""
+        gap = min(elapsed, LONGEST_GAP * period) if elapsed > 0.0 else 0.0  # also for a NaN
+        gap = period if math.isinf(elapsed) else gap
+        self._fading = self._fading * math.exp(-gap / _FADING_TIME)
+        return self._fading
+
+
+class IntegralAction(FadingTorque):
+    """Torque of the integral of acceleration errors.
+
+    Args:
+        mode: one of `MODES` but ``none``.
+        settings: their numbers may be replaced between steps: the torque does not jump.
+        disturbance_max: largest disturbance of each joint that is integrated, shape (n,), N m;
+            what friction and a wrong model never are, but a sensor's glitch or a blow may be.
+        hands: end effectors whose rows are stacked to one task.
+
+    Attributes:
+        law: what gives the torque of a step.
+
+    Raises:
+        TaskShapeError: the task leaves no null space.
+    """
+
+    rates = True
+
+    def __init__(
+        self, mode: str, settings: IntegralSettings, disturbance_max: Array, hands: int = 1
+    ) -> None:
+        self._asked = settings
+        self._rows = TASKS.get(mode)
+        # Largest lambda h f. It is less with a null space: loops of P K P are unstable earlier in
+        # some postures.
+        self._most = 1.0 if self._rows is None else 0.5
+        self.law: IntegralLaw
+        if self._rows is None:
+            self.law = IntegralFeedback(settings)
+        else:
+            kind = PrintedCompliance if settings.as_printed else NullspaceCompliance
+            self.law = kind(settings, hands * self._rows.stop)
+        self._disturbance_max = disturbance_max
+        super().__init__(settings)
+
+    def reset(self) -> None:
+        """See `FadingTorque`."""
+        super().reset()
+        self._lowered = self._checked = 0
+        self._use(self.settings)
+        self._started = self._lost = self._resuming = False
+        self._q_last = self._v_last = self._zero
+
+    def forget(self) -> None:
+        """See `FadingTorque`."""
+        self._started = False
+        self._resuming = True
+
+    def torque(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> Array:
+        """See `FadingTorque`."""
+        try:
+            torque = self._next(robot, v, a_last, elapsed)
+        except ValueError:  # numbers that are not finite, or no mass matrix
+            self._lost = True
+            torque = None
+        if torque is None:
+            self._resuming = True
+            self.skipped += 1
+        else:
+            self.last = torque
+        self.saturated = self.law.saturated
+        return self.last
+
+    def resume(self, robot: RobotModel, v: Array, torque: Array) -> None:
+        """See `FadingTorque`."""
+        self._started = False
+        self._checked = 0
+        self._use(self._stable(robot.M, robot.dt))
+        self._hold(robot, v, torque)
+        self.last = torque
+
+    def _next(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> Array | None:
+        """Return the torque of this step; None where the state jumped."""
+        arm, law = self._arm(robot, v), self.law
+        if not self._started:
+            self._start(robot, arm)
+        known = 0.0 < elapsed <= LONGEST_GAP * robot.dt and not self._lost
+        last = self._q_last, robot.q, self._v_last, v
+        jumped = known and _jumped(arm.M, *last, a_last, elapsed, self._disturbance_max)
+        self._lost = False
+        self._q_last, self._v_last = robot.q.copy(), v.copy()
+        if jumped or not known:
+            law.skip(arm, elapsed if 0.0 <= elapsed < math.inf else 0.0)
+            self._checked = 0  # the posture may be any
+        if jumped:
+            return None
+        if known:
+            torque = law.torque(arm, a_last, elapsed)
+        else:
+            self.skipped += 1
+            self._resuming = True
+            torque = law.torque(arm, self._zero, 0.0)
+        if self._resuming:
+            self._resuming = False
+            self._fading = self.last - torque
+        torque = torque + self._faded(elapsed, robot.dt)
+        settings = self._stable(arm.M, robot.dt)
+        if settings is not law.settings:
+            self._use(settings)
+            self._hold(robot, v, torque)
+        return torque
+
+    def _stable(self, M: Array, period: float) -> IntegralSettings:
+        """Return the settings with a gain that is stable here.
+
+        It is lowered by powers of sqrt(2), so that it changes seldom, and is the same for
+        `_CHECK_EVERY` steps, as the posture is nearly.
+        """
+        asked, used = self.settings, self.law.settings
+        self._checked -= 1
+        if self._checked >= 0 and asked is self._asked:
+            return used
+        self._checked = _CHECK_EVERY - 1
+        share = asked.gain * period * coupling(M) / self._most
+        if 0.0 < share < math.inf:
+            steps = 2.0 * math.log2(share)
+            if not steps <= self._lowered <= steps + 1.0 + _ROOM_TO_RAISE:
+                self._lowered = max(0, math.ceil(steps))
+        gain = asked.gain * 2.0 ** (-0.5 * self._lowered)
+        if gain == used.gain and (asked is self._asked or asked.same_as(self._asked)):
+            self._asked = asked
+            return used
+        return asked if gain == asked.gain else replace(asked, gain=gain)
+
+    def _use(self, settings: IntegralSettings) -> None:
+        self._asked, self.law.settings = self.settings, settings
+        self.gain = settings.gain
+
+    def _hold(self, robot: RobotModel, v: Array, torque: Array) -> None:
+        """Let the memory give `torque` now; what it cannot give fades."""
+        held = self._zero
+        try:
+            arm = self._arm(robot, v)
+            if not self._started:
+                self._start(robot, arm)
+            held = self.law.initialise(torque, arm)
+        except ValueError:  # too fast, or numbers that are not finite: all of it fades
+            self._started = False
+        self._fading = torque - held
+
+    def _start(self, robot: RobotModel, arm: ArmTerms) -> None:
+        """Let the memory begin, empty, at this state."""
+        self.law.reset(arm)
+        self._q_last, self._v_last = robot.q.copy(), arm.v.copy()
+        self._started, self._lost = True, False
+
+    def _arm(self, robot: RobotModel, v: Array) -> ArmTerms:
+        """Return what the law needs to know of the arm."""
+        rows = self._rows
+        if rows is None:
+            return ArmTerms(robot.M, robot.C, robot.J, robot.J_dot, v)
+        J, J_dot = robot.J[rows], robot.J_dot[rows]
+        if robot.others:
+            hands = (robot, *robot.others)
+            J = np.concatenate([hand.J[rows] for hand in hands])
+            J_dot = np.concatenate([hand.J_dot[rows] for hand in hands])
+        return ArmTerms(robot.M, robot.C, J, J_dot, v)
 
 
 class Integral(Part):
@@ -57,3 +315,54 @@ class Integral(Part):
             "integral_skipped_steps": self.action.skipped,
             "integral_lambda": self.action.gain,
         }
+
+
+def make_integral(
+    mode: str, settings: IntegralSettings, disturbance_max: Array, hands: int = 1
+) -> FadingTorque:
+    """Return the integral action of a mode; see `IntegralAction`."""
+    if mode == "none":
+        return FadingTorque(settings)
+    return IntegralAction(mode, settings, disturbance_max, hands)
+
+
+def coupling(M: Array) -> float:
+    """Return the largest eigenvalue f of M^-1 D, D = diag(M); NaN where M is no mass matrix.
+
+    With K = lambda D the errors s of the speeds of an ideal arm become
+
+        s_next = (I - lambda h M^-1 D) s
+
+    in a period h: they grow where lambda h f > 2, and change sign where it is above 1. A joint
+    alone has f = 1; coupled ones have more, those of Panda in its worst posture 77.
+    """
+    inertia = np.diagonal(M)
+    if not (math.isfinite(M.sum()) and inertia.min() > 0.0):
+        return math.nan
+    root = np.sqrt(inertia)
+    least = float(np.linalg.eigvalsh(M / np.outer(root, root))[0])
+    return 1.0 / least if least > 0.0 else math.nan
+
+
+@njit(cache=True)
+def _jumped(
+    M: Array,
+    q_last: Array,
+    q: Array,
+    v_last: Array,
+    v: Array,
+    a_last: Array,
+    elapsed: float,
+    disturbance_max: Array,
+) -> bool:
+    """Return whether velocity or position of a joint changed by more than is possible.
+
+    At most `disturbance_max`, shape (n,), N m, acts on a joint's own inertia besides `a_last`.
+    """
+    for j in range(v.size):
+        impulse = M[j, j] * abs(a_last[j] * elapsed - (v[j] - v_last[j]))
+        way = abs(q[j] - q_last[j]) - elapsed * (abs(v[j]) + abs(v_last[j]))
+        # A NaN is not within its limits.
+        if not (impulse <= disturbance_max[j] * elapsed and way <= _POSITION_JUMP):
+            return True
+    return False

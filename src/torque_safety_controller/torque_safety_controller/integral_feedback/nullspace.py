@@ -24,25 +24,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torque_safety_controller.integral_feedback.law import WIDENING_TIME, ArmTerms, IntegralLaw
+from torque_safety_controller.integral_feedback.law import ArmTerms, IntegralLaw
 from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors
-from torque_safety_controller.integral_feedback.settings import IntegralSettings
-from torque_safety_controller.nullspace.kernels import (
-    SINGULAR,
+from torque_safety_controller.integral_feedback.nullspace_step import (
     THRESHOLD,
     advance,
     dynamically_consistent_inverse,
-    limited,
-    torque_matrix,
-    write,
 )
+from torque_safety_controller.integral_feedback.settings import IntegralSettings
 from viability_bounds_pkg.exceptions import ArmSafetyError
 
 Array = NDArray[np.float64]
 
-FADING_TIME = 0.2
-"""Time constant with which that part of an initial torque fades that the memory cannot hold, s."""
-
+_SINGULAR = 1e-12  # relative size of singular values that are rounding
 _AT_LIMIT = 1.0 - 1e-9
 
 
@@ -51,7 +45,7 @@ class TaskShapeError(ArmSafetyError, ValueError):
 
 
 class Memory(NamedTuple):
-    """What lasts from one step to the next; written in place.
+    """What lasts from one step to the next.
 
     Attributes:
         a: the error that dies away, eq. (16), shape (n,), rad/s.
@@ -59,8 +53,6 @@ class Memory(NamedTuple):
         integral: integral(J' s), which is - J a, shape (m,).
         root: ``sqrt(diag M) x``, shape (n,): its square is the fast memory's energy whatever M
             does.
-        offset: what is left of an initial torque that the memory cannot hold, shape (n,), N m.
-        widening: of the budgets, shape (n,), N m.
         v: velocity, shape (n,), rad/s.
         J: Jacobian of the task, shape (m, n).
     """
@@ -69,8 +61,6 @@ class Memory(NamedTuple):
     s: Array
     integral: Array
     root: Array
-    offset: Array
-    widening: Array
     v: Array
     J: Array
 
@@ -107,28 +97,33 @@ class TaskLaw(IntegralLaw):
         super().skip(arm, dt)
         self.memory = self.memory._replace(J=arm.J.copy())
 
-    def _check(self, arm: ArmTerms, vector: Array) -> None:
+    def check(self, arm: ArmTerms, vector: Array) -> None:
         """Raise `ValueError` unless all is finite, and M can be a mass matrix."""
         M, C, J, J_dot, v = arm
         total = M.sum() + C.sum() + J.sum() + J_dot.sum() + v.sum() + vector.sum()
         if not (math.isfinite(total) and (np.diagonal(M) > 0.0).all()):
             raise ValueError("M must be positive definite, and all numbers finite")
 
-    def _initial(self, arm: ArmTerms, J_plus: Array, torque: Array) -> Array:
-        """Return the a whose slow memory gives what the task feels of `torque`.
+    def felt_by_task(self, arm: ArmTerms, torque: Array) -> Array:
+        """Return the a whose slow memory gives what the task feels of `torque`, shape (n,).
 
         The task feels the force F = J^+^T torque. Where J a = y the slow torque is
         J^T ((1 - mu) J^+^T K J^+ y), which is J^T F for this y.
+
+        Raises:
+            ValueError: see `check`.
         """
-        K = self.settings.gain * np.diagonal(arm.M)
+        self.check(arm, torque)
+        M, C, J, J_dot, _ = arm
+        J_plus, _ = dynamically_consistent_inverse(J, J_dot, M, C + C.T, THRESHOLD)
+        K = self.settings.gain * np.diagonal(M)
         B = (1.0 - self.settings.mu) * (J_plus.T * K) @ J_plus
-        return J_plus @ (np.linalg.pinv(B, SINGULAR) @ (J_plus.T @ torque))
+        a: Array = J_plus @ (np.linalg.pinv(B, _SINGULAR) @ (J_plus.T @ torque))
+        return a
 
 
 class NullspaceCompliance(TaskLaw):
-    """Additional torque that is stiff in a task of m < n rows; a change of settings keeps s.
-
-    An initial torque that the task does not feel fades with `FADING_TIME`.
+    """Additional torque that is stiff in a task of m < n rows.
 
     Args:
         settings: their number of joints stays.
@@ -144,29 +139,22 @@ class NullspaceCompliance(TaskLaw):
         super().__init__(settings, m, Memory)
         self._none = np.zeros_like(self.saturated)
 
-    def skip(self, arm: ArmTerms, dt: float) -> None:
+    @property
+    def leak_rates(self) -> dict[str, float]:
         """See `IntegralLaw`."""
-        super().skip(arm, dt)
-        memory, decay = self.memory, math.exp(-self.settings.slow_leak_rate * dt)
-        self.memory = memory._replace(
-            a=decay * memory.a,
-            s=decay * memory.s,
-            integral=decay * memory.integral,
-            root=decay * memory.root,
-            offset=math.exp(-dt / FADING_TIME) * memory.offset,
-        )
+        return dict.fromkeys(("a", "s", "integral", "root"), self.settings.slow_leak_rate)
 
     def torque(self, arm: ArmTerms, a_last: Array, dt: float) -> Array:
         """See `IntegralLaw`."""
         settings = self.settings
-        slow, null = settings.slow_leak_rate, settings.null_leak_rate
-        torque, cut, usable = advance(
+        slow, fast, null = (
+            settings.slow_leak_rate,
+            settings.fast_leak_rate,
+            settings.null_leak_rate,
+        )
+        *memory, torque, limited, usable = advance(
             *self.memory,
-            arm.J,
-            arm.J_dot,
-            arm.M,
-            arm.C,
-            arm.v,
+            *arm,
             a_last,
             dt,
             settings.budget,
@@ -174,41 +162,32 @@ class NullspaceCompliance(TaskLaw):
             settings.mu,
             fast_weight(settings),
             *leak_factors(slow, dt, False),
-            *leak_factors(settings.fast_leak_rate, dt, False),
-            math.exp((slow - (settings.fast_leak_rate if null is None else null)) * dt),
-            math.exp(-dt / FADING_TIME),
-            math.exp(-dt / WIDENING_TIME),
+            *leak_factors(fast, dt, False),
+            math.exp((slow - (fast if null is None else null)) * dt),
         )
-        return self._checked(torque, usable, cut)
+        if not usable:
+            raise ValueError("M must be positive definite, and all numbers finite")
+        self.memory = Memory(*memory, arm.v.copy(), arm.J.copy())
+        at_limit = np.abs(torque) >= _AT_LIMIT * settings.budget if limited else self._none
+        self.saturated = at_limit
+        return torque
 
     def initialise(self, torque: Array, arm: ArmTerms) -> Array:
         """See `IntegralLaw`; the slow memory takes what the task feels of it."""
-        self._check(arm, torque)
-        M, C, J, J_dot, v = arm
-        settings, gain, mu = self.settings, self.settings.gain, self.settings.mu
-        inverse = dynamically_consistent_inverse(J, J_dot, M, C + C.T, THRESHOLD)
-        a = self._initial(arm, inverse[0], torque)
-        forgets = settings.fast_leak_rate > settings.slow_leak_rate
-        x = a if forgets else np.zeros_like(a)
-        H = torque_matrix(J, J_dot, M, C, gain, mu, *inverse)
-        widening = np.maximum(np.abs(torque) - settings.budget, 0.0)
-        own = H @ a - mu * gain * np.diagonal(M) * x
-        limit = settings.budget + widening
-        a, x, own, cut = limited(M, H, limit, a, x, own, fast_weight(settings))
-        rest, memory = torque - own, tuple(self.memory)
-        given = memory, J, inverse[0], M, v, settings.budget, a, x, own, rest, widening
-        return self._checked(*write(*given), cut)
-
-    def _checked(self, torque: Array, usable: bool, cut: bool) -> Array:
-        """Return a torque, and note which joints are at their limits."""
-        if not usable:
-            raise ValueError("M must be positive definite, and all numbers finite")
-        self.saturated = np.abs(torque) >= _AT_LIMIT * self.settings.budget if cut else self._none
-        return torque
+        a = self.felt_by_task(arm, torque)
+        J_plus, _ = dynamically_consistent_inverse(
+            arm.J, arm.J_dot, arm.M, arm.C + arm.C.T, THRESHOLD
+        )
+        zero, integral = np.zeros_like(a), -(arm.J @ a)
+        forgets = self.settings.fast_leak_rate > self.settings.slow_leak_rate
+        root = np.sqrt(np.diagonal(arm.M)) * a if forgets else zero
+        null = a + J_plus @ integral
+        self.memory = Memory(a, null, integral, root, arm.v.copy(), arm.J.copy())
+        return self.torque(arm, zero, 0.0)
 
 
 def fast_weight(settings: IntegralSettings) -> float:
-    """Return the weight of the fast memory in the energy, see `kernels.energy_product`."""
+    """Return the weight w of the fast memory in the energy (a'M a + w x' diag(M) x) / 2."""
     if settings.fast_leak_rate > settings.slow_leak_rate:
         return settings.mu * settings.gain / (settings.fast_leak_rate - settings.slow_leak_rate)
     return 0.0
