@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from torque_safety_controller.loop_margins.gain_check import (
+from torque_safety_controller.loop_margins.arm_inertia import ArmInertia
+from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
+from torque_safety_controller.parts.disturbance import DisturbanceObserver
+from torque_safety_controller.tools.gain_limits import (
     LIMIT_MARGIN,
     MARGIN,
     TORQUE_STEP,
-    ArmInertia,
     GainCheck,
 )
-from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.parts.disturbance import DisturbanceObserver
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.robot.configuration import load_model

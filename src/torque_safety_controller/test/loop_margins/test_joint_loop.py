@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from torque_safety_controller.integral_feedback.leaky_integrator import LeakyIntegrator
-from torque_safety_controller.loop_margins.gain_check import limit_gains
 from torque_safety_controller.loop_margins.joint_loop import (
     Feedback,
     Link,
     filter_share,
+    limit_gains,
     motion,
     open_loop,
 )

@@ -10,11 +10,11 @@ import pinocchio as pin
 import pytest
 
 from sim_bridge.node.bullet_parameters import BulletConfiguration, make_robot
-from torque_safety_controller.loop_margins.gain_check import TORQUE_STEP
 from torque_safety_controller.node.assembly import make_controller
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parts.disturbance import DisturbanceObserver
 from torque_safety_controller.qp import AccelerationRange
+from torque_safety_controller.tools.gain_limits import TORQUE_STEP
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.robot.configuration import load_model

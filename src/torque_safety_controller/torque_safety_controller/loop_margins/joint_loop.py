@@ -166,3 +166,18 @@ def open_loop(link: Link, gains: Feedback) -> OpenLoop:
     new |= dict(zip("qva", moved, strict=True))
     step = np.array([new[name] for name in names])
     return OpenLoop(step[:, :-1], step[:, -1], command[:-1])
+
+
+def limit_gains(horizon: float, disturbance: Array, braking: Array) -> tuple[Array, Array]:
+    """Return kp, 1/s^2, and kd, 1/s, of a joint that rests on its limit: slopes of its bound.
+
+    The bound ends its step with w that T w / 2 + w^2 / (2 B) = x - T v / 2 allows, x from the
+    limit. It is at rest where w = T W; there dw = (2 dx - T dv) / T / (1 + 2 W / B).
+
+    Args:
+        horizon: T of the bounds, s.
+        disturbance: W, shape (n,), rad/s^2.
+        braking: limits of acceleration, of which W is not available, shape (n,), rad/s^2.
+    """
+    flatter = 1.0 / (1.0 + 2.0 * disturbance / np.maximum(braking - disturbance, 1e-9))
+    return 2.0 * flatter / horizon**2, (1.0 + flatter) / horizon

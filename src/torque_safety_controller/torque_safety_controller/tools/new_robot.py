@@ -18,14 +18,13 @@ from xml.etree import ElementTree
 
 import pinocchio as pin
 
-from torque_safety_controller.loop_margins.gain_check import OBSERVER, GainLimit
 from torque_safety_controller.new_robot.capsules import capsule_entries
 from torque_safety_controller.new_robot.chain import Chain, NewRobotError, find_chain
 from torque_safety_controller.new_robot.estimates import Estimates, estimate
 from torque_safety_controller.new_robot.files import parameter_file, scenario_file
 from torque_safety_controller.new_robot.postures import SelfCollisions, find_postures
 from torque_safety_controller.tools.fit_capsules import with_capsules
-from torque_safety_controller.tools.gain_limits import gain_check
+from torque_safety_controller.tools.gain_limits import OBSERVER, GainLimit, gain_check
 from viability_bounds_pkg.cli.command_line import Parser, positive, run_tool
 from viability_bounds_pkg.cli.limits_file import NODE, check_writable, write_whole
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
