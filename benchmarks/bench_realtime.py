@@ -53,12 +53,12 @@ from viability_bounds_pkg.cli.command_line import Parser
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.node.estimator_node import EstimatorNode
 from viability_bounds_pkg.recent_values import RecentValues
-from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.messages import Diagnostics, JointStateReader
+from viability_bounds_pkg.ros.arm_node import ArmNode, connect
+from viability_bounds_pkg.ros.diagnostics import Diagnostics
+from viability_bounds_pkg.ros.messages import JointStateReader
 from viability_bounds_pkg.ros.program import initialise, leave
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, make_executor
-from viability_bounds_pkg.ros.streams import connect
 from viability_bounds_pkg.state_estimation.estimator import StateEstimator
 
 CASES = (

@@ -30,7 +30,7 @@ from torque_safety_controller.tools import gain_limits
 from viability_bounds_pkg.cli import estimate_acceleration_limits
 from viability_bounds_pkg.node import bounds_node, estimator_node
 from viability_bounds_pkg.node.bounds_node import BoundsNode
-from viability_bounds_pkg.ros import arm_node, messages, program
+from viability_bounds_pkg.ros import arm_node, messages, program, robot_urdf
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS, stamp_to_ns
 from viability_bounds_pkg.testing.ros_harness import (
     RosHarness,
@@ -58,7 +58,6 @@ PROGRAMS = {
     "identify_friction": lambda a: identify_friction.main(a[1:]),
 }
 ALL = yaml.safe_load((ROOT / "test" / "mistakes.yaml").read_text(encoding="utf-8"))
-URDF = import_module("viability_bounds_pkg.ros.robot_urdf")  # the function has its name, too
 LOG = re.compile(r"\[[A-Z]+\] \[[\d.]+\] \[[\w.]+\]: ")
 
 
@@ -87,7 +86,7 @@ def test_on_a_command_line(mistake, tmp_path, monkeypatch, capfd):
     # A node that starts all the same ends at once.
     monkeypatch.setattr(program, "spin", lambda *_: None)
     monkeypatch.setattr(scenario_node, "play", lambda *_: None)
-    monkeypatch.setattr(URDF, "_TOPIC_TIMEOUT", 0.1)
+    monkeypatch.setattr(robot_urdf, "_TOPIC_TIMEOUT", 0.1)
     words = shlex.split(mistake["run"])
     while "=" in words[0]:
         monkeypatch.setenv(*words.pop(0).split("=", 1))

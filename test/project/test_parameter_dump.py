@@ -17,7 +17,7 @@ from sim_bridge.node.scenario_node import ScenarioNode
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.parameter import parameter_table
-from viability_bounds_pkg.ros.given_parameters import note_arguments
+from viability_bounds_pkg.ros.given_parameters import remember_arguments
 from viability_bounds_pkg.testing.ros_harness import overrides, private_domain, read_config
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -93,7 +93,7 @@ def test_a_node_starts_from_its_own_dump_with_the_same_configuration(ros, tmp_pa
             domain_id=domain,
             signal_handler_options=SignalHandlerOptions.NO,
         )
-        note_arguments(context, arguments)
+        remember_arguments(context, arguments)
         try:
             again = NODES[name](context=context)
             assert again.get_fully_qualified_name() == f"/left/{name}"

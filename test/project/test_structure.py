@@ -149,7 +149,7 @@ def test_no_folder_of_tests_is_crowded():
 
 @pytest.mark.parametrize(
     "path",
-    [p for p in modules() if p.stem.endswith(("_node", "streams"))],
+    [p for p in modules() if p.stem.endswith("_node")],
     ids=lambda path: path.stem,
 )
 def test_nodes_take_no_name_that_rclpy_uses_itself(path):
@@ -164,7 +164,7 @@ def test_nodes_take_no_name_that_rclpy_uses_itself(path):
     own = set()
     for each in ast.walk(ast.parse(path.read_text())):
         if isinstance(each, ast.ClassDef) and any(
-            getattr(b, "id", "") in ("Node", "StreamNode", "ArmNode") for b in each.bases
+            getattr(b, "id", "") in ("Node", "ArmNode") for b in each.bases
         ):
             for part in ast.walk(each):
                 if isinstance(part, ast.FunctionDef):

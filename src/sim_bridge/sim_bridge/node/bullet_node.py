@@ -14,7 +14,6 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
 from numpy.typing import NDArray
-from rclpy.clock import Clock, ClockType
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -30,12 +29,12 @@ from sim_bridge.node.world_subscriber import WorldSubscriber
 from viability_bounds_pkg.plausible import RESTART_GAP
 from viability_bounds_pkg.recent_values import RecentValues
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.joint_command import PositionCommand, TorqueCommand
-from viability_bounds_pkg.ros.messages import Diagnostics
+from viability_bounds_pkg.ros.diagnostics import Diagnostics
+from viability_bounds_pkg.ros.messages import PositionCommand, TorqueCommand
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.robot_urdf import warn_of_unusual
-from viability_bounds_pkg.ros.runtime import set_stamp
+from viability_bounds_pkg.ros.runtime import set_stamp, steady_timer
 from viability_bounds_pkg.ros.topics import (
     FT_WRENCH,
     JOINT_COMMANDS,
@@ -122,13 +121,12 @@ class BulletNode(ArmNode):
         self.listen(JOINT_COMMANDS, self._on_command)
         RESET.serve(self, self._on_reset)
         PAUSE.serve(self, self._on_pause)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
         if not config.lockstep:
-            self.create_timer(config.dt, self._tick, clock=steady)
-        self.create_timer(_RETRY_PERIOD, self._retry, clock=steady)
+            steady_timer(self, config.dt, self._tick)
+        steady_timer(self, _RETRY_PERIOD, self._retry)
         if self._clock_publisher is not None:
             self.publisher_watch.add(self._clock_publisher.topic_name)
-        self._diagnostics = Diagnostics(self, self._report, watch=self.publisher_watch)
+        self._diagnostics = Diagnostics(self, self._report, self.publisher_watch)
 
     def _restart(self) -> None:
         """Reset the robot and all counts; robot time continues."""

@@ -14,7 +14,7 @@ from sensor_msgs.msg import JointState
 from sim_bridge.hardware import CommandPath
 from sim_bridge.node.bullet_parameters import BulletConfiguration
 from viability_bounds_pkg.recent_values import RecentValues
-from viability_bounds_pkg.ros.joint_command import JointCommand, TorqueCommand, accept_command
+from viability_bounds_pkg.ros.messages import CommandReader, JointCommand, TorqueCommand
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 
 _STRAYS = 50
@@ -49,7 +49,7 @@ class CommandStream:
     ) -> None:
         self._config, self._refused = config, refused
         self._warn = warn
-        self._joints = list(config.joints)
+        self._reader = CommandReader(config.joints, refused, warn)
         self._dt_ns = round(1e9 * config.dt)
         self._warned_at = -math.inf
         self.restart()
@@ -125,7 +125,7 @@ class CommandStream:
             )
 
     def _read(self, message: JointState) -> JointCommand | None:
-        command = accept_command(message, self._joints, self._refused, self._warn)
+        command = self._reader.read(message)
         if isinstance(command, TorqueCommand):
             tau, tau_max = command.tau, self._config.torque_max
             self.torque_ratio = max(self.torque_ratio, float(np.max(np.abs(tau) / tau_max)))

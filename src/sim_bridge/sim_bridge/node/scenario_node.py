@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import rclpy
-from rclpy.clock import Clock, ClockType
 from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.task import Future
 
@@ -44,7 +43,7 @@ from viability_bounds_pkg.ros.program import (
     node_parser,
     report_refusal,
 )
-from viability_bounds_pkg.ros.runtime import make_executor
+from viability_bounds_pkg.ros.runtime import make_executor, steady_timer
 
 _POLL_PERIOD = 0.02
 _SHOW_PERIOD = 0.5
@@ -132,8 +131,7 @@ class ScenarioNode(ArmNode):
             for request in (*own, *map(to_service, self._due))
         }
         self._course = self._play()
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(_POLL_PERIOD, self._proceed, clock=steady)
+        steady_timer(self, _POLL_PERIOD, self._proceed)
 
     @property
     def robot(self) -> dict[str, str]:

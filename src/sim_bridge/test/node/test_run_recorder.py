@@ -4,10 +4,14 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 
 from sim_bridge.node.run_recorder import RunRecorder
-from viability_bounds_pkg.ros.messages import Diagnostics
-from viability_bounds_pkg.ros.streams import StreamNode
+from viability_bounds_pkg.ros.arm_node import ArmNode
+from viability_bounds_pkg.ros.diagnostics import Diagnostics
 
 NAMESPACES = ("", "left", "left/wrist", "right")
+
+
+class Player(ArmNode):
+    NAME = "player"
 
 
 @pytest.mark.parametrize("own", NAMESPACES)
@@ -16,7 +20,7 @@ def test_diagnostics_of_arms_in_other_namespaces_are_ignored(ros, own):
         robot = ros.add(Node("bullet_node", context=ros.context, namespace=namespace))
         report = DiagnosticStatus.OK, "", {"arm": namespace}
         Diagnostics(robot, lambda report=report: report)
-    node = ros.add(StreamNode("player", context=ros.context, namespace=own))
+    node = ros.add(Player(context=ros.context, namespace=own))
     recorder, told = RunRecorder(node, ["x"]), []
 
     def all_told():

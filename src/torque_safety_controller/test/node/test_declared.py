@@ -11,14 +11,14 @@ from torque_safety_controller.node.declared import (
     covered_misses,
     declared_robot,
 )
-from viability_bounds_pkg.ros.given_parameters import note_arguments
+from viability_bounds_pkg.ros.given_parameters import remember_arguments
 from viability_bounds_pkg.testing.ros_harness import config_folder
 
 
 def declared(*words):
     """Return what a node reads of the bounds node beside it, from its own command line."""
     context = Context()
-    note_arguments(context, ["--ros-args", *words])
+    remember_arguments(context, ["--ros-args", *words])
     return declared_robot(SimpleNamespace(context=context, get_namespace=lambda: "/left"))
 
 

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
@@ -35,10 +34,11 @@ from torque_safety_controller.parts.contact.interaction import Interaction
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.supervisor import Supervisor
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.messages import Arrival, Diagnostics
+from viability_bounds_pkg.ros.diagnostics import Diagnostics
+from viability_bounds_pkg.ros.messages import Arrival
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
-from viability_bounds_pkg.ros.robot_urdf import DescriptionWatch
+from viability_bounds_pkg.ros.runtime import steady_timer
 from viability_bounds_pkg.ros.topics import ACCELERATION_LIMITS
 from viability_bounds_pkg.state import State
 
@@ -99,15 +99,9 @@ class ControllerNode(ArmNode):
         ENABLE_TORQUE.serve(self, self._on_enable_torque)
         self.listen_to_states(config.use_estimated_states, self._on_state)
         self.listen(ACCELERATION_LIMITS, self._on_limits)
-        # Use the steady clock, so that watchdogs fire when /clock stops.
-        self._watchdog = self.create_timer(
-            min(config.bounds_timeout, config.state_timeout) / 4,
-            self._watch,
-            clock=Clock(clock_type=ClockType.STEADY_TIME),
-        )
-        self._diagnostics = Diagnostics(
-            self, self._report, self.publisher_watch, DescriptionWatch(self)
-        )
+        period = min(config.bounds_timeout, config.state_timeout) / 4
+        self._watchdog = steady_timer(self, period, self._watch)
+        self._diagnostics = Diagnostics(self, self._report, self.publisher_watch)
         if config.collision.bodies and not config.collision.collision_avoidance:
             self.get_logger().warning(
                 "parameter 'obstacles' is given, but 'collision_avoidance' is false: the arm does "

@@ -18,7 +18,7 @@ from torque_safety_controller.node.topics import ROS2_CONTROL_EFFORTS
 from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.plausible import RESTART_GAP, PlausibilityCheck
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.messages import Arrival, JointStateReader
+from viability_bounds_pkg.ros.messages import Arrival, JointOrder, JointStateReader, count_refusal
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import JOINT_COMMANDS
 
@@ -144,7 +144,7 @@ class LimitsReader:
         self.range = AccelerationRange(np.zeros(len(joints)), np.zeros(len(joints)))
         self.stamp = -1
         self.refused: Counter[str] = Counter()
-        self._joints = list(joints)
+        self._order = JointOrder(joints)
 
     def read(self, message: JointTrajectory) -> bool:
         """Take a message; return whether it was accepted."""
@@ -154,13 +154,9 @@ class LimitsReader:
         lower, upper = np.array(first.accelerations), np.array(second.accelerations)
         if not len(lower) == len(upper) == len(message.joint_names):
             return self._refuse("wrong size")
-        if message.joint_names != self._joints:
-            where = {name: i for i, name in enumerate(message.joint_names)}
-            if missing := next((joint for joint in self._joints if joint not in where), ""):
-                return self._refuse("missing joint", f": there is no '{missing}'")
-            index = [where[joint] for joint in self._joints]
-            lower, upper = lower[index], upper[index]
-        limits = AccelerationRange(lower, upper)
+        if missing := self._order.find(message.joint_names):
+            return self._refuse("missing joint", f"there is no '{missing}'")
+        limits = AccelerationRange(lower[self._order.index], upper[self._order.index])
         if fault := limits.fault:
             return self._refuse(fault)
         self.range = limits
@@ -168,9 +164,7 @@ class LimitsReader:
         return True
 
     def _refuse(self, reason: str, detail: str = "") -> bool:
-        self.refused[reason] += 1
-        if self._warn is not None and self.refused[reason] == 1:
-            self._warn(f"acceleration_limits refused: {reason}{detail}")
+        count_refusal("acceleration_limits", reason, detail, self.refused, self._warn)
         return False
 
 

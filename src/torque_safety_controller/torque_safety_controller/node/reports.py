@@ -9,7 +9,6 @@ import numpy as np
 import pinocchio as pin
 from diagnostic_msgs.msg import DiagnosticStatus
 from numpy.typing import NDArray
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from std_msgs.msg import String
 
@@ -30,6 +29,7 @@ from torque_safety_controller.supervisor import Supervisor
 from viability_bounds_pkg.recent_values import RecentValues
 from viability_bounds_pkg.ros.messages import JointStateReader, PeriodCheck, pose_message
 from viability_bounds_pkg.ros.parameters import NodeParameters
+from viability_bounds_pkg.ros.runtime import steady_timer
 
 Array = NDArray[np.float64]
 
@@ -226,8 +226,7 @@ class StatePublisher:
         self._mode = CONTROLLER_MODE.publisher(node)
         self._last: Mode | None = None
         self.mode(Mode.STOPPED)
-        # The steady clock, as with use_sim_time the other one may be slower than the robot.
-        node.create_timer(_PERIOD, self._publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        steady_timer(node, _PERIOD, self._publish)
 
     def mode(self, mode: Mode) -> None:
         """Publish the mode if it is new; ``hand_pose`` is silent while it is STOPPED."""

@@ -18,7 +18,6 @@ from control_msgs.action import FollowJointTrajectory
 from control_msgs.msg import JointJog, JointTolerance
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.action.server import ServerGoalHandle
-from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from rclpy.task import Future
@@ -38,7 +37,7 @@ from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import JointStateReader
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
-from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp, stamp_to_ns
+from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp, stamp_to_ns, steady_timer
 from viability_bounds_pkg.ros.topics import SLOW_JOINT_STATES, Topic
 from viability_bounds_pkg.state import State
 
@@ -181,8 +180,7 @@ class MoveitNode(ArmNode):
             handle_accepted_callback=self._accept,
             cancel_callback=lambda _: CancelResponse.ACCEPT,
         )
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(PERIOD, self._tick, clock=steady)
+        steady_timer(self, PERIOD, self._tick)
         self.get_logger().info(f"action and jogs in {self.get_fully_qualified_name()}")
 
     def destroy_node(self) -> None:

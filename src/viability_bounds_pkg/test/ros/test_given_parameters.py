@@ -9,7 +9,7 @@ from rclpy.parameter import Parameter
 
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.parameter_files import is_section_of
-from viability_bounds_pkg.ros.given_parameters import given_parameters, note_arguments
+from viability_bounds_pkg.ros.given_parameters import given_parameters, remember_arguments
 
 PLAIN = {
     "joints": ["one"],
@@ -31,7 +31,7 @@ def arguments(*rules, file=None):
 
 def given(node, words):
     context = Context()
-    note_arguments(context, words)
+    remember_arguments(context, words)
     return given_parameters(context, node)
 
 
@@ -105,7 +105,7 @@ def test_a_node_takes_the_values_given_last_and_forgets_null(ros, tmp_path):
         "/**:\n  ros__parameters: {rate_hz: 500, locked_joints: null, torque_max: null}\n"
         "/**/bounds_node:\n  ros__parameters: {method: exact}\n"
     )
-    note_arguments(ros.context, arguments("rate_hz:=250.0", "method:=naive", file=file))
+    remember_arguments(ros.context, arguments("rate_hz:=250.0", "method:=naive", file=file))
     # What rcl makes of them: the integer stays, the section of the node wins, null is a string.
     of_rcl = {"rate_hz": 500, "method": "exact", "locked_joints": "null", "torque_max": "null"}
     node = ros.start(BoundsNode, PLAIN | of_rcl)

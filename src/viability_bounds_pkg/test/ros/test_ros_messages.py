@@ -11,11 +11,8 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import Float64MultiArray
 
 from viability_bounds_pkg.plausible import JUMP, PlausibilityCheck
-from viability_bounds_pkg.ros.messages import (
-    Arrival,
-    Diagnostics,
-    JointStateReader,
-)
+from viability_bounds_pkg.ros.diagnostics import Diagnostics
+from viability_bounds_pkg.ros.messages import Arrival, JointStateReader
 from viability_bounds_pkg.ros.runtime import STATUS_QOS, set_stamp, stamp_to_ns
 from viability_bounds_pkg.testing.ros_harness import joint_state
 

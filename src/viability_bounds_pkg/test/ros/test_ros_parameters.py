@@ -25,7 +25,7 @@ from viability_bounds_pkg.parameter import (
 )
 from viability_bounds_pkg.robot.configuration import RobotConfiguration
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.given_parameters import note_arguments
+from viability_bounds_pkg.ros.given_parameters import remember_arguments
 from viability_bounds_pkg.ros.parameters import NodeParameters, UnknownParameterError
 from viability_bounds_pkg.testing.ros_harness import overrides
 
@@ -201,13 +201,13 @@ def test_a_parameter_cannot_be_deleted(ros):
     ],
 )
 def test_what_the_command_line_gives_is_checked(ros, rule, error, line):
-    note_arguments(ros.context, ["--ros-args", "-p", rule])
+    remember_arguments(ros.context, ["--ros-args", "-p", rule])
     with pytest.raises(error, match=line):
         start(ros)
 
 
 def test_parameters_of_other_nodes_may_be_given(ros):
-    note_arguments(ros.context, ["--ros-args", "-p", "pose_kp:=1.0"])
+    remember_arguments(ros.context, ["--ros-args", "-p", "pose_kp:=1.0"])
     assert not start(ros).has_parameter("pose_kp")
 
 

@@ -5,9 +5,8 @@ import pytest
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 
-from viability_bounds_pkg.ros.arm_node import ArmNode
+from viability_bounds_pkg.ros.arm_node import ArmNode, connect
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
-from viability_bounds_pkg.ros.streams import connect
 from viability_bounds_pkg.ros.topics import JOINT_COMMANDS, JOINT_STATES
 from viability_bounds_pkg.testing.ros_harness import RosHarness, joint_state
 

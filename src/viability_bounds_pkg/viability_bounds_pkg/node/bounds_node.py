@@ -22,10 +22,11 @@ from viability_bounds_pkg.node.bounds_parameters import (
 from viability_bounds_pkg.node.slow_topics import SlowTopics
 from viability_bounds_pkg.robot.configuration import TOPIC
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.messages import Arrival, Diagnostics, JointStateReader, PeriodCheck
+from viability_bounds_pkg.ros.diagnostics import Diagnostics
+from viability_bounds_pkg.ros.messages import Arrival, JointStateReader, PeriodCheck
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
-from viability_bounds_pkg.ros.robot_urdf import DescriptionWatch, warn_of_unusual
+from viability_bounds_pkg.ros.robot_urdf import warn_of_unusual
 from viability_bounds_pkg.ros.topics import ACCELERATION_LIMITS
 
 
@@ -63,9 +64,7 @@ class BoundsNode(ArmNode):
         self._limits = self.stream(ACCELERATION_LIMITS)
         self.listen_to_states(config.use_estimated_states, self._on_state)
         self._slow_topics = SlowTopics(self, config, self._reader, self._answer)
-        self._diagnostics = Diagnostics(
-            self, self._report, self.publisher_watch, DescriptionWatch(self)
-        )
+        self._diagnostics = Diagnostics(self, self._report, self.publisher_watch)
         self._warn_of_reduced_braking(config)
         self.announce(joints, config.rate_hz, f"method {config.method}")
 

@@ -17,13 +17,19 @@ from viability_bounds_pkg.node.estimator_parameters import (
     make_estimator,
     make_plausibility_check,
 )
-from viability_bounds_pkg.robot.configuration import TOPIC, load_model
+from viability_bounds_pkg.robot.configuration import load_model
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.joint_command import TorqueCommand, accept_command
-from viability_bounds_pkg.ros.messages import Arrival, Diagnostics, JointStateReader, PeriodCheck
+from viability_bounds_pkg.ros.diagnostics import Diagnostics
+from viability_bounds_pkg.ros.messages import (
+    Arrival,
+    CommandReader,
+    JointStateReader,
+    PeriodCheck,
+    TorqueCommand,
+)
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
-from viability_bounds_pkg.ros.robot_urdf import DescriptionWatch, robot_urdf, warn_of_unusual
+from viability_bounds_pkg.ros.robot_urdf import robot_urdf, warn_of_unusual
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import ESTIMATED_JOINT_STATES, JOINT_COMMANDS, JOINT_STATES
 from viability_bounds_pkg.state import State
@@ -48,8 +54,7 @@ class EstimatorNode(ArmNode):
             parameters = NodeParameters(self, EstimatorConfiguration)
             config = self._config = parameters.configuration
             urdf = robot_urdf(config, self)
-            if config.robot_description != TOPIC:
-                warn_of_unusual(self, config, urdf)
+            warn_of_unusual(self, config, urdf)
             model = load_model(config, urdf)
             self._estimator = make_estimator(config, model)
         joints = config.joints
@@ -59,14 +64,13 @@ class EstimatorNode(ArmNode):
         self._reader = JointStateReader(joints, config.state_timeout, self._warn, check)
         self._period = PeriodCheck(config.dt, self._warn)
         self._refused: Counter[str] = Counter()
+        self._commands = CommandReader(joints, self._refused, self._warn)
         self._answered = self._restarts = self.commands_heard = 0
         self._answer = JointState()
         self._estimates = self.stream(ESTIMATED_JOINT_STATES)
         self.listen(JOINT_STATES, self._on_state)
         self.listen(JOINT_COMMANDS, self._on_command)
-        self._diagnostics = Diagnostics(
-            self, self._report, self.publisher_watch, DescriptionWatch(self)
-        )
+        self._diagnostics = Diagnostics(self, self._report, self.publisher_watch)
         source = "estimated" if config.velocity_estimation else "as reported"
         lag = 1e3 * config.declared.motor_lag
         self.announce(
@@ -100,7 +104,7 @@ class EstimatorNode(ArmNode):
 
     def _on_command(self, message: JointState) -> None:
         self.commands_heard += 1
-        command = accept_command(message, self._joints, self._refused, self._warn)
+        command = self._commands.read(message)
         if command is None:
             return
         tau = None

@@ -7,14 +7,13 @@ import time
 from array import array
 
 import numpy as np
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
 from viability_bounds_pkg.ros.messages import JointStateReader
-from viability_bounds_pkg.ros.runtime import set_stamp
+from viability_bounds_pkg.ros.runtime import set_stamp, steady_timer
 from viability_bounds_pkg.ros.topics import (
     LIMIT_DISTANCES,
     SLOW_ACCELERATION_LIMITS,
@@ -46,8 +45,7 @@ class SlowTopics:
         self._distances = LIMIT_DISTANCES.publisher(node)
         self._slow_states = SLOW_JOINT_STATES.publisher(node)
         self._slow_limits = SLOW_ACCELERATION_LIMITS.publisher(node)
-        # The steady clock, as with use_sim_time the other one may be slower than the robot.
-        node.create_timer(_PERIOD, self._publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        steady_timer(node, _PERIOD, self._publish)
 
     def _publish(self) -> None:
         if time.monotonic() - self._states.heard_at > self._config.state_timeout:

@@ -1,18 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Base class of all nodes: a start as a whole, warnings about topics and clock."""
+"""Base class of all nodes: streams, a start as a whole, warnings about topics and clock."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, ClassVar
 
-from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidParameterTypeException
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
 
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.ros.given_parameters import given_parameters
-from viability_bounds_pkg.ros.streams import StreamNode
+from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
+from viability_bounds_pkg.ros.runtime import steady_timer
+from viability_bounds_pkg.ros.streams import Input, Queue, Stream
+from viability_bounds_pkg.ros.topics import (
+    ESTIMATED_JOINT_STATES,
+    JOINT_STATES,
+    Topic,
+    state_topic,
+)
 
 CLOCK_TIMEOUT = 5.0
 """How long ``/clock`` may be silent at start before a node warns, s."""
@@ -29,13 +38,16 @@ class StartError(ArmSafetyError, RuntimeError):
     """rclpy cannot start, or not make a node."""
 
 
-class ArmNode(StreamNode):
-    """A node that starts as a whole or not at all.
+class ArmNode(Node):
+    """A node that starts as a whole or not at all, publishes streams and obeys others.
 
     Attributes:
         NAME: of the node, unless it is remapped.
         PARAMETERS: the dataclass of its parameters.
         given: values of parameters that the command line and files give the node.
+        streams: that it publishes.
+        inputs: streams that it obeys.
+        publisher_watch: of the topics of both.
     """
 
     NAME: ClassVar[str]
@@ -47,10 +59,11 @@ class ArmNode(StreamNode):
             super().__init__(self.NAME, enable_logger_service=True, **node_arguments)
         except (RuntimeError, InvalidParameterTypeException) as error:  # security, use_sim_time
             raise StartError(str(error)) from error
-        self.given = given_parameters(self.context, self.get_fully_qualified_name())
-        for name in list(self.given):
-            if name.startswith(_OF_ROS):
-                del self.given[name]
+        given = given_parameters(self.context, self.get_fully_qualified_name())
+        self.given = {name: value for name, value in given.items() if not name.startswith(_OF_ROS)}
+        self.streams: list[Stream] = []
+        self.inputs: list[Input] = []
+        self.publisher_watch = PublisherWatch(self)
 
     @contextmanager
     def starting(self) -> Iterator[None]:
@@ -61,6 +74,29 @@ class ArmNode(StreamNode):
             self.destroy_node()
             raise
 
+    def stream(self, topic: Topic) -> Stream:
+        """Return a stream to publish."""
+        stream = Stream(self, topic)
+        self.streams.append(stream)
+        self.publisher_watch.add(stream.topic_name)
+        return stream
+
+    def listen(
+        self, topic: Topic, callback: Callable[[Any], None], qos: QoSProfile | None = None
+    ) -> None:
+        """Call `callback` with the messages of a stream while it has one publisher."""
+        obeyed = Input(self, topic, callback, self.publisher_watch, qos)
+        self.inputs.append(obeyed)
+        self.publisher_watch.add(obeyed.topic_name)
+
+    def listen_to_states(self, estimated: bool, callback: Callable[[Any], None]) -> None:
+        """Call `callback` with the joint states that the node works on: estimated, or reported."""
+        if estimated:
+            names = JOINT_STATES.name, ESTIMATED_JOINT_STATES.name
+            reported, estimates = map(self.resolve_topic_name, names)
+            self.publisher_watch.estimates = reported, estimates
+        self.listen(state_topic(estimated), callback)
+
     def announce(self, joints: Sequence[str], rate: float, what: str) -> None:
         """Log in one line what the node does, for which joints, and the topics that it uses.
 
@@ -69,63 +105,76 @@ class ArmNode(StreamNode):
             rate: of the control loop, Hz.
             what: modes and methods, in words.
         """
-        published, heard = map(" ".join, self.topics_used())
+        here = self.get_name(), self.get_namespace()
+        published = dict(self.get_publisher_names_and_types_by_node(*here))
+        heard = dict(self.get_subscriber_names_and_types_by_node(*here))
+        shown = (
+            " ".join(name for name in sorted(topics) if name not in _TOPICS_OF_ROS)
+            for topics in (heard, published)
+        )
         # A parameter of the scenario node, which robots' files have for all nodes.
-        name = self.given.get("robot_name", "robot")
+        robot = self.given.get("robot_name", "robot")
         self.get_logger().info(
-            f"{name}, {len(joints)} joints ({joints[0]} to "
-            f"{joints[-1]}) at {rate:g} Hz, {what}; subscribes to {heard}; publishes {published}"
+            f"{robot}, {len(joints)} joints ({joints[0]} to {joints[-1]}) at {rate:g} Hz, {what}; "
+            "subscribes to {}; publishes {}".format(*shown)
         )
         if self.get_parameter("use_sim_time").value:
             self._expect_clock()
-        self._watch_types(self.get_name(), self.get_namespace())
-
-    def topics_used(self) -> tuple[list[str], list[str]]:
-        """Return the names of the topics that the node publishes, and of those subscribed to."""
-        here = self.get_name(), self.get_namespace()
-        published, heard = (
-            sorted(name for name, _ in topics if name not in _TOPICS_OF_ROS)
-            for topics in (
-                self.get_publisher_names_and_types_by_node(*here),
-                self.get_subscriber_names_and_types_by_node(*here),
-            )
-        )
-        return published, heard
+        self._watch_types({name: types[0] for name, types in (published | heard).items()})
 
     def _expect_clock(self) -> None:
         """Warn once if nothing publishes ``/clock``: stamps of what is published stay zero."""
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
 
         def warn_without_clock() -> None:
             timer.cancel()
             if not self.count_publishers("/clock"):
-                self.get_logger().warning(
+                self._warn(
                     f"use_sim_time is true, but nothing has published /clock for {CLOCK_TIMEOUT:g}"
                     " s: set it to false, or start the simulation that publishes it"
                 )
 
-        timer = self.create_timer(CLOCK_TIMEOUT, warn_without_clock, clock=steady)
+        timer = steady_timer(self, CLOCK_TIMEOUT, warn_without_clock)
 
-    def _watch_types(self, name: str, namespace: str) -> None:
-        """Warn of topics that others use with another type: the middleware keeps them apart."""
-        own = {
-            topic: types[0]
-            for topics in (
-                self.get_publisher_names_and_types_by_node(name, namespace),
-                self.get_subscriber_names_and_types_by_node(name, namespace),
-            )
-            for topic, types in topics
-        }
+    def _watch_types(self, own: dict[str, str]) -> None:
+        """Warn of topics that others use with another type: the middleware keeps them apart.
+
+        Args:
+            own: types by topic.
+        """
 
         def warn_of_types() -> None:
             for topic, types in self.get_topic_names_and_types():
                 others = [each for each in types if each != own.get(topic, each)]
                 if others:
-                    kind = own.pop(topic)
-                    self.get_logger().warning(
-                        f"'{topic}' is {kind} here; what is {' or '.join(others)} elsewhere is "
-                        "not received"
+                    self._warn(
+                        f"'{topic}' is {own.pop(topic)} here; what is {' or '.join(others)} "
+                        "elsewhere is not received"
                     )
 
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(_TYPE_PERIOD, warn_of_types, clock=steady)
+        steady_timer(self, _TYPE_PERIOD, warn_of_types)
+
+    def _warn(self, text: str) -> None:
+        self.get_logger().warning(text)
+
+
+def connect(nodes: Sequence[ArmNode]) -> None:
+    """Connect the nodes of one process where an input has the topic of a stream.
+
+    Connected inputs have no ROS subscription: nobody else's messages are obeyed. Of inputs whose
+    publisher is in another process the first one subscribes for all.
+
+    Args:
+        nodes: in the order in which they get a message.
+    """
+    queue = Queue(nodes[0])
+    sources: dict[str, Stream | Input] = {}
+    for node in nodes:
+        for stream in node.streams:
+            stream.queue = queue
+            sources[stream.topic_name] = stream
+    for node in nodes:
+        for each in node.inputs:
+            source = sources.setdefault(each.topic_name, each)
+            if source is not each:
+                source.listeners += each.listeners
+                each.unsubscribe()

@@ -18,7 +18,7 @@ from viability_bounds_pkg.parameter_files import is_section_of, load_yaml, read_
 _ARGUMENTS: WeakKeyDictionary[Any, Sequence[str]] = WeakKeyDictionary()
 
 
-def note_arguments(context: Any, arguments: Sequence[str]) -> None:
+def remember_arguments(context: Any, arguments: Sequence[str]) -> None:
     """Remember the command line that an rclpy context was initialised with."""
     _ARGUMENTS[context] = arguments
 

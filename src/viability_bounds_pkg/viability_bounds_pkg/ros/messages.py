@@ -6,34 +6,60 @@ from __future__ import annotations
 import math
 from array import array
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from enum import Enum
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
 from numpy.typing import NDArray
-from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
 from viability_bounds_pkg.exceptions import did_you_mean
 from viability_bounds_pkg.plausible import PlausibilityCheck
-from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
-from viability_bounds_pkg.ros.robot_urdf import DescriptionWatch
 from viability_bounds_pkg.ros.runtime import set_stamp, stamp_to_ns
-from viability_bounds_pkg.ros.topics import DIAGNOSTICS, VALUES
 from viability_bounds_pkg.state import State
 
-Report = Callable[[], tuple[bytes, str, dict[str, Any]]]
-"""Returns level, message and values of a status."""
-
+Array = NDArray[np.float64]
+Warn = Callable[[str], object]
 
 _PERIODS_SEEN = 20
 """Fewer states do not tell their period."""
+
+
+class JointOrder:
+    """Where `joints` are in messages, which may name them in any order, and others with them.
+
+    Attributes:
+        index: of the joints in the names that were found last.
+    """
+
+    def __init__(self, joints: Sequence[str]) -> None:
+        self._joints = tuple(joints)
+        self._names: list[str] | None = None
+        self.index: slice | NDArray[np.intp] = slice(None)
+
+    def find(self, names: Sequence[str]) -> str:
+        """Set the index for a message's names; return the first missing joint, if any."""
+        if names == self._names:
+            return ""
+        where = {name: i for i, name in enumerate(names)}
+        if missing := next((joint for joint in self._joints if joint not in where), ""):
+            return missing
+        index = [where[joint] for joint in self._joints]
+        self._names = list(names)
+        self.index = slice(None) if index == list(range(len(names))) else np.array(index)
+        return ""
+
+
+def count_refusal(
+    topic: str, reason: str, detail: str, refused: Counter[str], warn: Warn | None
+) -> None:
+    """Count a dropped message by its reason; warn in words of the first one of each reason."""
+    refused[reason] += 1
+    if warn is not None and refused[reason] == 1:
+        warn(f"{topic} refused: {reason}" + (f": {detail}" if detail else ""))
 
 
 class Arrival(Enum):
@@ -54,9 +80,9 @@ class Arrival(Enum):
 class JointStateReader:
     """Reads ``sensor_msgs/JointState`` into arrays in the order of `joints`.
 
-    Names may come in any order, and joints of other limbs with them. Only growing stamps are
-    accepted, but also those of a source that has restarted: a robot or simulation that restarts
-    counts time from the beginning again, and one corrupt stamp may lie far in the future.
+    Only growing stamps are accepted, but also those of a source that has restarted: a robot or
+    simulation that restarts counts time from the beginning again, and one corrupt stamp may lie
+    far in the future.
 
     Args:
         joints: names of the n joints.
@@ -66,7 +92,8 @@ class JointStateReader:
 
     Attributes:
         accepted: how many new states were accepted.
-        q, v: position and velocity of the last accepted message, shape (n,), rad and rad/s.
+        message: the last accepted one; None before the first.
+        q, v: its position and velocity, shape (n,), rad and rad/s.
         stamp: its stamp, ns.
         heard_at: when it came, or was repeated last, s.
         refused: how many messages were dropped, by reason.
@@ -76,23 +103,18 @@ class JointStateReader:
         self,
         joints: Sequence[str],
         reset_after: float = 1.0,
-        warn: Callable[[str], object] | None = None,
+        warn: Warn | None = None,
         check: PlausibilityCheck | None = None,
     ) -> None:
-        n = len(joints)
-        self.accepted = 0
+        self._order, self._reset_after = JointOrder(joints), reset_after
         self._warn, self._check = warn, check
-        self.q = np.zeros(n)
-        self.v = np.zeros(n)
+        self.accepted = 0
+        self.message: JointState | None = None
+        self.q, self.v = np.zeros((2, len(joints)))
         self.stamp = -1
         self.heard_at = -math.inf
         self.refused: Counter[str] = Counter()
-        self._joints = tuple(joints)
-        self._reset_after = reset_after
         self._newest, self._newest_at = -1, -math.inf  # stamp that came, ns, and when, s
-        self._names: list[str] | None = None
-        self._index: NDArray[np.intp] | None = None
-        self._accepted: tuple[JointState, NDArray[np.intp] | None] | None = None
 
     def read(self, message: JointState, now: float) -> Arrival:
         """Read a message that arrived at `now`, in s on the steady clock."""
@@ -106,7 +128,7 @@ class JointStateReader:
         if stamp < self.stamp and not restarted:
             ago = 1e-9 * (self.stamp - stamp)
             return self._refuse("old stamp", f"{ago:.3g} s before that of the last one")
-        if message.name != self._names and (missing := self._match(message.name)):
+        if missing := self._order.find(message.name):
             hint = did_you_mean(missing, message.name)
             return self._refuse("missing joint", f"there is no '{missing}'{hint}")
         if not len(message.position) == len(message.velocity) == len(message.name):
@@ -115,9 +137,8 @@ class JointStateReader:
                 f"{len(message.velocity)} velocities"
             )
             return self._refuse("wrong size", sizes)
-        q, v = np.array(message.position), np.array(message.velocity)
-        if self._index is not None:
-            q, v = q[self._index], v[self._index]
+        index = self._order.index
+        q, v = np.array(message.position)[index], np.array(message.velocity)[index]
         # The sum is the quick test, NumPy's the exact one, of the joints that count.
         if not math.isfinite(sum(message.position) + sum(message.velocity)) and not (
             np.isfinite(q).all() and np.isfinite(v).all()
@@ -135,47 +156,31 @@ class JointStateReader:
             self._newest, self._newest_at = stamp, now
         if self._check is not None and (fault := self._check.fault(State(q, v), 1e-9 * stamp)):
             return self._refuse("impossible", fault)
-        self.q, self.v, self.stamp = q, v, stamp
-        self._accepted = message, self._index
+        self.q, self.v, self.stamp, self.message = q, v, stamp, message
         self.heard_at = now
         self.accepted += 1
         return Arrival.NEW
 
-    @property
-    def message(self) -> JointState | None:
-        """The last accepted message; None before the first."""
-        return None if self._accepted is None else self._accepted[0]
-
-    def effort(self) -> NDArray[np.float64] | None:
+    def effort(self) -> Array | None:
         """Return the torque of the motors in the last accepted message, shape (n,), N m.
 
         None where it does not tell, for each joint, a finite number.
         """
-        tau = np.empty_like(self.q)
-        return tau if self.copy_effort(tau) and np.isfinite(tau).all() else None
-
-    def copy_effort(self, tau: NDArray[np.float64]) -> bool:
-        """Write that torque, finite or not, to `tau`, shape (n,), N m.
-
-        Returns:
-            Whether there is one.
-        """
-        if self._accepted is None:
-            return False
-        message, index = self._accepted
-        if len(message.effort) != len(message.name):
-            return False
-        tau[:] = message.effort if index is None else np.array(message.effort)[index]
-        return True
+        message = self.message
+        if message is None or len(message.effort) != len(message.name):
+            return None
+        self._order.find(message.name)
+        tau = np.array(message.effort)[self._order.index]
+        return tau if np.isfinite(tau).all() else None
 
     def with_state(self, state: State) -> JointState:
         """Return the last accepted message with another state of the joints, all else as it is."""
-        if self._accepted is None:
+        message = self.message
+        if message is None:
             raise LookupError("no message was accepted yet")
-        message, index = self._accepted
+        self._order.find(message.name)
         q, v = np.array(message.position), np.array(message.velocity)
-        q[slice(None) if index is None else index] = state.q
-        v[slice(None) if index is None else index] = state.v
+        q[self._order.index], v[self._order.index] = state
         return JointState(
             header=message.header,
             name=message.name,
@@ -184,21 +189,8 @@ class JointStateReader:
             effort=message.effort,
         )
 
-    def _match(self, names: Sequence[str]) -> str:
-        """Take the order of joints from `names`; return the first that is missing, or nothing."""
-        where = {name: i for i, name in enumerate(names)}
-        if missing := next((joint for joint in self._joints if joint not in where), ""):
-            return missing
-        self._names = list(names)
-        index = [where[joint] for joint in self._joints]
-        same_order = index == list(range(len(names)))
-        self._index = None if same_order else np.array(index)
-        return ""
-
     def _refuse(self, reason: str, detail: str = "") -> Arrival:
-        self.refused[reason] += 1
-        if self._warn is not None and self.refused[reason] == 1:
-            self._warn(f"joint_states refused: {reason}" + (f": {detail}" if detail else ""))
+        count_refusal("joint_states", reason, detail, self.refused, self._warn)
         return Arrival.REFUSED
 
 
@@ -210,7 +202,7 @@ class PeriodCheck:
         warn: told once, in words, when they differ.
     """
 
-    def __init__(self, dt: float, warn: Callable[[str], object]) -> None:
+    def __init__(self, dt: float, warn: Warn) -> None:
         self._dt, self._warn = dt, warn
         self._count, self._stamp, self._wrong = 0, -1, 0
 
@@ -230,74 +222,52 @@ class PeriodCheck:
             )
 
 
-DIAGNOSTICS_PERIOD = 0.5
-"""Between two messages of a node, s; tests, which wait for them, shorten it."""
+class TorqueCommand(NamedTuple):
+    """Torques for the motors, shape (n,), N m."""
+
+    tau: Array
 
 
-class Diagnostics:
-    """Publishes one status on ``/diagnostics``, regularly and when asked.
+class PositionCommand(NamedTuple):
+    """Desired positions, rad, and velocities, rad/s, of the drives, shape (n,) each."""
 
-    What is a number in it is also sent on ``~/values``, as a number, where that is subscribed to.
+    q: Array
+    v: Array
+
+
+JointCommand = TorqueCommand | PositionCommand
+
+
+class CommandReader:
+    """Reads ``joint_commands`` for `joints`.
+
+    With efforts a message is a torque command, and its positions and velocities are ignored.
+    Without efforts it is a position command; missing velocities are zero.
 
     Args:
-        node: the publishing node; its name with the namespace, as in ``left/bounds_node``, is the
-            status' name, so that two arms are told apart.
-        report: returns level (a constant of ``DiagnosticStatus``), a message and the values.
-        watch: its topics with several publishers, and a missing estimator, are reported, too, as a
-            warning.
-        description: that the robot's has changed is, too.
+        joints: names of the n joints.
+        refused: counts invalid commands by reason.
+        warn: told in words when one is dropped for a reason for the first time.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        report: Report,
-        watch: PublisherWatch | None = None,
-        description: DescriptionWatch | None = None,
-    ) -> None:
-        self._watch = watch
-        self._description = description
-        self._report = report
-        self._node = node
-        self._publisher = DIAGNOSTICS.publisher(node)
-        self._values_publisher = VALUES.publisher(node)
-        # The steady clock, so that it is sent when /clock stops, too.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = node.create_timer(DIAGNOSTICS_PERIOD, self.publish, clock=steady)
+    def __init__(self, joints: Sequence[str], refused: Counter[str], warn: Warn) -> None:
+        self._order, self._refused, self._warn = JointOrder(joints), refused, warn
 
-    def publish(self) -> None:
-        """Send the status now."""
-        level, message, values = self._report()
-        if self._watch is not None:
-            values["topics_with_several_publishers"] = self._watch.several or "none"
-        troubles = [each.trouble for each in (self._watch, self._description) if each is not None]
-        for trouble in filter(None, troubles):
-            level = max(level, DiagnosticStatus.WARN)
-            message += f"; {trouble}"
-        status = DiagnosticStatus(
-            level=level,
-            name=self._node.get_fully_qualified_name().removeprefix("/"),
-            message=message,
-            hardware_id=self._node.get_namespace(),
-            values=[KeyValue(key=key, value=_text(value)) for key, value in values.items()],
-        )
-        array = DiagnosticArray(status=[status])
-        array.header.stamp = self._node.get_clock().now().to_msg()
-        self._publisher.publish(array)
-        if self._values_publisher.get_subscription_count():
-            self._values_publisher.publish(_numbers(values))
+    def read(self, message: JointState) -> JointCommand | None:
+        """Return the command in a message, None if it is invalid."""
+        velocity = message.velocity or [0.0] * len(message.name)
+        fields = [message.effort] if len(message.effort) else [message.position, velocity]
+        if any(len(values) != len(message.name) for values in fields):
+            return self._refuse("wrong size")
+        if self._order.find(message.name):
+            return self._refuse("missing joint")
+        arrays = [np.array(values)[self._order.index] for values in fields]
+        if not all(np.isfinite(each).all() for each in arrays):
+            return self._refuse("not finite")
+        return TorqueCommand(*arrays) if len(message.effort) else PositionCommand(*arrays)
 
-
-def _numbers(values: Mapping[str, Any]) -> Float64MultiArray:
-    """Return the numbers and arrays among `values`, one after the other, labelled by key."""
-    message = Float64MultiArray()
-    for key, value in values.items():
-        if isinstance(value, int | float | np.ndarray):
-            numbers = np.atleast_1d(value)
-            size = len(numbers)
-            message.layout.dim.append(MultiArrayDimension(label=key, size=size, stride=size))
-            message.data.extend(numbers.tolist())
-    return message
+    def _refuse(self, reason: str) -> None:
+        count_refusal("joint_commands", reason, "", self._refused, self._warn)
 
 
 def pose_message(pose: pin.SE3, frame: str = "", stamp: int = 0) -> PoseStamped:
@@ -309,13 +279,3 @@ def pose_message(pose: pin.SE3, frame: str = "", stamp: int = 0) -> PoseStamped:
     p.x, p.y, p.z = pose.translation.tolist()
     o.x, o.y, o.z, o.w = pin.Quaternion(pose.rotation).coeffs().tolist()
     return message
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.9g}"
-    if isinstance(value, np.ndarray):
-        return " ".join(f"{item:.9g}" for item in value)
-    if isinstance(value, Counter):
-        return " ".join(f"{key}: {count};" for key, count in value.items()) or "none"
-    return str(value)

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 
 import rclpy
-from rclpy.clock import Clock, ClockType
 from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -22,10 +21,14 @@ from viability_bounds_pkg.cli.command_line import Parser
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.parameter import parameter_table
 from viability_bounds_pkg.parameter_files import read_sections
-from viability_bounds_pkg.ros.arm_node import ArmNode, StartError
-from viability_bounds_pkg.ros.given_parameters import note_arguments
-from viability_bounds_pkg.ros.runtime import EventsExecutor, make_executor, settle_dds
-from viability_bounds_pkg.ros.streams import connect
+from viability_bounds_pkg.ros.arm_node import ArmNode, StartError, connect
+from viability_bounds_pkg.ros.given_parameters import remember_arguments
+from viability_bounds_pkg.ros.runtime import (
+    EventsExecutor,
+    make_executor,
+    settle_dds,
+    steady_timer,
+)
 
 _SIGNAL_CHECK_PERIOD = 0.2
 
@@ -54,8 +57,7 @@ def spin(executor: Executor, node: Node) -> None:
         if signals:
             told.set_result(None)
 
-    steady = Clock(clock_type=ClockType.STEADY_TIME)
-    node.create_timer(_SIGNAL_CHECK_PERIOD, end_wait, clock=steady)
+    steady_timer(node, _SIGNAL_CHECK_PERIOD, end_wait)
     while rclpy.ok(context=node.context) and not told.done():
         executor.spin_until_future_complete(told, timeout_sec=_SIGNAL_CHECK_PERIOD)
 
@@ -107,7 +109,7 @@ def initialise(parser: Parser, args: Sequence[str] | None = None) -> argparse.Na
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rclpy's own classes differ between releases
         raise StartError(f"arguments for ROS cannot be used: {error}") from error
-    note_arguments(rclpy.get_default_context(), arguments)
+    remember_arguments(rclpy.get_default_context(), arguments)
     return options
 
 

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+
+from viability_bounds_pkg.ros.runtime import steady_timer
 
 _PERIOD = 1.0
 _PATIENCE = 3
@@ -32,7 +33,7 @@ class PublisherWatch:
         self._node, self._without_estimates = node, 0
         # Faster than the node's own, which expands the name at each call.
         self._count = node.handle.get_count_publishers
-        node.create_timer(_PERIOD, self.check, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        steady_timer(node, _PERIOD, self.check)
 
     def add(self, topic: str) -> None:
         """Watch a topic, too; its name is resolved."""

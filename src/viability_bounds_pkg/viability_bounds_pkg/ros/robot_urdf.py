@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from xml.etree.ElementTree import ParseError, canonicalize
-
 from rclpy.node import Node
 from rclpy.task import Future
 from std_msgs.msg import String
@@ -37,36 +35,6 @@ def robot_urdf(config: RobotConfiguration, node: Node | None = None) -> str:
     except RobotDescriptionError as error:
         raise SettingError("robot_description", source, f"a URDF ({error})") from error
     return text
-
-
-class DescriptionWatch:
-    """Tells that the robot's description on its topic has changed, which a node cannot follow.
-
-    What bounds and controller hold for is computed from the description that is there at their
-    start. Comments and white space make no difference: several nodes may publish it.
-
-    Args:
-        node: warns once for each change.
-
-    Attributes:
-        trouble: what to report; empty if there is nothing.
-    """
-
-    def __init__(self, node: Node) -> None:
-        self.trouble = ""
-        self._node = node
-        self._known = ""
-        self._topic = ROBOT_DESCRIPTION.subscription(node, self._take).topic_name
-
-    def _take(self, message: String) -> None:
-        try:
-            text = canonicalize(message.data, strip_text=True)
-        except ParseError:
-            text = message.data
-        self._known, before = text, self._known
-        if before not in ("", text):
-            self.trouble = f"'{self._topic}' has changed: restart this node if the robot has"
-            self._node.get_logger().warning(self.trouble)
 
 
 def warn_of_unusual(node: Node, config: RobotConfiguration, urdf: str) -> None:

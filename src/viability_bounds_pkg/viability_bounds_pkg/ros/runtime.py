@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Quality of service, executor, stamps, and settings of DDS."""
+"""Quality of service, executor, timers, stamps, and settings of DDS."""
 
 from __future__ import annotations
 
-from collections.abc import MutableMapping
+from collections.abc import Callable, MutableMapping
 from pathlib import Path
 
 from builtin_interfaces.msg import Time
+from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.executors import Executor, SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.timer import Timer
 
 try:
     from rclpy.experimental import EventsExecutor as EventsExecutor
@@ -65,6 +68,11 @@ def make_executor(context: Context | None = None) -> Executor:
     if EventsExecutor is not None:
         return EventsExecutor(context=context)
     return SingleThreadedExecutor(context=context)
+
+
+def steady_timer(node: Node, period: float, callback: Callable[[], None]) -> Timer:
+    """Return a timer, period in s, on the steady clock: it also runs when ``/clock`` stops."""
+    return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
 def stamp_to_ns(stamp: Time) -> int:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 from rclpy.event_handler import PublisherEventCallbacks
@@ -11,12 +11,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
-from viability_bounds_pkg.ros.topics import (
-    ESTIMATED_JOINT_STATES,
-    JOINT_STATES,
-    Topic,
-    state_topic,
-)
+from viability_bounds_pkg.ros.topics import Topic
 
 Listener = Callable[[Any], None]
 
@@ -26,31 +21,28 @@ class Stream:
 
     Args:
         node: publishes them.
-        message: their type.
-        name: of the topic.
-        qos: of the publisher.
+        topic: of the messages.
 
     Attributes:
         listeners: callbacks of this process that get each message as the same object.
         subscribers: how many subscribe in ROS.
         queue: takes messages to the listeners; None while there are none.
+        topic_name: of the topic, resolved.
     """
 
-    def __init__(self, node: Node, message: type, name: str, qos: QoSProfile) -> None:
+    def __init__(self, node: Node, topic: Topic) -> None:
         # To count at each message takes longer than to deliver it.
         events = PublisherEventCallbacks(matched=self._on_matched)
-        self._publisher = node.create_publisher(message, name, qos, event_callbacks=events)
         self.subscribers = 0
+        self._publisher = node.create_publisher(
+            topic.message, topic.name, topic.qos, event_callbacks=events
+        )
+        self.topic_name: str = self._publisher.topic_name
         self.listeners: list[Listener] = []
         self.queue: Queue | None = None
 
     def _on_matched(self, info: Any) -> None:
         self.subscribers = info.current_count
-
-    @property
-    def topic_name(self) -> str:
-        """Name of the topic, resolved."""
-        return self._publisher.topic_name
 
     def publish(self, message: Any) -> None:
         """Send a message; it may be used again when the listeners have got it."""
@@ -70,11 +62,10 @@ class Input:
 
     Args:
         node: subscribes.
-        message: their type.
-        name: of the topic.
-        qos: of the subscription.
-        callback: gets the messages.
+        topic: of the messages.
+        callback: gets them.
         watch: tells whether there is one publisher.
+        qos: of the subscription; None for that of the topic.
 
     Attributes:
         listeners: the callback, and those of other nodes of the process that share the
@@ -85,15 +76,16 @@ class Input:
     def __init__(
         self,
         node: Node,
-        message: type,
-        name: str,
-        qos: QoSProfile,
+        topic: Topic,
         callback: Listener,
         watch: PublisherWatch,
+        qos: QoSProfile | None = None,
     ) -> None:
         self.listeners = [callback]
         self._node, self._watch = node, watch
-        self._subscription = node.create_subscription(message, name, self._receive, qos)
+        self._subscription = node.create_subscription(
+            topic.message, topic.name, self._receive, qos or topic.qos
+        )
         self.topic_name: str = self._subscription.topic_name
 
     def _receive(self, message: Any) -> None:
@@ -146,68 +138,3 @@ class Queue:
             stream.publish_outside(message)
         self._scheduled = False
         self._schedule()
-
-
-class StreamNode(Node):
-    """A node that publishes and obeys streams.
-
-    Attributes:
-        streams: that it publishes.
-        inputs: streams that it obeys.
-        publisher_watch: of the topics of both.
-    """
-
-    def __init__(self, name: str, **node_arguments: Any) -> None:
-        self.streams: list[Stream] = []
-        self.inputs: list[Input] = []
-        super().__init__(name, **node_arguments)
-        self.publisher_watch = PublisherWatch(self)
-
-    def stream(self, topic: Topic) -> Stream:
-        """Return a stream to publish."""
-        stream = Stream(self, topic.message, topic.name, topic.qos)
-        self.streams.append(stream)
-        self.publisher_watch.add(stream.topic_name)
-        return stream
-
-    def listen(
-        self, topic: Topic, callback: Callable[[Any], None], qos: QoSProfile | None = None
-    ) -> None:
-        """Call `callback` with the messages of a stream while it has one publisher."""
-        qos, watch = qos or topic.qos, self.publisher_watch
-        self.inputs.append(Input(self, topic.message, topic.name, qos, callback, watch))
-        watch.add(self.inputs[-1].topic_name)
-
-    def _warn(self, text: str) -> None:
-        self.get_logger().warning(text)
-
-    def listen_to_states(self, estimated: bool, callback: Callable[[Any], None]) -> None:
-        """Call `callback` with the joint states that the node works on: estimated, or reported."""
-        if estimated:
-            names = JOINT_STATES.name, ESTIMATED_JOINT_STATES.name
-            reported, estimates = map(self.resolve_topic_name, names)
-            self.publisher_watch.estimates = reported, estimates
-        self.listen(state_topic(estimated), callback)
-
-
-def connect(nodes: Sequence[StreamNode]) -> None:
-    """Connect the nodes of one process where an input has the topic of a stream.
-
-    Connected inputs have no ROS subscription: nobody else's messages are obeyed. Of inputs whose
-    publisher is in another process the first one subscribes for all.
-
-    Args:
-        nodes: in the order in which they get a message.
-    """
-    queue = Queue(nodes[0])
-    sources: dict[str, Stream | Input] = {}
-    for node in nodes:
-        for stream in node.streams:
-            stream.queue = queue
-            sources[stream.topic_name] = stream
-    for node in nodes:
-        for each in node.inputs:
-            source = sources.setdefault(each.topic_name, each)
-            if source is not each:
-                source.listeners += each.listeners
-                each.unsubscribe()

@@ -177,9 +177,8 @@ ROBOT_DESCRIPTION = Topic(
     String,
     LATCHED_QOS,
     ("bullet_node",),
-    ("bounds_node", "estimator_node", "controller_node", "viewer_node"),
-    "the URDF; read at start where the parameter `robot_description` is `topic`; that it changes "
-    "later is reported",
+    ("estimator_node", "controller_node", "viewer_node"),
+    "the URDF; read at start where the parameter `robot_description` is `topic`",
 )
 DIAGNOSTICS = Topic(
     "/diagnostics",

@@ -13,7 +13,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import pytest
 from hypothesis import settings
 
-from viability_bounds_pkg.ros import messages
+from viability_bounds_pkg.ros import diagnostics
 from viability_bounds_pkg.testing.ros_harness import RosHarness, private_domain
 
 # Every run tries the same examples; with --hypothesis-profile=explore it tries others.
@@ -30,7 +30,7 @@ def graph_of_its_own() -> Iterator[None]:
     """
     with private_domain() as domain, pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_DOMAIN_ID", str(domain))
-        patch.setattr(messages, "DIAGNOSTICS_PERIOD", 0.05)
+        patch.setattr(diagnostics, "DIAGNOSTICS_PERIOD", 0.05)
         yield
 
 
