@@ -105,9 +105,10 @@ def play(robot: str, seed: int, lie: Lie, checked: bool = True) -> Played:
 def test_faults_in_motion_are_told_and_the_arm_goes_on(robot, lie):
     played = play(robot, 3, LIES[lie])
     assert max(played.after) < 0.1
+    assert len(played.again) == len(played.after) and max(played.again) < 1.0
     if lie != "a bias of velocities":  # 1.5 rad/s are obeyed for tens of ms
-        assert len(played.again) == len(played.after) and max(played.again) < 1.0
-        assert played.position == 0.0 and played.speed == 0.0
+        # What freezes is obeyed until it contradicts itself.
+        assert played.position == 0.0 and played.speed <= (0.0 if lie == "zeros" else 0.02)
 
 
 @pytest.mark.long

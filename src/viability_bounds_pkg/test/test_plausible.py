@@ -8,8 +8,6 @@ from hypothesis import strategies as st
 
 from viability_bounds_pkg.plausible import (
     CONTRADICTION,
-    FORGETTING,
-    FROZEN,
     GAP,
     JUMP,
     NOT_LATER,
@@ -67,9 +65,9 @@ SPOILT = {
     "a position leaps": (lambda state: state._replace(q=state.q + 0.4 * JOINT), JUMP, 0.0),
     "a biased velocity": (lambda state: state._replace(v=state.v + JOINT), CONTRADICTION, WINDOW),
     "zeros": (lambda state: State(0.0 * state.q - 1.0, 0.0 * state.v), JUMP, 0.0),
-    "frozen": (lambda state: sine(1.0), FROZEN, 0.02),
-    "frozen positions": (lambda state: state._replace(q=sine(1.0).q), FROZEN, 0.02),
-    "a frozen position": (frozen_joint, FROZEN, 0.07),  # at 0.4 rad/s
+    "frozen": (lambda state: sine(1.0), CONTRADICTION, 0.06),
+    "frozen positions": (lambda state: state._replace(q=sine(1.0).q), CONTRADICTION, 0.06),
+    "a frozen position": (frozen_joint, CONTRADICTION, 0.15),
 }
 
 
@@ -77,15 +75,14 @@ SPOILT = {
 @pytest.mark.parametrize("name", SPOILT)
 def test_what_cannot_be_is_refused_and_what_comes_afterwards_is_accepted(name, h):
     spoil, reason, within = SPOILT[name]
-    # Of an arm that stands to the last bit the position may have frozen, or the velocity lied.
-    longest = 1.2 * FORGETTING if name == "a biased velocity" else 2.0 * WINDOW
+    longest = 2.0 * WINDOW
     refused = play(make_check(h), spoil, h, last=2.1 + longest)
     first, why = refused[0]
     assert why == reason and 1.0 - 1e-9 <= first <= 1.0 + within + 2.0 * h
     assert refused[-1][0] <= 1.6 + longest + h
 
 
-@pytest.mark.parametrize("name", ["frozen", "frozen positions", "degrees", "zeros"])
+@pytest.mark.parametrize("name", ["frozen", "degrees", "zeros"])
 def test_what_stays_impossible_stays_refused(name):
     spoil, _, within = SPOILT[name]
     refused = play(make_check(), spoil, end=6.0, last=6.0)
@@ -115,11 +112,6 @@ def test_velocities_that_are_not_used_are_not_checked():
     assert not play(check, lambda state: State(state.q, 1e200 * rng.standard_normal(N)))
     check.reset()
     assert play(check, SPOILT["a position leaps"][0])[0][1] == JUMP
-    check.reset()
-    refused = play(check, SPOILT["frozen positions"][0])
-    assert refused[0][1] == FROZEN and 1.0 < refused[0][0] < 1.02
-    assert len([t for t, _ in refused if t < 1.6]) > 290
-    assert refused[-1][0] < 1.6 + 2.0 * WINDOW
 
 
 def test_joints_without_limits_may_turn_for_ever():
@@ -140,10 +132,7 @@ def test_joints_without_limits_may_turn_for_ever():
 def test_violent_motions_impacts_filters_and_encoders_are_accepted(
     h, lag, resolution, used, lost, seed
 ):
-    """Accelerations of up to 60 rad/s^2, hits, and stops of all joints within one period.
-
-    The last only where velocities are used: positions alone would seem to have frozen.
-    """
+    """Accelerations of up to 60 rad/s^2, hits, and stops of all joints within one period."""
     rng = np.random.default_rng(seed)
     check = make_check(h, NONE if used else None, np.full(N, np.inf), np.full(N, 0.5 * resolution))
     (q, v, seen), a = np.zeros((3, N)), np.zeros(N)
@@ -152,7 +141,7 @@ def test_violent_motions_impacts_filters_and_encoders_are_accepted(
             a = rng.uniform(-60.0, 60.0, N)
         before, (q, v) = v, State(q, v).after(np.clip(a, (-2.0 - v) / h, (2.0 - v) / h), h)
         if rng.random() < 0.02:
-            hit = rng.uniform(-2.0, 2.0, N) if rng.random() < 0.7 or not used else NONE
+            hit = rng.uniform(-2.0, 2.0, N) if rng.random() < 0.7 else NONE
             q, v = q + rng.random() * h * (hit - v), hit
         seen = v + np.exp(-h / lag) * (seen - v) if lag else v
         told = resolution * np.round(q / resolution) if resolution else q
