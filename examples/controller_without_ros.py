@@ -20,7 +20,8 @@ from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks.gains import Gains
 from viability_bounds_pkg.acceleration_limits import estimate_acceleration_limits
 from viability_bounds_pkg.bounds.torque_margin import tightened, torque_margins
-from viability_bounds_pkg.estimate.hold_error import discretisation_margin
+from viability_bounds_pkg.estimate.drift import acceleration_drift
+from viability_bounds_pkg.estimate.worst_case import StateSpace
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.viability import BoundsSolver
@@ -37,9 +38,8 @@ def main() -> int:
         model, -q_max, q_max, v_max, tau_max, 5000, method="refined", cap=8.0
     )
     limits = JointLimits(names, -q_max, q_max, v_max, found.a_min, found.a_max)
-    jerk = discretisation_margin(
-        model, -q_max, q_max, v_max, found.a_min, found.a_max, tau_max, DT, 2000
-    ).jerk
+    space = StateSpace.of(model, -q_max, q_max, v_max, tau_max)
+    jerk = acceleration_drift(model, space, found.a_min, found.a_max, 2000)
     margins = torque_margins(1.1 * jerk, DT)
     solver = BoundsSolver(tightened(limits, margins), 2 * DT, margins.acceleration, period=DT)
     gains = Gains(pose_kp=100.0, posture_kp=10.0, posture_kd=6.0)

@@ -10,8 +10,8 @@ Using smaller limits than the ones found is always safe. The viability kernel
 with the smaller deceleration, and a torque that gives the larger one gives the smaller one too.
 What is lost is speed near the position limits. `cap` does that, and is wise for light joints
 such as wrists, whose torque would allow hundreds of rad/s^2 that neither the gears nor the
-control period are made for: the zero-order hold error of the acceleration grows with it (see
-`hold_error`).
+control period are made for: the drift of the acceleration under a held torque grows with it (see
+`estimate.drift`).
 
 Using larger ones (`overrides`) gives the guarantee up in the states where torque does not suffice.
 """
@@ -58,7 +58,7 @@ class AccelerationLimits:
         names: joints.
         a_min: lower limits, caps and overrides applied, shape (n,), rad/s^2, negative.
         a_max: upper limits, shape (n,), rad/s^2, positive.
-        worst: the tightest limits that the torque limits leave, their states and history.
+        worst: the tightest limits that the torque limits leave, and their states.
         overridden: joints whose limits were set by hand.
     """
 
@@ -93,7 +93,6 @@ def estimate_acceleration_limits(
     seed: int = 0,
     *,
     method: str = "sampling",
-    torque_reserve: ArrayLike = 0.0,
     overrides: Mapping[str, tuple[float, float]] | None = None,
     cap: ArrayLike | None = None,
 ) -> AccelerationLimits:
@@ -116,8 +115,6 @@ def estimate_acceleration_limits(
             "refined" unless given.
         seed: of the random generator; the same seed gives the same limits.
         method: "sampling" as in the paper, or "refined" (see `search_refined`).
-        torque_reserve: torque kept back for others, such as an integral term, scalar or shape
-            (n,), N m.
         overrides: limits (a_min, a_max) of joints to use instead of what is found, rad/s^2.
         cap: the greatest magnitude of the limits of the other joints, scalar or shape (n,),
             rad/s^2; infinite for none.
@@ -128,33 +125,10 @@ def estimate_acceleration_limits(
     """
     if method not in SEARCHES:
         raise LimitEstimateError(f"method must be one of {', '.join(SEARCHES)}, is {method!r}")
-    if samples is None:
-        samples = DEFAULT_SAMPLES[method]
-    tau_max, reserve = np.broadcast_arrays(np.asarray(tau_max, dtype=float), torque_reserve)
-    if not ((reserve >= 0.0) & (reserve < tau_max)).all():
-        raise LimitEstimateError("torque_reserve must be at least zero and below tau_max")
-    space = StateSpace.of(model, q_min, q_max, v_max, tau_max - reserve)
-    _check_adjustments(model, overrides or {}, cap)
-    worst = SEARCHES[method](model, space, samples, seed)
+    space = StateSpace.of(model, q_min, q_max, v_max, tau_max)
+    count = DEFAULT_SAMPLES[method] if samples is None else samples
+    worst = SEARCHES[method](model, space, count, seed)
     return limits_from_worst_cases(model, space, worst, overrides, cap)
-
-
-def _check_adjustments(
-    model: pin.Model, overrides: Mapping[str, tuple[float, float]], cap: ArrayLike | None
-) -> None:
-    names = list(model.names)[1:]
-    for joint, (low, high) in overrides.items():
-        if joint not in names:
-            known = ", ".join(names)
-            raise LimitEstimateError(f"override of unknown joint {joint!r}; there are: {known}")
-        if not (np.isfinite([low, high]).all() and low < 0 < high):
-            raise LimitEstimateError(
-                f"joint {joint}: override must be finite with min < 0 < max, "
-                f"is ({low:g}, {high:g}) rad/s^2"
-            )
-    values = np.asarray(np.inf if cap is None else cap, dtype=float)
-    if values.shape not in ((), (len(names),)) or not np.all(values > 0):
-        raise LimitEstimateError(f"cap must be positive, one value or {len(names)}")
 
 
 def limits_from_worst_cases(
@@ -169,12 +143,22 @@ def limits_from_worst_cases(
     Arguments and errors as of `estimate_acceleration_limits`.
     """
     overrides = dict(overrides or {})
-    _check_adjustments(model, overrides, cap)
     names = tuple(model.names)[1:]
+    for joint, (low, high) in overrides.items():
+        if joint not in names:
+            known = ", ".join(names)
+            raise LimitEstimateError(f"override of unknown joint {joint!r}; there are: {known}")
+        if not (np.isfinite([low, high]).all() and low < 0 < high):
+            raise LimitEstimateError(
+                f"joint {joint}: override must be finite with min < 0 < max, "
+                f"is ({low:g}, {high:g}) rad/s^2"
+            )
+    bound = np.asarray(np.inf if cap is None else cap, dtype=float)
+    if bound.shape not in ((), (len(names),)) or not np.all(bound > 0):
+        raise LimitEstimateError(f"cap must be positive, one value or {len(names)}")
     for j, joint in enumerate(names):
         if joint not in overrides and not worst.a_min[j] < 0 < worst.a_max[j]:
             raise _empty_interval(model, space, worst, j, overrides)
-    bound = np.broadcast_to(np.inf if cap is None else np.asarray(cap, dtype=float), len(names))
     a_min, a_max = np.maximum(worst.a_min, -bound), np.minimum(worst.a_max, bound)
     for joint, (low, high) in overrides.items():
         a_min[names.index(joint)], a_max[names.index(joint)] = low, high

@@ -22,7 +22,7 @@ from viability_bounds_pkg.acceleration_limits import (
     unavailable_share,
 )
 from viability_bounds_pkg.cli.limits_file import rounded
-from viability_bounds_pkg.estimate.hold_error import discretisation_margin
+from viability_bounds_pkg.estimate.drift import acceleration_drift
 from viability_bounds_pkg.estimate.worst_case import StateSpace, WorstCases, search_refined
 
 Array = NDArray[np.float64]
@@ -203,14 +203,9 @@ def _drift(
     """Return the control rate and the largest jerk under held torque at that rate."""
     braking = np.minimum(-a_min, a_max)
     rates = RATES if rate_hz is None else (rate_hz,)
+    found = acceleration_drift(chain.model, space, a_min, a_max)
+    drift = rounded(DRIFT_RESERVE * found, ROUND_UP)
     for rate in rates:
-        found = discretisation_margin(
-            chain.model, space.q_min, space.q_max, space.v_max, a_min, a_max,
-            space.tau_max, 1.0 / rate,
-        )  # fmt: skip
-        # The acceleration is right at the middle of the period: its error grows for half of it.
-        jerk = np.maximum(found.jerk, 2.0 * found.acceleration * rate)
-        drift = rounded(DRIFT_RESERVE * jerk, ROUND_UP)
         share = drift / rate / 18.0 / braking
         if (share <= DRIFT_SHARE).all():
             return rate, drift

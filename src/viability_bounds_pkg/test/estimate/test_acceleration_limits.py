@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Algorithm 4, the refined search, and the margin of a held torque, against Pinocchio."""
+"""Algorithm 4 and the refined search, against Pinocchio."""
 
 from __future__ import annotations
 
@@ -158,40 +158,22 @@ def test_same_seed_same_limits(method):
     assert np.any(first.a_max != other.a_max)
 
 
-@pytest.mark.parametrize("method", ["sampling", "refined"])
-def test_history_tightens_and_ends_with_the_result(method):
-    model = baxter()
-    search = {"sampling": search_by_sampling, "refined": search_refined}[method]
-    worst = search(model, StateSpace.of(model, *limits_of(model)), 5000, 0)
-    counts = [entry.evaluations for entry in worst.history]
-    assert counts[:4] == [1, 2, 4, 8]
-    assert counts[-1] == worst.evaluations
-    assert np.all(np.diff([entry.a_max for entry in worst.history], axis=0) <= 0)
-    assert np.all(np.diff([entry.a_min for entry in worst.history], axis=0) >= 0)
-    np.testing.assert_array_equal(worst.history[-1].a_max, worst.a_max)
-
-
 def test_shorter_run_is_the_start_of_a_longer_one():
     model = baxter()
     space = StateSpace.of(model, *limits_of(model))
     short = search_by_sampling(model, space, 64, 3)
     long = search_by_sampling(model, space, 300, 3)
-    entry = next(entry for entry in long.history if entry.evaluations == 64)
-    np.testing.assert_array_equal(entry.a_max, short.a_max)
+    assert (long.a_max <= short.a_max).all() and (long.a_max < short.a_max).any()
+    assert (long.a_max == short.a_max).any()
 
 
-def test_reserve_caps_and_overrides():
+def test_caps_and_overrides():
     model = baxter()
     limits = limits_of(model)
     arguments = {"samples": 2000, "seed": 0, "overrides": {"left_s1": (-3.0, 2.0)}}
     plain = estimate_acceleration_limits(model, *limits, **arguments)
     assert (plain.a_min[1], plain.a_max[1]) == (-3.0, 2.0)
     assert plain.overridden == {"left_s1"}
-    less = estimate_acceleration_limits(model, *limits, **arguments, torque_reserve=5.0)
-    np.testing.assert_array_less(less.worst.a_max, plain.worst.a_max)
-    reduced = (*limits[:3], limits[3] - 5.0)
-    by_hand = estimate_acceleration_limits(model, *reduced, **arguments)
-    np.testing.assert_array_equal(less.a_max, by_hand.a_max)
     capped = estimate_acceleration_limits(model, *limits, **arguments, cap=15.0)
     assert capped.a_max[6] == 15.0 and capped.a_min[6] == -15.0
     assert capped.a_max[0] == plain.a_max[0] < 15.0
@@ -281,12 +263,10 @@ def test_unavailable_share_counts_states():
         ({"q_min": np.full(7, 9.0)}, "joint left_s0: position limits"),
         ({"q_max": np.full(7, np.inf)}, "joint left_s0: position limits"),
         ({"v_max": np.zeros(7)}, "joint left_s0: v_max must be positive"),
-        ({"tau_max": np.full(7, np.nan)}, "torque_reserve|tau_max"),
+        ({"tau_max": np.full(7, np.nan)}, "joint left_s0: tau_max must be positive"),
         ({"samples": 0}, "samples must be at least 1, is 0"),
         ({"samples": 0, "method": "refined"}, "samples must be at least 1, is 0"),
         ({"method": "guess"}, "method must be one of sampling, refined"),
-        ({"torque_reserve": 15.0}, "torque_reserve"),
-        ({"torque_reserve": -1.0}, "torque_reserve"),
         ({"overrides": {"elbow": (-1, 1)}}, "unknown joint 'elbow'"),
         ({"overrides": {"left_s0": (1, 2)}}, "joint left_s0: override"),
         ({"cap": 0.0}, "cap must be positive"),

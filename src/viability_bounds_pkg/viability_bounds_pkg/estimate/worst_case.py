@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -22,13 +20,13 @@ from viability_bounds_pkg.exceptions import ArmSafetyError
 
 Array = NDArray[np.float64]
 
-CHUNK = 2**13
-"""States evaluated at once; a power of two, as are the entries of the history."""
+CHUNK = 10_000
+"""States evaluated at once."""
 
 NO_INERTIA = 1e-10
 """Below this diagonal entry of M (kg m^2 or kg) a joint is taken to move nothing."""
 
-SAMPLED_SHARE = 0.25
+SAMPLED_SHARE = 0.2
 """Share of the refined search's evaluations spent on random samples."""
 
 DESCENT = {"maxiter": 30, "ftol": 1e-4, "maxcor": 20}
@@ -87,20 +85,19 @@ class StateSpace:
                 raise LimitEstimateError(
                     f"{key} must have {model.nv} values, one a joint; its shape is {array.shape}"
                 )
-        low, high = arrays["q_min"], arrays["q_max"]
+        low, high, *positive = arrays.values()
         turning = np.isneginf(low) & np.isposinf(high)
         low[turning], high[turning] = -math.pi, math.pi
-        finite = np.isfinite(low) & np.isfinite(high) & (low <= high)
-        for key, fine, allowed in (
-            ("q_min", finite, "position limits must be finite and in order, or both infinite"),
-            *(
-                (key, np.isfinite(each) & (each > 0.0), f"{key} must be positive and finite")
-                for key, each in arrays.items()
-                if key in ("v_max", "tau_max")
-            ),
-        ):
-            if not fine.all():
-                j = int(np.argmin(fine))
+        ordered = np.isfinite(low) & np.isfinite(high) & (low <= high)
+        checks = [
+            ("q_min", ordered, "position limits must be finite and in order, or both infinite")
+        ]
+        for key, array in zip(("v_max", "tau_max"), positive, strict=True):
+            usable = np.isfinite(array) & (array > 0.0)
+            checks.append((key, usable, f"{key} must be positive and finite"))
+        for key, usable, allowed in checks:
+            if not usable.all():
+                j = int(np.argmin(usable))
                 raise LimitEstimateError(
                     f"joint {model.names[1 + j]}: {allowed}; {key} is {arrays[key][j]:g}"
                 )
@@ -114,14 +111,6 @@ class StateSpace:
         return q, v
 
 
-class HistoryEntry(NamedTuple):
-    """The estimate after some number of evaluations."""
-
-    evaluations: int
-    a_min: Array
-    a_max: Array
-
-
 class WorstCases:
     """The tightest acceleration limits found, and where.
 
@@ -132,7 +121,6 @@ class WorstCases:
         v: its velocity, shape (2, n, n), rad/s.
         evaluations: how often the dynamics were evaluated: once for M and h at a state, once
             more for their derivatives.
-        history: how the estimate went on with the evaluations, at about powers of two.
     """
 
     def __init__(self, n: int):
@@ -140,7 +128,6 @@ class WorstCases:
         self.q = np.full((2, n, n), np.nan)
         self.v = np.full((2, n, n), np.nan)
         self.evaluations = 0
-        self.history: list[HistoryEntry] = []
 
     @property
     def a_min(self) -> Array:
@@ -161,11 +148,6 @@ class WorstCases:
         self.room[better] = least[better]
         self.q[better] = q[row[better]]
         self.v[better] = v[row[better]]
-
-    def record(self) -> None:
-        """Add the present estimate to the history."""
-        if not self.history or self.evaluations > self.history[-1].evaluations:
-            self.history.append(HistoryEntry(self.evaluations, self.a_min, self.a_max.copy()))
 
 
 def torque_terms(model: pin.Model, data: pin.Data, q: Array, v: Array) -> tuple[Array, Array]:
@@ -209,17 +191,6 @@ def acceleration_room(
     return np.stack([(space.tau_max - h) / inertia, (space.tau_max + h) / inertia], axis=1)
 
 
-def _chunks(samples: int) -> Iterator[int]:
-    """Yield batch sizes that sum to `samples` and end on every power of two on the way."""
-    if samples < 1:
-        raise LimitEstimateError(f"samples must be at least 1, is {samples}")
-    done = 0
-    while done < samples:
-        size = min(max(done, 1), CHUNK, samples - done)
-        yield size
-        done += size
-
-
 def search_by_sampling(model: pin.Model, space: StateSpace, samples: int, seed: int) -> WorstCases:
     """Evaluate uniformly random states: Algorithm 4 of [DelPrete2018].
 
@@ -234,15 +205,19 @@ def search_by_sampling(model: pin.Model, space: StateSpace, samples: int, seed: 
     Raises:
         LimitEstimateError: fewer than one sample, or a joint that moves no inertia.
     """
+    _require_samples(samples)
     rng = np.random.default_rng(seed)
     data = model.createData()
     worst = WorstCases(space.n)
-    for size in _chunks(samples):
-        q, v = space.states(rng.random((size, 2 * space.n)))
+    for done in range(0, samples, CHUNK):
+        q, v = space.states(rng.random((min(CHUNK, samples - done), 2 * space.n)))
         worst.update(acceleration_room(model, data, space, q, v), q, v)
-        if worst.evaluations == samples or worst.evaluations.bit_count() == 1:
-            worst.record()
     return worst
+
+
+def _require_samples(samples: int) -> None:
+    if samples < 1:
+        raise LimitEstimateError(f"samples must be at least 1, is {samples}")
 
 
 def search_refined(model: pin.Model, space: StateSpace, evaluations: int, seed: int) -> WorstCases:
@@ -256,35 +231,24 @@ def search_refined(model: pin.Model, space: StateSpace, evaluations: int, seed: 
     As `search_by_sampling`, but `evaluations` is the most evaluations of the dynamics, derivatives
     included.
     """
+    _require_samples(evaluations)
     n = space.n
     data = model.createData()
     worst = WorstCases(n)
-    count = 2 ** max(int(evaluations * SAMPLED_SHARE).bit_length() - 1, 0)
-    rng = np.random.default_rng(seed)
-    points, rooms = [], []
-    for size in _chunks(min(count, evaluations)):
-        unit = rng.random((size, 2 * n))
-        corner = (worst.evaluations + np.arange(size)) % 2 == 1
-        unit[corner, n:] = np.round(unit[corner, n:])
-        q, v = space.states(unit)
-        room = acceleration_room(model, data, space, q, v)
-        worst.update(room, q, v)
-        worst.record()
-        points.append(unit)
-        rooms.append(room.reshape(size, 2 * n))
-    unit = np.concatenate(points)
-    order = np.argsort(np.concatenate(rooms), axis=0, kind="stable")
+    count = max(int(SAMPLED_SHARE * evaluations), 1)
+    unit = np.random.default_rng(seed).random((count, 2 * n))
+    unit[1::2, n:] = np.round(unit[1::2, n:])
+    q, v = space.states(unit)
+    room = acceleration_room(model, data, space, q, v)
+    worst.update(room, q, v)
     idle = 0
-    for ranks in order:
+    for starts in np.argsort(room.reshape(count, 2 * n), axis=0, kind="stable"):
         before = worst.room.copy()
-        for limit, start in enumerate(ranks):
+        for limit, start in enumerate(starts):
             _descend(model, data, space, worst, unit[start], *divmod(limit, n), evaluations)
-        if worst.evaluations >= 1.2 * worst.history[-1].evaluations:
-            worst.record()
         idle = 0 if np.any(worst.room < before - 1e-6 * np.abs(before)) else idle + 1
         if worst.evaluations + 2 > evaluations or idle == PATIENCE:
             break
-    worst.record()
     return worst
 
 
