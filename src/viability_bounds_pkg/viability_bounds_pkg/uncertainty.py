@@ -90,16 +90,10 @@ class DeclaredUncertainty:
         """Which declarations are not zero."""
         return [each.name for each in fields(self) if np.any(getattr(self, each.name))]
 
-    def without(self, *names: str) -> DeclaredUncertainty:
-        """Return the same with some of the declarations left out."""
-        nothing: dict[str, Any] = {name: 0 * getattr(self, name) for name in names}
+    def without(self, name: str) -> DeclaredUncertainty:
+        """Return the same with one of the declarations left out."""
+        nothing: dict[str, Any] = {name: 0 * getattr(self, name)}
         return replace(self, **nothing)
-
-    def of_joint(self, j: int) -> DeclaredUncertainty:
-        """Return what is declared of joint j alone, arrays of shape (1,)."""
-        arrays = {k: v for k, v in vars(self).items() if isinstance(v, np.ndarray)}
-        own: dict[str, Any] = {name: value[j : j + 1] for name, value in arrays.items()}
-        return replace(self, **own)
 
 
 class UncertaintyMargins(NamedTuple):
@@ -212,39 +206,18 @@ class Loop(NamedTuple):
             velocity_error=velocity_error,
         )
 
-    def of_joint(self, j: int) -> Loop:
-        """Return the loop of joint j alone."""
-        own = TorqueMargins(*(each[j : j + 1] for each in self.torque_margins))
-        return self._replace(limits=self.limits.of_joint(j), torque_margins=own)
-
     def refusal(self, declared: DeclaredUncertainty, error: JointLimitsError) -> ArmSafetyError:
-        """Return the error for declarations that leave a joint no bounds.
+        """Return the error for declarations that leave no bounds.
 
-        It names the first declaration without which there were some.
-
-        Args:
-            declared: of n joints.
-            error: what the bounds say; returned where nothing declared is the cause.
+        It names the first one without which there were some; `error`, what the bounds say, is
+        returned where there is none.
         """
-        if error.joint is None:
-            return error
-        j = self.limits.names.index(error.joint)
-        loop, own = self.of_joint(j), declared.of_joint(j)
-        if not own.names or not loop.has_bounds(own.without(*own.names)):
-            return error
-        too_large = [name for name in own.names if loop.has_bounds(own.without(name))]
-        numbers = {each: float(np.squeeze(getattr(own, each))) for each in own.names}
-        name = (too_large or own.names)[0]
-        value = numbers.pop(name)
-        others = ", ".join(f"{other} {number:g}" for other, number in numbers.items())
-        allowed = f"{'more' if name == 'motor_bandwidth' else 'less'} for '{error.joint}' at "
-        allowed += f"{1.0 / self.dt:g} Hz" + (f", with {others}" if others else "")
-        return SettingError(name, value, allowed)
-
-    def has_bounds(self, declared: DeclaredUncertainty) -> bool:
-        """Return whether there are bounds for what is declared."""
-        try:
-            self.bounds(declared)
-        except JointLimitsError:
-            return False
-        return True
+        for name in declared.names:
+            try:
+                self.bounds(declared.without(name))
+            except JointLimitsError:
+                continue
+            more = "more" if name == "motor_bandwidth" else "less"
+            allowed = f"{more} at {1.0 / self.dt:g} Hz; {error}"
+            return SettingError(name, getattr(declared, name), allowed)
+        return error

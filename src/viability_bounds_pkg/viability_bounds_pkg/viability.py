@@ -26,10 +26,9 @@ from viability_bounds_pkg.bounds.discrete_time import (
     checked_step,
     discrete_time,
     discrete_time_condition,
-    without_position_error,
 )
 from viability_bounds_pkg.bounds.kernel import AccelerationBounds, make_table, solve
-from viability_bounds_pkg.joint_limits import ROUNDING, JointLimits, JointLimitsError, joint_array
+from viability_bounds_pkg.joint_limits import ROUNDING, JointLimits, JointLimitsError
 
 Array = NDArray[np.float64]
 
@@ -88,7 +87,7 @@ class BoundsSolver:
             raise JointLimitsError("period", None, period, f"must be at most dt = {dt:g} s")
         margins = Margins.of(limits, margin, position_error, velocity_error)
         self.steps, self.braking, self.exact = discrete_time(limits, dt, period, margins)
-        self.table = _make_table(limits, self.steps, self.braking, margins)
+        self.table = make_table(limits, self.steps, self.braking, margins)
         # The first call compiles; let it be this one and not one in a control loop.
         self.bounds(np.zeros(len(limits)), np.zeros(len(limits)))
 
@@ -127,49 +126,22 @@ class BoundsSolver:
 
 
 def acceleration_bounds(
-    q: ArrayLike,
-    v: ArrayLike,
-    limits: JointLimits,
-    dt: float,
-    margin: ArrayLike | None = None,
-    period: float | None = None,
-    *,
-    position_error: ArrayLike | None = None,
-    velocity_error: ArrayLike | None = None,
+    q: ArrayLike, v: ArrayLike, limits: JointLimits, dt: float
 ) -> AccelerationBounds:
     """Return the largest interval of accelerations that keeps the limits for ever: problem (4).
 
-    A function for `BoundsSolver(limits, dt, ...).bounds(q, v)`, which documents arguments and
-    errors; the solver is kept for the next call with the same settings.
+    A function for `BoundsSolver(limits, dt).bounds(q, v)`, which documents arguments and errors;
+    the solver is kept for the next call with the same limits.
     """
-
-    def key(field: str, values: ArrayLike | None) -> _Numbers:
-        return None if values is None else tuple(joint_array(field, values, limits.names).tolist())
-
-    errors = key("position_error", position_error), key("velocity_error", velocity_error)
-    return _solver(limits, dt, key("margin", margin), period, *errors).bounds(q, v)
-
-
-_Numbers = tuple[float, ...] | None
+    return _solver(limits, dt).bounds(q, v)
 
 
 @lru_cache(maxsize=32)
-def _solver(
-    limits: JointLimits,
-    dt: float,
-    margin: _Numbers,
-    period: float | None,
-    position_error: _Numbers,
-    velocity_error: _Numbers,
-) -> BoundsSolver:
-    return BoundsSolver(
-        limits, dt, margin, period, position_error=position_error, velocity_error=velocity_error
-    )
+def _solver(limits: JointLimits, dt: float) -> BoundsSolver:
+    return BoundsSolver(limits, dt)
 
 
-def viable_velocity_range(
-    q: ArrayLike, limits: JointLimits, margin: ArrayLike | None = None
-) -> tuple[Array, Array]:
+def viable_velocity_range(q: ArrayLike, limits: JointLimits) -> tuple[Array, Array]:
     """Return the velocities from which the limits can be kept in continuous time: eq. (8)-(10).
 
     Where condition (11) holds this is also the kernel of discrete time; where it does not, the
@@ -178,13 +150,11 @@ def viable_velocity_range(
     Args:
         q: shape (n,) or (batch, n), rad.
         limits: of n joints.
-        margin: shape (n,), rad/s^2, or None; taken off the braking.
 
     Returns:
         Lowest and highest velocity, each of the shape of `q`, rad/s; nan outside the limits.
     """
-    kept = Margins.of(limits, margin, None, None).acceleration[:, None]
-    braking = np.stack([-limits.a_min, limits.a_max], axis=1) - kept
+    braking = np.stack([-limits.a_min, limits.a_max], axis=1)
     return _velocity_range(np.asarray(q, dtype=np.float64), limits, braking)
 
 
@@ -196,26 +166,3 @@ def _velocity_range(q: Array, limits: JointLimits, braking: Array) -> tuple[Arra
         lower = -np.minimum(np.sqrt(2.0 * braking[:, 1] * below), limits.v_max)
     outside = (above < 0.0) | (below < 0.0)
     return np.where(outside, np.nan, lower), np.where(outside, np.nan, upper)
-
-
-def _make_table(
-    limits: JointLimits, steps: Array, braking: Array, margins: Margins
-) -> NDArray[np.void]:
-    inner = without_position_error(limits, margins.position)
-    ranges = np.stack([inner.q_max, -inner.q_min], axis=1)
-    length = ranges.sum(axis=1, keepdims=True)
-    v_max = limits.v_max[:, None]
-    largest = np.abs(np.where(np.isfinite(ranges), ranges, 0.0)).max(axis=1, keepdims=True)
-    rounding = ROUNDING * (largest + np.minimum(v_max * v_max / (2.0 * braking), length))
-    return make_table(
-        dt=steps[:, None],
-        position=ranges,
-        braking=braking,
-        v_max=v_max,
-        low=np.stack([limits.a_min, -limits.a_max], axis=1),
-        high=np.stack([limits.a_max, -limits.a_min], axis=1),
-        margin=margins.acceleration[:, None],
-        velocity_error=margins.velocity[:, None],
-        # A joint counts as inside if it may be.
-        tolerance=rounding + 2.0 * margins.position[:, None],
-    )

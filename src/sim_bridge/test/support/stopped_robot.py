@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A robot that stops by itself, from states to which its bounds may have led."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from sim_bridge.bullet.limit_monitor import LimitMonitor
@@ -23,8 +25,8 @@ class Stopped:
             values |= changes
         self.config = read(BulletConfiguration, given["bullet_node"])
         bounds = read(BoundsConfiguration, given["bounds_node"])
-        self.kernel = tightened(bounds.limits, bounds.margins)
-        self.margin = bounds.margins.acceleration
+        kernel, margin = tightened(bounds.limits, bounds.margins), bounds.margins.acceleration
+        self.kernel = replace(kernel, a_min=kernel.a_min + margin, a_max=kernel.a_max - margin)
         config = self.config
         self.robot = make_robot(config)
         self.law = make_stop(config)
@@ -40,7 +42,7 @@ class Stopped:
         near = rng.uniform(0.0, 0.1, self.n)
         places = [rng.uniform(low, high), low + near, high - near]
         q = np.clip(np.choose(rng.choice(3, self.n, p=[0.6, 0.2, 0.2]), places), low, high)
-        slowest, fastest = viable_velocity_range(q, self.kernel, self.margin)
+        slowest, fastest = viable_velocity_range(q, self.kernel)
         share = np.where(rng.random(self.n) < 0.7, 1.0, rng.random(self.n))
         return q, share * np.where(rng.random(self.n) < 0.5, slowest, fastest)
 

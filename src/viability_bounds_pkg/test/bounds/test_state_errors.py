@@ -7,11 +7,7 @@ from adversary import POLICIES, VIOLATION, bring_back, states_in_kernel, states_
 from joint_cases import CASES, HOLDING, column, one_joint, states_of
 
 from viability_bounds_pkg.joint_limits import JointLimitsError
-from viability_bounds_pkg.viability import (
-    BoundsSolver,
-    acceleration_bounds,
-    discrete_time_condition,
-)
+from viability_bounds_pkg.viability import BoundsSolver, discrete_time_condition
 
 ROOMY = [name for name in HOLDING if name != "condition (11) just holds"]
 """Joints for which condition (11) holds with small errors, too."""
@@ -49,13 +45,9 @@ def test_no_errors_are_the_bounds_without_them_bit_for_bit(name, margin, period)
     q, v = (column(x) for x in states_of(case, 2000, seed=1))
     q[:50] += 0.1
     known = BoundsSolver(limits, dt, w, period * dt)
-    zeros = {"position_error": [0.0], "velocity_error": [0.0]}
-    for bounds in (
-        robust(case, 0.0, margin, period).bounds(q, v),
-        acceleration_bounds(q, v, limits, dt, w, period * dt, **zeros),
-    ):
-        for found, expected in zip(bounds, known.bounds(q, v), strict=True):
-            assert found.tobytes() == expected.tobytes()
+    bounds = robust(case, 0.0, margin, period).bounds(q, v)
+    for found, expected in zip(bounds, known.bounds(q, v), strict=True):
+        assert found.tobytes() == expected.tobytes()
 
 
 @pytest.mark.parametrize("name", ROOMY)
@@ -204,11 +196,7 @@ def test_every_joint_returns_although_its_state_is_unsure(name, policy):
 )
 def test_errors_that_cannot_be_held_against(errors, field, said):
     limits = one_joint(-0.5, 0.5, 2.0, -10.0, 10.0)
-    for use in (
-        BoundsSolver,
-        lambda *known, **more: acceleration_bounds([0.0], [0.0], *known, **more),
-    ):
-        with pytest.raises(JointLimitsError) as error:
-            use(limits, 0.1, **errors)
-        assert error.value.field == field
-        assert said in str(error.value)
+    with pytest.raises(JointLimitsError) as error:
+        BoundsSolver(limits, 0.1, **errors)
+    assert error.value.field == field
+    assert said in str(error.value)

@@ -142,8 +142,6 @@ def test_velocity_range_is_the_paper_s_kernel():
     assert upper == pytest.approx(np.minimum(2.0, np.sqrt(20.0 * (0.5 - q))))
     assert lower == pytest.approx(-np.minimum(2.0, np.sqrt(10.0 * (q + 0.5))))
     assert np.isnan(viable_velocity_range([0.6], limits)).all()
-    with_margin = viable_velocity_range(q, limits, margin=[2.0])[1]
-    assert with_margin == pytest.approx(np.minimum(2.0, np.sqrt(16.0 * (0.5 - q))))
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -328,7 +326,8 @@ def test_refuses_margins(margin, dt):
 
 def test_a_margin_keeps_the_acceleration_limits():
     limits = one_joint(-1.0, 1.0, 2.0, -10.0, 8.0)
-    lower, upper, viable = acceleration_bounds([0.0], [0.0], limits, 0.01, margin=[2.0])
+    solver = BoundsSolver(limits, 0.01, [2.0])
+    lower, upper, viable = solver.bounds([0.0], [0.0])
     assert (lower[0], upper[0], viable[0]) == (-10.0, 8.0, True)
-    lower, upper, _ = acceleration_bounds([0.0], [2.0], limits, 0.01, margin=[2.0])
+    lower, upper, _ = solver.bounds([0.0], [2.0])
     assert upper[0] == pytest.approx(-2.0)

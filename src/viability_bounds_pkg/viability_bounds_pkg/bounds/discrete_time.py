@@ -83,21 +83,6 @@ def _checked(
     return array
 
 
-class DiscreteTime(NamedTuple):
-    """Steps and decelerations of n joints for which condition (11) holds.
-
-    Attributes:
-        steps: shape (n,), s.
-        braking: that the kernel counts on, towards the upper and the lower limit, shape (n, 2),
-            rad/s^2.
-        full: whether that is all there is, less the margin, shape (n,), bool.
-    """
-
-    steps: Array
-    braking: Array
-    full: NDArray[np.bool_]
-
-
 def discrete_time_condition(
     limits: JointLimits,
     dt: float,
@@ -124,13 +109,13 @@ def discrete_time_condition(
     Raises:
         JointLimitsError: an argument is unusable in itself.
     """
-    dt = checked_step(dt)
-    return _holds(limits, dt, Margins.of(limits, margin, position_error, velocity_error))
+    margins = Margins.of(limits, margin, position_error, velocity_error)
+    return _largest_braking(limits, checked_step(dt), margins)[1]
 
 
 def discrete_time(
     limits: JointLimits, dt: float, shortest: float, margins: Margins
-) -> DiscreteTime:
+) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Return the longest step, and for it the largest braking, for which (11) holds.
 
     Of each joint the step is `dt`, half of it, half of that and so on, at least `shortest`. If
@@ -142,22 +127,24 @@ def discrete_time(
         shortest: shortest step, s.
         margins: of these joints.
 
+    Returns:
+        Steps, shape (n,), s; decelerations that the kernel counts on, towards the upper and the
+        lower limit, shape (n, 2), rad/s^2; and whether those are all there is, less the margin,
+        shape (n,).
+
     Raises:
         JointLimitsError: a margin or an error is too large for any kernel of this form.
     """
     step, steps = dt, np.full(len(limits), dt)
-    found = _holds(limits, step, margins)
-    while step > shortest and not found.all():
+    braking, full = _largest_braking(limits, step, margins)
+    while step > shortest and not full.all():
         step = max(0.5 * step, shortest)
-        steps[~found] = step
-        found |= _holds(limits, step, margins)
-    braking = np.stack([-limits.a_min, limits.a_max], axis=1) - margins.acceleration[:, None]
-    for j in np.flatnonzero(~found):
-        reduced = _reduced_braking(limits, int(j), float(steps[j]), margins)
-        if reduced is None:
-            raise _no_kernel(limits.names[j], float(steps[j]), margins, int(j))
-        braking[j] = reduced
-    return DiscreteTime(steps, braking, found)
+        with_step, fits = _largest_braking(limits, step, margins)
+        steps[~full], braking[~full] = step, with_step[~full]
+        full |= fits
+    for j in np.flatnonzero(np.isnan(braking).any(axis=1)):
+        raise _no_kernel(limits.names[j], float(steps[j]), margins, int(j))
+    return steps, braking, full
 
 
 def _no_kernel(joint: str, step: float, margins: Margins, j: int) -> JointLimitsError:
@@ -196,58 +183,36 @@ def without_position_error(limits: JointLimits, errors: Array) -> JointLimits:
     return replace(limits, q_min=limits.q_min + errors, q_max=limits.q_max - errors)
 
 
-def _holds(limits: JointLimits, dt: float, margins: Margins) -> NDArray[np.bool_]:
-    """Return whether (11) holds for full braking, shape (n,)."""
-    limits = without_position_error(limits, margins.position)
-    w, error = margins.acceleration[:, None], margins.velocity[:, None]
-    spread = margins.acceleration + margins.velocity / dt
-    full = np.stack([-limits.a_min, limits.a_max], axis=1)
-    exists = np.isfinite(np.stack([limits.q_max, limits.q_min], axis=1))
-    with np.errstate(over="ignore"):  # steps of any length
-        # Speed at the end of a step whose braking was needed only at its beginning.
-        hardest = full + w + 2.0 * error / dt
-        back = hardest * dt
-        room = 0.5 * dt * back * (1.0 + hardest / (full[:, ::-1] - w))
-    v_max, length = limits.v_max, limits.q_max - limits.q_min - dt * margins.velocity
-    slow = back <= (v_max * (1.0 + ROUNDING))[:, None]
-    fits = room <= (length * (1.0 + ROUNDING))[:, None]
-    bounded = ((slow & fits) | ~exists).all(axis=1)
-    return np.where(exists.any(axis=1), bounded, spread * dt <= v_max)
+def _largest_braking(
+    limits: JointLimits, dt: float, margins: Margins
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Return braking with which (11) holds, and whether it is all there is, less the margin.
 
+    What would make a joint too fast is taken off at first. With z = 2 W + 2 E_v / dt, the position
+    part is then, for equal braking B of both sides and for more of the stronger one, X,
 
-def _reduced_braking(
-    limits: JointLimits, j: int, dt: float, margins: Margins
-) -> tuple[float, float] | None:
-    """Return braking of joint j towards both limits with which (11) holds, or None.
+        2 B^2 + (3 z - 2 L / dt^2) B + z^2 <= 0,    (X + z) (1 + (X + z) / B) <= 2 L / dt^2.
 
-    First the largest B for both: the position part is B^2 + (3 w - L / dt^2) B + 2 w^2 <= 0 with
-    w = W + E_v / dt.
-    Where the weaker side cannot use more, the stronger is then given what (11) leaves it, which
-    only makes (11) easier for the weaker one.
+    Returns:
+        Towards the upper and the lower limit, shape (n, 2), rad/s^2, NaN where there is none; and
+        shape (n,).
     """
-    q_min, q_max = float(limits.q_min[j]), float(limits.q_max[j])
-    if math.isinf(q_min) and math.isinf(q_max):
-        return None
-    margin, off, error = (float(each[j]) for each in margins)
-    full = (-float(limits.a_min[j]), float(limits.a_max[j]))
-    w = margin + error / dt
-    fastest = float(limits.v_max[j]) / dt - 2.0 * w
-    b = min(*full, fastest + margin) - margin
-    steps = ((q_max - off) - (q_min + off) - dt * error) / dt / dt
-    spare = steps - 3.0 * w
-    if spare < math.inf:
-        root = spare * spare - 8.0 * w * w
-        if spare <= 0.0 or root < 0.0:
-            return None
-        largest = 0.5 * (spare + math.sqrt(root))
-        if b < 2.0 * w * w / largest:
-            return None
-        b = min(b, largest)
-    if b <= 0.0:
-        return None
-    # (B + 2 w)^2 / b + (B + 2 w) <= 2 L / dt^2 for the stronger side, without a difference.
-    stronger = (
-        4.0 * steps / (1.0 + math.sqrt(1.0 + 8.0 * steps / b)) if steps < math.inf else steps
-    )
-    stronger = max(b, min(stronger - 2.0 * w, fastest, max(full) - margin))
-    return (stronger, b) if full[0] > full[1] else (b, stronger)
+    inner = without_position_error(limits, margins.position)
+    exists = np.isfinite(np.stack([inner.q_max, inner.q_min], axis=1))
+    full = np.stack([-limits.a_min, limits.a_max], axis=1) - margins.acceleration[:, None]
+    spread = margins.acceleration + margins.velocity / dt
+    length = inner.q_max - inner.q_min - dt * margins.velocity
+    with np.errstate(all="ignore"):  # steps of any length
+        z, room = 2.0 * spread, 2.0 * length * (1.0 + ROUNDING) / dt / dt
+        fastest = limits.v_max * (1.0 + ROUNDING) / dt - z
+        b = np.where(exists, np.minimum(full, fastest[:, None]), full)
+        half = room - 3.0 * z
+        most = 0.25 * (half + np.sqrt(half * half - 8.0 * z * z))
+        equal = np.minimum(b.min(axis=1), most)
+        possible = (equal > 0.0) & (equal >= 0.5 * z * z / most)
+        stronger = 0.5 * equal * (np.sqrt(1.0 + 4.0 * room / equal) - 1.0) - z
+    continuous = ~exists.any(axis=1)
+    possible = np.where(continuous, spread * dt <= limits.v_max, possible)
+    stronger = np.where(continuous, np.inf, np.maximum(equal, stronger))
+    braking = np.where(possible[:, None], np.minimum(b, stronger[:, None]), np.nan)
+    return braking, (braking >= full).all(axis=1)

@@ -14,9 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from viability_bounds_pkg.joint_limits import ROUNDING
+from viability_bounds_pkg.bounds.discrete_time import Margins, without_position_error
+from viability_bounds_pkg.joint_limits import ROUNDING, JointLimits
 
 Array = NDArray[np.float64]
 
@@ -73,34 +74,36 @@ class AccelerationBounds(NamedTuple):
 
 
 def make_table(
-    *,
-    dt: ArrayLike,
-    position: ArrayLike,
-    braking: ArrayLike,
-    v_max: ArrayLike,
-    low: ArrayLike,
-    high: ArrayLike,
-    margin: ArrayLike = 0.0,
-    velocity_error: ArrayLike = 0.0,
-    tolerance: ArrayLike = 0.0,
+    limits: JointLimits, steps: Array, braking: Array, margins: Margins
 ) -> NDArray[np.void]:
     """Return the limits of n joints, `ONE_SIDED_LIMIT` of shape (n, 2): upper and lower.
 
-    Arguments are as documented there, and `braking` is B, rad/s^2; all of shape (n, 2), or
-    broadcast to it.
+    Args:
+        limits: of n joints.
+        steps: of each joint, shape (n,), s.
+        braking: B towards the upper and the lower limit, shape (n, 2), rad/s^2.
+        margins: what the bounds must hold for.
     """
-    position = np.array(position, dtype=float, ndmin=2)
+    inner = without_position_error(limits, margins.position)
+    position = np.stack([inner.q_max, -inner.q_min], axis=1)
+    v_max = limits.v_max[:, None]
     table = np.zeros(position.shape, dtype=ONE_SIDED_LIMIT)
-    table["position"], table["dt"], table["v_max"] = position, dt, v_max
-    table["low"], table["high"] = low, high
-    table["margin"], table["velocity_error"] = margin, velocity_error
-    table["tolerance"] = tolerance
-    half_dt, speed, b = 0.5 * table["dt"], table["v_max"], np.asarray(braking)
-    k = b * half_dt
-    table["half_dt"], table["twice_braking"], table["k"] = half_dt, 2.0 * b, k
+    table["position"], table["dt"], table["v_max"] = position, steps[:, None], v_max
+    table["low"] = np.stack([limits.a_min, -limits.a_max], axis=1)
+    table["high"] = np.stack([limits.a_max, -limits.a_min], axis=1)
+    table["margin"] = margins.acceleration[:, None]
+    table["velocity_error"] = margins.velocity[:, None]
+    largest = np.abs(np.where(np.isfinite(position), position, 0.0)).max(axis=1, keepdims=True)
+    length = position.sum(axis=1, keepdims=True)
+    rounding = ROUNDING * (largest + np.minimum(v_max * v_max / (2.0 * braking), length))
+    # A joint counts as inside if it may be.
+    table["tolerance"] = rounding + 2.0 * margins.position[:, None]
+    half_dt = 0.5 * table["dt"]
+    k = braking * half_dt
+    table["half_dt"], table["twice_braking"], table["k"] = half_dt, 2.0 * braking, k
     # Not zero even if dt is tiny, so that no room at all does not make 0 / 0.
     table["k_squared"] = np.maximum(k * k, _TINY)
-    table["free"] = half_dt * speed + 0.5 * speed * speed / b
+    table["free"] = half_dt * v_max + 0.5 * v_max * v_max / braking
     return table
 
 
@@ -127,34 +130,16 @@ def _solve(
 ) -> None:
     """Write the bounds of states one after the other, each of as many joints as the table."""
     n = len(table)
-    for first in range(0, len(q), n):
-        for j in range(n):
-            i = first + j
-            lower[i], upper[i], viable[i] = joint_bounds(q[i], v[i], table[j, 0], table[j, 1])
-
-
-@njit(cache=True, error_model="numpy")
-def joint_bounds(
-    q: float, v: float, above: np.record, below: np.record
-) -> tuple[float, float, bool]:
-    """Return the bounds of one joint state and whether it is in the kernel.
-
-    Args:
-        q: rad.
-        v: rad/s.
-        above: upper limit, a `ONE_SIDED_LIMIT`.
-        below: lower limit.
-
-    Returns:
-        Lower and upper bound, rad/s^2, and whether the state is viable.
-    """
-    high, keeps_high = _bound_towards(above.position - q, v, above)
-    low, keeps_low = _bound_towards(below.position + q, -v, below)
-    low = -low
-    slow = abs(v) - above.velocity_error <= above.v_max * _WITHIN
-    if low > high:
-        low = high = _resolve_conflict(above.position - q, below.position + q, v, low, high, above)
-    return low, high, keeps_high and keeps_low and slow
+    for i in range(len(q)):
+        above, below = table[i % n, 0], table[i % n, 1]
+        high, keeps_high = _bound_towards(above.position - q[i], v[i], above)
+        low, keeps_low = _bound_towards(below.position + q[i], -v[i], below)
+        low = -low
+        if low > high:
+            rooms = above.position - q[i], below.position + q[i]
+            low = high = _resolve_conflict(rooms[0], rooms[1], v[i], low, high, above)
+        slow = abs(v[i]) - above.velocity_error <= above.v_max * _WITHIN
+        lower[i], upper[i], viable[i] = low, high, keeps_high and keeps_low and slow
 
 
 @njit(cache=True, error_model="numpy")

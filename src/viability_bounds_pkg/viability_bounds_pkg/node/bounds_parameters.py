@@ -196,15 +196,25 @@ def make_bounds(config: BoundsConfiguration) -> Bounds:
     return partial(BASELINES[config.method], limits=config.limits, dt=config.horizon)
 
 
-def make_plausibility_check(config: BoundsConfiguration) -> PlausibilityCheck | None:
-    """Return the check of the states that the robot reports; None where the estimator has it."""
-    if config.use_estimated_states:
-        return None
+def make_plausibility_check(
+    config: Any, declared: DeclaredUncertainty | None, uses_velocities: bool = True
+) -> PlausibilityCheck:
+    """Return the check of the states that the robot reports.
+
+    Args:
+        config: has the limits and ``dt`` of `BoundsConfiguration`.
+        declared: of the robot's errors; None for none.
+        uses_velocities: whether velocities are not estimated.
+    """
+    none = np.zeros(len(config.joints))
+    errors = (none, none)
+    if declared is not None:
+        errors = declared.position_error, declared.velocity_error
     return PlausibilityCheck(
         config.position_min,
         config.position_max,
         config.velocity_max,
         config.dt,
-        config.declared.position_error,
-        config.declared.velocity_error,
+        errors[0],
+        errors[1] if uses_velocities else None,
     )
