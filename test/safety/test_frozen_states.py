@@ -10,10 +10,10 @@ import pytest
 from direct import DirectLoop, posture_at_limits
 
 from sim_bridge.node.bullet_parameters import make_stop
-from torque_safety_controller.node.assembly import make_plausibility_check
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.ramp import Ramp
 from torque_safety_controller.supervisor import Order
+from viability_bounds_pkg.node.bounds_parameters import make_plausibility_check
 from viability_bounds_pkg.state import State
 
 HASTE = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}

@@ -34,7 +34,6 @@ from viability_bounds_pkg.node.bounds_parameters import (
     BoundsConfiguration,
     make_bounds,
 )
-from viability_bounds_pkg.plausible import PlausibilityCheck
 from viability_bounds_pkg.robot.configuration import load_model
 from viability_bounds_pkg.robot.description import (
     RobotDescriptionError,
@@ -121,28 +120,6 @@ def make_parts(
         make_collision(config, robot.model),
     ]
     return [part for part in parts if part is not None]
-
-
-def make_plausibility_check(
-    config: ControllerConfiguration, declared: BoundsConfiguration | None
-) -> PlausibilityCheck | None:
-    """Return the check of the states that the robot reports; None where the estimator has it.
-
-    Args:
-        config: checked parameters.
-        declared: of the robot, for the bounds node.
-    """
-    if config.use_estimated_states:
-        return None
-    none = np.zeros(len(config.joints))
-    return PlausibilityCheck(
-        config.position_min,
-        config.position_max,
-        config.velocity_max,
-        config.dt,
-        none if declared is None else declared.declared.position_error,
-        none if declared is None else declared.declared.velocity_error,
-    )
 
 
 def make_integral_part(config: ControllerConfiguration, robot: RobotModel) -> Integral:

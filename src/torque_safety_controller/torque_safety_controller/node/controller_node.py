@@ -15,10 +15,7 @@ from trajectory_msgs.msg import JointTrajectory
 from torque_safety_controller.command_check import CommandCheck
 from torque_safety_controller.handover import Handover, HandoverRefused
 from torque_safety_controller.modes import Control, Mode
-from torque_safety_controller.node.assembly import (
-    make_controller,
-    make_plausibility_check,
-)
+from torque_safety_controller.node.assembly import make_controller
 from torque_safety_controller.node.declared import (
     commands_in_flight,
     covered_misses,
@@ -33,6 +30,7 @@ from torque_safety_controller.parameters.controller_parameters import Controller
 from torque_safety_controller.parts.contact.interaction import Interaction
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.supervisor import Supervisor
+from viability_bounds_pkg.node.bounds_parameters import make_plausibility_check
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.diagnostics import Diagnostics
 from viability_bounds_pkg.ros.messages import Arrival
@@ -68,7 +66,9 @@ class ControllerNode(ArmNode):
         self._handover = Handover(
             config.joints, config.position_min, config.position_max, config.torque_max, config.dt
         )
-        check = make_plausibility_check(config, declared)
+        check = None
+        if not config.use_estimated_states:
+            check = make_plausibility_check(config, declared and declared.declared)
         self._states = StateStream(config.joints, config.state_timeout, self._warn, check)
         self._limits = LimitsReader(config.joints, self._warn)
         self._goals = GoalSubscriber(self, self._controller, config, base, self._states)

@@ -53,7 +53,9 @@ class BoundsNode(ArmNode):
                 warn_of_unusual(self, config, config.read_urdf())
             self._bounds = make_bounds(config)
         joints = config.joints
-        check = make_plausibility_check(config)
+        check = None
+        if not config.use_estimated_states:
+            check = make_plausibility_check(config, config.declared)
         self._reader = JointStateReader(joints, config.state_timeout, self._warn, check)
         self._period = PeriodCheck(config.dt, self._warn)
         self._answered = 0

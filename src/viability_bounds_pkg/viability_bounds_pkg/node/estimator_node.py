@@ -12,11 +12,8 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import JointState
 
-from viability_bounds_pkg.node.estimator_parameters import (
-    EstimatorConfiguration,
-    make_estimator,
-    make_plausibility_check,
-)
+from viability_bounds_pkg.node.bounds_parameters import make_plausibility_check
+from viability_bounds_pkg.node.estimator_parameters import EstimatorConfiguration, make_estimator
 from viability_bounds_pkg.robot.configuration import load_model
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.diagnostics import Diagnostics
@@ -60,7 +57,7 @@ class EstimatorNode(ArmNode):
         joints = config.joints
         self._joints = list(joints)
         self._observers = config.observers
-        check = make_plausibility_check(config)
+        check = make_plausibility_check(config, config.declared, not config.velocity_estimation)
         self._reader = JointStateReader(joints, config.state_timeout, self._warn, check)
         self._period = PeriodCheck(config.dt, self._warn)
         self._refused: Counter[str] = Counter()

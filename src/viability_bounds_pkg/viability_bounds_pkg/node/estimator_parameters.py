@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import pinocchio as pin
 
 from viability_bounds_pkg.parameter import group, timeout
-from viability_bounds_pkg.plausible import PlausibilityCheck
 from viability_bounds_pkg.robot.configuration import ControlRate, LimitedRobotConfiguration
 from viability_bounds_pkg.state_estimation.estimator import StateEstimator
 from viability_bounds_pkg.state_estimation.observer import ObserverDesign
@@ -43,17 +42,4 @@ def make_estimator(config: EstimatorConfiguration, model: pin.Model) -> StateEst
         config.torque_max,
         declared.lasting_disturbance,
         1 + declared.missed_deadlines,
-    )
-
-
-def make_plausibility_check(config: EstimatorConfiguration) -> PlausibilityCheck:
-    """Return the check of the states that the robot reports."""
-    declared = config.declared
-    return PlausibilityCheck(
-        config.position_min,
-        config.position_max,
-        config.velocity_max,
-        config.dt,
-        declared.position_error,
-        None if config.velocity_estimation else declared.velocity_error,
     )
