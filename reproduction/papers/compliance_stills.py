@@ -9,13 +9,12 @@ from typing import NamedTuple
 import matplotlib.pyplot as plt
 import numpy as np
 import pinocchio as pin
+from camera import Camera
 from chain import ROOT
 from compliance_curve import Drawn, among_poles
 from compliance_push import ELBOW, Pushed, runs
 from figure import RESULTS, Figure
 from PIL import Image
-
-from sim_bridge.tools.camera import Camera
 
 FLOOR = -1.07  # m, under the feet
 

@@ -88,7 +88,6 @@ def test_nothing_is_sent_before_the_user_drives(arm):
 @pytest.mark.parametrize(
     "name, value, words",
     [
-        ("ft_frame", "wrist", "a frame of the URDF"),
         ("end_effector_frame", "hand", "a frame of the URDF"),
         ("viewer_host", "192.0.2.1", "an address of this machine"),
         ("acceleration_max", [1.0], "7 numbers"),

@@ -19,14 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 from sim_bridge.bullet.client import BulletClient, finite_vector, pybullet, silenced
 from sim_bridge.bullet.obstacles import BulletObstacles, ContactMaterial, LinkWrench
 from sim_bridge.bullet.sensor import ForceTorqueSensor
-from sim_bridge.urdf import (
-    FramePlacement,
-    PayloadError,
-    PreparedUrdf,
-    payload_link,
-    prepare_urdf,
-    with_payloads,
-)
+from sim_bridge.payload import PayloadError, payload_link, with_payloads
+from sim_bridge.urdf import FramePlacement, PreparedUrdf, prepare_urdf
 from viability_bounds_pkg.robot.description import RobotDescriptionError, unknown_name
 
 Array = NDArray[np.float64]
@@ -119,9 +113,10 @@ class BulletBody:
     def _prepared(self) -> PreparedUrdf:
         """Return the robot with its payloads for PyBullet; make its sensor."""
         urdf, joints, locked = self.description
-        loaded = with_payloads(urdf, self._payloads), joints, locked
         prepared = prepare_urdf(
-            *loaded,
+            with_payloads(urdf, self._payloads),
+            joints,
+            locked,
             sensor_frame=self._sensor_frame,
             mass_scales=self._mass_scales,
             rotor_inertias=self._rotor_inertias,
@@ -129,11 +124,7 @@ class BulletBody:
         self.sensor: ForceTorqueSensor | None = None
         if self._sensor_frame:
             self.sensor = ForceTorqueSensor(
-                *loaded,
-                self._sensor_frame,
-                self._mass_scales,
-                self._gravity,
-                self.physics_dt,
+                prepared.arm, self._sensor_frame, self._gravity, self.physics_dt
             )
         return prepared
 

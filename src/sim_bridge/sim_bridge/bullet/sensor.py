@@ -12,16 +12,15 @@ that PyBullet solves. How PyBullet transmits the force through its joints does n
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from xml.etree.ElementTree import SubElement, fromstring, tostring
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
 from sim_bridge.bullet.obstacles import LinkWrench
-from sim_bridge.urdf import joints_on, scale_masses
+from sim_bridge.urdf import ReducedArm
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import (
     FINITE,
@@ -31,7 +30,6 @@ from viability_bounds_pkg.parameter import (
     text,
     whole_number,
 )
-from viability_bounds_pkg.robot.description import build_model, kinematic_order
 
 Array = NDArray[np.float64]
 
@@ -42,11 +40,8 @@ class ForceTorqueSensor:
     The link's own weight and inertia are not measured.
 
     Args:
-        urdf_text: the URDF.
-        joints: names of the n joints that move.
-        locked_positions: where other joints are locked, rad or m.
+        arm: model of the moving joints, and of those on the sensor.
         frame: the link; the sensor measures at its origin, in its axes.
-        mass_scales: factors for mass and inertia of links, by name.
         gravity: shape (3,), m/s^2.
         physics_dt: the physics step h, s.
 
@@ -54,43 +49,18 @@ class ForceTorqueSensor:
         wrench: force, N, and moment, N m, of the load on the sensor in the last physics step:
             contacts, external wrenches, weight and inertia; shape (6,). After a reset it is that
             of zero accelerations.
-
-    Raises:
-        RobotDescriptionError: there is no such link, or it carries nothing.
     """
 
-    def __init__(
-        self,
-        urdf_text: str,
-        joints: Sequence[str],
-        locked_positions: Mapping[str, float],
-        frame: str,
-        mass_scales: Mapping[str, float] | None,
-        gravity: Array,
-        physics_dt: float,
-    ) -> None:
-        root = fromstring(urdf_text)
-        scale_masses(root, mass_scales or {})
-        locked = dict(locked_positions)
-        # The joints on the sensor become joints of the model, which computes their forces.
-        mounts = joints_on(root, frame)
-        names = [joint.get("name", "") for joint in mounts]
-        for joint in mounts:
-            if joint.get("type") == "fixed":
-                joint.set("type", "revolute")
-                SubElement(joint, "limit", effort="0", velocity="0")
-        text = tostring(root, encoding="unicode")
-        fixed = {name: locked.pop(name, 0.0) for name in names if name not in joints}
-        order = kinematic_order(text, [*joints, *fixed])
-        self._model = model = build_model(text, order, locked)
+    def __init__(self, arm: ReducedArm, frame: str, gravity: Array, physics_dt: float) -> None:
+        # The joints on the sensor are joints of the model, which computes their forces.
+        self._model = model = arm.model
         model.gravity.linear = gravity
         self._data = model.createData()
         self._frame = model.getFrameId(frame, pin.FrameType.BODY)
-        self._mounts = [model.getJointId(name) for name in names]
+        self._mounts = [model.getJointId(name) for name in arm.mounts]
         self._beyond = {joint for mount in self._mounts for joint in model.subtrees[mount]}
-        self._q = np.array([fixed.get(name, 0.0) for name in order])
-        self._v, self._a = np.zeros((2, len(order)))
-        self._moving = [order.index(name) for name in joints]
+        self._q, self._moving = arm.positions.copy(), arm.moving
+        self._v, self._a = np.zeros((2, model.nv))
         self._dt = physics_dt
         self.wrench: Array = np.zeros(6)
 

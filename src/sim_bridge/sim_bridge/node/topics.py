@@ -27,7 +27,7 @@ EXTERNAL_WRENCH = Topic(
     WrenchStamped,
     GOAL_QOS,
     (USER, "scenario_node", "viewer_node"),
-    (_NODE, "viewer_node"),
+    (_NODE,),
     "a push in world axes at the origin of the link `frame_id`, N and N m; one for each link; a "
     "stamp in the future takes effect then",
 )

@@ -55,7 +55,6 @@ from viability_bounds_pkg.ros.robot_urdf import robot_urdf
 from viability_bounds_pkg.ros.runtime import GOAL_QOS
 from viability_bounds_pkg.ros.topics import (
     DIAGNOSTICS,
-    FT_WRENCH,
     SLOW_ACCELERATION_LIMITS,
     SLOW_JOINT_STATES,
 )
@@ -79,7 +78,6 @@ class ViewerConfiguration(TaskFrames, LimitedRobotConfiguration):
 
     acceleration_min: Array = redeclared(BoundsConfiguration, "acceleration_min")
     acceleration_max: Array = redeclared(BoundsConfiguration, "acceleration_max")
-    ft_frame: str = text("link that is a force/torque sensor; none if empty", default="")
     viewer_host: str = text("address that the page is served on", default="127.0.0.1")
     viewer_port: int = whole_number(
         "port that the page is served on; the next free one if it is taken",
@@ -157,7 +155,7 @@ class PageCommands:
 
 
 class ViewerNode(ArmNode):
-    """Shows state, limits, goal and forces of the arm in a browser, and sends what the user asks.
+    """Shows state, limits and goal of the arm in a browser, and sends what the user asks.
 
     It subscribes to slow copies of the streams, and shows 20 times a second what has come last, so
     that neither its cost nor that of the control grows with the rate of the robot. It publishes
@@ -182,16 +180,11 @@ class ViewerNode(ArmNode):
         self._before: tuple[int, Array] | None = None  # stamp, ns, and speeds in the last picture
         self._acceleration = self._unknown
         self._goal: pin.SE3 | None = None
-        self._pushes: dict[str, Array] = {}
-        self._measured_force: Array | None = None
         self._status: dict[str, tuple[str, dict[str, str]]] = {}
         self._commands = PageCommands(self, config.base_frame)
         SLOW_JOINT_STATES.subscription(self, self._on_state)
         SLOW_ACCELERATION_LIMITS.subscription(self, self._on_limits)
-        if config.ft_frame:
-            FT_WRENCH.subscription(self, self._on_wrench)
         DIAGNOSTICS.subscription(self, self._on_diagnostics)
-        EXTERNAL_WRENCH.subscription(self, self._on_push)
         self.create_subscription(PoseStamped, "target_pose", self._on_goal, GOAL_QOS)
         self.get_logger().info(f"page at {self.page.address}")
 
@@ -218,9 +211,7 @@ class ViewerNode(ArmNode):
             self._mean_acceleration(),
             *self._limits,
         )
-        self.page.show(
-            Picture(joints, self._goal, self._pushes, self._measured_force, self._status_text())
-        )
+        self.page.show(Picture(joints, self._goal, self._status_text()))
 
     def _mean_acceleration(self) -> Array:
         """Return the change of the speeds since the last picture by robot time, rad/s^2."""
@@ -259,16 +250,6 @@ class ViewerNode(ArmNode):
         if len(limits) == 2 and all(each.shape == self._unknown.shape for each in limits):
             self._limits = limits[0], limits[1]
 
-    def _on_wrench(self, message: WrenchStamped) -> None:
-        self._measured_force = _force(message)
-
-    def _on_push(self, message: WrenchStamped) -> None:
-        force = _force(message)
-        if np.isfinite(force).all() and force.any():
-            self._pushes[message.header.frame_id] = force
-        else:
-            self._pushes.pop(message.header.frame_id, None)
-
     def _on_goal(self, message: PoseStamped) -> None:
         self._goal = _pose(message)
 
@@ -279,11 +260,6 @@ class ViewerNode(ArmNode):
             self._status[name] = status.message, values
             if name == "bullet_node" and self._commands is not None:
                 self._commands.robot_paused = values.get("paused") == "True"
-
-
-def _force(message: WrenchStamped) -> Array:
-    f = message.wrench.force
-    return np.array([f.x, f.y, f.z])
 
 
 def _pose(message: PoseStamped) -> pin.SE3 | None:
@@ -299,9 +275,9 @@ def _pose(message: PoseStamped) -> pin.SE3 | None:
 
 def _make_page(config: ViewerConfiguration, urdf: str) -> Page:
     model = load_model(config, urdf)
-    frames = config.base_frame, config.end_effectors[0], config.ft_frame
-    for name, frame in zip(("base_frame", "end_effector_frame", "ft_frame"), frames, strict=True):
-        if frame and not model.existFrame(frame):
+    frames = config.base_frame, config.end_effectors[0]
+    for name, frame in zip(("base_frame", "end_effector_frame"), frames, strict=True):
+        if not model.existFrame(frame):
             raise SettingError(name, frame, "a frame of the URDF")
     try:
         shapes = visual_shapes(urdf, model, config.locked)

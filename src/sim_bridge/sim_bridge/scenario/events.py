@@ -12,6 +12,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from sim_bridge.bullet.obstacles import Obstacle, ObstacleError
+from sim_bridge.payload import PayloadError, payload_inertia
 from sim_bridge.scenario.fields import (
     Check,
     ScenarioError,
@@ -25,7 +26,6 @@ from sim_bridge.scenario.fields import (
     refuse,
     vector,
 )
-from sim_bridge.urdf import PayloadError, payload_inertia
 from viability_bounds_pkg.exceptions import did_you_mean
 from viability_bounds_pkg.parameter_files import NODES, unknown_parameters
 from viability_bounds_pkg.pose_trajectory import (

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Sequence
 from html import escape
 from typing import NamedTuple
@@ -24,8 +23,6 @@ COLUMNS = 2
 _PLANE = 8.0, 18.0, 156.0, 76.0  # left, top, width, height
 _BARS = 104.0, 118.0  # top of the bars of torque and acceleration
 _BAR_HEIGHT = 8.0
-_TRAIL = 40
-"""Positions that are drawn behind the present one."""
 _WINDOW = math.pi
 """Half the width of the plane of a joint without position limits, rad."""
 _NEAR = 1e-3
@@ -91,11 +88,10 @@ class JointPictures:
 
     def __init__(self, joints: Sequence[str], limits: JointLimits, tau_max: Array) -> None:
         self._joints, self._limits, self._tau_max = tuple(joints), limits, tau_max
-        self._trails = [deque[tuple[float, float]](maxlen=_TRAIL) for _ in joints]
         self._kernels = [_kernel(limits, k) for k in range(len(joints))]
 
     def draw(self, values: JointValues) -> str:
-        """Return the picture of all joints as one SVG element; a trail follows each state."""
+        """Return the picture of all joints as one SVG element."""
         shares = usage(values, self._limits, self._tau_max)
         rows = -(-len(self._joints) // COLUMNS)
         parts = [
@@ -130,7 +126,6 @@ class JointPictures:
 
         box = [(low, v_max), (high, v_max), (high, -v_max), (low, -v_max)]
         kernel = self._kernels[k]
-        self._trails[k].append((q, v))
         across, down = place(q, v)
         name = escape(self._joints[k])
         distance = min(q - float(limits.q_min[k]), float(limits.q_max[k]) - q)
@@ -142,7 +137,6 @@ class JointPictures:
             f'<polygon points="{points(box)}" fill="#f4f4f4" stroke="#888"/>',
             f'<polygon points="{points(kernel if kernel is not None else box)}" fill="#cfe3f5" '
             'stroke="#3b76af" stroke-width="0.8"/>',
-            f'<polyline points="{points(self._trails[k])}" fill="none" stroke="#777"/>',
             f'<circle cx="{across:.1f}" cy="{down:.1f}" r="3.6" fill="{fill}" stroke="#222"/>',
             *self._bar(_BARS[0], "τ", float(self._tau_max[k]), float(values.tau[k])),
             *self._bar(

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import redirect_stdout
 from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple
@@ -21,11 +21,8 @@ from viability_bounds_pkg.joint_limits import JointLimits
 Array = NDArray[np.float64]
 
 _BASE_COLOUR = (150, 150, 155)
-_PUSH_COLOUR, _MEASURED_COLOUR = (220, 60, 40), (40, 90, 200)
 _PUSH_STIFFNESS = 200.0
 """Force of a push by how far its handle is dragged, N/m."""
-_ARROW_LENGTH = 0.01
-"""m/N."""
 
 
 class GoalAsked(NamedTuple):
@@ -58,10 +55,6 @@ class Picture(NamedTuple):
     joints: JointValues
     goal: pin.SE3 | None
     """Pose goal in the base frame; None if there is none."""
-    pushes: Mapping[str, Array]
-    """Forces on links, N in world axes, by link."""
-    measured_force: Array | None
-    """Of the wrist's sensor, N in its axes; None if there is none."""
     text: str
     """State in words, Markdown."""
 
@@ -75,7 +68,7 @@ class Page:
         shapes: visual geometry of the arm.
         limits: of the n joints.
         tau_max: torque limits, shape (n,), N m.
-        frames: names of the base, of the hand and of the force sensor; the latter may be empty.
+        frames: names of the base and of the hand.
 
     Attributes:
         address: of the page.
@@ -88,14 +81,13 @@ class Page:
         shapes: Sequence[VisualShape],
         limits: JointLimits,
         tau_max: Array,
-        frames: tuple[str, str, str],
+        frames: tuple[str, str],
     ) -> None:
         self._model, self._data = model, model.createData()
         self._limits, self._tau_max = limits, tau_max
         # Of the last picture, whole at any time: the threads of the server read them, too.
         self._base_pose, self._push_origin = pin.SE3.Identity(), np.zeros(3)
-        self._base, self._hand = (model.getFrameId(name) for name in frames[:2])
-        self._sensor = model.getFrameId(frames[2]) if frames[2] else None
+        self._base, self._hand = (model.getFrameId(name) for name in frames)
         self._requests: SimpleQueue[Request] = SimpleQueue()
         self._pictures = JointPictures(limits.names, limits, tau_max)
         self._driving = self._dragging = self._pushing = self._camera_placed = False
@@ -142,7 +134,7 @@ class Page:
                     if tuple(mesh.color) != tone:
                         mesh.color = tone
             self._show_goal(picture.goal)
-            self._show_forces(picture)
+            self._show_handle()
             self._joint_pictures.content = self._pictures.draw(picture.joints)
             self.show_text(picture.text)
 
@@ -176,7 +168,6 @@ class Page:
             )
             if at:
                 self._bodies[at][1].append(mesh)
-        self._arrows: dict[str, viser.ArrowsHandle] = {}
         self._goal = scene.add_transform_controls("/goal", scale=0.25, visible=False)
         self._handle = scene.add_transform_controls(
             "/push", scale=0.18, disable_rotations=True, visible=False
@@ -203,35 +194,11 @@ class Page:
             hand = self._data.oMf[self._hand]
             _place(self._goal, hand if goal is None else self._base_pose * goal)
 
-    def _show_forces(self, picture: Picture) -> None:
+    def _show_handle(self) -> None:
+        """Move the handle of pushes to its link, unless the user drags it."""
         self._handle.visible = self._driving and bool(self._link.value)
         if not self._pushing:
             self._handle.position = np.array(self._push_origin)
-        frames, model = self._data.oMf, self._model
-        forces = {
-            f"push {link}": (frames[model.getFrameId(link)].translation, force, _PUSH_COLOUR)
-            for link, force in picture.pushes.items()
-            if model.existFrame(link)
-        }
-        if picture.measured_force is not None and self._sensor is not None:
-            sensor = frames[self._sensor]
-            force = sensor.rotation @ picture.measured_force
-            forces["measured"] = sensor.translation, force, _MEASURED_COLOUR
-        for name in self._arrows.keys() - forces.keys():
-            self._arrows.pop(name).remove()
-        for name, (start, force, tone) in forces.items():
-            ends = np.array([[start, start + _ARROW_LENGTH * force]], dtype=np.float32)
-            if name in self._arrows:
-                self._arrows[name].points = ends
-                continue
-            self._arrows[name] = self._server.scene.add_arrows(
-                f"/forces/{name}",
-                ends,
-                colors=tone,
-                shaft_radius=0.008,
-                head_radius=0.02,
-                head_length=0.04,
-            )
 
     # The panel
 

@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a robot is made of and told: joints, URDFs, visuals, arguments."""
+"""What a robot is made of and told: joints, URDFs, arguments."""
 
 from contextlib import closing
-from xml.etree import ElementTree
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from bullet_pairs import (
     CASES,
@@ -17,7 +15,6 @@ from bullet_pairs import (
 )
 
 from sim_bridge.bullet.robot import BulletRobot
-from sim_bridge.urdf import prepare_urdf
 from viability_bounds_pkg.robot.description import (
     RobotDescriptionError,
     read_urdf,
@@ -40,36 +37,12 @@ def test_joints_may_come_in_any_order():
         np.testing.assert_array_equal(permuted, straight[order])
 
 
-def test_visuals_are_kept_only_when_wanted():
-    for visuals in (False, True):
-        text = prepare_urdf(read_urdf(PANDA), PANDA_ARM, visuals=visuals).text
-        assert text.count(".dae") == (11 if visuals else 0)
-
-
-def test_visuals_move_with_the_links_they_were_fused_to():
-    urdf = single_joint().replace(
-        "</robot>",
-        """<link name="tool"><visual><origin xyz="0 0 0.5" rpy="0 0 0.5"/>
-        <geometry><box size="1 1 1"/></geometry></visual></link>
-        <joint name="mount" type="fixed"><parent link="arm"/><child link="tool"/>
-        <origin xyz="1 0 0" rpy="1.5707963267948966 0 0"/></joint></robot>""",
-    )
-    root = ElementTree.fromstring(prepare_urdf(urdf, ["joint"], visuals=True).text)
-    origin = root.find("./link[@name='arm']/visual/origin")
-    xyz = [float(x) for x in origin.get("xyz").split()]
-    np.testing.assert_allclose(xyz, [1.0, -0.5, 0.0], atol=1e-12)
-    rpy = [float(x) for x in origin.get("rpy").split()]
-    expected = pin.rpy.rpyToMatrix(np.pi / 2, 0.0, 0.0) @ pin.rpy.rpyToMatrix(0.0, 0.0, 0.5)
-    np.testing.assert_allclose(pin.rpy.rpyToMatrix(*rpy), expected, atol=1e-12)
-    assert not list(ElementTree.fromstring(prepare_urdf(urdf, ["joint"]).text).iter("visual"))
-
-
 @pytest.mark.parametrize(
     ("joints", "locked", "match"),
     [
         (["nonsense"], {}, "unknown joint 'nonsense'.*panda_joint1"),
         (PANDA_ARM, {"nonsense": 0.0}, "unknown joint 'nonsense'"),
-        (["panda_joint8"], {}, "'panda_joint8' is fixed"),
+        (["panda_joint8"], {}, "unknown joint 'panda_joint8'"),
         (["panda_joint1", "panda_joint1"], {}, "once each"),
         ([], {}, "once each"),
         (PANDA_ARM, {"panda_joint2": 0.1}, "both moved and locked"),
@@ -85,25 +58,16 @@ def test_bad_joints_are_refused(joints, locked, match):
     ("urdf", "match"),
     [
         ("<robot", "not well-formed"),
-        (single_joint().replace('parent link="base"', 'parent link="bas"'), "no parent link"),
-        (single_joint().replace("</robot>", '<link name="lost"/></robot>'), "one tree"),
+        (single_joint().replace('parent link="base"', 'parent link="bas"'), "does not load"),
+        (single_joint().replace("</robot>", '<link name="lost"/></robot>'), "does not load"),
         (single_joint().replace('xyz="0 0 1"', 'xyz="0 0 0"'), "without a direction"),
-        (single_joint().replace('xyz="0 0 1"', 'xyz="0 1"'), "3 finite number"),
-        (single_joint().replace('value="0.5"', 'value="heavy"'), "1 finite number"),
+        (single_joint().replace('xyz="0 0 1"', 'xyz="0 1"'), "does not load"),
         (single_joint().replace('ixx="0.5"', 'ixx="-0.5"'), "link 'arm'.*positive"),
     ],
 )
 def test_bad_urdfs_are_refused(urdf, match):
     with pytest.raises(RobotDescriptionError, match=match):
         BulletRobot(urdf, ["joint"], physics_dt=PHYSICS_DT)
-
-
-def test_missing_mesh_is_refused_only_when_visuals_are_wanted():
-    mesh = '<visual><geometry><mesh filename="package://no/such.stl"/></geometry></visual></link>'
-    urdf = single_joint().replace("</link>", mesh)
-    prepare_urdf(urdf, ["joint"])
-    with pytest.raises(RobotDescriptionError, match=r"such\.stl"):
-        prepare_urdf(urdf, ["joint"], visuals=True)
 
 
 def test_bad_arguments_are_refused():

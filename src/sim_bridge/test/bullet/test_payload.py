@@ -8,7 +8,7 @@ import pytest
 from sim_bridge.bullet.friction import JointFriction
 from sim_bridge.bullet.obstacles import Obstacle
 from sim_bridge.bullet.robot import BulletRobot
-from sim_bridge.urdf import PayloadError, payload_inertia
+from sim_bridge.payload import PayloadError, payload_inertia
 from viability_bounds_pkg.robot.description import (
     RobotDescriptionError,
     build_model,

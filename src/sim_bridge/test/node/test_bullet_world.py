@@ -13,7 +13,7 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
 from sim_bridge.node.topics import EXTERNAL_WRENCH, OBSTACLES
-from sim_bridge.urdf import payload_inertia
+from sim_bridge.payload import payload_inertia
 from viability_bounds_pkg.robot.description import build_model, inertia_beyond, read_urdf
 from viability_bounds_pkg.ros.runtime import (
     CONTROL_QOS,

@@ -109,6 +109,8 @@ class Pair:
 
 
 def single_joint(kind="revolute", extra="", inertia=0.5):
+    if "limit" not in extra:
+        extra += '<limit effort="0" velocity="0"/>'
     # Mass and inertia are equal in number, so that torque and force accelerate alike.
     return f"""
     <robot name="single"><link name="base"/>

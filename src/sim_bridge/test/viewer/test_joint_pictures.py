@@ -75,11 +75,3 @@ def test_the_state_on_the_border_is_drawn_on_the_border():
     assert float(dot.get("cy")) == pytest.approx(min(ups))
     width = [float(point.split(",")[0]) for point in kernel.get("points").split()]
     assert float(dot.get("cx")) == pytest.approx(0.5 * (min(width) + max(width)), abs=0.1)
-
-
-def test_a_trail_follows_the_state():
-    pictures = JointPictures(LIMITS.names, LIMITS, TAU_MAX)
-    for k in range(100):
-        picture = pictures.draw(values(q=(0.01 * k, 0.0, 0.0)))
-    trail = next(ElementTree.fromstring(picture).iter(f"{SVG}polyline"))
-    assert len(trail.get("points").split()) == 40

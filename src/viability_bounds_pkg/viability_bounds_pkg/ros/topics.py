@@ -139,7 +139,7 @@ FT_WRENCH = Topic(
     WrenchStamped,
     CONTROL_QOS,
     ("bullet_node",),
-    ("controller_node", "scenario_node", "viewer_node"),
+    ("controller_node", "scenario_node"),
     "what the wrist's sensor measures, tool and bias included, in the axes of `ft_frame`, N and "
     "N m; positive is what acts on the arm; only where `ft_frame` is set",
 )

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from xml.etree.ElementTree import fromstring, tostring
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from sim_bridge.bullet.client import BulletClient, finite_vector, pybullet, silenced
 from sim_bridge.bullet.obstacles import Obstacle
 from sim_bridge.bullet.robot import BulletRobot
-from sim_bridge.urdf import prepare_urdf
+from viability_bounds_pkg.robot.description import resolve_uri
 
 _OVERSAMPLING = 2  # PyBullet's renderer does not smooth edges
 _NEAR, _FAR = 0.05, 20.0  # m
@@ -51,12 +52,14 @@ class Camera:
         colors: Mapping[str, Sequence[float]] | None = None,
     ) -> None:
         self._robot, self._colors = robot, dict(colors or {})
-        prepared = prepare_urdf(*robot.description, visuals=True)
+        urdf, _, _ = robot.description
         self._bullet = bullet = BulletClient()
         with silenced(1), silenced(2):
-            self._body = body = bullet.load_urdf(prepared.text)
+            self._body = body = bullet.load_urdf(_visuals_of(urdf))
         indices = {info.name: info.id for info in bullet.joint_infos(body)}
         self._joints = [indices[name] for name in robot.joints]
+        for name, position in robot.locked.items():
+            bullet.resetJointState(body, indices[name], position)
         for shape in bullet.getVisualShapeData(body):
             # Mirrored meshes would be seen from inside.
             bullet.changeVisualShape(body, shape[1], flags=pybullet.VISUAL_SHAPE_DOUBLE_SIDED)
@@ -127,3 +130,14 @@ class Camera:
     def close(self) -> None:
         """Disconnect from PyBullet; the camera cannot be used afterwards."""
         self._bullet.disconnect()
+
+
+def _visuals_of(urdf: str) -> str:
+    """Return a URDF with the paths of its visual meshes, without collision shapes."""
+    root = fromstring(urdf)
+    for link in root.iter("link"):
+        for shape in link.findall("collision"):
+            link.remove(shape)
+        for mesh in link.iter("mesh"):
+            mesh.set("filename", str(resolve_uri(mesh.get("filename", "")).resolve()))
+    return tostring(root, encoding="unicode")
