@@ -108,7 +108,7 @@ class DirectLoop:
 
     def change_friction(self, **settings: Any) -> None:
         """Change settings of the friction compensation, also those that are no parameters."""
-        friction = self.controller.find(Friction).compensation
+        friction = self.controller.find(Friction)
         friction.settings = replace(friction.settings, **settings)
 
     @property

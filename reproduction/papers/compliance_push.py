@@ -89,7 +89,7 @@ def weakest_direction(loop: DirectLoop, link: str) -> tuple[np.ndarray, float]:
     null = np.linalg.svd(J)[2][6:].T
     directions = null @ np.random.default_rng(0).normal(size=(null.shape[1], 100_000))
     # The compensation's model is the friction as identified.
-    stiction = loop.controller.find(Friction).compensation.settings.model.static
+    stiction = loop.controller.find(Friction).settings.model.static
     motion = J_link[:3] @ directions / (np.abs(directions).T @ stiction)
     sizes = np.linalg.norm(motion, axis=0)
     best = sizes.argmax()

@@ -70,7 +70,7 @@ def test_the_file_has_what_is_identified(found):
 def loop(integral, share) -> DirectLoop:
     """TALOS that believes in `share` of its friction and compensates that; 0: off."""
     made = DirectLoop(ROBOT, {"integral_action": integral})
-    model = made.controller.find(Friction).compensation.settings.model
+    model = made.controller.find(Friction).settings.model
     believed = {f"friction_model_{name}": share * getattr(model, name) for name in MODEL}
     if share:
         made.change(friction_compensation=1.0, **believed)

@@ -60,7 +60,7 @@ def steps(made, count, q=ARM.q_start, v=V):
 def test_both_are_added_and_the_integral_s_budget_is_its_own():
     made = controller(mode="joints")
     step = steps(made, 3000)
-    integral, friction = made.find(Integral).action, made.find(Friction).compensation
+    integral, friction = made.find(Integral).action, made.find(Friction)
     both = step.tau - made.robot.torque(step.a)
     np.testing.assert_allclose(both, integral.last + friction.last, atol=1e-9)
     assert integral.saturated.any()
@@ -75,7 +75,7 @@ def test_without_integral_action_there_is_friction_only():
     assert not made.find(Integral).action.last.any()
     without = controller(friction=OFF)
     steps(without, 2000)
-    assert without.find(Friction).compensation.idle
+    assert without.find(Friction).idle
     full = WANTED * np.minimum(MODEL.level(V), ON.budget)
     added = tau - steps(without, 1).tau
     np.testing.assert_allclose(added[FIRM], full[FIRM], rtol=1e-2)
@@ -94,7 +94,7 @@ def test_the_qp_keeps_the_sum_within_the_torque_limits(share):
         step = made.step(State(q, v), AccelerationRange(-WIDE, WIDE))
         assert (np.abs(step.tau) <= ARM.tau_max).all()
         assert not step.failure
-        wanted = made.robot.torque(step.a) + made.find(Friction).compensation.last
+        wanted = made.robot.torque(step.a) + made.find(Friction).last
         np.testing.assert_allclose(step.tau, wanted, atol=0.02 * ARM.tau_max.max())
         at_limit += (np.abs(step.tau) > 0.98 * ARM.tau_max).any()
     assert at_limit > 20
@@ -107,27 +107,27 @@ def test_the_handover_goes_on_from_the_drives_torque_and_friction_fades_in():
     made.robot.update(State(q, rest), rest)
     tau = made.robot.h + 0.04 * ARM.tau_max
     made.resume(State(q, V), AccelerationRange(-WIDE, WIDE), tau)
-    np.testing.assert_array_equal(made.find(Friction).compensation.last, 0.0)
+    np.testing.assert_array_equal(made.find(Friction).last, 0.0)
     first = made.step(State(q, V), AccelerationRange(-WIDE, WIDE))
-    friction = made.find(Friction).compensation.last
+    friction = made.find(Friction).last
     assert (np.abs(friction) <= 1.01 * DT / 0.2 * MODEL.level(V)).all()
     assert np.abs((first.tau - tau) / ARM.tau_max).max() < 0.01
     steps(made, 2000)
     full = WANTED * MODEL.level(V)
-    np.testing.assert_allclose(made.find(Friction).compensation.last[FIRM], full[FIRM], rtol=1e-2)
+    np.testing.assert_allclose(made.find(Friction).last[FIRM], full[FIRM], rtol=1e-2)
 
 
 def test_what_comes_after_a_gap_or_a_jump_does_not_kick():
     made = controller(mode="joints")
     before = steps(made, 500)
     for elapsed in (0.4, 0.0, -1.0, math.nan):
-        w = made.find(Friction).compensation.reference_velocity.copy()
+        w = made.find(Friction).reference_velocity.copy()
         tau = made.step(State(ARM.q_start, V), AccelerationRange(-WIDE, WIDE), None, elapsed).tau
-        np.testing.assert_array_equal(made.find(Friction).compensation.reference_velocity, w)
+        np.testing.assert_array_equal(made.find(Friction).reference_velocity, w)
         assert np.abs((tau - before.tau) / ARM.tau_max).max() < 2e-3
     # A glitch of the sensor, by which friction would be more than the budget.
     made.step(State(ARM.q_start, V + 200.0), AccelerationRange(-WIDE, WIDE))
-    assert (np.abs(made.find(Friction).compensation.last) <= ON.budget).all()
+    assert (np.abs(made.find(Friction).last) <= ON.budget).all()
 
 
 # Parameters

@@ -16,7 +16,7 @@ from torque_safety_controller.friction.settings import (
     FrictionSettings,
     no_friction,
 )
-from torque_safety_controller.parts.friction import FrictionCompensation
+from torque_safety_controller.parts.friction import Friction
 from viability_bounds_pkg.exceptions import SettingError
 
 DT = 1e-3
@@ -28,9 +28,9 @@ FULL = FrictionSettings(MODEL, WIDE, scale=1.0)
 M2 = np.array([[0.8, 0.2], [0.2, 0.3]])
 
 
-def started(settings=FULL, v=(0.0, 0.0)) -> FrictionCompensation:
+def started(settings=FULL, v=(0.0, 0.0)) -> Friction:
     """A compensation that has faded in, and has no memory yet."""
-    compensation = FrictionCompensation(settings)
+    compensation = Friction(settings)
     compensation.reset()
     for _ in range(60):
         compensation.torque(M2, np.array(v), np.zeros(2), 0.1, DT)
@@ -124,7 +124,7 @@ def test_a_time_that_is_not_known_moves_nothing():
 
 
 def test_off_it_adds_nothing_and_is_idle():
-    compensation = FrictionCompensation(replace(FULL, scale=0.0))
+    compensation = Friction(replace(FULL, scale=0.0))
     assert compensation.idle
     tau = compensation.torque(M2, np.ones(2), np.ones(2), DT, DT)
     np.testing.assert_array_equal(tau, 0.0)
@@ -132,7 +132,7 @@ def test_off_it_adds_nothing_and_is_idle():
 
 def test_switching_and_new_coefficients_fade():
     v, a = np.array([0.5, -0.4]), np.array([2.0, -1.0])
-    compensation = FrictionCompensation(replace(FULL, scale=0.0))
+    compensation = Friction(replace(FULL, scale=0.0))
     other = FrictionModel([15.0, 0.2], [15.0, 0.2], [0.0, 3.0], [0.05, 0.002])
     taus = [compensation.torque(M2, v, a, DT, DT).copy()]
     for settings_ in (
@@ -217,7 +217,7 @@ def times(model, share):
 def joint(share, theta=3.0, **others) -> FrictionJoint:
     """A joint that is believed to have `share` of its friction."""
     model = times(TRUTH, share)
-    compensation = FrictionCompensation(FrictionSettings(model, 1e3 * ONE, 1.0, theta))
+    compensation = Friction(FrictionSettings(model, 1e3 * ONE, 1.0, theta))
     held = FrictionJoint(compensation, TRUTH, **others)
     for _ in range(2000):  # fades in
         compensation.torque(held.m * np.eye(1), np.zeros(1), np.zeros(1), DT, DT)

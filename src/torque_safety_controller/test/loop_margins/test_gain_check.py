@@ -131,7 +131,7 @@ def test_disturbances_are_not_estimated_faster_than_predicted_commands_act():
     assert late.exceeded
     assert (late.value, late.limit) == (0.003, pytest.approx(0.005))
     for time, within in ((late.limit, True), (0.5 * late.limit, False)):
-        observer = DisturbanceObserver(1, time)
+        observer = Disturbance(1, time)
         v = np.zeros(1)
         for change in (wanted * 1e-3, wanted * 1e-3 + delay * (acted - wanted) * 1e-3):
             mass, most = np.eye(1), np.full(1, 1e3)

@@ -12,7 +12,7 @@ import pytest
 from sim_bridge.node.bullet_parameters import BulletConfiguration, make_robot
 from torque_safety_controller.node.assembly import make_controller
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.parts.disturbance import DisturbanceObserver
+from torque_safety_controller.parts.disturbance import Disturbance
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.tools.gain_limits import TORQUE_STEP
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, make_bounds
@@ -104,7 +104,7 @@ def test_late_commands_make_a_limit_cycle_of_the_file_s_gains(monkeypatch, chang
 
     In the loop of the linear analysis, changes of the integral torque count when they are seen.
     """
-    monkeypatch.setattr(DisturbanceObserver, "expect", lambda *given: None)
+    monkeypatch.setattr(Disturbance, "expect", lambda *given: None)
     assert low <= largest_step("talos_left_arm", 8, 1.5, delay=2, **changed) < high
 
 

@@ -185,7 +185,7 @@ def test_while_the_motors_give_other_torques_the_arm_is_slowed(ros, capfd):
 def test_what_was_learned_until_the_motors_were_told_is_forgotten(ros):
     motors = Motors(ros, disturbance_time=1e-6)
     motors.answer(150)  # states of an arm that does not move
-    observer = motors.chain.node._controller.find(Disturbance)._observer
+    observer = motors.chain.node._controller.find(Disturbance)
     learned = observer.estimate.copy()
     assert np.abs(learned).max() > 0.5
     others = -motors.tau
@@ -355,7 +355,7 @@ def test_what_was_learned_of_disturbances_is_forgotten_after_a_row_that_is_too_l
     """After a reset a wrist that had been driven wild was driven at 10 rad/s: found by fuzzing."""
     chain = NodeChain(ros, disturbance_time=0.02)
     stamp = give_goal(chain)
-    observer = chain.node._controller.find(Disturbance)._observer
+    observer = chain.node._controller.find(Disturbance)
     observer.estimate[:] = 5.0
     chain.answer(stamp + 5)
     assert observer.estimate.any()

@@ -7,7 +7,7 @@ from arms import load_arm
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torque_safety_controller.parts.disturbance import DisturbanceObserver
+from torque_safety_controller.parts.disturbance import Disturbance
 from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.step import Step
 from torque_safety_controller.supervisor import Order
@@ -34,7 +34,7 @@ def ride(time_constant, disturbance, noise=0.0, seed=0):
     """
     limits = JointLimits(["joint"], [-1.0], [1.0], [1.0], [-20.0], [20.0])
     solver = BoundsSolver(limits, 2 * DT, period=DT)
-    observer = DisturbanceObserver(1, time_constant or 0.0)
+    observer = Disturbance(1, time_constant or 0.0)
     rng = np.random.default_rng(seed)
     q, v, a = np.array([-0.9]), np.zeros(1), np.zeros(1)
     beyond = [-math.inf, -math.inf]
@@ -67,7 +67,7 @@ def test_a_lasting_push_towards_the_limit_does_not_carry_the_joint_beyond():
 
 def test_friction_does_not_widen_the_bounds():
     """It brakes; when it is gone, as at a reversal, nothing had relied on it."""
-    observer = DisturbanceObserver(1, 0.0)
+    observer = Disturbance(1, 0.0)
     lower, upper = np.array([-5.0]), np.array([3.0])
     v, a = np.zeros(1), np.array([3.0])
     observer.observe(v, a, DT, LARGEST, np.eye(1))
@@ -87,7 +87,7 @@ NUMBERS = st.floats(allow_nan=True, allow_infinity=True)
 
 @given(st.lists(NUMBERS, min_size=3, max_size=3), st.lists(NUMBERS, min_size=3, max_size=3))
 def test_bounds_stay_bounds(v, a):
-    observer = DisturbanceObserver(3, 0.002)
+    observer = Disturbance(3, 0.002)
     largest = np.full(3, 30.0)
     lower, upper = np.array([-5.0, 2.0, 0.0]), np.array([5.0, 2.0, 1e-12])
     with np.errstate(all="ignore"):
@@ -99,14 +99,16 @@ def test_bounds_stay_bounds(v, a):
 
 
 def test_it_keeps_what_it_knows_over_a_time_it_does_not_know():
-    observer = DisturbanceObserver(1, 0.0)
+    failed = Step(load_arm("panda").robot(), None, Order(), DT, LARGEST, np.zeros(7), 20.0)
+    failed.failure = "no solution"
+    observer = Disturbance(1, 0.0)
     for v in (0.0, 1.0):
         observer.observe(np.array([v]), np.zeros(1), 0.1, LARGEST, np.eye(1))
     assert observer.estimate == pytest.approx(10.0)
     for elapsed in (0.0, -1.0, math.nan):
         observer.observe(np.array([5.0]), np.zeros(1), elapsed, LARGEST, np.eye(1))
     assert observer.estimate == pytest.approx(10.0)
-    observer.pause()
+    observer.learn(failed)
     observer.observe(np.array([9.0]), np.zeros(1), 0.1, LARGEST, np.eye(1))
     assert observer.estimate == pytest.approx(10.0)
     observer.observe(np.array([9.3]), np.zeros(1), 0.1, LARGEST, np.eye(1))
@@ -119,7 +121,7 @@ def test_it_keeps_what_it_knows_over_a_time_it_does_not_know():
 def test_a_change_of_the_additional_torque_counts_before_it_is_seen():
     """With it in time the bounds of the true acceleration are kept in the very step."""
     M = np.array([[2.0, 0.9], [0.9, 0.5]])
-    observer = DisturbanceObserver(2, 0.003)
+    observer = Disturbance(2, 0.003)
     change = np.array([0.2, -0.1])
     observer.expect(change, np.full(2, 1e3), M)
     d = np.linalg.inv(M) @ change

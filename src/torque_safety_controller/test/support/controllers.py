@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.integral_feedback import IntegralSettings
 from torque_safety_controller.parts.disturbance import Disturbance
-from torque_safety_controller.parts.friction import Friction, FrictionCompensation
+from torque_safety_controller.parts.friction import Friction
 from torque_safety_controller.parts.goals import Goals
 from torque_safety_controller.parts.integral import FadingTorque, Integral, make_integral
 from torque_safety_controller.parts.joint_bounds import JointBounds
@@ -64,7 +64,7 @@ def make(
     if integral is not None:
         parts.append(Integral(integral, robot))
     if friction is not None:
-        parts.append(Friction(FrictionCompensation(friction)))
+        parts.append(Friction(friction))
     if gains.disturbance_time:
         parts.append(Disturbance(robot.n, gains.disturbance_time))
     return Controller(

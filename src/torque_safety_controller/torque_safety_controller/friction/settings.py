@@ -78,7 +78,7 @@ def no_friction(n: int) -> FrictionModel:
 
 @dataclass(frozen=True, eq=False)
 class FrictionSettings:
-    """Settings of `parts.friction.FrictionCompensation`.
+    """Settings of `parts.friction.Friction`.
 
     Attributes:
         model: of the joints' friction.

@@ -19,7 +19,7 @@ from torque_safety_controller.parts.contact.contacts import FrictionContact
 from torque_safety_controller.parts.contact.interaction import Interaction
 from torque_safety_controller.parts.contact.wrench_sensor import WrenchSensor
 from torque_safety_controller.parts.disturbance import Disturbance
-from torque_safety_controller.parts.friction import Friction, FrictionCompensation
+from torque_safety_controller.parts.friction import Friction
 from torque_safety_controller.parts.goals import Goals
 from torque_safety_controller.parts.integral import Integral, make_integral
 from torque_safety_controller.parts.joint_bounds import JointBounds
@@ -108,7 +108,7 @@ def make_parts(
         goals,
         # What is added to the model's torque leaves less of it to the QP and to plans.
         make_integral_part(config, robot),
-        Friction(FrictionCompensation(config.friction_settings)),
+        Friction(config.friction_settings),
         # A change of that torque disturbs before it can be measured.
         make_disturbance(config),
         # All before can run while the limits are on their way; all after narrows their bounds.

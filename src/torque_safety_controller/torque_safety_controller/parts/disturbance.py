@@ -31,8 +31,8 @@ from torque_safety_controller.step import Part, Step
 Array = NDArray[np.float64]
 
 
-class DisturbanceObserver:
-    """Filtered difference between measured and commanded accelerations.
+class Disturbance(Part):
+    """Tells later parts and the QP what disturbs the arm.
 
     Args:
         n: number of joints.
@@ -43,17 +43,28 @@ class DisturbanceObserver:
     """
 
     def __init__(self, n: int, time_constant: float) -> None:
-        self._time_constant, self._n = time_constant, n
+        self._time_constant, self._zero = time_constant, np.zeros(n)
         self.reset()
 
-    def reset(self) -> None:
-        """Forget the past."""
-        self.estimate = np.zeros(self._n)
-        self.pause()
-
-    def pause(self) -> None:
-        """Keep the estimate, and learn nothing from the time until the next step."""
+    def reset(self, robot: RobotModel | None = None) -> None:
+        """See `Part.reset`."""
+        self.estimate = self._zero
         self._v_last: Array | None = None
+
+    def prepare(self, step: Step) -> None:
+        """Estimate the disturbance by the step that has passed, and by what this one adds."""
+        robot = step.robot
+        if step.order.forget_disturbance:
+            self.reset()
+        known = step.elapsed if step.learns else 0.0
+        self.observe(robot.v, step.a_last, known, step.tau_max, robot.M)
+        self.expect(step.integral_change, step.tau_max, robot.M)
+        step.disturbance = self.estimate
+
+    def learn(self, step: Step) -> None:
+        """Learn nothing from braking without a solution: motors may not give what it asks for."""
+        if step.failure:
+            self._v_last = None
 
     def observe(self, v: Array, a_last: Array, elapsed: float, tau_max: Array, M: Array) -> None:
         """Update the estimate with the step that has just passed.
@@ -71,9 +82,8 @@ class DisturbanceObserver:
         if elapsed > 0.0 and self._v_last is not None:
             time = self._time_constant
             gain = -math.expm1(-elapsed / time) if time > 0.0 else 1.0
-            self.estimate = _observe(
-                self.estimate, v, self._v_last, a_last, elapsed, gain, tau_max, M
-            )
+            change = (v - self._v_last) / elapsed - a_last
+            self.estimate = _updated(self.estimate, change, gain, self._zero, tau_max, M)
         self._v_last = v.copy()
 
     def expect(self, torque: Array, tau_max: Array, M: Array) -> None:
@@ -85,70 +95,29 @@ class DisturbanceObserver:
             tau_max: torque limits, shape (n,), N m.
             M: mass matrix, shape (n, n), kg m^2.
         """
-        if not (torque.any() and math.isfinite(torque.dot(torque))):
-            return
-        with suppress(ValueError):  # of NumPy's, where M is no mass matrix
-            self.estimate = _expect(self.estimate, torque, tau_max, M)
+        if torque.any() and math.isfinite(torque.dot(torque)):
+            with suppress(ValueError):  # of NumPy's, where M is no mass matrix
+                self.estimate = _updated(self.estimate, self._zero, 0.0, torque, tau_max, M)
 
 
-class Disturbance(Part):
-    """Tells later parts and the QP what disturbs the arm.
+@njit(cache=True)
+def _updated(
+    old: Array, observed: Array, gain: float, torque: Array, tau_max: Array, M: Array
+) -> Array:
+    """Return the estimate with what was observed and what a torque adds, within motors' limits.
 
     Args:
-        n: number of joints.
-        time_constant: of the filter, s, >= 0.
+        old: estimate, shape (n,), rad/s^2.
+        observed: difference of accelerations, shape (n,), rad/s^2; a NaN resets the estimate.
+        gain: share of it that the filter takes; 0 for nothing observed.
+        torque: what is added to that of the last step, shape (n,), N m.
+        tau_max: torque limits, shape (n,), N m.
+        M: mass matrix, shape (n, n), kg m^2.
     """
-
-    def __init__(self, n: int, time_constant: float) -> None:
-        self._observer = DisturbanceObserver(n, time_constant)
-
-    def reset(self, robot: RobotModel) -> None:
-        """See `Part.reset`."""
-        self._observer.reset()
-
-    def prepare(self, step: Step) -> None:
-        """Estimate the disturbance by the step that has passed, and by what this one adds."""
-        observer, robot = self._observer, step.robot
-        if step.order.forget_disturbance:
-            observer.reset()
-        known = step.elapsed if step.learns else 0.0
-        observer.observe(robot.v, step.a_last, known, step.tau_max, robot.M)
-        observer.expect(step.integral_change, step.tau_max, robot.M)
-        step.disturbance = observer.estimate
-
-    def learn(self, step: Step) -> None:
-        """Learn nothing from braking without a solution: motors may not give what it asks for."""
-        if step.failure:
-            self._observer.pause()
-
-
-@njit(cache=True)
-def _observe(
-    old: Array,
-    v: Array,
-    v_last: Array,
-    a_last: Array,
-    elapsed: float,
-    gain: float,
-    tau_max: Array,
-    M: Array,
-) -> Array:
-    """Return the estimate filtered with `gain`, within what motors can give."""
-    estimate = old.copy()
-    for j in range(v.size):
-        e = (v[j] - v_last[j]) / elapsed - a_last[j]
-        e = estimate[j] + gain * (e - estimate[j])
-        largest = tau_max[j] / M[j, j]
-        # A NaN resets the estimate.
-        estimate[j] = min(max(e, -largest), largest) if e == e and largest > 0.0 else 0.0
-    return estimate
-
-
-@njit(cache=True)
-def _expect(estimate: Array, torque: Array, tau_max: Array, M: Array) -> Array:
-    """Return the estimate with M^-1 torque added, within what motors can give."""
-    change: Array = estimate + np.linalg.solve(M, torque)
+    estimate = old + gain * (observed - old)
+    if torque.any():
+        estimate += np.linalg.solve(M, torque)
     for j in range(estimate.size):
-        largest = tau_max[j] / M[j, j]
-        change[j] = min(max(change[j], -largest), largest)
-    return change
+        e, most = estimate[j], tau_max[j] / M[j, j]
+        estimate[j] = min(max(e, -most), most) if e == e and most > 0.0 else 0.0
+    return estimate

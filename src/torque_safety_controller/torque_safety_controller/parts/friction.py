@@ -24,6 +24,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from torque_safety_controller.friction.settings import GAIN, FrictionSettings
+from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.settings import Settings
 from torque_safety_controller.step import Part, Step
@@ -34,8 +35,8 @@ _FADING_TIME = 0.2  # s; in which new coefficients take the place of old ones
 _NEGLIGIBLE = 1e-9  # N m
 
 
-class FrictionCompensation:
-    """Friction compensation of one arm.
+class Friction(Part):
+    """Adds the torque that compensates friction where a joint is wanted to go.
 
     Args:
         settings: may be replaced between steps: the torque does not jump.
@@ -66,13 +67,26 @@ class FrictionCompensation:
         """Whether nothing is compensated."""
         return self._faded and self._settings.scale == 0.0
 
-    def reset(self) -> None:
+    def configure(self, settings: Settings) -> None:
+        """See `Part.configure`."""
+        self.settings = settings.friction
+
+    def reset(self, robot: RobotModel | None = None) -> None:
         """Forget the past: the compensation begins with nothing and fades in."""
         # Of Coulomb, of stiction beyond it, viscous; Stribeck velocity and budget.
         self._used = self._wanted.copy()
         self._used[:3] = 0.0
         self._faded, self._started = True, False
         self.last = self.reference_velocity = np.zeros(self._wanted.shape[1])
+
+    def prepare(self, step: Step) -> None:
+        """Add the torque to that of the model."""
+        robot, known = step.robot, step.elapsed if step.learns else 0.0
+        step.torque = step.torque + self.torque(robot.M, robot.v, step.a_last, known, robot.dt)
+
+    def report(self) -> dict[str, Any]:
+        """See `Part.report`."""
+        return {"friction_torque_nm": self.last}
 
     def torque(self, M: Array, v: Array, a_last: Array, elapsed: float, period: float) -> Array:
         """Return the compensating torque of a control step, shape (n,), N m.
@@ -96,7 +110,7 @@ class FrictionCompensation:
             self.reference_velocity = v
             self._started = True
         settings = self._settings
-        rate = settings.leak_rate * elapsed
+        kept, held = leak_factors(settings.leak_rate, elapsed, paper_form=False)
         try:
             self.last, self.reference_velocity, left = _compensate(
                 self._used,
@@ -106,44 +120,14 @@ class FrictionCompensation:
                 M,
                 v,
                 a_last,
-                math.exp(-rate),
-                elapsed * (-math.expm1(-rate) / rate if rate > 0.0 else 1.0),
+                kept,
+                elapsed * held,
                 GAIN / period if settings.gain is None else settings.gain,
             )
             self._faded = left < _NEGLIGIBLE
         except np.linalg.LinAlgError:  # no mass matrix
             self.last = self.reference_velocity = np.zeros(v.size)
         return self.last
-
-
-class Friction(Part):
-    """Adds the torque that compensates friction where a joint is wanted to go.
-
-    Args:
-        compensation: finds it.
-    """
-
-    def __init__(self, compensation: FrictionCompensation) -> None:
-        self.compensation = compensation
-
-    def configure(self, settings: Settings) -> None:
-        """See `Part.configure`."""
-        self.compensation.settings = settings.friction
-
-    def reset(self, robot: RobotModel) -> None:
-        """See `Part.reset`."""
-        self.compensation.reset()
-
-    def prepare(self, step: Step) -> None:
-        """Add the torque to that of the model."""
-        robot, known = step.robot, step.elapsed if step.learns else 0.0
-        step.torque = step.torque + self.compensation.torque(
-            robot.M, robot.v, step.a_last, known, robot.dt
-        )
-
-    def report(self) -> dict[str, Any]:
-        """See `Part.report`."""
-        return {"friction_torque_nm": self.compensation.last}
 
 
 @njit(cache=True)

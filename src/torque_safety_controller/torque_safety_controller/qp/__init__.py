@@ -4,14 +4,12 @@
 from torque_safety_controller.qp.inverse_dynamics_qp import InverseDynamicsQP, Solution
 from torque_safety_controller.qp.program import (
     AccelerationRange,
-    Constraint,
     ContactForces,
     LinearConstraints,
     NoSolutionFound,
     QuadraticProgram,
     TaskTerm,
     WrenchTerm,
-    build_program,
     stack_constraints,
 )
 from torque_safety_controller.qp.solvers import (
@@ -26,7 +24,6 @@ from torque_safety_controller.qp.solvers import (
 __all__ = [
     "SOLVERS",
     "AccelerationRange",
-    "Constraint",
     "ContactForces",
     "DaqpSolver",
     "InverseDynamicsQP",
@@ -40,6 +37,5 @@ __all__ = [
     "Status",
     "TaskTerm",
     "WrenchTerm",
-    "build_program",
     "stack_constraints",
 ]

@@ -9,9 +9,11 @@ possible, in the sense of least squares.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from torque_safety_controller.qp.program import (
@@ -21,15 +23,23 @@ from torque_safety_controller.qp.program import (
     NoSolutionFound,
     QuadraticProgram,
     TaskTerm,
-    build_program,
 )
-from torque_safety_controller.qp.relax import LeastRelaxation, first_to_solve
-from torque_safety_controller.qp.solvers import SOLVERS, Status
+from torque_safety_controller.qp.relax import relaxed_least
+from torque_safety_controller.qp.solvers import (
+    SOLVERS,
+    DaqpSolver,
+    ProxqpSolver,
+    Status,
+    first_to_solve,
+)
 
 Array = NDArray[np.float64]
 
 _NEGLIGIBLE = 1e-6
 """Less relaxation than this, rad/s^2, is none."""
+
+_PROXIMAL = (1e-2, 10.0)
+"""Of the search for the least relaxation; between 1e-4 and 1e-2 it makes no difference."""
 
 
 class Solution(NamedTuple):
@@ -68,7 +78,7 @@ class InverseDynamicsQP:
         # Limits that leave next to no room are DAQP's in any case: ProxQP can hardly solve those.
         self._relaxed_solvers = tuple(solvers.values())
         self._solvers = (solvers.pop(solver), *solvers.values())
-        self._relaxation = LeastRelaxation()
+        self._relaxing_solvers = (*map(DaqpSolver, _PROXIMAL), ProxqpSolver())
 
     def build(
         self,
@@ -80,10 +90,64 @@ class InverseDynamicsQP:
         constraints: LinearConstraints | None = None,
         contacts: ContactForces | None = None,
     ) -> QuadraticProgram:
-        """Return the program; see `build_program`."""
-        return build_program(
-            tasks, bounds, M, tau_lower, tau_upper, constraints, contacts, self._gamma
+        """Return the program in x = (a, rho) with C = (M, -B; G, 0).
+
+        Args:
+            tasks: at least one.
+            bounds: of the accelerations.
+            M: mass matrix, shape (n, n).
+            tau_lower: lower limits of M a - B rho, bias torque subtracted, shape (n,), N m.
+            tau_upper: upper limits of M a - B rho, shape (n,), N m.
+            constraints: on the accelerations besides.
+            contacts: what the environment can exert.
+
+        Raises:
+            NoSolutionFound: no task with a weight.
+            ValueError: constraints or contacts of the wrong shape.
+        """
+        n = self._n
+        G, row_lower, row_upper = constraints or _no_rows(n)
+        B, rho_max, wrench_tasks = contacts or _no_forces(n)
+        k, r = len(G), len(rho_max)
+        size = n + r
+        if G.shape != (len(row_lower), n) or row_lower.shape != row_upper.shape:
+            raise ValueError(
+                f"constraints on {n} joints with G {G.shape}, lower {row_lower.shape}, "
+                f"upper {row_upper.shape}"
+            )
+        if B.shape != (n, r):
+            raise ValueError(f"forces on {n} joints with B {B.shape}, rho_max {rho_max.shape}")
+        greatest = max([0.0, *(task.weight for task in (*tasks, *wrench_tasks))])
+        if greatest == 0.0:
+            raise NoSolutionFound("no task with a weight above 0")
+        # Mostly one task is of the joints: it is written at once.
+        joints = next((task for task in tasks if task.A is None), None)
+        b, share = (tau_lower, 0.0) if joints is None else (joints.b, joints.weight / greatest)
+        H, g, C, lower, upper = _plain(
+            r, k, self._gamma, *bounds, M, tau_lower, tau_upper, b, share
         )
+        if r:
+            C[:n, n:] = -B
+            upper[n:size] = rho_max
+        if k:
+            C[n:, :n] = G
+            lower[size + n :] = row_lower
+            upper[size + n :] = row_upper
+        for task in tasks:
+            if task.A is not None:
+                _add_least_squares(H, g, task.A, task.b, task.weight / greatest, 0)
+            elif task is not joints:
+                H[range(n), range(n)] += task.weight / greatest
+                g[:n] -= task.weight / greatest * task.b
+        for W, F_des, weight, first in wrench_tasks:
+            rows, columns = W.shape
+            if F_des.shape != (rows,) or not 0 <= first <= r - columns:
+                raise ValueError(
+                    f"wrench task with W {W.shape} from force {first} of {r} on, "
+                    f"F_des {F_des.shape}"
+                )
+            _add_least_squares(H, g, W, F_des, weight / greatest, n + first)
+        return QuadraticProgram(H, g, C, lower, upper)
 
     def solve(self, program: QuadraticProgram) -> Solution:
         """Return the accelerations and forces that serve the tasks best within the limits.
@@ -95,9 +159,10 @@ class InverseDynamicsQP:
             NoSolutionFound: numbers that are not finite or absurd, or limits that are crossed.
         """
         n = self._n
-        status, x, iterations = self._solvers[0].solve(program)
-        if status is Status.FAILED:
-            status, x, iterations = self._solvers[1].solve(program)
+        for solver in self._solvers:
+            status, x, iterations = solver.solve(program)
+            if status is not Status.FAILED:
+                break
         relaxation = constraint_relaxation = None
         if status is Status.INFEASIBLE:
             x, iterations = self._relaxed(program)
@@ -111,8 +176,89 @@ class InverseDynamicsQP:
 
     def _relaxed(self, program: QuadraticProgram) -> tuple[Array, int]:
         """Return the solution with bounds and constraints relaxed least, and the iterations."""
-        relaxed = self._relaxation.relax(program, self._n)
-        result = first_to_solve(self._relaxed_solvers, relaxed.program)
+        relaxed, least_x, iterations = relaxed_least(program, self._n, self._relaxing_solvers)
+        result = first_to_solve(self._relaxed_solvers, relaxed)
         # Where too little room is left for the tasks, what relaxes least keeps the limits, too.
-        x = result.x if result.status is Status.SOLVED else relaxed.x
-        return x, relaxed.iterations + result.iterations
+        x = result.x if result.status is Status.SOLVED else least_x
+        return x, iterations + result.iterations
+
+
+@lru_cache
+def _no_rows(n: int) -> LinearConstraints:
+    return LinearConstraints(np.zeros((0, n)), np.zeros(0), np.zeros(0))
+
+
+@lru_cache
+def _no_forces(n: int) -> ContactForces:
+    return ContactForces(np.zeros((n, 0)), np.zeros(0))
+
+
+# Compiled, because they are called at every step and NumPy takes several times as long.
+
+
+@njit(cache=True)
+def _plain(
+    r: int,
+    k: int,
+    gamma: float,
+    a_lower: Array,
+    a_upper: Array,
+    M: Array,
+    tau_lower: Array,
+    tau_upper: Array,
+    b: Array,
+    weight: float,
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return H, g, C, lower, upper of a program in x = (a, rho) with C = (M, 0; 0, 0).
+
+    Its cost is ``gamma |x|^2 / 2 + weight |a - b|^2 / 2``.
+
+    Args:
+        r: number of rho, with limits 0.
+        k: number of rows below M, with limits 0.
+        gamma: weight of |x|^2.
+        a_lower: limits of a, shape (n,).
+        a_upper: shape (n,).
+        M: shape (n, n).
+        tau_lower: limits of M a, shape (n,).
+        tau_upper: shape (n,).
+        b: shape (n,).
+        weight: of the difference of a and b.
+    """
+    n = len(a_lower)
+    size = n + r
+    H, g, C = np.zeros((size, size)), np.zeros(size), np.zeros((n + k, size))
+    lower, upper = np.zeros(size + n + k), np.zeros(size + n + k)
+    for i in range(size):
+        H[i, i] = gamma
+    for i in range(n):
+        if weight > 0.0:
+            H[i, i] += weight
+            g[i] = -weight * b[i]
+        for j in range(n):
+            C[i, j] = M[i, j]
+        lower[i], upper[i] = a_lower[i], a_upper[i]
+        lower[size + i], upper[size + i] = tau_lower[i], tau_upper[i]
+    return H, g, C, lower, upper
+
+
+@njit(cache=True)
+def _add_least_squares(H: Array, g: Array, A: Array, b: Array, weight: float, first: int) -> None:
+    """Add ``weight * |A z - b|^2 / 2`` to the cost ``x'Hx / 2 + g'x``, in place.
+
+    z are as many of x as A has columns, from index `first` on.
+    """
+    m, n = A.shape
+    for i in range(n):
+        for j in range(i + 1):
+            s = 0.0
+            for k in range(m):
+                s += A[k, i] * A[k, j]
+            s *= weight
+            H[first + i, first + j] += s
+            if i != j:
+                H[first + j, first + i] += s
+        s = 0.0
+        for k in range(m):
+            s += A[k, i] * b[k]
+        g[first + i] -= weight * s

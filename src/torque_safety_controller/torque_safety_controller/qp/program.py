@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The quadratic program of a control step: eq. (5) of [Benallegue2021].
+"""What the quadratic program of a control step is made of: eq. (5) of [Benallegue2021].
 
     minimise    sum_t w_t |A_t a - b_t|^2 + sum_c w_c |W_c rho - F_c|^2 + gamma (|a|^2 + |rho|^2)
     subject to  a_lower <= a <= a_upper,   lower <= G a <= upper,   0 <= rho <= rho_max,
@@ -11,13 +11,11 @@ Without contacts it is eq. (33) of [DelPrete2018]. Torques are eliminated by the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from torque_safety_controller.robot_model import RobotModel
 from viability_bounds_pkg.exceptions import ArmSafetyError
 
 Array = NDArray[np.float64]
@@ -88,21 +86,6 @@ class LinearConstraints(NamedTuple):
     """Shape (k,), not below `lower`; inf for no limit."""
 
 
-class Constraint(Protocol):
-    """Anything that limits the accelerations of the arm in its current state."""
-
-    def constraint(
-        self, robot: RobotModel, bounds: AccelerationRange, disturbance: Array | None = None
-    ) -> LinearConstraints | None:
-        """Return the constraints of one step; None for none.
-
-        Args:
-            robot: updated to the current state.
-            bounds: of the accelerations, which apply besides.
-            disturbance: acceleration on top of the commanded one, shape (n,), rad/s^2.
-        """
-
-
 class ContactForces(NamedTuple):
     """Forces of the environment on the arm, W rho with rho >= 0."""
 
@@ -160,151 +143,3 @@ def stack_constraints(parts: Sequence[LinearConstraints | None]) -> LinearConstr
     if len(given) < 2:
         return given[0] if given else None
     return LinearConstraints(*(np.concatenate(each) for each in zip(*given, strict=True)))
-
-
-def build_program(
-    tasks: Sequence[TaskTerm],
-    bounds: AccelerationRange,
-    M: Array,
-    tau_lower: Array,
-    tau_upper: Array,
-    constraints: LinearConstraints | None = None,
-    contacts: ContactForces | None = None,
-    gamma: float = 1e-6,
-) -> QuadraticProgram:
-    """Return the program in x = (a, rho) with C = (M, -B; G, 0).
-
-    Args:
-        tasks: at least one.
-        bounds: of the accelerations.
-        M: mass matrix, shape (n, n).
-        tau_lower: lower limits of M a - B rho, bias torque subtracted, shape (n,), N m.
-        tau_upper: upper limits of M a - B rho, shape (n,), N m.
-        constraints: on the accelerations besides.
-        contacts: what the environment can exert.
-        gamma: weight of |x|^2, relative to the largest task weight; keeps the solution unique.
-
-    Raises:
-        NoSolutionFound: no task with a weight.
-        ValueError: constraints or contacts of the wrong shape.
-    """
-    n, r, k = len(M), 0, 0
-    wrench_tasks: Sequence[WrenchTerm] = ()
-    if constraints is not None:
-        G, row_lower, row_upper = constraints
-        k = len(G)
-        if G.shape != (len(row_lower), n) or row_lower.shape != row_upper.shape:
-            raise ValueError(
-                f"constraints on {n} joints with G {G.shape}, lower {row_lower.shape}, "
-                f"upper {row_upper.shape}"
-            )
-    if contacts is not None:
-        B, rho_max, wrench_tasks = contacts
-        r = len(rho_max)
-        if B.shape != (n, r):
-            raise ValueError(f"forces on {n} joints with B {B.shape}, rho_max {rho_max.shape}")
-    weights = [task.weight for task in tasks] + [task.weight for task in wrench_tasks]
-    greatest = max([0.0, *weights])
-    if greatest == 0.0:
-        raise NoSolutionFound("no task with a weight above 0")
-    size = n + r
-    # Mostly one task is of the joints: it is written at once.
-    joints = next((task for task in tasks if task.A is None), None)
-    b, share = (tau_lower, 0.0) if joints is None else (joints.b, joints.weight / greatest)
-    a_lower, a_upper = bounds
-    program = QuadraticProgram(
-        *_plain(r, k, gamma, a_lower, a_upper, M, tau_lower, tau_upper, b, share)
-    )
-    H, g, C, lower, upper = program
-    if r:
-        C[:n, n:] = -B
-        upper[n:size] = rho_max
-    if k:
-        C[n:, :n] = G
-        lower[size + n :] = row_lower
-        upper[size + n :] = row_upper
-    for task in tasks:
-        if task.A is not None:
-            _add_least_squares(H, g, task.A, task.b, task.weight / greatest, 0)
-        elif task is not joints:
-            H[range(n), range(n)] += task.weight / greatest
-            g[:n] -= task.weight / greatest * task.b
-    for W, F_des, weight, first in wrench_tasks:
-        rows, columns = W.shape
-        if F_des.shape != (rows,) or not 0 <= first <= r - columns:
-            raise ValueError(
-                f"wrench task with W {W.shape} from force {first} of {r} on, F_des {F_des.shape}"
-            )
-        _add_least_squares(H, g, W, F_des, weight / greatest, n + first)
-    return program
-
-
-# Compiled, because they are called at every step and NumPy takes several times as long.
-
-
-@njit(cache=True)
-def _plain(
-    r: int,
-    k: int,
-    gamma: float,
-    a_lower: Array,
-    a_upper: Array,
-    M: Array,
-    tau_lower: Array,
-    tau_upper: Array,
-    b: Array,
-    weight: float,
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Return H, g, C, lower, upper of a program in x = (a, rho) with C = (M, 0; 0, 0).
-
-    Its cost is ``gamma |x|^2 / 2 + weight |a - b|^2 / 2``.
-
-    Args:
-        r: number of rho, with limits 0.
-        k: number of rows below M, with limits 0.
-        gamma: weight of |x|^2.
-        a_lower: limits of a, shape (n,).
-        a_upper: shape (n,).
-        M: shape (n, n).
-        tau_lower: limits of M a, shape (n,).
-        tau_upper: shape (n,).
-        b: shape (n,).
-        weight: of the difference of a and b.
-    """
-    n = len(a_lower)
-    size = n + r
-    H, g, C = np.zeros((size, size)), np.zeros(size), np.zeros((n + k, size))
-    lower, upper = np.zeros(size + n + k), np.zeros(size + n + k)
-    for i in range(size):
-        H[i, i] = gamma
-    for i in range(n):
-        if weight > 0.0:
-            H[i, i] += weight
-            g[i] = -weight * b[i]
-        for j in range(n):
-            C[i, j] = M[i, j]
-        lower[i], upper[i] = a_lower[i], a_upper[i]
-        lower[size + i], upper[size + i] = tau_lower[i], tau_upper[i]
-    return H, g, C, lower, upper
-
-
-@njit(cache=True)
-def _add_least_squares(H: Array, g: Array, A: Array, b: Array, weight: float, first: int) -> None:
-    """Add ``weight * |A z - b|^2 / 2`` to the cost ``x'Hx / 2 + g'x``, in place.
-
-    z are as many of x as A has columns, from index `first` on.
-    """
-    m, n = A.shape
-    for i in range(n):
-        for j in range(i + 1):
-            s = 0.0
-            for k in range(m):
-                s += A[k, i] * A[k, j]
-            s *= weight
-            H[first + i, first + j] += s
-            if i != j:
-                H[first + j, first + i] += s
-        s = 0.0
-        for k in range(m):
-            s += A[k, i] * b[k]
-        g[first + i] -= weight * s

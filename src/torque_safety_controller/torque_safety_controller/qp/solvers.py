@@ -10,7 +10,7 @@ solution, and now and then calls solved what has a duality gap. So answers of bo
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from enum import Enum
 from typing import NamedTuple, Protocol
 
@@ -135,6 +135,15 @@ class ProxqpSolver:
 
 SOLVERS: dict[str, Callable[[], Solver]] = {"daqp": DaqpSolver, "proxqp": ProxqpSolver}
 """By name; a solver that fails for numerical reasons is followed by the next one."""
+
+
+def first_to_solve(solvers: Iterable[Solver], program: QuadraticProgram) -> SolverResult:
+    """Return the first solution; if there is none, what the last solver says."""
+    for solver in solvers:
+        result = solver.solve(program)
+        if result.status is Status.SOLVED:
+            break
+    return result
 
 
 def _solve(

@@ -182,7 +182,7 @@ class Collision(Part):
             a_lower: bounds of the accelerations, shape (n,), rad/s^2, finite.
             a_upper: shape (n,), rad/s^2, not below `a_lower`.
             disturbance: what comes on top of the accelerations, shape (n,), rad/s^2. What of it
-                takes distance away is asked for in addition, as in `DisturbanceObserver.shift`.
+                takes distance away is asked for in addition, as in `Step.commanded`.
 
         Values that are not finite are the caller's to refuse.
         """
