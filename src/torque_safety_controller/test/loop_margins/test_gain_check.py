@@ -5,7 +5,7 @@ import pytest
 
 from torque_safety_controller.loop_margins.arm_inertia import ArmInertia
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.parts.disturbance import DisturbanceObserver
+from torque_safety_controller.parts.disturbance import Disturbance
 from torque_safety_controller.tools.gain_limits import (
     LIMIT_MARGIN,
     MARGIN,
