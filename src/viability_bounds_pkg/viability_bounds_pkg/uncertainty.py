@@ -9,15 +9,14 @@ off until then, and what other commands than those expected may do.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from viability_bounds_pkg.bounds.torque_margin import TorqueMargins, tightened
-from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError
-from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
+from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.parameter import joint_amounts, periods, switch
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.state_estimation.observer import ObserverDesign, design_observer
@@ -84,16 +83,6 @@ class DeclaredUncertainty:
             dt: control period, s.
         """
         return design_observer(dt, self.position_error, self.acceleration_disturbance)
-
-    @property
-    def names(self) -> list[str]:
-        """Which declarations are not zero."""
-        return [each.name for each in fields(self) if np.any(getattr(self, each.name))]
-
-    def without(self, name: str) -> DeclaredUncertainty:
-        """Return the same with one of the declarations left out."""
-        nothing: dict[str, Any] = {name: 0 * getattr(self, name)}
-        return replace(self, **nothing)
 
 
 class UncertaintyMargins(NamedTuple):
@@ -205,19 +194,3 @@ class Loop(NamedTuple):
             position_error=position_error,
             velocity_error=velocity_error,
         )
-
-    def refusal(self, declared: DeclaredUncertainty, error: JointLimitsError) -> ArmSafetyError:
-        """Return the error for declarations that leave no bounds.
-
-        It names the first one without which there were some; `error`, what the bounds say, is
-        returned where there is none.
-        """
-        for name in declared.names:
-            try:
-                self.bounds(declared.without(name))
-            except JointLimitsError:
-                continue
-            more = "more" if name == "motor_bandwidth" else "less"
-            allowed = f"{more} at {1.0 / self.dt:g} Hz; {error}"
-            return SettingError(name, getattr(declared, name), allowed)
-        return error

@@ -9,13 +9,14 @@ accelerations asked for within the bounds.
 from __future__ import annotations
 
 from collections import deque
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 from adversary import Violations, advance
 
 from viability_bounds_pkg.bounds.torque_margin import TorqueMargins
-from viability_bounds_pkg.joint_limits import JointLimits
+from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
 from viability_bounds_pkg.state import State
 from viability_bounds_pkg.uncertainty import DeclaredUncertainty, Loop, uncertainty_margins
 from viability_bounds_pkg.viability import BoundsSolver
@@ -210,14 +211,20 @@ def random_plan(rng, joints, shortest=1e-3, shares=(1.0, 1.0), predicted=True, *
     names = tuple(f"joint{j}" for j in range(joints))
     limits = JointLimits(names, -half, half, v_max, a_min, a_max)
     margins = TorqueMargins(*np.zeros((3, joints)))
-    loop = Loop(limits, margins, dt, 0.0, predicted)
-    good = [j for j in range(joints) if loop.of_joint(j).has_bounds(declared.of_joint(j))]
+    good = []
+    for j in range(joints):
+        own = TorqueMargins(*(each[j : j + 1] for each in margins))
+        with suppress(JointLimitsError):
+            Loop(limits.of_joint(j), own, dt, 0.0, predicted).bounds(of_joints(declared, [j]))
+            good.append(j)
     if not good:
         return random_plan(rng, joints, shortest, shares, predicted, **kinds)
-    chosen = {
-        name: value[good] if np.size(value) == joints else value
-        for name, value in vars(declared).items()
-    }
     names = tuple(names[j] for j in good)
     limits = JointLimits(names, -half[good], half[good], v_max[good], a_min[good], a_max[good])
-    return plan(limits, dt, DeclaredUncertainty(**chosen), predicted, shares)
+    return plan(limits, dt, of_joints(declared, good), predicted, shares)
+
+
+def of_joints(declared, joints):
+    """Return what is declared of some joints alone."""
+    values = {k: v[joints] if np.ndim(v) and len(v) else v for k, v in vars(declared).items()}
+    return DeclaredUncertainty(**values)

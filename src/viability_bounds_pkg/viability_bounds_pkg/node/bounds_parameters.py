@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import partial
+from contextlib import suppress
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -68,13 +69,7 @@ def limits_of(config: Any) -> JointLimits:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BoundsConfiguration(VelocityEstimation, StateSource, ControlRate, LimitedRobotConfiguration):
-    """Parameters of the bounds node; the torque limits are empty where none are needed.
-
-    Attributes:
-        limits: of the joints.
-        margins: what the exact bounds keep back.
-        uncertainty: what else they hold for, by what is declared.
-    """
+    """Parameters of the bounds node; the torque limits are empty where none are needed."""
 
     robot_description: str = redeclared(RobotConfiguration, "robot_description", default="")
     NOT_NEEDED = frozenset({"torque_max"})
@@ -107,17 +102,16 @@ class BoundsConfiguration(VelocityEstimation, StateSource, ControlRate, LimitedR
     state_timeout: float = timeout(
         "silence after which older stamps are accepted again, s", default=0.5
     )
-    limits: JointLimits = field(init=False)
-    margins: TorqueMargins = field(init=False)
-    uncertainty: UncertaintyMargins = field(init=False)
 
-    def __post_init__(self) -> None:
-        """Make limits and margins, which must leave something to move with."""
-        super().__post_init__()
-        limits = limits_of(self)
-        object.__setattr__(self, "limits", limits)
-        object.__setattr__(self, "margins", self._margins(limits))
-        object.__setattr__(self, "uncertainty", self.loop.margins(self.declared))
+    @cached_property
+    def limits(self) -> JointLimits:
+        """Limits of the joints."""
+        return limits_of(self)
+
+    @cached_property
+    def uncertainty(self) -> UncertaintyMargins:
+        """What the bounds hold for, by what is declared."""
+        return self.loop.margins(self.declared)
 
     @property
     def horizon(self) -> float:
@@ -125,45 +119,24 @@ class BoundsConfiguration(VelocityEstimation, StateSource, ControlRate, LimitedR
         return self.uncertainty.horizon
 
     @property
+    def margins(self) -> TorqueMargins:
+        """What the exact bounds keep back from the limits."""
+        margins = self.loop.torque_margins
+        disturbed = margins.acceleration + self.declared.acceleration_disturbance
+        return margins._replace(acceleration=disturbed)
+
+    @property
     def loop(self) -> Loop:
         """The control loop that the bounds are for."""
+        margins = torque_margins(self.acceleration_drift, self.dt)
         return Loop(
             self.limits,
-            self._torque_margins(),
+            margins._replace(position=margins.position + self.position_margin),
             self.dt,
             self.bounds_dt_factor * self.dt,
             self.use_estimated_states,
             self.use_estimated_states and self.velocity_estimation,
         )
-
-    def _torque_margins(self) -> TorqueMargins:
-        margins = torque_margins(self.acceleration_drift, self.dt)
-        margins.position[:] += self.position_margin
-        return margins
-
-    def _margins(self, limits: JointLimits) -> TorqueMargins:
-        margins, disturbance = self._torque_margins(), self.declared.acceleration_disturbance
-        margins.acceleration[:] += disturbance
-        braking = np.minimum(-limits.a_min, limits.a_max)
-        if not (margins.acceleration < braking).all():
-            name, value = "acceleration_drift", self.acceleration_drift
-            if disturbance.any():
-                name, value = "acceleration_disturbance", disturbance
-            allowed = (
-                f"less than what there is to brake with, {braking}, by the margins for the rate"
-            )
-            raise SettingError(name, value, allowed)
-        for name, margin, room in (
-            ("velocity_max", margins.velocity, limits.v_max),
-            ("position_max", margins.position, 0.5 * (limits.q_max - limits.q_min)),
-        ):
-            if not (margin < room).all():
-                raise SettingError(
-                    name,
-                    getattr(self, name),
-                    f"more than the margins for acceleration_drift at this rate take: {margin}",
-                )
-        return margins
 
 
 Bounds = Callable[[Array, Array], viability.AccelerationBounds]
@@ -179,10 +152,28 @@ def make_solver(config: BoundsConfiguration) -> viability.BoundsSolver:
     try:
         return config.loop.bounds(config.declared)
     except JointLimitsError as error:
-        found = config.loop.refusal(config.declared, error)
-        if not isinstance(found, SettingError):
-            found = SettingError("rate_hz", config.rate_hz, f"what leaves bounds: {found}")
-        raise found from error
+        raise _cause(config, error) from error
+
+
+def _cause(config: BoundsConfiguration, error: JointLimitsError) -> SettingError:
+    """Return the error that names the first setting without which there were bounds."""
+    declared = config.declared
+    without = {
+        each.name: replace(config, declared=replace(declared, **{each.name: 0 * value}))
+        for each in fields(declared)
+        if np.any(value := getattr(declared, each.name))
+    }
+    without["acceleration_drift"] = replace(
+        config, acceleration_drift=0 * config.acceleration_drift
+    )
+    without["position_margin"] = replace(config, position_margin=0.0)
+    for name, less in without.items():
+        with suppress(JointLimitsError):
+            less.loop.bounds(less.declared)
+            value = getattr(declared, name, getattr(config, name, None))
+            wanted = "more" if name == "motor_bandwidth" else "less"
+            return SettingError(name, value, f"{wanted} at {config.rate_hz:g} Hz ({error})")
+    return SettingError("rate_hz", config.rate_hz, f"what leaves bounds ({error})")
 
 
 def make_bounds(config: BoundsConfiguration) -> Bounds:
