@@ -163,10 +163,8 @@ def _cause(config: BoundsConfiguration, error: JointLimitsError) -> SettingError
         for each in fields(declared)
         if np.any(value := getattr(declared, each.name))
     }
-    without["acceleration_drift"] = replace(
-        config, acceleration_drift=0 * config.acceleration_drift
-    )
-    without["position_margin"] = replace(config, position_margin=0.0)
+    for name in ("acceleration_drift", "position_margin"):
+        without[name] = replace(config, **{name: 0 * getattr(config, name)})
     for name, less in without.items():
         with suppress(JointLimitsError):
             less.loop.bounds(less.declared)
