@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller step beside TSID's, and its QPs by the dense backends of qpsolvers.
+"""This controller beside others: the limits that they keep, the times of a step, the QP's solvers.
 
+First the limits, of TSID, placo and a clamp, as in `peer_limits`. Then the times:
 Panda follows poses and postures at random within its limits of position, speed, acceleration and
 torque, so that limits are active. In the same states TSID gets the same tasks, weights and limits,
 and each backend the same QPs. Values are compared first, with tasks written as TSID has them, then
@@ -17,6 +18,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import peer_limits
 import pinocchio as pin
 from live_robot import load
 from other_environment import TSID, Arrays, worker
@@ -280,8 +282,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=2000)
     parser.add_argument("--rounds", type=int, default=15, help="of blocks by turns")
+    parser.add_argument("--goals", type=int, default=20, help="of the comparison of limits")
     options = parser.parse_args()
     print(load())
+    peer_limits.compare(options.goals)
+    print()
     given, programs = record(options.steps)
     step_beside_tsid(given, options.rounds)
     print(f"\n{len(programs)} QPs, a call{'':12}median, largest difference, failed")

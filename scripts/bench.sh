@@ -12,8 +12,8 @@ Ratios compare programs that run in turns in one process. NAME --help lists opti
               also with estimator, prediction and margins
   realtime    all nodes by the wall clock: one process, separate ones, relays, and what the
               machine itself can do; where the time of a period goes
-  peers       the step beside TSID's, the QPs by solvers of qpsolvers; both are installed into
-              .venv-tsid and .venv-qpsolvers
+  peers       limits kept beside TSID, placo and a clamp; the step beside TSID's; the QPs by solvers
+              of qpsolvers; these are installed into .venv-tsid, .venv-placo and .venv-qpsolvers
   step        one controller step, part by part
   bounds      acceleration bounds: one arm, and batches; with --tsid also TSID's, which is
               installed into .venv-tsid

@@ -16,9 +16,10 @@ Writes figures to results/, and prints a table with the paper's numbers and ours
   imperfect          late, coarse and noisy robots, with and without each remedy, and
                      docs/reproduction_imperfect.md (40 min on two cores)
   imperfect panda    one of the robots; its rows replace those of before
+  contrast           the moving picture of README
   soak               faults while the arm moves: restarts, wrong states, second nodes (3 min)
   exactness          the bounds compared with brute force (30 min)
-  all                all of the above but imperfect, soak and exactness (default)
+  all                all of the above but imperfect, contrast, soak and exactness (default)
 USAGE
 }
 
@@ -34,7 +35,7 @@ if [ "$what" = all ]; then
 fi
 what="${what//-/_}"
 case "$what" in
-paper0 | paper1_integral | paper1_compliance | whole_arm | imperfect | soak | exactness) ;;
+paper0 | paper1_integral | paper1_compliance | whole_arm | imperfect | contrast | soak | exactness) ;;
 *)
     echo "error: unknown '$what'; --help lists what there is" >&2
     exit 2
