@@ -7,11 +7,10 @@ from contextlib import closing
 
 import matplotlib.pyplot as plt
 import numpy as np
+from camera import Camera
 from chain import ROOT
 from direct import DirectLoop, column
 from PIL import Image
-
-from sim_bridge.tools.camera import Camera
 
 JOINT = 3  # the elbow, panda_joint4
 GOAL = np.array([0.0, 0.35, 0.0, 0.3, 0.0, 1.9, 0.8])  # rad, the elbow's beyond its limit
