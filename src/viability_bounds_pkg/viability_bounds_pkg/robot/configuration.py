@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, ClassVar
+from typing import ClassVar
 from xml.etree import ElementTree
 
 import numpy as np
@@ -45,7 +45,6 @@ _TURNS_MAX = 2.0
 """Turns of a joint with limits from which on its angles are surely degrees."""
 
 _ANGLES = ("position_min", "position_max", "start_positions", "collision_posture")
-_LIMITS = (("velocity_max", "velocity"), ("torque_max", "effort"))
 _SLACK = 1e-3
 """Relative excess over limits of the URDF that rounding explains."""
 
@@ -100,22 +99,22 @@ class RobotConfiguration:
     def _complete(self) -> None:
         """Fill limits that are not given with those of the URDF."""
         missing = [name for name in LIMITS_OF_URDF if len(getattr(self, name, "given")) == 0]
+        source = self.robot_description
+        if source in ("", TOPIC):
+            allowed = "a list of numbers"
+            if source == TOPIC:
+                allowed += ", where the URDF comes from its topic"
+            for name in missing:
+                if name not in self.NOT_NEEDED:
+                    raise SettingError(name, None, allowed)
+            return
         for name in missing:
-            if self.robot_description in ("", TOPIC):
-                if name in self.NOT_NEEDED:
-                    continue
-                allowed = "a list of numbers"
-                if self.robot_description == TOPIC:
-                    allowed += ", where the URDF comes from its topic"
-                raise SettingError(name, None, allowed)
-            limits = urdf_limits(self.robot_description, self.joints)[name]
-            lacking = [each for each, value in limits.items() if value is None]
-            if lacking and name in self.NOT_NEEDED:
-                continue
-            if lacking:
-                allowed = f"given, as the URDF has no {LIMITS_OF_URDF[name]} limit of {lacking[0]}"
-                raise SettingError(name, None, allowed)
-            object.__setattr__(self, name, np.array(list(limits.values()), dtype=float))
+            limits = urdf_limits(source, self.joints)[name]
+            if None not in limits:
+                object.__setattr__(self, name, np.array(limits, dtype=float))
+            elif name not in self.NOT_NEEDED:
+                lacking = f"{LIMITS_OF_URDF[name]} limit of {self.joints[limits.index(None)]}"
+                raise SettingError(name, None, f"given, as the URDF has no {lacking}")
 
     @property
     def locked(self) -> dict[str, float]:
@@ -182,52 +181,34 @@ class TaskFrames:
 
 
 @lru_cache(maxsize=16)
-def urdf_limits(source: str, joints: tuple[str, ...]) -> Mapping[str, Mapping[str, float | None]]:
-    """Return the limits that a URDF gives joints, by the names of `LIMITS_OF_URDF` and joint.
+def urdf_limits(source: str, joints: tuple[str, ...]) -> Mapping[str, list[float | None]]:
+    """Return the limits that a URDF gives joints, in their order, by `LIMITS_OF_URDF`.
 
-    Read once: parameters may change while nodes control a robot.
-
-    Args:
-        source: path or URI of the URDF.
-        joints: whose limits; unknown ones are left to later checks, with limits of None.
-
-    Returns:
-        rad, rad/s and N m; infinite positions of continuous joints; None where there is no limit,
-        or one that is no use: no finite number, no speed, no torque.
+    Read once: parameters may change while nodes control a robot. Limits are in rad, rad/s and N m,
+    and None where there is none to use.
 
     Raises:
-        SettingError: there is no such URDF.
+        SettingError: there is no such URDF, or it lacks a joint.
     """
     try:
-        elements = urdf_joints(read_urdf(source), joints)
+        elements = _urdf_joints(read_urdf(source), joints)
     except RobotDescriptionError as error:
         raise SettingError("robot_description", source, f"a URDF ({error})") from error
-    return {
-        name: {joint: _limit(elements[joint], key) for joint in joints}
-        for name, key in LIMITS_OF_URDF.items()
-    }
+    return {name: [_limit(each, key) for each in elements] for name, key in LIMITS_OF_URDF.items()}
 
 
-def urdf_joints(urdf: str, joints: Sequence[str]) -> dict[str, ElementTree.Element]:
-    """Return the elements of a URDF's joints by name.
-
-    Args:
-        urdf: its text.
-        joints: names that it must have.
-
-    Raises:
-        SettingError: a joint that the URDF does not have.
-    """
+def _urdf_joints(urdf: str, joints: Sequence[str]) -> list[ElementTree.Element]:
+    """Return the elements of a URDF's joints; raise `SettingError` if it lacks one."""
     # Those of transmissions have the same names, and nothing to compare with.
     elements = {
-        each.get("name", ""): each for each in ElementTree.fromstring(urdf).findall("joint")
+        each.get("name", ""): each for each in ElementTree.fromstring(urdf).iterfind("joint")
     }
     for name in joints:
         if name not in elements:
             movable = [each for each, e in elements.items() if e.get("type") != "fixed"]
             hint = did_you_mean(name, movable) or f": {', '.join(movable)}"
             raise SettingError("joints", name, f"joints of the URDF{hint}")
-    return elements
+    return [elements[name] for name in joints]
 
 
 def _limit(joint: ElementTree.Element, key: str) -> float | None:
@@ -254,39 +235,34 @@ def check_with_urdf(config: RobotConfiguration, urdf: str) -> list[str]:
     Raises:
         SettingError: a joint that the URDF does not have, or angles that must be degrees.
     """
-    elements = urdf_joints(urdf, config.joints)
-    return [
-        line
-        for index, name in enumerate(config.joints)
-        for line in _unusual(config, index, elements[name])
-    ]
+    elements = _urdf_joints(urdf, config.joints)
+    return [line for j, joint in enumerate(elements) for line in _unusual(config, j, joint)]
 
 
-def _unusual(config: RobotConfiguration, index: int, joint: ElementTree.Element) -> Iterator[str]:
-    name, limit = config.joints[index], joint.find("limit")
-    if joint.get("type") == "revolute":
-        for parameter in _ANGLES:
-            values = getattr(config, parameter, ())
-            turns = abs(values[index]) / math.tau if len(values) else 0.0
-            if _TURNS_MAX < turns < math.inf:
-                allowed = f"rad; {values[index]:g} of {name} are {turns:.0f} turns: degrees?"
-                raise SettingError(parameter, values, allowed)
-    if limit is None or joint.get("type") == "continuous":
-        return
-    ends = (("position_min", "lower", -1.0), ("position_max", "upper", 1.0))
-    for parameter, key, sign in (*ends, *((p, k, 1.0) for p, k in _LIMITS)):
-        values, of_urdf = getattr(config, parameter, ()), float(limit.get(key, "nan"))
-        if len(values) and sign * (values[index] - of_urdf) > _SLACK * max(1.0, abs(of_urdf)):
+def _unusual(config: RobotConfiguration, j: int, joint: ElementTree.Element) -> Iterator[str]:
+    name = config.joints[j]
+    for parameter in _ANGLES if joint.get("type") == "revolute" else ():
+        values = getattr(config, parameter, ())
+        turns = abs(values[j]) / math.tau if len(values) else 0.0
+        if _TURNS_MAX < turns < math.inf:
+            allowed = f"rad; {values[j]:g} of {name} are {turns:.0f} turns: degrees?"
+            raise SettingError(parameter, values, allowed)
+    for parameter, key in LIMITS_OF_URDF.items():
+        values, of_urdf = getattr(config, parameter, ()), _limit(joint, key)
+        if not len(values) or of_urdf is None or math.isinf(of_urdf):
+            continue
+        excess = of_urdf - values[j] if key == "lower" else values[j] - of_urdf
+        if excess > _SLACK * max(1.0, abs(of_urdf)):
             yield (
-                f"parameter '{parameter}' is {values[index]:g} for {name}, beyond the {of_urdf:g} "
+                f"parameter '{parameter}' is {values[j]:g} for {name}, beyond the {of_urdf:g} "
                 "of the URDF"
             )
     start = getattr(config, "start_positions", None)
-    low, high = config.position_min, config.position_max
-    if start is not None and not low[index] <= start[index] <= high[index]:
+    low, high = config.position_min[j], config.position_max[j]
+    if start is not None and not low <= start[j] <= high:
         yield (
-            f"parameter 'start_positions' is {start[index]:g} for {name}, outside its position "
-            f"limits, {low[index]:g} to {high[index]:g}"
+            f"parameter 'start_positions' is {start[j]:g} for {name}, outside its position "
+            f"limits, {low:g} to {high:g}"
         )
 
 
@@ -303,19 +279,6 @@ def load_model(config: RobotConfiguration, urdf: str) -> pin.Model:
     try:
         return build_model(urdf, config.joints, config.locked, config.rotor_inertia)
     except RobotDescriptionError as error:
-        name, value, allowed = _culprit(config, urdf)
-        raise SettingError(name, value, f"{allowed} ({error})") from error
-
-
-def _culprit(config: RobotConfiguration, urdf: str) -> tuple[str, Any, str]:
-    """Return which parameter keeps a model from being built, its value, and what it may be."""
-    joints = config.joints
-    for name, value, allowed, chosen in (
-        ("robot_description", config.robot_description, "a URDF", ()),
-        ("joints", joints, "joints of the URDF, base to tip", joints),
-    ):
-        try:
-            build_model(urdf, chosen)
-        except RobotDescriptionError:
-            return name, value, allowed
-    return "locked_joints", config.locked_joints, "other joints of the URDF"
+        allowed = {"joints": "joints of the URDF, base to tip", "robot_description": "a URDF"}
+        said = f"{allowed.get(error.parameter, 'what fits the URDF')} ({error})"
+        raise SettingError(error.parameter, getattr(config, error.parameter), said) from error

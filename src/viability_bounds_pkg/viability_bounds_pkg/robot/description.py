@@ -19,26 +19,37 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from viability_bounds_pkg.exceptions import ArmSafetyError, did_you_mean
 
 
 class RobotDescriptionError(ArmSafetyError, ValueError):
-    """A URDF that cannot be found or loaded, or that does not fit what is asked of it."""
+    """A URDF that cannot be found or loaded, or that does not fit what is asked of it.
+
+    Attributes:
+        parameter: which parameter of a robot is at fault.
+    """
+
+    def __init__(self, message: str, parameter: str = "robot_description") -> None:
+        self.parameter = parameter
+        super().__init__(message)
 
 
-def unknown_name(kind: str, name: str, known: Iterable[str]) -> RobotDescriptionError:
+def unknown_name(
+    kind: str, name: str, known: Iterable[str], parameter: str = "robot_description"
+) -> RobotDescriptionError:
     """Return the error of a name that the URDF does not have.
 
     Args:
         kind: what it names, such as "joint".
         name: which is not there.
         known: names that are.
+        parameter: that has the name.
     """
     names = list(known)
     hint = did_you_mean(name, names) or f"; the URDF has: {', '.join(names)}"
-    return RobotDescriptionError(f"unknown {kind} {name!r}{hint}")
+    return RobotDescriptionError(f"unknown {kind} {name!r}{hint}", parameter)
 
 
 def package_directories() -> Iterator[Path]:
@@ -142,28 +153,22 @@ def build_model(
         full = pin.buildModelFromXML(urdf)
     except (ValueError, RuntimeError) as error:
         raise RobotDescriptionError(f"URDF does not load: {error}") from error
-    configuration = pin.neutral(full)
-    names = list(full.names)
-    for name in (*joints, *(locked_positions or ())):
-        if name not in names:
-            raise unknown_name("joint", name, names[1:])
-    for name, position in (locked_positions or {}).items():
-        joint = full.joints[full.getJointId(name)]
-        if joint.nq != 1:
-            raise RobotDescriptionError(f"joint {name!r} cannot be locked at one coordinate")
-        configuration[joint.idx_q] = position
-    locked = [i for i in range(1, full.njoints) if names[i] not in joints]
-    model = pin.buildReducedModel(full, locked, configuration)
-    for index in range(1, model.njoints):
-        if model.joints[index].nq != 1 or model.joints[index].nv != 1:
-            raise RobotDescriptionError(
-                f"joint {model.names[index]!r} is planar or floating; "
-                "joints must be revolute, continuous or prismatic"
-            )
+    for name in joints:
+        if not full.existJointName(name):
+            raise unknown_name("joint", name, list(full.names)[1:], "joints")
+    locked = [i for i in range(1, full.njoints) if full.names[i] not in joints]
+    model = pin.buildReducedModel(full, locked, _posture(full, locked_positions))
     kept = list(model.names)[1:]
+    for name, joint in zip(kept, list(model.joints)[1:], strict=True):
+        if joint.nq != 1 or joint.nv != 1:
+            raise RobotDescriptionError(
+                f"joint {name!r} is planar or floating; "
+                "joints must be revolute, continuous or prismatic",
+                "joints",
+            )
     if kept != list(joints):
         raise RobotDescriptionError(
-            f"joints must be listed once each, from base to tip: {', '.join(kept)}"
+            f"joints must be listed once each, from base to tip: {', '.join(kept)}", "joints"
         )
     for index in [i for i, name in enumerate(joints) if name in continuous]:
         model.lowerPositionLimit[index] = -math.inf
@@ -172,10 +177,26 @@ def build_model(
         armature = np.asarray(rotor_inertia, dtype=float)
         if armature.shape != (model.nv,) or not (np.isfinite(armature) & (armature >= 0)).all():
             raise RobotDescriptionError(
-                f"rotor_inertia must be {model.nv} finite numbers >= 0, not {armature}"
+                f"rotor_inertia must be {model.nv} finite numbers >= 0, not {armature}",
+                "rotor_inertia",
             )
         model.armature = armature
     return model
+
+
+def _posture(model: pin.Model, positions: Mapping[str, float] | None) -> NDArray[np.float64]:
+    """Return coordinates of a model with joints at `positions`, rad, and the others at zero."""
+    q = pin.neutral(model)
+    for name, position in (positions or {}).items():
+        if not model.existJointName(name):
+            raise unknown_name("joint", name, list(model.names)[1:], "locked_joints")
+        joint = model.joints[model.getJointId(name)]
+        if joint.nq != 1:
+            raise RobotDescriptionError(
+                f"joint {name!r} cannot be locked at one coordinate", "locked_joints"
+            )
+        q[joint.idx_q] = position
+    return q
 
 
 def inertia_beyond(
@@ -196,11 +217,8 @@ def inertia_beyond(
     model = pin.buildModelFromXML(_continuous_as_revolute(urdf)[0])
     if not model.existFrame(frame, pin.FrameType.BODY):
         raise RobotDescriptionError(f"unknown link {frame!r}")
-    q = pin.neutral(model)
-    for name, position in (locked_positions or {}).items():
-        q[model.joints[model.getJointId(name)].idx_q] = position
     data = model.createData()
-    pin.framesForwardKinematics(model, data, q)
+    pin.framesForwardKinematics(model, data, _posture(model, locked_positions))
     root = model.getFrameId(frame, pin.FrameType.BODY)
     beyond = {root}
     total = pin.Inertia.Zero()
@@ -266,8 +284,9 @@ def load_geometry(
     Raises:
         RobotDescriptionError: a mesh cannot be found or loaded, or a shape is not understood.
     """
+    root = ElementTree.fromstring(urdf)
     # Pinocchio's own error does not name the mesh.
-    for mesh in ElementTree.fromstring(urdf).iterfind(f".//{kind}//mesh"):
+    for mesh in root.iterfind(f".//{kind}//mesh"):
         if "://" in (name := mesh.get("filename", "")):
             resolve_uri(name)
     full = pin.buildModelFromXML(urdf)
@@ -279,25 +298,19 @@ def load_geometry(
             geometry = pin.buildGeomFromUrdfString(full, urdf, which, directories)
     except (ValueError, RuntimeError) as error:
         raise RobotDescriptionError(f"{kind} geometry does not load: {error}") from error
-    if kind == "collision":
-        _check_complete(urdf, full, geometry)
-    configuration = pin.neutral(full)
-    for name, position in (locked_positions or {}).items():
-        configuration[full.joints[full.getJointId(name)].idx_q] = position
+    if kind == "collision":  # the parser drops shapes that it does not understand
+        found = Counter(full.frames[item.parentFrame].name for item in geometry.geometryObjects)
+        for link in root.iter("link"):
+            name, shapes = link.get("name", ""), len(link.findall("collision"))
+            if full.existFrame(name) and found[name] != shapes:
+                raise RobotDescriptionError(
+                    f"link {name!r}: only {found[name]} of {shapes} collision shapes were "
+                    "understood"
+                )
     kept = set(model.names)
     locked = [i for i in range(1, full.njoints) if full.names[i] not in kept]
-    reduced, (geometry,) = pin.buildReducedModel(full, [geometry], locked, configuration)
+    posture = _posture(full, locked_positions)
+    reduced, (geometry,) = pin.buildReducedModel(full, [geometry], locked, posture)
     if list(reduced.names) != list(model.names):
         raise RobotDescriptionError("the model was not made of this URDF")
     return geometry
-
-
-def _check_complete(urdf: str, model: pin.Model, geometry: pin.GeometryModel) -> None:
-    """Raise if a shape of the URDF is missing: its parser drops what it does not understand."""
-    found = Counter(model.frames[item.parentFrame].name for item in geometry.geometryObjects)
-    for link in ElementTree.fromstring(urdf).iter("link"):
-        name, shapes = link.get("name", ""), len(link.findall("collision"))
-        if model.existFrame(name) and found[name] != shapes:
-            raise RobotDescriptionError(
-                f"link {name!r}: only {found[name]} of {shapes} collision shapes were understood"
-            )
