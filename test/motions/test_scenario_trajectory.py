@@ -41,7 +41,6 @@ def test_the_controller_follows_the_trajectory_of_the_scenario(seed):
         "plane": ["-z", "x"],
         "phase": 0.4,
         "period": 1.5,
-        "ramp": 0.2,
         "orientation": quaternion(rng),
     }
     for fields in ({"points": entries}, {"circle": circle}):

@@ -25,7 +25,7 @@ CONFIG = ROOT / "config"
 
 NODES = {node.NAME: node for node in (BoundsNode, ControllerNode, BulletNode, ScenarioNode)}
 EXTRA = {
-    "bounds_node": {"method": "damper", "bounds_dt_factor": 3},
+    "bounds_node": {"method": "naive", "bounds_dt_factor": 3},
     "controller_node": {
         "pose_kd": 1e-7,
         "safety_filter": True,

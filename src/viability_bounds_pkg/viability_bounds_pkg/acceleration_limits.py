@@ -94,7 +94,7 @@ def estimate_acceleration_limits(
     *,
     method: str = "sampling",
     overrides: Mapping[str, tuple[float, float]] | None = None,
-    cap: ArrayLike | None = None,
+    cap: float = np.inf,
 ) -> AccelerationLimits:
     """Return worst-case acceleration limits: Algorithm 4 of [DelPrete2018].
 
@@ -116,8 +116,7 @@ def estimate_acceleration_limits(
         seed: of the random generator; the same seed gives the same limits.
         method: "sampling" as in the paper, or "refined" (see `search_refined`).
         overrides: limits (a_min, a_max) of joints to use instead of what is found, rad/s^2.
-        cap: the greatest magnitude of the limits of the other joints, scalar or shape (n,),
-            rad/s^2; infinite for none.
+        cap: the greatest magnitude of the limits of the other joints, rad/s^2.
 
     Raises:
         EmptyIntervalError: a joint without override is left no interval.
@@ -136,7 +135,7 @@ def limits_from_worst_cases(
     space: StateSpace,
     worst: WorstCases,
     overrides: Mapping[str, tuple[float, float]] | None = None,
-    cap: ArrayLike | None = None,
+    cap: float = np.inf,
 ) -> AccelerationLimits:
     """Apply overrides and caps to the limits that a search of `space` found.
 
@@ -153,13 +152,12 @@ def limits_from_worst_cases(
                 f"joint {joint}: override must be finite with min < 0 < max, "
                 f"is ({low:g}, {high:g}) rad/s^2"
             )
-    bound = np.asarray(np.inf if cap is None else cap, dtype=float)
-    if bound.shape not in ((), (len(names),)) or not np.all(bound > 0):
-        raise LimitEstimateError(f"cap must be positive, one value or {len(names)}")
+    if not cap > 0.0:
+        raise LimitEstimateError(f"cap must be positive, is {cap:g}")
     for j, joint in enumerate(names):
         if joint not in overrides and not worst.a_min[j] < 0 < worst.a_max[j]:
             raise _empty_interval(model, space, worst, j, overrides)
-    a_min, a_max = np.maximum(worst.a_min, -bound), np.minimum(worst.a_max, bound)
+    a_min, a_max = np.maximum(worst.a_min, -cap), np.minimum(worst.a_max, cap)
     for joint, (low, high) in overrides.items():
         a_min[names.index(joint)], a_max[names.index(joint)] = low, high
     return AccelerationLimits(names, a_min, a_max, worst, frozenset(overrides))

@@ -7,8 +7,6 @@ clipped to the acceleration limits and, if they still cross, both set to their m
 
 - `naive_bounds`: eq. (2) of [DelPrete2018]. A larger `dt` than the control period makes it
   gentler, "most of the time" [Park1998, Saab2013].
-- `damper_bounds`: speed limited by a linear function of the distance to the position limit,
-  tuned by hand [Kanehiro2010, Faverjon1987].
 - `decre_bounds`, `rubrecht_bounds`: formulas for velocity control [Decre2009, Rubrecht2010,
   Rubrecht2012], reconstructed from what [DelPrete2018] says of them; `docs/bounds.md` gives the
   reasons. The joint is taken to move with one velocity u throughout the step and to change it
@@ -37,34 +35,6 @@ def naive_bounds(q: ArrayLike, v: ArrayLike, limits: JointLimits, dt: float) -> 
     lower = np.maximum((-limits.v_max - v) / dt, 2.0 * (limits.q_min - q - dt * v) / dt**2)
     upper = np.minimum((limits.v_max - v) / dt, 2.0 * (limits.q_max - q - dt * v) / dt**2)
     return _usable(lower, upper, limits)
-
-
-def damper_velocity_range(
-    q: ArrayLike, limits: JointLimits, influence: float, gain: float
-) -> tuple[Array, Array]:
-    """Return the speeds that a linear velocity damper allows, as in `damper_bounds`."""
-    q = np.asarray(q, dtype=np.float64)
-
-    def towards(room: Array) -> Array:
-        slowed = gain * room / influence
-        return np.minimum(np.where(room < influence, slowed, np.inf), limits.v_max)
-
-    return -towards(q - limits.q_min), towards(limits.q_max - q)
-
-
-def damper_bounds(
-    q: ArrayLike,
-    v: ArrayLike,
-    limits: JointLimits,
-    dt: float,
-    influence: float = 0.2,
-    gain: float = 1.0,
-) -> AccelerationBounds:
-    """Return the accelerations that obey a linear velocity damper at the end of the step.
-
-    It acts nearer to a limit than `influence`, rad, and allows the speed `gain`, rad/s, there.
-    """
-    return _to_reach(v, damper_velocity_range(q, limits, influence, gain), limits, dt)
 
 
 def decre_velocity_range(q: ArrayLike, limits: JointLimits, dt: float) -> tuple[Array, Array]:

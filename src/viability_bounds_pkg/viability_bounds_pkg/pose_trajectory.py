@@ -190,10 +190,9 @@ def circle(
     *,
     period: float,
     turns: float = 1.0,
-    ramp: float | None = None,
     points_per_turn: int = 48,
 ) -> list[TrajectoryPoint]:
-    """Return points of a circle at constant orientation, from rest to rest.
+    """Return points of a circle at constant orientation, from rest to rest by a quintic angle.
 
     At angle th from the start the end effector is at  centre + radius (cos(th) e_1 + sin(th) e_2),
 
@@ -208,20 +207,18 @@ def circle(
         radius: m.
         axes: e_1, from the centre to the start, and e_2, in which it begins to move; shape (3,)
             each, unit, at right angles.
-        period: duration of a turn, s.
+        period: mean duration of a turn, s.
         turns: their number.
-        ramp: time of acceleration at the start, and of deceleration at the end, s, at most `turns`
-            periods; it is added to the duration. None: the angle follows the quintic from rest to
-            rest over all turns, and `period` is the mean duration of a turn.
         points_per_turn: of the result.
     """
     e_1, e_2 = map(np.asarray, axes)
     centre = start.translation - radius * e_1
-    duration = turns * period + (ramp or 0.0)
+    duration, whole = turns * period, 2.0 * math.pi * turns
+    angle = [whole * _FROM_REST_TO_REST.deriv(k) / duration**k for k in range(3)]
     points = []
-    count = math.ceil(points_per_turn * duration / period) + 1
+    count = math.ceil(points_per_turn * turns) + 1
     for t in np.linspace(0.0, duration, count).tolist():
-        th, rate, rate_dot = _circle_angle(t, duration, period, turns, ramp)
+        th, rate, rate_dot = (float(each(t / duration)) for each in angle)
         outward = math.cos(th) * e_1 + math.sin(th) * e_2
         along = math.cos(th) * e_2 - math.sin(th) * e_1
         pose = pin.SE3(start.rotation, centre + radius * outward)
@@ -230,23 +227,3 @@ def circle(
         acceleration[:3] = radius * (rate_dot * along - rate**2 * outward)
         points.append(TrajectoryPoint(t, pose, velocity, acceleration))
     return points
-
-
-def _circle_angle(
-    t: float, duration: float, period: float, turns: float, ramp: float | None
-) -> tuple[float, float, float]:
-    """Return the angle from the start and its first two derivatives: rad, rad/s, rad/s^2."""
-    whole, top_rate = 2.0 * math.pi * turns, 2.0 * math.pi / period
-    if ramp is None:
-        x = t / duration
-        s, s_dot, s_ddot = (_FROM_REST_TO_REST.deriv(k)(x) / duration**k for k in range(3))
-        return whole * s, whole * s_dot, whole * s_ddot
-    if t > 0.5 * duration:  # the deceleration mirrors the acceleration
-        left = max(duration - t, 0.0)
-        th, rate, rate_dot = _circle_angle(left, duration, period, turns, ramp)
-        return whole - th, rate, -rate_dot
-    if t >= ramp:
-        return top_rate * (t - 0.5 * ramp), top_rate, 0.0
-    x = t / ramp
-    s_int, s, s_dot = (_FROM_REST_TO_REST.integ().deriv(k)(x) * ramp ** (1 - k) for k in range(3))
-    return top_rate * s_int, top_rate * s, top_rate * s_dot

@@ -255,18 +255,17 @@ def _points(content: Any, where: str) -> list[TrajectoryPoint]:
 
 
 def _circle(content: Any, where: str) -> list[TrajectoryPoint]:
-    fields = read_fields(content, where, _CIRCLE, ("phase", "turns", "ramp"))
+    fields = read_fields(content, where, _CIRCLE, ("phase", "turns"))
     first, second = fields["plane"]
     phase = fields.get("phase", 0.0)
     outward = math.cos(phase) * first + math.sin(phase) * second
     along = math.cos(phase) * second - math.sin(phase) * first
-    turns, period, ramp = fields.get("turns", 1), fields["period"], fields.get("ramp")
-    if ramp is not None and ramp > turns * period:
-        allowed = f"at most {turns * period:g}, the time of all turns"
-        raise refuse(f"{where}.ramp", ramp, allowed)
-    radius = 0.5 * fields["diameter"]
     return circle(
-        _pose(fields, "start"), radius, (outward, along), period=period, turns=turns, ramp=ramp
+        _pose(fields, "start"),
+        0.5 * fields["diameter"],
+        (outward, along),
+        period=fields["period"],
+        turns=fields.get("turns", 1),
     )
 
 
@@ -300,7 +299,6 @@ _CIRCLE: dict[str, Check] = {
     "phase": number,
     "turns": positive,
     "period": positive,
-    "ramp": positive,
 }
 _OBSTACLE: dict[str, Check] = {
     "name": name,

@@ -141,7 +141,6 @@ BOX = "name: a, shape: box, size: [1, 1, 1], position: [0, 0, 0]"
         ("trajectory", f"{{circle: {{{CIRCLE.replace('[y, z]', '[y, -y]')}}}}}", "circle.plane"),
         ("trajectory", f"{{circle: {{{CIRCLE.replace('[y, z]', '[y, w]')}}}}}", "two of x, y, z"),
         ("trajectory", f"{{circle: {{{CIRCLE}, turns: 0}}}}", "circle.turns"),
-        ("trajectory", f"{{circle: {{{CIRCLE}, ramp: 1.5}}}}", "ramp is 1.5; allowed: at most 1"),
         ("trajectory", f"{{circle: {{{CIRCLE}, colour: 1}}}}", "circle has colour"),
         ("wrench", "{force: [1, 2]}", "wrench.force"),
         ("wrench", "{frame: 1}", "wrench.frame"),

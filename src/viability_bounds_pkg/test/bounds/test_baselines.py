@@ -6,8 +6,6 @@ import pytest
 from joint_cases import column, one_joint
 
 from viability_bounds_pkg.baselines import (
-    damper_bounds,
-    damper_velocity_range,
     decre_bounds,
     decre_velocity_range,
     naive_bounds,
@@ -20,7 +18,7 @@ from viability_bounds_pkg.viability import acceleration_bounds, viable_velocity_
 FIGURE_1 = one_joint(-1.0, 1.0, 5.0, -15.0, 15.0)
 ASYMMETRIC = one_joint(-1.0, 2.0, 5.0, -15.0, 6.0)
 FIGURE_4 = one_joint(-1.7, 2.0, 2.0, -12.0, 12.0)
-METHODS = [naive_bounds, damper_bounds, decre_bounds, rubrecht_bounds]
+METHODS = [naive_bounds, decre_bounds, rubrecht_bounds]
 
 
 def states(limits, count=5000):
@@ -69,13 +67,6 @@ def test_naive_bounds_are_equation_2():
     )
     assert upper[:, 0] == pytest.approx([15.0, 1.0, 2.0 / 0.01 * (0.001 - 0.01)])
     assert lower[:, 0] == pytest.approx([-15.0, -15.0, -15.0])
-
-
-def test_damper_is_linear_within_its_influence():
-    q = column([0.0, 0.8, 0.95, 1.0])
-    lower, upper = damper_velocity_range(q, FIGURE_1, influence=0.2, gain=3.0)
-    assert upper[:, 0] == pytest.approx([5.0, 3.0, 0.75, 0.0])
-    assert lower[:, 0] == pytest.approx([-5.0] * 4)
 
 
 @pytest.mark.parametrize("limits", [FIGURE_1, ASYMMETRIC])
@@ -148,14 +139,3 @@ def test_velocity_methods_under_constant_acceleration():
     step_error = 0.5 * 12.0 * 0.01**2
     assert 2.0 < pull_to_the_limit(rubrecht_bounds)[0] <= 2.0 + step_error
     assert pull_to_the_limit(decre_bounds)[0] > 2.0 + 10.0 * step_error
-
-
-def test_a_damper_needs_tuning():
-    def gentle(q, v, limits, dt):
-        return damper_bounds(q, v, limits, dt, influence=0.4, gain=2.0)
-
-    def steep(q, v, limits, dt):
-        return damper_bounds(q, v, limits, dt, influence=0.05, gain=2.0)
-
-    assert pull_to_the_limit(gentle)[0] <= 2.0 + 1e-3
-    assert pull_to_the_limit(steep)[0] > 2.0 + 0.05

@@ -65,7 +65,7 @@ def test_options_reach_the_limits(write_robot, call):
         *common,
         *("--torque-reserve", 0.2),
         *("--override", "wrist=-3,2.5"),
-        *("--cap", 40, "--cap", "shoulder=5"),
+        *("--cap", 5),
         "--drift",
     )
     assert (ended.returncode, ended.stderr) == (0, "")
@@ -73,8 +73,6 @@ def test_options_reach_the_limits(write_robot, call):
     assert plain["acceleration_max"][0] > 5.0
     assert changed["acceleration_min"] == [-5.0, -3.0]
     assert changed["acceleration_max"] == [5.0, 2.5]
-    capped = printed(call(path, *common, "--cap", 4, "--cap", "wrist=6"))
-    assert capped["acceleration_min"] == [-4.0, -6.0]
     assert len(changed["acceleration_drift"]) == 2 and min(changed["acceleration_drift"]) > 0.0
     assert "shoulder: a in [-5, 5] rad/s^2 (capped)" in ended.stdout
 
@@ -268,7 +266,6 @@ def test_bad_usage_is_told_in_one_line(write_robot, call, arguments, message):
     [
         (["--override", "elbow=-1,1"], "override of unknown joint 'elbow'"),
         (["--override", "wrist=1,2"], "joint wrist: override must be finite with min < 0 < max"),
-        (["--cap", "elbow=1"], "cap of unknown joint 'elbow'"),
         (["-o", "{tmp}"], "is a directory"),
         (["-o", "{tmp}/none/limits.yaml"], "no directory"),
         (["-o", "{tmp}/robot.yaml"], "is the robot's parameter file"),

@@ -34,12 +34,7 @@ from viability_bounds_pkg.cli.limits_file import (
     write_whole,
 )
 from viability_bounds_pkg.estimate.drift import acceleration_drift
-from viability_bounds_pkg.estimate.worst_case import (
-    Array,
-    LimitEstimateError,
-    StateSpace,
-    WorstCases,
-)
+from viability_bounds_pkg.estimate.worst_case import Array, StateSpace, WorstCases
 from viability_bounds_pkg.parameter_files import ParameterFileError
 
 
@@ -64,11 +59,6 @@ def _override(text: str) -> tuple[str, tuple[float, float]]:
         return joint, (float(low), float(high))
     except ValueError as error:
         raise argparse.ArgumentTypeError(f"must read JOINT=MIN,MAX, is {text!r}") from error
-
-
-def _cap(text: str) -> tuple[str, float]:
-    joint, _, value = text.rpartition("=")
-    return joint, positive(value)
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -118,11 +108,10 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     add(
         "--cap",
-        type=_cap,
-        action="append",
-        default=[],
-        metavar="[JOINT=]VALUE",
-        help="greatest limit of all joints, or of one, rad/s^2; repeatable",
+        type=positive,
+        default=np.inf,
+        metavar="VALUE",
+        help="greatest limit of all joints, rad/s^2",
     )
     add(
         "--drift",
@@ -135,19 +124,6 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     if options.samples is None:
         options.samples = DEFAULT_SAMPLES[options.method]
     return options
-
-
-def _caps(options: argparse.Namespace, names: Sequence[str]) -> Array:
-    """Return the cap of each joint, shape (n,), rad/s^2; one for the joint beats one for all."""
-    caps = np.full(len(names), dict(options.cap).get("", np.inf))
-    for joint, value in options.cap:
-        if joint and joint not in names:
-            raise LimitEstimateError(
-                f"cap of unknown joint {joint!r}; there are: {', '.join(names)}"
-            )
-        if joint:
-            caps[names.index(joint)] = value
-    return caps
 
 
 def _in_share(
@@ -170,7 +146,7 @@ def _run(options: argparse.Namespace) -> int:
             )
     robot = read_robot(options.parameters)
     names = list(robot.model.names)[1:]
-    caps, overrides = _caps(options, names), dict(options.override)
+    overrides = dict(options.override)
     torque = (1.0 - options.torque_reserve) * robot.tau_max
     space = StateSpace.of(robot.model, robot.q_min, robot.q_max, robot.v_max, torque)
     search = SEARCHES[options.method]
@@ -178,7 +154,7 @@ def _run(options: argparse.Namespace) -> int:
     _report_search(names, worst)
     if options.share > 0.0:
         overrides = _in_share(robot, space, worst, options.share) | overrides
-    limits = limits_from_worst_cases(robot.model, space, worst, overrides, caps)
+    limits = limits_from_worst_cases(robot.model, space, worst, overrides, options.cap)
     _report_limits(limits, unavailable_share(robot.model, space, limits))
     drift = None
     if options.drift:

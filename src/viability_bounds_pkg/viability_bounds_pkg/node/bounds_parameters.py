@@ -48,7 +48,6 @@ BASELINES = {
     "naive": baselines.naive_bounds,
     "decre": baselines.decre_bounds,
     "rubrecht": baselines.rubrecht_bounds,
-    "damper": baselines.damper_bounds,
 }
 """Methods to compare with."""
 

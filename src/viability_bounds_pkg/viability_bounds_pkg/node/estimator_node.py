@@ -126,8 +126,6 @@ class EstimatorNode(ArmNode):
         }
         if (design := self._observers) is not None:
             values |= {
-                "velocity_lag_s": design.lag,
-                "velocity_noise_rad_s": design.noise,
                 "position_error_rad": design.position_error,
                 "velocity_error_rad_s": design.velocity_error,
                 "innovation_declared_rad": design.innovation,

@@ -55,9 +55,6 @@ class ObserverDesign:
         position_error: largest error of the estimated position, rad.
         velocity_error: largest error of the estimated velocity, rad/s.
         innovation: largest difference between measured and predicted position, rad.
-        lag: by which velocities that no known acceleration explains come late, s.
-        noise: standard deviation of the velocity where errors of the position are independent and
-            uniform within their limits, rad/s.
     """
 
     position_gain: Array
@@ -66,8 +63,6 @@ class ObserverDesign:
     position_error: Array
     velocity_error: Array
     innovation: Array
-    lag: Array
-    noise: Array
 
 
 def design_observer(
@@ -106,8 +101,6 @@ def design_observer(
         position_error=worst(gains.position),
         velocity_error=worst(gains.velocity) / dt,
         innovation=worst(gains.innovation),
-        lag=dt * (2.0 / (1.0 - p) - 1.5),
-        noise=gains.noise[chosen] * delta / (np.sqrt(3.0) * dt),
     )
 
 
@@ -161,20 +154,18 @@ class Observer:
 class _ErrorGains(NamedTuple):
     """Largest errors per error of the position and of the acceleration, period 1, for `_POLES`.
 
-    Those are L1 norms of the responses, shape (poles, 2); `noise`, shape (poles,), is the L2 norm
-    of the response of the velocity to errors of the position.
+    L1 norms of the responses, shape (poles, 2) each.
     """
 
     position: Array
     velocity: Array
     innovation: Array
-    noise: Array
 
 
 @cache
 def _error_gains() -> _ErrorGains:
     rows = np.array([_norms(p) for p in _POLES])
-    return _ErrorGains(rows[:, 0:2], rows[:, 2:4], rows[:, 4:6], rows[:, 6])
+    return _ErrorGains(rows[:, 0:2], rows[:, 2:4], rows[:, 4:6])
 
 
 def _norms(p: float) -> tuple[float, ...]:
@@ -202,7 +193,6 @@ def _norms(p: float) -> tuple[float, ...]:
         _integral(ends[:, 1]),
         float(np.abs(from_noise @ before).sum()) + 1.0,
         _integral(before @ ends) + 0.5,
-        float(np.sqrt((from_noise[:, 1] ** 2).sum())),
     )
 
 
