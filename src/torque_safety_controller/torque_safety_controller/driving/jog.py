@@ -13,6 +13,7 @@ Without a new command for `TIMEOUT` u is zero, and the goal comes to rest.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pinocchio as pin
@@ -54,15 +55,14 @@ class _Jog:
     """
 
     def __init__(self) -> None:
-        self.velocity = np.zeros(0)
-        self._command = np.zeros(0)
+        self.velocity = self._command = np.zeros(0)
         self._ends = self._stamp = -1
 
     def command(self, velocity: Array) -> None:
         """Command a velocity, shape (k,), from the next step on."""
         self._command, self._ends = velocity, -1
 
-    def _step(self, stamp: int) -> tuple[Array | None, float]:
+    def _commanded(self, stamp: int) -> tuple[Array | None, float]:
         """Return u, shape (k,), None when the jog has ended; and the time since the last step, s.
 
         Args:
@@ -99,23 +99,22 @@ class JointJog(_Jog):
         super().__init__()
         self._q_min, self._q_max = q_min, q_max
         self._v_max = np.minimum(v_max, JOINT_SPEED_MAX)
-        self._q_des = np.zeros(0)
+        self._q_des: Array | None = None
 
     def advance(self, controller: Controller, state: State, stamp: int) -> bool:
         """Set the goal of one control step; see `Motion`."""
-        if not len(self._q_des):
+        if self._q_des is None:
             self._q_des, self.velocity = state.q.copy(), state.v.copy()
-        wanted, elapsed = self._step(stamp)
+        wanted, elapsed = self._commanded(stamp)
         if wanted is None:
             controller.goals.set_posture(self._q_des)
             return False
         # All by the same share: the direction stays.
         wanted = wanted / max(1.0, float((np.abs(wanted) / self._v_max).max()))
         rate = self._smooth(wanted, elapsed)
-        q_des = self._q_des + elapsed * self.velocity
-        q_des = np.clip(q_des, state.q - JOINT_LEAD, state.q + JOINT_LEAD)
-        self._q_des = np.clip(q_des, self._q_min, self._q_max)
-        at_limit = q_des != self._q_des
+        ahead = np.clip(self._q_des + elapsed * self.velocity - state.q, -JOINT_LEAD, JOINT_LEAD)
+        self._q_des = np.clip(state.q + ahead, self._q_min, self._q_max)
+        at_limit = self._q_des != state.q + ahead
         self.velocity[at_limit] = rate[at_limit] = 0.0
         controller.goals.release_pose()
         controller.goals.set_posture(self._q_des, self.velocity, rate)
@@ -129,10 +128,9 @@ class HandJog(_Jog):
         speed_max: of translation, m/s, and rotation, rad/s; faster commands are shortened.
     """
 
-    def __init__(self, speed_max: tuple[float, float] = HAND_SPEED_MAX) -> None:
+    def __init__(self, speed_max: Sequence[float] = HAND_SPEED_MAX) -> None:
         super().__init__()
-        self._speed_max = speed_max
-        self._in_hand = False
+        self._speed_max, self._in_hand = speed_max, False
         self._goal: pin.SE3 | None = None
 
     def command_twist(self, twist: Array, in_hand: bool) -> None:
@@ -155,7 +153,7 @@ class HandJog(_Jog):
             # What the robot's model knows is the last step, or nothing.
             robot.update(state, robot.a_last)
             self._goal, self.velocity = robot.pose.copy(), robot.J @ robot.v
-        wanted, elapsed = self._step(stamp)
+        wanted, elapsed = self._commanded(stamp)
         if wanted is None:
             controller.goals.set_pose(self._goal)
             return False
@@ -163,16 +161,13 @@ class HandJog(_Jog):
         if not self._in_hand:
             wanted = (wanted.reshape(2, 3) @ R).ravel()
         rate = self._smooth(wanted, elapsed)
-        linear, angular = self.velocity[:3], self.velocity[3:]
-        p = self._goal.translation + elapsed * R @ linear
-        R = R @ pin.exp3(elapsed * angular)
+        linear, angular = np.split(self.velocity, 2)
         # The pose of the last step: one period's motion is far less than the lead.
-        ahead = p - robot.pose.translation
-        turn = pin.log3(robot.pose.rotation.T @ R)
+        here = robot.pose
+        ahead = self._goal.translation + elapsed * R @ linear - here.translation
+        turn = pin.log3(here.rotation.T @ R @ pin.exp3(elapsed * angular))
         shorten(ahead, HAND_LEAD[0])
-        if np.linalg.norm(turn) > HAND_LEAD[1]:
-            shorten(turn, HAND_LEAD[1])
-            R = robot.pose.rotation @ pin.exp3(turn)
-        self._goal = pin.SE3(R, robot.pose.translation + ahead)
+        shorten(turn, HAND_LEAD[1])
+        self._goal = pin.SE3(here.rotation @ pin.exp3(turn), here.translation + ahead)
         controller.goals.set_pose(self._goal, self.velocity.copy(), rate)
         return True

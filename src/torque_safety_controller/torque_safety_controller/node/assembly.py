@@ -3,15 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
 from torque_safety_controller.controller import Controller
-from torque_safety_controller.parameters.contact_parameters import ContactPoint
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parts.collision.avoidance import Collision
 from torque_safety_controller.parts.collision.model import build_collision_model
@@ -60,6 +58,9 @@ def make_controller(
 ) -> tuple[Controller, pin.SE3]:
     """Return a controller, warmed up, and the placement of the base frame.
 
+    Tasks and limits are in the root frame of the URDF; the placement converts what is in
+    ``base_frame``.
+
     Args:
         config: checked parameters.
         node: listens for the URDF if it comes from a topic.
@@ -68,7 +69,16 @@ def make_controller(
     Raises:
         SettingError: parameters that do not fit the URDF.
     """
-    robot, base, urdf = load_robot(config, node)
+    urdf = robot_urdf(config, node)
+    model = load_model(config, urdf)
+    if node is not None:
+        warn_of_unusual(node, config, urdf)
+    roots = ", ".join(each.name for each in model.frames if each.parentJoint == 0)
+    base = _frame(model, config.base_frame, "base_frame", f"a frame fixed to the root: {roots}")
+    if base.parentJoint != 0:
+        allowed = "a frame fixed to the root, not a moving one"
+        raise SettingError("base_frame", config.base_frame, allowed)
+    robot = _robot(config, model)
     controller = Controller(
         robot,
         make_parts(config, robot, urdf, declared),
@@ -78,7 +88,7 @@ def make_controller(
         config.gains.hold_kd,
     )
     controller.warm_up()
-    return controller, base
+    return controller, base.placement
 
 
 def make_parts(
@@ -89,8 +99,7 @@ def make_parts(
 ) -> list[Part]:
     """Return the parts of a controller that its parameters ask for, in their order.
 
-    A part reads only what parts before it have written. Tasks and limits are in the root frame of
-    the URDF; `LoadedRobot.base` converts what is in `base_frame`.
+    A part reads only what parts before it have written. What is off is left out.
 
     Args:
         config: checked parameters.
@@ -101,19 +110,27 @@ def make_parts(
     Raises:
         SettingError: parameters that do not fit the URDF.
     """
+    hands, time = 1 + len(robot.others), config.gains.disturbance_time
     goals = Goals(robot.n, config.gains, len(robot.others))
+    integral = make_integral(
+        config.integral.integral_action,
+        config.integral_settings,
+        DISTURBANCE_MAX * config.torque_max,
+        hands,
+    )
     parts = [
         # It may make the hand's pose the goal, and soften the pose task.
-        make_interaction(config, robot, urdf, goals),
+        _interaction(config, robot, urdf, goals),
         goals,
-        # What is added to the model's torque leaves less of it to the QP and to plans.
-        make_integral_part(config, robot),
+        # What is added to the model's torque leaves less of it to the QP and to plans. A torque
+        # that is taken over fades where integral action is off.
+        Integral(integral, robot),
         Friction(config.friction_settings),
         # A change of that torque disturbs before it can be measured.
-        make_disturbance(config),
+        Disturbance(robot.n, time) if time else None,
         # All before can run while the limits are on their way; all after narrows their bounds.
-        JointBounds(make_own_bounds(config, declared)),
-        make_safety_filter(config, robot.model),
+        JointBounds(_own_bounds(config, declared)),
+        _safety_filter(config, robot.model),
         # A slowed arm is slowed inside of what the filter allows.
         SlowDown(config.position_min, config.position_max, config.dt),
         # It counts on no more braking than the bounds leave.
@@ -122,53 +139,29 @@ def make_parts(
     return [part for part in parts if part is not None]
 
 
-def make_integral_part(config: ControllerConfiguration, robot: RobotModel) -> Integral:
-    """Return the integral action; a torque that is taken over fades where it is off."""
-    mode, settings = config.integral.integral_action, config.integral_settings
-    most = DISTURBANCE_MAX * config.torque_max
-    return Integral(make_integral(mode, settings, most, 1 + len(robot.others)), robot)
-
-
-def make_disturbance(config: ControllerConfiguration) -> Disturbance | None:
-    """Return what estimates disturbances; None where that is off."""
-    time = config.gains.disturbance_time
-    return Disturbance(len(config.joints), time) if time else None
-
-
-def make_safety_filter(config: ControllerConfiguration, model: pin.Model) -> SafetyFilter | None:
-    """Return what keeps a plan in hand; None where that is off.
-
-    Args:
-        config: checked parameters.
-        model: of the arm.
-    """
+def _safety_filter(config: ControllerConfiguration, model: pin.Model) -> SafetyFilter | None:
     if not config.safety_filter:
         return None
-    limits = config.collision
     return SafetyFilter(
         model,
         config.position_min,
         config.position_max,
-        limits.acceleration_min,
-        limits.acceleration_max,
+        config.collision.acceleration_min,
+        config.collision.acceleration_max,
         config.torque_max,
         config.dt,
         config.torque_reserve,
     )
 
 
-def make_own_bounds(
+def _own_bounds(
     config: ControllerConfiguration, declared: BoundsConfiguration | None
 ) -> Bounds | None:
     """Return the bounds in HOLD while those of ``acceleration_limits`` are stale.
 
     They are those of the bounds node, as far as its parameters are known and its method keeps
     limits. Else they know nothing of declared errors and delays, and keep a share of the
-    acceleration instead.
-
-    Args:
-        config: checked parameters; None is returned where they lack limits.
-        declared: parameters of the bounds node.
+    acceleration instead. None without limits.
     """
     if declared is not None and declared.method == "exact":
         with suppress(ArmSafetyError):  # the node that they are for says so
@@ -182,56 +175,6 @@ def make_own_bounds(
     )
     margin = MARGIN * np.minimum(-low, high)
     return BoundsSolver(limits, HORIZON * config.dt, margin, period=config.dt).bounds
-
-
-class LoadedRobot(NamedTuple):
-    """What the URDF says.
-
-    Attributes:
-        robot: model of the arm.
-        base: placement of the base frame in the URDF's root frame.
-        urdf: its text.
-    """
-
-    robot: RobotModel
-    base: pin.SE3
-    urdf: str
-
-
-def load_robot(config: ControllerConfiguration, node: Node | None = None) -> LoadedRobot:
-    """Read the URDF, once, and return what is made of it.
-
-    Args:
-        config: checked parameters.
-        node: listens for the URDF if it comes from a topic.
-
-    Raises:
-        SettingError: a URDF that does not load, or a joint or frame that it does not have.
-    """
-    urdf = robot_urdf(config, node)
-    model = load_model(config, urdf)
-    if node is not None:
-        warn_of_unusual(node, config, urdf)
-    frame, (first, *others) = config.end_effector_frame, config.end_effectors
-    if len(others) > 1 or first in others:
-        raise SettingError("end_effector_frame", frame, "a frame of the URDF, or two of them")
-    try:
-        robot = RobotModel(model, first, config.dt, others)
-    except RobotDescriptionError as error:
-        allowed = f"a frame of the URDF ({error})"
-        raise SettingError("end_effector_frame", frame, allowed) from error
-    return LoadedRobot(robot, _base_placement(model, config.base_frame), urdf)
-
-
-def _base_placement(model: pin.Model, frame: str) -> pin.SE3:
-    if not model.existFrame(frame):
-        known = [each.name for each in model.frames if each.parentJoint == 0]
-        allowed = f"a frame fixed to the root: {', '.join(known)}{did_you_mean(frame, known)}"
-        raise SettingError("base_frame", frame, allowed)
-    found = model.frames[model.getFrameId(frame)]
-    if found.parentJoint != 0:
-        raise SettingError("base_frame", frame, "a frame fixed to the root, not a moving one")
-    return found.placement
 
 
 def make_collision(config: ControllerConfiguration, model: pin.Model) -> Collision | None:
@@ -270,73 +213,59 @@ def make_collision(config: ControllerConfiguration, model: pin.Model) -> Collisi
     )
 
 
-def make_interaction(
+def _interaction(
     config: ControllerConfiguration, robot: RobotModel, urdf: str, goals: Goals
 ) -> Interaction | None:
-    """Return what handles forces; None without a sensor.
-
-    Args:
-        config: checked parameters.
-        robot: model of the arm.
-        urdf: text of its URDF.
-        goals: of the arm.
-
-    Raises:
-        SettingError: a frame that the URDF does not have or that is not where it must be.
-    """
-    sensor = _sensor(config, robot, urdf)
-    contact = _contact(config.interaction.points, robot)
-    if sensor is None:
-        return None
-    if contact is None:
-        return Interaction(goals, sensor, settings=config.interaction.settings)
-    placement = _between(robot.model, robot.frame, contact.frame)
-    return Interaction(goals, sensor, contact, placement, config.interaction.settings)
-
-
-def _sensor(config: ControllerConfiguration, robot: RobotModel, urdf: str) -> WrenchSensor | None:
+    """Return what handles forces; None without a sensor."""
     settings, model = config.interaction, robot.model
-    frame = settings.ft_frame
-    if not frame:
+    hand = model.frames[model.getFrameId(robot.frame)]
+    contact, placement = None, None
+    if points := settings.points:
+        frames = [
+            _frame(model, point.frame, f"contacts[{index}].frame", "a frame of the URDF")
+            for index, point in enumerate(points)
+        ]
+        names = list(dict.fromkeys(point.frame for point in points))
+        if len(names) > 1 or frames[0].parentJoint != hand.parentJoint:
+            raise SettingError("contacts", names, f"one link, fixed to {robot.frame!r}")
+        places, first = [point.point for point in points], points[0]
+        contact = FrictionContact(first.frame, places, first.normal, first.friction)
+        placement = hand.placement.actInv(frames[0].placement)
+    if not settings.ft_frame:
         return None
-    if not model.existFrame(frame, pin.FrameType.BODY):
-        links = [each.name for each in model.frames if each.type == pin.FrameType.BODY]
-        allowed = f"a link of the URDF, or empty{did_you_mean(frame, links)}"
-        raise SettingError("ft_frame", frame, allowed)
-    if _joint_of(model, frame) != _joint_of(model, robot.frame):
-        raise SettingError("ft_frame", frame, f"a link fixed to {robot.frame!r}")
+    frame = _frame(
+        model, settings.ft_frame, "ft_frame", "a link of the URDF, or empty", links=True
+    )
+    if frame.parentJoint != hand.parentJoint:
+        raise SettingError("ft_frame", settings.ft_frame, f"a link fixed to {robot.frame!r}")
     try:
-        inertia = inertia_beyond(urdf, frame, config.locked)
+        tool = inertia_beyond(urdf, settings.ft_frame, config.locked)
     except RobotDescriptionError as error:
-        raise SettingError("ft_frame", frame, f"a link of the URDF ({error})") from error
-    placement = _between(model, robot.frame, frame)
-    return WrenchSensor(placement, inertia, model.gravity.linear)
+        allowed = f"a link of the URDF ({error})"
+        raise SettingError("ft_frame", settings.ft_frame, allowed) from error
+    at_hand = hand.placement.actInv(frame.placement)
+    sensor = WrenchSensor(at_hand, tool, model.gravity.linear)
+    return Interaction(goals, sensor, contact, placement, settings.settings)
 
 
-def _contact(points: Sequence[ContactPoint], robot: RobotModel) -> FrictionContact | None:
-    """Return the contact of the hand; None without points."""
-    if not points:
-        return None
-    for index, point in enumerate(points):
-        if not robot.model.existFrame(point.frame):
-            hint = did_you_mean(point.frame, (each.name for each in robot.model.frames))
-            allowed = f"a frame of the URDF{hint}"
-            raise SettingError(f"contacts[{index}].frame", point.frame, allowed)
-    first = points[0]
-    frames = list(dict.fromkeys(each.frame for each in points))
-    if len(frames) > 1 or _joint_of(robot.model, first.frame) != _joint_of(
-        robot.model, robot.frame
-    ):
-        raise SettingError("contacts", frames, f"one link, fixed to {robot.frame!r}")
-    places = np.array([each.point for each in points])
-    return FrictionContact(first.frame, places, first.normal, first.friction)
+def _robot(config: ControllerConfiguration, model: pin.Model) -> RobotModel:
+    frame, (first, *others) = config.end_effector_frame, config.end_effectors
+    if len(others) > 1 or first in others:
+        raise SettingError("end_effector_frame", frame, "a frame of the URDF, or two of them")
+    try:
+        return RobotModel(model, first, config.dt, others)
+    except RobotDescriptionError as error:
+        allowed = f"a frame of the URDF ({error})"
+        raise SettingError("end_effector_frame", frame, allowed) from error
 
 
-def _joint_of(model: pin.Model, frame: str) -> int:
-    return int(model.frames[model.getFrameId(frame)].parentJoint)
-
-
-def _between(model: pin.Model, frame: str, other: str) -> pin.SE3:
-    """Return the placement of a frame in another that is fixed to the same joint."""
-    first, second = (model.frames[model.getFrameId(name)].placement for name in (frame, other))
-    return first.actInv(second)
+def _frame(
+    model: pin.Model, name: str, parameter: str, allowed: str, links: bool = False
+) -> pin.Frame:
+    """Return a frame that a parameter names, one of a link where only these are allowed."""
+    known = {each.name: each for each in reversed(list(model.frames))}  # of a name, the first
+    if links:
+        known = {k: each for k, each in known.items() if each.type == pin.FrameType.BODY}
+    if name not in known:
+        raise SettingError(parameter, name, allowed + did_you_mean(name, known))
+    return known[name]

@@ -156,10 +156,10 @@ class ControllerNode(ArmNode):
         states = self._states
         if states.answered_stamp < 0 or self._supervisor.mode is Mode.STOPPED:
             return
-        in_row = states.count_refused()
+        states.refused_in_row += 1
         if self._supervisor.by_drives:
             self._commands.position(self._handover.hold(states.q), stamp)
-        elif in_row == UNSEEN:
+        elif states.refused_in_row == UNSEEN:
             self._supervisor.refused(states.why_refused)
 
     def _start_over(self, arrival: Arrival) -> None:

@@ -229,7 +229,7 @@ class GoalSubscriber:
             motion = self.motion
             if not isinstance(motion, HandJog):
                 largest = self._controller.goals.gains.pose_speed_max
-                motion = HandJog(largest if len(largest) else HAND_SPEED_MAX)
+                motion = HandJog(largest.tolist() or HAND_SPEED_MAX)
                 self.motion = motion
             motion.command_twist(twist, in_hand)
 

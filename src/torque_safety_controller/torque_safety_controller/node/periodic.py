@@ -90,11 +90,6 @@ class StateStream(JointStateReader):
             self.waiting_since = now
         return Arrival.NEW
 
-    def count_refused(self) -> int:
-        """Count a dropped state of an arm that is answered; return how many in a row."""
-        self.refused_in_row += 1
-        return self.refused_in_row
-
     def mark_answered(self) -> None:
         """Count the last state as answered."""
         self.answered_stamp = self.stamp

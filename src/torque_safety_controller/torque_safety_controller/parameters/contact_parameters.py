@@ -19,7 +19,6 @@ from viability_bounds_pkg.parameter import (
     NEGATIVE,
     NOT_NEGATIVE,
     POSITIVE,
-    check_per_joint,
     group,
     joint_numbers,
     number,
@@ -204,27 +203,6 @@ class CollisionConfiguration:
         object.__setattr__(self, "capsules", tuple(capsules))
         object.__setattr__(self, "bodies", _obstacles(self.obstacles))
 
-    def check(self, robot: RobotConfiguration) -> None:
-        """Check what depends on the robot.
-
-        Raises:
-            SettingError: a posture beyond the position limits, or no limits of acceleration.
-        """
-        q, low, high = self.collision_posture, robot.position_min, robot.position_max
-        if len(q) and not ((low <= q) & (q <= high) & np.isfinite(q)).all():
-            raise SettingError("collision_posture", q, "within the position limits")
-        if self.collision_avoidance:
-            self.check_accelerations(robot)
-
-    def check_accelerations(self, robot: RobotConfiguration) -> None:
-        """Check that there are acceleration limits.
-
-        Raises:
-            SettingError: none.
-        """
-        check_per_joint("acceleration_min", self.acceleration_min, robot.joints)
-        check_per_joint("acceleration_max", self.acceleration_max, robot.joints)
-
     def posture(self, robot: RobotConfiguration) -> Array:
         """Return the posture that is free of collisions, shape (n,), rad."""
         if len(self.collision_posture):
@@ -244,9 +222,9 @@ def _obstacles(entries: tuple[str, ...]) -> tuple[Shape, ...]:
             size = np.zeros(3)
         elif not len(size):
             raise SettingError(f"{label}.size", None, "3 finite numbers > 0")
-        if len(set(size[: _EQUAL.get(entry.shape, 1)])) > 1:
-            allowed = f"the same diameter {_EQUAL[entry.shape]} times"
-            raise SettingError(f"{label}.size", size, allowed)
+        same = _EQUAL.get(entry.shape, 1)
+        if (size[:same] != size[0]).any():
+            raise SettingError(f"{label}.size", size, f"the same diameter {same} times")
         orientation = pin.Quaternion(pin.rpy.rpyToMatrix(entry.rpy)).coeffs()
         obstacles[name] = make_obstacle(name, entry.shape, size, entry.position, orientation)
     return tuple(obstacles.values())

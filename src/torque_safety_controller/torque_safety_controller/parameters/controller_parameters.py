@@ -29,6 +29,7 @@ from viability_bounds_pkg.parameter import (
     NOT_NEGATIVE,
     POSITIVE,
     Range,
+    check_per_joint,
     group,
     joint_amounts,
     joint_numbers,
@@ -265,6 +266,13 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
         integral = self.integral.settings(self.torque_max, len(self.end_effectors))
         object.__setattr__(self, "integral_settings", integral)
         object.__setattr__(self, "friction_settings", self.friction.settings(self.torque_max))
-        self.collision.check(self)
-        if self.safety_filter:
-            self.collision.check_accelerations(self)
+        self._check_collision()
+
+    def _check_collision(self) -> None:
+        collision, low, high = self.collision, self.position_min, self.position_max
+        q = collision.collision_posture
+        if len(q) and not ((low <= q) & (q <= high) & np.isfinite(q)).all():
+            raise SettingError("collision_posture", q, "within the position limits")
+        if collision.collision_avoidance or self.safety_filter:
+            for name in ("acceleration_min", "acceleration_max"):
+                check_per_joint(name, getattr(collision, name), self.joints)

@@ -10,8 +10,7 @@ import sys
 import termios
 import time
 import tty
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 
 import rclpy
 from geometry_msgs.msg import TwistStamped
@@ -41,10 +40,6 @@ PERIOD = 0.05
 
 HELD = 0.5
 """How long a key counts as held, s: a terminal's first repetition comes so late."""
-
-
-class NoTerminalError(ArmSafetyError, OSError):
-    """Standard input is no terminal, so that no keys come."""
 
 
 class Teleop:
@@ -86,11 +81,9 @@ class Teleop:
 
     def tick(self, now: float) -> None:
         """Publish the jog of the key that is held at `now`, s."""
-        if self._message is None:
-            return
         if now > self._until:
             self.stop()
-        else:
+        elif self._message is not None:
             self._publish(self._message)
 
     def stop(self) -> None:
@@ -119,24 +112,6 @@ class Teleop:
         return None
 
 
-@contextmanager
-def raw_terminal() -> Iterator[int]:
-    """Let keys come at once, and give the terminal back as it was.
-
-    Raises:
-        NoTerminalError: there is none.
-    """
-    if not sys.stdin.isatty():
-        raise NoTerminalError("standard input is no terminal: start it in one")
-    terminal = sys.stdin.fileno()
-    before = termios.tcgetattr(terminal)
-    try:
-        tty.setcbreak(terminal)
-        yield terminal
-    finally:
-        termios.tcsetattr(terminal, termios.TCSADRAIN, before)
-
-
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = Parser(
         prog="teleop",
@@ -159,21 +134,26 @@ def _run(options: argparse.Namespace) -> int:
     section = "/**/controller_node"
     joints = read_files(RobotConfiguration, options.params_file, section).joints
     frames = read_files(TaskFrames, options.params_file, section)
+    if not sys.stdin.isatty():
+        raise ArmSafetyError("standard input is no terminal: start it in one")
     settle_dds(os.environ)
-    with raw_terminal() as terminal:
-        rclpy.init(args=[])
-        node = Node("teleop", start_parameter_services=False)
-        speeds = options.speed, options.turn, options.joint_speed
-        teleop = Teleop(node, joints, (frames.base_frame, frames.end_effectors[0]), speeds)
-        print(HELP)
-        try:
-            _loop(teleop, terminal)
-        except KeyboardInterrupt:
-            pass
-        finally:
-            teleop.stop()
-            node.destroy_node()
-            rclpy.try_shutdown()
+    rclpy.init(args=[])
+    node = Node("teleop", start_parameter_services=False)
+    speeds = options.speed, options.turn, options.joint_speed
+    teleop = Teleop(node, joints, (frames.base_frame, frames.end_effectors[0]), speeds)
+    print(HELP)
+    terminal = sys.stdin.fileno()
+    before = termios.tcgetattr(terminal)
+    try:
+        tty.setcbreak(terminal)  # keys come at once
+        _loop(teleop, terminal)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        termios.tcsetattr(terminal, termios.TCSADRAIN, before)
+        teleop.stop()
+        node.destroy_node()
+        rclpy.try_shutdown()
     return 0
 
 
