@@ -87,7 +87,9 @@ class DirectLoop:
         self._sensor = None
         interaction = self.controller.find(Interaction)
         if self.robot.sensor and interaction is not None:
-            self._sensor = ForceTorqueReading(self.robot.sensor, config.sensor)
+            self._sensor = ForceTorqueReading(
+                self.robot.sensor, config.sensor, config.imperfections.imperfection_seed
+            )
         self.samples: list[Sample] = []
         self.t = 0.0
         self.robot.reset(config.start_positions, np.zeros(len(config.joints)))

@@ -175,10 +175,6 @@ def test_torque_control_is_handed_over_and_back():
             {"time": 0.1, "push": {"link": "no_link", "duration": 1.0, "force": [1.0, 0.0, 0.0]}},
             ("refused by bullet_node: external_wrench: ",),
         ),
-        (
-            {"time": 0.1, "payload": {"link": "panda_link0", "mass": 1.0}},
-            ("refused by bullet_node: payload: ",),
-        ),
     ],
 )
 def test_what_is_refused_ends_the_scenario_and_says_why(tmp_path, event, names):

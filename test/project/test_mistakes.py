@@ -205,7 +205,7 @@ def test_in_a_message(mistake, nodes, controller, robot, gets):
     for word, value in WORDS.items():
         text = text.replace(word, yaml.safe_dump(value, default_flow_style=True).strip())
     message = filled(imported(sent["type"])(), yaml.safe_load(text))
-    others = dict.fromkeys(("external_wrench", "obstacles", "payload"), robot)
+    others = dict.fromkeys(("external_wrench", "obstacles"), robot)
     heard = (others | {"acceleration_limits": controller}).get(sent["topic"], nodes)
     gets(heard, mistake["line"], each=lambda: heard.publish(sent["topic"], message))
 

@@ -42,8 +42,8 @@ def test_integral_torque_for_a_small_payload_counts_in_plans():
     """0.3 kg that no model knows: 7% of the shoulder's torque, half of it the integral's."""
     own = {"integral_action": "joints", "integral_budget": [5.0] * 4 + [1.5] * 3}
     loop = DirectLoop("baxter_left_arm", STIFF | STRONG | own)
-    payload = pin.Inertia(0.3, np.zeros(3), 1e-4 * np.eye(3))
-    loop.robot.set_payload(loop.controller.robot.frame, payload)
+    weight = [0.0, 0.0, -0.3 * 9.81]
+    loop.robot.apply_wrench(loop.controller.robot.frame, weight, np.zeros(3))
     race(loop, 15.0, 4)
     assert_kept(loop)
     used = np.abs(column(tuple(loop.samples), "additional")).max(axis=0)

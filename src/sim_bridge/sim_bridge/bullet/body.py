@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 from sim_bridge.bullet.client import BulletClient, finite_vector, pybullet, silenced
 from sim_bridge.bullet.obstacles import BulletObstacles, ContactMaterial, LinkWrench
 from sim_bridge.bullet.sensor import ForceTorqueSensor
-from sim_bridge.payload import PayloadError, payload_link, with_payloads
 from sim_bridge.urdf import FramePlacement, PreparedUrdf, prepare_urdf
 from viability_bounds_pkg.robot.description import RobotDescriptionError, unknown_name
 
@@ -79,18 +78,30 @@ class BulletBody:
             raise ValueError(f"physics_dt must be positive and finite, not {physics_dt}")
         self.joints, self.physics_dt = tuple(joints), physics_dt
         self.description = urdf_text, self.joints, dict(locked_positions or {})
-        gravity = finite_vector("gravity", gravity, 3)
-        self._sensor_frame, self._gravity = sensor_frame, gravity
-        self._mass_scales, self._rotor_inertias = mass_scales, rotor_inertias
-        self._payloads: dict[str, pin.Inertia] = {}
-        prepared = self._prepared()
+        self._gravity = finite_vector("gravity", gravity, 3)
+        self._prepared = prepared = prepare_urdf(
+            *self.description,
+            sensor_frame=sensor_frame,
+            mass_scales=mass_scales,
+            rotor_inertias=rotor_inertias,
+        )
+        self.sensor: ForceTorqueSensor | None = None
+        if sensor_frame:
+            self.sensor = ForceTorqueSensor(prepared.arm, sensor_frame, self._gravity, physics_dt)
         self.locked = prepared.locked
+        self._material = material or ContactMaterial()
         self._wrenches: dict[str, LinkWrench] = {}
-        self._bullet = bullet = BulletClient()
-        self.client_id = bullet.id
-        bullet.setGravity(*gravity.tolist())
+        self._bullet = BulletClient()
+        self.client_id = self._bullet.id
+        self._make_world()
+
+    def _make_world(self) -> None:
+        """Make a world anew: the robot, its motors and brakes off, and no obstacles."""
+        bullet = self._bullet
+        bullet.resetSimulation()
+        bullet.setGravity(*self._gravity.tolist())
         bullet.setPhysicsEngineParameter(
-            fixedTimeStep=physics_dt,
+            fixedTimeStep=self.physics_dt,
             numSolverIterations=_SOLVER_ITERATIONS,
             solverResidualThreshold=_SOLVER_RESIDUAL,
             deterministicOverlappingPairs=1,
@@ -99,42 +110,21 @@ class BulletBody:
             bullet.setPhysicsEngineParameter(
                 constraintSolverType=pybullet.CONSTRAINT_SOLVER_LCP_DANTZIG
             )
-        self._load(prepared)
+        self._load(self._prepared)
         self.obstacles = BulletObstacles(
             bullet,
             self.body_id,
-            self._link_names(),
-            material or ContactMaterial(),
-            physics_dt,
-            gravity.tolist(),
-            prepared.missing,
+            {index: link for link, index in self._links.items()},
+            self._material,
+            self.physics_dt,
+            self._gravity.tolist(),
+            self._prepared.missing,
         )
-
-    def _prepared(self) -> PreparedUrdf:
-        """Return the robot with its payloads for PyBullet; make its sensor."""
-        urdf, joints, locked = self.description
-        prepared = prepare_urdf(
-            with_payloads(urdf, self._payloads),
-            joints,
-            locked,
-            sensor_frame=self._sensor_frame,
-            mass_scales=self._mass_scales,
-            rotor_inertias=self._rotor_inertias,
-        )
-        self.sensor: ForceTorqueSensor | None = None
-        if self._sensor_frame:
-            self.sensor = ForceTorqueSensor(
-                prepared.arm, self._sensor_frame, self._gravity, self.physics_dt
-            )
-        return prepared
 
     def _load(self, prepared: PreparedUrdf) -> None:
         """Load the robot, its motors and brakes off."""
         bullet = self._bullet
-        payloads = set(map(payload_link, self._payloads))
-        self._frames = {
-            link: frame for link, frame in prepared.frames.items() if link not in payloads
-        }
+        self._frames = prepared.frames
         try:
             self.body_id = body = bullet.load_urdf(
                 prepared.text, flags=pybullet.URDF_USE_INERTIA_FROM_FILE
@@ -161,14 +151,11 @@ class BulletBody:
         for info in infos:  # PyBullet starts with the motors on
             if info.kind != pybullet.JOINT_FIXED:
                 bullet.setJointMotorControl2(body, info.id, pybullet.VELOCITY_CONTROL, force=0.0)
-        self._gears = [self._couple(joint, rotor) for joint, rotor in self._rotors.items()]
+        for joint, rotor in self._rotors.items():
+            self._couple(joint, rotor)
 
-    def _link_names(self) -> dict[int, str]:
-        """Return the names of links by PyBullet's indices."""
-        return {index: link for link, index in self._links.items()}
-
-    def _couple(self, joint: int, rotor: int) -> int:
-        """Couple a rotor to its joint by a gear constraint, and return that.
+    def _couple(self, joint: int, rotor: int) -> None:
+        """Couple a rotor to its joint by a gear constraint.
 
         Brakes and friction must act on the joint, not on the rotor: Dantzig's solver misses the
         coupling between a gear and a motor on its second joint.
@@ -180,21 +167,17 @@ class BulletBody:
         # Velocities are equal at the end of each step; the rotor's position does not matter.
         # PyBullet's constraint is v + ratio * v_rotor = 0.
         self._bullet.changeConstraint(gear, gearRatio=-1.0, erp=0.0, maxForce=_GEAR_TORQUE_MAX)
-        return gear
 
     # The physics step
 
     def _set_state(self, q: Array, v: Array) -> None:
         """Put the joints at positions `q`, rad, with velocities `v`, rad/s, shape (n,) each."""
-        self._place(q, v)
-        self.obstacles.reset()
-        self._measure(q, v, v)
-
-    def _place(self, q: Array, v: Array) -> None:
         for index, *state in zip(self._indices, q.tolist(), v.tolist(), strict=True):
             self._bullet.resetJointState(self.body_id, index, *state)
             if index in self._rotors:
                 self._bullet.resetJointState(self.body_id, self._rotors[index], *state)
+        self.obstacles.reset()
+        self._measure(q, v, v)
 
     def _set_torques(self, torques: Array) -> None:
         """Apply joint torques in the next step, shape (n,), N m."""
@@ -226,55 +209,6 @@ class BulletBody:
             self.sensor.update(q, v, v_next, wrenches)
 
     # Links
-
-    def set_payload(self, link: str, inertia: pin.Inertia | None) -> None:
-        """Mount a payload on a link, from the next physics step on; the state stays as it is.
-
-        PyBullet cannot move a centre of mass: the robot is loaded anew, which takes 20 to 200 ms.
-
-        Args:
-            link: any link of the URDF that moves. One on the force/torque sensor is measured.
-            inertia: of the payload in the frame of the link; None removes it. It replaces the
-                payload that the link has.
-
-        Raises:
-            RobotDescriptionError: there is no such link.
-            PayloadError: the link does not move.
-        """
-        self.check_payload(link)
-        if inertia is None and link not in self._payloads:
-            return
-        self._payloads.pop(link, None)
-        if inertia is not None:
-            self._payloads[link] = inertia
-        self._reload()
-
-    def check_payload(self, link: str) -> None:
-        """Raise the errors of `set_payload` for this link."""
-        if self._links[self._frame(link).link] < 0:
-            raise PayloadError(f"payload of link {link!r}: that link does not move")
-
-    def clear_payloads(self) -> None:
-        """Remove all payloads."""
-        if self._payloads:
-            self._payloads.clear()
-            self._reload()
-
-    def _reload(self) -> None:
-        states = self._joint_states()
-        measured = self.sensor.wrench if self.sensor else None
-        prepared = self._prepared()
-        for gear in self._gears:
-            self._bullet.removeConstraint(gear)
-        self._bullet.removeBody(self.body_id)
-        self._load(prepared)
-        if self.sensor and measured is not None:  # until the next step
-            self.sensor.wrench = measured
-        # What is no number stays in PyBullet whatever state is set afterwards.
-        self._place(
-            *np.nan_to_num(np.array([state[:2] for state in states]).T, posinf=0.0, neginf=0.0)
-        )
-        self.obstacles.replace_robot(self.body_id, self._link_names())
 
     def apply_wrench(self, link: str, force: ArrayLike, torque: ArrayLike) -> None:
         """Apply a wrench to a link, from the next physics step until `clear_wrenches`.

@@ -3,9 +3,9 @@
 
 A joint behind a gear of ratio N, with motor torque tau, obeys
 
-    (M + I) a + h = tau + b - f(v) + contact,    I = N^2 times the inertia of the rotor,
+    (M + I) a + h = tau - f(v) + contact,    I = N^2 times the inertia of the rotor,
 
-with an error b of the motor's torque, and a friction f that follows Stribeck's curve with
+with a friction f that follows Stribeck's curve with
 Stribeck velocity v_s, and takes any value up to F_s at rest:
 
     f(v) = sign(v) L(v) + d v,    L(v) = F_c + (F_s - F_c) exp(-(v / v_s)^2),
@@ -40,7 +40,7 @@ _DAMPING_MASS = 0.05  # d h, kg
 
 
 class JointFriction:
-    """Friction, rotors and torque biases of n joints. Arguments are scalars or of shape (n,).
+    """Friction and rotors of n joints. Arguments are scalars or of shape (n,).
 
     Args:
         n: number of joints.
@@ -49,11 +49,10 @@ class JointFriction:
         friction_viscous: d, N m s/rad.
         stribeck_velocity: v_s at which dry friction has decreased from F_s to F_c but for 1/e
             of the difference, rad/s.
-        torque_bias: b, torque of the motors in addition to the commanded one, N m.
         rotor_inertia: I, as seen from the joint, kg m^2.
 
     Raises:
-        ValueError: a wrong shape, a number that is not finite, a negative one (except the bias),
+        ValueError: a wrong shape, a number that is not finite, a negative one,
             stiction below Coulomb friction, a Stribeck velocity of zero.
     """
 
@@ -65,19 +64,17 @@ class JointFriction:
         friction_static: ArrayLike | None = None,
         friction_viscous: ArrayLike = 0.0,
         stribeck_velocity: ArrayLike = DEFAULT_STRIBECK_VELOCITY,
-        torque_bias: ArrayLike = 0.0,
         rotor_inertia: ArrayLike = 0.0,
     ) -> None:
-        def per_joint(name: str, value: ArrayLike, *, signed: bool = False) -> Array:
+        def per_joint(name: str, value: ArrayLike) -> Array:
             value = np.full(n, value) if np.ndim(value) == 0 else value
-            return finite_vector(name, value, n, signed=signed).copy()
+            return finite_vector(name, value, n, signed=False).copy()
 
         static = friction_coulomb if friction_static is None else friction_static
         self.friction_coulomb = per_joint("friction_coulomb", friction_coulomb)
         self.friction_static = per_joint("friction_static", static)
         self.friction_viscous = per_joint("friction_viscous", friction_viscous)
         self.stribeck_velocity = per_joint("stribeck_velocity", stribeck_velocity)
-        self.torque_bias = per_joint("torque_bias", torque_bias, signed=True)
         self.rotor_inertia = per_joint("rotor_inertia", rotor_inertia)
         if np.any(self.friction_static < self.friction_coulomb):
             raise ValueError("friction_static must not be below friction_coulomb")
@@ -87,9 +84,8 @@ class JointFriction:
 
     @property
     def ideal(self) -> bool:
-        """Whether there is no friction, bias or rotor at all."""
-        added = (self.friction_static, self.friction_viscous, self.torque_bias, self.rotor_inertia)
-        return not any(x.any() for x in added)
+        """Whether there is no friction or rotor at all."""
+        return not (self.friction_static + self.friction_viscous + self.rotor_inertia).any()
 
     def simulated_inertia(self, dt: float) -> Array:
         """Return the inertias I + h d of the rotors in a simulation, shape (n,), kg m^2."""
@@ -103,9 +99,9 @@ class JointFriction:
             tau: commanded torques, shape (n,), N m.
 
         Returns:
-            The torque ``tau + b - d v`` and the limit L(v) of dry friction, shape (n,) each, N m.
+            The torque ``tau - d v`` and the limit L(v) of dry friction, shape (n,) each, N m.
         """
-        torque = tau + self.torque_bias - self.friction_viscous * v
+        torque = tau - self.friction_viscous * v
         falling = np.exp(-((v / self.stribeck_velocity) ** 2))
         return torque, self.friction_coulomb + self._excess * falling
 

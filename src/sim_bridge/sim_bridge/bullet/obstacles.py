@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,7 +31,6 @@ from viability_bounds_pkg.parameter import Range, above, check, number
 from viability_bounds_pkg.robot.description import RobotDescriptionError
 
 Array = NDArray[np.float64]
-Kept = TypeVar("Kept")
 
 SHAPES = ("box", "sphere", "cylinder")
 _ROUND = {"sphere": (0, 1, 2), "cylinder": (0, 1)}  # axes along which the sizes are equal
@@ -265,24 +264,6 @@ class BulletObstacles:
         """Remove all obstacles."""
         for name in list(self._surfaces):
             self.remove(name)
-
-    def replace_robot(self, body: int, links: Mapping[int, str]) -> None:
-        """Continue all contacts with the robot loaded again.
-
-        Args:
-            body: the robot in PyBullet.
-            links: names of its links, by PyBullet's indices.
-        """
-        indices = {link: index for index, link in links.items()}
-
-        def renamed(old: Mapping[_Touching, Kept]) -> dict[_Touching, Kept]:
-            return {
-                key._replace(link=indices[self._links[key.link]]): kept
-                for key, kept in old.items()
-            }
-
-        self._touching, self._friction = renamed(self._touching), renamed(self._friction)
-        self._body, self._links = body, links
 
     def reset(self) -> None:
         """Release the robot, and reset the largest force."""

@@ -61,7 +61,7 @@ class BulletRobot(BulletBody):
 
     Args:
         urdf_text, joints, physics_dt: as of `BulletBody`; all arrays are in the order of `joints`.
-        joint_friction: friction, rotors and torque biases of the joints; none by default.
+        joint_friction: friction and rotors of the joints; none by default.
         motors: what the torques of `step` and of the drives pass through; ideal by default.
         body: further options of `BulletBody`: locked joints, gravity, obstacles, masses, a sensor.
 
@@ -125,7 +125,7 @@ class BulletRobot(BulletBody):
         v = finite_vector("v", v, len(self.joints))
         raw = finite_vector("q", q, len(self.joints)) + 0.5 * self.physics_dt * v
         if not self.finite:
-            self._reload()  # after a push without measure: PyBullet keeps what is no number
+            self._make_world()  # after a push without measure: PyBullet keeps what is no number
         self._set_state(raw, v)
         self._q[:], self._v[:] = raw, v
         self._motor_torque.fill(0.0)
@@ -299,8 +299,7 @@ class BulletRobot(BulletBody):
 
     def _apply_friction(self, model: JointFriction, braking: bool) -> None:
         """Apply the torques of the motors, and friction together with the brakes."""
-        # A motor that is off has no bias either.
-        tau = -model.torque_bias if braking else self._motor_torque
+        tau = np.zeros_like(self._v) if braking else self._motor_torque
         torque, dry_friction = model.loads(self._v, tau)
         self._set_torques(torque)
         self._set_brakes(dry_friction + self._brakes)

@@ -22,14 +22,7 @@ from numpy.typing import NDArray
 from sim_bridge.bullet.obstacles import LinkWrench
 from sim_bridge.urdf import ReducedArm
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.parameter import (
-    FINITE,
-    NOT_NEGATIVE,
-    Range,
-    numbers,
-    text,
-    whole_number,
-)
+from viability_bounds_pkg.parameter import FINITE, NOT_NEGATIVE, numbers, text
 
 Array = NDArray[np.float64]
 
@@ -110,7 +103,6 @@ class SensorConfiguration:
         length=6,
         if_empty=0.0,
     )
-    ft_seed: int = whole_number("seed of that noise", Range(0, 2**31 - 1), default=0)
 
     def __post_init__(self) -> None:
         """Check that there is no bias or noise without a sensor."""
@@ -126,11 +118,12 @@ class ForceTorqueReading:
     Args:
         sensor: of a robot.
         config: of that sensor.
+        seed: of the noise.
     """
 
-    def __init__(self, sensor: ForceTorqueSensor, config: SensorConfiguration) -> None:
+    def __init__(self, sensor: ForceTorqueSensor, config: SensorConfiguration, seed: int) -> None:
         self._sensor, self._config = sensor, config
-        self._random = np.random.default_rng(config.ft_seed)
+        self._random = np.random.default_rng(seed)
 
     def read(self) -> Array:
         """Return force and moment, shape (6,), N and N m, with new noise."""

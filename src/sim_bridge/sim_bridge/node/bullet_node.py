@@ -136,7 +136,8 @@ class BulletNode(ArmNode):
         self._robot.reset(config.start_positions, np.zeros(n))
         self._reading = self._sensing.reset(*self._true_state())
         sensor = self._robot.sensor
-        self._sensor = ForceTorqueReading(sensor, config.sensor) if sensor else None
+        seed = config.imperfections.imperfection_seed
+        self._sensor = ForceTorqueReading(sensor, config.sensor, seed) if sensor else None
         self._monitor.reset()
         self._commands.restart()
         self._braked = 0

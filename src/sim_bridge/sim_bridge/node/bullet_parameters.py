@@ -110,11 +110,6 @@ class BulletConfiguration(ControlRate, LimitedRobotConfiguration):
         POSITIVE,
         if_empty=DEFAULT_STRIBECK_VELOCITY,
     )
-    torque_bias: Array = joint_numbers(
-        "torque of the motors beyond what is commanded and reported, N m; none if empty",
-        FINITE,
-        if_empty=0.0,
-    )
     mass_scale_links: tuple[str, ...] = texts(
         "links with another mass than in the URDF", default=(), note="each once"
     )
@@ -172,7 +167,7 @@ class BulletConfiguration(ControlRate, LimitedRobotConfiguration):
 
     @property
     def joint_friction(self) -> JointFriction:
-        """Friction, bias and rotors of the joints."""
+        """Friction and rotors of the joints."""
         static = self.friction_static
         return JointFriction(
             len(self.joints),
@@ -180,7 +175,6 @@ class BulletConfiguration(ControlRate, LimitedRobotConfiguration):
             friction_static=static if len(static) else self.friction_coulomb,
             friction_viscous=self.friction_viscous,
             stribeck_velocity=self.stribeck_velocity,
-            torque_bias=self.torque_bias,
             rotor_inertia=self.rotor_inertia,
         )
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from sensor_msgs.msg import JointState
 
-from sim_bridge.hardware import CommandPath
+from sim_bridge.command_path import CommandPath
 from sim_bridge.node.bullet_parameters import BulletConfiguration
 from viability_bounds_pkg.recent_values import RecentValues
 from viability_bounds_pkg.ros.messages import CommandReader, JointCommand, TorqueCommand

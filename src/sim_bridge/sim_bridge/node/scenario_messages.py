@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import pinocchio as pin
-from geometry_msgs.msg import InertiaStamped, PoseStamped, Transform, Twist, WrenchStamped
+from geometry_msgs.msg import PoseStamped, Transform, Twist, WrenchStamped
 from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -21,7 +21,6 @@ from sim_bridge.scenario.events import (
     AddObstacle,
     EnableTorque,
     Goal,
-    PayloadChange,
     PoseGoal,
     PostureGoal,
     Push,
@@ -82,7 +81,7 @@ def to_controller(
 
 
 def to_robot(scenario: Scenario, base_frame: str) -> list[ScheduledMessage]:
-    """Return pushes, their ends, payloads, and obstacles in the base frame, in order of time."""
+    """Return pushes, their ends, and obstacles in the base frame, in order of time."""
     pushes = [event for event in scenario.events if isinstance(event, Push)]
     # Ends first: where one push directly follows another, the new one must remain.
     messages = [_push(Push(push.time + push.duration, 0.0, push.link)) for push in pushes]
@@ -92,7 +91,6 @@ def to_robot(scenario: Scenario, base_frame: str) -> list[ScheduledMessage]:
         for event in scenario.events
         if isinstance(event, AddObstacle | RemoveObstacle)
     ]
-    messages += [_payload(event) for event in scenario.events if isinstance(event, PayloadChange)]
     return sorted(messages, key=lambda each: each.delay)
 
 
@@ -186,16 +184,6 @@ def _wrench(frame: str, force: tuple[float, ...], torque: tuple[float, ...]) -> 
 def _push(push: Push) -> ScheduledMessage:
     message = _wrench(push.link, push.force, push.torque)
     return ScheduledMessage("external_wrench", message, message.header, _delay(push.time))
-
-
-def _payload(event: PayloadChange) -> ScheduledMessage:
-    message = InertiaStamped()
-    message.header.frame_id = event.link
-    inertia, centre = message.inertia, message.inertia.com
-    inertia.m = event.mass
-    centre.x, centre.y, centre.z = event.centre
-    inertia.ixx, inertia.ixy, inertia.ixz, inertia.iyy, inertia.iyz, inertia.izz = event.inertia
-    return ScheduledMessage("payload", message, message.header, _delay(event.time))
 
 
 def _obstacle(event: AddObstacle | RemoveObstacle, base_frame: str) -> ScheduledMessage:

@@ -50,7 +50,7 @@ _SHOW_PERIOD = 0.5
 _WAIT_SHOWN_AFTER = 10.0
 _REFUSAL_COUNTS: dict[str, tuple[str, str | tuple[str, ...]]] = {
     "controller_node": ("goals_refused", "target_"),
-    "bullet_node": ("commands_refused", ("external_wrench", "obstacles", "payload")),
+    "bullet_node": ("commands_refused", ("external_wrench", "obstacles")),
 }
 """By node, the diagnostics key that counts refusals by topic, and the topics of a scenario."""
 
@@ -93,7 +93,7 @@ class ScenarioRefused(ArmSafetyError, RuntimeError):
 class ScenarioNode(ArmNode):
     """Resets a paused robot, plays a scenario on it, and records the run.
 
-    Goals, pushes, payloads and obstacles are sent before their time with the stamps at which they
+    Goals, pushes and obstacles are sent before their time with the stamps at which they
     take effect. In lockstep the robot is paused where a service must be called, until it has
     answered; so a run in lockstep is the same each time.
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from geometry_msgs.msg import InertiaStamped, WrenchStamped
+from geometry_msgs.msg import WrenchStamped
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
@@ -31,16 +31,6 @@ EXTERNAL_WRENCH = Topic(
     "a push in world axes at the origin of the link `frame_id`, N and N m; one for each link; a "
     "stamp in the future takes effect then",
 )
-PAYLOAD = Topic(
-    "payload",
-    InertiaStamped,
-    GOAL_QOS,
-    (USER, "scenario_node"),
-    (_NODE,),
-    "a load on the link `frame_id` that the controller does not know: mass, centre and inertia in "
-    "the link's frame, kg, m, kg m^2; a mass of 0 removes it; one for each link; a stamp in the "
-    "future takes effect then",
-)
 CLOCK = Topic(
     "/clock",
     Clock,
@@ -49,7 +39,7 @@ CLOCK = Topic(
     (USER,),
     "robot time; only with `publish_clock`",
 )
-TOPICS = (OBSTACLES, EXTERNAL_WRENCH, PAYLOAD, CLOCK)
+TOPICS = (OBSTACLES, EXTERNAL_WRENCH, CLOCK)
 
 RESET = OfferedService(
     "reset", Trigger, _NODE, "puts the robot at its start configuration, at rest"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Applies external wrenches, payloads and obstacles from messages at their time stamps."""
+"""Applies external wrenches and obstacles from messages at their time stamps."""
 
 from __future__ import annotations
 
@@ -10,19 +10,18 @@ from functools import partial
 from typing import NamedTuple
 
 import pinocchio as pin
-from geometry_msgs.msg import InertiaStamped, WrenchStamped
+from geometry_msgs.msg import WrenchStamped
 from rclpy.node import Node
 from visualization_msgs.msg import Marker, MarkerArray
 
 from sim_bridge.bullet.obstacles import Obstacle, ObstacleError
 from sim_bridge.bullet.robot import BulletRobot
-from sim_bridge.node.topics import EXTERNAL_WRENCH, OBSTACLES, PAYLOAD
-from sim_bridge.payload import PayloadError, payload_inertia
+from sim_bridge.node.topics import EXTERNAL_WRENCH, OBSTACLES
 from viability_bounds_pkg.robot.description import RobotDescriptionError
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 
 _SHAPES = {Marker.CUBE: "box", Marker.SPHERE: "sphere", Marker.CYLINDER: "cylinder"}
-_REFUSED = (RobotDescriptionError, ObstacleError, PayloadError, ValueError)
+_REFUSED = (RobotDescriptionError, ObstacleError, ValueError)
 
 
 class _Change(NamedTuple):
@@ -36,7 +35,7 @@ class _Change(NamedTuple):
 
 
 class WorldSubscriber:
-    """Subscribes to wrenches, payloads and obstacles, and applies them to a robot and its world.
+    """Subscribes to wrenches and obstacles, and applies them to a robot and its world.
 
     A message with a stamp of zero or in the past takes effect in the next control period, others
     in the first period that begins at or after their stamp.
@@ -63,7 +62,6 @@ class WorldSubscriber:
         for topic, callback in (
             (EXTERNAL_WRENCH, self._on_wrench),
             (OBSTACLES, self._on_obstacles),
-            (PAYLOAD, self._on_payload),
         ):
             topic.subscription(node, callback, partial(self._refuse, topic.name))
 
@@ -72,11 +70,10 @@ class WorldSubscriber:
         return len(self._pending)
 
     def clear(self) -> None:
-        """Remove all wrenches, payloads and obstacles, and discard the waiting messages."""
+        """Remove all wrenches and obstacles, and discard the waiting messages."""
         self._pending.clear()
         self.wrench_ends.clear()
         self._robot.clear_wrenches()
-        self._robot.clear_payloads()
         self._robot.obstacles.clear()
 
     def apply_due(self, stamp: int) -> None:
@@ -115,19 +112,6 @@ class WorldSubscriber:
         stamp = stamp_to_ns(message.header.stamp)
         apply = partial(self._robot.apply_wrench, link, force, torque)
         self._add(_Change(stamp, "external_wrench", link, apply))
-
-    def _on_payload(self, message: InertiaStamped) -> None:
-        link, given = message.header.frame_id, message.inertia
-        centre = given.com.x, given.com.y, given.com.z
-        moments = given.ixx, given.ixy, given.ixz, given.iyy, given.iyz, given.izz
-        try:
-            self._robot.check_payload(link)
-            inertia = payload_inertia(link, given.m, centre, moments) if given.m != 0.0 else None
-        except _REFUSED as error:
-            self._refuse("payload", error)
-            return
-        apply = partial(self._robot.set_payload, link, inertia)
-        self._add(_Change(stamp_to_ns(message.header.stamp), "payload", "", apply))
 
     def _on_obstacles(self, message: MarkerArray) -> None:
         for marker in message.markers:

@@ -12,7 +12,6 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from sim_bridge.bullet.obstacles import Obstacle, ObstacleError
-from sim_bridge.payload import PayloadError, payload_inertia
 from sim_bridge.scenario.fields import (
     Check,
     ScenarioError,
@@ -86,16 +85,6 @@ class Push(NamedTuple):
     torque: tuple[float, ...] = _ZERO  # N m
 
 
-class PayloadChange(NamedTuple):
-    """A load on a link of the robot from `time` on; the controller does not know of it."""
-
-    time: float
-    link: str
-    mass: float  # kg; 0: none any more
-    centre: tuple[float, ...] = _ZERO  # of mass, in the link's frame, m
-    inertia: tuple[float, ...] = 2 * _ZERO  # xx, xy, xz, yy, yz, zz about its centre, kg m^2
-
-
 class AddObstacle(NamedTuple):
     """An obstacle in the robot's world; the controller does not know of it."""
 
@@ -134,7 +123,7 @@ class TriggerCall(NamedTuple):
 
 Goal = PoseGoal | PostureGoal | TrajectoryGoal | WrenchGoal
 """Sent to the controller before their time."""
-WorldEvent = Push | PayloadChange | AddObstacle | RemoveObstacle
+WorldEvent = Push | AddObstacle | RemoveObstacle
 """Sent to the robot before their time."""
 ServiceEvent = EnableTorque | ParameterChange | TriggerCall
 """Services that take effect at once, called at their time."""
@@ -161,25 +150,10 @@ def read_event(content: Any, where: str) -> Event:
     fields = read_fields(content[kind], place, read, event._field_defaults)
     if kind == "push" and not {"force", "torque"} & set(fields):
         raise ScenarioError(f"{place} has no force and no torque; allowed: one of them or both")
-    if kind == "payload":
-        _check_payload(event(time, **fields), place)
     own_node = kind == "parameters" and fields["node"].rpartition("/")[2] in NODES
     if own_node and (unknown := unknown_parameters(fields["values"])):
         raise ScenarioError(f"{place}.values: {unknown}")
     return event(time, **fields)
-
-
-def _check_payload(payload: PayloadChange, where: str) -> None:
-    _, link, mass, centre, inertia = payload
-    try:
-        if mass > 0.0:
-            payload_inertia(link, mass, centre, inertia)
-    except PayloadError as error:
-        raise ScenarioError(f"{where}: {error}") from None
-
-
-def _moments(value: Any, where: str) -> tuple[float, ...]:
-    return vector(value, where, 6)
 
 
 def _posture(content: Any, where: str) -> Mapping[str, float]:
@@ -313,10 +287,6 @@ _KINDS: dict[str, tuple[Any, Check | Mapping[str, Check]]] = {
     "trajectory": (TrajectoryGoal, read_trajectory),
     "wrench": (WrenchGoal, {"force": vector, "torque": vector, "frame": name}),
     "push": (Push, {"link": name, "duration": positive, "force": vector, "torque": vector}),
-    "payload": (
-        PayloadChange,
-        {"link": name, "mass": not_negative, "centre": vector, "inertia": _moments},
-    ),
     "obstacle": (AddObstacle, _obstacle),
     "remove_obstacle": (RemoveObstacle, {"name": name}),
     "enable_torque": (EnableTorque, _true_or_false),

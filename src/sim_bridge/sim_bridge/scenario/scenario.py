@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scenario: goals, pushes, payloads, obstacles and service calls over time, read from YAML."""
+"""A scenario: goals, pushes, obstacles and service calls over time, read from YAML."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from xml.etree import ElementTree
 from sim_bridge.scenario.events import (
     AddObstacle,
     Event,
-    PayloadChange,
     PostureGoal,
     Push,
     RemoveObstacle,
@@ -63,31 +62,27 @@ class ScenarioConfiguration(TaskFrames, LimitedRobotConfiguration):
             raise SettingError("scenario", self.scenario, f"a scenario ({reason})") from error
         object.__setattr__(self, "plan", plan)
         object.__setattr__(self, "urdf", self.read_urdf())
-        links = [each.get("name", "") for each in ElementTree.fromstring(self.urdf).iter("link")]
-        frames = self.end_effectors[0], self.base_frame
+        root = ElementTree.fromstring(self.urdf)
+        links = [link.get("name", "") for link in root.iter("link")]
         for event in plan.events:
-            allowed = ""
-            if isinstance(event, PostureGoal) and set(self.joints) - set(event.positions):
-                missing = ", ".join(name for name in self.joints if name not in event.positions)
-                allowed = (
-                    f"postures of all 'joints'; at {event.time:g} s there is none of {missing}"
-                )
-            elif isinstance(event, PostureGoal) and set(event.positions) - set(self.joints):
-                others = ", ".join(name for name in event.positions if name not in self.joints)
-                allowed = f"postures of 'joints'; at {event.time:g} s there is one of {others}"
-            if isinstance(event, WrenchGoal) and event.frame not in ("", *frames):
-                allowed = (
-                    f"wrenches in the axes of {' or '.join(frames)}; at {event.time:g} s there "
-                    f"is one in those of {event.frame!r}"
-                )
-            if isinstance(event, Push | PayloadChange) and event.link not in links:
-                kind = "pushes" if isinstance(event, Push) else "payloads"
-                allowed = (
-                    f"{kind} of links of the URDF; at {event.time:g} s there is one of "
-                    f"'{event.link}'{did_you_mean(event.link, links)}"
-                )
-            if allowed:
+            if allowed := self._allowed_instead(event, links):
                 raise SettingError("scenario", self.scenario, allowed)
+
+    def _allowed_instead(self, event: Event, links: list[str]) -> str:
+        """Return what is allowed where an event does not fit the arm; nothing where it does."""
+        at = f"at {event.time:g} s there is"
+        if isinstance(event, PostureGoal):
+            if missing := [name for name in self.joints if name not in event.positions]:
+                return f"postures of all 'joints'; {at} none of {', '.join(missing)}"
+            if others := [name for name in event.positions if name not in self.joints]:
+                return f"postures of 'joints'; {at} one of {', '.join(others)}"
+        frames = self.end_effectors[0], self.base_frame
+        if isinstance(event, WrenchGoal) and event.frame not in ("", *frames):
+            return f"wrenches in the axes of {' or '.join(frames)}; {at} one in {event.frame!r}"
+        if isinstance(event, Push) and event.link not in links:
+            hint = did_you_mean(event.link, links)
+            return f"pushes of links of the URDF; {at} one of '{event.link}'{hint}"
+        return ""
 
 
 def load_scenario(path: str | Path) -> Scenario:

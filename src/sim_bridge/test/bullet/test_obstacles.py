@@ -112,7 +112,8 @@ def gantry(axes, joint_friction=None, gravity=(0.0, 0.0, 0.0), **options):
           <inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial>
           {ball if i == 2 else ""}</link>
           <joint name="joint{i}" type="prismatic"><parent link="{parent}"/>
-          <child link="link{i}"/><axis xyz="{" ".join(map(str, axis))}"/></joint>"""
+          <child link="link{i}"/><axis xyz="{" ".join(map(str, axis))}"/>
+          <limit lower="-9" upper="9" effort="0" velocity="0"/></joint>"""
     joints = [f"joint{i}" for i in range(3)]
     return closing(
         BulletRobot(

@@ -52,7 +52,6 @@ class Driven:
                 friction_coulomb=0.1 * self.tau_max[self.order],
                 friction_static=0.13 * self.tau_max[self.order],
                 friction_viscous=0.02 * self.tau_max[self.order],
-                torque_bias=0.02 * self.tau_max[self.order],
                 rotor_inertia=rotors[self.order],
             )
         self.robot = BulletRobot(

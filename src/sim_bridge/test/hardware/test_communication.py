@@ -3,7 +3,8 @@ from itertools import groupby
 
 import pytest
 
-from sim_bridge.hardware import CommandPath, Imperfections
+from sim_bridge.command_path import CommandPath
+from sim_bridge.hardware import Imperfections
 
 
 def drawn(probability, longest, count=40_000, seed=0):

@@ -138,7 +138,7 @@ def test_control_changes_at_any_time_without_a_jump(ros):
 
 
 def test_the_sensor_is_published_for_each_state_with_bias_and_seeded_noise(ros):
-    robot = RobotProbe(ros, ft_seed=3)
+    robot = RobotProbe(ros, imperfection_seed=3)
     felt = ros.listen(WrenchStamped, "ft_wrench")
     ros.hears("ft_wrench")
 

@@ -25,7 +25,6 @@ def test_joint_friction_and_masses_reach_the_robot(ros):
         friction_static=[2.0 * f for f in friction],
         friction_viscous=[0.1] * 7,
         stribeck_velocity=[0.02] * 7,
-        torque_bias=[0.1, 0.0, 0.0, 0.0, 0.0, 0.0, -0.1],
         rotor_inertia=[0.1] * 7,
         mass_scale_links=["panda_link4"],
         mass_scales=[1.2],
@@ -35,7 +34,6 @@ def test_joint_friction_and_masses_reach_the_robot(ros):
     np.testing.assert_array_equal(simulated.friction_static, 2.0 * np.array(friction))
     np.testing.assert_array_equal(simulated.friction_viscous, 0.1)
     np.testing.assert_array_equal(simulated.stribeck_velocity, 0.02)
-    np.testing.assert_array_equal(simulated.torque_bias, [0.1, 0.0, 0.0, 0.0, 0.0, 0.0, -0.1])
     np.testing.assert_array_equal(simulated.rotor_inertia, 0.1)
     assert robot.node._config.scaled_links == {"panda_link4": 1.2}
     # Less than the stiction, though wrong by the mass error and more: it stays where it is.
@@ -122,8 +120,6 @@ def test_without_stiction_of_its_own_a_joint_has_that_of_coulomb(ros):
         ),
         ({"friction_viscous": [math.nan] * 7}, "friction_viscous", "nan"),
         ({"stribeck_velocity": [0.0] * 7}, "stribeck_velocity", "> 0"),
-        ({"torque_bias": [math.inf] * 7}, "torque_bias", "finite"),
-        ({"torque_bias": [1.0]}, "torque_bias", "7 numbers"),
         ({"rotor_inertia": [-0.1] * 7}, "rotor_inertia", ">= 0"),
         ({"rotor_inertia": [0.1] * 3}, "rotor_inertia", "7 numbers"),
         ({"mass_scale_links": ["panda_link4"]}, "mass_scales", "1 numbers"),
@@ -148,7 +144,6 @@ def test_without_stiction_of_its_own_a_joint_has_that_of_coulomb(ros):
         ({"ft_bias": [1.0] * 3}, "ft_bias", "6 finite numbers"),
         ({"ft_noise": [math.inf] * 6}, "ft_noise", "6 finite numbers"),
         ({"ft_noise": [-0.1] * 6}, "ft_noise", ">= 0"),
-        ({"ft_seed": -1}, "ft_seed", ">= 0"),
         ({"encoder_resolution": [1e-4]}, "encoder_resolution", "7 numbers"),
         ({"encoder_resolution": [-1e-4] * 7}, "encoder_resolution", ">= 0"),
         ({"position_noise": [math.nan] * 7}, "position_noise", "nan"),

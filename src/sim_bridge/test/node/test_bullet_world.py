@@ -1,20 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The robot node: pushes, obstacles and payloads."""
+"""The robot node: pushes and obstacles."""
 
 import math
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from geometry_msgs.msg import InertiaStamped, WrenchStamped
-from robot_probe import JOINTS, MODEL, PERIOD, VALUES, Q, RobotProbe
+from geometry_msgs.msg import WrenchStamped
+from robot_probe import MODEL, PERIOD, VALUES, Q, RobotProbe
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
 from sim_bridge.node.topics import EXTERNAL_WRENCH, OBSTACLES
-from sim_bridge.payload import payload_inertia
-from viability_bounds_pkg.robot.description import build_model, inertia_beyond, read_urdf
+from viability_bounds_pkg.robot.description import inertia_beyond, read_urdf
 from viability_bounds_pkg.ros.runtime import (
     CONTROL_QOS,
     GOAL_QOS,
@@ -200,50 +199,3 @@ def test_contacts_are_felt_by_motion_sensor_and_diagnostics(ros):
     tool = inertia_beyond(read_urdf(VALUES["robot_description"]), VALUES["ft_frame"])
     ros.wait_until(lambda: felt.stamps[-1] == robot.stamp)
     assert felt[-1].wrench.force.z == pytest.approx(9.81 * tool.mass - 15.0, abs=1.5)
-
-
-def test_payloads_come_and_go_with_their_stamps(ros):
-    """Gravity is compensated without them, so that they accelerate the arm."""
-    robot = RobotProbe(ros)
-    payloads = ros.talk(InertiaStamped, "payload", GOAL_QOS)
-
-    def send(link, mass, stamp=0, inertia=0.0):
-        message = InertiaStamped()
-        message.header.frame_id = link
-        message.inertia.m, message.inertia.com.z, message.inertia.izz = mass, 0.1, inertia
-        set_stamp(message.header.stamp, stamp)
-        payloads.publish(message)
-
-    start = robot.stamp
-    send("panda_hand", 2.0, start + 3 * PERIOD)
-    send("panda_hand", 0.0, start + 6 * PERIOD)
-    send("panda_hand", -2.0)
-    send("panda_hand", 1.0, inertia=0.5)
-    send("panda_lnik5", 1.0)
-    send("panda_link0", 1.0)
-    send("panda_hand", math.nan)
-    ros.wait_until(lambda: len(robot.node._world) == 2, "the payloads")
-    robot.await_reported("world_changes_pending", "2")
-    assert "payload: 5;" in robot.reported("commands_refused")
-    robot.step(times=20)
-    velocities = {}
-    for stamp, state in zip(robot.states.stamps, robot.states, strict=True):
-        velocities[stamp] = np.array(state.velocity[:7])
-    v = np.array([velocities[start + k * PERIOD] for k in range(21)])
-    changes = np.abs(np.diff(v, axis=0)).max(axis=1)
-    payload = payload_inertia("panda_hand", 2.0, [0.0, 0.0, 0.1], [0.0] * 6)
-    model = build_model(read_urdf(VALUES["robot_description"]), JOINTS)
-    frame = model.frames[model.getFrameId("panda_hand", pin.FrameType.BODY)]
-    hold = pin.computeGeneralizedGravity(model, model.createData(), Q)
-    model.appendBodyToJoint(frame.parentJoint, payload, frame.placement)
-    a = pin.aba(model, model.createData(), Q, np.zeros(7), hold)
-    assert max(changes[:3]) < 1e-9
-    np.testing.assert_allclose(changes[3], np.abs(a).max() * PERIOD * 1e-9, rtol=0.02)
-    assert min(changes[3:6]) > 0.9 * changes[3]
-    assert max(changes[6:]) < 0.1 * changes[3]
-    send("panda_hand", 2.0)
-    ros.wait_until(lambda: len(robot.node._world) == 1, "the payload")
-    robot.step()
-    assert robot.node._robot._payloads
-    assert ros.call(Trigger, "bullet_node/reset", Trigger.Request()).success
-    assert not robot.node._robot._payloads

@@ -10,7 +10,8 @@ import yaml
 from robot_probe import BRAKES, JOINTS, VALUES, RobotProbe
 from std_srvs.srv import SetBool, Trigger
 
-from sim_bridge.hardware import CommandPath, Imperfections, Motors, Sensing
+from sim_bridge.command_path import CommandPath
+from sim_bridge.hardware import Imperfections, Motors, Sensing
 from sim_bridge.node.bullet_parameters import BulletConfiguration, make_robot
 from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.testing.ros_harness import read_config

@@ -8,7 +8,6 @@ from sim_bridge.scenario.events import (
     AddObstacle,
     EnableTorque,
     ParameterChange,
-    PayloadChange,
     PoseGoal,
     PostureGoal,
     Push,
@@ -71,12 +70,10 @@ events:
   - {time: 6, push: {link: a, duration: 2, force: [0, 0, 1]}}
   - {time: 6.5, push: {link: b, duration: 2, force: [0, 0, 1]}}
   - {time: 8, push: {link: a, duration: 2, force: [0, 0, 1]}}
-  - {time: 8.1, payload: {link: a, mass: 2, centre: [0, 0, 0.1], inertia: [3, 0, 0, 3, 0, 3]}}
-  - {time: 8.2, payload: {link: a, mass: 0}}
 """,
         )
     )
-    wrench, pole, gone, position, change, call, *_, load, unload = scenario.events
+    wrench, pole, gone, position, change, call, *_ = scenario.events
     assert wrench == WrenchGoal(0.0, (0.0, 0.0, -10.0), (0.0, 0.0, 0.0), "")
     assert isinstance(pole, AddObstacle)
     assert (pole.obstacle.name, pole.obstacle.shape) == ("pole", "cylinder")
@@ -87,9 +84,6 @@ events:
     values = {"a": 1, "b": [1.0, 2.5], "c": "x", "d": True, "e": ["x", "y"]}
     assert change == ParameterChange(4.0, "n", values)
     assert call == TriggerCall(5.0, "controller_node/tare_ft_sensor")
-    inertia = (3.0, 0.0, 0.0, 3.0, 0.0, 3.0)
-    assert load == PayloadChange(8.1, "a", 2.0, (0.0, 0.0, 0.1), inertia)
-    assert unload == PayloadChange(8.2, "a", 0.0, (0.0, 0.0, 0.0), 6 * (0.0,))
 
 
 def test_a_circle_starts_where_it_is_told_and_leads_around(tmp_path):
@@ -152,13 +146,6 @@ BOX = "name: a, shape: box, size: [1, 1, 1], position: [0, 0, 0]"
         ),
         ("obstacle", f"{{{BOX}, size: [1, 1, 0]}}", "size"),
         ("obstacle", f"{{{BOX}, mass: 1}}", "obstacle has mass"),
-        ("payload", "{mass: 1}", "payload.link"),
-        ("payload", "{link: a}", "payload.mass"),
-        ("payload", "{link: a, mass: -1}", "payload.mass is -1; allowed: a finite number >= 0"),
-        ("payload", "{link: a, mass: 1, centre: [1, 2]}", "payload.centre"),
-        ("payload", "{link: a, mass: 1, inertia: [1, 1, 1]}", "payload.inertia is [1, 1, 1]"),
-        ("payload", "{link: a, mass: 1, inertia: [1, 0, 0, 1, 0, 9]}", "sum of the others"),
-        ("payload", "{link: a, mass: 1, weight: 2}", "payload has weight"),
         ("remove_obstacle", "{name: a}", "names 'a'; there are: none"),
         ("enable_torque", "1", "true or false"),
         ("parameters", "{values: {a: 1}}", "parameters.node"),

@@ -33,7 +33,8 @@ def single_joint(gravity=(0.0, 0.0, 0.0), physics_dt=H, **options):
         <collision><origin xyz="1 0 0"/><geometry><sphere radius="0.1"/></geometry></collision>
       </link>
       <joint name="joint" type="revolute"><parent link="base"/><child link="arm"/>
-        <axis xyz="{options.pop("axis", "0 0 1")}"/></joint></robot>"""
+        <axis xyz="{options.pop("axis", "0 0 1")}"/>
+        <limit effort="0" velocity="0"/></joint></robot>"""
     return closing(
         BulletRobot(
             urdf,
