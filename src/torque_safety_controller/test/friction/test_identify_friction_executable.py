@@ -18,7 +18,7 @@ from viability_bounds_pkg.testing.executables import called, started
 
 MODULE = "torque_safety_controller.cli.identify_friction"
 
-TRUTH = FrictionModel([3.0, 0.4], [4.0, 0.5], [0.5, 0.1], [0.03, 0.03])
+TRUTH = FrictionModel(*np.array([[3.0, 0.4], [4.0, 0.5], [0.5, 0.1], [0.03, 0.03]]))
 
 
 @pytest.fixture

@@ -47,28 +47,23 @@ class Recording:
     tau: Array
 
     def __post_init__(self) -> None:
-        for key in KEYS:
-            try:
-                value = np.asarray(getattr(self, key), dtype=np.float64)
-            except (TypeError, ValueError) as error:
-                raise RecordingError(f"'{key}' is not an array of numbers") from error
-            object.__setattr__(self, key, value)
-        if self.t.ndim != 1 or len(self.t) < 2:
+        samples, n = len(self.t), self.n
+        if self.t.ndim != 1 or samples < 2:
             raise RecordingError(f"'t' must have shape (N,) with N > 1, has {self.t.shape}")
-        for key in KEYS:
-            value, shape = getattr(self, key), (len(self.t), self.n)
-            if key != "t" and value.shape != shape:
-                raise RecordingError(f"'{key}' must have shape {shape}, has {value.shape}")
+        for key in KEYS[1:]:
+            value = getattr(self, key)
+            if value.shape != (samples, n):
+                raise RecordingError(f"'{key}' must have shape {samples, n}, has {value.shape}")
             if not np.isfinite(value).all():
                 raise RecordingError(f"'{key}' has numbers that are not finite")
-        late = np.flatnonzero(np.diff(self.t) <= 0.0)
-        if late.size:
-            raise RecordingError(f"'t' does not increase after sample {late[0]}")
+        if not (np.diff(self.t) > 0.0).all():
+            late = int(np.argmin(np.diff(self.t) > 0.0))
+            raise RecordingError(f"'t' does not increase after sample {late}")
 
     @property
     def n(self) -> int:
         """Number of joints."""
-        return self.q.shape[1] if self.q.ndim == 2 else 0
+        return self.q.shape[1]
 
 
 def load_recording(path: Path, joints: Sequence[str]) -> Recording:
@@ -83,30 +78,25 @@ def load_recording(path: Path, joints: Sequence[str]) -> Recording:
     """
     try:
         with np.load(path, allow_pickle=False) as file:
-            arrays = {key: file[key] for key in (*KEYS, "joints") if key in file}
-    except (OSError, ValueError, EOFError, BadZipFile) as error:
-        raise RecordingError(f"{path}: no NumPy file of arrays ({error})") from error
-    except TypeError as error:  # a single array, .npy
-        raise RecordingError(f"{path}: one array, where an .npz file is needed") from error
-    missing = [key for key in KEYS if key not in arrays]
-    if missing:
-        raise RecordingError(f"{path}: array {missing[0]!r} is missing")
-    names = [str(name) for name in np.atleast_1d(arrays.pop("joints", np.array(joints)))]
-    unknown = [joint for joint in joints if joint not in names]
-    if unknown:
-        raise RecordingError(f"{path}: joint {unknown[0]!r} is missing; it has {', '.join(names)}")
-    columns = [names.index(joint) for joint in joints]
-    for key in KEYS[1:]:
-        if arrays[key].ndim != 2 or arrays[key].shape[1] != len(names):
-            raise RecordingError(
-                f"{path}: {key!r} must have one column for each of {len(names)} joints, "
-                f"has shape {arrays[key].shape}"
-            )
-        arrays[key] = arrays[key][:, columns]
-    try:
+            arrays = {key: file[key].astype(np.float64) for key in KEYS}
+            names = [str(name) for name in file["joints"]] if "joints" in file else list(joints)
+        for joint in joints:
+            if joint not in names:
+                raise RecordingError(f"joint '{joint}' is missing; it has {', '.join(names)}")
+        for key in KEYS[1:]:
+            if arrays[key].ndim != 2 or arrays[key].shape[1] != len(names):
+                raise RecordingError(
+                    f"'{key}' must have one column for each of {len(names)} joints, has shape "
+                    f"{arrays[key].shape}"
+                )
+            arrays[key] = arrays[key][:, [names.index(joint) for joint in joints]]
         return Recording(**arrays)
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from error
+    except KeyError as error:
+        raise RecordingError(f"{path}: array missing: {error}") from error
+    except (OSError, TypeError, ValueError, EOFError, BadZipFile) as error:
+        raise RecordingError(f"{path}: no NumPy file of arrays of numbers ({error})") from error
 
 
 @dataclass(frozen=True, eq=False)
