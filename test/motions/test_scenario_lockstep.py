@@ -225,7 +225,8 @@ def test_a_run_without_a_pose_has_metrics_without_a_pose_error(tmp_path, ros, ca
     path.write_text(yaml.safe_dump(scenario))
     result = run_chain(load_values(ROBOT), scenario, {})
     config = ros.start(ScenarioNode, load_values(ROBOT) | {"scenario": str(path)}).config
-    made = config, result.run, result.robot, {"method": "exact"}, {}
+    told = {"bullet_node": result.robot, "bounds_node": {"method": "exact"}, "controller_node": {}}
+    made = config, result.run, told
     assert write_report(tmp_path / "out", *made)
     full = tmp_path / "full"
     with (

@@ -63,7 +63,7 @@ class ReducedArm(NamedTuple):
 
     model: pin.Model
     positions: Array  # of its m joints where they do not move, rad or m, shape (m,)
-    moving: list[int]  # of its joints, those that move, in the order asked for
+    moving: list[int]  # of its joints, those that move
     mounts: list[str]  # names of the joints on the sensor
 
 
@@ -93,7 +93,7 @@ def prepare_urdf(
 
     Args:
         urdf: text of the URDF.
-        joints: the joints that move, in any order: revolute, continuous or prismatic.
+        joints: the joints that move, base to tip: revolute, continuous or prismatic.
         locked_positions: where other joints are locked, rad or m; joints left out are locked
             at zero. Mimic joints are joints like any other here, as they are in Pinocchio.
         sensor_frame: link with which those that it carries do not become one, even if they are
@@ -104,9 +104,9 @@ def prepare_urdf(
             centres: neither gravity nor the arm's motion acts on them.
 
     Raises:
-        RobotDescriptionError: a URDF that does not load, a joint that is unknown, repeated, both
-            moved and locked, or without one coordinate; an unknown link, or one scaled by other
-            than a finite positive number; a link that carries none as `sensor_frame`.
+        RobotDescriptionError: a URDF that does not load, a joint that is unknown, repeated, out of
+            order, both moved and locked, or without one coordinate; an unknown link, or one scaled
+            by other than a finite positive number; a link that carries none as `sensor_frame`.
     """
     try:
         root = fromstring(urdf)
@@ -160,8 +160,6 @@ def _reduced_arm(
     mass_scales: Mapping[str, float],
 ) -> ReducedArm:
     """Return the model of `joints`, and of the joints on the sensor, which become revolute."""
-    if not joints or len(set(joints)) != len(joints):
-        raise RobotDescriptionError(f"joints must be listed once each, not {list(joints)}")
     for name, position in locked.items():
         if name in joints:
             raise RobotDescriptionError(f"joint {name!r} cannot be both moved and locked")
@@ -181,8 +179,8 @@ def _reduced_arm(
         order = kinematic_order(text, wanted)
     except (ValueError, RuntimeError) as error:
         raise RobotDescriptionError(f"URDF does not load: {error}") from error
-    if len(order) != len(wanted):
-        order = tuple(wanted)  # the model's error names the one that is unknown
+    if [name for name in order if name in joints] != list(joints):
+        order = tuple(wanted)  # the model's error says what is wrong with them
     rest = {name: position for name, position in locked.items() if name not in held}
     model = build_model(text, order, rest)
     positions = np.array([held.get(name, 0.0) for name in order])

@@ -32,7 +32,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from viability_bounds_pkg.robot.description import build_model, kinematic_order
+from viability_bounds_pkg.robot.description import build_model
 
 Array = NDArray[np.float64]
 
@@ -53,14 +53,14 @@ WINDOW = 2e-4
 
 
 class PositionDrive:
-    """The drives of n joints; arrays of shape (n,) in the order of `joints`.
+    """The drives of n joints; all arrays are of shape (n,).
 
     A model of the robot with its rotors gives the gains, and the prediction that replaces the
     faster loops of a real drive.
 
     Args:
         urdf: the robot.
-        joints: in any order.
+        joints: base to tip.
         locked_positions: where other joints are locked, rad or m.
         rotor_inertia: of the joints, shape (n,), kg m^2.
         dt: time between two calls of `torque`, s.
@@ -77,11 +77,9 @@ class PositionDrive:
         rotor_inertia: Array,
         dt: float,
     ) -> None:
-        order = kinematic_order(urdf, joints)
-        self._order = [joints.index(name) for name in order]
-        self._model = build_model(urdf, order, locked_positions, rotor_inertia[self._order])
+        self._model = build_model(urdf, joints, locked_positions, rotor_inertia)
         self._data, self._dt = self._model.createData(), dt
-        self._z = np.zeros(len(joints))  # in the model's order, as all arrays inside
+        self._z = np.zeros(len(joints))
 
     def reset(self, q: Array, v: Array, tau_max: Array, tau: Array | None) -> None:
         """Initialise the integral for a bumpless transfer.
@@ -92,8 +90,8 @@ class PositionDrive:
             tau_max: torque limits, N m.
             tau: the torque of the motors until now, N m; None for the bias forces.
         """
-        M, bias, k = self._dynamics(q[self._order], v[self._order], tau_max[self._order])
-        tau = bias if tau is None else tau[self._order]
+        M, bias, k = self._dynamics(q, v, tau_max)
+        tau = bias if tau is None else tau
         P = self._dt * k * (1.0 + 0.5 * POSITION_GAIN * self._dt)
         self._z = tau + P * np.linalg.solve(M, tau - bias)
 
@@ -110,9 +108,6 @@ class PositionDrive:
             v_max: limit of the reference velocity, rad/s.
             tau_max: torque limits, N m.
         """
-        q, v, q_des, v_des, v_max, tau_max = np.stack((q, v, q_des, v_des, v_max, tau_max))[
-            :, self._order
-        ]
         h = self._dt
         M, bias, k = self._dynamics(q, v, tau_max)
         wanted = v_des + POSITION_GAIN * (q_des - q - h * v)
@@ -125,12 +120,10 @@ class PositionDrive:
         arrived = (np.abs(q_des - q) < WINDOW) & (v_des == 0.0)
         winding_up = (tau - clipped) * error > 0.0
         self._z += np.where(arrived | winding_up, 0.0, (h / INTEGRAL_TIME) * k * error)
-        output = np.empty_like(clipped)
-        output[self._order] = clipped
-        return output
+        return clipped
 
     def _dynamics(self, q: Array, v: Array, tau_max: Array) -> tuple[Array, Array, Array]:
-        """Return M, the bias forces b and the velocity gains k, in the model's order."""
+        """Return M, the bias forces b and the velocity gains k."""
         M = pin.crba(self._model, self._data, q)
         bias = pin.nonLinearEffects(self._model, self._data, q, v)
         stiff = tau_max / (POSITION_GAIN * FULL_TORQUE_ERROR)

@@ -6,7 +6,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -17,7 +16,7 @@ from sim_bridge.bullet.obstacles import ContactMaterial
 from sim_bridge.bullet.robot import BulletRobot
 from sim_bridge.bullet.sensor import SensorConfiguration
 from sim_bridge.hardware import Imperfections, Motors
-from viability_bounds_pkg.exceptions import SettingError
+from viability_bounds_pkg.exceptions import SettingError, did_you_mean
 from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
 from viability_bounds_pkg.parameter import (
     FINITE,
@@ -37,12 +36,12 @@ from viability_bounds_pkg.parameter import (
     timeout,
     whole_number,
 )
-from viability_bounds_pkg.robot.configuration import ControlRate, LimitedRobotConfiguration
-from viability_bounds_pkg.robot.description import (
-    RobotDescriptionError,
-    build_model,
-    kinematic_order,
+from viability_bounds_pkg.robot.configuration import (
+    ControlRate,
+    LimitedRobotConfiguration,
+    load_model,
 )
+from viability_bounds_pkg.robot.description import RobotDescriptionError
 from viability_bounds_pkg.stop import CoordinatedStop
 
 Array = NDArray[np.float64]
@@ -187,6 +186,19 @@ def make_robot(config: BulletConfiguration) -> BulletRobot:
     """
     imperfections = config.imperfections
     motors = Motors(imperfections, config.torque_max, config.physics_dt)
+    load_model(config, config.urdf)  # its error names the parameter
+    root, frame = ElementTree.fromstring(config.urdf), config.sensor.ft_frame
+    joints = {joint.get("name", "") for joint in root.iter("joint")} - set(config.joints)
+    links = {link.get("name", "") for link in root.iter("link")}
+    carriers = {parent.get("link", "") for parent in root.iter("parent")}
+    for name, chosen, known, allowed in (
+        ("locked_joints", config.locked_joints, joints, "other joints of the URDF"),
+        ("mass_scale_links", config.mass_scale_links, links, "links of the URDF"),
+        ("ft_frame", (frame,), carriers, "a link of the URDF that carries others, or empty"),
+    ):
+        for each in filter(None, chosen):
+            if each not in known:
+                raise SettingError(name, each, f"{allowed}{did_you_mean(each, known)}")
     try:
         return BulletRobot(
             config.urdf,
@@ -197,11 +209,11 @@ def make_robot(config: BulletConfiguration) -> BulletRobot:
             motors=motors if imperfections.of_motors else None,
             mass_scales=config.scaled_links,
             material=config.material,
-            sensor_frame=config.sensor.ft_frame,
+            sensor_frame=frame,
         )
     except RobotDescriptionError as error:
-        name, value, allowed = _culprit(config)
-        raise SettingError(name, value, f"{allowed} ({error})") from error
+        allowed = f"a URDF that PyBullet can load ({error})"
+        raise SettingError("robot_description", config.robot_description, allowed) from error
 
 
 def make_stop(config: BulletConfiguration) -> CoordinatedStop | None:
@@ -215,9 +227,7 @@ def make_stop(config: BulletConfiguration) -> CoordinatedStop | None:
     """
     if not len(config.acceleration_min):
         return None
-    dt, order = config.dt / config.substeps, kinematic_order(config.urdf, config.joints)
-    inertia = config.rotor_inertia[[config.joints.index(name) for name in order]]
-    model = build_model(config.urdf, order, config.locked, inertia)
+    dt, model = config.physics_dt, load_model(config, config.urdf)
     a_min, a_max = config.acceleration_min, config.acceleration_max
     clearance = 0.5 * dt * dt * np.maximum(-a_min, a_max)
     try:
@@ -240,20 +250,3 @@ def make_stop(config: BulletConfiguration) -> CoordinatedStop | None:
     except JointLimitsError as error:
         allowed = f"limits that can be kept in steps of {dt:g} s ({error})"
         raise SettingError("acceleration_max", a_max, allowed) from error
-
-
-def _culprit(config: BulletConfiguration) -> tuple[str, Any, str]:
-    """Return the parameter that prevents the robot, its value, and what it may be."""
-    root = ElementTree.fromstring(config.urdf)
-    joints = {joint.get("name") for joint in root.iter("joint")}
-    if not joints >= set(config.joints):
-        return "joints", config.joints, "joints of the URDF"
-    if not joints - set(config.joints) >= set(config.locked_joints):
-        return "locked_joints", config.locked_joints, "other joints of the URDF"
-    if not {link.get("name") for link in root.iter("link")} >= set(config.mass_scale_links):
-        return "mass_scale_links", config.mass_scale_links, "links of the URDF"
-    carriers = {parent.get("link") for parent in root.iter("parent")}
-    if config.sensor.ft_frame and config.sensor.ft_frame not in carriers:
-        allowed = "a link of the URDF that carries others, or empty"
-        return "ft_frame", config.sensor.ft_frame, allowed
-    return "robot_description", config.robot_description, "a URDF that PyBullet can load"

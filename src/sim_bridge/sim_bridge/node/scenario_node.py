@@ -361,14 +361,7 @@ def main(args: list[str] | None = None) -> int:
         if options.out is None:
             return 0
         diagnostics = node.recorder.diagnostics
-        kept = write_report(
-            options.out,
-            node.config,
-            node.recorded_run(),
-            node.robot,
-            diagnostics["bounds_node"],
-            diagnostics["controller_node"],
-        )
+        kept = write_report(options.out, node.config, node.recorded_run(), diagnostics)
         return 0 if kept else 1
     except (TimeoutError, ScenarioRefused, OSError) as error:
         report_refusal(error)

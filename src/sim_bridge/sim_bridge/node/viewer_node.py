@@ -30,7 +30,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from sim_bridge.node.topics import EXTERNAL_WRENCH
 from sim_bridge.viewer.joint_pictures import JointValues
-from sim_bridge.viewer.page import DrivingAsked, GoalAsked, Page, Picture, PushAsked, Request
+from sim_bridge.viewer.page import DrivingAsked, GoalAsked, Page, PushAsked, Request
 from sim_bridge.viewer.shapes import visual_shapes
 from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError
 from viability_bounds_pkg.joint_limits import JointLimits
@@ -211,7 +211,7 @@ class ViewerNode(ArmNode):
             self._mean_acceleration(),
             *self._limits,
         )
-        self.page.show(Picture(joints, self._goal, self._status_text()))
+        self.page.show(joints, self._goal, self._status_text())
 
     def _mean_acceleration(self) -> Array:
         """Return the change of the speeds since the last picture by robot time, rad/s^2."""

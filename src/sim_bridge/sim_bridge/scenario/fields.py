@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping
+from functools import partial
 from typing import Any
 
 from viability_bounds_pkg.exceptions import ArmSafetyError, did_you_mean
+from viability_bounds_pkg.parameter import FINITE, NOT_NEGATIVE, POSITIVE, Range
 
 _QUATERNION_TOLERANCE = 1e-3
 
@@ -70,25 +72,15 @@ def name(value: Any, where: str) -> str:
     return value
 
 
-def number(value: Any, where: str) -> float:
-    """Check a finite number."""
-    if not _is_finite(value):
-        raise refuse(where, value, "a finite number")
+def number(value: Any, where: str, allowed: Range = FINITE) -> float:
+    """Check a finite number in a range."""
+    if not _is_finite(value) or value not in allowed:
+        raise refuse(where, value, f"a finite number {allowed}".strip())
     return float(value)
 
 
-def not_negative(value: Any, where: str) -> float:
-    """Check a finite number >= 0."""
-    if not _is_finite(value) or value < 0:
-        raise refuse(where, value, "a finite number >= 0")
-    return float(value)
-
-
-def positive(value: Any, where: str) -> float:
-    """Check a finite number > 0."""
-    if not _is_finite(value) or value <= 0:
-        raise refuse(where, value, "a finite number > 0")
-    return float(value)
+not_negative = partial(number, allowed=NOT_NEGATIVE)
+positive = partial(number, allowed=POSITIVE)
 
 
 def vector(value: Any, where: str, size: int = 3) -> tuple[float, ...]:

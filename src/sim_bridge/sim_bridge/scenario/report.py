@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,9 +62,7 @@ def write_report(
     directory: Path,
     config: ScenarioConfiguration,
     run: RecordedRun,
-    robot: dict[str, str],
-    bounds: dict[str, str],
-    controller: dict[str, str],
+    diagnostics: Mapping[str, Mapping[str, str]],
 ) -> bool:
     """Write ``figure.png``, ``data.npz`` and ``metrics.json``; print a table and the verdict.
 
@@ -72,9 +70,7 @@ def write_report(
         directory: created if it does not exist.
         config: scenario and arm.
         run: the recording.
-        robot: the robot's last diagnostics, by key; they cover every physics step.
-        bounds: the bounds node's last diagnostics.
-        controller: the controller's.
+        diagnostics: the last ones of each node, by key; the robot's cover every physics step.
 
     Returns:
         Whether every limit was kept.
@@ -84,7 +80,7 @@ def write_report(
     """
     reference = pose_reference(config.plan.events, run.t)
     errors = _errors(config, run, reference)
-    metrics = _metrics(config, run, robot, errors, bounds, controller)
+    metrics = _metrics(config, run, errors, diagnostics)
     _print_table(metrics)
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -155,7 +151,7 @@ def _errors(config: ScenarioConfiguration, run: RecordedRun, reference: Array) -
     return errors
 
 
-def _floats(robot: dict[str, str], key: str) -> Array:
+def _floats(robot: Mapping[str, str], key: str) -> Array:
     return np.array([float(item) for item in robot[key].split()])
 
 
@@ -164,24 +160,20 @@ def _or_none(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _trajectory_error(config: ScenarioConfiguration, run: RecordedRun, errors: Array) -> float:
-    """Return the largest distance to a trajectory while it lasted, m; NaN if there was none."""
-    worst = np.nan
+def _metrics(
+    config: ScenarioConfiguration,
+    run: RecordedRun,
+    errors: Array,
+    diagnostics: Mapping[str, Mapping[str, str]],
+) -> Metrics:
+    robot, bounds, controller = (
+        diagnostics[name] for name in ("bullet_node", "bounds_node", "controller_node")
+    )
+    worst = np.nan  # distance to a trajectory while it lasted
     for event in config.plan.events:
         if isinstance(event, TrajectoryGoal):
             during = (run.t >= event.time) & (run.t <= event.time + event.trajectory.duration)
             worst = np.fmax(worst, np.fmax.reduce(errors[during, 0], initial=np.nan))
-    return worst
-
-
-def _metrics(
-    config: ScenarioConfiguration,
-    run: RecordedRun,
-    robot: dict[str, str],
-    errors: Array,
-    bounds: dict[str, str],
-    controller: dict[str, str],
-) -> Metrics:
     position = _floats(robot, "position_violation_rad")
     velocity = _floats(robot, "velocity_violation_rad_s")
     ratio = max(float(robot["commanded_torque_ratio_max"]), _floats(robot, "torque_ratio").max())
@@ -204,7 +196,7 @@ def _metrics(
         "max_torque_ratio": float(ratio),
         "final_position_error_m": _or_none(errors[-1, 0]),
         "final_orientation_error_rad": _or_none(errors[-1, 1]),
-        "max_trajectory_error_m": _or_none(_trajectory_error(config, run, errors)),
+        "max_trajectory_error_m": _or_none(worst),
         "max_contact_force_n": _or_none(float(robot.get("contact_force_max_n", "nan"))),
         "deadline_misses": int(robot["deadline_misses"]),
         "late_periods": int(robot["late_periods"]),
@@ -304,7 +296,7 @@ _LIMIT = {"color": "tab:red", "linestyle": "--", "linewidth": 1.2}
 def _draw(
     path: Path, config: ScenarioConfiguration, run: RecordedRun, errors: Array, metrics: Metrics
 ) -> None:
-    """Draw the joint nearest to a limit in detail, and all joints relative to their limits."""
+    """Draw the joint nearest to a limit on the left, all relative to their limits on the right."""
     from matplotlib.figure import Figure  # takes a second to import
 
     figure = Figure(figsize=(12, 10), layout="constrained")
@@ -314,51 +306,39 @@ def _draw(
         f"{config.robot_name}: {metrics['bounds_method']} bounds, {metrics['rate_hz']:g} Hz, "
         f"{metrics['clock']}: {outcome}"
     )
-    clearance = np.minimum(run.q - config.position_min, config.position_max - run.q).min(axis=0)
-    _draw_joint(axes[:, 0], config, run, int(np.argmin(clearance)), 1.0 / metrics["rate_hz"])
-    _draw_all(axes[:, 1], config, run, errors)
+    low, high = config.position_min, config.position_max
+    j = int(np.argmin(np.minimum(run.q - low, high - run.q).min(axis=0)))
+    for (left, right), (name, unit, values, lower, upper) in zip(
+        axes[:3],
+        (
+            ("position", "rad", run.q, low, high),
+            ("velocity", "rad/s", run.v, -config.velocity_max, config.velocity_max),
+            ("torque", "N m", run.tau, -config.torque_max, config.torque_max),
+        ),
+        strict=True,
+    ):
+        left.plot(run.t, values[:, j])
+        right.plot(run.t, (2.0 * values - lower - upper) / (upper - lower))
+        left.set(ylabel=f"{name} [{unit}]")
+        right.set(ylabel=f"{name} / limit")
+        for axis, limits in ((left, (lower[j], upper[j])), (right, (-1.0, 1.0))):
+            for limit in limits:
+                axis.axhline(limit, **_LIMIT)
+    axes[0, 0].set(title=f"{run.joints[j]}, the joint nearest to a limit")
+    axes[0, 1].set(title="all joints, limits at -1 and 1")
+    axes[0, 1].legend(run.joints, loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize="small")
+    acceleration, error = axes[3]
+    acceleration.fill_between(
+        run.t, run.a_lower[:, j], run.a_upper[:, j], alpha=0.25, label="allowed"
+    )
+    measured = np.diff(run.v[:, j]) * metrics["rate_hz"]
+    acceleration.plot(run.t[:-1], measured, linewidth=1.0, label="measured")
+    acceleration.set(ylabel="acceleration [rad/s$^2$]", xlabel="time [s]")
+    for values, label in zip(errors.T, ("position [mm]", "orientation [mrad]"), strict=True):
+        error.semilogy(run.t, np.maximum(1e3 * values, 1e-3), label=label)
+    error.set(ylabel="error of the pose goal", xlabel="time [s]")
+    for axis in axes[3]:
+        axis.legend(loc="upper right")
     for axis in axes.flat:
         axis.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
-
-
-def _draw_joint(
-    axes: Any, config: ScenarioConfiguration, run: RecordedRun, j: int, dt: float
-) -> None:
-    position, velocity, acceleration, torque = axes
-    t, v_max, tau_max = run.t, config.velocity_max[j], config.torque_max[j]
-    acceleration.fill_between(t, run.a_lower[:, j], run.a_upper[:, j], alpha=0.25, label="allowed")
-    acceleration.plot(t[:-1], np.diff(run.v[:, j]) / dt, linewidth=1.0, label="measured")
-    acceleration.set(ylabel="acceleration [rad/s$^2$]")
-    acceleration.legend(loc="upper right")
-    for axis, values, limits, label in (
-        (position, run.q, (config.position_min[j], config.position_max[j]), "position [rad]"),
-        (velocity, run.v, (-v_max, v_max), "velocity [rad/s]"),
-        (torque, run.tau, (-tau_max, tau_max), "torque [N m]"),
-    ):
-        axis.plot(t, values[:, j])
-        axis.set(ylabel=label)
-        for limit in limits:
-            axis.axhline(limit, **_LIMIT)
-    position.set(title=f"{run.joints[j]}, the joint nearest to a limit")
-    torque.set(xlabel="time [s]")
-
-
-def _draw_all(axes: Any, config: ScenarioConfiguration, run: RecordedRun, errors: Array) -> None:
-    middle = 0.5 * (config.position_max + config.position_min)
-    half = 0.5 * (config.position_max - config.position_min)
-    for axis, shares, name in (
-        (axes[0], (run.q - middle) / half, "position"),
-        (axes[1], run.v / config.velocity_max, "velocity"),
-        (axes[2], run.tau / config.torque_max, "torque"),
-    ):
-        axis.plot(run.t, shares, label=run.joints)
-        axis.set(ylabel=f"{name} / limit")
-        for sign in (-1, 1):
-            axis.axhline(sign, **_LIMIT)
-    axes[0].set(title="all joints, limits at -1 and 1")
-    axes[0].legend(run.joints, loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize="small")
-    for values, label in zip(errors.T, ("position [mm]", "orientation [mrad]"), strict=True):
-        axes[3].semilogy(run.t, np.maximum(1e3 * values, 1e-3), label=label)
-    axes[3].set(ylabel="error of the pose goal", xlabel="time [s]")
-    axes[3].legend(loc="upper right")

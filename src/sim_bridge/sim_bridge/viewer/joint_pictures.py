@@ -88,7 +88,7 @@ class JointPictures:
 
     def __init__(self, joints: Sequence[str], limits: JointLimits, tau_max: Array) -> None:
         self._joints, self._limits, self._tau_max = tuple(joints), limits, tau_max
-        self._kernels = [_kernel(limits, k) for k in range(len(joints))]
+        self._kernels = _kernels(limits)
 
     def draw(self, values: JointValues) -> str:
         """Return the picture of all joints as one SVG element."""
@@ -180,14 +180,13 @@ class JointPictures:
         return parts
 
 
-def _kernel(limits: JointLimits, k: int) -> Array | None:
-    """Return the border of the kernel of a joint, shape (m, 2), rad and rad/s; None if endless."""
-    one = limits.of_joint(k)
-    low, high = float(one.q_min[0]), float(one.q_max[0])
-    if not (math.isfinite(low) and math.isfinite(high)):
-        return None
+def _kernels(limits: JointLimits) -> list[Array | None]:
+    """Return the borders of the joints' kernels, shape (m, 2), rad and rad/s; None if endless."""
+    finite = np.isfinite(limits.q_min) & np.isfinite(limits.q_max)
+    low, high = np.where(finite, limits.q_min, 0.0), np.where(finite, limits.q_max, 0.0)
     # Positions are dense where the border is steep.
-    at = 0.5 * (low + high) + 0.5 * (high - low) * np.sin(np.linspace(-0.5, 0.5, 61) * np.pi)
-    at = np.clip(at, low, high)
-    slowest, fastest = (each[:, 0] for each in viable_velocity_range(at[:, None], one))
-    return np.column_stack([np.r_[at, at[::-1]], np.r_[fastest, slowest[::-1]]])
+    spread = np.sin(np.linspace(-0.5, 0.5, 61) * np.pi)[:, None]
+    q = np.clip(0.5 * (low + high) + 0.5 * (high - low) * spread, low, high)
+    slowest, fastest = viable_velocity_range(q, limits)
+    borders = np.stack([np.r_[q, q[::-1]], np.r_[fastest, slowest[::-1]]], axis=-1)
+    return [borders[:, k] if finite[k] else None for k in range(finite.size)]

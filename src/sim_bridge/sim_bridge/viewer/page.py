@@ -49,16 +49,6 @@ class DrivingAsked(NamedTuple):
 Request = GoalAsked | PushAsked | DrivingAsked
 
 
-class Picture(NamedTuple):
-    """All that is shown at one time."""
-
-    joints: JointValues
-    goal: pin.SE3 | None
-    """Pose goal in the base frame; None if there is none."""
-    text: str
-    """State in words, Markdown."""
-
-
 class Page:
     """Serves the page, shows pictures, and queues what its user asks for.
 
@@ -114,18 +104,24 @@ class Page:
             kept.pop(subject, None)
             kept[subject] = request
 
-    def show(self, picture: Picture) -> None:
-        """Update the page; nothing to do while nobody has it open."""
+    def show(self, joints: JointValues, goal: pin.SE3 | None, text: str) -> None:
+        """Update the page; nothing to do while nobody has it open.
+
+        Args:
+            joints: their values.
+            goal: pose goal in the base frame; None if there is none.
+            text: state in words, Markdown.
+        """
         if self._camera_placed and not self._server.get_clients():
             return
-        pin.framesForwardKinematics(self._model, self._data, picture.joints.q)
+        pin.framesForwardKinematics(self._model, self._data, joints.q)
         if not self._camera_placed:
             self._place_camera()
         self._base_pose = self._data.oMf[self._base].copy()
         if self._link.value:
             link = self._data.oMf[self._model.getFrameId(self._link.value)]
             self._push_origin = link.translation.copy()
-        shares = usage(picture.joints, self._limits, self._tau_max)
+        shares = usage(joints, self._limits, self._tau_max)
         with self._server.atomic():
             for index, (frame, meshes) in self._bodies.items():
                 _place(frame, self._data.oMi[index])
@@ -133,10 +129,10 @@ class Page:
                 for mesh in meshes:
                     if tuple(mesh.color) != tone:
                         mesh.color = tone
-            self._show_goal(picture.goal)
+            self._show_goal(goal)
             self._show_handle()
-            self._joint_pictures.content = self._pictures.draw(picture.joints)
-            self.show_text(picture.text)
+            self._joint_pictures.content = self._pictures.draw(joints)
+            self.show_text(text)
 
     def show_text(self, text: str) -> None:
         """Show text alone, Markdown."""

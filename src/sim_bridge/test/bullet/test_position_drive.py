@@ -39,29 +39,28 @@ ROBOTS = {
 class Driven:
     """A robot under its drives; arrays in the order of its joints."""
 
-    def __init__(self, name, *, geared=False, order=None, physics_dt=H):
+    def __init__(self, name, *, geared=False, physics_dt=H):
         urdf, joints, self.tau_max, self.q, rotors, scales = ROBOTS[name]
         self.n = len(joints)
-        self.order = np.arange(self.n) if order is None else order
         self.model = build_model(read_urdf(urdf), joints)
         self.v_max = np.full(self.n, 2.0)
         joint_friction = JointFriction(self.n)
         if geared:
             joint_friction = JointFriction(
                 self.n,
-                friction_coulomb=0.1 * self.tau_max[self.order],
-                friction_static=0.13 * self.tau_max[self.order],
-                friction_viscous=0.02 * self.tau_max[self.order],
-                rotor_inertia=rotors[self.order],
+                friction_coulomb=0.1 * self.tau_max,
+                friction_static=0.13 * self.tau_max,
+                friction_viscous=0.02 * self.tau_max,
+                rotor_inertia=rotors,
             )
         self.robot = BulletRobot(
             read_urdf(urdf),
-            [joints[i] for i in self.order],
+            joints,
             physics_dt=physics_dt,
             joint_friction=joint_friction,
             mass_scales=scales if geared else None,
         )
-        self.robot.reset(self.q[self.order], np.zeros(self.n))
+        self.robot.reset(self.q, np.zeros(self.n))
 
     def __enter__(self):
         return self
@@ -71,14 +70,12 @@ class Driven:
 
     def move(self, q, v=None, steps=1):
         v = np.zeros(self.n) if v is None else v
-        limits = self.tau_max[self.order], self.v_max[self.order]
-        self.robot.move(q[self.order], v[self.order], *limits, steps)
+        limits = self.tau_max, self.v_max
+        self.robot.move(q, v, *limits, steps)
 
     @property
     def state(self):
-        state = self.robot.state()
-        back = np.argsort(self.order)
-        return type(state)(*(x[back] for x in state))
+        return self.robot.state()
 
     def gravity(self):
         return pin.computeGeneralizedGravity(self.model, self.model.createData(), self.state.q)
@@ -179,16 +176,6 @@ def test_a_reset_starts_it_anew():
         driven.robot.reset(driven.q, np.zeros(7))
         driven.move(driven.q)
         np.testing.assert_allclose(driven.state.motor_torque, driven.gravity(), atol=1e-3)
-
-
-def test_the_order_of_joints_does_not_matter():
-    states = []
-    for order in (None, np.random.default_rng(1).permutation(9)):
-        with Driven("talos", geared=True, order=order) as driven:
-            driven.move(driven.q + 0.1, steps=200)
-            states.append(driven.state)
-    np.testing.assert_allclose(states[1].q, states[0].q, atol=1e-9)
-    np.testing.assert_allclose(states[1].motor_torque, states[0].motor_torque, atol=1e-5)
 
 
 def test_bad_targets_are_refused():
