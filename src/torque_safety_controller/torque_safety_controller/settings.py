@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from torque_safety_controller.friction.settings import FrictionSettings
 from torque_safety_controller.integral_feedback.settings import IntegralSettings
-from torque_safety_controller.parts.contact.admittance import InteractionSettings
+from torque_safety_controller.tasks.admittance import InteractionSettings
 from torque_safety_controller.tasks.gains import Gains
 
 

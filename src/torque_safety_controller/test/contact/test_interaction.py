@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.parts.contact import interaction
-from torque_safety_controller.parts.contact.admittance import KV, AdmittanceTask, admittance
 from torque_safety_controller.parts.contact.contacts import FrictionContact
 from torque_safety_controller.parts.contact.interaction import (
     Compliance,
@@ -24,6 +23,7 @@ from torque_safety_controller.parts.contact.wrench_sensor import WrenchSensor
 from torque_safety_controller.parts.goals import Goals
 from torque_safety_controller.parts.joint_bounds import JointBounds
 from torque_safety_controller.qp import AccelerationRange
+from torque_safety_controller.tasks.admittance import KV, AdmittanceTask, admittance
 from viability_bounds_pkg.state import State
 
 GAINS = replace(PLAIN, posture_weight=1e-6)  # so little that the hand does what its tasks want

@@ -204,9 +204,12 @@ def test_a_far_goal_is_approached_at_the_speed_allowed(arm):
 
 
 def test_without_a_speed_or_a_stiffness_no_error_is_too_large():
-    assert Gains(pose_kp=90.0, posture_kp=0.0, pose_speed_max=np.empty(0)).pose_error_max is None
+    unlimited = (math.inf, math.inf)
+    gains = Gains(pose_kp=90.0, posture_kp=0.0, pose_speed_max=np.empty(0))
+    assert gains.pose_error_max == unlimited
     speeds = np.array([0.3, 0.7])
-    assert Gains(pose_kp=0.0, posture_kp=0.0, pose_speed_max=speeds).pose_error_max is None
+    gains = Gains(pose_kp=0.0, posture_kp=0.0, pose_speed_max=speeds)
+    assert gains.pose_error_max == unlimited
     limits = Gains(pose_kp=100.0, pose_kd=10.0, posture_kp=0.0, pose_speed_max=speeds)
     assert limits.pose_error_max == pytest.approx((0.03, 0.07))
 

@@ -8,6 +8,7 @@ interpolation (PCHIP), which does not overshoot, and rest at both ends.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
@@ -91,15 +92,11 @@ class JointTrajectory:
         finite = np.isfinite(np.column_stack([times, *parts])).all(axis=1)
         if not finite.all():
             raise JointTrajectoryError(f"points[{int(finite.argmin())}] is not finite")
-        if times[0] < 0.0:
-            raise JointTrajectoryError(f"points[0].time is {times[0]:g}; allowed: at least 0")
-        grows = np.diff(times) > 0.0
-        if not grows.all():
-            k = int(grows.argmin()) + 1
-            raise JointTrajectoryError(
-                f"points[{k}].time is {times[k]:g}; allowed: more than {times[k - 1]:g}, that of "
-                "the last one"
-            )
+        grows = np.diff(times, prepend=-math.inf) > 0.0
+        if times[0] < 0.0 or not grows.all():
+            k = 0 if times[0] < 0.0 else int(grows.argmin())
+            allowed = f"more than {times[k - 1]:g}, that of the last one" if k else "at least 0"
+            raise JointTrajectoryError(f"points[{k}].time is {times[k]:g}; allowed: {allowed}")
         self.points = tuple(points)
         self.duration = points[-1].time
         with np.errstate(all="ignore"):  # what overflows is too fast

@@ -86,13 +86,17 @@ class ControllerNode(ArmNode):
         )
         self._report = ControllerReport(
             self,
-            self._node_parameters,
+            config,
             self._controller,
             self._supervisor,
             self._states,
-            self._limits,
-            self._goals,
-            self._wrenches,
+            {
+                "goals_refused": self._goals.refused,
+                "states_refused": self._states.refused,
+                "limits_refused": self._limits.refused,
+                "wrenches_refused": self._wrenches.refused,
+            },
+            self._goals.__len__,
         )
         self._commands = JointCommands(self, config.joints, config.ros2_control_topic)
         self._published = StatePublisher(self, self._controller.robot, config, base, self._states)

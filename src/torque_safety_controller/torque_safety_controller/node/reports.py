@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,13 +16,8 @@ from std_msgs.msg import String
 
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.modes import Mode
-from torque_safety_controller.node.goals import GoalSubscriber
-from torque_safety_controller.node.periodic import LimitsReader, StateStream
-from torque_safety_controller.node.topics import (
-    CONTROLLER_MODE,
-    HAND_POSE,
-)
-from torque_safety_controller.node.wrenches import WrenchSubscriber
+from torque_safety_controller.node.periodic import StateStream
+from torque_safety_controller.node.topics import CONTROLLER_MODE, HAND_POSE
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.parts.collision.avoidance import Collision
 from torque_safety_controller.robot_model import RobotModel
@@ -28,7 +25,6 @@ from torque_safety_controller.step import Step, joints_named
 from torque_safety_controller.supervisor import Supervisor
 from viability_bounds_pkg.recent_values import RecentValues
 from viability_bounds_pkg.ros.messages import JointStateReader, PeriodCheck, pose_message
-from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.runtime import steady_timer
 
 Array = NDArray[np.float64]
@@ -61,30 +57,30 @@ class ControllerReport:
 
     Args:
         node: logs.
-        parameters: with the present configuration.
+        config: of the arm; only what does not change while the node runs is used.
         controller: of the arm.
         supervisor: has mode, reason and share.
         states: as they come.
-        limits: as they come.
-        goals: waiting and refused.
-        wrenches: measured and wanted.
+        refused: what was refused, by kind and reason.
+        pending: how many goals wait.
     """
 
     def __init__(
         self,
         node: Node,
-        parameters: NodeParameters[ControllerConfiguration],
+        config: ControllerConfiguration,
         controller: Controller,
         supervisor: Supervisor,
         states: StateStream,
-        limits: LimitsReader,
-        goals: GoalSubscriber,
-        wrenches: WrenchSubscriber,
+        refused: Mapping[str, Counter[str]],
+        pending: Callable[[], int],
     ) -> None:
-        self._parameters, self._controller, self._supervisor = parameters, controller, supervisor
-        self._states, self._limits = states, limits
-        self._goals, self._wrenches = goals, wrenches
-        config = parameters.configuration
+        self._controller, self._supervisor, self._states = controller, supervisor, states
+        self._refused, self._pending = refused, pending
+        self._fixed = {
+            "integral_action": config.integral.integral_action,
+            "torque_rate_max": "clipped" if config.clips_torque_rates else "none",
+        }
         if collision := controller.find(Collision):
             logger, margin = node.get_logger(), collision.margin
             pairs = len(collision.model.names)
@@ -124,7 +120,6 @@ class ControllerReport:
         return level, f"{text}; {short}" if short else text, values
 
     def _values(self) -> dict[str, Any]:
-        config = self._parameters.configuration
         values = {
             "steps": self._steps,
             "qp_failures": self._failures,
@@ -132,14 +127,9 @@ class ControllerReport:
             "bounds_last_relaxation_rad_s2": self._last_relaxation,
             "latency_p50_us": 1e6 * self._latencies.percentile(50),
             "latency_p99_us": 1e6 * self._latencies.percentile(99),
-            "integral_action": config.integral.integral_action,
-            "torque_rate_max": "clipped" if config.clips_torque_rates else "none",
-            "goals_pending": len(self._goals),
-            "goals_refused": self._goals.refused,
-            "states_refused": self._states.refused,
-            "limits_refused": self._limits.refused,
-            "wrenches_refused": self._wrenches.refused,
+            "goals_pending": self._pending(),
         }
+        values |= self._fixed | self._refused
         values |= self._supervisor.values() | self._controller.report()
         return values if self._last is None else values | self._of_step(self._last)
 

@@ -12,7 +12,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from torque_safety_controller.parts.collision.shapes import SHAPES, Shape, capsule, make_obstacle
-from torque_safety_controller.parts.contact.admittance import InteractionSettings
+from torque_safety_controller.tasks.admittance import InteractionSettings
 from viability_bounds_pkg.exceptions import SettingError, did_you_mean
 from viability_bounds_pkg.parameter import (
     FINITE,

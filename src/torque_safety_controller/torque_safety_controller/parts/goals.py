@@ -15,7 +15,6 @@ from torque_safety_controller.settings import Settings
 from torque_safety_controller.step import Part, Step, joints_beyond
 from torque_safety_controller.tasks.gains import Gains
 from torque_safety_controller.tasks.pose_task import (
-    OtherHandTask,
     PoseMotion,
     PoseTask,
     pose_error,
@@ -203,12 +202,12 @@ class Goals(Part):
 
     def _make_tasks(self, stiffness: Array | None) -> list[Task]:
         goals, gains = self.targets, self.gains
-        tasks: list[Task] = []
+        hands: list[PoseTask] = []
         if gains.pose_weight > 0.0:
             if goals.pose is not None:
-                tasks.append(_pose_task(goals.pose, gains, goals.motion, stiffness))
-            tasks += [
-                OtherHandTask(_pose_task(pose, gains), hand)
+                hands.append(_pose_task(goals.pose, gains, goals.motion, stiffness))
+            hands += [
+                _pose_task(pose, gains, hand=hand)
                 for hand, pose in enumerate(goals.others)
                 if pose is not None
             ]
@@ -217,18 +216,16 @@ class Goals(Part):
             feedforward = gains.posture_kd * goals.v
             if goals.a is not None:
                 feedforward = feedforward + goals.a
-        tasks.append(
-            PostureTask(
-                self.posture if goals.q is None else goals.q,
-                gains.posture_kp,
-                gains.posture_kd,
-                gains.posture_weight,
-                bool(tasks) and goals.pose is not None,
-                feedforward,
-                tuple(each.hand for each in tasks if isinstance(each, OtherHandTask)),
-            )
+        posture = PostureTask(
+            self.posture if goals.q is None else goals.q,
+            gains.posture_kp,
+            gains.posture_kd,
+            gains.posture_weight,
+            any(each.hand is None for each in hands),
+            feedforward,
+            tuple(each.hand for each in hands if each.hand is not None),
         )
-        return tasks
+        return [*hands, posture]
 
 
 def _pose_task(
@@ -236,6 +233,7 @@ def _pose_task(
     gains: Gains,
     motion: PoseMotion | None = None,
     stiffness: Array | None = None,
+    hand: int | None = None,
 ) -> PoseTask:
     return PoseTask(
         pose_des,
@@ -246,4 +244,5 @@ def _pose_task(
         stiffness,
         gains.pose_error_max,
         gains.pose_error == "separate",
+        hand,
     )

@@ -78,13 +78,13 @@ class Gains:
             object.__setattr__(self, "posture_kd", critical_damping(self.posture_kp))
 
     @property
-    def pose_error_max(self) -> tuple[float, float] | None:
+    def pose_error_max(self) -> tuple[float, float]:
         """Errors of translation, m, and rotation, rad, beyond which the pose task is no stiffer.
 
-        Damping then balances stiffness at `pose_speed_max`: kp error = kd speed. None: no limit.
+        Damping then balances stiffness at `pose_speed_max`: kp error = kd speed.
         """
         if not len(self.pose_speed_max) or self.pose_kp == 0.0:
-            return None
+            return math.inf, math.inf
         linear, angular = (self.pose_speed_max * (self.pose_kd / self.pose_kp)).tolist()
         return linear, angular
 

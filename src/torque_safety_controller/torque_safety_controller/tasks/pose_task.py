@@ -27,9 +27,7 @@ from torque_safety_controller.robot_model import FrameModel, RobotModel
 
 Array = NDArray[np.float64]
 
-
 _ALL = np.ones(6)
-_UNLIMITED = (math.inf, math.inf)
 
 
 class PoseMotion(NamedTuple):
@@ -53,10 +51,10 @@ class PoseTask:
         motion: of the goal; None for one at rest.
         stiffness: share of `kp` in each of the end effector's axes, shape (6,); None for all.
         error_max: sizes at which the error of translation, m, and that of rotation, rad, count
-            at most, so that a far goal is approached at no more than kp / kd times them; None
-            for no limit.
+            at most, so that a far goal is approached at no more than kp / kd times them.
         separate: whether position and orientation count apart, (7)-(8) of [Benallegue2021]; else
             their error is the logarithm of SE(3).
+        hand: index in `RobotModel.others` of a further end effector; None for the first one.
     """
 
     pose_des: pin.SE3
@@ -65,29 +63,31 @@ class PoseTask:
     weight: float
     motion: PoseMotion | None = None
     stiffness: Array | None = None
-    error_max: tuple[float, float] | None = None
+    error_max: tuple[float, float] = (math.inf, math.inf)
     separate: bool = False
+    hand: int | None = None
 
-    def term(self, robot: FrameModel) -> TaskTerm:
+    def term(self, robot: RobotModel) -> TaskTerm:
         """Return ``J a = kp error - kd J v - J' v + feedforward`` as a term of the cost."""
-        pose, goal = robot.pose, self.pose_des
+        frame: FrameModel = robot if self.hand is None else robot.others[self.hand]
+        pose, goal = frame.pose, self.pose_des
         error = separate_error(pose, goal) if self.separate else pose_error(pose, goal)
         twist, b = _spring_and_damper(
             error,
             self.kp,
             self.kd,
             _ALL if self.stiffness is None else self.stiffness,
-            self.error_max or _UNLIMITED,
-            robot.J,
-            robot.v,
-            robot.drift,
+            self.error_max,
+            frame.J,
+            frame.v,
+            frame.drift,
             self.separate,
         )
         if self.motion is not None and self.separate:
-            b += self._separate_feedforward(robot.pose, self.motion)
+            b += self._separate_feedforward(pose, self.motion)
         elif self.motion is not None:
-            b += self._feedforward(robot.pose, twist, self.motion)
-        return TaskTerm(robot.J, b, self.weight)
+            b += self._feedforward(pose, twist, self.motion)
+        return TaskTerm(frame.J, b, self.weight)
 
     def _separate_feedforward(self, pose: pin.SE3, motion: PoseMotion) -> Array:
         """Return ``kd (p_d', w_d) + (p_d'', w_d')`` in the end effector's axes, shape (6,)."""
@@ -110,23 +110,6 @@ class PoseTask:
         rate = between.act(pin.Motion(motion.twist_rate)) - pin.Motion(twist).cross(seen)
         feedforward: Array = self.kd * seen.vector + rate.vector
         return feedforward
-
-
-@dataclass(slots=True)
-class OtherHandTask:
-    """The pose task of a further end effector.
-
-    Attributes:
-        task: of its pose.
-        hand: its index in `RobotModel.others`.
-    """
-
-    task: PoseTask
-    hand: int
-
-    def term(self, robot: RobotModel) -> TaskTerm:
-        """See `PoseTask.term`."""
-        return self.task.term(robot.others[self.hand])
 
 
 @njit(cache=True)
