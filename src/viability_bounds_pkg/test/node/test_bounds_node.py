@@ -19,7 +19,7 @@ from viability_bounds_pkg.testing.ros_harness import (
     joint_state,
     names_parameter,
 )
-from viability_bounds_pkg.viability import acceleration_bounds
+from viability_bounds_pkg.viability import BoundsSolver
 
 NODE = "bounds_node"
 JOINTS = ["turn", "lift", "spin"]
@@ -56,7 +56,7 @@ NEAR = [0.96, 1.9, 4.0], [0.6, 0.85, 2.95]
 
 
 def exact(q, v, factor=2.0):
-    return acceleration_bounds(q, v, LIMITS, factor * PERIOD, None, PERIOD)
+    return BoundsSolver(LIMITS, factor * PERIOD, period=PERIOD).bounds(q, v)
 
 
 class BoundsProbe:
@@ -229,7 +229,7 @@ def test_it_holds_for_what_is_declared(ros):
     robot = BoundsProbe(ros, **DECLARED)
     q, v = map(np.array, NEAR)
     errors = {name: DECLARED[name] for name in ("position_error", "velocity_error")}
-    bounds = acceleration_bounds(q, v, LIMITS, 4.0 * PERIOD, None, PERIOD, **errors)
+    bounds = BoundsSolver(LIMITS, 4.0 * PERIOD, period=PERIOD, **errors).bounds(q, v)
     assert (bounds.upper < exact(q, v).upper).all(), "what is declared has no effect here"
     check(robot.ask(10 * MS, q, v), bounds)
     ros.wait_until(lambda: ros.reported(NODE, "states_answered") == "1")
@@ -245,7 +245,7 @@ def test_a_shorter_horizon_than_declared_is_not_taken(ros):
     ros.wait_until(lambda: ros.reported(NODE, "bounds_period_s") != "")
     q, v = map(np.array, NEAR)
     errors = {name: DECLARED[name] for name in ("position_error", "velocity_error")}
-    bounds = acceleration_bounds(q, v, LIMITS, 4.0 * PERIOD, None, PERIOD, **errors)
+    bounds = BoundsSolver(LIMITS, 4.0 * PERIOD, period=PERIOD, **errors).bounds(q, v)
     check(robot.ask(10 * MS, q, v), bounds)
 
 
