@@ -24,7 +24,7 @@ from torque_safety_controller.node import topics as controller_topics
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.remote.moveit_parameters import MoveitConfiguration
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration
-from viability_bounds_pkg.node.estimator_parameters import EstimatorConfiguration
+from viability_bounds_pkg.node.estimator_node import EstimatorConfiguration
 from viability_bounds_pkg.parameter import REQUIRED, Parameter, parameter_table
 from viability_bounds_pkg.ros.topics import SHARED_TOPICS, OfferedService, Topic
 

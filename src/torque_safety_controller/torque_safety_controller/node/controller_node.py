@@ -268,7 +268,7 @@ class ControllerNode(ArmNode):
     def _watch(self) -> None:
         now, config, states = time.monotonic(), self._config, self._states
         if now - states.message_at > _QUIET * config.bounds_timeout:
-            self._supervisor.silent(self.publisher_watch.several or "no joint state")
+            self._supervisor.silent(self.publisher_watch.trouble or "no joint state")
         elif states.silent(now):
             self._supervisor.silent(states.why_refused)
         elif states.waits(now) > config.bounds_timeout:

@@ -21,7 +21,7 @@ def make_nodes() -> Iterator[ArmNode]:
     yield bounds
     controller = ControllerNode()
     yield controller
-    if bounds.publisher_watch.estimates or controller.publisher_watch.estimates:
+    if bounds.uses_estimates or controller.uses_estimates:
         yield EstimatorNode()
 
 

@@ -251,6 +251,8 @@ def test_a_shorter_horizon_than_declared_is_not_taken(ros):
 
 def test_it_answers_estimated_states_where_it_is_told_to(ros):
     robot = BoundsProbe(ros, states="estimated_joint_states", use_estimated_states=True)
+    missing = "no joint state from estimator_node yet"
+    ros.wait_until(lambda: ros.reported(NODE, "message") == missing)
     check(robot.ask(10 * MS, *NEAR), exact(*map(np.array, NEAR)))
     names = {name for name, _ in robot.node.get_topic_names_and_types()}
     assert "/joint_states" not in names

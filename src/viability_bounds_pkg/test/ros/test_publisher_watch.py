@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import pytest
 from rclpy.node import Node
-from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
@@ -87,35 +86,3 @@ def test_other_namespaces_and_topics_are_no_rivals(ros, watched):
     assert watch.admits(TOPIC)
     assert not watch.rivals
     assert not log.warnings
-
-
-def test_a_missing_estimator_is_told_once_it_has_been_missing_for_some_checks(ros, monkeypatch):
-    node = ros.add(Node("arm", context=ros.context))
-    log = Log(node, monkeypatch)
-    watch = PublisherWatch(node)
-    names = watch.estimates = "/joint_states", "/estimated_joint_states"
-
-    def check():
-        for _ in range(4):
-            watch.check()
-
-    check()
-    assert watch.trouble == ""  # the robot is not there either
-    node.create_publisher(JointState, names[0], 1)
-    ros.wait_until(lambda: node.count_publishers(names[0]), "the robot")
-    watch.check()
-    assert watch.trouble == ""  # the estimator may come a moment later
-    check()
-    missing = "'/joint_states' has a publisher, '/estimated_joint_states' has none"
-    assert watch.trouble == missing
-    (text,) = log.warnings
-    assert text == f"{missing}: start estimator_node, or set use_estimated_states to false"
-    estimator = node.create_publisher(JointState, names[1], 1)
-    ros.wait_until(lambda: node.count_publishers(names[1]), "the estimator")
-    check()
-    assert watch.trouble == ""
-    node.destroy_publisher(estimator)
-    ros.wait_until(lambda: not node.count_publishers(names[1]), "its end")
-    check()
-    assert watch.trouble == missing
-    assert len(log.warnings) == 2

@@ -8,12 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from std_msgs.msg import Float64MultiArray
 
 from viability_bounds_pkg.plausible import JUMP, PlausibilityCheck
 from viability_bounds_pkg.ros.diagnostics import Diagnostics
 from viability_bounds_pkg.ros.messages import Arrival, JointStateReader
-from viability_bounds_pkg.ros.runtime import STATUS_QOS, set_stamp, stamp_to_ns
+from viability_bounds_pkg.ros.runtime import set_stamp, stamp_to_ns
 from viability_bounds_pkg.testing.ros_harness import joint_state
 
 JOINTS = ("a", "b", "c")
@@ -230,27 +229,6 @@ def test_diagnostics_come_by_themselves_although_time_stands_still(ros):
         "level": DiagnosticStatus.WARN,
         "message": "so so",
     }
-
-
-def test_numbers_in_diagnostics_are_sent_as_numbers_too(ros):
-    node = ros.add(Node("watched", context=ros.context, namespace="left"))
-    values = {
-        "count": 3,
-        "array": np.array([1.0, -0.25, np.nan]),
-        "text": "4.0",
-        "flags": np.array([0, 2]),
-        "on": True,
-        "number": 1.0 / 3.0,
-        "refused": JointStateReader(JOINTS).refused,
-    }
-    Diagnostics(node, lambda: (DiagnosticStatus.OK, "", values))
-    heard = ros.listen(Float64MultiArray, "left/watched/values", STATUS_QOS)
-    ros.wait_until(lambda: heard, "values")
-    dimensions = heard[0].layout.dim
-    assert [dim.label for dim in dimensions] == ["count", "array", "flags", "on", "number"]
-    assert [dim.size for dim in dimensions] == [1, 3, 2, 1, 1]
-    expected = [3.0, 1.0, -0.25, np.nan, 0.0, 2.0, 1.0, 1.0 / 3.0]
-    np.testing.assert_array_equal(heard[0].data, expected)
 
 
 def test_diagnostics_of_two_arms_are_told_apart(ros):

@@ -107,7 +107,6 @@ class BoundsNode(ArmNode):
     def _report(self) -> tuple[bytes, str, dict[str, Any]]:
         config = self._node_parameters.configuration
         self._period.compare(self._reader)
-        silent = self._reader.stamp < 0
         values = {
             "method": config.method,
             "control_period_s": config.dt,
@@ -121,8 +120,9 @@ class BoundsNode(ArmNode):
             "states_refused": self._reader.refused,
             "states_outside_kernel_by_joint": self._outside,
         }
-        if silent:
-            return DiagnosticStatus.WARN, "no joint state yet", values
+        if self._reader.stamp < 0:
+            source = " from estimator_node" if self.uses_estimates else ""
+            return DiagnosticStatus.WARN, f"no joint state{source} yet", values
         if self._reader.refused:
             return DiagnosticStatus.WARN, "joint states were refused", values
         return DiagnosticStatus.OK, "answering", values

@@ -6,15 +6,21 @@ from __future__ import annotations
 import sys
 import time
 from collections import Counter
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import JointState
 
 from viability_bounds_pkg.node.bounds_parameters import make_plausibility_check
-from viability_bounds_pkg.node.estimator_parameters import EstimatorConfiguration, make_estimator
-from viability_bounds_pkg.robot.configuration import load_model
+from viability_bounds_pkg.parameter import group, timeout
+from viability_bounds_pkg.robot.configuration import (
+    ControlRate,
+    LimitedRobotConfiguration,
+    load_model,
+)
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.diagnostics import Diagnostics
 from viability_bounds_pkg.ros.messages import (
@@ -30,6 +36,40 @@ from viability_bounds_pkg.ros.robot_urdf import robot_urdf, warn_of_unusual
 from viability_bounds_pkg.ros.runtime import stamp_to_ns
 from viability_bounds_pkg.ros.topics import ESTIMATED_JOINT_STATES, JOINT_COMMANDS, JOINT_STATES
 from viability_bounds_pkg.state import State
+from viability_bounds_pkg.state_estimation.estimator import StateEstimator
+from viability_bounds_pkg.state_estimation.observer import ObserverDesign
+from viability_bounds_pkg.uncertainty import DeclaredUncertainty, VelocityEstimation
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class EstimatorConfiguration(VelocityEstimation, ControlRate, LimitedRobotConfiguration):
+    """Parameters of the estimator node."""
+
+    declared: DeclaredUncertainty = group(DeclaredUncertainty)
+    state_timeout: float = timeout(
+        "silence after which older stamps are accepted again, s", default=0.5
+    )
+
+    @property
+    def observers(self) -> ObserverDesign | None:
+        """Observers of the velocities; None where they are not estimated."""
+        return self.declared.observers(self.dt) if self.velocity_estimation else None
+
+
+def make_estimator(config: EstimatorConfiguration, model: pin.Model) -> StateEstimator:
+    """Return the estimator of an arm."""
+    declared = config.declared
+    return StateEstimator(
+        model,
+        config.dt,
+        declared.delay,
+        declared.motor_lag,
+        config.observers,
+        config.velocity_max,
+        config.torque_max,
+        declared.lasting_disturbance,
+        1 + declared.missed_deadlines,
+    )
 
 
 class EstimatorNode(ArmNode):

@@ -16,12 +16,7 @@ from viability_bounds_pkg.ros.given_parameters import given_parameters
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.runtime import steady_timer
 from viability_bounds_pkg.ros.streams import Input, Queue, Stream
-from viability_bounds_pkg.ros.topics import (
-    ESTIMATED_JOINT_STATES,
-    JOINT_STATES,
-    Topic,
-    state_topic,
-)
+from viability_bounds_pkg.ros.topics import Topic, state_topic
 
 CLOCK_TIMEOUT = 5.0
 """How long ``/clock`` may be silent at start before a node warns, s."""
@@ -48,6 +43,7 @@ class ArmNode(Node):
         streams: that it publishes.
         inputs: streams that it obeys.
         publisher_watch: of the topics of both.
+        uses_estimates: whether it needs ``estimated_joint_states``.
     """
 
     NAME: ClassVar[str]
@@ -63,6 +59,7 @@ class ArmNode(Node):
         self.given = {name: value for name, value in given.items() if not name.startswith(_OF_ROS)}
         self.streams: list[Stream] = []
         self.inputs: list[Input] = []
+        self.uses_estimates = False
         self.publisher_watch = PublisherWatch(self)
 
     @contextmanager
@@ -91,10 +88,7 @@ class ArmNode(Node):
 
     def listen_to_states(self, estimated: bool, callback: Callable[[Any], None]) -> None:
         """Call `callback` with the joint states that the node works on: estimated, or reported."""
-        if estimated:
-            names = JOINT_STATES.name, ESTIMATED_JOINT_STATES.name
-            reported, estimates = map(self.resolve_topic_name, names)
-            self.publisher_watch.estimates = reported, estimates
+        self.uses_estimates = estimated
         self.listen(state_topic(estimated), callback)
 
     def announce(self, joints: Sequence[str], rate: float, what: str) -> None:

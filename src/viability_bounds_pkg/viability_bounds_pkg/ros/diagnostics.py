@@ -1,20 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publishes a node's status on ``/diagnostics``, and the numbers in it for plots."""
+"""Publishes a node's status on ``/diagnostics``."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
-from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
 from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
 from viability_bounds_pkg.ros.runtime import steady_timer
-from viability_bounds_pkg.ros.topics import DIAGNOSTICS, VALUES
+from viability_bounds_pkg.ros.topics import DIAGNOSTICS
 
 Report = Callable[[], tuple[bytes, str, dict[str, Any]]]
 """Returns level, message and values of a status."""
@@ -26,28 +25,25 @@ DIAGNOSTICS_PERIOD = 0.5
 class Diagnostics:
     """Publishes one status on ``/diagnostics``, regularly and when asked.
 
-    What is a number in it is also sent on ``~/values``, as a number, where that is subscribed to.
-
     Args:
         node: the publishing node; its name with the namespace, as in ``left/bounds_node``, is the
             status' name, so that two arms are told apart.
         report: returns level (a constant of ``DiagnosticStatus``), a message and the values.
-        watch: its topics with several publishers, and a missing estimator, are reported, too, as a
-            warning.
+        watch: its topics with several publishers are reported, too, as a warning.
     """
 
     def __init__(self, node: Node, report: Report, watch: PublisherWatch | None = None) -> None:
         self._node, self._report, self._watch = node, report, watch
         self._publisher = DIAGNOSTICS.publisher(node)
-        self._values_publisher = VALUES.publisher(node)
         self._timer = steady_timer(node, DIAGNOSTICS_PERIOD, self.publish)
 
     def publish(self) -> None:
         """Send the status now."""
         level, message, values = self._report()
         if self._watch is not None:
-            values["topics_with_several_publishers"] = self._watch.several or "none"
-            if trouble := self._watch.trouble:
+            trouble = self._watch.trouble
+            values["topics_with_several_publishers"] = trouble or "none"
+            if trouble:
                 level = max(level, DiagnosticStatus.WARN)
                 message += f"; {trouble}"
         status = DiagnosticStatus(
@@ -60,20 +56,6 @@ class Diagnostics:
         array = DiagnosticArray(status=[status])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(array)
-        if self._values_publisher.get_subscription_count():
-            self._values_publisher.publish(_numbers(values))
-
-
-def _numbers(values: Mapping[str, Any]) -> Float64MultiArray:
-    """Return the numbers and arrays among `values`, one after the other, labelled by key."""
-    message = Float64MultiArray()
-    for key, value in values.items():
-        if isinstance(value, int | float | np.ndarray):
-            numbers = np.atleast_1d(value)
-            size = len(numbers)
-            message.layout.dim.append(MultiArrayDimension(label=key, size=size, stride=size))
-            message.data.extend(numbers.tolist())
-    return message
 
 
 def _text(value: Any) -> str:

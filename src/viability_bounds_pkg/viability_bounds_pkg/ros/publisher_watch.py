@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detects duplicate publishers of topics that may have one only, and a missing estimator."""
+"""Detects duplicate publishers of topics that may have one only."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from rclpy.node import Node
 from viability_bounds_pkg.ros.runtime import steady_timer
 
 _PERIOD = 1.0
-_PATIENCE = 3
-"""Checks in a row that must find no estimator: others may start first."""
 
 
 class PublisherWatch:
@@ -22,15 +20,12 @@ class PublisherWatch:
 
     Attributes:
         rivals: nodes that publish the same topic, by topic; only topics with several.
-        estimates: topics of reported and of estimated joint states where the node needs the
-            latter: it is also logged, once each time, that nobody estimates them.
     """
 
     def __init__(self, node: Node) -> None:
         self.rivals: dict[str, tuple[str, ...]] = {}
-        self.estimates: tuple[str, str] | None = None
         self._topics: list[str] = []
-        self._node, self._without_estimates = node, 0
+        self._node = node
         # Faster than the node's own, which expands the name at each call.
         self._count = node.handle.get_count_publishers
         steady_timer(node, _PERIOD, self.check)
@@ -41,19 +36,6 @@ class PublisherWatch:
 
     @property
     def trouble(self) -> str:
-        """Topics with several publishers in words, and a missing estimator; empty without."""
-        return "; ".join(filter(None, (self.several, self.missing)))
-
-    @property
-    def missing(self) -> str:
-        """Says that the estimator is missing, empty if it is not."""
-        if self.estimates is None or self._without_estimates < _PATIENCE:
-            return ""
-        reported, estimated = self.estimates
-        return f"'{reported}' has a publisher, '{estimated}' has none"
-
-    @property
-    def several(self) -> str:
         """Topics with several publishers in words, empty if there is none."""
         return "; ".join(
             f"{len(names)} publishers of '{topic}': {', '.join(names)}"
@@ -71,14 +53,6 @@ class PublisherWatch:
         """Compare the graph with what was known."""
         for topic in self._topics:
             self._check_topic(topic)
-        if self.estimates is not None:
-            reported, estimated = map(self._count, self.estimates)
-            lacking = reported and not estimated
-            self._without_estimates = self._without_estimates + 1 if lacking else 0
-            if self._without_estimates == _PATIENCE:
-                self._node.get_logger().warning(
-                    f"{self.missing}: start estimator_node, or set use_estimated_states to false"
-                )
 
     def _check_topic(self, topic: str) -> None:
         names: list[str] = []

@@ -16,7 +16,7 @@ from rclpy.qos import QoSProfile
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray, String
+from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, LATCHED_QOS, SLOW_QOS, STATUS_QOS
@@ -189,16 +189,6 @@ DIAGNOSTICS = Topic(
     "mode and why, refused messages by reason, margins, latency, solver, closest approach; the "
     "name of a status is that of its node with the namespace, as in `left/bullet_node`",
 )
-VALUES = Topic(
-    "~/values",
-    Float64MultiArray,
-    STATUS_QOS,
-    ("bounds_node", "estimator_node", "controller_node", "bullet_node"),
-    (USER,),
-    "the numbers in the node's diagnostics, to plot them: `data` has one quantity after the "
-    "other, `layout.dim` the key of each as `label` and how many numbers it has as `size`, not "
-    "the dimensions of one array; sent with `/diagnostics`",
-)
 
 
 def state_topic(estimated: bool) -> Topic:
@@ -217,6 +207,5 @@ SHARED_TOPICS = (
     SLOW_ACCELERATION_LIMITS,
     ROBOT_DESCRIPTION,
     DIAGNOSTICS,
-    VALUES,
 )
 """Topics between nodes of different packages, and those of the bounds node."""
