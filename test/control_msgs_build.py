@@ -34,13 +34,6 @@ string joint_name
 uint16 component
 """
     + TOLERANCE,
-    "msg/JointJog.msg": """\
-std_msgs/Header header
-string[] joint_names
-float64[] displacements
-float64[] velocities
-float64 duration
-""",
     "action/FollowJointTrajectory.action": """\
 trajectory_msgs/JointTrajectory trajectory
 trajectory_msgs/MultiDOFJointTrajectory multi_dof_trajectory

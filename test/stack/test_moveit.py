@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The action FollowJointTrajectory and JointJog, through the real nodes in lockstep."""
+"""The action FollowJointTrajectory, through the real nodes in lockstep."""
 
 import re
 import sys
@@ -298,24 +298,6 @@ def test_without_a_robot_it_says_so(ros, moveit, monkeypatch):
     user = User(ros, moveit, robot=False)
     outcome = user.wait(user.send())
     assert outcome[1:] == (-1, "no joint states are heard for 0.3 s")
-
-
-def test_jogs_move_a_joint_and_end_a_goal(ros, moveit):
-    user = User(ros, moveit)
-    jogs = ros.talk(moveit.JointJog, "moveit_node/joint_jog", GOAL_QOS)
-    goal = user.send(duration=8.0)
-    ros.wait_until(lambda: goal.feedback)
-    jogs.publish(moveit.JointJog(joint_names=JOINTS[5:6], displacements=[0.4]))
-    user.run(0.5)
-    assert goal.answer is None
-    before = user.q
-    jog = moveit.JointJog(joint_names=JOINTS[5:6], velocities=[0.4])
-    ros.wait_until(lambda: user.q[5] - before[5] > 0.2, each=lambda: jogs.publish(jog))
-    assert goal.outcome[:2] == (GoalStatus.STATUS_ABORTED, -1)
-    assert goal.outcome[2] == "a jog has come"
-    ros.wait_until(lambda: np.abs(user.v).max() < 1e-3)
-    ros.wait_until(lambda: ros.probe.count_publishers("jog_joints") == 0)
-    user.ros.assert_limits_kept()
 
 
 def test_its_help_lists_its_parameters(moveit, monkeypatch, capsys):

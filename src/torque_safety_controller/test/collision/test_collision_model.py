@@ -148,7 +148,7 @@ def test_neighbours_are_left_out_and_what_is_always_near():
     assert "panda_hand - table" in collision.names
     for name in ("panda_link2 - panda_link1", "panda_hand - panda_link7", "panda_link0 - table"):
         assert name not in collision.names
-    assert collision.left_out["near at start"] == ["panda_link7 - panda_link5"]
+    assert collision.left_out["collision_posture"] == ["panda_link7 - panda_link5"]
 
 
 def build(**changes):

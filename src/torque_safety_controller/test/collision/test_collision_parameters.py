@@ -57,10 +57,10 @@ def test_obstacles_become_shapes_in_the_base_frame():
 def test_pairs_near_in_the_given_posture_are_left_out():
     chosen = load()
     assert "panda_hand - panda_link1" in chosen.model.names
-    assert chosen.model.left_out["near at start"] == ["panda_link7 - panda_link5"]
+    assert chosen.model.left_out["collision_posture"] == ["panda_link7 - panda_link5"]
     # In the middle of the limits, the default, the hand is bent back to the forearm.
     middle = load(collision_posture=None)
-    assert "panda_hand - panda_link5" in middle.model.left_out["near at start"]
+    assert "panda_hand - panda_link5" in middle.model.left_out["collision_posture"]
 
 
 def test_acceleration_limits_arrive():
@@ -72,7 +72,7 @@ def test_acceleration_limits_arrive():
 def test_what_an_arm_is_mounted_on_is_left_out_and_said_to_be():
     top = "{name: top, shape: box, size: [1.0, 1.0, 0.1], position: [0.2, 0.0, 0.15]}"
     model = load(obstacles=[top]).model
-    assert "panda_link1 - top" in model.left_out["near always"]
+    assert "panda_link1 - top" in model.left_out["all postures"]
     assert "panda_hand - top" in model.names
 
 

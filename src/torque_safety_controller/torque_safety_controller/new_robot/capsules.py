@@ -22,6 +22,8 @@ _ROUNDS = 24
 _CANDIDATES = 48
 _EXTREMES = 96  # directions in which vertices are sought that decide the fit
 _SMALLEST = 1e-4  # m; radius of the capsule around a point
+_SIDES = 16  # of the prism around a cylinder
+_ROUNDED = 4  # digits, of metres
 _ROUNDING = 1e-11  # m; what the squares of distances lack
 
 
@@ -38,12 +40,6 @@ class Capsule(NamedTuple):
     end: Array
     radius: float
 
-    @property
-    def volume(self) -> float:
-        """In m^3."""
-        length = float(np.linalg.norm(self.end - self.start))
-        return float(np.pi * self.radius**2 * (length + 4.0 / 3.0 * self.radius))
-
 
 def fitted_capsule(points: Array) -> Capsule:
     """Return a small capsule around points, shape (m, 3), m.
@@ -52,8 +48,10 @@ def fitted_capsule(points: Array) -> Capsule:
     """
     rng = np.random.default_rng(0)
     extremes = _extremes(points)
-    axes = _principal_axes(extremes)
-    middle = _middle(extremes, axes)
+    centred = extremes - extremes.mean(axis=0)
+    axes = np.linalg.svd(centred, full_matrices=len(extremes) < 3)[2]  # principal ones
+    along = extremes @ axes.T
+    middle = 0.5 * (along.max(axis=0) + along.min(axis=0)) @ axes
     scale = max(float(np.abs(extremes - points.mean(axis=0)).max()), _SMALLEST)
     volumes = _volumes(extremes, axes, middle[None])
     best = int(np.argmin(volumes))
@@ -68,20 +66,6 @@ def fitted_capsule(points: Array) -> Capsule:
         if volumes[best] < volume:
             axis, origin, volume = turned[best], moved[best], volumes[best]
     return _capsule_along(points, axis, origin)
-
-
-def _principal_axes(points: Array) -> Array:
-    """Return the principal axes of points as rows, shape (3, 3)."""
-    centred = points - points.mean(axis=0)
-    axes: Array = np.linalg.svd(centred, full_matrices=len(points) < 3)[2]
-    return axes
-
-
-def _middle(points: Array, axes: Array) -> Array:
-    """Return the middle of the box around points along given axes, shape (3,)."""
-    along = points @ axes.T
-    middle: Array = 0.5 * (along.max(axis=0) + along.min(axis=0)) @ axes
-    return middle
 
 
 def _extremes(points: Array) -> Array:
@@ -121,10 +105,6 @@ def _coordinates(points: Array, axes: Array, origins: Array) -> tuple[Array, Arr
     squared = np.sum(points**2, axis=1)[None] - 2.0 * origins @ points.T
     squared += np.sum(origins**2, axis=1)[:, None]
     return along, np.maximum(squared - along**2, 0.0)
-
-
-_SIDES = 16  # of the prism around a cylinder
-_ROUNDED = 4  # digits, of metres
 
 
 def capsule_entries(model: pin.Model, geometry: pin.GeometryModel) -> list[str]:

@@ -85,8 +85,9 @@ class ControllerReport:
             logger, margin = node.get_logger(), collision.margin
             pairs = len(collision.model.names)
             logger.info(f"collision avoidance keeps {pairs} pairs of shapes {margin:g} m apart")
-            for text in collision.left_out():
-                logger.warning(text)
+            for where, names in collision.model.left_out.items():
+                apart = ", ".join(sorted(set(names)))
+                logger.warning(f"not kept apart, as near each other in {where}: {apart}")
         self._shortfall = Shortfall(config.position_min, config.position_max)
         self._period = PeriodCheck(config.dt, node.get_logger().warning)
         self._steps = self._relaxed_steps = self._failures = 0

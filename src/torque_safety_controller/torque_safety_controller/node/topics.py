@@ -79,7 +79,7 @@ JOG_JOINTS = Topic(
     "jog_joints",
     JointState,
     GOAL_QOS,
-    (USER, "moveit_node"),
+    (USER,),
     (_NODE,),
     "`velocity` of the joints named for at most 0.25 s, rad/s, of the others 0; no `position`; a "
     "goal for the pose is given up",

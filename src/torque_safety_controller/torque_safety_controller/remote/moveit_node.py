@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The MoveIt node: the action FollowJointTrajectory and JointJog in, goals of the controller out.
+"""The MoveIt node: the action FollowJointTrajectory in, joint trajectories for the controller out.
 
 It needs the package control_msgs.
 """
@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from control_msgs.action import FollowJointTrajectory
-from control_msgs.msg import JointJog, JointTolerance
+from control_msgs.msg import JointTolerance
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.duration import Duration
@@ -28,7 +28,6 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from torque_safety_controller.node.goal_messages import GoalRefused, joint_trajectory_from_message
 from torque_safety_controller.node.topics import (
     CONTROLLER_MODE,
-    JOG_JOINTS,
     TARGET_JOINT_TRAJECTORY,
 )
 from torque_safety_controller.remote.execution import Execution, Progress, Tolerances
@@ -37,8 +36,8 @@ from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import JointStateReader
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
-from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp, stamp_to_ns, steady_timer
-from viability_bounds_pkg.ros.topics import SLOW_JOINT_STATES, Topic
+from viability_bounds_pkg.ros.runtime import set_stamp, stamp_to_ns, steady_timer
+from viability_bounds_pkg.ros.topics import SLOW_JOINT_STATES
 from viability_bounds_pkg.state import State
 
 Result = FollowJointTrajectory.Result
@@ -52,8 +51,6 @@ _CONNECTING = 5.0
 """How long the controller may take to listen, s."""
 _LEAVING = Duration(seconds=0.5)
 """How long what was published last may take to arrive."""
-_JOG_TIME = 2.0
-"""How long after the last jog others may not jog, s."""
 
 _ENDS = {
     Progress.REACHED: Result.SUCCESSFUL,
@@ -115,25 +112,26 @@ class _Run:
 
 
 class _Outlet:
-    """A topic of goals, published only while somebody drives, so that others may otherwise."""
+    """The topic of trajectories; published only during a goal, so that others may otherwise."""
 
-    def __init__(self, node: ArmNode, topic: Topic) -> None:
-        self._node, self._topic = node, topic
+    def __init__(self, node: ArmNode) -> None:
+        self._node = node
         self._publisher: Publisher | None = None
 
     @property
     def ready(self) -> bool:
         """Whether a controller listens; the first question begins to publish."""
         if self._publisher is None:
-            self._publisher = self._topic.publisher(self._node)
+            self._publisher = TARGET_JOINT_TRAJECTORY.publisher(self._node)
         return self._publisher.get_subscription_count() > 0
 
     @property
     def others(self) -> bool:
         """Whether another node publishes it."""
-        return self._node.count_publishers(self._topic.name) > (self._publisher is not None)
+        count = self._node.count_publishers(TARGET_JOINT_TRAJECTORY.name)
+        return count > (self._publisher is not None)
 
-    def publish(self, message: Any) -> None:
+    def publish(self, message: JointTrajectory) -> None:
         """Publish to those who listen."""
         if self.ready and self._publisher is not None:
             self._publisher.publish(message)
@@ -147,7 +145,7 @@ class _Outlet:
 
 
 class MoveitNode(ArmNode):
-    """Offers the action FollowJointTrajectory, and takes JointJog, as MoveIt sends them.
+    """Offers the action FollowJointTrajectory, as MoveIt sends it.
 
     A process of its own beside the controller, whose control steps it does not delay. The last
     goal counts: an older one is aborted. What is asked for is checked as the controller checks
@@ -161,9 +159,7 @@ class MoveitNode(ArmNode):
         super().__init__(**node_arguments)
         self._runs: dict[bytes, _Run] = {}
         self._run: _Run | None = None
-        self._trajectories = _Outlet(self, TARGET_JOINT_TRAJECTORY)
-        self._jogs = _Outlet(self, JOG_JOINTS)
-        self._jogged = -math.inf
+        self._trajectories = _Outlet(self)
         self._mode = ""
         self._server: ActionServer | None = None
         with self.starting():
@@ -171,7 +167,6 @@ class MoveitNode(ArmNode):
         self._reader = JointStateReader(self._config.joints)
         SLOW_JOINT_STATES.subscription(self, self._on_state)
         CONTROLLER_MODE.subscription(self, self._on_mode)
-        self.create_subscription(JointJog, "~/joint_jog", self._on_jog, GOAL_QOS)
         self._server = ActionServer(
             self,
             FollowJointTrajectory,
@@ -181,14 +176,13 @@ class MoveitNode(ArmNode):
             cancel_callback=lambda _: CancelResponse.ACCEPT,
         )
         steady_timer(self, PERIOD, self._tick)
-        self.get_logger().info(f"action and jogs in {self.get_fully_qualified_name()}")
+        self.get_logger().info(f"action in {self.get_fully_qualified_name()}")
 
     def destroy_node(self) -> None:
         """Stop what the arm was sent to do."""
         if self._run is not None:
             self._end(self._run, Result.INVALID_GOAL, "moveit_node ends")
-        for outlet in (self._trajectories, self._jogs):
-            outlet.close()
+        self._trajectories.close()
         if self._server is not None:
             self._server.destroy()  # else it would stay in the ROS graph
         super().destroy_node()
@@ -270,10 +264,8 @@ class MoveitNode(ArmNode):
         run.ended.set_result(None)
 
     def _tick(self) -> None:
-        """Send or judge the goal; let others jog when nobody does here."""
+        """Send or judge the goal."""
         now, run = time.monotonic(), self._run
-        if now - self._jogged > _JOG_TIME:
-            self._jogs.close()
         if run is None or run.execution is None:
             return
         if run.handle.is_cancel_requested:
@@ -330,28 +322,6 @@ class MoveitNode(ArmNode):
 
     def _on_mode(self, message: String) -> None:
         self._mode = message.data
-
-    def _on_jog(self, message: JointJog) -> None:
-        if len(message.displacements):
-            self.get_logger().warning(
-                "joint_jog refused: displacements are given; allowed: velocities only",
-                throttle_duration_sec=1.0,
-            )
-            return
-        if self._run is not None:
-            self._end(self._run, Result.INVALID_GOAL, "a jog has come")
-        now = time.monotonic()
-        if not self._jogs.ready and now - self._jogged < _JOG_TIME:
-            self.get_logger().warning("no controller is heard", throttle_duration_sec=1.0)
-        self._jogged = now
-        # The controller checks the rest, and says what is wrong.
-        self._jogs.publish(
-            JointState(
-                header=message.header,
-                name=list(message.joint_names),
-                velocity=message.velocities,
-            )
-        )
 
 
 def _identity(handle: ServerGoalHandle) -> bytes:

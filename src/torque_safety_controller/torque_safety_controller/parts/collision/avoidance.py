@@ -43,12 +43,6 @@ obstacles have more, and a QP needs an end."""
 _UNBOUNDED = 1e6  # rad/s^2; more than anything has
 _SLIGHT = 1e-3  # m; violations of the margin below this are not reported
 
-_LEFT_OUT = {
-    "near at start": "as they are near each other in collision_posture",
-    "near mostly": "as they are near each other in most postures",
-    "near always": "as they are near each other in all postures",
-}
-
 
 class CollisionRows(NamedTuple):
     """Rows ``G a >= lower``.
@@ -249,12 +243,3 @@ class Collision(Part):
             "collision_not_viable_steps": self._not_viable_steps,
             "collision_relaxed_steps": self._relaxed_steps,
         }
-
-    def left_out(self) -> list[str]:
-        """Return which pairs are not kept apart, and why, a sentence for each reason."""
-        found = self.model.left_out
-        return [
-            f"not kept apart, {why}: {', '.join(sorted(set(found[reason])))}"
-            for reason, why in _LEFT_OUT.items()
-            if reason in found
-        ]

@@ -17,6 +17,9 @@ from viability_bounds_pkg.exceptions import SettingError, did_you_mean
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
+AT_START, MOSTLY, ALWAYS = "collision_posture", "most postures", "all postures"
+"""Where pairs are near each other that are not kept apart."""
+
 _MOSTLY = 0.5  # links that are near each other in more than this share of postures are left out
 _POSTURES = 200  # from which it is told
 _WHOLE, _ENDS = (0.0, 1.0), ((0.0, 0.0), (1.0, 1.0))  # shares of a segment
@@ -70,8 +73,8 @@ class CollisionModel:
         moves: 1 for joints that move the first shape of a pair only, -1 the second only, shape
             (p, n).
         names: of the two shapes of each pair, ``link - link`` or ``link - obstacle``.
-        left_out: pairs that are not kept apart, by reason: ``near at start``, ``near mostly``;
-            with obstacles ``near always``, as what the arm is mounted on.
+        left_out: pairs that are not kept apart, by where they are near each other: `AT_START`,
+            `MOSTLY`; with obstacles `ALWAYS`, as what the arm is mounted on.
     """
 
     arm: pin.Model
@@ -127,21 +130,18 @@ def build_collision_model(
     low = np.where(np.isfinite(model.lowerPositionLimit), model.lowerPositionLimit, -np.pi)
     high = np.where(np.isfinite(model.upperPositionLimit), model.upperPositionLimit, np.pi)
     postures = np.random.default_rng(0).uniform(low, high, size=(_POSTURES, model.nq))
-    share = _near(model, geometry, clearance, postures).mean(axis=0)
-    at_start = _near(model, geometry, clearance, np.array([q_start], dtype=np.float64))[0]
+    near = _near(model, geometry, clearance, np.vstack([np.asarray(q_start), postures]))
+    share = near[1:].mean(axis=0)
     kept: list[int] = []
     left_out: dict[str, list[str]] = {}
     names = [f"{shapes[i].name} - {shapes[j].name}" for i, j in chosen]
     for k, name in enumerate(names):
-        reason = ""
-        if k >= own:
-            reason = "near always" if share[k] == 1.0 else ""
-        elif at_start[k]:
-            reason = "near at start"
-        elif share[k] > _MOSTLY:
-            reason = "near mostly"
-        if reason:
-            left_out.setdefault(reason, []).append(name)
+        if k < own and near[0, k]:
+            left_out.setdefault(AT_START, []).append(name)
+        elif k < own and share[k] > _MOSTLY:
+            left_out.setdefault(MOSTLY, []).append(name)
+        elif share[k] == 1.0:
+            left_out.setdefault(ALWAYS, []).append(name)
         else:
             kept.append(k)
     moved = np.zeros((len(shapes), model.njoints))
