@@ -70,6 +70,16 @@ def above(low: float, high: float, special: float | None = None) -> Range:
     return Range(low, high, without=low, special=special)
 
 
+_IN_WORDS = {
+    float: "a number",
+    int: "a whole number",
+    bool: "true or false",
+    str: "a string",
+    list[float]: "a list of numbers",
+    list[str]: "a list of strings",
+}
+
+
 @dataclass(frozen=True, kw_only=True)
 class Parameter:
     """What is known about a parameter.
@@ -77,7 +87,7 @@ class Parameter:
     Attributes:
         name: ROS name; that of the field.
         kind: `float`, `int`, `bool`, `str`, `list[float]` or `list[str]`. Whole numbers are
-            taken where floats are wanted, because YAML writers leave the point out.
+            accepted where floats are wanted, because YAML writers leave the point out.
         description: shown by ``ros2 param describe``; ends with the unit where there is one.
         default: value when none is given, or `REQUIRED`. An empty list means that the list may
             be left out.
@@ -108,14 +118,15 @@ class Parameter:
         Raises:
             SettingError: the value is missing, of another type, or not allowed.
         """
-        if value is None and self.default is REQUIRED:
-            raise SettingError(self.name, None, self._type_in_words)
-        converted = self._convert(self.default if value is None else value)
+        given = self.default if value is None else value
+        converted = self._convert(None if given is REQUIRED else given)
         if self.kind in (float, list[float]) and _is_absurd(converted):
             raise SettingError(self.name, value, f"numbers up to {LARGEST:g} in size")
-        if not self._allows(converted):
-            hint = did_you_mean(value, self.choices) if self.choices else ""
+        if self.choices and converted not in self.choices:
+            hint = did_you_mean(value, self.choices)
             raise SettingError(self.name, value, self.constraints + hint)
+        if not self._allows(converted):
+            raise SettingError(self.name, value, self.constraints)
         return converted
 
     @property
@@ -129,17 +140,17 @@ class Parameter:
         text = ""
         if self.choices:
             text = f"one of {', '.join(self.choices)}"
-        elif self.kind in (float, int) and self.within is not None:
-            text = f"{_SCALARS[self.kind]} {self.within}"
         elif self.kind == list[float]:
-            numbers = "numbers" if self.within is None else f"finite numbers {self.within}".strip()
+            text = "numbers" if self.within is None else f"finite numbers {self.within}".strip()
             if self.length is not None:
-                text = f"{self.length} {numbers}"
+                text = f"{self.length} {text}"
             elif self.per_joint:
-                text = f"{numbers}, one for each of 'joints'"
-            elif self.within is not None:
-                text = numbers
+                text += ", one for each of 'joints'"
+            elif self.within is None:
+                text = ""
             text += ", or none" if text and self.optional else ""
+        elif self.within is not None:
+            text = f"{_IN_WORDS[self.kind]} {self.within}"
         return "; ".join(filter(None, (text, self.note)))
 
     def _convert(self, value: Any) -> Any:
@@ -149,31 +160,19 @@ class Parameter:
             return tuple(value)
         if self.kind is float and _is_number(value):
             return float(value)
-        if self.kind in (int, bool, str) and type(value) is self.kind:
+        if type(value) is self.kind:
             return value
-        raise SettingError(self.name, value, self._type_in_words)
+        allowed = _IN_WORDS[self.kind] if self.length is None else self.constraints
+        raise SettingError(self.name, value, allowed)
 
     def _allows(self, value: Any) -> bool:
-        if self.choices:
-            return value in self.choices
         if not _is_sequence(value):
             return self.within is None or value in self.within
-        if not len(value) and self.optional:
+        if self.optional and not len(value):
             return True
-        if self.length is not None and len(value) != self.length:
+        if self.length not in (None, len(value)):
             return False
         return self.within is None or all(item in self.within for item in value)
-
-    @property
-    def _type_in_words(self) -> str:
-        if self.kind in _SCALARS:
-            return _SCALARS[self.kind]
-        if self.length is not None:
-            return self.constraints
-        return "a list of numbers" if self.kind == list[float] else "a list of strings"
-
-
-_SCALARS = {float: "a number", int: "a whole number", bool: "true or false", str: "a string"}
 
 
 def _is_absurd(value: float | Array) -> bool:

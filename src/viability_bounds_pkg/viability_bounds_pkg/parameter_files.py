@@ -132,6 +132,19 @@ def is_section_of(section: str, node: str) -> bool:
     return re.fullmatch("".join(kinds.get(word, f"/{word}") for word in words), node) is not None
 
 
+def values_for(path: str | Path, node: str) -> dict[str, Any]:
+    """Return the values that the sections of a parameter file give a node, by its full name.
+
+    Raises:
+        YamlError, ParameterFileError: see `read_sections`.
+    """
+    values: dict[str, Any] = {}
+    for section, parameters in read_sections(path).items():
+        if is_section_of(section, node):
+            values |= parameters
+    return values
+
+
 def node_parameters(paths: Sequence[Path], node: str) -> dict[str, Any]:
     """Return the parameters of one node, those for all nodes included.
 
@@ -140,17 +153,14 @@ def node_parameters(paths: Sequence[Path], node: str) -> dict[str, Any]:
         node: its name, which may follow ``/**/``.
 
     Raises:
-        YamlError: see `read_sections`.
-        ParameterFileError: see `read_sections`; a misspelt parameter; none for `node`.
+        YamlError, ParameterFileError: see `read_sections`; a misspelt parameter; none for `node`.
     """
     parameters: dict[str, Any] = {}
     for path in paths:
-        for section, values in read_sections(path).items():
-            if not is_section_of(section, f"/{node.rpartition('/')[2]}"):
-                continue
-            if unknown := unknown_parameters(values):
-                raise ParameterFileError(f"{path}: {unknown}")
-            parameters |= values
+        values = values_for(path, f"/{node.rpartition('/')[2]}")
+        if unknown := unknown_parameters(values):
+            raise ParameterFileError(f"{path}: {unknown}")
+        parameters |= values
     if not parameters:
         raise ParameterFileError(f"{_listed(paths)}: no parameters under '/**' or '{node}'")
     return parameters
@@ -165,9 +175,8 @@ def read_files(kind: type[Configuration], paths: Sequence[Path], node: str) -> C
         node: see `node_parameters`.
 
     Raises:
-        YamlError: see `node_parameters`.
-        ParameterFileError: see `node_parameters`; or a value is missing, of another type, or not
-            allowed.
+        YamlError, ParameterFileError: see `node_parameters`; or a value is missing, of another
+            type, or not allowed.
     """
     try:
         return read(kind, node_parameters(paths, node))

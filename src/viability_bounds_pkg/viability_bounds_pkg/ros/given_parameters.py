@@ -13,7 +13,7 @@ from itertools import pairwise
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from viability_bounds_pkg.parameter_files import is_section_of, load_yaml, read_sections
+from viability_bounds_pkg.parameter_files import is_section_of, load_yaml, values_for
 
 _ARGUMENTS: WeakKeyDictionary[Any, Sequence[str]] = WeakKeyDictionary()
 
@@ -37,9 +37,7 @@ def given_parameters(context: Any, node: str) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for flag, text in pairwise(_ARGUMENTS.get(context, ())):
         if flag == "--params-file":
-            for section, parameters in read_sections(text).items():
-                if is_section_of(section, node):
-                    values |= parameters
+            values |= values_for(text, node)
         elif flag in ("-p", "--param"):
             name, _, value = text.partition(":=")
             of, _, name = name.rpartition(":")

@@ -126,13 +126,13 @@ def describe(row: Parameter) -> ParameterDescriptor:
         dynamic_typing=True,
     )
     if row.within is not None and row.kind in (float, int):
-        ends = [row.within.low, row.within.high]
-        if row.within.special is not None:
-            ends = [min(ends[0], row.within.special), max(ends[1], row.within.special)]
+        low, high, special = row.within.low, row.within.high, row.within.special
+        if special is not None:
+            low, high = min(low, special), max(high, special)
         if row.kind is float:
-            of = FloatingPointRange(from_value=float(ends[0]), to_value=float(ends[1]))
-            descriptor.floating_point_range = [of]
+            floats = FloatingPointRange(from_value=float(low), to_value=float(high))
+            descriptor.floating_point_range = [floats]
         else:
-            of = IntegerRange(from_value=int(ends[0]), to_value=int(ends[1]))
-            descriptor.integer_range = [of]
+            whole = IntegerRange(from_value=int(low), to_value=int(high))
+            descriptor.integer_range = [whole]
     return descriptor
