@@ -23,10 +23,9 @@ from trajectory_msgs.msg import JointTrajectory
 
 from sim_bridge.node import bullet_node, scenario_node
 from sim_bridge.node.bullet_node import BulletNode
-from torque_safety_controller.cli import identify_friction
 from torque_safety_controller.node import controller_node
 from torque_safety_controller.node.controller_node import ControllerNode
-from torque_safety_controller.tools import gain_limits
+from torque_safety_controller.tools import gain_limits, identify_friction
 from viability_bounds_pkg.cli import estimate_acceleration_limits
 from viability_bounds_pkg.node import bounds_node, estimator_node
 from viability_bounds_pkg.node.bounds_node import BoundsNode

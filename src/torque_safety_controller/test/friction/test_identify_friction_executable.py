@@ -11,12 +11,12 @@ import pinocchio as pin
 import pytest
 import yaml
 
-from torque_safety_controller.cli.identify_friction import main
 from torque_safety_controller.friction.settings import FrictionModel
+from torque_safety_controller.tools.identify_friction import main
 from viability_bounds_pkg.cli.limits_file import read_robot
 from viability_bounds_pkg.testing.executables import called, started
 
-MODULE = "torque_safety_controller.cli.identify_friction"
+MODULE = "torque_safety_controller.tools.identify_friction"
 
 TRUTH = FrictionModel(*np.array([[3.0, 0.4], [4.0, 0.5], [0.5, 0.1], [0.03, 0.03]]))
 
@@ -142,7 +142,7 @@ def test_what_cannot_be_done_is_told_in_one_line(
 
 INTERRUPTIBLE = """
 import os, signal, sys
-from torque_safety_controller.cli import identify_friction as tool
+from torque_safety_controller.tools import identify_friction as tool
 fits = tool.identify
 def interrupted(*arguments):
     for fit in fits(*arguments):

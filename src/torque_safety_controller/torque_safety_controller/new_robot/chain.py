@@ -157,7 +157,7 @@ def _check_kinds(root: Element, way: Mapping[str, Element]) -> None:
         if (mimic := joint.find("mimic")) is not None
     }
     moving = [name for name, joint in way.items() if joint.get("type") in _MOVING]
-    for name, joint in reversed(way.items()):
+    for name, joint in reversed(list(way.items())):
         kind = joint.get("type")
         if kind in ("floating", "planar"):
             raise NewRobotError(

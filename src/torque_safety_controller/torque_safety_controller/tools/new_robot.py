@@ -33,7 +33,6 @@ from viability_bounds_pkg.robot.description import (
     RobotDescriptionError,
     check_urdf,
     load_geometry,
-    package_directories,
     read_urdf,
     resolve_uri,
 )
@@ -93,7 +92,7 @@ def _read(options: argparse.Namespace) -> tuple[str, str, Path | None]:
     text = re.sub("<!--.*?-->", "", path.read_text(errors="replace"), flags=re.DOTALL)
     if path.suffix == ".xacro" or "<xacro:" in text:
         return _through_xacro(path), "", path.parent
-    return read_urdf(str(path)), _uri(path), path.parent
+    return read_urdf(str(path)), options.urdf if "://" in options.urdf else str(path), path.parent
 
 
 def _from_topic() -> str:
@@ -123,14 +122,6 @@ def _through_xacro(path: Path) -> str:
         raise NewRobotError(f"xacro {path} fails: {error}; give it what it asks for") from error
     check_urdf(urdf, str(path))
     return urdf
-
-
-def _uri(path: Path) -> str:
-    """Return a file as a ``package://`` URI where packages are looked up there."""
-    for directory in package_directories():
-        if directory.is_dir() and path.is_relative_to(directory.resolve()):
-            return f"package://{path.relative_to(directory.resolve())}"
-    return str(path)
 
 
 def _run(options: argparse.Namespace) -> int:
