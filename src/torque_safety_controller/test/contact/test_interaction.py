@@ -113,9 +113,10 @@ def test_the_hand_does_not_rush(push):
     np.testing.assert_allclose(g[3:] / 50.0, min(0.2 * push / 50.0, 0.1) * direction)
 
 
-def test_a_hand_that_feels_too_little_moves_on_and_too_much_back():
+def test_a_hand_that_feels_too_little_moves_on_and_too_much_back(monkeypatch):
     """The paper's weights: the mean of what the two tasks want, in the direction of force only."""
-    hand = SimulatedHand(force_directions=Z, admittance_speed_max=np.full(2, 10.0))
+    monkeypatch.setattr(interaction, "PRESS_SPEED_MAX", (10.0, 10.0))
+    hand = SimulatedHand(force_directions=Z)
     hand.interaction.set_target(-force(z=-10.0))  # press along z: the table pushes with -10
     for _ in range(3000):
         free = hand.step(force())

@@ -243,7 +243,6 @@ def contact(**changed):
         ({"admittance_kp": [-1.0, 0.1]}, "admittance_kp"),
         ({"admittance_kp": [0.1, math.inf]}, "admittance_kp"),
         ({"admittance_kp": []}, "admittance_kp"),
-        ({"admittance_speed_max": [0.1]}, "admittance_speed_max"),
         ({"yield_threshold": [0.0, 1.0]}, "yield_threshold"),
         ({"contacts": [contact(frame="moon")]}, "contacts[0].frame"),
         ({"contacts": [contact(), contact(frame="panda_link8")]}, "contacts"),
@@ -268,12 +267,10 @@ def test_a_wrong_parameter_is_named(changed, named):
 def test_each_parameter_reaches_the_settings():
     interaction = build(
         admittance_kp=[0.2, 0.03],
-        admittance_speed_max=[0.1, 0.4],
         yield_threshold=[3.0, 4.0],
     ).find(Interaction)
     settings = interaction.settings
     np.testing.assert_array_equal(settings.admittance_kp, [0.2, 0.03])
-    np.testing.assert_array_equal(settings.admittance_speed_max, [0.1, 0.4])
     np.testing.assert_array_equal(settings.yield_threshold, [3.0, 4.0])
     np.testing.assert_array_equal(settings.force_directions, [0, 0, 1, 0, 0, 0])
 

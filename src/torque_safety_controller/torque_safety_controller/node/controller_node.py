@@ -68,7 +68,8 @@ class ControllerNode(ArmNode):
         )
         check = None
         if not config.use_estimated_states:
-            check = make_plausibility_check(config, declared and declared.declared)
+            errors = None if declared is None else declared.declared
+            check = make_plausibility_check(config, errors)
         self._states = StateStream(config.joints, config.state_timeout, self._warn, check)
         self._limits = LimitsReader(config.joints, self._warn)
         self._goals = GoalSubscriber(self, self._controller, config, base, self._states)

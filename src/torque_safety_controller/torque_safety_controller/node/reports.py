@@ -121,7 +121,7 @@ class ControllerReport:
         return level, f"{text}; {short}" if short else text, values
 
     def _values(self) -> dict[str, Any]:
-        values = {
+        values: dict[str, Any] = {
             "steps": self._steps,
             "qp_failures": self._failures,
             "bounds_relaxed_steps": self._relaxed_steps,
@@ -130,8 +130,9 @@ class ControllerReport:
             "latency_p99_us": 1e6 * self._latencies.percentile(99),
             "goals_pending": self._pending(),
         }
-        values |= self._fixed | self._refused
-        values |= self._supervisor.values() | self._controller.report()
+        for more in (self._fixed, self._refused, self._supervisor.values()):
+            values |= more
+        values |= self._controller.report()
         return values if self._last is None else values | self._of_step(self._last)
 
     def _of_step(self, step: Step) -> dict[str, Any]:

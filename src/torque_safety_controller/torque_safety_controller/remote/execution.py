@@ -52,15 +52,12 @@ class Tolerances:
 
 @dataclass(eq=False)
 class Execution:
-    """Compares what the arm does with the trajectory that it was sent.
-
-    Times are those of the stamps of joint states.
+    """Compares what the arm does with the trajectory that it was sent, by the states' stamps.
 
     Attributes:
         desired: positions, velocities and accelerations of the trajectory at the last state, shape
             (n,) each.
-        off: of the arm from it in position and velocity, shape (n,) each, rad and rad/s; desired
-            minus actual.
+        off: desired less actual positions and velocities, shape (n,) each, rad and rad/s.
         why: what was too far off, in words.
     """
 
@@ -81,22 +78,12 @@ class Execution:
     why: str = field(init=False, default="")
 
     def start(self, state: State, stamp: int) -> None:
-        """Start the trajectory from where the arm is, as the controller does.
-
-        Args:
-            state: of the joints.
-            stamp: time then, ns.
-        """
+        """Start the trajectory from a state, at `stamp`, ns, as the controller does."""
         self.begin = self.begin or stamp
         self.trajectory = self.trajectory.from_state(state)
 
     def judge(self, state: State, stamp: int) -> Progress:
-        """Judge a state of the arm.
-
-        Args:
-            state: of the joints.
-            stamp: of the state, ns.
-        """
+        """Judge a state of the arm with a stamp, ns."""
         t = 1e-9 * (stamp - self.begin)
         self.desired = self.trajectory.sample(t)
         self.off = self.desired[0] - state.q, self.desired[1] - state.v

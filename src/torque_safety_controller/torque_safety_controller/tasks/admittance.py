@@ -54,13 +54,6 @@ class InteractionSettings:
         default=(5e-3, 5e-3),
         live=True,
     )
-    admittance_speed_max: Array = numbers(
-        "speeds at which the hand approaches what it is to press on, m/s and rad/s",
-        POSITIVE,
-        length=2,
-        default=(0.01, 0.05),
-        live=True,
-    )
     yield_threshold: Array = numbers(
         "force, N, and moment, N m, above which the hand yields; below half of both it stops, and "
         "stays where it is then; it never yields if empty",

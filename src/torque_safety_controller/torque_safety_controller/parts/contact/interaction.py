@@ -43,6 +43,9 @@ FORCE_STEP = 0.5
 """By how much the force that the QP counts on at the hand may exceed the measured one along the
 contact's normal, N: the hand neither rushes at what it is to touch, nor presses on nothing."""
 
+PRESS_SPEED_MAX = (0.005, 0.05)
+"""Speeds at which the hand approaches what it is to press on at most, m/s and rad/s."""
+
 YIELD_RELEASE = 0.5
 """Share of the thresholds of dual compliance below which the hand stops to yield."""
 
@@ -256,7 +259,7 @@ class Interaction(Part):
             mask * (self.reference - F),
             mask * (self._goal_rate - rate),
             settings.admittance_kp.tolist(),
-            settings.admittance_speed_max.tolist(),
+            PRESS_SPEED_MAX,
             gains.pose_kd,
         )
         return [AdmittanceTask(g, gains.pose_weight, self._rows)]
