@@ -34,7 +34,6 @@ from viability_bounds_pkg.estimate.worst_case import (
     acceleration_room,
     search_by_sampling,
     search_refined,
-    torque_terms,
 )
 
 SEARCHES: dict[str, Callable[..., WorstCases]] = {
@@ -46,8 +45,8 @@ DEFAULT_SAMPLES = {"sampling": 1_000_000, "refined": 10_000}
 USEFUL_ACCELERATION = 1.0
 """What a suggested velocity scale leaves each joint at least, either way, rad/s^2."""
 
-SCALE_SAMPLES = 10_000
-"""Random states to begin a velocity scale with, and evaluations of each refined search."""
+SCALE_EVALUATIONS = 10_000
+"""Evaluations of each search for a velocity scale."""
 
 
 @dataclass(frozen=True)
@@ -177,9 +176,11 @@ def _empty_interval(
         f"rad/s, leave every joint {USEFUL_ACCELERATION:g} rad/s^2 either way; else"
     )
     if found.scale == 0.0:
+        gravity = pin.computeGeneralizedGravity(model, model.createData(), found.q)
+        weight = abs(gravity[list(model.names).index(found.joint) - 1])
         remedy = (
-            f"lower velocities do not help: joint {found.joint} takes "
-            f"{abs(found.static_torque):.3g} N m just to hold still at q = {_text(found.q)};"
+            f"lower velocities do not help: joint {found.joint} takes {weight:.3g} N m just to "
+            f"hold still at q = {_text(found.q)};"
         )
     message = (
         f"joint {joint}: its torque of {space.tau_max[j]:.4g} N m leaves no acceleration "
@@ -203,14 +204,12 @@ class VelocityScale(NamedTuple):
         joint: the joint that limits it; empty when the scale is 1, and the rest is NaN.
         q: the state that limits it, shape (n,), rad.
         v: its velocity, scaled, shape (n,), rad/s.
-        static_torque: the torque of that joint that holds the arm at rest in `q`, N m.
     """
 
     scale: float
     joint: str
     q: Array
     v: Array
-    static_torque: float
 
 
 def largest_velocity_scale(
@@ -222,9 +221,10 @@ def largest_velocity_scale(
 ) -> VelocityScale:
     """Return the largest factor of `space.v_max` that leaves every joint `required` either way.
 
-    No bisection is needed: at scale s, ``h = g(q) + s^2 c(q, v)``, so that each state allows an
-    explicit range of s^2. The least over random states is refined by exchange: a refined search
-    at that scale adds the worst states it finds, until it finds none that allows less.
+    With h = g(q) + c(q, v), where c grows with the square of the speeds, each state in which a
+    joint can accelerate by r, and by r_0 at rest, allows to scale speeds by
+    ``sqrt((r_0 - required) / (r_0 - r))``. A refined search finds the worst states; it is repeated
+    at the scale that they allow, until it finds none that allows less.
 
     Args:
         model: the robot.
@@ -233,50 +233,33 @@ def largest_velocity_scale(
             rad/s^2.
         ignore: names of joints that need not (those overridden).
     """
-    counted = np.array([name not in ignore for name in list(model.names)[1:]])
-    q, v = space.states(np.random.default_rng(0).random((SCALE_SAMPLES, 2 * space.n)))
-    nothing = np.full(space.n, np.nan)
-    found = VelocityScale(1.0, "", nothing, nothing, np.nan)
+    n, names = space.n, list(model.names)[1:]
+    counted = np.array([name not in ignore for name in names])
+    nothing = np.full(n, np.nan)
+    found = VelocityScale(1.0, "", nothing, nothing)
     for attempt in range(20):
-        allowed = _scale_allowed(model, space, q, v, required, counted)
-        if allowed and allowed.scale < found.scale:
-            found = allowed
-        if found.scale == 0.0:
+        scaled = StateSpace(space.q_min, space.q_max, found.scale * space.v_max, space.tau_max)
+        worst = search_refined(model, scaled, SCALE_EVALUATIONS, attempt)
+        lacking = counted & (worst.room < required)
+        if found.scale == 0.0 or not lacking.any():
             break
-        # Slightly below, or the states already known would be found once more.
-        scale = found.scale * (1.0 - 1e-4 if attempt else 1.0)
-        scaled = StateSpace(space.q_min, space.q_max, scale * space.v_max, space.tau_max)
-        worst = search_refined(model, scaled, SCALE_SAMPLES, attempt)
-        if not (worst.room[:, counted] < required).any():
-            return found._replace(scale=scale)
-        q = worst.q[:, counted].reshape(-1, space.n)
-        v = worst.v[:, counted].reshape(-1, space.n) / scale
+        q = worst.q.reshape(-1, n)
+        at_rest = acceleration_room(model, model.createData(), space, q, np.zeros_like(q))
+        at_rest = np.einsum("sjsj->sj", at_rest.reshape(2, n, 2, n))  # of the joint and the side
+        spare = np.maximum(at_rest - required, 0.0)
+        square = np.divide(
+            spare, spare + required - worst.room, out=np.ones((2, n)), where=lacking
+        )
+        # Where several states allow nothing, name the one whose weight is the most beyond.
+        side, j = np.unravel_index(
+            np.argmin(np.where(square == square.min(), at_rest, np.inf)), (2, n)
+        )
+        # Slightly below, or the same states would be found once more.
+        factor = float(np.sqrt(square[side, j]) * (1.0 - 1e-4))
+        found = VelocityScale(
+            factor * found.scale, names[j], worst.q[side, j], factor * worst.v[side, j]
+        )
     return found
-
-
-def _scale_allowed(
-    model: pin.Model, space: StateSpace, q: Array, v: Array, required: float, counted: Array
-) -> VelocityScale | None:
-    """Return the least scale that one of the states, each of shape (batch, n), allows, below 1."""
-    data = model.createData()
-    h, inertia = torque_terms(model, data, q, v)
-    gravity, _ = torque_terms(model, data, q, np.zeros_like(v))
-    sign = np.array([1.0, -1.0])[:, None, None]
-    # Up and down: tau_max - sign (gravity + s^2 (h - gravity)) >= M required.
-    slack = space.tau_max - sign * gravity - inertia * required
-    growth = sign * (h - gravity)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        square = np.where(slack < 0, 0.0, np.where(growth > 0, slack / growth, np.inf))
-    square = np.where(counted, square, np.inf)
-    least = square.min()
-    if not least < 1.0:
-        return None
-    # Where several states allow nothing, name the one whose weight is the most beyond.
-    rank = np.where(square == least, slack / inertia, np.inf)
-    _, row, j = np.unravel_index(np.argmin(rank), rank.shape)
-    scale = float(np.sqrt(least))
-    joint = list(model.names)[1 + j]
-    return VelocityScale(scale, joint, q[row], scale * v[row], float(gravity[row, j]))
 
 
 def unavailable_share(

@@ -65,17 +65,18 @@ class JointLimits:
         object.__setattr__(self, "names", names)
         for field in ("q_min", "q_max", "v_max", "a_min", "a_max"):
             object.__setattr__(self, field, joint_array(field, getattr(self, field), names))
-        for j, name in enumerate(names):
-            low, high = float(self.q_min[j]), float(self.q_max[j])
-            if low == math.inf:
-                raise JointLimitsError("q_min", name, low, "must be finite or -inf")
-            if high == -math.inf:
-                raise JointLimitsError("q_max", name, high, "must be finite or inf")
-            if not low < high:
-                raise JointLimitsError("q_max", name, high, f"must be above q_min ({low})")
-            _require_finite("v_max", name, self.v_max[j], positive=True)
-            _require_finite("a_min", name, self.a_min[j], positive=False)
-            _require_finite("a_max", name, self.a_max[j], positive=True)
+        low, high = self.q_min, self.q_max
+        for field, usable, allowed in (
+            ("q_min", low < math.inf, "must be finite or -inf"),
+            ("q_max", high > -math.inf, "must be finite or inf"),
+            ("q_max", low < high, "must be above q_min"),
+            ("v_max", _finite(self.v_max), "must be finite and positive"),
+            ("a_min", _finite(-self.a_min), "must be finite and negative"),
+            ("a_max", _finite(self.a_max), "must be finite and positive"),
+        ):
+            if not usable.all():
+                j = int(np.argmin(usable))
+                raise JointLimitsError(field, names[j], float(getattr(self, field)[j]), allowed)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -125,7 +126,6 @@ def _checked_names(names: Sequence[str]) -> tuple[str, ...]:
     return result
 
 
-def _require_finite(field: str, joint: str, value: float, *, positive: bool) -> None:
-    if not (math.isfinite(value) and (value > 0) == positive and value != 0):
-        sign = "positive" if positive else "negative"
-        raise JointLimitsError(field, joint, float(value), f"must be finite and {sign}")
+def _finite(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which values are finite and positive."""
+    return np.isfinite(values) & (values > 0.0)

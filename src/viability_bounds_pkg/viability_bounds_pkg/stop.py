@@ -44,7 +44,6 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError, joint_array
 from viability_bounds_pkg.viability import BoundsSolver
 
@@ -54,7 +53,10 @@ HORIZON = 2.0
 """Horizon of the bounds in steps: one late call is covered, and the bounds do not chatter."""
 
 MARGIN = 0.05
-"""Share of the acceleration limits that is the margin where none is given."""
+"""How far accelerations may be off within a step, as a share of the acceleration limits."""
+
+REST_SPEED = 1e-3
+"""The arm is at rest when no joint is faster, rad/s; above the noise of the velocities."""
 
 HARDER = 3.0
 """Hardest braking outside the kernel in units of the acceleration limits, where motors can."""
@@ -104,12 +106,8 @@ class CoordinatedStop:
         limits: those of the arm that must be kept; accelerations that the motors can give.
         tau_max: torque limits of the motors, N m.
         dt: step of the drive, between two calls of `torque`, s.
-        margin: how far accelerations may be off within a step, rad/s^2; 5 % of the smaller
-            acceleration limit where not given.
         observer_time: time constant of the observer of disturbances, s; inf for none. It needs
             velocities whose noise is far below the acceleration limits times this time.
-        rest_speed: the arm is at rest when no joint is faster, rad/s; above the noise of the
-            velocities.
         motor_lag: time constants of the motors' torques, shape (n,), s; none where not given.
 
     Attributes:
@@ -120,7 +118,6 @@ class CoordinatedStop:
 
     Raises:
         JointLimitsError: other joints in `limits` than in `model`, or numbers that cannot be.
-        SettingError: a time or a speed that is not positive.
     """
 
     def __init__(
@@ -129,10 +126,8 @@ class CoordinatedStop:
         limits: JointLimits,
         tau_max: ArrayLike,
         dt: float,
-        margin: ArrayLike | None = None,
         *,
         observer_time: float = math.inf,
-        rest_speed: float = 1e-3,
         motor_lag: ArrayLike | None = None,
     ) -> None:
         names = list(model.names)[1:]
@@ -143,15 +138,9 @@ class CoordinatedStop:
         for name, value in zip(limits.names, torques.tolist(), strict=True):
             if not (math.isfinite(value) and value > 0.0):
                 raise JointLimitsError("tau_max", name, value, "must be finite and positive")
-        for setting, value in (("observer_time", observer_time), ("rest_speed", rest_speed)):
-            if not value > 0.0:
-                raise SettingError(setting, value, "a number > 0")
         given = np.zeros(len(names)) if motor_lag is None else motor_lag
         lag = joint_array("motor_lag", given, limits.names)
-        if not (np.isfinite(lag) & (lag >= 0.0)).all():
-            raise SettingError("motor_lag", lag, "finite numbers >= 0")
-        if margin is None:
-            margin = MARGIN * np.minimum(-limits.a_min, limits.a_max)
+        margin = MARGIN * np.minimum(-limits.a_min, limits.a_max)
         self._solver = BoundsSolver(limits, HORIZON * dt, margin, period=dt)
         self._limits, self._dt, self._tau_max = limits, dt, torques
         # Where the joints of the model are in the caller's arrays, and the other way round.
@@ -159,7 +148,6 @@ class CoordinatedStop:
         self._back = np.argsort(self._order)
         self._model, self._data = model, model.createData()
         self._share = 0.0 if math.isinf(observer_time) else -math.expm1(-dt / observer_time)
-        self._rest_speed = rest_speed
         self._scale = 0.5 * (limits.a_max - limits.a_min)
         self._lag = lag if lag.any() else None
         clear = np.minimum(HOLD_CLEARANCE, 0.5 * (limits.q_max - limits.q_min))
@@ -294,7 +282,7 @@ class CoordinatedStop:
     def _stopping(self, q: Array, v: Array) -> Array:
         """Return accelerations that stop the arm, or hold it, regardless of its limits."""
         self._resting = True
-        if not self.at_rest and float(np.abs(v).max()) <= self._rest_speed:
+        if not self.at_rest and float(np.abs(v).max()) <= REST_SPEED:
             self.at_rest = True
             self._place = np.clip(q, self._lowest, self._highest)
         if self.at_rest:
@@ -308,7 +296,7 @@ class CoordinatedStop:
         """Return braking by which joints come to rest before `HOLD_CLEARANCE`, per speed, 1/s."""
         speed = np.abs(v)
         room = np.where(v > 0.0, self._highest - q, q - self._lowest)
-        at_once = np.where(speed > self._rest_speed, 1.0 / self._dt, 0.0)
+        at_once = np.where(speed > REST_SPEED, 1.0 / self._dt, 0.0)
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.minimum(np.where(room > 0.0, 0.5 * speed / room, np.inf), at_once)
 

@@ -8,7 +8,6 @@ import pinocchio as pin
 import pytest
 from stopping_arm import Arm, H
 
-from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
 from viability_bounds_pkg.stop import (
     GIVE_WAY,
@@ -264,19 +263,16 @@ def test_a_stop_begun_anew_remembers_nothing(panda):
 
 
 @pytest.mark.parametrize(
-    ("changed", "error", "says"),
+    ("changed", "says"),
     [
-        ({"tau_max": np.zeros(7)}, JointLimitsError, "panda_joint1"),
-        ({"tau_max": np.ones(3)}, JointLimitsError, "7 joints"),
-        ({"dt": 0.0}, JointLimitsError, "dt"),
-        ({"margin": np.full(7, 20.0)}, JointLimitsError, "margin"),
-        ({"observer_time": 0.0}, SettingError, "observer_time"),
-        ({"rest_speed": -1.0}, SettingError, "rest_speed"),
+        ({"tau_max": np.zeros(7)}, "panda_joint1"),
+        ({"tau_max": np.ones(3)}, "7 joints"),
+        ({"dt": 0.0}, "dt"),
     ],
 )
-def test_settings_that_cannot_be_are_refused(panda, changed, error, says):
+def test_settings_that_cannot_be_are_refused(panda, changed, says):
     given = {"model": panda.model, "limits": panda.limits, "tau_max": panda.tau_max, "dt": H}
-    with pytest.raises(error, match=says):
+    with pytest.raises(JointLimitsError, match=says):
         CoordinatedStop(**given | changed)
 
 

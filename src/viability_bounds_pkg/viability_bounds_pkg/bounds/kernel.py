@@ -28,10 +28,8 @@ ONE_SIDED_LIMIT = np.dtype(
     [
         ("position", np.float64),
         ("dt", np.float64),
-        ("half_dt", np.float64),
         ("twice_braking", np.float64),
         ("k", np.float64),
-        ("k_squared", np.float64),
         ("free", np.float64),
         ("v_max", np.float64),
         ("low", np.float64),
@@ -45,9 +43,9 @@ ONE_SIDED_LIMIT = np.dtype(
 """One position limit of one joint, as compiled code reads it by name.
 
 - position: of the limit, rad; the room is ``position - q``, for the lower limit ``position + q``.
-- dt, half_dt: step and its half, s.
+- dt: step, s.
 - twice_braking: 2 B, rad/s^2, where B is the deceleration that the kernel counts on.
-- k, k_squared: B dt / 2, rad/s, and its square.
+- k: B dt / 2, rad/s; not zero even if dt is tiny, so that no room at all does not make 0 / 0.
 - free: budget ``room - dt v / 2`` from which on only the speed limit counts, rad.
 - v_max: speed limit, rad/s.
 - low, high: hardest accelerations away from the limit and towards it, rad/s^2.
@@ -98,12 +96,9 @@ def make_table(
     rounding = ROUNDING * (largest + np.minimum(v_max * v_max / (2.0 * braking), length))
     # A joint counts as inside if it may be.
     table["tolerance"] = rounding + 2.0 * margins.position[:, None]
-    half_dt = 0.5 * table["dt"]
-    k = braking * half_dt
-    table["half_dt"], table["twice_braking"], table["k"] = half_dt, 2.0 * braking, k
-    # Not zero even if dt is tiny, so that no room at all does not make 0 / 0.
-    table["k_squared"] = np.maximum(k * k, _TINY)
-    table["free"] = half_dt * v_max + 0.5 * v_max * v_max / braking
+    table["twice_braking"] = 2.0 * braking
+    table["k"] = np.maximum(0.5 * braking * table["dt"], _TINY)
+    table["free"] = 0.5 * table["dt"] * v_max + 0.5 * v_max * v_max / braking
     return table
 
 
@@ -159,13 +154,13 @@ def _bound_towards(room: float, v: float, limit: np.record) -> tuple[float, bool
     dt = limit.dt
     v += limit.velocity_error
     # Room that is left if the step ends at rest.
-    budget = room - limit.half_dt * v
+    budget = room - 0.5 * dt * v
     if budget >= limit.free:
         a = (limit.v_max - v) / dt
     elif budget >= 0.0:
         # The largest end-of-step speed w with dt w / 2 + w^2 / (2 B) <= budget.
         c = limit.twice_braking * budget
-        a = (min(c / (limit.k + sqrt(limit.k_squared + c)), limit.v_max) - v) / dt
+        a = (min(c / (limit.k + sqrt(limit.k * limit.k + c)), limit.v_max) - v) / dt
     elif v > 0.0:
         # Stop within the step: eq. (19). Outside, and still leaving: brake.
         a = -v * (v / (2.0 * room)) if room > 0.0 else limit.low
@@ -198,9 +193,9 @@ def _resolve_conflict(
     """
     dt, v_max, error = limit.dt, limit.v_max, limit.velocity_error
     direction = v
-    if room_above < limit.half_dt * (v + error):
+    if room_above < 0.5 * dt * (v + error):
         direction = v + error
-    elif room_below < limit.half_dt * (error - v):
+    elif room_below < 0.5 * dt * (error - v):
         direction = v - error
     if room_above < 0.0 or (room_below >= 0.0 and direction > 0.0):
         a = lower
