@@ -13,7 +13,7 @@ import numpy as np
 from other_environment import TSID, worker
 
 from viability_bounds_pkg.joint_limits import JointLimits
-from viability_bounds_pkg.viability import BoundsSolver, discrete_time_condition
+from viability_bounds_pkg.viability import BoundsSolver
 
 JOINTS = 7
 STATES = 20_000
@@ -70,7 +70,7 @@ def _states(limits: list[float], dt: float, count: int, rng: np.random.Generator
 
 def _compare_where_it_holds(name, case, states, theirs) -> None:
     solver, a_max = _solver(case), case[3]
-    assert discrete_time_condition(solver.limits, solver.steps[0]).all()
+    assert solver.exact.all()
     lower, upper, viable = solver.bounds(*states)
     error = np.maximum(np.abs(lower - theirs[0]), np.abs(upper - theirs[1])) / (2.0 * a_max)
     outside = ~viable
@@ -86,7 +86,7 @@ def _compare_where_it_holds(name, case, states, theirs) -> None:
 
 def _compare_where_it_fails(name, case, given, found) -> None:
     solver = _solver(case)
-    assert not discrete_time_condition(solver.limits, solver.steps[0]).any()
+    assert not solver.exact.any()
     states, theirs = given[f"states:{name}"], found[f"states:{name}"]
     lower, upper, viable = solver.bounds(*states)
     tolerance = 1e-6 * 2.0 * case[3]

@@ -198,18 +198,9 @@ def _compared(
 ) -> tuple[int, Array]:  # fmt: skip
     """Return the index in `_REASONS` of what is wrong with a state, and the drift after it.
 
-    Args:
-        q0: positions before, shape (n,), rad.
-        v0: velocities before, shape (n,), rad/s.
-        drift0: drift before, shape (n,), rad.
-        q: positions, shape (n,), rad.
-        v: velocities, shape (n,), rad/s.
-        h: time between both, s.
-        unseen: part of it of which nothing is known, s.
-        position: error of positions, shape (n,), rad.
-        fastest: speeds of joints that are pushed, shape (n,), rad/s.
-        most: largest drift that is plausible, shape (n,), rad.
-        uses_velocities: whether velocities count.
+    `q0`, `v0` and `drift0` are of the earlier state, `h` is the time between both, `unseen` that
+    of which nothing is known. `position`, `fastest` and `most` bound errors of positions,
+    speeds of joints that are pushed, and the drift. Arrays are of shape (n,), units as above.
     """
     found, drift = 0, np.zeros_like(q)
     for j in range(q.size):

@@ -25,7 +25,6 @@ from viability_bounds_pkg.bounds.discrete_time import (
     Margins,
     checked_step,
     discrete_time,
-    discrete_time_condition,
 )
 from viability_bounds_pkg.bounds.kernel import AccelerationBounds, make_table, solve
 from viability_bounds_pkg.joint_limits import ROUNDING, JointLimits, JointLimitsError
@@ -36,7 +35,6 @@ __all__ = [
     "AccelerationBounds",
     "BoundsSolver",
     "acceleration_bounds",
-    "discrete_time_condition",
     "viable_velocity_range",
 ]
 

@@ -23,12 +23,13 @@ from joint_cases import (
     HOLDING,
     ODD_STEPS,
     column,
+    discrete_time_condition,
     one_joint,
     states_of,
 )
 
 from viability_bounds_pkg.joint_limits import JointLimitsError
-from viability_bounds_pkg.viability import BoundsSolver, discrete_time_condition
+from viability_bounds_pkg.viability import BoundsSolver
 
 CASES = {**CASES, **FAST_LOOP, **ODD_STEPS}
 
@@ -128,8 +129,8 @@ def test_the_step_is_as_long_as_the_discrete_time_condition_allows():
     long = BoundsSolver(limits, 105.0 * dt, period=dt)
     assert dt <= long.steps[0] < 105.0 * dt
     assert long.exact.all()
-    assert discrete_time_condition(limits, long.steps[0]).all()
-    assert not discrete_time_condition(limits, 2.0 * long.steps[0]).any()
+    assert discrete_time_condition(limits, long.steps[0])
+    assert not discrete_time_condition(limits, 2.0 * long.steps[0])
     assert BoundsSolver(limits, 2.0 * dt, period=dt).steps == 2.0 * dt  # it suits all states
     case = CASES[JUST]
     limits, dt = one_joint(*case[:5]), case[5]
@@ -206,7 +207,7 @@ def test_every_joint_returns(name, policy, margin):
     run = bring_back(solver, q, v, policy, 3000, rng)
     assert run.stray == 0
     assert max(run.again, run.speed) <= VIOLATION
-    if discrete_time_condition(limits, dt, [w]).all():
+    if discrete_time_condition(limits, dt, [w]):
         assert run.position <= VIOLATION
 
 

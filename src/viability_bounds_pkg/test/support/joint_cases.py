@@ -3,8 +3,8 @@
 
 import numpy as np
 
-from viability_bounds_pkg.joint_limits import JointLimits
-from viability_bounds_pkg.viability import discrete_time_condition
+from viability_bounds_pkg.joint_limits import JointLimits, JointLimitsError
+from viability_bounds_pkg.viability import BoundsSolver
 
 Case = tuple[float, float, float, float, float, float]
 """q_min, q_max, v_max, a_min, a_max, dt."""
@@ -41,9 +41,17 @@ def one_joint(q_min, q_max, v_max, a_min, a_max):
     return JointLimits(["joint"], [q_min], [q_max], [v_max], [a_min], [a_max])
 
 
+def discrete_time_condition(limits, dt, margin=None, **errors):
+    """Return whether condition (11) holds for all joints with all of their braking."""
+    try:
+        return bool(BoundsSolver(limits, dt, margin, **errors).exact.all())
+    except JointLimitsError:
+        return False
+
+
 def condition_holds(case):
     """Return whether condition (11) holds for a joint."""
-    return bool(discrete_time_condition(one_joint(*case[:5]), case[5])[0])
+    return discrete_time_condition(one_joint(*case[:5]), case[5])
 
 
 def column(values):

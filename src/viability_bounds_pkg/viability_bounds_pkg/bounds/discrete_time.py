@@ -83,36 +83,6 @@ def _checked(
     return array
 
 
-def discrete_time_condition(
-    limits: JointLimits,
-    dt: float,
-    margin: ArrayLike | None = None,
-    *,
-    position_error: ArrayLike | None = None,
-    velocity_error: ArrayLike | None = None,
-) -> NDArray[np.bool_]:
-    """Return for which joints one braking step at either end stays inside the limits: eq. (11).
-
-    Where it fails, the viability kernel is smaller than that of continuous time, eq. (10), and
-    Algorithms 1 to 3 are too permissive.
-
-    Args:
-        limits: of n joints.
-        dt: step, s.
-        margin: shape (n,), rad/s^2, or None for zeros.
-        position_error: shape (n,), rad, or None for zeros.
-        velocity_error: shape (n,), rad/s, or None for zeros.
-
-    Returns:
-        shape (n,), bool.
-
-    Raises:
-        JointLimitsError: an argument is unusable in itself.
-    """
-    margins = Margins.of(limits, margin, position_error, velocity_error)
-    return _largest_braking(limits, checked_step(dt), margins)[1]
-
-
 def discrete_time(
     limits: JointLimits, dt: float, shortest: float, margins: Margins
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -178,8 +148,6 @@ def without_position_error(limits: JointLimits, errors: Array) -> JointLimits:
         limits: of n joints.
         errors: of reported positions, shape (n,), rad.
     """
-    if not errors.any():
-        return limits
     return replace(limits, q_min=limits.q_min + errors, q_max=limits.q_max - errors)
 
 
@@ -215,4 +183,5 @@ def _largest_braking(
     possible = np.where(continuous, spread * dt <= limits.v_max, possible)
     stronger = np.where(continuous, np.inf, np.maximum(equal, stronger))
     braking = np.where(possible[:, None], np.minimum(b, stronger[:, None]), np.nan)
-    return braking, (braking >= full).all(axis=1)
+    is_full: NDArray[np.bool_] = np.all(braking >= full, axis=1)
+    return braking, is_full

@@ -8,6 +8,7 @@ the limits.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -53,11 +54,9 @@ def tightened(limits: JointLimits, margins: TorqueMargins) -> JointLimits:
 
     The margin of acceleration is `viability.BoundsSolver`'s to take.
     """
-    return JointLimits(
-        limits.names,
-        limits.q_min + margins.position,
-        limits.q_max - margins.position,
-        limits.v_max - margins.velocity,
-        limits.a_min,
-        limits.a_max,
+    return replace(
+        limits,
+        q_min=limits.q_min + margins.position,
+        q_max=limits.q_max - margins.position,
+        v_max=limits.v_max - margins.velocity,
     )

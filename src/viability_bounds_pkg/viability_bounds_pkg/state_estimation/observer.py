@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -84,23 +83,20 @@ def design_observer(
     gains = _error_gains()
     # In units of the period: the choice depends on the ratio of both errors only.
     least = np.maximum(w, LEAST_ACCELERATION_ERROR) * dt**2
-    error = np.outer(delta, gains.velocity[:, 0]) + np.outer(least, gains.velocity[:, 1])
+    error = np.outer(delta, gains[:, 1, 0]) + np.outer(least, gains[:, 1, 1])
     close = error <= SLACK * error.min(axis=1, keepdims=True)
     slowest = len(_POLES) - 1 - np.argmax(close[:, ::-1], axis=1)
     chosen = np.where(delta > 0.0, slowest, 0)
 
-    def worst(gain: Array) -> Array:
-        largest: Array = gain[chosen, 0] * delta + gain[chosen, 1] * w * dt**2
-        return largest
-
+    worst = gains[chosen, :, 0].T * delta + gains[chosen, :, 1].T * w * dt**2
     p = _POLES[chosen]
     return ObserverDesign(
         position_gain=1.0 - p**2,
         velocity_gain=(1.0 - p) ** 2 / dt,
         learning_gain=LEARNING * (1.0 - p) ** 3 / dt**2,
-        position_error=worst(gains.position),
-        velocity_error=worst(gains.velocity) / dt,
-        innovation=worst(gains.innovation),
+        position_error=worst[0],
+        velocity_error=worst[1] / dt,
+        innovation=worst[2],
     )
 
 
@@ -151,25 +147,17 @@ class Observer:
         return np.minimum(np.maximum(disturbance, -self._lasting), self._lasting)
 
 
-class _ErrorGains(NamedTuple):
-    """Largest errors per error of the position and of the acceleration, period 1, for `_POLES`.
-
-    L1 norms of the responses, shape (poles, 2) each.
-    """
-
-    position: Array
-    velocity: Array
-    innovation: Array
-
-
 @cache
-def _error_gains() -> _ErrorGains:
-    rows = np.array([_norms(p) for p in _POLES])
-    return _ErrorGains(rows[:, 0:2], rows[:, 2:4], rows[:, 4:6])
+def _error_gains() -> Array:
+    """Return `_norms` of all poles, shape (poles, 3, 2)."""
+    return np.array([_norms(p) for p in _POLES])
 
 
-def _norms(p: float) -> tuple[float, ...]:
-    """Return the norms for one pole.
+def _norms(p: float) -> Array:
+    """Return the largest errors that one pole leaves, for the period 1, shape (3, 2).
+
+    L1 norms of the responses of position, velocity and innovation to errors of the position and of
+    the acceleration.
 
     The error e = (q - q^, v - v^) follows e+ = A e + B(s) d(s) - L n with A = (I - L C) F,
     B(s) = (I - L C) (1 - s, 1) for d at time s of the period. Powers of a 2 x 2 matrix with a
@@ -186,13 +174,12 @@ def _norms(p: float) -> tuple[float, ...]:
     # The response to d(s) is linear in s: its values at both ends of the period.
     ends = powers @ corrected @ np.array([[1.0, 0.0], [1.0, 1.0]])
     before = step[0]  # position before the correction, of the error one period earlier
-    return (
-        float(np.abs(from_noise[:, 0]).sum()),
-        _integral(ends[:, 0]),
-        float(np.abs(from_noise[:, 1]).sum()),
-        _integral(ends[:, 1]),
-        float(np.abs(from_noise @ before).sum()) + 1.0,
-        _integral(before @ ends) + 0.5,
+    return np.array(
+        [
+            [np.abs(from_noise[:, 0]).sum(), _integral(ends[:, 0])],
+            [np.abs(from_noise[:, 1]).sum(), _integral(ends[:, 1])],
+            [np.abs(from_noise @ before).sum() + 1.0, _integral(before @ ends) + 0.5],
+        ]
     )
 
 
