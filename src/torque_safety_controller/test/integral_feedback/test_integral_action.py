@@ -31,7 +31,7 @@ def test_what_is_forgotten_again_and_again_fades_from_what_it_was(mode):
     for _ in range(500):
         loop.action.forget()
         loop.robot.update(State(loop.robot.q, loop.robot.v), np.zeros(N))
-        torques.append(loop.action.torque(loop.robot, loop.robot.v, np.zeros(N), math.inf))
+        torques.append(loop.action.torque(loop.robot, np.zeros(N), math.inf))
     assert relative(torques[0]) > 0.03
     assert relative(np.diff(torques, axis=0)) < 0.02 * relative(torques[0])
     np.testing.assert_allclose(torques[-1], torques[0] * math.exp(-500 * DT / 0.2), rtol=0.05)
@@ -82,9 +82,9 @@ def test_it_begins_with_the_torque_it_is_told(mode):
         loop = IntegralLoop(mode)
         torque = rng.uniform(-0.3, 0.3, N) * ARM.tau_max
         loop.robot.update(State(loop.q, REST), REST)
-        loop.action.resume(loop.robot, REST, torque)
+        loop.action.resume(loop.robot, torque)
         np.testing.assert_array_equal(loop.action.last, torque)
-        after = loop.action.torque(loop.robot, REST, REST, DT)
+        after = loop.action.torque(loop.robot, REST, DT)
         assert relative(after - torque) <= 0.01
 
 
@@ -93,7 +93,7 @@ def test_what_cannot_be_initialised_fades():
     loop.robot.update(State(loop.q, REST), REST)
     loop.robot.C = -LAMBDA * np.diag(np.diagonal(loop.robot.M))  # C + K is singular
     torque = 0.1 * ARM.tau_max
-    loop.action.resume(loop.robot, REST, torque)
+    loop.action.resume(loop.robot, torque)
     np.testing.assert_array_equal(loop.action.last, torque)
-    after = loop.action.torque(loop.robot, REST, REST, DT)
+    after = loop.action.torque(loop.robot, REST, DT)
     np.testing.assert_allclose(after, torque * math.exp(-DT / 0.2), rtol=1e-9)

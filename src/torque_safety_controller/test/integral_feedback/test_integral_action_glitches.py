@@ -120,7 +120,7 @@ def test_numbers_beyond_sense_keep_the_last_torque():
             seen[0] = bad
             with np.errstate(all="ignore"):
                 loop.robot.update(State(loop.q, seen), loop.a)
-            added = loop.action.torque(loop.robot, seen, loop.a, DT)
+            added = loop.action.torque(loop.robot, loop.a, DT)
             np.testing.assert_array_equal(added, before)
             loop.run(0.02)
             assert loop.steps(21) < 1e-3
@@ -134,9 +134,9 @@ def test_a_beginning_with_numbers_beyond_sense_is_put_off(mode):
     seen = np.full(N, math.nan)
     with np.errstate(all="ignore"):
         loop.robot.update(State(loop.q, seen), loop.a)
-    np.testing.assert_array_equal(loop.action.torque(loop.robot, seen, loop.a, DT), REST)
+    np.testing.assert_array_equal(loop.action.torque(loop.robot, loop.a, DT), REST)
     loop.action.settings = make_settings(gain=20.0)
-    np.testing.assert_array_equal(loop.action.torque(loop.robot, seen, loop.a, DT), REST)
+    np.testing.assert_array_equal(loop.action.torque(loop.robot, loop.a, DT), REST)
     loop.run(0.4)
     assert relative(loop.action.last) > 0.02 or mode == "none"
 
@@ -187,7 +187,7 @@ def test_steps_are_bounded_whatever_velocity_does():
     for _ in range(2000):
         v = rng.uniform(-1.0, 1.0, N) * ARM.v_max * rng.choice([1e-3, 0.01, 0.1, 1.0])
         loop.robot.update(State(ARM.q_start, v), REST)
-        loop.action.torque(loop.robot, v, rng.uniform(-20.0, 20.0, N), DT)
+        loop.action.torque(loop.robot, rng.uniform(-20.0, 20.0, N), DT)
         K_s = loop.action.law.s * LAMBDA * np.diagonal(loop.robot.M)
         largest, before = max(largest, relative(K_s - before)), K_s
     assert 0.5 * bound < largest
@@ -229,7 +229,7 @@ def test_it_is_finite_and_never_raises(mode, steps):
             if theta is not None:
                 action.settings = make_settings(slow_leak_rate=theta)
             robot.update(State(ARM.q_start + q, v), a)
-            torque = action.torque(robot, v, a, elapsed)
+            torque = action.torque(robot, a, elapsed)
             assert torque.shape == (N,)
             assert np.isfinite(torque).all()
             assert (np.abs(torque) <= 2.0 * BUDGET).all()
@@ -237,8 +237,8 @@ def test_it_is_finite_and_never_raises(mode, steps):
         rest = State(ARM.q_start, REST), REST
         robot.update(*rest)
         for _ in range(4):
-            action.torque(robot, REST, REST, DT)
+            action.torque(robot, REST, DT)
         skipped = action.skipped
         for _ in range(3):
-            action.torque(robot, REST, REST, DT)
+            action.torque(robot, REST, DT)
         assert action.skipped == skipped

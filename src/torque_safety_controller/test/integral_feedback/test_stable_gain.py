@@ -6,7 +6,8 @@ import pytest
 from arms import load_arm
 
 from torque_safety_controller.integral_feedback import IntegralSettings
-from torque_safety_controller.parts.integral import IntegralAction, coupling
+from torque_safety_controller.integral_feedback.stable_gain import coupling
+from torque_safety_controller.parts.integral import IntegralAction
 from viability_bounds_pkg.state import State
 
 DT = 0.002
@@ -31,7 +32,7 @@ def action(arm, gain):
 
 def used(made, robot):
     """The gain after a step."""
-    made.torque(robot, REST, REST, DT)
+    made.torque(robot, REST, DT)
     return made.gain
 
 

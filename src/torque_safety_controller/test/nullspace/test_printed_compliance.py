@@ -15,7 +15,6 @@ from printed_law import FAST, LAMBDA, MU, SLOW, STEP, PrintedLaw
 from task_arm import TaskArm, arm_terms
 
 from torque_safety_controller.integral_feedback import IntegralSettings
-from torque_safety_controller.integral_feedback.nullspace import NullspaceCompliance
 from torque_safety_controller.integral_feedback.printed import PrintedCompliance
 
 SMALL = 1e-5  # s; of differences
@@ -124,18 +123,3 @@ def test_a_torque_is_taken_over_as_far_as_the_task_feels_it(method):
     np.testing.assert_allclose(compliance.initialise(torque, run.now), torque, rtol=1e-9)
     after = compliance.torque(run.now, np.zeros(7), DT)
     np.testing.assert_allclose(after, torque, rtol=0.01)
-
-
-@pytest.mark.parametrize("rate", [0.1, 5.0, 100.0])
-def test_what_is_in_the_null_space_is_forgotten_at_its_own_rate(rate):
-    """theta_null of `NullspaceCompliance`, at rest and without gains to speak of."""
-    run = ComplianceRun("panda")
-    compliance = NullspaceCompliance(unlimited(7, gain=1e-9, null_leak_rate=rate), 6)
-    compliance.reset(run.now)
-    J = run.terms.J
-    null = np.linalg.svd(J)[2][6]
-    compliance.memory.a[:] = compliance.memory.s[:] = null
-    for _ in range(50):
-        compliance.torque(run.now, np.zeros(7), DT)
-    assert np.abs(J @ compliance.memory.a).max() < 1e-9
-    assert compliance.memory.a @ null == pytest.approx(np.exp(-rate * 50 * DT), rel=1e-6)

@@ -95,10 +95,10 @@ def at(arm, motion, t):
 
 def test_one_integral_for_both_is_what_the_paper_prints():
     motion, arm, action = Motion(), robot(), additional("paper")
-    action.torque(at(arm, motion, 0.0), motion.v(0.0), motion.a_ref(0.0), 0.0)
+    action.torque(at(arm, motion, 0.0), motion.a_ref(0.0), 0.0)
     for k in range(1, 60):
         t = k * STEP
-        found = action.torque(at(arm, motion, t), motion.v(t), motion.a_ref(t - STEP), STEP)
+        found = action.torque(at(arm, motion, t), motion.a_ref(t - STEP), STEP)
         expected = motion.expected(t)
         np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
     assert np.abs(motion.integral[6:]).max() > 1e-5  # the second hand counts
@@ -108,12 +108,12 @@ def test_the_errors_of_both_hands_are_integrated_exactly():
     """(25), without leaks: J a grows by the middle of J times the increment of s."""
     motion, arm = Motion(), robot()
     action = additional("qp", gain=5.0, slow_leak_rate=0.0, fast_leak_rate=50.0)
-    action.torque(at(arm, motion, 0.0), motion.v(0.0), motion.a_ref(0.0), 0.0)
+    action.torque(at(arm, motion, 0.0), motion.a_ref(0.0), 0.0)
     task, total = action.law, np.zeros(12)
     assert isinstance(task, NullspaceCompliance)
     for k in range(1, 40):
         t = k * STEP
-        action.torque(at(arm, motion, t), motion.v(t), motion.a_ref(t - STEP), STEP)
+        action.torque(at(arm, motion, t), motion.a_ref(t - STEP), STEP)
         grown = motion.a_ref(t - STEP) * STEP - (motion.v(t) - motion.v(t - STEP))
         total += 0.5 * (motion.J(t) + motion.J(t - STEP)) @ grown
         np.testing.assert_allclose(motion.J(t) @ task.memory.a, total, atol=1e-8)

@@ -35,10 +35,9 @@ def random_problem(rng, k=10, r=8, room=1.0) -> Problem:
     middle = (1.0 - room) * 20.0 * rng.normal(size=N)
     half = room * rng.uniform(2.0, 30.0, N)
     rho_max = np.where(rng.random(r) < 0.2, 0.0, np.inf)
-    half_r = r // 2
     wrenches = [
-        WrenchTerm(rng.normal(size=(6, half_r)), 10.0 * rng.normal(size=6), 0.5, 0),
-        WrenchTerm(rng.normal(size=(3, r - half_r)), 10.0 * rng.normal(size=3), 2.0, half_r),
+        WrenchTerm(rng.normal(size=(6, r)), 10.0 * rng.normal(size=6), 0.5),
+        WrenchTerm(rng.normal(size=(3, r)), 10.0 * rng.normal(size=3), 2.0),
     ]
     return Problem(
         [
@@ -61,7 +60,7 @@ def cost_of(problem: Problem):
     scale = max(t.weight for t in [*problem.tasks, *problem.contacts.tasks])
     H, g = GAMMA * np.eye(N + r), np.zeros(N + r)
     terms = [(A, b, weight, 0) for A, b, weight in problem.tasks]
-    terms += [(W, F, weight, N + first) for W, F, weight, first in problem.contacts.tasks]
+    terms += [(W, F, weight, N) for W, F, weight in problem.contacts.tasks]
     for A, b, weight, first in terms:
         A = np.eye(N) if A is None else A
         part = np.zeros((len(b), N + r))
@@ -287,11 +286,10 @@ def test_wrong_shapes_are_refused():
         {"rows": rows._replace(upper=rows.upper[1:])},
         {"contacts": contacts._replace(B=contacts.B[1:])},
         {"contacts": contacts._replace(rho_max=contacts.rho_max[1:])},
-        {"contacts": contacts._replace(tasks=[task._replace(first=5)])},
-        {"contacts": contacts._replace(tasks=[task._replace(first=-1)])},
+        {"contacts": contacts._replace(tasks=[task._replace(W=task.W[:, 1:])])},
         {"contacts": contacts._replace(tasks=[task._replace(F_des=np.zeros(6))])},
     ):
-        with pytest.raises(ValueError, match="joints with|wrench task with"):
+        with pytest.raises(ValueError, match="joints with|wrench task of"):
             solution_of(InverseDynamicsQP(N, GAMMA), problem._replace(**bad))
 
 

@@ -39,7 +39,7 @@ class IntegralLoop:
         """Play a period; return what was added."""
         v = self.v if v_seen is None else v_seen
         self.robot.update(State(self.q, v), self.a)
-        added = self.action.torque(self.robot, v, self.a, elapsed)
+        added = self.action.torque(self.robot, self.a, elapsed)
         self.a = 100.0 * (ARM.q_start - self.q) - 20.0 * v
         tau = self.robot.torque(self.a) + added + disturbance
         self.q, self.v = ARM.move(self.q, self.v, tau, DT, steps=1)

@@ -92,18 +92,15 @@ class IntegralFeedback(IntegralLaw):
         At the limits it is (10) or (11); with anti-windup ``qp`` integrators shrink there, too.
         """
         settings, printed = self.settings, self.settings.as_printed
+        rates = (settings.fast_leak_rate + self.leak, settings.slow_leak_rate + self.leak)
         fast, slow, torque, saturated, limited, usable = _advance(
-            *self.memory,
-            arm.M,
-            arm.C,
-            arm.v,
+            tuple(self.memory),
+            (arm.M, arm.C, arm.v),
             a_last,
             dt,
             settings.budget,
-            settings.gain,
-            settings.mu,
-            *leak_factors(settings.fast_leak_rate + self.leak, dt, printed),
-            *leak_factors(settings.slow_leak_rate + self.leak, dt, printed),
+            (settings.gain, settings.mu),
+            (*leak_factors(rates[0], dt, printed), *leak_factors(rates[1], dt, printed)),
             printed,
         )
         if not usable:
@@ -137,7 +134,7 @@ class IntegralFeedback(IntegralLaw):
         K = self.settings.gain * np.diagonal(arm.M)
         s: Array = np.full(len(K), np.nan)
         with suppress(np.linalg.LinAlgError):
-            s = np.linalg.solve(arm.C + np.diag(K), torque)
+            s[:] = np.linalg.solve(arm.C + np.diag(K), torque)
         # A NaN is not of sensible size.
         if not np.abs(K * s).max() <= _AMPLIFIED * np.abs(torque).max():
             raise InitialisationError("the arm moves too fast: C + K cannot be inverted")
@@ -150,30 +147,36 @@ class IntegralFeedback(IntegralLaw):
 
 @njit(cache=True)
 def _advance(
-    fast_last: Array,
-    slow_last: Array,
-    v_last: Array,
-    M: Array,
-    C: Array,
-    v: Array,
+    memory: tuple[Array, ...],
+    arm: tuple[Array, ...],
     a_last: Array,
     dt: float,
     budget: Array,
-    gain: float,
-    mu: float,
-    fast_kept: float,
-    fast_gain: float,
-    slow_kept: float,
-    slow_gain: float,
+    numbers: tuple[float, float],
+    factors: tuple[float, float, float, float],
     as_printed: bool,
 ) -> tuple[Array, Array, Array, NDArray[np.bool_], bool, bool]:
     """Return the memory after a step, and its torque before limits.
+
+    Args:
+        memory: of the last step, see `Memory`.
+        arm: M and C, shape (n, n), and v, shape (n,).
+        a_last: acceleration commanded in the last step, shape (n,), rad/s^2.
+        dt: time since, s.
+        budget: shape (n,), N m.
+        numbers: gain lambda, 1/s, and weight mu of the fast integral.
+        factors: of the fast integral and then of the slow one, see `leak_factors`.
+        as_printed: whether budgets are for K s only.
 
     Returns:
         The fast and the slow integral, the torque (C + K) s, which joints are beyond their
         budgets, shape (n,) each; whether any is, or is not finite; whether all that was given is
         finite.
     """
+    fast_last, slow_last, v_last = memory
+    M, C, v = arm
+    gain, mu = numbers
+    fast_kept, fast_gain, slow_kept, slow_gain = factors
     n = v.size
     fast, slow, u, s = np.empty(n), np.empty(n), np.zeros(n), np.empty(n)
     beyond, limited, usable = np.zeros(n, dtype=np.bool_), False, True

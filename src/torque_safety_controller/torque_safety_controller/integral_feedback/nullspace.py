@@ -104,8 +104,8 @@ class TaskLaw(IntegralLaw):
         if not (math.isfinite(total) and (np.diagonal(M) > 0.0).all()):
             raise ValueError("M must be positive definite, and all numbers finite")
 
-    def felt_by_task(self, arm: ArmTerms, torque: Array) -> Array:
-        """Return the a whose slow memory gives what the task feels of `torque`, shape (n,).
+    def felt_by_task(self, arm: ArmTerms, torque: Array) -> tuple[Array, Array]:
+        """Return the a whose slow memory gives what the task feels of `torque`, and J^+.
 
         The task feels the force F = J^+^T torque. Where J a = y the slow torque is
         J^T ((1 - mu) J^+^T K J^+ y), which is J^T F for this y.
@@ -118,8 +118,7 @@ class TaskLaw(IntegralLaw):
         J_plus, _ = dynamically_consistent_inverse(J, J_dot, M, C + C.T, THRESHOLD)
         K = self.settings.gain * np.diagonal(M)
         B = (1.0 - self.settings.mu) * (J_plus.T * K) @ J_plus
-        a: Array = J_plus @ (np.linalg.pinv(B, _SINGULAR) @ (J_plus.T @ torque))
-        return a
+        return J_plus @ (np.linalg.pinv(B, _SINGULAR) @ (J_plus.T @ torque)), J_plus
 
 
 class NullspaceCompliance(TaskLaw):
@@ -147,37 +146,22 @@ class NullspaceCompliance(TaskLaw):
     def torque(self, arm: ArmTerms, a_last: Array, dt: float) -> Array:
         """See `IntegralLaw`."""
         settings = self.settings
-        slow, fast, null = (
-            settings.slow_leak_rate,
-            settings.fast_leak_rate,
-            settings.null_leak_rate,
-        )
-        *memory, torque, limited, usable = advance(
-            *self.memory,
-            *arm,
-            a_last,
-            dt,
-            settings.budget,
-            settings.gain,
-            settings.mu,
-            fast_weight(settings),
-            *leak_factors(slow, dt, False),
-            *leak_factors(fast, dt, False),
-            math.exp((slow - (fast if null is None else null)) * dt),
+        slow, fast = settings.slow_leak_rate, settings.fast_leak_rate
+        factors = (*leak_factors(slow, dt, False), *leak_factors(fast, dt, False))
+        numbers = (settings.gain, settings.mu, fast_weight(settings))
+        a, s, integral, root, torque, limited, usable = advance(
+            tuple(self.memory), tuple(arm), a_last, dt, settings.budget, numbers, factors
         )
         if not usable:
             raise ValueError("M must be positive definite, and all numbers finite")
-        self.memory = Memory(*memory, arm.v.copy(), arm.J.copy())
+        self.memory = Memory(a, s, integral, root, arm.v.copy(), arm.J.copy())
         at_limit = np.abs(torque) >= _AT_LIMIT * settings.budget if limited else self._none
         self.saturated = at_limit
         return torque
 
     def initialise(self, torque: Array, arm: ArmTerms) -> Array:
         """See `IntegralLaw`; the slow memory takes what the task feels of it."""
-        a = self.felt_by_task(arm, torque)
-        J_plus, _ = dynamically_consistent_inverse(
-            arm.J, arm.J_dot, arm.M, arm.C + arm.C.T, THRESHOLD
-        )
+        a, J_plus = self.felt_by_task(arm, torque)
         zero, integral = np.zeros_like(a), -(arm.J @ a)
         forgets = self.settings.fast_leak_rate > self.settings.slow_leak_rate
         root = np.sqrt(np.diagonal(arm.M)) * a if forgets else zero

@@ -45,59 +45,34 @@ _SINGULAR = 1e-12  # relative size of pivots that are rounding
 
 @njit(cache=True)
 def advance(
-    a_last: Array,
-    s_last: Array,
-    integral: Array,
-    root: Array,
-    v_last: Array,
-    J_last: Array,
-    M: Array,
-    C: Array,
-    J: Array,
-    J_dot: Array,
-    v: Array,
+    memory: tuple[Array, ...],
+    arm: tuple[Array, ...],
     reference: Array,
     dt: float,
     budget: Array,
-    gain: float,
-    mu: float,
-    weight: float,
-    slow: float,
-    slow_gain: float,
-    fast: float,
-    fast_gain: float,
-    null: float,
+    numbers: tuple[float, float, float],
+    factors: tuple[float, float, float, float],
 ) -> tuple[Array, Array, Array, Array, Array, bool, bool]:
     """Return the memory after a step, and its torque.
 
     Args:
-        a_last: memory of the last step, as the next five; see `Memory`.
-        s_last: shape (n,), rad/s.
-        integral: shape (m,).
-        root: shape (n,).
-        v_last: shape (n,), rad/s.
-        J_last: shape (m, n).
-        M: terms of the arm, as the next four; see `ArmTerms`.
-        C: shape (n, n).
-        J: shape (m, n).
-        J_dot: shape (m, n).
-        v: shape (n,), rad/s.
+        memory: of the last step, see `nullspace.Memory`.
+        arm: its terms, see `ArmTerms`.
         reference: acceleration commanded in the last step, shape (n,), rad/s^2.
         dt: time since, s.
         budget: shape (n,), N m.
-        gain: lambda, 1/s.
-        mu: weight of the fast memory.
-        weight: of its energy.
-        slow: what a step leaves of the slow memory.
-        slow_gain: what it takes of the increment of s.
-        fast: the same of the fast memory.
-        fast_gain: likewise.
-        null: what is left in the null space of what the slow memory keeps.
+        numbers: gain lambda, 1/s; weight mu of the fast memory, and that of its energy.
+        factors: what a step leaves of the slow memory, and what it takes of the increment of s;
+            the same of the fast memory, whose rate the slow one has in the null space.
 
     Returns:
         The first four of the memory; the torque, shape (n,), N m; whether it is limited; whether
         all is finite, and M can be a mass matrix.
     """
+    a_last, s_last, integral, root, v_last, J_last = memory
+    M, C, J, J_dot, v = arm
+    gain, mu, weight = numbers
+    slow, slow_gain, fast, fast_gain = factors
     total = M.sum() + C.sum() + J.sum() + J_dot.sum() + v.sum() + reference.sum()
     if not (math.isfinite(total) and (np.diag(M) > 0.0).all()):
         return a_last, s_last, integral, root, v, False, False
@@ -110,7 +85,7 @@ def advance(
     a = s - J_plus @ (slow * integral + (J - J_last) @ (0.5 * (left + s)))
     # The fast memory takes fast_gain of what a gained, of which slow_gain is seen.
     x = (1.0 - ratio) * a + (ratio * slow - fast) * a_last + fast * root / np.sqrt(np.diag(M))
-    a = a - (1.0 - null) * (a - J_plus @ (J @ a))
+    a = a - (1.0 - fast / slow) * (a - J_plus @ (J @ a)) if slow > 0.0 else a
     H = torque_matrix(J, J_dot, M, C, gain, mu, J_plus, J_plus_dot)
     torque = H @ a - mu * gain * np.diag(M) * x
     a, x, torque, cut = limited(M, H, budget, a, x, torque, weight)
@@ -176,10 +151,10 @@ def limited(
         # How far from (scale a, scale x) to (a + shift, x) the energy is that of (a, x).
         da, dx = (1.0 - scale) * a + shift, (1.0 - scale) * x
         weights = weight * np.diag(M)
-        energy = a @ (M @ a) + x @ (weights * x)  # twice, as the next two
+        energy = float(a @ (M @ a) + x @ (weights * x))  # twice, as the next two
         spare = (1.0 - scale * scale) * energy
-        linear = scale * (da @ (M @ a) + dx @ (weights * x))
-        square = da @ (M @ da) + dx @ (weights * dx)
+        linear = float(scale * (da @ (M @ a) + dx @ (weights * x)))
+        square = float(da @ (M @ da) + dx @ (weights * dx))
         if square + 2.0 * linear <= spare:
             way = 1.0
         else:

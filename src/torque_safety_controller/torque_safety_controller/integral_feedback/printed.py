@@ -100,7 +100,7 @@ class PrintedCompliance(TaskLaw):
 
     def initialise(self, torque: Array, arm: ArmTerms) -> Array:
         """See `IntegralLaw`; the slow memory takes what the task feels of it."""
-        a = self.felt_by_task(arm, torque)
+        a, _ = self.felt_by_task(arm, torque)
         zero, v, J = np.zeros_like(a), arm.v.copy(), arm.J.copy()
         self.memory = PrintedMemory(a, np.zeros(len(J)), a, a, zero, v, J)
         return self.torque(arm, zero, 0.0)

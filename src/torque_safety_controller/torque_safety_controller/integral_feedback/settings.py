@@ -36,8 +36,6 @@ class IntegralSettings:
         fast_leak_rate: theta_f, 1/s, >= theta_s.
         mu: weight of the fast integrator, 0 to 1, eq. (14).
         anti_windup: one of `METHODS`.
-        null_leak_rate: theta_null, with which `NullspaceCompliance` forgets what is in the null
-            space, 1/s, >= theta_s; None for theta_f.
 
     Raises:
         SettingError: a value is out of range.
@@ -49,7 +47,6 @@ class IntegralSettings:
     fast_leak_rate: float = 100.0
     mu: float = 0.5
     anti_windup: str = "qp"
-    null_leak_rate: float | None = None
 
     def __post_init__(self) -> None:
         budget = np.array(self.budget, dtype=np.float64)
@@ -62,10 +59,9 @@ class IntegralSettings:
         slow = self.slow_leak_rate
         if not 0.0 <= slow < math.inf:
             raise SettingError("slow_leak_rate", slow, "a finite number >= 0")
-        for name in ("fast_leak_rate", "null_leak_rate"):
-            rate = getattr(self, name)
-            if rate is not None and not slow <= rate < math.inf:
-                raise SettingError(name, rate, f"a finite number >= the slow one, {slow}")
+        fast = self.fast_leak_rate
+        if not slow <= fast < math.inf:
+            raise SettingError("fast_leak_rate", fast, f"a finite number >= the slow one, {slow}")
         if not 0.0 <= self.mu <= 1.0:
             raise SettingError("mu", self.mu, "a number from 0 to 1")
         if self.anti_windup not in METHODS:

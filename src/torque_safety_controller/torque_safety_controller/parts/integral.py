@@ -26,17 +26,12 @@ from torque_safety_controller.integral_feedback import (
 )
 from torque_safety_controller.integral_feedback.nullspace import NullspaceCompliance
 from torque_safety_controller.integral_feedback.printed import PrintedCompliance
+from torque_safety_controller.integral_feedback.stable_gain import StableGain
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.settings import Settings
 from torque_safety_controller.step import LONGEST_GAP, Part, Step, joints_named
 
 Array = NDArray[np.float64]
-
-_CHECK_EVERY = 5
-"""Control steps after which it is checked whether the gain is stable in the posture."""
-
-_ROOM_TO_RAISE = 0.5
-"""Steps by which the gain could be higher before it is raised."""
 
 _POSITION_JUMP = 0.05  # rad or m; beyond what the velocities account for
 _FADING_TIME = 0.2  # s; of what the memory cannot hold
@@ -52,13 +47,11 @@ class FadingTorque:
         settings: as they are set.
         last: torque of the last step, shape (n,), N m.
         skipped: steps that were not integrated over: time jumped, or the state did.
-        gain: lambda that is used, 1/s; what is set, or what is stable; 0 for none.
         saturated: which joints are at their budget, shape (n,).
         rates: whether the robot's matrices are needed with their rates.
     """
 
     rates = False
-    gain = 0.0
 
     def __init__(self, settings: IntegralSettings) -> None:
         self.settings = settings
@@ -71,10 +64,15 @@ class FadingTorque:
         """Forget the past: the next step begins with nothing added."""
         self.last = self._fading = self._zero
 
+    @property
+    def gain(self) -> float:
+        """Lambda that is used, 1/s: what is set, or what is stable; 0 for none."""
+        return 0.0
+
     def forget(self) -> None:
         """Let the integral begin anew: what it gives now fades."""
 
-    def torque(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> Array:
+    def torque(self, robot: RobotModel, a_last: Array, elapsed: float) -> Array:
         """Return what to add in this step, shape (n,), N m; finite whatever comes.
 
         After a jump in time, or of the state, the torque goes on from the last one, and the
@@ -82,7 +80,6 @@ class FadingTorque:
 
         Args:
             robot: of the arm, updated with rates.
-            v: velocity, shape (n,), rad/s.
             a_last: acceleration commanded in the last step, shape (n,), rad/s^2.
             elapsed: time since the last step, s.
         """
@@ -90,14 +87,13 @@ class FadingTorque:
             self.last = self._faded(elapsed, robot.dt)
         return self.last
 
-    def resume(self, robot: RobotModel, v: Array, torque: Array) -> None:
+    def resume(self, robot: RobotModel, torque: Array) -> None:
         """Begin so that the torque is `torque` now.
 
         The memory holds what it can of it within the budgets; the rest fades.
 
         Args:
             robot: of the arm, updated with rates.
-            v: velocity, shape (n,), rad/s.
             torque: shape (n,), N m, finite.
         """
         self.last = self._fading = torque
@@ -132,11 +128,9 @@ class IntegralAction(FadingTorque):
     def __init__(
         self, mode: str, settings: IntegralSettings, disturbance_max: Array, hands: int = 1
     ) -> None:
-        self._asked = settings
         self._rows = TASKS.get(mode)
-        # Largest lambda h f. It is less with a null space: loops of P K P are unstable earlier in
-        # some postures.
-        self._most = 1.0 if self._rows is None else 0.5
+        # Less with a null space: loops of P K P are unstable earlier in some postures.
+        self._largest_product = 1.0 if self._rows is None else 0.5
         self.law: IntegralLaw
         if self._rows is None:
             self.law = IntegralFeedback(settings)
@@ -149,20 +143,25 @@ class IntegralAction(FadingTorque):
     def reset(self) -> None:
         """See `FadingTorque`."""
         super().reset()
-        self._lowered = self._checked = 0
-        self._use(self.settings)
+        self._stable = StableGain(self._largest_product)
+        self._asked = self.law.settings = self.settings
         self._started = self._lost = self._resuming = False
         self._q_last = self._v_last = self._zero
+
+    @property
+    def gain(self) -> float:
+        """See `FadingTorque`."""
+        return self.law.settings.gain
 
     def forget(self) -> None:
         """See `FadingTorque`."""
         self._started = False
         self._resuming = True
 
-    def torque(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> Array:
+    def torque(self, robot: RobotModel, a_last: Array, elapsed: float) -> Array:
         """See `FadingTorque`."""
         try:
-            torque = self._next(robot, v, a_last, elapsed)
+            torque = self._next(robot, a_last, elapsed)
         except ValueError:  # numbers that are not finite, or no mass matrix
             self._lost = True
             torque = None
@@ -174,27 +173,27 @@ class IntegralAction(FadingTorque):
         self.saturated = self.law.saturated
         return self.last
 
-    def resume(self, robot: RobotModel, v: Array, torque: Array) -> None:
+    def resume(self, robot: RobotModel, torque: Array) -> None:
         """See `FadingTorque`."""
         self._started = False
-        self._checked = 0
-        self._use(self._stable(robot.M, robot.dt))
-        self._hold(robot, v, torque)
+        self._stable.check_next()
+        self.law.settings = self._wanted(robot)
+        self._hold(robot, torque)
         self.last = torque
 
-    def _next(self, robot: RobotModel, v: Array, a_last: Array, elapsed: float) -> Array | None:
+    def _next(self, robot: RobotModel, a_last: Array, elapsed: float) -> Array | None:
         """Return the torque of this step; None where the state jumped."""
-        arm, law = self._arm(robot, v), self.law
+        arm, law = self._arm(robot), self.law
         if not self._started:
             self._start(robot, arm)
         known = 0.0 < elapsed <= LONGEST_GAP * robot.dt and not self._lost
-        last = self._q_last, robot.q, self._v_last, v
+        last = self._q_last, robot.q, self._v_last, robot.v
         jumped = known and _jumped(arm.M, *last, a_last, elapsed, self._disturbance_max)
         self._lost = False
-        self._q_last, self._v_last = robot.q.copy(), v.copy()
+        self._q_last, self._v_last = robot.q.copy(), robot.v.copy()
         if jumped or not known:
             law.skip(arm, elapsed if 0.0 <= elapsed < math.inf else 0.0)
-            self._checked = 0  # the posture may be any
+            self._stable.check_next()
         if jumped:
             return None
         if known:
@@ -207,43 +206,27 @@ class IntegralAction(FadingTorque):
             self._resuming = False
             self._fading = self.last - torque
         torque = torque + self._faded(elapsed, robot.dt)
-        settings = self._stable(arm.M, robot.dt)
+        settings = self._wanted(robot)
         if settings is not law.settings:
-            self._use(settings)
-            self._hold(robot, v, torque)
+            law.settings = settings
+            self._hold(robot, torque)
         return torque
 
-    def _stable(self, M: Array, period: float) -> IntegralSettings:
-        """Return the settings with a gain that is stable here.
-
-        It is lowered by powers of sqrt(2), so that it changes seldom, and is the same for
-        `_CHECK_EVERY` steps, as the posture is nearly.
-        """
+    def _wanted(self, robot: RobotModel) -> IntegralSettings:
+        """Return the settings with a gain that is stable here; those in use unless they differ."""
         asked, used = self.settings, self.law.settings
-        self._checked -= 1
-        if self._checked >= 0 and asked is self._asked:
-            return used
-        self._checked = _CHECK_EVERY - 1
-        share = asked.gain * period * coupling(M) / self._most
-        if 0.0 < share < math.inf:
-            steps = 2.0 * math.log2(share)
-            if not steps <= self._lowered <= steps + 1.0 + _ROOM_TO_RAISE:
-                self._lowered = max(0, math.ceil(steps))
-        gain = asked.gain * 2.0 ** (-0.5 * self._lowered)
-        if gain == used.gain and (asked is self._asked or asked.same_as(self._asked)):
+        gain = self._stable.gain(asked.gain, robot.M, robot.dt)
+        if asked is not self._asked:
             self._asked = asked
-            return used
-        return asked if gain == asked.gain else replace(asked, gain=gain)
+            if not asked.same_as(replace(used, gain=asked.gain)):
+                return replace(asked, gain=gain)
+        return used if gain == used.gain else replace(used, gain=gain)
 
-    def _use(self, settings: IntegralSettings) -> None:
-        self._asked, self.law.settings = self.settings, settings
-        self.gain = settings.gain
-
-    def _hold(self, robot: RobotModel, v: Array, torque: Array) -> None:
+    def _hold(self, robot: RobotModel, torque: Array) -> None:
         """Let the memory give `torque` now; what it cannot give fades."""
         held = self._zero
         try:
-            arm = self._arm(robot, v)
+            arm = self._arm(robot)
             if not self._started:
                 self._start(robot, arm)
             held = self.law.initialise(torque, arm)
@@ -257,17 +240,17 @@ class IntegralAction(FadingTorque):
         self._q_last, self._v_last = robot.q.copy(), arm.v.copy()
         self._started, self._lost = True, False
 
-    def _arm(self, robot: RobotModel, v: Array) -> ArmTerms:
+    def _arm(self, robot: RobotModel) -> ArmTerms:
         """Return what the law needs to know of the arm."""
         rows = self._rows
         if rows is None:
-            return ArmTerms(robot.M, robot.C, robot.J, robot.J_dot, v)
+            return ArmTerms(robot.M, robot.C, robot.J, robot.J_dot, robot.v)
         J, J_dot = robot.J[rows], robot.J_dot[rows]
         if robot.others:
             hands = (robot, *robot.others)
             J = np.concatenate([hand.J[rows] for hand in hands])
             J_dot = np.concatenate([hand.J_dot[rows] for hand in hands])
-        return ArmTerms(robot.M, robot.C, J, J_dot, v)
+        return ArmTerms(robot.M, robot.C, J, J_dot, robot.v)
 
 
 class Integral(Part):
@@ -299,14 +282,14 @@ class Integral(Part):
         if step.order.forget_integral:
             action.forget()
         before, time = action.last, step.elapsed if step.order.obeyed else math.inf
-        torque = action.torque(step.robot, step.robot.v, step.a_last, time)
+        torque = action.torque(step.robot, step.a_last, time)
         step.torque = step.torque + torque
         if torque is not before:
             step.integral_change = torque - before
 
     def resume(self, step: Step, torque: Array) -> None:
         """See `Part.resume`."""
-        self.action.resume(step.robot, step.robot.v, torque)
+        self.action.resume(step.robot, torque)
 
     def report(self) -> dict[str, Any]:
         """See `Part.report`."""
@@ -324,24 +307,6 @@ def make_integral(
     if mode == "none":
         return FadingTorque(settings)
     return IntegralAction(mode, settings, disturbance_max, hands)
-
-
-def coupling(M: Array) -> float:
-    """Return the largest eigenvalue f of M^-1 D, D = diag(M); NaN where M is no mass matrix.
-
-    With K = lambda D the errors s of the speeds of an ideal arm become
-
-        s_next = (I - lambda h M^-1 D) s
-
-    in a period h: they grow where lambda h f > 2, and change sign where it is above 1. A joint
-    alone has f = 1; coupled ones have more, those of Panda in its worst posture 77.
-    """
-    inertia = np.diagonal(M)
-    if not (math.isfinite(M.sum()) and inertia.min() > 0.0):
-        return math.nan
-    root = np.sqrt(inertia)
-    least = float(np.linalg.eigvalsh(M / np.outer(root, root))[0])
-    return 1.0 / least if least > 0.0 else math.nan
 
 
 @njit(cache=True)

@@ -29,6 +29,7 @@ from torque_safety_controller.qp.solvers import (
     SOLVERS,
     DaqpSolver,
     ProxqpSolver,
+    Solver,
     Status,
     first_to_solve,
 )
@@ -78,7 +79,10 @@ class InverseDynamicsQP:
         # Limits that leave next to no room are DAQP's in any case: ProxQP can hardly solve those.
         self._relaxed_solvers = tuple(solvers.values())
         self._solvers = (solvers.pop(solver), *solvers.values())
-        self._relaxing_solvers = (*map(DaqpSolver, _PROXIMAL), ProxqpSolver())
+        self._relaxing_solvers: tuple[Solver, ...] = (
+            *map(DaqpSolver, _PROXIMAL),
+            ProxqpSolver(),
+        )
 
     def build(
         self,
@@ -117,7 +121,8 @@ class InverseDynamicsQP:
             )
         if B.shape != (n, r):
             raise ValueError(f"forces on {n} joints with B {B.shape}, rho_max {rho_max.shape}")
-        greatest = max([0.0, *(task.weight for task in (*tasks, *wrench_tasks))])
+        weights = [task.weight for task in tasks] + [task.weight for task in wrench_tasks]
+        greatest = max([0.0, *weights])
         if greatest == 0.0:
             raise NoSolutionFound("no task with a weight above 0")
         # Mostly one task is of the joints: it is written at once.
@@ -139,14 +144,10 @@ class InverseDynamicsQP:
             elif task is not joints:
                 H[range(n), range(n)] += task.weight / greatest
                 g[:n] -= task.weight / greatest * task.b
-        for W, F_des, weight, first in wrench_tasks:
-            rows, columns = W.shape
-            if F_des.shape != (rows,) or not 0 <= first <= r - columns:
-                raise ValueError(
-                    f"wrench task with W {W.shape} from force {first} of {r} on, "
-                    f"F_des {F_des.shape}"
-                )
-            _add_least_squares(H, g, W, F_des, weight / greatest, n + first)
+        for W, F_des, weight in wrench_tasks:
+            if W.shape != (*F_des.shape, r):
+                raise ValueError(f"wrench task of {r} forces, W {W.shape}, F_des {F_des.shape}")
+            _add_least_squares(H, g, W, F_des, weight / greatest, n)
         return QuadraticProgram(H, g, C, lower, upper)
 
     def solve(self, program: QuadraticProgram) -> Solution:

@@ -45,12 +45,10 @@ class WrenchTerm(NamedTuple):
     """The term ``weight * |W rho - F_des|^2`` of the cost: [Benallegue2021], III-E (a)."""
 
     W: Array
-    """Shape (m, r): what rho >= 0 means as a wrench, or as some components of it."""
+    """Shape (m, r): what rho >= 0 means as a wrench, or as some components of one."""
     F_des: Array
     """Shape (m,), N and N m: what the environment should exert on the link."""
     weight: float
-    first: int
-    """Where the r coefficients begin among those of all contacts."""
 
 
 class AccelerationRange(NamedTuple):
@@ -137,9 +135,9 @@ class NoSolutionFound(ArmSafetyError, RuntimeError):
         self.program = program
 
 
-def stack_constraints(parts: Sequence[LinearConstraints | None]) -> LinearConstraints | None:
+def stack_constraints(parts: Sequence[LinearConstraints]) -> LinearConstraints | None:
     """Return all constraints as one, in order; None without any."""
-    given = [part for part in parts if part is not None and len(part.G)]
+    given = [part for part in parts if len(part.G)]
     if len(given) < 2:
         return given[0] if given else None
     return LinearConstraints(*(np.concatenate(each) for each in zip(*given, strict=True)))

@@ -103,4 +103,4 @@ class FrictionContact:
         )
         W = self.W if self.exerts_moments else self.W[:3]
         rho_max = np.full(W.shape[1], np.inf)
-        return ContactForces(J.T @ self.W, rho_max, [WrenchTerm(W, F_des[: len(W)], weight, 0)])
+        return ContactForces(J.T @ self.W, rho_max, [WrenchTerm(W, F_des[: len(W)], weight)])
