@@ -270,7 +270,7 @@ def test_no_torque_steps_where_commands_are_lost_while_states_come(ros, robot):
     """In motion to limits, for 0.6 s; the robot stops itself meanwhile."""
     arm = chain(ros, robot, command_timeout=2)
     values, path, taus = read_config(robot, "bullet_node"), arm._commands.path, []
-    arriving, begin = path.arriving, arm._next_state
+    send, begin = path.send, arm._next_state
     rate, tau_max = values["rate_hz"], np.array(values["torque_max"])
     lost = False
 
@@ -282,7 +282,7 @@ def test_no_torque_steps_where_commands_are_lost_while_states_come(ros, robot):
         end = arm._periods + round(seconds * rate)
         ros.wait_until(lambda: arm._periods >= end, "control periods", timeout=60.0)
 
-    path.arriving = lambda sent: arriving(None if lost else sent)
+    path.send = lambda command, age=0: lost or send(command, age)
     arm._next_state = watched_begin
     user = ros.talk(JointState, "target_posture", GOAL_QOS)
     rng = np.random.default_rng(1)

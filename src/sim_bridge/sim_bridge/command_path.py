@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -11,10 +10,6 @@ import numpy as np
 from sim_bridge.hardware import Imperfections, RandomStream
 
 Command = TypeVar("Command")
-
-
-class _Lost:
-    """A command that was lost."""
 
 
 class CommandPath(Generic[Command]):
@@ -28,7 +23,7 @@ class CommandPath(Generic[Command]):
 
     Attributes:
         missed: number of commands lost on purpose.
-        absent: whether none had come for the period that `arriving` was last called for.
+        absent: whether none had come for the last period.
     """
 
     def __init__(self, imperfections: Imperfections) -> None:
@@ -37,50 +32,37 @@ class CommandPath(Generic[Command]):
             np.random.default_rng([given.imperfection_seed, stream])
             for stream in (RandomStream.MISSED_DEADLINES, RandomStream.OUTAGES)
         )
-        # None where no command has come yet.
-        self._queue: deque[Command | _Lost | None] = deque([None] * given.command_delay)
+        # By the number of the period whose state they answer; None for one that was lost.
+        self._sent: dict[int, Command | None] = {}
+        self._period = 0  # the next one to be simulated
         self._missed_in_row = self._outage_left = self.missed = 0
         self.absent = True
 
-    def arriving(self, sent: Command | None) -> Command | None:
-        """Return the command that acts in this period.
+    def send(self, command: Command, age: int = 0) -> bool:
+        """Add a command.
 
         Args:
-            sent: the command that has come in it; None if there is none.
-
-        Returns:
-            The answer to the state of `command_delay` periods ago; None if there was none, or it
-            was lost.
-        """
-        self._queue.append(None if sent is None else self._send(sent))
-        due = self._queue.popleft()
-        self.absent = due is None
-        return None if isinstance(due, _Lost) else due
-
-    def insert_late(self, sent: Command, periods: int, *, ended: bool) -> bool:
-        """Add the answer to a state of an earlier period.
-
-        Args:
-            sent: the command.
-            periods: how many periods ago, above 0.
-            ended: whether `arriving` has been called for this period.
+            command: that has come.
+            age: number of periods from the state that it answers to the next to be simulated.
 
         Returns:
             Whether it can still act; not if it comes for the second time, either.
         """
-        k = len(self._queue) - periods - ended
-        if k < 0 or self._queue[k] is not None:
+        answered = self._period - age
+        if age > self._given.command_delay or answered in self._sent:
             return False
-        self._queue[k] = self._send(sent)
+        missed, in_outage = self._misses_period(), self._in_outage()
+        lost = missed or in_outage
+        self.missed += lost
+        self._sent[answered] = None if lost else command
         return True
 
-    def _send(self, command: Command) -> Command | _Lost:
-        """Return a command, or `_Lost` where it misses its period or falls into an outage."""
-        missed, in_outage = self._misses_period(), self._in_outage()
-        if not (missed or in_outage):
-            return command
-        self.missed += 1
-        return _Lost()
+    def due(self) -> Command | None:
+        """Return the command that acts in the next period; None if it is absent or was lost."""
+        answered = self._period - self._given.command_delay
+        self._period += 1
+        self.absent = answered not in self._sent
+        return self._sent.pop(answered, None)
 
     def _misses_period(self) -> bool:
         """Return whether the next command misses its period, never too many in a row."""

@@ -199,6 +199,7 @@ class BulletNode(ArmNode):
         config = self._config
         self._world.apply_due(self._stamp)
         commands = self._commands
+        commands.proceed()
         command = commands.acting
         if not self._robot.finite:  # after a push beyond all measure: no law stops that
             self._robot.brake(config.substeps, config.torque_max)
@@ -235,7 +236,6 @@ class BulletNode(ArmNode):
             # A real robot would have gone on.
             self._late += max(0, round(took / dt) - 1)
         if not self._advanced:
-            self._commands.receive(None)
             self._advance()
         self._next_state()
 

@@ -66,7 +66,7 @@ class CommandStream:
     def accept(
         self, message: JointState, stamp: int, published_at: float, *, ended: bool, paused: bool
     ) -> bool:
-        """Check a message, and let its command act if it is for this period.
+        """Check a message, and keep its command until it acts.
 
         Args:
             message: that has come.
@@ -76,36 +76,28 @@ class CommandStream:
             paused: whether no command is obeyed.
 
         Returns:
-            Whether it is the command for this period, which then acts.
+            Whether it is the command for this period.
         """
         own = stamp_to_ns(message.header.stamp)
         age, rest = divmod(stamp - own, self._dt_ns)
-        late = 0 < age <= self._config.imperfections.command_delay and not self._config.lockstep
-        if rest or not (late or (age == 0 and not ended)):
-            if not paused:
-                self._count_stray(own, stamp)
-            return False
         if paused:
+            return False
+        if rest or not 0 <= age <= self._config.imperfections.command_delay:
+            self._count_stray(own, stamp)
             return False
         command = self._read(message)
         if command is None:
             return False
-        if late and not self.path.insert_late(command, age, ended=ended):
+        if not self.path.send(command, age + ended):
             self._count_stray(own, stamp)
             return False
         self._strays = 0
         self.latencies.add(time.monotonic() - published_at + age * self._config.dt)
-        if not late:
-            self.receive(command)
-        return not late
+        return bool(age == 0)
 
-    def receive(self, sent: JointCommand | None) -> None:
-        """Apply the command that arrives in the present period, or hold the last one.
-
-        Args:
-            sent: the command that was sent in it; None if there is none.
-        """
-        arrived = self.path.arriving(sent)
+    def proceed(self) -> None:
+        """Apply the command that is due in the present period, or hold the last one."""
+        arrived = self.path.due()
         if arrived is not None:
             self.acting, self.commanded = arrived, True
             self.missed_in_row = 0

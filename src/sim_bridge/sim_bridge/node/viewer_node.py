@@ -6,22 +6,19 @@ from __future__ import annotations
 import logging
 import math
 import os
-import signal
 import socket
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from numpy.typing import NDArray
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
@@ -32,7 +29,7 @@ from sim_bridge.node.topics import EXTERNAL_WRENCH
 from sim_bridge.viewer.joint_pictures import JointValues
 from sim_bridge.viewer.page import DrivingAsked, GoalAsked, Page, PushAsked, Request
 from sim_bridge.viewer.shapes import visual_shapes
-from viability_bounds_pkg.exceptions import ArmSafetyError, SettingError
+from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.node.bounds_parameters import BoundsConfiguration, limits_of
 from viability_bounds_pkg.parameter import Range, redeclared, text, whole_number
@@ -45,14 +42,9 @@ from viability_bounds_pkg.robot.description import RobotDescriptionError
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.messages import JointStateReader, pose_message
 from viability_bounds_pkg.ros.parameters import NodeParameters
-from viability_bounds_pkg.ros.program import (
-    initialise,
-    leave,
-    node_parser,
-    report_refusal,
-)
+from viability_bounds_pkg.ros.program import node_parser, run_together
 from viability_bounds_pkg.ros.robot_urdf import robot_urdf
-from viability_bounds_pkg.ros.runtime import GOAL_QOS
+from viability_bounds_pkg.ros.runtime import GOAL_QOS, steady_timer
 from viability_bounds_pkg.ros.topics import (
     DIAGNOSTICS,
     SLOW_ACCELERATION_LIMITS,
@@ -170,7 +162,6 @@ class ViewerNode(ArmNode):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__(**node_arguments)
-        self._commands: PageCommands | None = None
         with self.starting():
             config = NodeParameters(self, ViewerConfiguration).configuration
             self.page = _make_page(config, robot_urdf(config, self))
@@ -186,11 +177,12 @@ class ViewerNode(ArmNode):
         SLOW_ACCELERATION_LIMITS.subscription(self, self._on_limits)
         DIAGNOSTICS.subscription(self, self._on_diagnostics)
         self.create_subscription(PoseStamped, "target_pose", self._on_goal, GOAL_QOS)
+        steady_timer(self, PERIOD, self.update_page)
         self.get_logger().info(f"page at {self.page.address}")
 
     def destroy_node(self) -> None:
         """End the user's pushes and close the page, too."""
-        if self._commands is not None:
+        if hasattr(self, "_commands"):
             self._commands.stop()
             self.page.close()
         super().destroy_node()
@@ -198,8 +190,7 @@ class ViewerNode(ArmNode):
     def update_page(self) -> None:
         """Send what the user asked for, and show what is known."""
         for request in self.page.requests():
-            if self._commands is not None:
-                self._commands.send(request)
+            self._commands.send(request)
         if self._reader.accepted == 0:
             self.page.show_text(self._status_text())
             return
@@ -225,7 +216,7 @@ class ViewerNode(ArmNode):
     def _status_text(self) -> str:
         lines = []
         if time.monotonic() - self._reader.heard_at > _SILENT:
-            if self._commands is not None and self._commands.robot_paused:
+            if self._commands.robot_paused:
                 return "the simulated robot is paused"
             lines.append("**`bounds_node` sends no joint states**")
         message, controller = self._status.get("controller_node", ("not heard", {}))
@@ -258,7 +249,7 @@ class ViewerNode(ArmNode):
             name = status.name.rpartition("/")[2]
             values = {value.key: value.value for value in status.values}
             self._status[name] = status.message, values
-            if name == "bullet_node" and self._commands is not None:
+            if name == "bullet_node":
                 self._commands.robot_paused = values.get("paused") == "True"
 
 
@@ -300,23 +291,6 @@ def _make_page(config: ViewerConfiguration, urdf: str) -> Page:
     )
 
 
-def run(node: ViewerNode, ended: Callable[[], bool]) -> None:
-    """Read messages and show pictures until `ended`.
-
-    Between two pictures nothing is read, so that of each stream only the newest message counts.
-    """
-    executor = SingleThreadedExecutor(context=node.context)
-    executor.add_node(node)
-    while not ended() and rclpy.ok(context=node.context):
-        start = time.monotonic()
-        # Each call takes one message; goals and diagnostics of all nodes may wait.
-        for _ in range(len(list(node.subscriptions)) + 10):
-            executor.spin_once(timeout_sec=0.0)
-        node.update_page()
-        time.sleep(max(0.0, start + PERIOD - time.monotonic()))
-    executor.remove_node(node)
-
-
 def _lower_priority() -> None:
     """Give all threads idle priority, so that the control has precedence.
 
@@ -330,22 +304,14 @@ def _lower_priority() -> None:
 
 def main(args: list[str] | None = None) -> int:
     """Serve the page until SIGINT or SIGTERM comes; return the exit code."""
-    node = None
-    try:
-        initialise(node_parser(ViewerNode), args)
-        signals: list[int] = []
-        for each in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(each, lambda number, _: signals.append(number))
+
+    def make_nodes() -> Iterator[ArmNode]:
         node = ViewerNode()
+        yield node
         print(f"the arm is at {node.page.address}", flush=True)
         _lower_priority()
-        run(node, lambda: bool(signals))
-    except ArmSafetyError as error:
-        report_refusal(error)
-        return 1
-    finally:
-        leave(*filter(None, [node]))
-    return 0
+
+    return run_together(node_parser(ViewerNode), make_nodes, args)
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ from sim_bridge.node.bullet_parameters import (
     BulletConfiguration,
     make_robot,
 )
-from viability_bounds_pkg.cli.command_line import Parser, positive, run_tool
+from viability_bounds_pkg.cli.command_line import Parser, run_tool
 from viability_bounds_pkg.cli.limits_file import check_writable, write_whole
 from viability_bounds_pkg.exceptions import ArmSafetyError
 from viability_bounds_pkg.parameter_files import ParameterFileError, read_files
@@ -94,35 +94,15 @@ def excitation(
     return np.vstack(q), np.vstack(v)
 
 
-def _share(text: str) -> float:
-    value = float(text)
-    if not 0.0 < value <= 1.0:
-        raise argparse.ArgumentTypeError(f"must be above 0 and at most 1, is {text}")
-    return value
-
-
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = Parser(
         prog="record_excitation",
         description="Move the joints of the simulated robot, slowly and fast, each way, under "
         "position control by its drives, and record it for identify_friction.",
     )
-    add = parser.add_argument
-    add("parameters", type=Path, help="the robot's parameter file (ROS 2 YAML)")
-    add("-o", "--output", type=Path, required=True, help="recording to write (.npz)")
-    add(
-        "--amplitude",
-        type=positive,
-        default=0.6,
-        metavar="RAD",
-        help="how far a joint moves at most (default: %(default)s)",
-    )
-    add(
-        "--speed",
-        type=_share,
-        default=0.5,
-        metavar="SHARE",
-        help="how fast, in velocity limits, at most (default: %(default)s)",
+    parser.add_argument("parameters", type=Path, help="the robot's parameter file (ROS 2 YAML)")
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, help="recording to write (.npz)"
     )
     return parser.parse_args(arguments)
 
@@ -132,9 +112,7 @@ def _run(options: argparse.Namespace) -> int:
     if options.output.resolve() == options.parameters.resolve():
         raise ParameterFileError(f"{options.output} is read, and cannot be written too")
     config = read_files(BulletConfiguration, [options.parameters], "/**/bullet_node")
-    motion = excitation(
-        config, config.start_positions, config.dt, options.amplitude, options.speed
-    )
+    motion = excitation(config, config.start_positions, config.dt)
     with closing(make_robot(config)) as robot:
         recorded, monitor = record(robot, config, *motion)
     broken = np.flatnonzero(

@@ -26,7 +26,10 @@ class Robot:
 
     def takes(self, stamp, tau=TAU, *, ended=False, paused=False):
         message = joint_state(JOINTS, stamp, tau=tau)
-        return self.stream.accept(message, NOW, 0.0, ended=ended, paused=paused)
+        now = self.stream.accept(message, NOW, 0.0, ended=ended, paused=paused)
+        if now:
+            self.stream.proceed()
+        return now
 
 
 def test_the_command_of_the_period_acts_and_is_clipped():
@@ -51,6 +54,7 @@ def test_one_for_another_period_is_counted_and_told_when_no_other_comes(stamp):
 
 def test_one_that_comes_twice_is_for_no_period():
     robot = Robot()
+    robot.stream.proceed()
     assert not robot.takes(NOW, ended=True)
     assert robot.refused == {"not for this period": 1}
 
@@ -58,14 +62,14 @@ def test_one_that_comes_twice_is_for_no_period():
 def test_a_late_one_acts_when_it_would_have_acted_anyhow():
     robot = Robot(command_delay=2)
     stream = robot.stream
-    stream.receive(None)
+    stream.proceed()
     assert not robot.takes(NOW - PERIOD)  # it does not end the period
     assert not robot.refused
     assert not robot.takes(NOW - PERIOD)  # for the second time
     assert robot.refused == {"not for this period": 1}
-    stream.receive(None)
+    stream.proceed()
     assert stream.acting is None
-    stream.receive(None)
+    stream.proceed()
     np.testing.assert_array_equal(stream.acting.tau, TAU)
 
 
@@ -89,9 +93,9 @@ def test_the_last_one_is_held_for_the_time_out():
     robot = Robot(command_timeout=3)
     assert robot.takes(NOW)
     for _ in range(3):
-        robot.stream.receive(None)
+        robot.stream.proceed()
         assert robot.stream.acting is not None
-    robot.stream.receive(None)
+    robot.stream.proceed()
     assert robot.stream.acting is None
     assert (robot.stream.missed, robot.stream.missed_in_row) == (4, 4)
     assert robot.said == ["no command for 4 periods: stopping until they are back"]
@@ -104,4 +108,5 @@ def test_positions_are_commands_too():
     message = joint_state(JOINTS, NOW, Q)
     message.velocity = []
     assert robot.stream.accept(message, NOW, 0.0, ended=False, paused=False)
+    robot.stream.proceed()
     np.testing.assert_array_equal(robot.stream.acting.q, Q)

@@ -51,7 +51,7 @@ def lost(probability, longest, seed):
         missed_probability=probability, missed_in_row=longest, imperfection_seed=seed
     )
     path = CommandPath(given)
-    return [path.arriving(k) is None for k in range(100)]
+    return [path.send(k) and path.due() is None for k in range(100)]
 
 
 def torques(count, seed=0):
