@@ -135,21 +135,18 @@ class Imperfections:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters that make a difference."""
-        return tuple(each.name for each in fields(self) if self._is_on(each.name))
-
-    def _is_on(self, name: str) -> bool:
-        value = getattr(self, name)
-        if name in ("missed_in_row", "outage_longest", "imperfection_seed"):
-            return False
-        return value != "exact" if isinstance(value, str) else bool(np.any(value))
+        named = ((each.name, getattr(self, each.name)) for each in fields(self))
+        on = {n: v != "exact" if isinstance(v, str) else bool(np.any(v)) for n, v in named}
+        return tuple(name for name in on if on[name] and name not in _DETAILS)
 
     @property
     def of_motors(self) -> bool:
         """Whether torques differ from those asked for."""
-        return any(map(self._is_on, _MOTORS))
+        return not _MOTORS.isdisjoint(self.names)
 
 
-_MOTORS = "motor_bandwidth", "torque_constant_error", "torque_ripple", "current_noise"
+_MOTORS = {"motor_bandwidth", "torque_constant_error", "torque_ripple", "current_noise"}
+_DETAILS = {"missed_in_row", "outage_longest", "imperfection_seed"}  # without effect alone
 
 
 class RandomStream(IntEnum):

@@ -30,7 +30,7 @@ from viability_bounds_pkg.plausible import RESTART_GAP
 from viability_bounds_pkg.recent_values import RecentValues
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.diagnostics import Diagnostics
-from viability_bounds_pkg.ros.messages import PositionCommand, TorqueCommand
+from viability_bounds_pkg.ros.messages import PositionCommand, TorqueCommand, wrench_message
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.robot_urdf import warn_of_unusual
@@ -176,18 +176,12 @@ class BulletNode(ArmNode):
         if self._clock_publisher is not None:
             self._clock_publisher.publish(ClockMessage(clock=state.header.stamp))
         if self._ft_publisher and self._sensor:  # first: subscribers use it with the state
-            self._ft_wrench = self._wrench_message(self._sensor.read())
+            wrench = self._sensor.read()
+            frame = self._config.sensor.ft_frame
+            self._ft_wrench = wrench_message(frame, wrench[:3], wrench[3:], self._stamp)
             self._ft_publisher.publish(self._ft_wrench)
         self._published_at = time.monotonic()
         self._state_publisher.publish(state)
-
-    def _wrench_message(self, wrench: Array) -> WrenchStamped:
-        message = WrenchStamped()
-        message.header.frame_id = self._config.sensor.ft_frame
-        set_stamp(message.header.stamp, self._stamp)
-        f, t = message.wrench.force, message.wrench.torque
-        f.x, f.y, f.z, t.x, t.y, t.z = wrench.tolist()
-        return message
 
     def _true_state(self) -> tuple[Array, Array, Array]:
         """Return the state of the joints, and the torques that the drives believe to give."""

@@ -6,8 +6,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import pinocchio as pin
-from geometry_msgs.msg import PoseStamped, Transform, Twist, WrenchStamped
+from geometry_msgs.msg import Transform, Twist
 from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -31,6 +32,7 @@ from sim_bridge.scenario.events import (
 )
 from sim_bridge.scenario.scenario import Scenario
 from viability_bounds_pkg.pose_trajectory import TrajectoryPoint
+from viability_bounds_pkg.ros.messages import pose_message, wrench_message
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp
 
 _IN_FLIGHT_MAX = GOAL_QOS.depth - 2
@@ -134,11 +136,8 @@ def _delay(time: float) -> int:
 
 def _goal(event: Goal, base_frame: str, end_effector_frame: str) -> ScheduledMessage:
     if isinstance(event, PoseGoal):
-        message = PoseStamped()
-        message.header.frame_id = base_frame
-        p, o = message.pose.position, message.pose.orientation
-        p.x, p.y, p.z = event.position
-        o.x, o.y, o.z, o.w = event.orientation
+        pose = pin.XYZQUATToSE3(np.array([*event.position, *event.orientation]))
+        message = pose_message(pose, base_frame)
         topic = "target_pose"
     elif isinstance(event, PostureGoal):
         positions = event.positions
@@ -152,7 +151,7 @@ def _goal(event: Goal, base_frame: str, end_effector_frame: str) -> ScheduledMes
         message.header.frame_id = base_frame
         topic = "target_trajectory"
     else:
-        message = _wrench(event.frame or end_effector_frame, event.force, event.torque)
+        message = wrench_message(event.frame or end_effector_frame, event.force, event.torque)
         topic = "target_wrench"
     return ScheduledMessage(topic, message, message.header, _delay(event.time))
 
@@ -172,17 +171,8 @@ def _point(point: TrajectoryPoint) -> MultiDOFJointTrajectoryPoint:
     return message
 
 
-def _wrench(frame: str, force: tuple[float, ...], torque: tuple[float, ...]) -> WrenchStamped:
-    message = WrenchStamped()
-    message.header.frame_id = frame
-    f, t = message.wrench.force, message.wrench.torque
-    f.x, f.y, f.z = force
-    t.x, t.y, t.z = torque
-    return message
-
-
 def _push(push: Push) -> ScheduledMessage:
-    message = _wrench(push.link, push.force, push.torque)
+    message = wrench_message(push.link, push.force, push.torque)
     return ScheduledMessage("external_wrench", message, message.header, _delay(push.time))
 
 

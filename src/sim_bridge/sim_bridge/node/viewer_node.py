@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped, WrenchStamped
+from geometry_msgs.msg import PoseStamped
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -40,7 +40,7 @@ from viability_bounds_pkg.robot.configuration import (
 )
 from viability_bounds_pkg.robot.description import RobotDescriptionError
 from viability_bounds_pkg.ros.arm_node import ArmNode
-from viability_bounds_pkg.ros.messages import JointStateReader, pose_message
+from viability_bounds_pkg.ros.messages import JointStateReader, pose_message, wrench_message
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import node_parser, run_together
 from viability_bounds_pkg.ros.robot_urdf import robot_urdf
@@ -138,11 +138,7 @@ class PageCommands:
     def _push(self, link: str, force: Array) -> None:
         if self._wrenches is None:
             return
-        message = WrenchStamped()
-        message.header.frame_id = link
-        f = message.wrench.force
-        f.x, f.y, f.z = force.tolist()
-        self._wrenches.publish(message)
+        self._wrenches.publish(wrench_message(link, force))
         (self._pushed.add if force.any() else self._pushed.discard)(link)
 
 

@@ -6,13 +6,13 @@ from __future__ import annotations
 import math
 from array import array
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, WrenchStamped
 from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 
@@ -278,4 +278,24 @@ def pose_message(pose: pin.SE3, frame: str = "", stamp: int = 0) -> PoseStamped:
     p, o = message.pose.position, message.pose.orientation
     p.x, p.y, p.z = pose.translation.tolist()
     o.x, o.y, o.z, o.w = pin.Quaternion(pose.rotation).coeffs().tolist()
+    return message
+
+
+def wrench_message(
+    frame: str, force: Iterable[float], torque: Iterable[float] = (0.0, 0.0, 0.0), stamp: int = 0
+) -> WrenchStamped:
+    """Return a wrench as a message.
+
+    Args:
+        frame: its frame.
+        force: three numbers, N.
+        torque: three numbers, N m.
+        stamp: ns.
+    """
+    message = WrenchStamped()
+    message.header.frame_id = frame
+    set_stamp(message.header.stamp, stamp)
+    f, t = message.wrench.force, message.wrench.torque
+    f.x, f.y, f.z = map(float, force)
+    t.x, t.y, t.z = map(float, torque)
     return message

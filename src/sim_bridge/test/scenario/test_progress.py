@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-from sim_bridge.node import scenario_node
-from sim_bridge.node.scenario_node import Progress
+from sim_bridge.scenario import progress as module
+from sim_bridge.scenario.progress import Progress
 
 
 def test_it_prints_a_line_for_each_quarter_and_what_it_waits_for(capsys, monkeypatch):
     now = [0.0]
-    monkeypatch.setattr(scenario_node.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
     progress = Progress(8.0)
     for _ in range(200):
         now[0] += 0.1
