@@ -13,11 +13,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from torque_safety_controller.parts.collision.distances import (
-    Features,
-    find_features,
-    move_segments,
-)
+from torque_safety_controller.parts.collision.distances import find_features, move_segments
 from torque_safety_controller.parts.collision.model import CollisionModel
 from torque_safety_controller.parts.collision.rows import BRAKING, RESERVE, SPEED_MAX, write_rows
 from torque_safety_controller.qp import LinearConstraints
@@ -115,11 +111,8 @@ class Collision(Part):
         self._limits = np.zeros((4, n))
         self._limits[0] = np.minimum(-np.asarray(a_min), a_max)
         # A row more than there are distances: what is not kept is written, too.
-        self._features = Features(
-            pair=np.zeros(most + 1, dtype=np.int64),
-            line=np.zeros((most + 1, 6)),
-            motion=np.zeros((most + 1, 3)),
-        )
+        self._pair = np.zeros(most + 1, dtype=np.int64)
+        self._line, self._motion = np.zeros((most + 1, 6)), np.zeros((most + 1, 3))
         self._G, self._lower = np.zeros((most + 1, n)), np.zeros(most + 1)
         self._source = np.zeros(most + 1, dtype=np.int64)
         self._viable = np.zeros(most + 1, dtype=bool)
@@ -180,7 +173,8 @@ class Collision(Part):
 
         Values that are not finite are the caller's to refuse.
         """
-        arm, segments, features = self.model.arm, self.model.segments, self._features
+        arm, segments = self.model.arm, self.model.segments
+        features = self._pair, self._line, self._motion
         kept, dt = self.margin + RESERVE, self.dt
         pin.computeJointJacobiansTimeVariation(arm, self._data, q, v)
         np.concatenate(self._views, out=self._placements.reshape(-1, 3))
@@ -200,14 +194,14 @@ class Collision(Part):
         )  # fmt: skip
         chosen: slice | NDArray[np.int64] = slice(k)
         if k > self.rows_max:
-            distances = features.motion[self._source[:k], 0]
+            distances = self._motion[self._source[:k], 0]
             chosen = np.sort(np.argpartition(distances, self.rows_max)[: self.rows_max])
         source = self._source[chosen]
-        distance, rate, bias = features.motion[source].T
+        distance, rate, bias = self._motion[source].T
         return CollisionRows(
             G=self._G[chosen],
             lower=self._lower[chosen],
-            pair=features.pair[source],
+            pair=self._pair[source],
             distance=distance,
             rate=rate,
             bias=bias,

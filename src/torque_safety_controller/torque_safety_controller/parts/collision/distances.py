@@ -10,7 +10,6 @@ positions, velocities and accelerations in between are interpolated.
 from __future__ import annotations
 
 from math import inf, sqrt
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -27,22 +26,6 @@ _PARALLEL = 1e-2
 _SAME = 1e-6  # lines that differ by less are one
 _PIECE = 1e-3  # m; half the length of an edge that stands for it around a point
 _BEHIND = 1.0  # m; how far behind a face its reference point is, so that the normal is exact
-
-
-class Features(NamedTuple):
-    """Distances that matter in a state; only the first ones, as many as were found, are valid.
-
-    Attributes:
-        pair: that each belongs to, shape (c,), int.
-        line: unit vector from the second body to the first, and its moment about the root's
-            origin, shape (c, 6): the distance's gradient is ``line (J_first - J_second)``.
-        motion: distance, m, its rate, m/s, and its acceleration at zero joint acceleration,
-            m/s^2, shape (c, 3).
-    """
-
-    pair: Integers
-    line: Array
-    motion: Array
 
 
 @njit(cache=True)
@@ -109,11 +92,13 @@ def find_features(
         dt: how long an acceleration is held, s.
         braking: deceleration that distances count on, m/s^2.
         distances: written: of all pairs, shape (p,), m; inf for those that do not matter.
-        pair_of: written, see `Features`, like `line` and `motion`.
-        line: likewise.
-        motion: likewise.
+        pair_of: written: pair that each belongs to, shape (c,), int.
+        line: written: unit vector from the second body to the first, and its moment about the
+            root's origin, shape (c, 6): the distance's gradient is ``line (J_first - J_second)``.
+        motion: written: distance, m, its rate, m/s, and its acceleration at zero joint
+            acceleration, m/s^2, shape (c, 3).
     """
-    rel, count = np.empty((7, 3)), 0
+    count = 0
     for pair in range(len(distances)):
         i, j, box = bodies[start[pair], 0], bodies[start[pair], 1], bodies[start[pair], 2]
         if box >= 0:
@@ -140,10 +125,8 @@ def find_features(
             edge = box < 0 and bodies[start[pair], 2] >= 0
             if edge and not 0.0 < s < 1.0:
                 continue  # the ends have distances of their own
-            _relative(i, s, j, t, points, rel)
-            d = _write_feature(
-                i, s, t, box >= 0 and radius[j] > 0.0, points, rel, line[count], motion[count]
-            )
+            flat = box >= 0 and radius[j] > 0.0
+            d = _write_feature(i, s, j, t, flat, points, line[count], motion[count])
             gap = motion[count, 0] = d - radius[i] - radius[j]
             distances[pair] = min(distances[pair], gap)
             known = gap > limit
@@ -156,23 +139,6 @@ def find_features(
                 pair_of[count] = pair
                 count += 1
     return count
-
-
-@njit(cache=True)
-def _relative(i: int, s: float, j: int, t: float, points: Array, rel: Array) -> None:
-    """Write how a point of segment i moves relative to one of j.
-
-    Rows 0 to 2 are position, velocity and acceleration; rows 3 and 4 segment i from end to end and
-    its rate; rows 5 and 6 segment j and its rate.
-    """
-    for k in range(3):
-        for order in range(3):
-            p = (1.0 - s) * points[i, 0, order, k] + s * points[i, 1, order, k]
-            o = (1.0 - t) * points[j, 0, order, k] + t * points[j, 1, order, k]
-            rel[order, k] = p - o
-        for order in range(2):
-            rel[3 + order, k] = points[i, 1, order, k] - points[i, 0, order, k]
-            rel[5 + order, k] = points[j, 1, order, k] - points[j, 0, order, k]
 
 
 @njit(cache=True)
@@ -275,7 +241,7 @@ def _chord(i: int, boxes: Array, box: int, points: Array) -> float:
 
 @njit(cache=True)
 def _write_feature(
-    i: int, s: float, t: float, flat: bool, points: Array, rel: Array, line: Array, motion: Array
+    i: int, s: float, j: int, t: float, flat: bool, points: Array, line: Array, motion: Array
 ) -> float:
     """Write line, rate and acceleration of a distance; return that of the axes, m.
 
@@ -284,34 +250,49 @@ def _write_feature(
     Args:
         i: the first segment.
         s: share of it at which its closest point is.
-        t: likewise, of the second.
+        j: the second segment.
+        t: likewise.
         flat: whether the second is a face.
         points: of `move_segments`.
-        rel: of `_relative`.
-        line: written, see `Features`.
+        line: written, see `find_features`.
         motion: rate and acceleration are written.
     """
-    d = sqrt(rel[0, 0] ** 2 + rel[0, 1] ** 2 + rel[0, 2] ** 2)
-    if d > _MET:
-        for k in range(3):
-            line[k] = rel[0, k] / d
-    else:
+    for k in range(3):
+        line[k] = (1.0 - s) * points[i, 0, 0, k] + s * points[i, 1, 0, k]
+        line[k] -= (1.0 - t) * points[j, 0, 0, k] + t * points[j, 1, 0, k]
+    size = d = sqrt(line[0] ** 2 + line[1] ** 2 + line[2] ** 2)
+    if d <= _MET:
         for k in range(3):
             y, z = (k + 1) % 3, (k + 2) % 3
-            line[k] = rel[3, y] * rel[5, z] - rel[3, z] * rel[5, y] + _MET * (0.5 + 0.1 * k)
+            u_y, u_z = (
+                points[i, 1, 0, y] - points[i, 0, 0, y],
+                points[i, 1, 0, z] - points[i, 0, 0, z],
+            )
+            w_y, w_z = (
+                points[j, 1, 0, y] - points[j, 0, 0, y],
+                points[j, 1, 0, z] - points[j, 0, 0, z],
+            )
+            line[k] = u_y * w_z - u_z * w_y + _MET * (0.5 + 0.1 * k)
         size = sqrt(line[0] ** 2 + line[1] ** 2 + line[2] ** 2)
-        for k in range(3):
-            line[k] /= size
+    for k in range(3):
+        line[k] /= size
     rate, bias, square, w_s, w_t, a, b, e = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(3):
         y, z = (k + 1) % 3, (k + 2) % 3
         p_y = (1.0 - s) * points[i, 0, 0, y] + s * points[i, 1, 0, y]
         p_z = (1.0 - s) * points[i, 0, 0, z] + s * points[i, 1, 0, z]
         line[3 + k] = p_y * line[z] - p_z * line[y]
-        v, u, w = rel[1, k], rel[3, k], rel[5, k]
-        rate, bias, square = rate + line[k] * v, bias + line[k] * rel[2, k], square + v * v
-        w_s += v * u + d * line[k] * rel[4, k]
-        w_t += v * w + d * line[k] * rel[6, k]
+        # Velocity and acceleration of the first point relative to the second.
+        v = (1.0 - s) * points[i, 0, 1, k] + s * points[i, 1, 1, k]
+        v -= (1.0 - t) * points[j, 0, 1, k] + t * points[j, 1, 1, k]
+        dv = (1.0 - s) * points[i, 0, 2, k] + s * points[i, 1, 2, k]
+        dv -= (1.0 - t) * points[j, 0, 2, k] + t * points[j, 1, 2, k]
+        # The segments from end to end, and their rates.
+        u, du = points[i, 1, 0, k] - points[i, 0, 0, k], points[i, 1, 1, k] - points[i, 0, 1, k]
+        w, dw = points[j, 1, 0, k] - points[j, 0, 0, k], points[j, 1, 1, k] - points[j, 0, 1, k]
+        rate, bias, square = rate + line[k] * v, bias + line[k] * dv, square + v * v
+        w_s += v * u + d * line[k] * du
+        w_t += v * w + d * line[k] * dw
         a, b, e = a + u * u, b + u * w, e + w * w
     if not flat and d >= _BLUNT:
         # What sliding leaves of the curvature, less w' H^-1 w, by elimination.

@@ -47,7 +47,7 @@ def write_rows(
 
     Args:
         count: how many distances there are.
-        pair_of: see `distances.Features`, like `line` and `motion`.
+        pair_of: see `distances.find_features`, like `line` and `motion`.
         line: likewise.
         motion: likewise.
         moves: 1 for joints that move the first body of a pair only, -1 the second only, shape
