@@ -19,7 +19,6 @@ from viability_bounds_pkg.node.bounds_parameters import (
     make_plausibility_check,
     make_solver,
 )
-from viability_bounds_pkg.node.slow_topics import SlowTopics
 from viability_bounds_pkg.robot.configuration import TOPIC
 from viability_bounds_pkg.ros.arm_node import ArmNode
 from viability_bounds_pkg.ros.diagnostics import Diagnostics
@@ -27,7 +26,16 @@ from viability_bounds_pkg.ros.messages import Arrival, JointStateReader, PeriodC
 from viability_bounds_pkg.ros.parameters import NodeParameters
 from viability_bounds_pkg.ros.program import run
 from viability_bounds_pkg.ros.robot_urdf import warn_of_unusual
-from viability_bounds_pkg.ros.topics import ACCELERATION_LIMITS
+from viability_bounds_pkg.ros.runtime import set_stamp, steady_timer
+from viability_bounds_pkg.ros.topics import (
+    ACCELERATION_LIMITS,
+    LIMIT_DISTANCES,
+    SLOW_ACCELERATION_LIMITS,
+    SLOW_JOINT_STATES,
+)
+
+_SLOW_PERIOD = 0.05
+"""Between two copies of the streams for tools, s."""
 
 
 class BoundsNode(ArmNode):
@@ -65,7 +73,11 @@ class BoundsNode(ArmNode):
         )
         self._limits = self.stream(ACCELERATION_LIMITS)
         self.listen_to_states(config.use_estimated_states, self._on_state)
-        self._slow_topics = SlowTopics(self, config, self._reader, self._answer)
+        self._slow_states = SLOW_JOINT_STATES.publisher(self)
+        self._slow_limits = SLOW_ACCELERATION_LIMITS.publisher(self)
+        self._distances = LIMIT_DISTANCES.publisher(self)
+        # Beside the answers to states, which do no work for these topics.
+        steady_timer(self, _SLOW_PERIOD, self._publish_slowly)
         self._diagnostics = Diagnostics(self, self._report, self.publisher_watch)
         self._warn_of_reduced_braking(config)
         self.announce(joints, config.rate_hz, f"method {config.method}")
@@ -103,6 +115,32 @@ class BoundsNode(ArmNode):
                 self._outside += ~bounds.viable
             self._answered += 1
         self._limits.publish(self._answer)
+
+    def _publish_slowly(self) -> None:
+        """Publish distances to the limits, and copies of the streams, where they are heard."""
+        silence = time.monotonic() - self._reader.heard_at
+        if silence > self._node_parameters.configuration.state_timeout:
+            return
+        if self._slow_states.get_subscription_count():
+            self._slow_states.publish(self._reader.message)
+        if self._slow_limits.get_subscription_count():
+            self._slow_limits.publish(self._answer)
+        if self._distances.get_subscription_count():
+            self._distances.publish(self._limit_distances())
+
+    def _limit_distances(self) -> JointState:
+        config, reader = self._node_parameters.configuration, self._reader
+        tau = reader.effort()
+        distances = np.minimum(reader.q - config.position_min, config.position_max - reader.q)
+        message = JointState(
+            name=list(config.joints),
+            position=array("d", distances.tobytes()),
+            velocity=array("d", (config.velocity_max - np.abs(reader.v)).tobytes()),
+        )
+        if tau is not None and len(config.torque_max):
+            message.effort = array("d", (config.torque_max - np.abs(tau)).tobytes())
+        set_stamp(message.header.stamp, reader.stamp)
+        return message
 
     def _report(self) -> tuple[bytes, str, dict[str, Any]]:
         config = self._node_parameters.configuration

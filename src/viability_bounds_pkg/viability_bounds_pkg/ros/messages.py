@@ -258,16 +258,16 @@ class CommandReader:
         velocity = message.velocity or [0.0] * len(message.name)
         fields = [message.effort] if len(message.effort) else [message.position, velocity]
         if any(len(values) != len(message.name) for values in fields):
-            return self._refuse("wrong size")
-        if self._order.find(message.name):
-            return self._refuse("missing joint")
-        arrays = [np.array(values)[self._order.index] for values in fields]
-        if not all(np.isfinite(each).all() for each in arrays):
-            return self._refuse("not finite")
-        return TorqueCommand(*arrays) if len(message.effort) else PositionCommand(*arrays)
-
-    def _refuse(self, reason: str) -> None:
+            reason = "wrong size"
+        elif self._order.find(message.name):
+            reason = "missing joint"
+        else:
+            arrays = [np.array(values)[self._order.index] for values in fields]
+            if all(np.isfinite(each).all() for each in arrays):
+                return TorqueCommand(*arrays) if len(message.effort) else PositionCommand(*arrays)
+            reason = "not finite"
         count_refusal("joint_commands", reason, "", self._refused, self._warn)
+        return None
 
 
 def pose_message(pose: pin.SE3, frame: str = "", stamp: int = 0) -> PoseStamped:

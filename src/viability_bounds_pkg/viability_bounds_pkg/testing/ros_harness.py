@@ -12,7 +12,6 @@ from __future__ import annotations
 import functools
 import itertools
 import os
-import re
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -23,6 +22,7 @@ from typing import Any
 
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
+import pytest
 import rclpy
 from ament_index_python.packages import get_package_share_directory
 from diagnostic_msgs.msg import DiagnosticArray
@@ -60,9 +60,8 @@ TIMEOUT = 30.0
 RECORDING_QOS = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Loses nothing that comes while other callbacks run."""
 
-# On Linux these domains use no port that the system hands out by itself: the upper ones are for
-# tests alone, among the lower ones may be other programs.
-_DOMAINS = (range(215, 232), range(60, 101))
+# On Linux these domains use no port that the system hands out by itself.
+_DOMAINS = (*range(215, 232), *range(60, 101))
 _LOCK_PORT = 17_400
 _turns = itertools.count(os.getpid())
 
@@ -70,31 +69,25 @@ _turns = itertools.count(os.getpid())
 @contextmanager
 def private_domain() -> Iterator[int]:
     """Hold a domain id that no other process uses, or holds through this function."""
-    deadline = time.monotonic() + 60.0
-    while time.monotonic() < deadline:
-        for domains in _DOMAINS:
-            for _ in domains:
-                domain = domains[next(_turns) % len(domains)]
-                with socket.socket() as lock:
-                    try:
-                        lock.bind(("127.0.0.1", _LOCK_PORT + domain))
-                    except OSError:
-                        continue
-                    if _in_use(domain):
-                        continue
-                    yield domain
-                    return
+    for _ in _DOMAINS:
+        domain = _DOMAINS[next(_turns) % len(_DOMAINS)]
+        with socket.socket() as lock, socket.socket(type=socket.SOCK_DGRAM) as port:
+            # The second port is that of the first node of a domain.
+            free = _binds(lock, "127.0.0.1", _LOCK_PORT + domain)
+            free = free and _binds(port, "", 7410 + 250 * domain)
+            port.close()
+            if free:
+                yield domain
+                return
     raise RuntimeError("every domain is taken")
 
 
-def _in_use(domain: int) -> bool:
-    """Return whether a node has the port that the first one of a domain takes."""
-    with socket.socket(type=socket.SOCK_DGRAM) as port:
-        try:
-            port.bind(("", 7410 + 250 * domain))
-        except OSError:
-            return True
-    return False
+def _binds(opened: socket.socket, host: str, port: int) -> bool:
+    try:
+        opened.bind((host, port))
+    except OSError:
+        return False
+    return True
 
 
 _read_once = functools.cache(read_yaml)
@@ -166,25 +159,13 @@ class RosHarness:
     def refuses_to_start(
         self, make: Callable[..., Node], values: Mapping[str, Any], name: str, shown: str = ""
     ) -> None:
-        """Expect that a node does not start, and says why in the one line that users get.
-
-        Args:
-            make: the node.
-            values: its parameters.
-            name: of the parameter that is named.
-            shown: part of the line.
-        """
-        try:
+        """Expect that a node does not start: one line names a parameter and contains `shown`."""
+        with pytest.raises(
+            SettingError, match=r"\Aparameter '.+' is .+; allowed: .+\Z"
+        ) as refused:
             self.start(make, values)
-        except SettingError as refusal:
-            text = str(refusal)
-            assert refusal.name == name, text
-            assert re.fullmatch(rf"parameter '{re.escape(name)}' is (.+); allowed: (.+)", text), (
-                text
-            )
-            assert shown in text
-        else:
-            raise AssertionError(f"it started with another {name}")
+        assert refused.value.name == name
+        assert shown in str(refused.value)
 
     def stop(self, node: Node) -> None:
         """Take a node down before the test ends."""
