@@ -92,7 +92,9 @@ class IntegralFeedback(IntegralLaw):
         At the limits it is (10) or (11); with anti-windup ``qp`` integrators shrink there, too.
         """
         settings, printed = self.settings, self.settings.as_printed
-        rates = (settings.fast_leak_rate + self.leak, settings.slow_leak_rate + self.leak)
+        fast_factors, slow_factors = (
+            leak_factors(rate, dt, printed) for rate in self.leak_rates.values()
+        )
         fast, slow, torque, saturated, limited, usable = _advance(
             tuple(self.memory),
             (arm.M, arm.C, arm.v),
@@ -100,7 +102,7 @@ class IntegralFeedback(IntegralLaw):
             dt,
             settings.budget,
             (settings.gain, settings.mu),
-            (*leak_factors(rates[0], dt, printed), *leak_factors(rates[1], dt, printed)),
+            (*fast_factors, *slow_factors),
             printed,
         )
         if not usable:
