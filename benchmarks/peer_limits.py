@@ -16,7 +16,6 @@ import numpy as np
 import pinocchio as pin
 from other_environment import TSID, worker
 from peer_rollout import Arm, drive
-from viability_bounds_pkg.estimate.hold_error import discretisation_margin
 
 from torque_safety_controller.controller import Controller
 from torque_safety_controller.parts.goals import Goals
@@ -25,6 +24,8 @@ from torque_safety_controller.qp import AccelerationRange
 from torque_safety_controller.robot_model import RobotModel
 from torque_safety_controller.tasks.gains import Gains
 from viability_bounds_pkg.bounds.torque_margin import tightened, torque_margins
+from viability_bounds_pkg.estimate.drift import acceleration_drift
+from viability_bounds_pkg.estimate.worst_case import StateSpace
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.robot.description import build_model, read_urdf
 from viability_bounds_pkg.state import State
@@ -46,10 +47,9 @@ class Ours:
         ones, dt = np.ones(model.nv), given["dt"]
         low, high = given["low"], given["high"]
         limits = JointLimits(JOINTS, low, high, V_MAX * ones, -A_MAX * ones, A_MAX * ones)
-        bound = limits.v_max, limits.a_min, limits.a_max, TAU_MAX
-        margins = torque_margins(
-            1.1 * discretisation_margin(model, low, high, *bound, dt, 5000).jerk, dt
-        )
+        space = StateSpace.of(model, low, high, limits.v_max, TAU_MAX)
+        drift = acceleration_drift(model, space, limits.a_min, limits.a_max, 5000)
+        margins = torque_margins(1.1 * drift, dt)
         self._bounds = BoundsSolver(
             tightened(limits, margins), 2.0 * dt, margins.acceleration, period=dt
         )
