@@ -40,7 +40,7 @@ class Fixed:
     def reset(self) -> None:
         """Nothing to forget."""
 
-    def torque(self, robot, v, a_last, elapsed):
+    def torque(self, robot, a_last, elapsed):
         return self.last
 
 

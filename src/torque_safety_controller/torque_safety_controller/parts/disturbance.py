@@ -48,7 +48,7 @@ class Disturbance(Part):
 
     def reset(self, robot: RobotModel | None = None) -> None:
         """See `Part.reset`."""
-        self.estimate = self._zero
+        self.estimate = np.zeros_like(self._zero)
         self._v_last: Array | None = None
 
     def prepare(self, step: Step) -> None:
