@@ -17,9 +17,6 @@ TRUSTED_AFTER = 100
 """States in a row that must agree before one that does not counts: some robots report torques of
 other units or places, or zeros."""
 
-TOLERANCE = 0.03
-"""Share of the torque limits by which torques may differ: ripple and resolution of motors."""
-
 IGNORED_AFTER = 3
 """States in a row that do not agree after which commands count as ignored."""
 
@@ -28,7 +25,7 @@ class CommandCheck:
     """Compares each reported torque with the range of the last commanded ones.
 
     Args:
-        tau_max: torque limits, shape (n,), N m.
+        tolerance: what they may differ by, shape (n,), N m; inf to compare nothing.
         reach: number of commands one of which acts at a state.
 
     Attributes:
@@ -36,9 +33,9 @@ class CommandCheck:
         times: how often that began.
     """
 
-    def __init__(self, tau_max: Array, reach: int) -> None:
-        self._tolerance = TOLERANCE * tau_max
-        self._sent = np.zeros((reach, tau_max.size))
+    def __init__(self, tolerance: Array, reach: int) -> None:
+        self._tolerance = tolerance
+        self._sent = np.zeros((reach, tolerance.size))
         self.times = 0
         self.reset()
 

@@ -242,10 +242,11 @@ def test_where_torques_are_not_reported_any_more_commands_count_as_obeyed(ros):
     assert not motors.chain.node._supervisor._causes.get("ignored")
 
 
-def test_motors_that_cannot_be_compared_change_nothing(ros):
-    motors = Motors(ros)
+@pytest.mark.parametrize("changed", [{}, {"effort_tolerance": 0.0}], ids=["unknown", "not wanted"])
+def test_motors_that_cannot_be_compared_change_nothing(ros, changed):
+    motors = Motors(ros, **changed)
     others = np.full(ARM.n, 0.1)  # motors that are on
-    motors.answer(60, others)
+    motors.answer(60, None if changed else others)
     assert motors.answer(20, others) == pytest.approx(1.0)
     ros.run_for(0.1)
     assert motors.chain.reported("commands_ignored") == "0"

@@ -6,20 +6,15 @@ import math
 import numpy as np
 import pytest
 
-from torque_safety_controller.command_check import (
-    IGNORED_AFTER,
-    TOLERANCE,
-    TRUSTED_AFTER,
-    CommandCheck,
-)
+from torque_safety_controller.command_check import IGNORED_AFTER, TRUSTED_AFTER, CommandCheck
 
-LIMITS = np.array([1.0, 2.0]) / TOLERANCE
+TOLERANCE = np.array([1.0, 2.0])
 TAU = np.array([5.0, -3.0])
 
 
 def agreed(reach=3) -> CommandCheck:
     """Return a check after enough states that agree."""
-    check = CommandCheck(LIMITS, reach)
+    check = CommandCheck(TOLERANCE, reach)
     for _ in range(TRUSTED_AFTER):
         check.sent(TAU)
         assert check.agrees(TAU)
@@ -52,7 +47,7 @@ def test_what_is_not_finite_agrees_with_nothing(value):
 
 
 def test_torques_that_never_agreed_are_of_another_kind():
-    check = CommandCheck(LIMITS, 3)
+    check = CommandCheck(TOLERANCE, 3)
     for _ in range(3 * TRUSTED_AFTER):
         check.sent(TAU)
         assert check.agrees(np.zeros(2))

@@ -107,7 +107,7 @@ def test_what_must_not_change_by_accident():
 @pytest.mark.parametrize("name", CAUSES)
 def test_each_cause_gives_its_mode_and_its_share_and_ends(name):
     begins, ends = ROWS[name]
-    cause, chain = CAUSES[name], Chain(commands=CommandCheck(TAU, 1))
+    cause, chain = CAUSES[name], Chain(commands=CommandCheck(0.1 * TAU, 1))
     chain.supervisor.robot_returned("")
     chain.answer(None)
     chain.run(TRUSTED_AFTER)
@@ -183,7 +183,7 @@ def test_a_pause_in_which_the_robot_stops_itself_holds_the_arm_until_it_rests():
 
 
 def test_nothing_is_learned_and_the_integral_fades_while_commands_do_not_act():
-    chain = Chain(commands=CommandCheck(TAU, 1))
+    chain = Chain(commands=CommandCheck(0.1 * TAU, 1))
     chain.answer(None)
     chain.run(TRUSTED_AFTER)
     orders = [chain.answer(tau=-TAU) for _ in range(60)]
@@ -275,7 +275,7 @@ class Events(RuleBasedStateMachine):
 
     def __init__(self):
         super().__init__()
-        self.chain = Chain("torque", CommandCheck(TAU, 2))
+        self.chain = Chain("torque", CommandCheck(0.1 * TAU, 2))
         self.supervisor, self.share = self.chain.supervisor, 1.0
         self.answered = False
 

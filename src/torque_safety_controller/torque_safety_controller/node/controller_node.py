@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable
@@ -81,7 +82,10 @@ class ControllerNode(ArmNode):
             config.start_control,
             covered_misses(declared),
             config.bounds_timeout,
-            CommandCheck(config.torque_max, commands_in_flight(declared)),
+            CommandCheck(
+                (config.effort_tolerance or math.inf) * config.torque_max,
+                commands_in_flight(declared),
+            ),
             self._on_mode,
             lambda line: self._later(self._warn, line),
         )

@@ -232,6 +232,12 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
         "with the next one, s",
         default=0.5,
     )
+    effort_tolerance: float = number(
+        "by how much torques of joint states may differ from those that were commanded, share of "
+        "torque_max; beyond, commands count as not acting, and the arm is slowed; 0: not compared",
+        Range(0.0, 2.0),
+        default=0.03,
+    )
     ros2_control_topic: str = text(
         "where to publish efforts as std_msgs/Float64MultiArray too; empty: nowhere", default=""
     )
