@@ -64,6 +64,17 @@ def test_rotors_that_cannot_be_are_refused(urdf, rotors):
         build_model(urdf, JOINTS, None, rotors)
 
 
+@pytest.mark.parametrize("value", ["heavy", "${mass}", "nan", "1 kg"])
+@pytest.mark.parametrize("element", ["mass value", "inertia ixx", "origin xyz", "axis xyz"])
+def test_numbers_that_are_none_are_refused(urdf, tmp_path, element, value):
+    path = tmp_path / "robot.urdf"
+    path.write_text(
+        urdf.replace("<link ", f'<link name="odd"><{element}="{value}"/></link><link ', 1)
+    )
+    with pytest.raises(RobotDescriptionError, match=f"<{element}='.*'>: no number"):
+        read_urdf(str(path))
+
+
 def test_joints_are_put_into_kinematic_order(urdf):
     assert kinematic_order(urdf, JOINTS[::-1]) == tuple(JOINTS)
     assert kinematic_order(urdf, [JOINTS[4], JOINTS[2]]) == (JOINTS[2], JOINTS[4])

@@ -23,6 +23,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from viability_bounds_pkg.exceptions import ArmSafetyError, did_you_mean
 
+_OF_NUMBERS = ("mass", "inertia", "origin", "axis")
+"""Elements of a URDF whose attributes are numbers."""
+
 
 class RobotDescriptionError(ArmSafetyError, ValueError):
     """A URDF that cannot be found or loaded, or that does not fit what is asked of it.
@@ -121,6 +124,20 @@ def check_urdf(text: str, source: str) -> None:
         raise RobotDescriptionError(f"{source}: is for xacro; xacro {source} > robot.urdf")
     if root.find("link") is None:
         raise RobotDescriptionError(f"{source}: there is no <link> in it")
+    # The parser would count an inertia that it cannot read as zero.
+    for element in root.iter():
+        for name, value in element.items() if element.tag in _OF_NUMBERS else ():
+            if not _are_finite(value.split()):
+                raise RobotDescriptionError(
+                    f"{source}: <{element.tag} {name}={value!r}>: no number"
+                )
+
+
+def _are_finite(words: Iterable[str]) -> bool:
+    try:
+        return all(math.isfinite(float(word)) for word in words)
+    except ValueError:
+        return False
 
 
 def build_model(
