@@ -70,6 +70,28 @@ def table(
     return "\n".join(lines)
 
 
+def read_part(name: str, page: str = "results.md") -> str:
+    """Return what a page of docs/ has between ``<!-- name -->`` and ``<!-- /name -->``."""
+    return _split(name, page)[1]
+
+
+def write_part(name: str, text: str, page: str = "results.md") -> None:
+    """Write the part of a page of docs/ between ``<!-- name -->`` and ``<!-- /name -->``."""
+    before, _, after = _split(name, page)
+    (ROOT / "docs" / page).write_text(f"{before}\n\n{text.strip()}\n\n{after}")
+
+
+def _split(name: str, page: str) -> tuple[str, str, str]:
+    """Return a page up to the first mark, between the marks, and from the second mark on."""
+    first, last = f"<!-- {name} -->", f"<!-- /{name} -->"
+    text = (ROOT / "docs" / page).read_text()
+    before, found, rest = text.partition(first)
+    between, end, after = rest.partition(last)
+    if not (found and end):
+        raise ValueError(f"docs/{page} has no part between {first} and {last}")
+    return before + first, between, last + after
+
+
 def verdict(agrees: bool, text: str = "agrees") -> str:
     """Return the last entry of a row: `text`, or that it differs."""
     return text if agrees else "DIFFERS"

@@ -6,20 +6,21 @@ usage() {
     cat <<'USAGE'
 usage: bash scripts/reproduce.sh [WHAT] [part or options]
 
-Writes figures to results/, and prints a table with the paper's numbers and ours.
+Writes figures to results/ and tables to docs/results.md, and prints the tables.
 
-  paper0             all figures of the first paper, and docs/reproduction.md
+  paper0             all figures of the first paper
   paper0 fig5        one of them
   paper1-integral    the second paper: handover, anti-windup, endurance
   paper1-compliance  pushes, poles, yielding and pressing hand
   whole_arm          weak motors, with and without the safety filter (10 min)
-  imperfect          late, coarse and noisy robots, with and without each remedy, and
-                     docs/reproduction_imperfect.md (40 min on two cores)
+  imperfect          late, coarse and noisy robots, with and without each remedy (40 min on
+                     two cores)
   imperfect panda    one of the robots; its rows replace those of before
   contrast           the moving picture of README
+  theory             figures and tables of the pages under docs/theory (3 min)
   soak               faults while the arm moves: restarts, wrong states, second nodes (3 min)
   exactness          the bounds compared with brute force (30 min)
-  all                all of the above but imperfect, contrast, soak and exactness (default)
+  all                the first four (default)
 USAGE
 }
 
@@ -35,7 +36,7 @@ if [ "$what" = all ]; then
 fi
 what="${what//-/_}"
 case "$what" in
-paper0 | paper1_integral | paper1_compliance | whole_arm | imperfect | contrast | soak | exactness) ;;
+paper0 | paper1_integral | paper1_compliance | whole_arm | imperfect | contrast | theory | soak | exactness) ;;
 *)
     echo "error: unknown '$what'; --help lists what there is" >&2
     exit 2

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Limits of three imperfect robots, late, coarse and noisy, with and without remedies.
 
-bash scripts/reproduce.sh imperfect                 the tables, and docs/reproduction_imperfect.md
+bash scripts/reproduce.sh imperfect                 the tables of docs/results.md
 bash scripts/reproduce.sh imperfect panda           those of one robot
 bash scripts/reproduce.sh imperfect page            only the page, of all rows that were played
 bash scripts/reproduce.sh imperfect --minutes 1     quicker: 1 minute each in place of 10
@@ -418,7 +418,7 @@ def main() -> int:
     names = (given.case,) if given.case else tuple(CASES)
     fine = play_all(robots, names, given.minutes, given.others)
     titles = {name: case.title for name, case in CASES.items()}
-    write_page(ROBOTS, titles, PUSHED, NEAR)
+    write_page(ROBOTS, titles, PUSHED)
     return 0 if fine else 1
 
 

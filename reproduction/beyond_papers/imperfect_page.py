@@ -12,7 +12,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from chain import ROOT
-from figure import RESULTS, Figure, table
+from figure import RESULTS, Figure, read_part, table, write_part
 
 NAME = "imperfect"
 WITHIN_DECLARED = ("all", "outage_stop", "filter", "filter_weak")
@@ -40,78 +40,6 @@ COST_HEADS = (
     "distance left at limits, mrad",
 )
 COSTS = "What the remedies cost an ideal robot"
-PAGE = """\
-# Results for imperfect robots
-
-Written by `bash scripts/reproduce.sh imperfect`; do not edit. The real nodes in lockstep, on
-robots whose states are late, coarse and noisy, whose commands are late or lost, and whose motors
-are not what the model says: `config/imperfect/<robot>.yaml` has the values and their sources,
-[simulated_robot.md](simulated_robot.md) their models. Numbers are under `results/imperfect/`.
-
-![Largest violations by case](images/imperfect.png)
-
-The largest violation of a position and of a speed limit in each case; a circle is none at all.
-Grey: nothing is spoilt. Green: within what is declared, all done. Red: a remedy is missing.
-Orange: beyond what is declared.
-
-## How it is played
-
-Each minute has random numbers of its own, the same in all cases. It has four rounds: nine goals of
-a second each, and one that is kept for 6 s. A goal is a posture, and the pose of the hand in it;
-each joint has it at one of its limits with a probability of one half. In every second round a
-link is pushed once per second in a random direction; a push rises within 0.2 s and lasts for 0.2 s
-more. In every second minute the posture task is so stiff (kp 100 1/s², alone) that it drives each
-joint into its limits.
-
-{pushes}
-
-Remedies: the *observer* estimates velocities from positions, and the *prediction* takes the state
-through the commands under way ([state_estimation.md](state_estimation.md)); *margins and horizon*
-of the bounds follow from what is declared ([uncertainty.md](uncertainty.md)); the *stop* is that
-of [stopping.md](stopping.md), the alternative are brakes. "Twice as much" has twice the delays,
-errors, noise and longest row of lost commands, and half the bandwidths.
-
-| column | |
-|---|---|
-| position, speed | farthest beyond a limit, any joint, true state, at each physics step |
-| torque | largest true torque of a motor; more than 1 would be beyond its limit |
-| torque step | largest change of a commanded torque from one control period to the next |
-| at rest | the same in the last second of the goals that are kept, joints on limits included |
-| hand at rest | distance from a goal 8 s after it was sent: median to largest |
-
-An arm that moves by more than 20 mrad in that second is still on its way, as the filter may lead
-it round what it cannot hold; then that second does not count.
-
-A row of which something is promised ends with a verdict. Where what is spoilt is within what is
-declared ("all done", also while commands fail and the drives stop by themselves, and with the
-safety filter), position and speed must be 0 and torque at most 1. With "all done" alone, the step
-at rest must also be at most {step:g}, and the median distance of the hand at most {factor:g} times
-that of the same robot with nothing spoilt and nothing done, or what a step of all encoders is at
-the hand. The other rows are for comparison.
-Rows stay until they are played again: they may be of different versions of the project.
-
-The *safety filter* ([whole_arm.md](whole_arm.md)) is on in all rows of `baxter_left_arm`, as in
-its file, and elsewhere where a row says so. `torque_reserve` in the files is for the pushes above.
-Panda's maker allows torques to change by 1000 N m/s.
-
-Two things that a verdict does not say. It holds for the minutes, goals and pushes of its row, in
-lockstep. Pushes and TALOS' friction are at times more than `acceleration_disturbance` declares:
-what keeps the limits then are the disturbance observer and further margins in the files, which are
-tested, not proven.
-{parts}
-## {costs_heading}
-
-The rows "nothing spoilt" above have what they cost in violations and torque steps. The time that
-they cost: all joints go together from the middle of their ranges to a limit and back, with the
-stiff posture task, until all are within {near:g} mrad of the goal. Where "-" stands some joint
-stays farther off than that, because of margins or because the torque does not suffice there; the
-last column has the largest distance left at the limits.
-
-{costs}
-
-`bash scripts/bench.sh chain --imperfect` measures the time from a state to its command, without
-and with the remedies.
-"""
 
 
 @dataclass(frozen=True)
@@ -251,18 +179,13 @@ def ideal_hand(robot: str) -> float | None:
 # Page and picture
 
 
-def page_path() -> Path:
-    """Return where the page is."""
-    return ROOT / "docs" / f"reproduction_{NAME}.md"
-
-
 def rows_of_page() -> dict[tuple[str, str], Row]:
     """Return the rows of all tables of the page, by the heading above them and first cell."""
-    path, heading = page_path(), ""
+    heading = ""
     rows = {}
-    for line in path.read_text().splitlines() if path.exists() else ():
-        if line.startswith("## "):
-            heading = line.removeprefix("## ")
+    for line in read_part(NAME).splitlines():
+        if line.startswith("### "):
+            heading = line.removeprefix("### ")
         elif line.startswith("| "):
             cells = tuple(cell.strip() for cell in line[1:-1].split("|"))
             rows[heading, cells[0]] = cells
@@ -329,26 +252,21 @@ def write_page(
     robots: Sequence[str],
     titles: Mapping[str, str],
     pushed: Mapping[str, Mapping[str, float]],
-    near: float,
 ) -> None:
-    """Write page and picture of all rows, data and metrics of those whose numbers are kept.
+    """Write tables and picture of all rows, data and metrics of those whose numbers are kept.
 
-    What the page has of other cases in `titles` stays as it is.
+    What docs/results.md has of other cases in `titles` stays as it is.
 
     Args:
         robots: in the order of the page.
         titles: of the cases by name, in the order of the rows.
         pushed: by robot, the forces by link, N.
-        near: how near a goal counts as reached, rad.
     """
-    outcomes = {robot: kept_outcomes(robot, list(titles)) for robot in robots}
-    if not any(outcomes.values()):
-        return
     before = rows_of_page()
-    figure, pushes, costs = Figure(NAME), Figure(NAME), Figure(NAME)
+    figure, costs = Figure(NAME), Figure(NAME)
     rows: dict[str, dict[str, Row]] = {}
-    for robot, part in outcomes.items():
-        hand = ideal_hand(robot)
+    for robot in robots:
+        part, hand = kept_outcomes(robot, list(titles)), ideal_hand(robot)
         known = {
             name: row(name, part[name], hand) if name in part else before.get((robot, title))
             for name, title in titles.items()
@@ -365,22 +283,14 @@ def write_page(
             cells = cells if len(cells) > 1 else before.get((COSTS, cells[0]), ())
             costs.rows += [cells] if cells else []
     rows = {robot: part for robot, part in rows.items() if part}
+    if not rows:
+        return
     figure.save(draw(rows, titles))
     image = ROOT / "docs" / "images" / f"{NAME}.png"
     image.write_bytes((RESULTS / NAME / "figure.png").read_bytes())
-    parts = ""
+    text = ""
     for robot, part in rows.items():
-        one = Figure(NAME, rows=list(part.values()))
-        parts += f"\n## {robot}\n\n{table([one], HEADS)}\n"
-        links = (f"`{link}` {force:g} N" for link, force in pushed[robot].items())
-        pushes.rows.append((robot, ", ".join(links)))
-    page = PAGE.format(
-        pushes=table([pushes], ("robot", "links that are pushed, and how hard")),
-        step=STEP_AT_REST,
-        factor=HAND_FACTOR,
-        parts=parts,
-        near=1e3 * near,
-        costs_heading=COSTS,
-        costs=table([costs], COST_HEADS),
-    )
-    page_path().write_text(page)
+        links = ", ".join(f"`{link}` {force:g} N" for link, force in pushed[robot].items())
+        text += f"### {robot}\n\nPushed: {links}.\n\n"
+        text += table([Figure(NAME, rows=list(part.values()))], HEADS) + "\n\n"
+    write_part(NAME, f"{text}### {COSTS}\n\n{table([costs], COST_HEADS)}")

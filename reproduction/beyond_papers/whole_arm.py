@@ -10,7 +10,7 @@ In turns, random postures that can be held, half of the joints next to their lim
 the hand in random postures, not all of which can be reached from where the arm is without
 planning. The next goal comes when the arm has been at rest at one, or after the time limit.
 The tasks are stiff, so that the limits decide. Robot, bounds and controller are those of the
-files, in one loop in lockstep, with exact states. The page is `docs/whole_arm.md`. What is done is
+files, in one loop in lockstep, with exact states. The table is in docs/results.md. What is done is
 kept in results/whole_arm/ until a source file changes.
 """
 
@@ -25,7 +25,7 @@ import numpy as np
 import pinocchio as pin
 from chain import ROOT
 from direct import DirectLoop, column
-from figure import Figure, table, verdict
+from figure import Figure, table, verdict, write_part
 from pieces import in_pieces
 
 from torque_safety_controller.parts.whole_arm.braking_plan import (
@@ -247,8 +247,6 @@ def add_row(figure: Figure, name: str, minutes: list[dict[str, Any]]) -> bool:
             f"{position:.2g}",
             f"{speed:.2g}",
             f"{torque:.3f}",
-            *(f"{near.sum()}, {at.sum()} of {near.size}" for near, at in (postures.T, poses.T)),
-            f"{median:.2f} s",
             f"{share:.2%}" if filtered else "-",
             verdict(fine, "kept") if filtered else "",
         )
@@ -316,10 +314,11 @@ def main() -> int:
     figure = Figure("whole_arm")
     kept = compare(figure, given.minutes, given.limit, given.row)
     heads = ("arm", "played", "position, rad", "speed, rad/s", "torque")
-    heads = (*heads, "postures: near, at", "poses: near, at", "median time", "steps changed", "")
-    print("\n" + table([figure], heads))
+    rows = table([figure], (*heads, "steps changed", ""))
+    print("\n" + rows)
     if given.row:
         return 0 if kept else 1
+    write_part("whole-arm", rows)
     picture, axes = plt.subplots(1, 3, figsize=(16, 4.6), layout="constrained")
     shoulder(axes[0])
     safe_set(axes[1], 0.0)

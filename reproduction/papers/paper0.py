@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Figures 1, 3, 4 and 5 and the timing of Algorithm 4 of [DelPrete2018], and a table beside it.
 
-bash scripts/reproduce.sh paper0         all of it, and docs/reproduction.md
+bash scripts/reproduce.sh paper0         all of it, and a table of docs/results.md
 bash scripts/reproduce.sh paper0 fig5    one figure
 """
 
@@ -16,7 +16,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import yaml
 from chain import ROOT, ChainResult, load_values, run_chain
-from figure import Figure, joint_axes, reproduce, table
+from figure import Figure, joint_axes, reproduce, table, write_part
 from matplotlib.colors import BoundaryNorm, ListedColormap
 
 from viability_bounds_pkg import baselines, viability
@@ -393,19 +393,8 @@ FIGURES: dict[str, Callable[[], Figure]] = {
 
 
 def write_document(figures: list[Figure]) -> None:
-    """Write docs/reproduction.md."""
-    (ROOT / "docs" / "reproduction.md").write_text(
-        "# Results beside the paper: bounds\n\n"
-        "Written by `bash scripts/reproduce.sh paper0`; do not edit. [DelPrete2018] with the\n"
-        "real nodes, in lockstep; pictures and data are under `results/`.\n\n"
-        f"{table(figures)}\n\n"
-        "Fig. 5: the paper does not give its poses. Here the arm starts with the elbow at 0.446\n"
-        "rad and the goal is a pose that the elbow can hold at 0.084 rad, 0.13 rad inside its\n"
-        "limit: the path, not the goal, leads beyond the limit. Acceleration limits are those\n"
-        "of `config/baxter_left_arm.yaml`; the exact bounds also keep its torque margins.\n\n"
-        "Here commands act at once on states that are exact. The same bounds on robots that are\n"
-        "late, coarse and noisy: [reproduction_imperfect.md](reproduction_imperfect.md).\n"
-    )
+    """Write the table of docs/results.md."""
+    write_part("paper0", table(figures))
 
 
 if __name__ == "__main__":

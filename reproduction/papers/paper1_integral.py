@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Figures 3 and 5 of [Benallegue2021], an ablation of the integral action, and an endurance run.
 
-bash scripts/reproduce.sh paper1-integral              all of it, and docs/reproduction_integral.md
+bash scripts/reproduce.sh paper1-integral              all of it, and tables of docs/results.md
 bash scripts/reproduce.sh paper1-integral fig5         one part
 
 TALOS' torso and left arm, 9 joints at 1 kHz, with friction of 10% of the torque limits (stiction
@@ -16,9 +16,8 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 import pinocchio as pin
-from chain import ROOT
 from direct import DirectLoop, column, distance, hand_places
-from figure import Figure, reproduce, table
+from figure import Figure, reproduce, table, write_part
 
 from torque_safety_controller.parts.contact.interaction import Interaction
 
@@ -215,24 +214,24 @@ def _rows_of_figure_5(force: tuple[float, ...], found: dict[str, dict]) -> list[
     rows = []
     for name, run in found.items():
         here = (
-            f"the term at {run['share_pushed']:.2f} budgets at the end of the push, at most "
-            f"{run['share']:.2f}; overshoot {1e3 * run['overshoot']:.1f} mm, within 1 cm after "
-            f"{run['recovery']:.2f} s; measured force swings by {run['swing']:.1f} N"
+            f"{run['share_pushed']:.2f} budgets when let go, {run['share']:.2f} at most; "
+            f"overshoot {1e3 * run['overshoot']:.1f} mm; within 1 cm after {run['recovery']:.2f} "
+            f"s; force swings by {run['swing']:.1f} N"
         )
         values = "the file's values" if "file" in name else "the paper's values"
         if run is bad:
-            paper = "the term grows, higher oscillation at release, in the force, too"
+            paper = "grows; larger oscillation at release"
             so = run["share_pushed"] > 2.0
             for each in ("overshoot", "swing"):
                 so &= run[each] > found["(11) as printed"][each]
         else:
-            paper = "the term saturates, no visible oscillation"
+            paper = "saturates; no visible oscillation"
             # C s of an arm that still moves is in it, too.
             so = run["share_pushed"] <= 1.2 and run["overshoot"] <= bad["overshoot"] / 3.0
             if name == "(11) as printed":
-                paper += "; it is beyond the limit at release, as C s is not limited"
+                paper += "; C s takes it beyond at release"
                 so &= run["share"] > 1.2
-        what = f"Fig. 5: hand pushed with {np.linalg.norm(force):.0f} N {side} for 5 s; {name}"
+        what = f"Fig. 5: {np.linalg.norm(force):.0f} N {side}, {name}"
         rows.append((what, paper, here, f"so with {values}" if so else f"not so with {values}"))
     return rows
 
@@ -484,14 +483,8 @@ def tables(figures: list[Figure]) -> str:
 
 
 def write_document(figures: list[Figure]) -> None:
-    """Write docs/reproduction_integral.md."""
-    (ROOT / "docs" / "reproduction_integral.md").write_text(
-        "# Results beside the paper: integral action\n\n"
-        "Written by `bash scripts/reproduce.sh paper1-integral`; do not edit.\n"
-        "[Benallegue2021] on TALOS' torso and left arm at 1 kHz, with friction, rotors and\n"
-        "mass errors; pictures and data are under `results/`.\n\n"
-        f"{tables(figures)}\n"
-    )
+    """Write the tables of docs/results.md."""
+    write_part("paper1-integral", tables(figures))
 
 
 if __name__ == "__main__":

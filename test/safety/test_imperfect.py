@@ -11,6 +11,7 @@ from imperfect import CASES, Course, node_values, scaled
 from imperfect_page import Minute, Outcome
 
 ROBOT = "baxter_left_arm"
+EMPTY = "# Results\n\n<!-- imperfect -->\n<!-- /imperfect -->\n\n## Next\n"
 KEPT = Minute(position=0.0, speed=0.0, torque=1.0, step=0.2, step_at_rest=0.01, stopped=0)
 BROKEN = Minute(position=0.0, speed=1e-3, torque=0.8, step=0.1, step_at_rest=0.04, stopped=3)
 
@@ -94,8 +95,10 @@ def folder(tmp_path, monkeypatch):
     """Results and page go here."""
     monkeypatch.setattr(imperfect_page, "RESULTS", tmp_path)
     monkeypatch.setattr("figure.RESULTS", tmp_path)
+    monkeypatch.setattr("figure.ROOT", tmp_path)
     monkeypatch.setattr(imperfect_page, "ROOT", tmp_path)
     (tmp_path / "docs" / "images").mkdir(parents=True)
+    (tmp_path / "docs" / "results.md").write_text(EMPTY)
     return tmp_path
 
 
@@ -106,8 +109,8 @@ def played(robot, name, *minutes):
 
 def write(folder):
     titles = {name: case.title for name, case in CASES.items()}
-    imperfect_page.write_page(imperfect.ROBOTS, titles, imperfect.PUSHED, 5e-3)
-    return (folder / "docs" / "reproduction_imperfect.md").read_text()
+    imperfect_page.write_page(imperfect.ROBOTS, titles, imperfect.PUSHED)
+    return (folder / "docs" / "results.md").read_text()
 
 
 def test_rows_of_earlier_runs_stay_and_are_replaced_by_new_ones(folder):
@@ -116,7 +119,7 @@ def test_rows_of_earlier_runs_stay_and_are_replaced_by_new_ones(folder):
     played(ROBOT, "ideal", KEPT, KEPT)
     imperfect_page.keep(ROBOT, "costs", "ideal", {"times": [1.5, None, 2.5, 3.5], "left": 0.01})
     first = write(folder)
-    assert first.index("## panda") < first.index(f"## {ROBOT}")
+    assert first.index("## panda") < first.index(f"## {ROBOT}") < first.index("## Next")
     assert "DIFFERS: a limit was passed" in first and "| kept |" in first
     assert f"| {ROBOT}, nothing done | 1.50 | - | 2.50 | 3.50 | 10.0 |" in first
     played(ROBOT, "all", KEPT)
@@ -133,6 +136,11 @@ def test_rows_of_earlier_runs_stay_and_are_replaced_by_new_ones(folder):
 
 
 def test_nothing_is_written_before_anything_was_played(folder):
-    titles = {name: case.title for name, case in CASES.items()}
-    imperfect_page.write_page(imperfect.ROBOTS, titles, imperfect.PUSHED, 5e-3)
-    assert not (folder / "docs" / "reproduction_imperfect.md").exists()
+    assert write(folder) == EMPTY
+
+
+def test_a_page_without_marks_is_refused(folder):
+    played("panda", "all", KEPT)
+    (folder / "docs" / "results.md").write_text("# Results\n")
+    with pytest.raises(ValueError, match="docs/results.md has no part"):
+        write(folder)
