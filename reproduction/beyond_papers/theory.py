@@ -37,7 +37,7 @@ RED, GREEN, GREY = "tab:red", "tab:green", "tab:gray"
 
 def publish(figure: Figure, picture: plt.Figure, name: str) -> Figure:
     """Write a picture under docs/images, and the figure under results/."""
-    picture.savefig(ROOT / "docs" / "images" / f"{name}.png", dpi=90)
+    picture.savefig(ROOT / "docs" / "images" / f"{name}.png", dpi=110)
     figure.save(picture)
     return figure
 
@@ -46,7 +46,7 @@ def bounds() -> Figure:
     """One joint that is sent beyond its limit, with usual bounds and with exact ones."""
     figure = Figure("theory-bounds")
     limits, dt, goal = JointLimits(("joint",), [-1.0], [1.0], [2.0], [-10.0], [10.0]), 0.01, 1.2
-    picture, axes = plt.subplots(1, 3, figsize=(15, 4.4), layout="constrained")
+    picture, axes = plt.subplots(1, 3, figsize=(11.5, 3.8), layout="constrained")
     place = np.linspace(-1.0, 1.0, 801)
     low, high = viability.viable_velocity_range(place[:, None], limits)
     axes[0].fill_between(place, low[:, 0], high[:, 0], color=GREEN, alpha=0.15, lw=0)
@@ -75,7 +75,7 @@ def bounds() -> Figure:
     axes[0].set(xlim=(-1.05, 1.3), ylim=(-2.2, 2.2), xlabel="position, rad", ylabel="speed, rad/s")
     axes[1].axhline(1.0, color="k", ls="--", lw=1)
     axes[1].set(xlabel="time, s", ylabel="position, rad; dashed: its limit")
-    axes[2].set(xlabel="time, s", ylabel="acceleration, rad/s²; shaded: exact bounds")
+    axes[2].set(xlabel="time, s", ylabel="acceleration, rad/s²; shaded: exact")
     for axis in axes:
         axis.grid(alpha=0.3)
     axes[0].legend(loc="lower left", fontsize=9)
@@ -94,7 +94,7 @@ def bounds() -> Figure:
 def integral_action() -> Figure:
     """TALOS' hand, pushed for 5 s and let go, without anti-windup and with it."""
     figure = Figure("theory-integral")
-    picture, axes = plt.subplots(1, 2, figsize=(13, 4.2), layout="constrained")
+    picture, axes = plt.subplots(1, 2, figsize=(10, 3.7), layout="constrained")
     overshoot = {}
     for name, changed, color in (
         ("without anti-windup", UNLIMITED, RED),
@@ -126,7 +126,7 @@ def integral_action() -> Figure:
 def nullspace() -> Figure:
     """TALOS' elbow, pushed to and fro, stiff in all joints and in the hand's pose only."""
     figure = Figure("theory-nullspace")
-    picture, axes = plt.subplots(1, 2, figsize=(13, 4.2), layout="constrained")
+    picture, axes = plt.subplots(1, 2, figsize=(10, 3.7), layout="constrained")
     moved = {}
     for (name, changed), color in zip(MODES.items(), (RED, GREEN), strict=True):
         run = push_elbow(changed, hand=0.0)
@@ -182,7 +182,7 @@ def stopping() -> Figure:
 def _speeds() -> plt.Figure:
     """Draw the speeds of Panda's joints in a stop, by brakes and by the law."""
     stopped = Stopped("panda")
-    picture, axes = plt.subplots(1, 2, figsize=(13, 3.8), sharey=True, layout="constrained")
+    picture, axes = plt.subplots(1, 2, figsize=(10, 3.4), sharey=True, layout="constrained")
     with closing(stopped.robot):
         rng = np.random.default_rng(0)
         states = [stopped.edge(rng) for _ in range(STATES)]
@@ -273,7 +273,7 @@ def estimator() -> Figure:
     t, true, difference, estimate = np.array(rows)[50:].T
     bound = float(design.velocity_error[0]) + w * delay * dt
     figure.data["t, true, difference, estimate"] = np.array(rows)
-    picture, axes = plt.subplots(1, 2, figsize=(13, 4.0), layout="constrained")
+    picture, axes = plt.subplots(1, 2, figsize=(10, 3.7), layout="constrained")
     axes[0].plot(t, difference, color=RED, lw=0.8, label="difference of positions, as reported")
     axes[0].plot(t, true, color="k", lw=2.5, label="true, when the command acts")
     axes[0].plot(t, estimate, color=GREEN, lw=1.2, label="estimated and predicted")

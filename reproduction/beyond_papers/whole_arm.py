@@ -300,7 +300,7 @@ def safe_set(axis: plt.Axes, elbow: float) -> None:
     axis.set(
         xlabel="left_s1, rad",
         ylabel="its speed, rad/s",
-        title=f"where a safe plan is known, elbow at {elbow:g} rad",
+        title=f"safe plans, elbow at {elbow:g} rad",
     )
 
 
@@ -319,7 +319,7 @@ def main() -> int:
     if given.row:
         return 0 if kept else 1
     write_part("whole-arm", rows)
-    picture, axes = plt.subplots(1, 3, figsize=(16, 4.6), layout="constrained")
+    picture, axes = plt.subplots(1, 3, figsize=(12.5, 4.0), layout="constrained")
     shoulder(axes[0])
     safe_set(axes[1], 0.0)
     safe_set(axes[2], 1.5)
