@@ -67,14 +67,14 @@ class Case(NamedTuple):
 
 CASES = (
     Case("the paper's values", PAPER, ADMITTANCE),
-    Case("the paper's values, half the friction", PAPER | arm(0.5), ADMITTANCE),
+    Case("half the friction", PAPER | arm(0.5), ADMITTANCE),
     Case(
-        "the paper's values, half the friction, 4 times the rotors",
+        "half the friction, 4 times the rotors",
         PAPER | arm(0.5, 4.0),
         ADMITTANCE,
     ),
     Case(
-        "λ = 10, else the paper's values, half the friction",
+        "half the friction, λ = 10 1/s",
         PAPER | arm(0.5) | {"integral_lambda": 10.0},
         ADMITTANCE,
     ),
@@ -115,8 +115,7 @@ Holds = Callable[[Mapping[str, float]], bool]
 
 STATEMENTS: tuple[tuple[str, str, Told, Holds | None], ...] = (
     (
-        "Fig. 6 to 8: elbow pushed for 3 s, in both directions, with 0.9 of what stiction holds; "
-        "a null-space joint moves without / with null-space compliance",
+        "Fig. 6 to 8: elbow pushed, a joint moves without / with",
         "hardly / much easier (no number)",
         lambda found: (
             f"{found['elbow_n']:.0f} N: {found['without_witness_motion_rad']:.3f} / "
@@ -135,8 +134,7 @@ STATEMENTS: tuple[tuple[str, str, Told, Holds | None], ...] = (
         None,
     ),
     (
-        f"Fig. 6: hand pushed with {HAND_FORCE:.0f} N along x, y, z; mean error of the last "
-        "0.3 s, without / with",
+        f"Fig. 6: hand pushed with {HAND_FORCE:.0f} N, its error without / with",
         "stiff / also stiff (no number)",
         lambda found: (
             f"{1e3 * found['without_steady_m']:.2f} / {1e3 * found['with_steady_m']:.2f} mm"
@@ -144,7 +142,7 @@ STATEMENTS: tuple[tuple[str, str, Told, Holds | None], ...] = (
         lambda found: found["with_steady_m"] <= 1.1 * found["without_steady_m"],
     ),
     (
-        "Fig. 9: elbow pushed as above for 2 s, with; joint, hand",
+        "Fig. 9: elbow pushed for 2 s, joint and hand",
         "the hand stays where it is (no number)",
         lambda found: f"{found['dual_joint_rad']:.3f} rad, {1e3 * found['dual_hand_m']:.1f} mm",
         None,
@@ -156,13 +154,13 @@ STATEMENTS: tuple[tuple[str, str, Told, Holds | None], ...] = (
         lambda found: found["led_m"] >= 0.02,
     ),
     (
-        "Fig. 10, 11: one turn of 40 cm in 8 s, without poles, with",
+        "Fig. 10, 11: a turn of 40 cm in 8 s, without poles",
         "-",
         lambda found: f"{1e3 * found['free_m']:.1f} mm",
         None,
     ),
     (
-        "Fig. 10, 11: the same among our two poles, posture kp 0, with",
+        "Fig. 10, 11: the same among two poles",
         "under 20 mm",
         lambda found: f"{1e3 * found['poles_m']:.1f} mm",
         lambda found: found["poles_m"] < 0.02,
