@@ -328,7 +328,7 @@ def pressing(figure: Figure) -> None:
             f"{name}, {note}, presses with {FORCE:.0f} N: at most {numbers['most_n']:.1f} N; "
             f"within {100 * numbers['error_standing']:.1f} % standing, "
             f"{100 * numbers['error_sliding']:.1f} % sliding {100 * SLIDE[1]:.0f} cm",
-            "within 5 %, 2 N" if _holds(numbers) else "not held: docs/forces.md",
+            "within 5 %, 2 N" if _holds(numbers) else "not held: friction",
         )
         for (name, numbers), note in zip(
             judged.items(), ("without friction", "its friction compensated"), strict=True

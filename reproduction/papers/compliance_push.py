@@ -25,8 +25,7 @@ MODES = {
 RAMP = 0.3  # s, in which a person's push grows
 HAND_FORCE, ELBOW_FORCE = 50.0, 100.0  # N
 ACTIVE = {"leak_rate": 100.0, "gain": 300.0}
-"""Of the friction compensation, for active compliance."""
-"""Friction compensated by 70% the way the joint moves: docs/friction.md, "Which theta?"."""
+"""Of the friction compensation: 70% of the friction, the way the joint moves."""
 
 
 class TimedForce(NamedTuple):
