@@ -8,8 +8,8 @@ Braking lasts whole steps: a joint that stops in front of one limit early in a s
 back until the step ends, and may then be too fast, or too close to the other limit. Where (11)
 fails this is what decides, and the kernel is smaller than that of continuous time.
 
-`docs/theory/bounds.md` derives the kernel: a state that moves towards a limit at speed v is viable if
-and only if its room to that limit is at least U(v), where
+A state that moves towards a limit at speed v is viable if and only if its room to that limit is at
+least U(v), where
 
     U(v) = v^2 / (2 (u + v))                      for v <= b,
     U(v) = v - b / 2 + U(v - b)                   for v > b,

@@ -224,8 +224,9 @@ OBSERVER_HEADS = (
     "robot, its first joint",
     "Delta, rad",
     "W, rad/s²",
-    "observer: largest error, noise, rad/s; lag, ms",
-    "differences: largest error of quantisation, noise, rad/s",
+    "observer: largest error, rad/s",
+    "observer: lag, ms",
+    "differences: error of quantisation alone, rad/s",
 )
 
 
@@ -237,16 +238,16 @@ def estimator() -> Figure:
         delta, w = (own[key][0] for key in ("position_error", "acceleration_disturbance"))
         dt = 1.0 / own["rate_hz"]
         design = design_observer(dt, delta, w)
-        error, noise, lag = (
-            float(each[0]) for each in (design.velocity_error, design.noise, design.lag)
-        )
+        pole = float(np.sqrt(1.0 - design.position_gain[0]))
+        lag = dt * (2.0 / (1.0 - pole) - 1.5)
         figure.rows.append(
             (
                 name,
                 f"{delta:.2g}",
                 f"{w:g}",
-                f"{error:.3f}, {noise:.4f}; {1e3 * lag:.1f}",
-                f"{2.0 * delta / dt:.3f}, {np.sqrt(2.0 / 3.0) * delta / dt:.3f}",
+                f"{design.velocity_error[0]:.3f}",
+                f"{1e3 * lag:.1f}",
+                f"{2.0 * delta / dt:.3f}",
             )
         )
     dt, delay, w, step = 0.002, 2, 1.0, 9.6e-5
