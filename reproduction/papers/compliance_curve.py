@@ -236,8 +236,7 @@ def _rows(found: dict[tuple[str, str], dict[str, float]]) -> list[tuple[str, str
         rows.append(
             (
                 f"Fig. 10, 11: {what}",
-                "the disturbance is visible, the error remains under 2 cm; only tried with "
-                "null-space compliance",
+                "under 2 cm; only tried with",
                 f"with: {_told(with_it)}, {_forces(with_it)}; without: {_told(lacking)}, "
                 f"{_forces(lacking)}",
                 "so with the file's values" if kept and lower else "DIFFERS",

@@ -214,8 +214,7 @@ def figure_6() -> Figure:
         (
             f"Fig. 6, 7, 8: elbow pushed with {ELBOW_FORCE:.0f} N for 3 s, in both directions "
             f"(stiction alone holds {least:.0f} N)",
-            "hardly moves, with a lot of resistance; much easier to move with null-space "
-            "compliance, some force is still required",
+            "hardly moves without; much easier to move with",
             f"null-space joint moves {lacking['witness_motion_rad']:.3f} rad without, "
             f"{with_it['witness_motion_rad']:.3f} rad with ({joint}), {ratio:.0f} times further; "
             f"hand meanwhile within {told[0]} without, {told[1]} with",
