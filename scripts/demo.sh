@@ -14,7 +14,7 @@ usage: bash scripts/demo.sh [robot] [scenario] [--bounds METHOD] [--rate HZ] [--
                path of a file, see docs/scenarios.md (default: demo; of a robot that has none, it
                holds its start posture for 2 s)
   --bounds     how acceleration limits are computed: exact (default), or naive, which violates the
-               limits, decre, rubrecht, damper; these without the safety filter
+               limits, decre, rubrecht; these without the safety filter
   --rate       control rate in Hz (default: the robot's own)
   --real-time  by the wall clock; without, in lockstep: the simulation waits for each command, so
                that it is as fast as the machine can, repeatable, and misses no deadline
@@ -94,8 +94,8 @@ for each in "${params[@]}"; do
     [ -f "$each" ] || refuse "no parameter file '$each'"
 done
 case "$bounds" in
-exact | naive | decre | rubrecht | damper) ;;
-*) refuse "--bounds is '$bounds'; allowed: exact, naive, decre, rubrecht, damper" ;;
+exact | naive | decre | rubrecht) ;;
+*) refuse "--bounds is '$bounds'; allowed: exact, naive, decre, rubrecht" ;;
 esac
 if [ "$rate" != default ] && ! { [[ "$rate" =~ ^[0-9]*\.?[0-9]+$|^[0-9]+\.$ ]] &&
     awk -v rate="$rate" 'BEGIN { exit !(0 < rate && rate <= 10000) }'; }; then
