@@ -18,7 +18,7 @@ from figure import RESULTS, Figure, table
 
 from viability_bounds_pkg.robot.description import package_directories
 
-PAGE = ROOT / "docs" / "new_robot.md"
+PAGE = ROOT / "docs" / "start" / "your_robot.md"
 BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
 FOLDER = RESULTS / "new_robot"
 HEADS = (

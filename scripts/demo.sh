@@ -11,7 +11,7 @@ usage: bash scripts/demo.sh [robot] [scenario] [--bounds METHOD] [--rate HZ] [--
   robot        the name of a parameter file in config/, as baxter_left_arm (default), panda and
                talos_left_arm, or the path of one; scripts/new_robot.sh makes one from a URDF
   scenario     the name in config/scenarios/<robot>_<scenario>.yaml, beside the robot's file, or the
-               path of a file, see docs/scenarios.md (default: demo; of a robot that has none, it
+               path of a file, see docs/guides/simulation.md (default: demo; of a robot that has none, it
                holds its start posture for 2 s)
   --bounds     how acceleration limits are computed: exact (default), or naive, which violates the
                limits, decre, rubrecht; these without the safety filter
@@ -20,16 +20,16 @@ usage: bash scripts/demo.sh [robot] [scenario] [--bounds METHOD] [--rate HZ] [--
                that it is as fast as the machine can, repeatable, and misses no deadline
   --imperfect  with encoders, delays, motors and lost commands like those of a real robot, and
                with what is done about them, from config/imperfect/<robot>.yaml; estimator_node
-               runs, too; see docs/simulated_robot.md
+               runs, too; see docs/guides/simulation.md
   --params     a further parameter file, such as config/obstacles/panda_wall.yaml; repeatable, the
                last value given counts
   --processes  each node in a process of its own; without, robot, estimator, bounds and controller
-               are one process (docs/performance.md)
+               are one process (docs/guides/real_time.md)
   --view       shows the arm on a page in the browser, by the wall clock; Enter plays the scenario,
-               in between the arm can be driven there, Ctrl-C ends (docs/viewer.md); where standard
+               in between the arm can be driven there, Ctrl-C ends (docs/guides/tools.md); where standard
                input is no terminal, the scenario is played once
   --record     also writes all messages to recording.mcap there, for Foxglove and PlotJuggler
-               (docs/visualisation.md)
+               (docs/guides/tools.md)
   --out        where figure, data and metrics go (default: results/<robot>_<scenario>; then
                results/demo is a link to it)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write docs/parameters.md, docs/topics.md and the list of names from the nodes' tables.
+"""Write the pages of docs/reference and the list of parameters' names from the nodes' tables.
 
 python scripts/make_reference.py
 python scripts/make_reference.py --check    # say which page is stale, write nothing
@@ -8,7 +8,9 @@ python scripts/make_reference.py --check    # say which page is stale, write not
 from __future__ import annotations
 
 import argparse
+import re
 import sys
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -47,63 +49,85 @@ _TYPES = {
     int: "integer",
     bool: "bool",
     str: "string",
-    list[float]: "double array",
-    list[str]: "string array",
+    list[float]: "double[]",
+    list[str]: "string[]",
 }
+_SHORTER = (
+    (r", one for each of 'joints'(, or none)?", ", per joint"),
+    (r"^(an? )?(whole |finite )?(number|numbers)\b,? ?", ""),
+    (r"^(\d+) (finite )?numbers\b(, or none)?", r"\1 numbers"),
+    (r"^>= (\S+) and <= ([^\s,;]+)", r"\1 to \2"),
+    (r"^> (\S+) and <= ([^\s,;]+)", r"> \1 to \2"),
+    (r"^one of ", ""),
+)
+"""How allowed values are said in fewer words; what a table's head says already is left out."""
+
+_PLAYERS = {"scenario_node", "viewer_node"}
+"""Nodes that send and read what users can, so that the tables of topics leave them out."""
 
 
 def parameters_page() -> str:
-    """Return the text of docs/parameters.md."""
-    heads = ("parameter", "type", "default", "allowed", "live", "description")
+    """Return the text of docs/reference/parameters.md."""
+    heads = ("parameter", "type, default", "allowed", "live", "meaning")
     text = f"""{_HEAD}
 # Parameters
 
-`ros2 param describe <node> <parameter>` shows the same. Arrays with one number for each joint are
-in the order of `joints`; an array that may be empty may be left out. A value that is not allowed
-stops a node at start with one line that names the parameter, the value and what is allowed. *Live*
-parameters can change while the node runs, where such a value is refused; all others are read-only.
-Whole numbers are accepted where a double is expected. Of several values given the last one counts,
-whether it comes from a file or from `-p`, and whatever section of the file it is in.
+`ros2 param describe NODE PARAMETER` shows the same.
+
+- *Per joint*: an array with one number for each joint, in the order of `joints`. An array whose
+  default is empty may be left out.
+- *Live*: can change while the node runs. All others are read-only.
+- A value that is not allowed stops a node at start with one line that names the parameter, the
+  value and what is allowed. While it runs the value is refused, and the old one stays. A name that
+  no node has is refused, too.
+- Of several values the last one given counts, whether it comes from a file or from `-p`.
+
+A file has sections `/**` for all nodes and `/**/controller_node` for one, each with
+`ros__parameters`. The files in `config/` are examples.
+
+## Several nodes
+
 """
-    rows = {row.name: row for table in TABLES.values() for row in table}
-    shared = [name for name in rows if _is_shared(name)]
-    text += "\n## Shared\n\nParameters of several nodes with the same meaning.\n\n"
+    shared: dict[tuple[str, ...], list[str]] = defaultdict(list)
+    for node, table in TABLES.items():
+        for row in table:
+            shared[_cells(row)].append(node)
+    shared = {cells: nodes for cells, nodes in shared.items() if len(nodes) > 1}
     text += _table(
         ("parameter", "nodes", *heads[1:]),
-        ((f"`{name}`", _nodes(name), *_cells(rows[name])[1:]) for name in shared),
+        ((cells[0], _nodes(nodes), *cells[1:]) for cells, nodes in shared.items()),
     )
     for node, table in TABLES.items():
-        own = [row for row in table if row.name not in shared]
-        text += f"\n## {node}\n\n" + _table(heads, map(_cells, own))
+        own = [cells for cells in map(_cells, table) if cells not in shared]
+        if own:
+            text += f"\n## {node}\n\n" + _table(heads, own)
     return text
 
 
 def topics_page() -> str:
-    """Return the text of docs/topics.md."""
+    """Return the text of docs/reference/topics.md."""
     text = f"""{_HEAD}
-# Topics and services
+# Topics, services, modes
 
-Control streams are best effort with depth 1, so that the newest message wins; goals are reliable.
-A robot of your own takes the place of `bullet_node`.
+Names are relative: a namespace is enough for a second arm. A robot of your own takes the place of
+`bullet_node`. `scenario_node` and `viewer_node` send and read what users can; they are left out.
+Names of nodes are without `_node`.
 
-## Topics
+## Control streams
+
+Best effort with depth 1, so that the newest message wins. The stamp names the control step.
 
 """
-    heads = ("topic", "type", "from", "to", "quality of service", "meaning")
-    text += _table(
-        heads,
-        (
-            (
-                f"`{topic.name}`",
-                _type_name(topic.message),
-                ", ".join(topic.source),
-                ", ".join(topic.sink),
-                _quality(topic),
-                topic.meaning,
-            )
-            for topic in TOPICS
-        ),
-    )
+    heads = ("topic", "type", "from → to", "meaning")
+    streams = [topic for topic in TOPICS if not _is_reliable(topic)]
+    text += _table(heads, map(_topic_cells, streams))
+    text += """
+## Goals and reports
+
+Reliable: publish them so, too. *Latched* is transient local: who comes later gets the last one.
+
+"""
+    text += _table(heads, (_topic_cells(topic) for topic in TOPICS if topic not in streams))
     text += "\n## Services\n\n"
     text += _table(
         ("service", "type", "meaning"),
@@ -112,14 +136,40 @@ A robot of your own takes the place of `bullet_node`.
     return text + _modes()
 
 
+def _topic_cells(topic: Topic) -> tuple[str, ...]:
+    latched = topic.qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    return (
+        f"`{topic.name}`",
+        _type_name(topic.message),
+        f"{_ends(topic.source)} → {_ends(topic.sink)}",
+        ("latched; " if latched else "") + topic.meaning,
+    )
+
+
+def _is_reliable(topic: Topic) -> bool:
+    return topic.qos.reliability == ReliabilityPolicy.RELIABLE
+
+
+def _ends(nodes: Sequence[str]) -> str:
+    """Return the nodes at one end of a topic, without those that stand for users."""
+    return _nodes([node for node in nodes if node not in _PLAYERS]) or "user"
+
+
 def _modes() -> str:
     """Return what the modes of the controller follow from."""
     text = """
 ## Modes of controller_node
 
-What mode and reason follow from, and the share of the goals that the arm serves. Of all that lasts
-the first row gives the mode; without any it is TRACKING, and the share rises to 1 within 0.5 s
-([stopping.md](stopping.md#the-controllers-part)). `/diagnostics` has mode, reason and share.
+| mode | what the controller does |
+| --- | --- |
+| TRACKING | serves the goals inside all limits |
+| HOLD | gravity compensation and damping, inside limits that it computes itself where none come |
+| POSITION | the robot's own drives hold the commanded position |
+| STOPPED | publishes nothing, so that the robot stops itself |
+
+The table says what mode and reason follow from, and which share of the goals the arm serves. Of
+all that lasts the first row gives the mode. Without any the mode is TRACKING, and the share rises
+to 1 within 0.5 s. `/diagnostics` has mode, reason and share.
 
 """
     text += _table(
@@ -152,28 +202,31 @@ def parameter_names() -> str:
 
 
 PAGES = {
-    "docs/parameters.md": parameters_page,
-    "docs/topics.md": topics_page,
+    "docs/reference/parameters.md": parameters_page,
+    "docs/reference/topics.md": topics_page,
     "src/viability_bounds_pkg/viability_bounds_pkg/ros/parameter_names.txt": parameter_names,
 }
 
 
-def _is_shared(name: str) -> bool:
-    """Return whether several nodes have a parameter and all mean the same by it."""
-    cells = [_cells(row) for table in TABLES.values() for row in table if row.name == name]
-    return len(cells) > 1 and len(set(cells)) == 1
-
-
-def _nodes(name: str) -> str:
-    """Return which nodes have a parameter, without the end of their names."""
-    having = (node for node, table in TABLES.items() if any(row.name == name for row in table))
-    return ", ".join(node.removesuffix("_node") for node in having)
+def _nodes(nodes: Sequence[str]) -> str:
+    """Return the names of nodes without their end."""
+    if len(nodes) == len(TABLES):
+        return "all"
+    return ", ".join(node.removesuffix("_node") for node in nodes)
 
 
 def _cells(row: Parameter) -> tuple[str, ...]:
     live = "live" if row.live else ""
-    allowed = row.constraints
-    return f"`{row.name}`", _TYPES[row.kind], _default(row), allowed, live, row.description
+    kind = f"{_TYPES[row.kind]}, {_default(row)}"
+    return f"`{row.name}`", kind, _allowed(row), live, row.description
+
+
+def _allowed(row: Parameter) -> str:
+    """Return what is allowed, in few words."""
+    text = row.constraints
+    for pattern, shorter in _SHORTER:
+        text = re.sub(pattern, shorter, text)
+    return text
 
 
 def _default(row: Parameter) -> str:
@@ -188,13 +241,6 @@ def _default(row: Parameter) -> str:
 
 def _type_name(message: type) -> str:
     return f"{message.__module__.split('.')[0]}/{message.__name__}"
-
-
-def _quality(topic: Topic) -> str:
-    reliable = topic.qos.reliability == ReliabilityPolicy.RELIABLE
-    latched = topic.qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
-    kind = ("reliable" if reliable else "best effort") + (", transient local" if latched else "")
-    return f"{kind}, depth {topic.qos.depth}"
 
 
 def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -18,10 +18,10 @@ usage: bash scripts/new_robot.sh URDF TIP [--base LINK] [--name NAME] [--rate HZ
   --out       folder of the files (default: config)
   --force     replace files of this name
   --table     play arms of installed packages, in results/new_robot, and write the table in
-              docs/new_robot.md; rows of arms that are not named stay
+              docs/start/your_robot.md; rows of arms that are not named stay
 
 Writes <name>.yaml, with a comment to each number, and scenarios/<name>_demo.yaml, and plays the
-scenario in lockstep: into limits and back. docs/new_robot.md has more.
+scenario in lockstep: into limits and back. docs/start/your_robot.md has more.
 Exits with 0 when no limit was violated, 1 when one was or no files can be made, 2 when it could
 not run.
 USAGE

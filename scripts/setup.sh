@@ -7,7 +7,7 @@
 # With ROS 2 Jazzy sourced, it makes .venv on top of that (system site packages), keeps the system's
 # NumPy, and adds what is missing. Without, it installs the Jazzy wheels into .venv. Then it builds
 # the three packages with colcon, and compiles what Numba would otherwise compile at the first start
-# of a node. What is done already is not done again. See docs/installation.md.
+# of a node. What is done already is not done again. See docs/start/install.md.
 
 _usage() {
     cat <<'USAGE'
@@ -53,7 +53,7 @@ print(sys._base_executable if sys.prefix == sys.argv[1] else sys.executable)' "$
 
     # The inputs of an installation; when one of them changes, it is repeated.
     stamp="$venv/.installed"
-    inputs="$(cat "$root"/requirements/*.txt; echo "$ros"
+    inputs="$(cat "$root"/requirements/{common,constraints,pinocchio,wheels}.txt; echo "$ros"
         "$python" --version; [ "$ros" = wheels ] || _packages fingerprint)"
     wanted="$(printf '%s' "$inputs" | sha256sum | cut -d' ' -f1)"
     if [ "$(cat "$stamp" 2>/dev/null)" != "$wanted" ]; then

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""docs/parameters.md and docs/topics.md say what the nodes really have."""
+"""The pages of docs/reference say what the nodes really have."""
 
 import importlib.util
 from collections import defaultdict
@@ -63,9 +63,9 @@ def test_check_finds_a_stale_page(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(make_reference, "ROOT", tmp_path)
     assert make_reference.main([]) == 0
     assert make_reference.main(["--check"]) == 0
-    (tmp_path / "docs" / "topics.md").write_text("old")
+    (tmp_path / "docs" / "reference" / "topics.md").write_text("old")
     assert make_reference.main(["--check"]) == 1
-    assert "docs/topics.md is stale" in capsys.readouterr().err
+    assert "docs/reference/topics.md is stale" in capsys.readouterr().err
 
 
 def start(ros, name):

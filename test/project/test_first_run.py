@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every command of docs/start/first_run.md works, as a newcomer types it."""
+
+import os
+import signal
+import subprocess
+
+import pinocchio as pin
+import pytest
+from shown_commands import ROOT, blocks, commands, make_hurried_tree, run
+
+from torque_safety_controller.remote.arm_client import ArmClient
+from viability_bounds_pkg.testing.executables import run_to_end
+
+PAGE = (ROOT / "docs" / "start" / "first_run.md").read_text()
+COMMANDS = sorted(commands(PAGE))
+SESSIONS = [
+    "\n".join(line.removeprefix("$ ") for line in block.splitlines())
+    for block in blocks(PAGE, "console")
+]
+(GOAL,) = blocks(PAGE, "python")
+JOINTS = [f"panda_joint{k}" for k in range(1, 8)]
+BROKEN = "--bounds naive"
+"""With it a limit is broken, says the page."""
+
+pytestmark = pytest.mark.long
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory):
+    return make_hurried_tree(tmp_path_factory.mktemp("tree"))
+
+
+def test_an_arm_is_made_and_each_command_runs(tree):
+    (tree / "examples").symlink_to(ROOT / "examples")
+    # The arm is made before it is shown; its scenario is played in full.
+    for command in sorted(COMMANDS, key=lambda each: "new_robot" not in each):
+        if BROKEN in command:
+            continue
+        result = run(command, tree)
+        busy = "--view" in command and result.returncode == 1  # by the wall clock
+        assert result.returncode == 0 or busy, command + result.stdout + result.stderr
+
+
+def test_the_usual_bounds_break_a_limit(tmp_path):
+    (command,) = (each for each in COMMANDS if BROKEN in each)
+    result = run(f"{command} --out {tmp_path}")
+    assert result.returncode == 1, result.stdout + result.stderr
+    assert "BROKEN" in result.stdout
+
+
+def test_a_goal_from_the_script_is_reached_and_held_after_its_end(tree):
+    stack, viewer, script = (typed(session) for session in SESSIONS)
+    (tree / "goal.py").write_text(GOAL)
+    programs = [started(stack, tree), started(viewer, tree)]
+    try:
+        with ArmClient(JOINTS, timeout=120.0) as arm:
+            start = arm.state().hand
+            ended = run_to_end("bash", "-c", script, cwd=tree, timeout=120)
+            assert ended.returncode == 0, ended.stderr
+            arm.wait(6.0)
+            hand = arm.state().hand
+            arm.wait(1.0)
+            later = arm.state().hand
+    finally:
+        for program in programs:
+            os.killpg(program.pid, signal.SIGINT)
+        said = [program.communicate(timeout=60)[0] for program in programs]
+    goal = pin.SE3(pin.Quaternion(0.0, 1.0, 0.0, 0.0).toRotationMatrix(), hand.translation)
+    goal.translation[:] = 0.4, 0.2, 0.5
+    assert abs(start.translation - goal.translation).max() > 0.1
+    for pose in (hand, later):
+        assert abs(pose.translation - goal.translation).max() < 0.005, said  # m
+        assert abs(pin.log3(pose.rotation.T @ goal.rotation)).max() < 0.02  # rad
+    assert "the arm is at http://127.0.0.1" in said[1]
+
+
+def typed(session):
+    """Return a session of a terminal, in the domain of this test."""
+    assert "ROS_DOMAIN_ID=7 " in session
+    return session.replace("ROS_DOMAIN_ID=7 ", f"ROS_DOMAIN_ID={os.environ['ROS_DOMAIN_ID']} ")
+
+
+def started(session, tree):
+    """Start what is typed in a terminal; its last command takes the place of the shell."""
+    *before, last = session.splitlines()
+    return subprocess.Popen(
+        ["bash", "-c", "\n".join((*before, f"exec {last}"))],
+        cwd=tree,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
