@@ -9,7 +9,7 @@ same: s'u > 0. Both ways leave alone what is within the limits:
   s'x, no less than (10) does.
 
 For the K of the control step, lambda diag(M), (11) is the clip of each component by itself;
-`docs/integral_action.md` proves it.
+`docs/theory/integral_action.md` proves it.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Modes of the controller and what they follow from: tables that `docs/topics.md` shows."""
+"""Modes of the controller, and what they follow from; `docs/reference/topics.md` shows both."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ class RobotModel(FrameModel):
 
     because the acceleration under a constant torque drifts: a torque right for the middle of
     the step gives the wanted change of velocity with an error of second order in dt, one for
-    its beginning with an error of first order. `docs/torque_margin.md` measures both. The
+    its beginning with an error of first order. `docs/theory/bounds.md` measures both. The
     acceleration a of the step is not known before the QP is solved; the last one stands in for
     it in `update`, and `torque` takes the one that was found.
 

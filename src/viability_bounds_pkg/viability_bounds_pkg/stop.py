@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stop law for drives: brings an arm to rest with all limits kept, without commands.
 
-`docs/stopping.md` derives and proves it.
+`docs/theory/whole_arm.md` derives and proves it.
 
 At each step of the drive, h, the joints slow down in proportion to their speeds, so that the arm
 keeps its direction and all joints come to rest together, as soon as their acceleration limits

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Declared uncertainty of a robot, and the horizon and errors that its bounds must hold for.
 
-All declarations zero: states are exact, commands act at once. `docs/uncertainty.md` derives the
+All declarations zero: states are exact, commands act at once. `docs/theory/bounds.md` derives the
 rest. The bounds are asked for a state that belongs to the instant when the command begins to act
 if it is not late; its error is that of the state for its own instant, what the acceleration may be
 off until then, and what other commands than those expected may do.

@@ -3,8 +3,8 @@
 
 A state is viable when position and velocity limits can be kept for ever from it. The bounds are
 the accelerations, constant over one step, that keep the limits during the step and lead to a
-viable state. `docs/bounds.md` derives everything below. In short, towards the upper limit, with
-`room` to it and braking B:
+viable state. `docs/theory/bounds.md` derives everything below. In short, towards the upper limit,
+with `room` to it and braking B:
 
 - the step may end with velocity w >= 0 when the joint can still stop afterwards, which holds for
   ``dt w / 2 + w^2 / (2 B) <= room - dt v / 2``; the largest such w gives (w - v) / dt;

@@ -2,8 +2,8 @@
 """A robot in a PyBullet world of its own, without what PyBullet adds to rigid-body dynamics.
 
 PyBullet's Dantzig solver, a direct one, computes the constraint impulses of brakes, friction,
-rotors and contacts, exact to rounding (docs/simulated_robot.md). If it finds no solution, PyBullet
-falls back to sequential impulses.
+rotors and contacts, exact to rounding (docs/guides/simulation.md). If it finds no solution,
+PyBullet falls back to sequential impulses.
 """
 
 from __future__ import annotations

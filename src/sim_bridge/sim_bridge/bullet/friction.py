@@ -18,7 +18,7 @@ on the right, viscous friction is implicit as well, an explicit torque and a lar
     (M + I + h d) (v_k+1 - v_k) = ... - h d v_k.
 
 In PyBullet dry friction is a motor with velocity target zero and limited torque, and each rotor a
-link that a gear constraint couples to its joint; docs/simulated_robot.md has the reasons.
+link that a gear constraint couples to its joint; docs/guides/simulation.md has the reasons.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ moves a body of mass m by m (v+ - v) = h (F + f), which is the same for
     m = h d + h^2 k,    f = -k x - (d + h k) v.
 
 Along the surface PyBullet's contacts are frictionless; `ContactFriction` has Coulomb's law.
-docs/simulated_robot.md gives the reasons.
+docs/guides/simulation.md gives the reasons.
 """
 
 from __future__ import annotations

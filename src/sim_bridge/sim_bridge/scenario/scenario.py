@@ -86,7 +86,7 @@ class ScenarioConfiguration(TaskFrames, LimitedRobotConfiguration):
 
 
 def load_scenario(path: str | Path) -> Scenario:
-    """Read a scenario; ``docs/scenarios.md`` describes the file.
+    """Read a scenario; ``docs/guides/simulation.md`` describes the file.
 
     Raises:
         ScenarioError: the file is missing, or an entry in it is unknown, malformed or out of

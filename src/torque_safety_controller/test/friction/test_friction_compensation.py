@@ -44,7 +44,7 @@ def felt(M):
 
 
 def expected(w, model, M, v, a, dt, theta, share=1.0, budget=WIDE):
-    """The law as `docs/friction.md` has it, one joint after the other."""
+    """The law as `docs/guides/tuning.md` has it, one joint after the other."""
     w, tau = w.copy(), np.empty(len(w))
     for i in range(len(w)):
         friction = min(share * model.level(v)[i], budget[i])
@@ -285,7 +285,7 @@ def test_periods_of_delay_do_not_matter():
 
 
 def lyapunov(x, v, w, M, kp, kd, theta, limit):
-    """V of `docs/friction.md` for springs and dampers times M, and torques up to `limit`."""
+    """V of `docs/guides/tuning.md` for springs and dampers times M, and torques up to `limit`."""
     gain = GAMMA * felt(M)
     free = np.minimum(np.abs(w), limit / gain)
     energy = np.sum(0.5 * gain * free**2 + limit * (np.abs(w) - free))

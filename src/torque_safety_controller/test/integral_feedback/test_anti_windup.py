@@ -222,7 +222,7 @@ def test_inequality_has_an_effect():
 
 
 def test_jumps_where_only_one_point_is_left():
-    """(11) as printed is not continuous in s: see docs/integral_action.md."""
+    """(11) as printed is not continuous in s: see docs/theory/integral_action.md."""
     u, u_max = np.array([4.0, -1.5]), np.array([1.0, 2.0])
     np.testing.assert_allclose(project_to_limits(u, [1.0, 1e-6], u_max), [1.0, -0.375])
     np.testing.assert_allclose(project_to_limits(u, [1.0, -1e-6], u_max), [1.0, -1.5])

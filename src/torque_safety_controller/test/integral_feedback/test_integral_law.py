@@ -24,7 +24,7 @@ from torque_safety_controller.integral_feedback.leaky_integrator import leak_fac
 
 
 def extended_qp(M, s, u, limit, w):
-    """(11) with a leak, as a general QP; docs/integral_action.md."""
+    """(11) with a leak, as a general QP; docs/theory/integral_action.md."""
     s = s / np.abs(s).max()
     momentum = M @ s
     row = np.r_[s, s @ momentum / np.linalg.norm(momentum)]

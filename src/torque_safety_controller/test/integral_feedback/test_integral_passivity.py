@@ -139,7 +139,7 @@ def test_energy_decreases_at_the_rate_of_the_theory(arm, with_coriolis):
 
 
 def test_two_rates_lose_energy_as_derived(arm):
-    """docs/integral_action.md, "Two leak rates": the rate of W, the sum of both energies."""
+    """The rate of W, the sum of both energies, as docs/theory/integral_action.md has it."""
     dynamics, n = Dynamics(arm), arm.n
     mu, theta_f, theta_s = 0.4, 9.0, 0.5
 

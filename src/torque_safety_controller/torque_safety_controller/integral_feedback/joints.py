@@ -6,8 +6,8 @@ Of the torque of a control step,
     tau = M a_ref + h + (C + K) s,   K = lambda diag(M),   s' = a_ref - v',
 
 this is the last term, with s forgotten at two rates, and limited. It is known before the QP is
-solved, which then keeps the sum within the torque limits. `docs/integral_action.md` derives it
-all, and says where it goes beyond the paper.
+solved, which then keeps the sum within the torque limits. `docs/theory/integral_action.md` derives
+it all, and says where it goes beyond the paper.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ and the torque added to that of the reference is
 
 The task's error is integrated, and its integral dies away; the null space is held by a memory of
 some 10 ms only. The torque is linear in the memory (a, x), where x = a - a_fast is what the fast
-memory has forgotten, and the stored energy is quadratic. `docs/nullspace_compliance.md` derives
+memory has forgotten, and the stored energy is quadratic. `docs/theory/nullspace.md` derives
 it, says where it leaves the paper, and proves that nothing in it grows for ever.
 """
 

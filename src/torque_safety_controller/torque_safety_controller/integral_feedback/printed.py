@@ -8,7 +8,7 @@
 
 u_K is limited by (10), or by (11) with a for s. Nothing but a_slow and a_fast leaks: under a
 lasting push s, its integral and with them the rest of u grow without limit.
-`docs/departures.md` says what the law of `NullspaceCompliance` does instead.
+`docs/theory/nullspace.md` says what the law of `NullspaceCompliance` does instead.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@
 
 All of it is linear, and sampled once a control period. Each quantity is a row vector, what it is
 made of: of the state of the loop and of the command that enters at the motor. One step of the
-loop, written with such rows, gives its matrices. `docs/gains.md` derives it.
+loop, written with such rows, gives its matrices. `docs/guides/tuning.md` derives it.
 """
 
 from __future__ import annotations

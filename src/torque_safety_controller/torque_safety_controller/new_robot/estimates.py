@@ -3,7 +3,8 @@
 
 The limits must be available in every state within position and speed limits. Where they are not at
 the speeds of the URDF, either the speeds are lowered, or, where a motor is too weak whatever the
-speed, the safety filter is chosen, which needs them in most states only (docs/whole_arm.md).
+speed, the safety filter is chosen, which needs them in most states only
+(docs/theory/whole_arm.md).
 """
 
 from __future__ import annotations

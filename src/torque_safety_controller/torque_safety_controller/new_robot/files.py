@@ -15,7 +15,7 @@ from torque_safety_controller.new_robot.estimates import CAP, RESERVE, SHARE, Es
 from torque_safety_controller.new_robot.postures import Postures
 
 _FILTER = f"""\
-    # Limits are available in {SHARE:.0%} of states only; docs/whole_arm.md.
+    # Limits are available in {SHARE:.0%} of states only; docs/theory/whole_arm.md.
     safety_filter: true
 """
 
@@ -50,7 +50,7 @@ _ROBOT = """\
     # Two control periods ahead avoid chatter.
     bounds_dt_factor: 2.0
     # rad/s^3. Largest jerk found while a torque is held for a control period, plus 10%;
-    # docs/torque_margin.md.
+    # docs/theory/bounds.md.
     acceleration_drift: {drift}
     # rad. Error of the simulated position in a physics step of h = 1 ms: a h^2 / 8 with the
     # largest acceleration a.

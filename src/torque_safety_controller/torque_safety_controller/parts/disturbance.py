@@ -13,7 +13,7 @@ opposes the motion, does not widen them.
 
 With a filter of time constant T for the noise of the velocity, the error that remains is the
 change of the disturbance within T: after a step by d the bound is exceeded by d exp(-t / T).
-`docs/disturbances.md` measures it.
+`docs/theory/bounds.md` measures it.
 """
 
 from __future__ import annotations

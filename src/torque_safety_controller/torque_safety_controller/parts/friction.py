@@ -9,9 +9,9 @@
 
 with k the share to compensate, and m the inertia that the joint's motor feels. A joint that moves
 as it should has w = v, and its friction is compensated; one at rest has w ~ a_ref / theta: the
-acceleration wanted decides the direction, and takes it out of its stiction. `docs/friction.md`
-derives the law, and what keeps it from driving the joint: of the friction itself it never takes
-more than there is, and of too large a model it makes a stiffer spring.
+acceleration wanted decides the direction, and takes it out of its stiction.
+`docs/guides/tuning.md` has the law, and what keeps it from driving the joint: of the friction
+itself it never takes more than there is, and of too large a model it makes a stiffer spring.
 """
 
 from __future__ import annotations

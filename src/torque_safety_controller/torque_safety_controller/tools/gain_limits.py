@@ -2,7 +2,8 @@
 """Command line tool that prints gains beside the largest that a robot allows.
 
 Reads a robot's parameter files: delay, bandwidth of the motors and resolution of the encoders, as
-declared for bounds_node, and the gains of controller_node. `docs/gains.md` derives the limits.
+declared for bounds_node, and the gains of controller_node. `docs/guides/tuning.md` derives the
+limits.
 """
 
 from __future__ import annotations
@@ -261,8 +262,8 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         "resolution of its encoders permit.",
         epilog=f"The loop of a joint keeps a modulus margin of {MARGIN:g}, that of a joint at its "
         f"limit {LIMIT_MARGIN:g}; at rest a step of the encoders changes no torque by more than "
-        f"{TORQUE_STEP:.0%} of torque_max a period. docs/gains.md derives both. Exit code 1: a "
-        "gain is beyond its limit.",
+        f"{TORQUE_STEP:.0%} of torque_max a period. docs/guides/tuning.md derives both. "
+        "Exit code 1: a gain is beyond its limit.",
     )
     parser.add_parameter_files()
     return parser.parse_args(arguments)

@@ -61,8 +61,8 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = Parser(
         prog="new_robot",
         description="Make the parameter files of an arm from its URDF.",
-        epilog="scripts/new_robot.sh runs it, and then the arm. docs/new_robot.md tells what is "
-        "found and how.",
+        epilog="scripts/new_robot.sh runs it, and then the arm. docs/start/your_robot.md tells "
+        "what is found and how.",
     )
     add = parser.add_argument
     add("urdf", nargs="?", help="URDF or xacro file, or package:// URI")

@@ -47,7 +47,7 @@ def drift_of_baxter(**options):
 
 
 def test_a_torque_for_the_middle_of_a_period_is_off_by_half_the_period_s_drift():
-    """Near worst states: what docs/torque_margin.md concludes from the drift."""
+    """Near worst states: what docs/theory/bounds.md concludes from the drift."""
     model, dt = baxter(), 0.002
     data, most = model.createData(), drift_of_baxter()
     q_min, q_max, v_max, _ = limits_of(model)

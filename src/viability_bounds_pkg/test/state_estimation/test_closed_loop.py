@@ -83,7 +83,7 @@ class Loop:
         return np.max([np.abs(np.subtract(x, y)) for x, y in pairs], axis=0)
 
     def allowed(self):
-        """Return what the declared errors allow, point 5 of docs/uncertainty.md."""
+        """Return what the declared errors allow, point 5 of docs/theory/bounds.md."""
         tau = self.delay * DT + self.lag
         e_q, e_v = self.design.position_error, self.design.velocity_error
         return e_q + tau * e_v + 0.5 * W * tau**2, e_v + W * tau

@@ -93,7 +93,7 @@ def test_joints_come_to_rest_clear_of_their_limits_where_they_can(arm):
 
 @pytest.mark.parametrize("adversary", ["out", "back", "random", "alternating"])
 def test_an_adversary_of_accelerations_within_the_margin_passes_no_limit(panda, adversary):
-    """The proof of docs/stopping.md: accelerations are off by all of the margin in each step."""
+    """As in docs/theory/whole_arm.md, accelerations are off by all of the margin in each step."""
     rng = np.random.default_rng(1)
     stop, limits = panda.stop(), panda.limits
     for _ in range(10):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Problem (4) of [DelPrete2018] solved as it is stated, to check the closed forms against.
 
-Nothing here comes from Algorithms 1 to 3 or from `docs/bounds.md`: no stopping distance, no
+Nothing here comes from Algorithms 1 to 3 or from `docs/theory/bounds.md`: no stopping distance, no
 kernel, no case distinction. A motion is N steps of constant acceleration, eq. (5). Everything is
 linear in the accelerations, so that "maximise a_0 subject to the limits" is a linear program
 with a constraint for each of infinitely many times. It is solved by exchange: keep the limits at

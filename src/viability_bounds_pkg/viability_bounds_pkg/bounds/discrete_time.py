@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The discrete-time condition (11) of [DelPrete2018]: when braking at full rate is safe.
 
-Asymmetric limits, a margin for disturbances and continuous joints are worked out in
-`docs/bounds.md`, errors of the state in `docs/uncertainty.md`. With B_up, B_lo the decelerations
+Asymmetric limits, a margin for disturbances, continuous joints and errors of the state are worked
+out in `docs/theory/bounds.md`. With B_up, B_lo the decelerations
 that the kernel counts on towards the upper and the lower limit, W the margin, E_q and E_v the
 largest errors of position and velocity, and
 

@@ -2,7 +2,7 @@
 """Margins on joint limits for the zero-order hold error of a torque command.
 
 The bounds assume constant acceleration within a step; a robot under a constant torque has
-only nearly that. `docs/torque_margin.md` derives the margins below and shows that they keep
+only nearly that. `docs/theory/bounds.md` derives the margins below and shows that they keep
 the limits.
 """
 

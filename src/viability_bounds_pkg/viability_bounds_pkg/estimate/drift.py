@@ -4,7 +4,7 @@
 A torque-controlled robot receives a torque that is constant for a control period, so that its
 acceleration is not: the inertia and the bias forces of eq. (30) of [DelPrete2018] change on the
 way. The paper neglects it ("time steps are typically short"); here it is searched for, so that
-the acceleration bounds can keep it back as a margin (`docs/torque_margin.md`).
+the acceleration bounds can keep it back as a margin (`docs/theory/bounds.md`).
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ class StateEstimator:
 
     A state with stamp k is of an earlier instant, and the command that answers it acts at a later
     one, `delay` periods apart. Between them the commands with the stamps k - delay to k - 1 act.
-    In the period before that instant it was command k - delay - 1. See `docs/state_estimation.md`.
+    In the period before that instant it was command k - delay - 1. See `docs/theory/estimator.md`.
 
     Args:
         model: n joints with one coordinate each.

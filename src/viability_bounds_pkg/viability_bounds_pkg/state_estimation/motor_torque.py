@@ -2,7 +2,7 @@
 """The torque that the motors gave: that of a command, or where none explains it, the reported one.
 
 A command has no noise, but may have been lost; the reported effort decides. See
-`docs/state_estimation.md`.
+`docs/theory/estimator.md`.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ disturbances with the signs of the response reach it, and nothing within Delta a
 
 A lasting d, such as friction at rest, leaves a lasting error of the velocity. So an integrator of
 r may learn a part c^, |c^| <= C, that is added to a. To the observer, d - c^ is the disturbance,
-which W has to cover; W >= |d| + C covers it whatever is learned. `docs/state_estimation.md`
+which W has to cover; W >= |d| + C covers it whatever is learned. `docs/theory/estimator.md`
 compares the observer with others.
 """
 

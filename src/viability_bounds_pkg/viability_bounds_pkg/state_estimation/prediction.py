@@ -19,7 +19,7 @@ class ForwardModel:
     """Mean accelerations of an arm under torques held for a period.
 
     They are those in the middle of the period, to which the last acceleration leads: of second
-    order in the period, as the torques of the controller are (`docs/torque_margin.md`).
+    order in the period, as the torques of the controller are (`docs/theory/bounds.md`).
 
     Args:
         model: n joints with one coordinate each.

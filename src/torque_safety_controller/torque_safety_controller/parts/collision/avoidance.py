@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Keeps links apart from each other and from obstacles, by constraints on joint accelerations.
 
-`docs/collision_avoidance.md` derives the rows, and says what they promise and what not.
+`docs/guides/collision.md` derives the rows, and says what they promise and what not.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@
 All bodies are segments with a radius, except boxes: these have segments as edges, and a segment
 that is the point nearest to something, or the edge through it. Segments move with their two ends:
 positions, velocities and accelerations in between are interpolated.
-`docs/collision_avoidance.md` derives the formulas.
+`docs/guides/collision.md` derives the formulas.
 """
 
 from __future__ import annotations

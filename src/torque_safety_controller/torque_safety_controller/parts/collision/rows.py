@@ -2,7 +2,7 @@
 """From distances to linear constraints on joint accelerations, compiled.
 
 A distance has a position, a speed and a braking limit, so that it is kept as the lower limit of a
-joint is. `docs/collision_avoidance.md` derives the rows.
+joint is. `docs/guides/collision.md` derives the rows.
 """
 
 from __future__ import annotations

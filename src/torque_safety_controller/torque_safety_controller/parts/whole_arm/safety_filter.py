@@ -8,7 +8,8 @@ arm to rest and holds it there, with positions and torques within their limits a
 (`braking_plan`). A step is taken as it is wanted if such a plan is known from where it leads;
 otherwise it is taken between what is wanted and the plan, as near to what is wanted as a few
 trials find; in the worst case it is the plan's own, after which the rest of the plan is still in
-hand. `docs/whole_arm.md` has the proof and its assumptions. Rates of torques are not planned.
+hand. `docs/theory/whole_arm.md` has the proof and its assumptions. Rates of torques are not
+planned.
 """
 
 from __future__ import annotations
