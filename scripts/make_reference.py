@@ -68,7 +68,7 @@ _PLAYERS = {"scenario_node", "viewer_node"}
 
 def parameters_page() -> str:
     """Return the text of docs/reference/parameters.md."""
-    heads = ("parameter", "type, default", "allowed", "live", "meaning")
+    heads = ("parameter", "type, default", "allowed", "meaning")
     text = f"""{_HEAD}
 # Parameters
 
@@ -216,9 +216,8 @@ def _nodes(nodes: Sequence[str]) -> str:
 
 
 def _cells(row: Parameter) -> tuple[str, ...]:
-    live = "live" if row.live else ""
-    kind = f"{_TYPES[row.kind]}, {_default(row)}"
-    return f"`{row.name}`", kind, _allowed(row), live, row.description
+    kind = f"{_TYPES[row.kind]}, {_default(row)}" + (", *live*" if row.live else "")
+    return f"`{row.name}`", kind, _allowed(row), row.description
 
 
 def _allowed(row: Parameter) -> str:
