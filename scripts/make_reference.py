@@ -62,6 +62,9 @@ _SHORTER = (
 )
 """How allowed values are said in fewer words; what a table's head says already is left out."""
 
+_BREAK = "<wbr>"
+"""Where a long name may be broken."""
+
 _PLAYERS = {"scenario_node", "viewer_node"}
 """Nodes that send and read what users can, so that the tables of topics leave them out."""
 
@@ -239,7 +242,7 @@ def _default(row: Parameter) -> str:
 
 
 def _type_name(message: type) -> str:
-    return f"{message.__module__.split('.')[0]}/{message.__name__}"
+    return f"{message.__module__.split('.')[0]}/{_BREAK}{message.__name__}"
 
 
 def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -248,7 +251,9 @@ def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def _escaped(cell: str) -> str:
-    return cell.replace("|", "\\|").replace("<", "&lt;") if "`" not in cell else cell
+    if "`" in cell:
+        return cell
+    return cell.replace("|", "\\|").replace("<", "&lt;").replace("&lt;wbr>", _BREAK)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
