@@ -11,7 +11,7 @@ the opposite friction, so that the two can be separated where a joint passes the
 both directions. x and b are eliminated, for each joint alone, and friction is fitted to the rest
 by least squares with Huber's weights; v_s is found by a search (variable projection,
 [Golub1973]). Standard errors come from the scatter between pieces of the recording, because
-neighbouring residuals are correlated. `docs/guides/tuning.md` shows results.
+neighbouring residuals are correlated. `docs/guides/tuning.md` tells how to use it.
 """
 
 from __future__ import annotations
