@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from contextlib import closing
+from io import BytesIO
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -87,12 +88,10 @@ def _frame(
         axis.grid(alpha=0.3)
         axis.text(BEGIN + 0.03, 6.0, "beyond the limit", color=RED, fontsize="small")
     axes[1, 0].set_ylabel("elbow to its limit [°]")
-    picture.canvas.draw()
-    image = Image.frombytes(
-        "RGBA", picture.canvas.get_width_height(), bytes(picture.canvas.buffer_rgba())
-    ).convert("RGB")
+    drawn = BytesIO()
+    picture.savefig(drawn, dpi=100)
     plt.close(picture)
-    return image
+    return Image.open(drawn).convert("RGB")
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ PACKAGE = "viability_bounds_pkg"
 
 setup(
     name=PACKAGE,
-    version="0.1.0",
+    version="0.2.0",
     packages=find_packages(exclude=["test"]),
     package_data={PACKAGE: ["py.typed", "ros/*_names.txt", "ros/fastdds.xml"]},
     data_files=[

@@ -62,7 +62,7 @@ def test_a_goal_from_the_script_is_reached_and_held_after_its_end(tree, ros):
         start = place(poses[-1])
         ended = run_to_end("bash", "-c", script, cwd=tree, timeout=120)
         assert ended.returncode == 0, ended.stderr
-        ros.wait_until(lambda: distance(poses[-1]) < NEAR, timeout=60.0)
+        ros.wait_until(lambda: distance(poses[-1]) < NEAR, timeout=180.0)
         count = len(poses)
         ros.wait_until(lambda: len(poses) > count + 40)  # 2 s
     finally:

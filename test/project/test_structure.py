@@ -3,6 +3,7 @@ import ast
 import functools
 import re
 import sys
+from importlib import import_module
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -212,6 +213,18 @@ def test_packages_are_described_alike(package):
     assert (folder / licence).read_text() == (ROOT / "LICENSE").read_text()
     assert (folder / "resource" / package).exists()
     assert f"script_dir=$base/lib/{package}" in (folder / "setup.cfg").read_text()
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_public_names_are_at_the_top_of_their_package(package):
+    module = import_module(package)
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert module.__version__ == citation["version"]
+    for name in getattr(module, "__all__", ()):
+        assert getattr(module, name).__name__ == name
+        assert name in dir(module)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = module.nothing
 
 
 KEYS = {

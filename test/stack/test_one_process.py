@@ -26,7 +26,7 @@ from viability_bounds_pkg.testing.executables import as_child
 from viability_bounds_pkg.testing.ros_harness import joint_state, private_domain
 
 ROOT = Path(__file__).resolve().parents[2]
-DEADLINE = 30.0  # s
+DEADLINE = 90.0  # s
 SAFETY = ("torque_safety_controller", "safety_stack")
 SIMULATED = ("sim_bridge", "simulated_stack")
 
