@@ -275,8 +275,10 @@ class BulletNode(ArmNode):
             self._paused = False
             self._started_at, self._played = time.monotonic(), self._periods
             self._plan_pause()
-            # A new stamp: commands that came during the pause are for old goals. In real time it
-            # comes with the next tick, so that the first period is a whole one.
+            # A new stamp: commands that answer what was sent during the pause are for old goals,
+            # also those still on their way. In real time it comes with the next tick, so that
+            # the first period is a whole one.
+            self._commands.resume(self._stamp)
             self._advanced = True
             if self._config.lockstep:
                 self._next_state()

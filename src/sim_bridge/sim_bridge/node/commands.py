@@ -52,6 +52,7 @@ class CommandStream:
         self._reader = CommandReader(config.joints, refused, warn)
         self._dt_ns = round(1e9 * config.dt)
         self._warned_at = -math.inf
+        self._resumed_after = -1
         self.restart()
 
     def restart(self) -> None:
@@ -62,6 +63,10 @@ class CommandStream:
         self.missed_in_row = self.missed = self._strays = 0
         self.torque_ratio = 0.0
         self.latencies = RecentValues()
+
+    def resume(self, stamp: int) -> None:
+        """Obey after a pause no command that answers a state up to a stamp, ns, of before."""
+        self._resumed_after = stamp
 
     def accept(
         self, message: JointState, stamp: int, published_at: float, *, ended: bool, paused: bool
@@ -80,7 +85,7 @@ class CommandStream:
         """
         own = stamp_to_ns(message.header.stamp)
         age, rest = divmod(stamp - own, self._dt_ns)
-        if paused:
+        if paused or own <= self._resumed_after:
             return False
         if rest or not 0 <= age <= self._config.imperfections.command_delay:
             self._count_stray(own, stamp)

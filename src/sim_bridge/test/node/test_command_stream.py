@@ -89,6 +89,15 @@ def test_what_cannot_be_read_is_told_once_and_counted():
     assert robot.said == ["joint_commands refused: not finite"]
 
 
+def test_one_for_a_state_of_a_pause_does_not_act_after_it():
+    """With a delay it would be in time for the first period."""
+    robot = Robot(command_delay=1)
+    robot.stream.resume(NOW - PERIOD)
+    robot.takes(NOW - PERIOD)
+    robot.stream.proceed()
+    assert robot.stream.acting is None
+
+
 def test_the_last_one_is_held_for_the_time_out():
     robot = Robot(command_timeout=3)
     assert robot.takes(NOW)
