@@ -80,10 +80,9 @@ def parameters_page() -> str:
 - *Per joint*: an array with one number for each joint, in the order of `joints`. An array whose
   default is empty may be left out.
 - *Live*: can change while the node runs. All others are read-only.
-- A value that is not allowed stops a node at start with one line that names the parameter, the
-  value and what is allowed. While it runs the value is refused, and the old one stays. A name that
-  no node has is refused, too.
-- Of several values the last one given counts, whether it comes from a file or from `-p`.
+- At start a wrong value or an unknown name stops the node with one line, which says what is
+  allowed. While it runs the value is refused, and the old one stays.
+- Of several values the last one given counts, from files and from `-p`.
 
 A file has sections `/**` for all nodes and `/**/controller_node` for one, each with
 `ros__parameters`. The files in `config/` are examples.
@@ -112,13 +111,14 @@ def topics_page() -> str:
     text = f"""{_HEAD}
 # Topics, services, modes
 
-Names are relative: a namespace is enough for a second arm. A robot of your own takes the place of
-`bullet_node`. `scenario_node` and `viewer_node` send and read what users can; they are left out.
-Names of nodes are without `_node`.
+Names are relative, so that a second arm needs only a namespace. A robot of your own takes the
+place of `bullet_node`. The tables write nodes without `_node`. *User* stands for programs of
+yours; `scenario_node` and `viewer_node` count as such.
 
 ## Control streams
 
-Best effort with depth 1, so that the newest message wins. The stamp names the control step.
+Best effort with depth 1: the newest message wins. The stamp of a joint state names the control
+step; estimates, limits and commands carry the stamp of the state that they answer.
 
 """
     heads = ("topic", "type", "from → to", "meaning")
@@ -127,7 +127,8 @@ Best effort with depth 1, so that the newest message wins. The stamp names the c
     text += """
 ## Goals and reports
 
-Reliable: publish them so, too. *Latched* is transient local: who comes later gets the last one.
+Reliable: publish them so, too. A goal, push or obstacle with a stamp in the future takes effect
+then. *Latched* is transient local: a late subscriber gets the last message.
 
 """
     text += _table(heads, (_topic_cells(topic) for topic in TOPICS if topic not in streams))
@@ -170,9 +171,10 @@ def _modes() -> str:
 | POSITION | the robot's own drives hold the commanded position |
 | STOPPED | publishes nothing, so that the robot stops itself |
 
-The table says what mode and reason follow from, and which share of the goals the arm serves. Of
-all that lasts the first row gives the mode. Without any the mode is TRACKING, and the share rises
-to 1 within 0.5 s. `/diagnostics` has mode, reason and share.
+The table lists what keeps the controller from serving its goals. Several causes may last at the
+same time; the first of them in the table gives the mode. Without any, the mode is TRACKING.
+*Share* is the part of the goals that the arm serves, 0 to 1; it rises to 1 within 0.5 s.
+`/diagnostics` has mode, reason and share.
 
 """
     text += _table(
@@ -189,8 +191,8 @@ to 1 within 0.5 s. `/diagnostics` has mode, reason and share.
         ),
     )
     text += """
-`control` in `/diagnostics` says which control commands the joints. A robot that was away is given
-positions again where `start_control` is `position`.
+`control` in `/diagnostics` says what commands the joints. With `start_control: position` a robot
+that was away gets positions again.
 
 """
     return text + _table(

@@ -55,65 +55,63 @@ class Imperfections:
 
     encoder_resolution: Array = joint_amounts("step of the encoders, rad; 0 or empty: exact")
     position_noise: Array = joint_amounts(
-        "standard deviation of the encoders' noise, before it is rounded to their steps and "
-        "clipped at 3 of it, rad; none if empty"
+        "standard deviation of the encoders' noise, rad; none if empty"
     )
     velocity_source: str = text(
-        "exact: the true velocity; encoder: difference of two encoder positions over a period",
+        "exact: the true velocity; encoder: difference of encoder positions over a period",
         default="exact",
         choices=("exact", "encoder"),
     )
     velocity_filter_hz: float = number(
-        "first-order low-pass of the drives for the velocity, Hz; 0: none",
+        "first-order low-pass of the velocity, Hz; 0: none",
         Range(0.0, 5000.0),
         default=0.0,
         note="below half of rate_hz",
     )
     velocity_noise: Array = joint_amounts(
-        "standard deviation of the noise of reported velocities, clipped at 3 of it, rad/s; none "
-        "if empty"
+        "standard deviation of the velocity's noise, rad/s; none if empty"
     )
     state_delay: int = periods("control periods by which states are reported late")
-    command_delay: int = periods(
-        "control periods by which commands act late; in real time they may come so much later"
-    )
+    command_delay: int = periods("control periods by which commands act late")
     motor_bandwidth: Array = joint_amounts(
         "bandwidth of the motors' torque, a first-order lag, Hz; 0 or empty: infinite"
     )
     torque_constant_error: Array = joint_numbers(
-        "share by which the true torque is larger than the reported one; 0 if empty",
+        "share by which the true torque exceeds the reported one; 0 if empty",
         Range(-0.5, 0.5),
         if_empty=0.0,
     )
     torque_ripple: Array = joint_numbers(
-        "amplitude of torque that changes with the motor's angle, share of torque_max; 0 if empty",
+        "amplitude of torque ripple, share of torque_max; 0 if empty",
         Range(0.0, 0.5),
         if_empty=0.0,
     )
     current_noise: Array = joint_numbers(
-        "standard deviation of the noise of the torque and, apart from that, of the reported "
-        "effort, clipped at 3 of it, share of torque_max; 0 if empty",
+        "standard deviation of the noise of torque and of reported effort, share of torque_max;"
+        " 0 if empty",
         Range(0.0, 0.2),
         if_empty=0.0,
     )
     missed_probability: float = number(
-        "probability that a command misses its period, in which the last one is held then",
+        "probability that a command misses its period; the last one is held",
         Range(0.0, 1.0, without=1.0),
         default=0.0,
     )
-    missed_in_row: int = whole_number("longest row of such periods", Range(1, 1000), default=4)
+    missed_in_row: int = whole_number(
+        "largest number of consecutive missed periods", Range(1, 1000), default=4
+    )
     outage_probability: float = number(
-        "probability of each command that an outage starts with it, in which all are lost",
+        "probability that an outage starts, in which all commands are lost",
         Range(0.0, 1.0, without=1.0),
         default=0.0,
     )
     outage_longest: int = whole_number(
-        "longest outage, control periods; each length up to it is as likely",
+        "longest outage, control periods",
         Range(1, 10_000),
         default=100,
     )
     imperfection_seed: int = whole_number(
-        "seed of all these random numbers", Range(0, 2**31 - 1), default=0
+        "seed of all random numbers", Range(0, 2**31 - 1), default=0
     )
 
     def check_rate(self, rate_hz: float) -> None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Exact joint acceleration bounds that keep position and velocity limits for ever.
 
-The public names are found here; `docs/reference/api.md` lists their modules.
+The public names are found here; `docs/start/without_ros.md` lists their modules.
 """
 
 from __future__ import annotations

@@ -30,8 +30,7 @@ class VelocityEstimation:
     """Where the velocities in estimated joint states come from."""
 
     velocity_estimation: bool = switch(
-        "whether velocities are estimated from positions and torques; false takes those that the "
-        "robot reports",
+        "estimate velocities from positions and torques; false: use the reported ones",
         default=True,
     )
 
@@ -41,30 +40,27 @@ class DeclaredUncertainty:
     """Largest errors of states, times and accelerations; arrays of shape (n,)."""
 
     position_error: Array = joint_amounts(
-        "largest error of a reported position, rad: resolution and noise of the encoder; 0 if "
-        "empty"
+        "largest error of a reported position (resolution, noise), rad; 0 if empty"
     )
     velocity_error: Array = joint_amounts(
         "largest error of a reported velocity, rad/s; 0 if empty",
         note="not used with use_estimated_states, where the observer's own error counts",
     )
     acceleration_disturbance: Array = joint_amounts(
-        "how much more than commanded the joints may accelerate by what the model does not know, "
-        "friction, payloads, pushes, rad/s^2; the bounds are tightened by it; 0 if empty"
+        "largest difference of true and commanded acceleration (friction, payload, pushes), "
+        "which the bounds keep as a margin, rad/s^2; 0 if empty"
     )
     lasting_disturbance: Array = joint_amounts(
-        "up to which the estimator learns what the model does not know and lasts, friction, "
-        "payloads, wrong masses, rad/s^2, so that velocities of joints at rest have no bias; its "
-        "errors are guaranteed where acceleration_disturbance covers the rest; 0 if empty"
+        "largest part of it that lasts (friction, wrong masses) and that the estimator may "
+        "learn, rad/s^2; 0 if empty"
     )
     delay: int = periods(
-        "control periods from the instant of a reported state to the one when the command that "
-        "answers it begins to act"
+        "control periods from the instant of a state until the command for it begins to act"
     )
-    delay_jitter: int = periods("control periods by which the delay may be longer at times")
+    delay_jitter: int = periods("control periods by which the delay may sometimes be longer")
     missed_deadlines: int = periods(
-        "longest row of control periods in which no new command arrives and the robot keeps the "
-        "last one"
+        "largest number of consecutive control periods without a new command; the robot keeps "
+        "the last one"
     )
     motor_bandwidth: Array = joint_amounts(
         "bandwidth of the motors' torque as a first-order lag, Hz; 0 or empty: no lag"

@@ -63,54 +63,51 @@ class BulletConfiguration(ControlRate, LimitedRobotConfiguration):
     start_positions: Array = joint_numbers("positions at start and after reset, rad", FINITE)
     physics_step_max: float = number("longest physics step, s", above(0.0, 1.0), default=0.001)
     clock: str = text(
-        "real_time: a period lasts its time on the wall clock; lockstep: until its command comes",
+        "real_time: by the wall clock; lockstep: each period waits for its command",
         default="real_time",
         choices=CLOCKS,
     )
     command_timeout: int = whole_number(
-        "control periods that the last command is held for before the robot stops itself",
+        "control periods for which the last command is held; then the robot stops itself",
         Range(1, 1000),
         default=5,
     )
     acceleration_min: Array = joint_numbers(
-        "lower acceleration limits when the robot stops itself, rad/s^2; it brakes with all its "
-        "torque if empty",
+        "lower acceleration limits of the stop, rad/s^2; full brake torque if empty",
         NEGATIVE,
         default=(),
         note="together with acceleration_max",
     )
     acceleration_max: Array = joint_numbers(
-        "upper acceleration limits when the robot stops itself, rad/s^2",
+        "upper acceleration limits of the stop, rad/s^2",
         POSITIVE,
         default=(),
         note="together with acceleration_min",
     )
     start_paused: bool = switch("wait for the pause service before moving", default=False)
     pause_after: float = number(
-        "robot time after which it pauses by itself, s since it began to move; 0: never",
+        "robot time after which it pauses, s; 0: never",
         Range(0.0, 1e5),
         default=0.0,
         live=True,
     )
     publish_clock: bool = switch("publish /clock", default=False)
-    friction_coulomb: Array = joint_amounts("dry friction of moving joints, N m; none if empty")
+    friction_coulomb: Array = joint_amounts("dry friction in motion, N m; none if empty")
     friction_static: Array = joint_numbers(
-        "dry friction of joints at rest, N m; that of moving ones if empty",
+        "dry friction at rest, N m; that in motion if empty",
         NOT_NEGATIVE,
         default=(),
         note="at least friction_coulomb",
     )
-    friction_viscous: Array = joint_amounts(
-        "friction that grows with speed, N m s/rad; none if empty"
-    )
+    friction_viscous: Array = joint_amounts("viscous friction, N m s/rad; none if empty")
     stribeck_velocity: Array = joint_numbers(
-        "speed at which static has become Coulomb friction but for 1/e of the difference, rad/s; "
+        "speed of the change from static to Coulomb friction, rad/s; "
         f"{DEFAULT_STRIBECK_VELOCITY} if empty",
         POSITIVE,
         if_empty=DEFAULT_STRIBECK_VELOCITY,
     )
     mass_scale_links: tuple[str, ...] = texts(
-        "links with another mass than in the URDF", default=(), note="each once"
+        "links whose mass differs from the URDF", default=(), note="each once"
     )
     mass_scales: Array = numbers(
         "factors for their masses and inertias",

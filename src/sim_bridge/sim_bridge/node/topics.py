@@ -19,8 +19,7 @@ OBSTACLES = Topic(
     GOAL_QOS,
     (USER, "scenario_node"),
     (_NODE,),
-    "obstacles in the simulated world that the controller does not know: boxes, spheres and "
-    "cylinders; a stamp in the future takes effect then",
+    "simulated obstacles that the controller does not know: boxes, spheres, cylinders",
 )
 EXTERNAL_WRENCH = Topic(
     "external_wrench",
@@ -28,8 +27,7 @@ EXTERNAL_WRENCH = Topic(
     GOAL_QOS,
     (USER, "scenario_node", "viewer_node"),
     (_NODE,),
-    "a push in world axes at the origin of the link `frame_id`, N and N m; one for each link; a "
-    "stamp in the future takes effect then",
+    "push on the link `frame_id` at its origin, in world axes, N and N m",
 )
 CLOCK = Topic(
     "/clock",

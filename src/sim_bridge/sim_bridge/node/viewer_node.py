@@ -70,9 +70,9 @@ class ViewerConfiguration(TaskFrames, LimitedRobotConfiguration):
 
     acceleration_min: Array = redeclared(BoundsConfiguration, "acceleration_min")
     acceleration_max: Array = redeclared(BoundsConfiguration, "acceleration_max")
-    viewer_host: str = text("address that the page is served on", default="127.0.0.1")
+    viewer_host: str = text("address of the page", default="127.0.0.1")
     viewer_port: int = whole_number(
-        "port that the page is served on; the next free one if it is taken",
+        "port of the page; the next free one if it is taken",
         Range(1024, 65535),
         default=8080,
     )

@@ -21,7 +21,7 @@ TARGET_POSE = Topic(
     GOAL_QOS,
     (USER, "scenario_node", "viewer_node"),
     (_NODE, "viewer_node"),
-    "end-effector goal in `base_frame`; a stamp in the future takes effect then",
+    "end-effector goal in `base_frame`",
 )
 TARGET_POSE_SECOND = Topic(
     "target_pose_second",
@@ -29,7 +29,7 @@ TARGET_POSE_SECOND = Topic(
     GOAL_QOS,
     (USER,),
     (_NODE,),
-    "goal of the second end effector, where `end_effector_frame` names two; else as `target_pose`",
+    "goal of the second end effector, where `end_effector_frame` names two",
 )
 TARGET_POSTURE = Topic(
     "target_posture",
@@ -37,7 +37,7 @@ TARGET_POSTURE = Topic(
     GOAL_QOS,
     (USER, "scenario_node"),
     (_NODE,),
-    "joint goal, matched by name, rad; a stamp in the future takes effect then",
+    "joint goal, matched by name, rad",
 )
 TARGET_TRAJECTORY = Topic(
     "target_trajectory",
@@ -45,8 +45,7 @@ TARGET_TRAJECTORY = Topic(
     GOAL_QOS,
     (USER, "scenario_node"),
     (_NODE,),
-    "poses of the end effector over time, with velocities and accelerations to feed forward, in "
-    "`base_frame`; one transform in each point",
+    "poses of the end effector over time, in `base_frame`; one transform in each point",
 )
 TARGET_WRENCH = Topic(
     "target_wrench",
@@ -54,8 +53,8 @@ TARGET_WRENCH = Topic(
     GOAL_QOS,
     (USER, "scenario_node"),
     (_NODE,),
-    "wrench that the hand exerts in `force_directions`, N and N m; axes of the end effector (or "
-    "empty) or of `base_frame`",
+    "wrench that the hand exerts in `force_directions`, N and N m; axes of the end effector (or"
+    " empty) or of `base_frame`",
 )
 TARGET_JOINT_TRAJECTORY = Topic(
     "target_joint_trajectory",
@@ -63,8 +62,8 @@ TARGET_JOINT_TRAJECTORY = Topic(
     GOAL_QOS,
     (USER, "moveit_node"),
     (_NODE,),
-    "positions of all joints over time, rad, perhaps with velocities and accelerations, matched "
-    "by name; a goal for the pose is given up; without points: the joints come to rest",
+    "positions of all joints over time, rad, matched by name; replaces a pose goal; without "
+    "points: stop",
 )
 JOG_HAND = Topic(
     "jog_hand",
@@ -72,7 +71,7 @@ JOG_HAND = Topic(
     GOAL_QOS,
     (USER,),
     (_NODE,),
-    "twist of the end effector for at most 0.25 s, m/s and rad/s, in the axes of `base_frame` (or "
+    "twist of the end effector, m/s and rad/s, valid for 0.25 s; axes of `base_frame` (or "
     "empty) or of the end effector",
 )
 JOG_JOINTS = Topic(
@@ -81,8 +80,7 @@ JOG_JOINTS = Topic(
     GOAL_QOS,
     (USER,),
     (_NODE,),
-    "`velocity` of the joints named for at most 0.25 s, rad/s, of the others 0; no `position`; a "
-    "goal for the pose is given up",
+    "`velocity` of some joints, rad/s, valid for 0.25 s; replaces a pose goal",
 )
 ROS2_CONTROL_EFFORTS = Topic(
     "<ros2_control_topic>",
@@ -90,9 +88,8 @@ ROS2_CONTROL_EFFORTS = Topic(
     QoSProfile(depth=1),
     (_NODE,),
     (USER,),
-    "the efforts of `joint_commands` in `joints` order, for effort controllers of ros2_control; "
-    "the parameter `ros2_control_topic` names the topic; silent in position control; reliable, "
-    "as those controllers may ask for",
+    "efforts of `joint_commands` in the order of `joints`, for effort controllers of "
+    "ros2_control; silent in position control",
 )
 HAND_POSE = Topic(
     "hand_pose",
@@ -100,8 +97,7 @@ HAND_POSE = Topic(
     STATUS_QOS,
     (_NODE,),
     (USER,),
-    "pose of the end effector in `base_frame`, 20 times a second unless the mode is STOPPED; "
-    "stamp of the joint state",
+    "pose of the end effector in `base_frame`, 20 times a second",
 )
 CONTROLLER_MODE = Topic(
     "controller_mode",
@@ -109,7 +105,7 @@ CONTROLLER_MODE = Topic(
     LATCHED_QOS,
     (_NODE,),
     ("moveit_node", USER),
-    "TRACKING, HOLD, POSITION or STOPPED, when it changes; the reasons are in `/diagnostics`",
+    "TRACKING, HOLD, POSITION or STOPPED, at each change",
 )
 GOALS = (
     TARGET_POSE,
@@ -134,14 +130,12 @@ ENABLE_TORQUE = OfferedService(
     "enable_torque",
     SetBool,
     _NODE,
-    "hands over from position to torque control without a step in torque (true), and back "
-    "(false), or says why not",
+    "true: from position to torque control without a torque step; false: back",
 )
 TARE_FT_SENSOR = OfferedService(
     "tare_ft_sensor",
     Trigger,
     _NODE,
-    "takes the present measurement as the sensor's bias; call it with the hand free; only where "
-    "`ft_frame` is set",
+    "sets the sensor's bias to the present measurement; call it with the hand free",
 )
 SERVICES = (ENABLE_TORQUE, TARE_FT_SENSOR)

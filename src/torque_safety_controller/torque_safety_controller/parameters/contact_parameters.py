@@ -92,9 +92,8 @@ class InteractionConfiguration:
     ft_frame: str = text("link of the wrist's force/torque sensor; none if empty", default="")
     settings: InteractionSettings = group(InteractionSettings)
     contacts: tuple[str, ...] = texts(
-        "points at which the hand touches while it exerts target_wrench, on one link fixed to it "
-        "and in its axes: point, m, its origin if left out; normal, direction in which the "
-        "environment pushes; friction, Coulomb's coefficient, 0 if left out",
+        "points where the hand touches, all on one link: point in its axes, m; normal, the "
+        "direction in which the environment pushes; Coulomb's friction",
         default=(),
         note="each a YAML mapping '{frame: link, point: [x, y, z], normal: [x, y, z], "
         "friction: 0.3}'; all have the same frame, normal and friction",
@@ -157,38 +156,34 @@ class CollisionConfiguration:
     """
 
     collision_avoidance: bool = switch(
-        "whether links keep away from each other and from the obstacles below", default=False
+        "links keep a distance from each other and from obstacles", default=False
     )
     collision_capsules: tuple[str, ...] = texts(
-        "capsules around the links, which are kept apart in place of these, from the tool "
-        "fit_capsules: ends of the axis in the link's frame and radius, m",
+        "capsules around the links, from the tool fit_capsules: ends of the axis in the link's "
+        "frame, and radius, m",
         default=(),
         note="each a YAML mapping '{link: hand, start: [x, y, z], end: [x, y, z], radius: r}'",
     )
     collision_posture: Array = joint_numbers(
-        "a posture free of collisions, rad: what is nearer there than the margin is not kept "
-        "apart; the middle of the position limits if empty",
+        "a posture free of collisions, rad: pairs nearer than 2.5 cm there are not guarded; the"
+        " middle of the position limits if empty",
         default=(),
         note="within the position limits",
     )
     acceleration_min: Array = joint_numbers(
-        "for collision_avoidance, safety_filter, and HOLD without bounds: lower acceleration "
-        "limits, rad/s^2",
+        "lower acceleration limits, rad/s^2, for collision_avoidance, safety_filter, and HOLD "
+        "without bounds",
         NEGATIVE,
         default=(),
     )
     acceleration_max: Array = joint_numbers(
-        "for collision_avoidance, safety_filter, and HOLD without bounds: upper acceleration "
-        "limits, rad/s^2",
+        "upper acceleration limits, rad/s^2, as acceleration_min",
         POSITIVE,
         default=(),
     )
     obstacles: tuple[str, ...] = texts(
-        "obstacles to keep away from, fixed in base_frame: position of the centre, of a "
-        "half_space a point on its surface, m; rpy, rotations about the fixed axes x, y, z, rad, "
-        "0 if left out, a half_space is where z < 0; size, m, as in a Marker: edges of a box, "
-        "diameter three times of a sphere, diameter, diameter and height along z of a cylinder, "
-        "nothing of a half_space",
+        "obstacles to keep away from, fixed in base_frame, m and rad; docs/guides/collision.md "
+        "explains the fields",
         default=(),
         note="each a YAML mapping '{name: wall, shape: box, size: [x, y, z], position: "
         f"[x, y, z], rpy: [r, p, y]}}' with another name; shape is one of {', '.join(SHAPES)}",

@@ -56,8 +56,8 @@ class IntegralConfiguration:
     """Parameters of the integral action."""
 
     integral_action: str = text(
-        "none; joints: all joints stiff; task, position: the end effector's pose, or its "
-        "position, stiff and the null space compliant",
+        "joints: all joints stiff; task, position: pose or position of the hand stiff, null "
+        "space compliant",
         default="none",
         choices=MODES,
     )
@@ -69,15 +69,14 @@ class IntegralConfiguration:
         note="at most torque_max",
     )
     integral_lambda: float = number(
-        "gain, K = lambda diag(M), 1/s; less is used in postures where it would be unstable",
+        "gain lambda, 1/s; lowered in postures where it would be unstable",
         Range(1.0, 1e3),
         default=2.0,
         live=True,
     )
     integral_anti_windup: str = text(
-        "qp limits the whole torque and the integrators; paper and scaling limit the torque of "
-        "the gains only, by eq. (11) and (10), and the law is as printed, that of task and "
-        "position with (16), (21) and (26)",
+        "qp: limits the whole additional torque and the integrators; paper, scaling: eq. (11), "
+        "(10), the laws as printed",
         default="qp",
         choices=METHODS,
     )
@@ -123,22 +122,22 @@ class FrictionConfiguration:
         live=True,
     )
     friction_model_coulomb: Array = joint_numbers(
-        "dry friction of moving joints, N m; none if empty", NOT_NEGATIVE, default=(), live=True
+        "dry friction in motion, N m; none if empty", NOT_NEGATIVE, default=(), live=True
     )
     friction_model_static: Array = joint_numbers(
-        "dry friction of joints at rest, N m; that of moving ones if empty",
+        "dry friction at rest, N m; that in motion if empty",
         NOT_NEGATIVE,
         default=(),
         live=True,
     )
     friction_model_viscous: Array = joint_numbers(
-        "friction that grows with speed, N m s/rad; none if empty",
+        "viscous friction, N m s/rad; none if empty",
         NOT_NEGATIVE,
         default=(),
         live=True,
     )
     friction_model_stribeck_velocity: Array = joint_numbers(
-        "speed at which static has become Coulomb friction but for 1/e of the difference, rad/s; "
+        "speed of the change from static to Coulomb friction, rad/s; "
         f"{DEFAULT_STRIBECK_VELOCITY:g} if empty",
         POSITIVE,
         if_empty=DEFAULT_STRIBECK_VELOCITY,
@@ -185,31 +184,30 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
     NOT_NEEDED = frozenset({"velocity_max"})
 
     velocity_max: Array = joint_numbers(
-        "speed limits, rad/s, for driving, and HOLD without bounds; those of the URDF if empty, "
-        "or none",
+        "speed limits of jogs, trajectories and HOLD without bounds, rad/s; those of the URDF "
+        "if empty, or none",
         POSITIVE,
         default=(),
     )
     torque_rate_max: Array = joint_numbers(
-        "limits of the rate of torque, N m/s; torques are clipped to them, and other limits not "
-        "promised then; none if empty",
+        "limits of the torque rate, N m/s; torques are clipped, and other limits are not "
+        "promised; none if empty",
         if_empty=np.inf,
         note="all > 0",
     )
     gains: Gains = group(Gains)
     safety_filter: bool = switch(
-        "whether steps are changed after which no plan is known that brings the arm to rest "
-        "within all limits; acceleration_min and acceleration_max need not be available in every "
-        "state then",
+        "always keep a plan to rest within all limits; needed where acceleration limits are not"
+        " available in every state",
         default=False,
     )
     torque_reserve: Array = joint_amounts(
-        "torque that safety_filter leaves unplanned, for pushes, payloads and errors of the "
-        "motors, which no model knows, N m; none if empty",
+        "torque that safety_filter keeps back for pushes, payloads and errors of the motors, N "
+        "m; none if empty",
         note="less than 0.97 of torque_max",
     )
     qp_solver: str = text(
-        "solver of the QP; proxqp takes several times as long",
+        "solver that is asked first; proxqp takes several times as long",
         default="daqp",
         choices=tuple(SOLVERS),
     )
@@ -218,28 +216,27 @@ class ControllerConfiguration(StateSource, ControlRate, TaskFrames, RobotConfigu
     interaction: InteractionConfiguration = group(InteractionConfiguration)
     collision: CollisionConfiguration = group(CollisionConfiguration)
     start_control: str = text(
-        "what the robot is commanded by until enable_torque is called",
+        "control of the joints until enable_torque is called",
         default="torque",
         choices=CONTROLS,
     )
     bounds_timeout: float = timeout(
-        "how long a state waits for its acceleration limits before HOLD, s; without a joint state "
-        "for 1.5 times as long: STOPPED",
+        "how long a state waits for its acceleration limits before HOLD, s; no state for 1.5 "
+        "times as long: STOPPED",
         default=0.05,
     )
     state_timeout: float = timeout(
-        "how long without a usable joint state until the arm may be elsewhere and all begins anew "
-        "with the next one, s",
+        "time without a usable state after which the controller starts anew, s",
         default=0.5,
     )
     effort_tolerance: float = number(
-        "by how much torques of joint states may differ from those that were commanded, share of "
-        "torque_max; beyond, commands count as not acting, and the arm is slowed; 0: not compared",
+        "allowed difference of reported and commanded torques, share of torque_max; beyond it "
+        "commands count as ignored; 0: not compared",
         Range(0.0, 2.0),
         default=0.03,
     )
     ros2_control_topic: str = text(
-        "where to publish efforts as std_msgs/Float64MultiArray too; empty: nowhere", default=""
+        "topic for efforts as std_msgs/Float64MultiArray; none if empty", default=""
     )
     integral_settings: IntegralSettings = field(init=False)
     friction_settings: FrictionSettings = field(init=False)

@@ -17,14 +17,12 @@ class MoveitConfiguration(RobotConfiguration):
     NOT_NEEDED: ClassVar[frozenset[str]] = frozenset({"torque_max"})
 
     trajectory_goal_tolerance: float = number(
-        "how near each joint must be to the end of a trajectory whose goal_tolerance does not say "
-        "it, rad",
+        "tolerance of each joint at the end of a trajectory without goal_tolerance, rad",
         above(0.0, 1.0),
         default=0.01,
     )
     trajectory_goal_time: float = number(
-        "how long after the end of a trajectory, where its goal_time_tolerance is 0, s of the "
-        "robot's time",
+        "time allowed after the end of a trajectory without goal_time_tolerance, s of robot time",
         above(0.0, 600.0),
         default=5.0,
     )

@@ -40,8 +40,7 @@ class InteractionSettings:
     """
 
     force_directions: Array = numbers(
-        "1 where target_wrench is exerted, 0 elsewhere: x, y, z and about x, y, z of the end "
-        "effector's axes",
+        "1 where target_wrench is exerted, else 0: along and about x, y, z of the end effector",
         length=6,
         default=(0.0,) * 6,
         live=True,
@@ -55,8 +54,7 @@ class InteractionSettings:
         live=True,
     )
     yield_threshold: Array = numbers(
-        "force, N, and moment, N m, above which the hand yields; below half of both it stops, and "
-        "stays where it is then; it never yields if empty",
+        "force, N, and moment, N m, above which the hand yields; never if empty",
         POSITIVE,
         length=2,
         default=(),

@@ -43,14 +43,14 @@ class Gains:
         "weight of the pose task; 0: no pose task", Range(0.0, 1e5), default=1.0, live=True
     )
     pose_error: str = text(
-        "error of the pose task: separate, of position and orientation in the axes of the root, "
-        "which leads the hand straight to its goal; or the logarithm of SE(3), along a screw",
+        "separate: position and orientation apart, so that the hand moves straight; logarithm: "
+        "of SE(3), along a screw",
         default="separate",
         live=True,
         choices=POSE_ERRORS,
     )
     pose_speed_max: Array = numbers(
-        "speeds at which the pose task approaches its goal at most, m/s and rad/s; no limit if "
+        "largest speeds at which the pose task approaches its goal, m/s and rad/s; no limit if "
         "empty",
         POSITIVE,
         length=2,
@@ -64,8 +64,7 @@ class Gains:
     )
     hold_kd: float = number("damping in HOLD, 1/s", Range(0.0, 1e4), default=20.0, live=True)
     disturbance_time: float = number(
-        "time constant with which the error of the accelerations is estimated, to tighten the "
-        "bounds by it, s; 0: not at all",
+        "time constant of the disturbance observer, which tightens the bounds, s; 0: off",
         Range(0.0, 0.1),
         default=0.0,
     )

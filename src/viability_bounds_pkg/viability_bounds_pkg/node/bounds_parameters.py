@@ -75,25 +75,23 @@ class BoundsConfiguration(VelocityEstimation, StateSource, ControlRate, LimitedR
     acceleration_min: Array = joint_numbers("lower acceleration limits, rad/s^2", NEGATIVE)
     acceleration_max: Array = joint_numbers("upper acceleration limits, rad/s^2", POSITIVE)
     acceleration_drift: Array = joint_amounts(
-        "largest jerk under held torque, rad/s^3; the bounds are tightened by the error that it "
-        "causes within a control period; 0 if empty"
+        "largest jerk under a held torque, for which the bounds keep a margin, rad/s^3; 0 if empty"
     )
     declared: DeclaredUncertainty = group(DeclaredUncertainty)
     position_margin: float = number(
-        "how much further inside the position limits to keep the joints, rad: what the robot or "
-        "its sensors may be off",
+        "distance to keep from the position limits, rad",
         Range(0.0, 1.0),
         default=0.0,
     )
     bounds_dt_factor: float = number(
-        "horizon of the bounds in control periods, longer where missed deadlines are declared; 2 "
+        "horizon of the bounds in control periods; longer if missed deadlines are declared; 2 "
         "avoids chatter",
         Range(1.0, 1e3),
         default=2.0,
         live=True,
     )
     method: str = text(
-        "how bounds are computed: exact keeps the limits; the others are for comparison",
+        "exact keeps the limits; the others are for comparison",
         default="exact",
         live=True,
         choices=METHODS,

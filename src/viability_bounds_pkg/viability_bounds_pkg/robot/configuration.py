@@ -58,12 +58,12 @@ class RobotConfiguration:
 
     robot_description: str = text("URDF: path, package:// URI, or 'topic': from that topic")
     joints: tuple[str, ...] = texts(
-        "joints that move, base to tip, in the order of all arrays",
+        "joints that move, from base to tip; the order of all arrays",
         note="at least one name, each once",
     )
-    locked_joints: tuple[str, ...] = texts("other joints that are not at zero", default=())
+    locked_joints: tuple[str, ...] = texts("locked joints that are not at zero", default=())
     locked_positions: Array = numbers(
-        "where they are, rad", default=(), note="one for each of 'locked_joints'"
+        "their positions, rad", default=(), note="one for each of 'locked_joints'"
     )
     position_min: Array = joint_numbers(
         "lower position limits, rad; -.inf for continuous joints; those of the URDF if empty",
@@ -160,7 +160,7 @@ class StateSource:
     """Which joint states a node works on."""
 
     use_estimated_states: bool = switch(
-        "work on estimated_joint_states of estimator_node, not on joint_states", default=False
+        "use estimated_joint_states of estimator_node instead of joint_states", default=False
     )
 
 
@@ -170,8 +170,7 @@ class TaskFrames:
 
     base_frame: str = text("frame of pose goals; fixed to the URDF's root")
     end_effector_frame: str = text(
-        "frame that pose goals move; of two, 'left_hand right_hand', the second one has goals of "
-        "its own, target_pose_second"
+        "frame that pose goals move; for two hands 'left_hand right_hand'"
     )
 
     @property

@@ -102,9 +102,8 @@ JOINT_STATES = Topic(
     CONTROL_QOS,
     ("bullet_node",),
     ("bounds_node", "controller_node", "estimator_node", "scenario_node"),
-    "positions, rad, and velocities, rad/s; `effort` is the torque of the motors, N m; joints in "
-    "any order, further joints are ignored; the stamp names the control step; `bullet_node` sends "
-    "the movable joints that are locked, too",
+    "positions, rad, and velocities, rad/s; `effort` is the motors' torque, N m; any order; "
+    "further joints are ignored",
 )
 ESTIMATED_JOINT_STATES = Topic(
     "estimated_joint_states",
@@ -112,9 +111,7 @@ ESTIMATED_JOINT_STATES = Topic(
     CONTROL_QOS,
     ("estimator_node",),
     ("bounds_node", "controller_node"),
-    "positions, rad, and velocities, rad/s, expected at the instant when the command that answers "
-    "them begins to act; `effort` and stamp are those of the joint state they are made of; only "
-    "where `use_estimated_states` is set",
+    "the state expected when the command for it begins to act; only with `use_estimated_states`",
 )
 ACCELERATION_LIMITS = Topic(
     "acceleration_limits",
@@ -122,8 +119,7 @@ ACCELERATION_LIMITS = Topic(
     CONTROL_QOS,
     ("bounds_node",),
     ("controller_node", "scenario_node"),
-    "`points[0].accelerations` lower, `points[1].accelerations` upper, rad/s²; stamp of the state "
-    "they answer",
+    "`points[0].accelerations` lower, `points[1].accelerations` upper, rad/s²",
 )
 JOINT_COMMANDS = Topic(
     "joint_commands",
@@ -131,8 +127,7 @@ JOINT_COMMANDS = Topic(
     CONTROL_QOS,
     ("controller_node",),
     ("bullet_node", "estimator_node", "scenario_node"),
-    "`effort` in N m; or `position` (and `velocity`) without effort: position control by the "
-    "drives; stamp of the state they answer",
+    "`effort`, N m; or `position` without effort: position control by the drives",
 )
 FT_WRENCH = Topic(
     "ft_wrench",
@@ -140,8 +135,8 @@ FT_WRENCH = Topic(
     CONTROL_QOS,
     ("bullet_node",),
     ("controller_node", "scenario_node"),
-    "what the wrist's sensor measures, tool and bias included, in the axes of `ft_frame`, N and "
-    "N m; positive is what acts on the arm; only where `ft_frame` is set",
+    "what the wrist sensor measures, tool and bias included, in the axes of `ft_frame`, N and N"
+    " m; positive acts on the arm",
 )
 LIMIT_DISTANCES = Topic(
     "limit_distances",
@@ -149,11 +144,8 @@ LIMIT_DISTANCES = Topic(
     STATUS_QOS,
     ("bounds_node",),
     (USER,),
-    "by how much joints are inside the limits of `bounds_node`, negative outside, in the fields "
-    "of a joint state: `position` to the nearer of position_min and position_max, rad, .inf "
-    "without them; `velocity` to velocity_max, rad/s; `effort` from the motors' torque to "
-    "torque_max, N m, where both are known; 20 times a second, silent when the robot is; stamp of "
-    "the joint state",
+    "distance of each joint to its limits of position, rad, speed, rad/s, and torque, N m; "
+    "negative outside; 20 times a second",
 )
 SLOW_JOINT_STATES = Topic(
     "slow/joint_states",
@@ -161,8 +153,7 @@ SLOW_JOINT_STATES = Topic(
     SLOW_QOS,
     ("bounds_node",),
     ("viewer_node", "moveit_node", USER),
-    "the joint state that `bounds_node` answered last, 20 times a second, silent when the robot "
-    "is: for who looks on, or is connected by a slow network",
+    "copy of `joint_states`, 20 times a second, for displays and slow networks",
 )
 SLOW_ACCELERATION_LIMITS = Topic(
     "slow/acceleration_limits",
@@ -170,7 +161,7 @@ SLOW_ACCELERATION_LIMITS = Topic(
     SLOW_QOS,
     ("bounds_node",),
     ("viewer_node", USER),
-    "the last `acceleration_limits`, as `slow/joint_states`",
+    "copy of `acceleration_limits`, likewise",
 )
 ROBOT_DESCRIPTION = Topic(
     "robot_description",
@@ -186,8 +177,8 @@ DIAGNOSTICS = Topic(
     STATUS_QOS,
     ("bounds_node", "estimator_node", "controller_node", "bullet_node"),
     ("scenario_node", "viewer_node"),
-    "mode and why, refused messages by reason, margins, latency, solver, closest approach; the "
-    "name of a status is that of its node with the namespace, as in `left/bullet_node`",
+    "mode and reason, refused messages, margins, latency, closest approach; a status has the "
+    "name of its node, as `left/bullet_node`",
 )
 
 
