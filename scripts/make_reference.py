@@ -21,7 +21,7 @@ from sim_bridge.node import topics as bullet_topics
 from sim_bridge.node.bullet_parameters import BulletConfiguration
 from sim_bridge.node.viewer_node import ViewerConfiguration
 from sim_bridge.scenario.scenario import ScenarioConfiguration
-from torque_safety_controller.modes import CAUSES, CHANGES
+from torque_safety_controller.modes import CAUSES
 from torque_safety_controller.node import topics as controller_topics
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.remote.moveit_parameters import MoveitConfiguration
@@ -53,7 +53,7 @@ _TYPES = {
     list[str]: "string[]",
 }
 _SHORTER = (
-    (r", one for each of 'joints'(, or none)?", ", per joint"),
+    (r",? ?one for each of 'joints'(, or none)?;? ?", ""),
     (r"^(an? )?(whole |finite )?(number|numbers)\b,? ?", ""),
     (r"^(\d+) (finite )?numbers\b(, or none)?", r"\1 numbers"),
     (r"^>= (\S+) and <= ([^\s,;]+)", r"\1 to \2"),
@@ -77,8 +77,8 @@ def parameters_page() -> str:
 
 `ros2 param describe NODE PARAMETER` shows the same.
 
-- *Per joint*: an array with one number for each joint, in the order of `joints`. An array whose
-  default is empty may be left out.
+- *double[]*: where no other length is given, one number for each joint, in the order of `joints`.
+  An array whose default is empty may be left out.
 - *Live*: can change while the node runs. All others are read-only.
 - At start a wrong value or an unknown name stops the node with one line, which says what is
   allowed. While it runs the value is refused, and the old one stays.
@@ -190,15 +190,7 @@ same time; the first of them in the table gives the mode. Without any, the mode 
             for cause in CAUSES.values()
         ),
     )
-    text += """
-`control` in `/diagnostics` says what commands the joints. With `start_control: position` a robot
-that was away gets positions again.
-
-"""
-    return text + _table(
-        ("control", "event", "control after it"),
-        ((before.value, event, after.value) for (before, event), after in CHANGES.items()),
-    )
+    return text
 
 
 def parameter_names() -> str:
