@@ -53,8 +53,8 @@ _TYPES = {
     list[str]: "string[]",
 }
 _SHORTER = (
-    (r",? ?one for each of 'joints'(, or none)?;? ?", ""),
-    (r"^(an? )?(whole |finite )?(number|numbers)\b,? ?", ""),
+    (r", one for each of 'joints'(, or none)?", ""),
+    (r"^(an? )?(whole |finite )?(number|numbers)\b[,;]? ?", ""),
     (r"^(\d+) (finite )?numbers\b(, or none)?", r"\1 numbers"),
     (r"^>= (\S+) and <= ([^\s,;]+)", r"\1 to \2"),
     (r"^> (\S+) and <= ([^\s,;]+)", r"> \1 to \2"),
