@@ -17,21 +17,19 @@ import argparse
 import os
 import time
 from array import array
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import rclpy
-import yaml
+from chain import load_node_values, load_values
 from geometry_msgs.msg import PoseStamped
+from live_robot import goals
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from relays import RelayCommand, RelayLimits
 from sensor_msgs.msg import JointState
 
 from sim_bridge.bullet.robot import BulletRobot
-from sim_bridge.scenario.events import PoseGoal
-from sim_bridge.scenario.scenario import load_scenario
 from torque_safety_controller.node.controller_node import ControllerNode
 from viability_bounds_pkg.node.bounds_node import BoundsNode
 from viability_bounds_pkg.node.estimator_node import EstimatorNode
@@ -39,11 +37,12 @@ from viability_bounds_pkg.robot.description import build_model, read_urdf
 from viability_bounds_pkg.ros.arm_node import ArmNode, connect
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, make_executor, set_stamp
 from viability_bounds_pkg.ros.topics import JOINT_COMMANDS, JOINT_STATES
+from viability_bounds_pkg.testing.ros_harness import overrides
 
-ROOT = Path(__file__).resolve().parent.parent
 DT_NS = 1_000_000
 WAYS = ("middleware", "one process")
-KINDS = ("real", "relay")
+START = 20.0
+"""After so long at the latest a chain must answer, s."""
 
 
 class Probe(ArmNode):
@@ -51,25 +50,17 @@ class Probe(ArmNode):
 
     NAME = "probe"
 
-    def __init__(self, joints: list[str], robot: BulletRobot, **arguments) -> None:
+    def __init__(self, joints: list[str], robot: BulletRobot, **arguments: Any) -> None:
         super().__init__(**arguments)
         self._state = JointState(name=joints, effort=array("d", [0.0] * len(joints)))
         self.robot = robot
         self._stamp = 0
         self.command: array | None = None
         self._publisher = self.stream(JOINT_STATES)
-        self._goal = self.create_publisher(PoseStamped, "target_pose", GOAL_QOS)
+        self.goal = self.create_publisher(PoseStamped, "target_pose", GOAL_QOS)
         self.listen(JOINT_COMMANDS, self._on_command)
 
-    def set_goal(self, goal: PoseGoal) -> None:
-        """Give the controller something to track."""
-        message = PoseStamped()
-        p, o = message.pose.position, message.pose.orientation
-        p.x, p.y, p.z = goal.position
-        o.x, o.y, o.z, o.w = goal.orientation
-        self._goal.publish(message)
-
-    def cycle(self, executor, timeout: float = 1.0) -> float:
+    def cycle(self, executor: Any, timeout: float = 1.0) -> float:
         """Send a state, wait for its command, return how long it took, s; NaN if it is lost."""
         self._stamp += DT_NS
         q, v, _ = self.robot.state()
@@ -89,34 +80,7 @@ class Probe(ArmNode):
         self.command = message.effort
 
 
-def parameters(robot: str) -> dict:
-    """Return the parameters of all nodes in a robot's file, by name."""
-    content = yaml.safe_load((ROOT / "config" / f"{robot}.yaml").read_text())
-    return {
-        name: value for part in content.values() for name, value in part["ros__parameters"].items()
-    }
-
-
-def remedies(robot: str, node: str) -> dict:
-    """Return the parameters of a node with what is declared for the imperfect robot.
-
-    Without rotors, which the probes' robots do not have.
-    """
-    values: dict = {}
-    for name in (robot, f"imperfect/{robot}"):
-        content = yaml.safe_load((ROOT / "config" / f"{name}.yaml").read_text())
-        for section in ("/**", f"/**/{node}"):
-            values |= content.get(section, {}).get("ros__parameters", {})
-    return values | {"rotor_inertia": parameters(robot).get("rotor_inertia", [])}
-
-
-def overridden(values: dict) -> list[Parameter]:
-    """Return parameters for a node of a chain."""
-    values = values | {"bounds_timeout": 1.0, "rate_hz": 1e9 / DT_NS}
-    return [Parameter(name, value=value) for name, value in values.items() if value != []]
-
-
-def drive(executor, probe: Probe, model, cycles: int) -> list[float]:
+def drive(executor: Any, probe: Probe, model: pin.Model, cycles: int) -> list[float]:
     """Return the times of some cycles, s, moving the probe's arm in between."""
     data = model.createData()
     times = []
@@ -126,6 +90,41 @@ def drive(executor, probe: Probe, model, cycles: int) -> list[float]:
         commanded = probe.command is not None and any(probe.command)
         probe.robot.step(np.array(probe.command) if commanded else gravity)
     return times
+
+
+def make_chains(robot: str, imperfect: bool) -> tuple[dict[str, Probe], list[Node], pin.Model]:
+    """Return the probes by the names of their chains, all other nodes, and the arm's model."""
+    values = load_values(robot)
+    joints, urdf = values["joints"], read_urdf(values["robot_description"])
+    nodes: list[Node] = []
+    probes: dict[str, Probe] = {}
+
+    def add(name: str, chain: list[Any], way: str, namespace: str) -> None:
+        arm = BulletRobot(urdf, joints, physics_dt=DT_NS * 1e-9)
+        arm.reset(values["start_positions"], np.zeros(len(joints)))
+        probes[name] = Probe(joints, arm, namespace=namespace)
+        if way == "one process":
+            connect([probes[name], *chain])
+        nodes.extend(chain)
+
+    def configured(kind: Any, namespace: str, own: dict[str, Any]) -> Node:
+        own = own | {"bounds_timeout": 1.0, "rate_hz": 1e9 / DT_NS}
+        given = overrides({name: value for name, value in own.items() if value != []})
+        return kind(namespace=namespace, parameter_overrides=given)
+
+    for way in WAYS:
+        real, relay = (f"{kind}_{way.replace(' ', '_')}" for kind in ("real", "relay"))
+        kinds = (BoundsNode, ControllerNode)
+        add(f"real, {way}", [configured(kind, real, values) for kind in kinds], way, real)
+        relays = [kind(joints, namespace=relay) for kind in (RelayLimits, RelayCommand)]
+        add(f"relay, {way}", relays, way, relay)
+    if imperfect:
+        own = load_node_values(robot, f"imperfect/{robot}")
+        rotors = {"rotor_inertia": values.get("rotor_inertia", [])}  # the probes' robots have none
+        kinds = (EstimatorNode, BoundsNode, ControllerNode)
+        chain = [configured(kind, "remedies", own[kind.NAME] | rotors) for kind in kinds]
+        add("remedies", chain, "middleware", "remedies")
+    return probes, nodes, build_model(urdf, joints)
 
 
 def main() -> None:
@@ -139,52 +138,22 @@ def main() -> None:
     options.block = min(options.block, options.cycles)
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     rclpy.init()
-    values = parameters(options.robot)
-    joints = values["joints"]
-    urdf = read_urdf(values["robot_description"])
-    model = build_model(urdf, joints)
-    scenario = load_scenario(ROOT / "config" / "scenarios" / f"{options.robot}_demo.yaml")
-    goals = [event for event in scenario.events if isinstance(event, PoseGoal)]
-
-    def make_robot() -> BulletRobot:
-        robot = BulletRobot(urdf, joints, physics_dt=DT_NS * 1e-9)
-        robot.reset(values["start_positions"], np.zeros(len(joints)))
-        return robot
-
-    nodes: list[Node] = []
-    probes: dict[str, Probe] = {}
-    for way in WAYS:
-        real, relay = ({"namespace": f"{kind}_{way.replace(' ', '_')}"} for kind in KINDS)
-        given = real | {"parameter_overrides": overridden(values)}
-        for name, chain in (
-            (f"real, {way}", [BoundsNode(**given), ControllerNode(**given)]),
-            (f"relay, {way}", [RelayLimits(joints, **relay), RelayCommand(joints, **relay)]),
-        ):
-            namespace = real if name.startswith("real") else relay
-            probes[name] = Probe(joints, make_robot(), **namespace)
-            if way == "one process":
-                connect([probes[name], *chain])
-            nodes += chain
-    if options.imperfect:
-        for kind in (EstimatorNode, BoundsNode, ControllerNode):
-            own = overridden(remedies(options.robot, kind.NAME))
-            nodes.append(kind(namespace="remedies", parameter_overrides=own))
-        probes["remedies"] = Probe(joints, make_robot(), namespace="remedies")
+    probes, nodes, model = make_chains(options.robot, options.imperfect)
     executor = make_executor()
     running: list[Node] = [*nodes, *probes.values()]
     for node in running:
         executor.add_node(node)
     for name, probe in probes.items():
-        deadline = time.monotonic() + 20.0
+        deadline = time.monotonic() + START
         while np.isnan(probe.cycle(executor)):
             if time.monotonic() > deadline:
                 raise SystemExit(f"the {name} chain does not answer")
     times: dict[str, list[float]] = {name: [] for name in probes}
-    blocks = options.cycles // options.block
+    messages, blocks = goals(options.robot), options.cycles // options.block
     for block in range(blocks):
         for name, probe in probes.items():
             if not name.startswith("relay"):
-                probe.set_goal(goals[block * len(goals) // blocks])
+                probe.goal.publish(messages[block * len(messages) // blocks])
             times[name] += drive(executor, probe, model, options.block)
     found = {name: 1e6 * np.nanpercentile(each, (50, 99)) for name, each in times.items()}
     for name, (median, slow) in found.items():

@@ -3,26 +3,32 @@
 
 Each robot plays its demo's goals by turns in the ways to run it; diagnostics of the robot tell
 what was missed: periods without their command in time, and those that passed while the simulated
-robot was late itself, whose motion would have gone on.
-"both" is what a real robot would miss. A bare loop, which sleeps until the next period and does
-nothing else, shows what the machine itself can do; a busy loop, which in each period computes for
-as long as the one process, what it leaves to programs that compute; relays in place of bounds and
-controller, in the robot's process, what messages and simulation take. Then, in lockstep, where the
-time of a period goes.
+robot was late itself, whose motion would have gone on. "both" is what a real robot would miss. A
+bare loop, which sleeps until the next period and does nothing else, shows what the machine itself
+can do; a busy loop, which in each period computes for as long as the one process, what it leaves
+to programs that compute; relays in place of bounds and controller, in the robot's process, what
+messages and simulation take.
+
+With --loads, robots are sent to random corners of their position limits instead, with stiff gains,
+a process for each node, while the machine is idle, or as many programs as it has processors
+compute without end, or programs are stopped for 5 to 500 ms, again and again. The limits are
+checked at each physics step; the exit code is 1 when one was passed. The table of all robots and
+loads goes to docs/results.md.
 """
 
 from __future__ import annotations
 
 import argparse
-import itertools
 import math
+import os
+import sys
 import time
-from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
+from chain import load_values
+from figure import table, write_part
 from live_robot import (
     ONE_PROCESS,
     PROCESSES,
@@ -31,47 +37,47 @@ from live_robot import (
     User,
     configuration,
     cpu_seconds,
+    disturbed,
     goals,
     load,
     running,
 )
-from rclpy.node import Node
-from rclpy.publisher import Publisher
-from rclpy.task import Future
 
-from sim_bridge.bullet.robot import BulletRobot
-from sim_bridge.node.bullet_node import BulletNode
-from sim_bridge.node.commands import CommandStream
-from torque_safety_controller.controller import Controller
-from torque_safety_controller.node.controller_node import ControllerNode
-from torque_safety_controller.node.periodic import LimitsReader
-from torque_safety_controller.node.safety_stack import make_nodes
-from torque_safety_controller.parts.whole_arm.safety_filter import SafetyFilter
-from torque_safety_controller.qp import InverseDynamicsQP
-from torque_safety_controller.robot_model import RobotModel
-from viability_bounds_pkg.cli.command_line import Parser
-from viability_bounds_pkg.node.bounds_node import BoundsNode
-from viability_bounds_pkg.node.estimator_node import EstimatorNode
 from viability_bounds_pkg.recent_values import RecentValues
-from viability_bounds_pkg.ros.arm_node import ArmNode, connect
-from viability_bounds_pkg.ros.diagnostics import Diagnostics
-from viability_bounds_pkg.ros.messages import JointStateReader
-from viability_bounds_pkg.ros.program import initialise, leave
-from viability_bounds_pkg.ros.publisher_watch import PublisherWatch
-from viability_bounds_pkg.ros.runtime import GOAL_QOS, make_executor
-from viability_bounds_pkg.state_estimation.estimator import StateEstimator
+from viability_bounds_pkg.testing.ros_harness import joint_state, private_domain
 
-CASES = (
-    ("panda", 500.0),
-    ("panda", 1000.0),
-    ("talos_left_arm", 1000.0),
-    ("baxter_left_arm", 100.0),
-)
+CASES = {
+    "panda@500": ("panda", 500.0),
+    "panda@1000": ("panda", 1000.0),
+    "talos_left_arm@1000": ("talos_left_arm", 1000.0),
+    "baxter_left_arm@100": ("baxter_left_arm", 100.0),
+}
 WAYS = RELAYS, ONE_PROCESS, PROCESSES
 SETTLING = 1.0
 """How long a robot moves before it is measured, s."""
-LONG_ENOUGH = 6.0
-"""For where the time of a period goes, s."""
+LOADED = "panda@500", "talos_left_arm@1000", "baxter_left_arm@100"
+LOADS = (
+    "idle",
+    "busy",
+    "pause controller_node",
+    "pause bounds_node",
+    "pause bullet_node",
+    "pause all",
+)
+HASTE = {"posture_kp": 100.0, "posture_kd": -1.0, "posture_weight": 10.0, "pose_weight": 0.0}
+"""Gains by which joint goals drive the joints at their limits."""
+CORNERS = 40
+LOAD_HEADS = (
+    "robot",
+    "load",
+    "periods",
+    "missed",
+    "late",
+    "stopped",
+    "nearest limit, rad",
+    "torque",
+    "limits",
+)
 
 
 def memory(programs: Programs) -> float:
@@ -85,11 +91,7 @@ def memory(programs: Programs) -> float:
 def measure(
     robot: str, rate: float, way: str, seconds: float, imperfect: bool
 ) -> tuple[str, float]:
-    """Run a robot by the wall clock for some seconds; return what came of it.
-
-    Returns:
-        the row, and the share of a processor that was used.
-    """
+    """Run a robot for some seconds; return the row, and the share of a processor that was used."""
     arguments = configuration(robot, rate, imperfect=imperfect)
     with running(way, arguments, imperfect) as programs:
         user = User(goals(robot), "target_pose")
@@ -103,13 +105,13 @@ def measure(
             megabytes = memory(programs)
         finally:
             user.ros.close()
-    periods, missed, stopped, late = (
+    counts = [
         int(after[key]) - int(before[key])
-        for key in ("periods", "deadline_misses", "braked_periods", "late_periods")
-    )
-    latency = [float(after[f"latency_{part}_us"]) for part in ("p50", "p99")]
+        for key in ("periods", "deadline_misses", "late_periods", "braked_periods")
+    ]
     errors = [float(after[f"period_error_{part}_us"]) for part in ("p50", "p99", "max")]
-    return row(way, periods, missed, late, stopped, errors, latency, cpu, megabytes), cpu
+    latency = [float(after[f"latency_{part}_us"]) for part in ("p50", "p99")]
+    return row(way, counts, [*errors, *latency], cpu, megabytes), cpu
 
 
 def bare_loop(rate: float, seconds: float, busy: float = 0.0) -> str:
@@ -131,7 +133,8 @@ def bare_loop(rate: float, seconds: float, busy: float = 0.0) -> str:
             pass
     cpu = (time.process_time() - used) / (last - begin)
     found = [1e6 * errors.percentile(50), 1e6 * errors.percentile(99), 1e6 * errors.largest]
-    return row("busy loop" if busy else "bare loop", periods, 0, lost, 0, found, [], cpu, math.nan)
+    times = [*found, math.nan, math.nan]
+    return row("busy loop" if busy else "bare loop", [periods, 0, lost, 0], times, cpu, math.nan)
 
 
 HEAD = (
@@ -141,191 +144,102 @@ HEAD = (
 )
 
 
-def row(
-    name: str,
-    periods: int,
-    missed: int,
-    late: int,
-    stopped: int,
-    errors: list[float],
-    latency: list[float],
-    cpu: float,
-    megabytes: float,
-) -> str:
+def row(name: str, counts: list[int], times: list[float], cpu: float, megabytes: float) -> str:
     """Return a line of the table."""
-    p50, p99 = latency or (math.nan, math.nan)
-    text = (
+    periods, missed, late, stopped = counts
+    widths = (7, 8, 9, 7, 9)
+    return (
         f"{name:12} {periods:8} {missed:7} {late:6} {(missed + late) / (periods + late):7.2%} "
-        f"{stopped:8} "
-        f"{errors[0]:7.0f} {errors[1]:8.0f} {errors[2]:9.0f} {p50:7.0f} {p99:9.0f} "
+        f"{stopped:8} {' '.join(f'{t:{w}.0f}' for t, w in zip(times, widths, strict=True))} "
         f"{cpu:6.0%} {megabytes:7.0f}"
-    )
-    return text.replace("nan", "  -")
+    ).replace("nan", "  -")
 
 
-class Stopwatch:
-    """Adds up the time in functions, without that in others that they call."""
-
-    def __init__(self) -> None:
-        self.periods: list[dict[str, float]] = []
-        self._now: defaultdict[str, float] = defaultdict(float)
-        self._inner = [0.0]
-
-    def watch(self, owner: Any, function: str, stage: str) -> None:
-        """Add the time in a function of a class or module to a stage."""
-        plain = getattr(owner, function)
-
-        def timed(*arguments: Any, **named: Any) -> Any:
-            self._inner.append(0.0)
-            begin = time.perf_counter()
-            try:
-                return plain(*arguments, **named)
-            finally:
-                took = time.perf_counter() - begin
-                self._now[stage] += took - self._inner.pop()
-                self._inner[-1] += took
-
-        setattr(owner, function, timed)
-
-    def each(self, owner: Any, function: str) -> None:
-        """Let a new period begin where a function is called."""
-        plain = getattr(owner, function)
-
-        def counted(*arguments: Any) -> Any:
-            self.periods.append(dict(self._now) | {"whole period": time.perf_counter()})
-            self._now.clear()
-            return plain(*arguments)
-
-        setattr(owner, function, counted)
-
-
-STAGES = (
-    (BulletRobot, "step", "robot: physics"),
-    (BulletNode, "_next_state", "robot: state to message"),
-    (BulletNode, "_on_command", "robot: rest"),
-    (CommandStream, "receive", "robot: command from message"),
-    (JointStateReader, "read", "states from messages"),
-    (EstimatorNode, "_on_state", "estimator: rest"),
-    (EstimatorNode, "_on_command", "estimator: rest"),
-    (StateEstimator, "step", "estimator: estimate"),
-    (BoundsNode, "_on_state", "bounds"),
-    (LimitsReader, "read", "controller: limits from message"),
-    (RobotModel, "update", "controller: model"),
-    (RobotModel, "torque", "controller: model"),
-    (SafetyFilter, "prepare", "controller: safety filter"),
-    (SafetyFilter, "choose", "controller: safety filter"),
-    (InverseDynamicsQP, "build", "controller: QP"),
-    (InverseDynamicsQP, "solve", "controller: QP"),
-    (Controller, "step", "controller: rest of the step"),
-    (ControllerNode, "_on_state", "controller: rest of the node"),
-    (ControllerNode, "_on_limits", "controller: rest of the node"),
-    (Publisher, "publish", "publish"),
-    (Diagnostics, "publish", "diagnostics"),
-    (PublisherWatch, "check", "watch of the graph"),
-)
-watch = Stopwatch()
-
-
-def stages(robot: str, rate: float, seconds: float, imperfect: bool) -> None:
-    """Print where the time of a period goes, in this process, in lockstep.
-
-    Once with messages past the middleware, once with all of them by it.
-    """
-    for owner, function, stage in STAGES:
-        watch.watch(owner, function, stage)
-    watch.each(BulletNode, "_next_state")
-    periods = {
-        way: stages_of(robot, rate, seconds, imperfect, way == "direct")
-        for way in ("direct", "messages")
-    }
-    whole = {
-        way: np.diff([each["whole period"] for each in found[1:]])
-        for way, found in periods.items()
-    }
-    print(f"{'us':35}" + "".join(f"{way:>9} {'mean':>8} {'longest':>9}" for way in periods))
-    names = dict.fromkeys(stage for _, _, stage in STAGES)
-    counted = {way: np.zeros(len(found) - 2) for way, found in periods.items()}
-    for name in [*names, "executor and what is not listed", "whole period"]:
-        line = f"{name:35}"
-        for way, found in periods.items():
-            if name in names:
-                times = np.array([each.get(name, 0.0) for each in found[2:]])
-                counted[way] += times
-            else:
-                times = whole[way] - (0.0 if name == "whole period" else counted[way])
-            line += "".join(
-                f"{1e6 * value:{width}.1f}"
-                for value, width in ((np.median(times), 9), (times.mean(), 9), (times.max(), 10))
-            )
-        print(line)
-    ratio = np.median(whole["direct"]) / np.median(whole["messages"])
-    print(f"direct / messages: {ratio:.2f} of the period")
-
-
-def stages_of(
-    robot: str, rate: float, seconds: float, imperfect: bool, connected: bool
-) -> list[dict[str, float]]:
-    """Run the nodes in lockstep for some seconds; return the times of each period by stage, s."""
-    arguments = configuration(robot, rate, imperfect=imperfect)
-    arguments += [
-        "-p",
-        "clock:=lockstep",
-        "-p",
-        "bounds_timeout:=5.0",
-        "-p",
-        "state_timeout:=10.0",
+def under_load(
+    robot: str, kind: str, seconds: float, seed: int, imperfect: bool
+) -> tuple[str, ...]:
+    """Drive a robot at its limits under a load for some seconds; return the row."""
+    rng, values = np.random.default_rng(seed), load_values(robot)
+    low, high = (np.array(values[f"position_{end}"]) for end in ("min", "max"))
+    corners = [
+        joint_state(values["joints"], 0, np.where(rng.random(len(low)) < 0.5, low, high))
+        for _ in range(CORNERS)
     ]
-    parser = Parser(prog="bench_realtime")
-    initialise(parser, ["bench_realtime", "--ros-args", *arguments, "--log-level", "error"])
-    watch.periods.clear()
-    nodes: list[ArmNode] = [BulletNode(), *make_nodes()]
-    if connected:
-        connect(nodes)
-    user = Node("user")
-    publisher = user.create_publisher(PoseStamped, "target_pose", GOAL_QOS)
-    turns = itertools.cycle(goals(robot))
-    user.create_timer(0.5, lambda: publisher.publish(next(turns)))
-    ended: Future[None] = Future()
-    user.create_timer(SETTLING + seconds, lambda: ended.set_result(None))
-
-    def settled() -> None:
-        begin.cancel()
-        watch.periods.clear()
-
-    begin = user.create_timer(SETTLING, settled)
-    executor = make_executor()
-    for node in (*nodes, user):
-        executor.add_node(node)
-    while not ended.done():  # without a time-out it runs no callback
-        executor.spin_until_future_complete(ended, timeout_sec=seconds)
-    leave(*nodes, user)
-    return list(watch.periods)
+    arguments = configuration(robot, imperfect=imperfect)
+    for name, value in HASTE.items():
+        arguments += ["-p", f"controller_node:{name}:={value}"]
+    with private_domain() as domain:
+        os.environ["ROS_DOMAIN_ID"] = str(domain)
+        with running(PROCESSES, arguments, imperfect) as programs:
+            user = User(corners, "target_posture")
+            try:
+                user.start(programs)
+                with disturbed(kind, programs, rng):
+                    user.use(seconds)
+                found = user.report()
+            finally:
+                user.ros.close()
+    return load_row(robot, kind, found)
 
 
-def main() -> None:
-    """Measure and print."""
+def load_row(robot: str, kind: str, found: dict[str, Any]) -> tuple[str, ...]:
+    """Return the row of a run by what the robot reports; the last cell names what was passed."""
+
+    def worst(key: str, of: Any = max) -> float:
+        return float(of(float(word) for word in found[key].split()))
+
+    beyond = (
+        ("position", worst("position_violation_rad"), "rad"),
+        ("speed", worst("velocity_violation_rad_s"), "rad/s"),
+    )
+    passed = [f"{name} by {value:.2g} {unit}" for name, value, unit in beyond if value > 0.0]
+    if found["level"] == b"\x02" and not passed:
+        passed.append("torque")
+    nearest = min(worst(f"{end}_clearance_rad", min) for end in ("lower", "upper"))
+    keys = ("periods", "deadline_misses", "late_periods", "braked_periods")
+    counts = (found[key] for key in keys)
+    verdict = f"**passed**: {', '.join(passed)}" if passed else "kept"
+    return robot, kind, *counts, f"{nearest:.1g}", f"{worst('torque_ratio'):.3f}", verdict
+
+
+def all_loads(options: argparse.Namespace) -> int:
+    """Run robots under loads, print the table; return 1 if a limit was passed."""
+    print(f"{options.seconds:g} s each; {load()}", *LOAD_HEADS, sep=" | ", flush=True)
+    rows = []
+    for case in options.case or LOADED:
+        for kind in options.load or LOADS:
+            robot = CASES[case][0]
+            rows.append(under_load(robot, kind, options.seconds, options.seed, options.imperfect))
+            print(*rows[-1], sep=" | ", flush=True)
+    if not (options.case or options.load or options.imperfect):
+        write_part("late-machines", table(rows, LOAD_HEADS))
+    return int(any(cells[-1] != "kept" for cells in rows))
+
+
+def main() -> int:
+    """Measure and print; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=4.0, help="for each line")
-    robots = [f"{robot}@{rate:g}" for robot, rate in CASES]
-    parser.add_argument("--case", action="append", choices=robots, help="repeatable; default: all")
+    parser.add_argument("--seconds", type=float, help="for each line (4; 60 with --loads)")
+    parser.add_argument("--case", action="append", choices=CASES, help="repeatable; default: all")
     parser.add_argument("--imperfect", action="store_true", help="robots with all remedies")
-    parser.add_argument("--only", choices=("ways", "stages"), help="a part of it (default: both)")
+    parser.add_argument("--loads", action="store_true", help="limits kept on late machines")
+    parser.add_argument("--load", action="append", choices=LOADS, help="repeatable; default: all")
+    parser.add_argument("--seed", type=int, default=0, help="of goals and pauses")
     options = parser.parse_args()
-    for robot, rate in CASES:
-        if options.case and f"{robot}@{rate:g}" not in options.case:
-            continue
-        print(f"\n{robot} at {rate:g} Hz; {load()}")
-        if options.only != "stages":
-            print(HEAD)
-            print(bare_loop(rate, options.seconds))
-            for way in WAYS:
-                line, cpu = measure(robot, rate, way, options.seconds, options.imperfect)
-                print(line, flush=True)
-                if way == ONE_PROCESS:
-                    print(bare_loop(rate, options.seconds, min(cpu, 0.95)), flush=True)
-        if options.only != "ways":
-            stages(robot, rate, min(options.seconds, LONG_ENOUGH), options.imperfect)
+    options.seconds = options.seconds or (60.0 if options.loads else 4.0)
+    if options.loads:
+        return all_loads(options)
+    for case in options.case or CASES:
+        robot, rate = CASES[case]
+        print(f"\n{robot} at {rate:g} Hz; {load()}\n{HEAD}")
+        print(bare_loop(rate, options.seconds))
+        for way in WAYS:
+            line, cpu = measure(robot, rate, way, options.seconds, options.imperfect)
+            print(line, flush=True)
+            if way == ONE_PROCESS:
+                print(bare_loop(rate, options.seconds, min(cpu, 0.95)), flush=True)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs the nodes of a robot by the wall clock as users do, and sends them goals."""
+"""Runs the nodes of a robot by the wall clock as users do, sends them goals, and disturbs them."""
 
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from itertools import cycle
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 from geometry_msgs.msg import PoseStamped
 from std_srvs.srv import SetBool
@@ -21,15 +24,10 @@ from viability_bounds_pkg.testing.executables import as_child
 from viability_bounds_pkg.testing.ros_harness import RosHarness
 
 ROOT = Path(__file__).resolve().parent.parent
-ONE_PROCESS, SEPARATE_ROBOT, PROCESSES = "one process", "stack + robot", "processes"
-RELAYS = "relays"
+ONE_PROCESS, PROCESSES, RELAYS = "one process", "processes", "relays"
 RELAY_PROGRAM = Path(__file__).parent / "relays.py"
 WAYS = {
     ONE_PROCESS: (("sim_bridge", "simulated_stack"),),
-    SEPARATE_ROBOT: (
-        ("sim_bridge", "bullet_node"),
-        ("torque_safety_controller", "safety_stack"),
-    ),
     PROCESSES: (
         ("sim_bridge", "bullet_node"),
         ("viability_bounds_pkg", "bounds_node"),
@@ -40,6 +38,8 @@ WAYS = {
 
 START = 60.0
 """How long programs may take to start, s."""
+PAUSES, BETWEEN = (0.005, 0.5), (0.05, 0.8)
+"""Shortest and longest pause of a program, and time between two, s."""
 
 Programs = dict[str, subprocess.Popen[bytes]]
 
@@ -135,6 +135,53 @@ def running(way: str, arguments: list[str], imperfect: bool) -> Iterator[Program
             program.terminate()
         for program in started.values():
             program.wait()
+
+
+@contextmanager
+def busy_machine() -> Iterator[None]:
+    """Compute without end, in a process for each processor."""
+    loops = [
+        subprocess.Popen([sys.executable, "-c", "while True: pass"], preexec_fn=as_child)
+        for _ in range(os.cpu_count() or 1)
+    ]
+    try:
+        yield
+    finally:
+        for loop in loops:
+            loop.kill()
+            loop.wait()
+
+
+@contextmanager
+def pauses(programs: list[subprocess.Popen[bytes]], rng: np.random.Generator) -> Iterator[None]:
+    """Stop programs together (SIGSTOP) at random times, and let them go on."""
+    ended = threading.Event()
+
+    def disturb() -> None:
+        while not ended.wait(rng.uniform(*BETWEEN)):
+            for program in programs:
+                program.send_signal(signal.SIGSTOP)
+            ended.wait(rng.uniform(*PAUSES))
+            for program in programs:
+                program.send_signal(signal.SIGCONT)
+
+    thread = threading.Thread(target=disturb)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def disturbed(kind: str, programs: Programs, rng: np.random.Generator) -> Any:
+    """Return the context of a load: "idle", "busy", or "pause NAME" of a program, or of all."""
+    if kind == "idle":
+        return nullcontext()
+    if kind == "busy":
+        return busy_machine()
+    name = kind.removeprefix("pause ")
+    return pauses([each for key, each in programs.items() if name in (key, "all")], rng)
 
 
 def cpu_seconds(programs: Programs) -> float:

@@ -20,6 +20,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 TSID = (".venv-tsid", ("tsid==1.7.1", "pin==3.4.*", "cmeel-urdfdom==4.*", "cmeel-tinyxml2==10.*"))
 """What works together: the wheels do not say which URDF and XML libraries they were built for."""
+PLACO = (".venv-placo", ("placo==0.10.2",))
 
 Arrays = dict[str, np.ndarray]
 Ask = Callable[[], tuple[float, ...]]
@@ -27,15 +28,14 @@ Ask = Callable[[], tuple[float, ...]]
 
 @contextmanager
 def worker(
-    environment: tuple[str, Sequence[str]], script: str, given: Arrays, *words: str
+    environment: tuple[str, Sequence[str]], given: Arrays, *words: str
 ) -> Iterator[tuple[Arrays, Ask]]:
     """Run a program on arrays; yield what it found, and a function that lets it time a block.
 
     Args:
         environment: name of the folder, and what pip installs into it.
-        script: of this folder; called with the files of what is given and found, and `words`.
-        given: its input.
-        words: further arguments.
+        given: the input of `rival_worker.py`.
+        words: its task and the name of the rival.
     """
     python = _interpreter(*environment)
     with tempfile.TemporaryDirectory() as directory:
@@ -44,7 +44,7 @@ def worker(
         # Not our packages, nor a Pinocchio that ROS may have brought.
         clean = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "LD_LIBRARY_PATH")}
         process = subprocess.Popen(
-            [python, str(ROOT / "benchmarks" / script), source, target, *words],
+            [python, str(ROOT / "benchmarks" / "rival_worker.py"), source, target, *words],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -59,7 +59,7 @@ def worker(
 
         try:
             if process.stdout.readline() != "ready\n":
-                sys.exit(f"{script} failed; remove {environment[0]} to have it made again")
+                sys.exit(f"{words} failed; remove {environment[0]} to have it made again")
             with np.load(target) as found:
                 yield dict(found), ask
         finally:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results for one figure of a paper: picture, data, metrics, and rows of the table."""
+"""What a command shows: picture, data, metrics, and rows of a table between marks of a page."""
 
 from __future__ import annotations
 
@@ -15,110 +15,123 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from chain import ROOT
+from PIL import Image
 
 RESULTS = ROOT / "results"
+DOCS = ROOT / "docs"
+WIDTH, COLORS = 1100, 200
+"""Pixels and colours of pictures in docs/images, so that they stay small."""
+HEADS = ("figure", "the paper", "here", "")
+DIFFERS = "DIFFERS"
+
+Row = tuple[str, ...]
 
 
 @dataclass
 class Figure:
-    """Results for one figure of the paper.
+    """What one figure shows.
 
     Attributes:
         name: folder under results/.
+        part: of a page, where its rows go; empty for rows that are only printed.
+        heads: of its table.
+        page: under docs/.
         data: arrays for ``data.npz``.
         metrics: numbers for ``metrics.json``.
-        rows: (what, the paper, here, agreement or why not) for the table.
+        rows: of the table; the last cell tells whether it is as claimed.
     """
 
     name: str
+    part: str = ""
+    heads: Row = HEADS
+    page: str = "results.md"
     data: dict[str, np.ndarray] = field(default_factory=dict)
     metrics: dict[str, float] = field(default_factory=dict)
-    rows: list[tuple[str, ...]] = field(default_factory=list)
+    rows: list[Row] = field(default_factory=list)
 
-    def save(self, picture: plt.Figure | None) -> None:
-        """Write picture, data and metrics."""
+    def add(self, *cells: str, holds: bool = True, so: str = "agrees") -> None:
+        """Add a row, whose last cell is `so` where what is claimed holds."""
+        self.rows.append((*cells, so if holds else DIFFERS))
+
+    def save(self, picture: plt.Figure | None = None, image: str = "") -> None:
+        """Write picture, data and metrics, and the picture to docs/images under a name."""
         directory = RESULTS / self.name
         directory.mkdir(parents=True, exist_ok=True)
         if picture is not None:
             picture.savefig(directory / "figure.png", dpi=130)
             plt.close(picture)
+        if image:
+            large = Image.open(directory / "figure.png").convert("RGB")
+            small = large.resize((WIDTH, round(large.height * WIDTH / large.width)))
+            small = small.quantize(COLORS, Image.Quantize.MAXCOVERAGE)
+            small.save(DOCS / "images" / f"{image}.png", optimize=True)
         np.savez_compressed(directory / "data.npz", **self.data)
         (directory / "metrics.json").write_text(json.dumps(self.metrics, indent=2) + "\n")
 
 
-def joint_axes(joints: Sequence[str], x: str, y: str) -> tuple[plt.Figure, np.ndarray]:
-    """Return a picture with axes for each of 7 joints, labelled `x` and `y`."""
-    picture, axes = plt.subplots(2, 4, figsize=(14, 6), sharex=True, layout="constrained")
-    axes[1, 3].set_visible(False)
-    for axis, joint in zip(axes.flat, joints, strict=False):
-        axis.set_title(joint)
-        axis.grid(alpha=0.3)
-    for axis in axes[:, 0]:
-        axis.set_ylabel(y)
-    for axis in axes[1, :3]:
-        axis.set_xlabel(x)
-    return picture, axes.flat[: len(joints)]
+def table(rows: Sequence[Row], heads: Row = HEADS) -> str:
+    """Return rows as a Markdown table."""
+    lines = [f"| {' | '.join(cells)} |" for cells in (heads, *rows)]
+    return "\n".join([lines[0], "|" + "---|" * len(heads), *lines[1:]])
 
 
-def table(
-    figures: list[Figure], heads: tuple[str, ...] = ("figure", "the paper", "here", "")
-) -> str:
-    """Return the rows of all figures as a Markdown table."""
-    lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
+def tables(figures: Sequence[Figure]) -> dict[tuple[str, str], str]:
+    """Return the tables by page and part: figures with the same heads share one."""
+    rows: dict[tuple[str, str], dict[Row, list[Row]]] = {}
     for figure in figures:
-        lines += ["| " + " | ".join(row) + " |" for row in figure.rows]
-    return "\n".join(lines)
+        if figure.rows:
+            parts = rows.setdefault((figure.page, figure.part), {})
+            parts.setdefault(figure.heads, []).extend(figure.rows)
+    return {
+        place: "\n\n".join(table(each, heads) for heads, each in parts.items())
+        for place, parts in rows.items()
+    }
 
 
-def read_part(name: str, page: str = "results.md") -> str:
-    """Return what a page of docs/ has between ``<!-- name -->`` and ``<!-- /name -->``."""
-    return _split(name, page)[1]
+def page_rows(part: str, page: str = "results.md") -> dict[tuple[str, str], Row]:
+    """Return the rows of a part of a page, by the heading above them and their first cell."""
+    heading, rows = "", {}
+    for line in _split(part, page)[1].splitlines():
+        if line.startswith("### "):
+            heading = line.removeprefix("### ")
+        elif line.startswith("| "):
+            cells = tuple(cell.strip() for cell in line[1:-1].split("|"))
+            rows[heading, cells[0]] = cells
+    return rows
 
 
-def write_part(name: str, text: str, page: str = "results.md") -> None:
-    """Write the part of a page of docs/ between ``<!-- name -->`` and ``<!-- /name -->``."""
-    before, _, after = _split(name, page)
-    (ROOT / "docs" / page).write_text(f"{before}\n\n{text.strip()}\n\n{after}")
+def write_part(part: str, text: str, page: str = "results.md") -> None:
+    """Write what a page of docs/ has between ``<!-- part -->`` and ``<!-- /part -->``."""
+    before, _, after = _split(part, page)
+    (DOCS / page).write_text(f"{before}\n\n{text.strip()}\n\n{after}")
 
 
-def _split(name: str, page: str) -> tuple[str, str, str]:
+def _split(part: str, page: str) -> tuple[str, str, str]:
     """Return a page up to the first mark, between the marks, and from the second mark on."""
-    first, last = f"<!-- {name} -->", f"<!-- /{name} -->"
-    text = (ROOT / "docs" / page).read_text()
-    before, found, rest = text.partition(first)
+    first, last = f"<!-- {part} -->", f"<!-- /{part} -->"
+    before, found, rest = (DOCS / page).read_text().partition(first)
     between, end, after = rest.partition(last)
     if not (found and end):
         raise ValueError(f"docs/{page} has no part between {first} and {last}")
     return before + first, between, last + after
 
 
-def verdict(agrees: bool, text: str = "agrees") -> str:
-    """Return the last entry of a row: `text`, or that it differs."""
-    return text if agrees else "DIFFERS"
-
-
-def reproduce(
-    description: str,
-    parts: Mapping[str, Callable[[], Figure]],
-    write: Callable[[list[Figure]], None],
-    show: Callable[[list[Figure]], str] = table,
-) -> int:
-    """Reproduce what the command line names, print the table, and tell whether all agrees.
+def reproduce(description: str, parts: Mapping[str, Callable[[], Figure]]) -> int:
+    """Make the figures that the command line names, print their rows, and write whole tables.
 
     Args:
-        description: of the command, its first line.
+        description: of the command; its first line is shown.
         parts: by name.
-        write: makes a page of all figures; called when all were made.
-        show: makes the table.
 
     Returns:
-        1 when a row says that it differs from the paper, else 0.
+        1 when something is not as claimed, else 0.
     """
     parser = argparse.ArgumentParser(description=description.splitlines()[0])
     parser.add_argument("part", nargs="?", default="all", choices=("all", *parts))
-    part = parser.parse_args().part
-    figures = [make() for make in (parts.values() if part == "all" else [parts[part]])]
-    print(show(figures))
-    if part == "all":
-        write(figures)
-    return int(any("DIFFERS" in row[-1] for figure in figures for row in figure.rows))
+    wanted = parser.parse_args().part
+    figures = [make() for name, make in parts.items() if wanted in ("all", name)]
+    for (page, part), text in tables(figures).items():
+        print(text, end="\n\n")
+        if wanted == "all" and part:
+            write_part(part, text, page)
+    return int(any(DIFFERS in row[-1] for figure in figures for row in figure.rows))

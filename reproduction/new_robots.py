@@ -8,18 +8,16 @@ import json
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import yaml
 from chain import ROOT
-from figure import RESULTS, Figure, table
+from figure import RESULTS, Row, page_rows, table, write_part
 
 from viability_bounds_pkg.robot.description import package_directories
 
-PAGE = ROOT / "docs" / "start" / "your_robot.md"
-BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
+PART, PAGE = "new-robots", "start/your_robot.md"
 FOLDER = RESULTS / "new_robot"
 HEADS = (
     "arm",
@@ -38,8 +36,7 @@ DATA = "package://example-robot-data/robots/"
 BULLET = "pybullet_data:"
 
 
-@dataclass(frozen=True)
-class Arm:
+class Arm(NamedTuple):
     """An arm of an installed package.
 
     Attributes:
@@ -107,96 +104,60 @@ def urdf_of(arm: Arm) -> str:
     return str(Path(pybullet_data.getDataPath()) / arm.urdf.removeprefix(BULLET))
 
 
-def make(name: str, arm: Arm) -> dict[str, Any]:
+def play(name: str, arm: Arm) -> Row:
     """Make the files of an arm and play it; return its row."""
-    folder = FOLDER / "config"
+    config, metrics = FOLDER / "config", FOLDER / name / "metrics.json"
     command = ["bash", str(ROOT / "scripts" / "new_robot.sh"), urdf_of(arm), arm.tip]
-    command += ["--name", name, "--out", str(folder), "--force"]
+    command += ["--name", name, "--out", str(config), "--force"]
     command += ["--base", arm.base] if arm.base else []
-    begin = time.monotonic()
-    (FOLDER / f"{name}.txt").unlink(missing_ok=True)
-    seconds, lines = 0.0, []
-    metrics = FOLDER / name / "metrics.json"
+    begin, seconds, lines = time.monotonic(), 0.0, []
     metrics.unlink(missing_ok=True)
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     ) as run:
         assert run.stdout is not None
         for line in run.stdout:
-            lines.append(line)
+            lines.append(line.strip())
             if line.startswith("written: ") and not seconds:
                 seconds = time.monotonic() - begin
-    (FOLDER / f"{name}.txt").write_text("".join(lines))
-    row: dict[str, Any] = {"seconds": seconds}
+    (FOLDER / f"{name}.txt").write_text("\n".join(lines) + "\n")
     if not seconds:
         refusals = [line for line in lines if line.startswith("new_robot: ")]
-        return row | {"refused": (refusals or lines[-1:])[-1].strip().removeprefix("new_robot: ")}
-    text = (folder / f"{name}.yaml").read_text()
-    values = yaml.safe_load(text)
+        why = (refusals or lines)[-1].removeprefix("new_robot: ")
+        return (f"`{name}`", *[""] * (len(HEADS) - 2), why)
+    values = yaml.safe_load((config / f"{name}.yaml").read_text())
     robot = values["/**"]["ros__parameters"]
-    row["joints"] = len(robot["joints"])
-    row["endless"] = sum(" turns without end" in line for line in lines)
-    row["rate"] = robot["rate_hz"]
-    row["speeds"] = next(
-        (line.split()[0] for line in lines if " of the URDF's: at higher" in line), "1"
+    slower = [line.split()[0] for line in lines if " of the URDF's: at higher" in line]
+    (reached,) = (line for line in lines if line.startswith("scenario: "))
+    low = min(map(abs, robot["acceleration_min"] + robot["acceleration_max"]))
+    filtered = values["/**/controller_node"]["ros__parameters"].get("safety_filter")
+    return (
+        f"`{name}`",
+        str(len(robot["joints"])),
+        str(sum(" turns without end" in line for line in lines) or "-"),
+        f"{robot['rate_hz']:g}",
+        *(slower or ["1"])[:1],
+        f"{low:g} to {max(robot['acceleration_max']):g}",
+        "yes" if filtered else "-",
+        reached.partition(" with ")[2].partition(" position")[0].replace(" of the ", " of "),
+        f"{seconds:.0f}",
+        verdict(metrics, lines),
     )
-    row["accelerations"] = [
-        min(map(abs, robot["acceleration_min"] + robot["acceleration_max"])),
-        max(robot["acceleration_max"]),
-    ]
-    control = values["/**/controller_node"]["ros__parameters"]
-    row["filter"] = bool(control.get("safety_filter"))
-    row["reached"] = next(
-        line.partition(" with ")[2].partition(" position")[0].replace(" of the ", " of ")
-        for line in lines
-        if line.startswith("scenario: ")
-    )
-    return row | {"limits": verdict(metrics, lines)}
 
 
 def verdict(path: Path, lines: list[str]) -> str:
     """Return what a run says: kept, what was passed, or why it did not run."""
     if not path.exists():
-        errors = [line.strip() for line in lines if "error" in line.lower()]
+        errors = [line for line in lines if "error" in line.lower()]
         return f"did not run: {errors[-1] if errors else 'no message'}"
     metrics = json.loads(path.read_text())
-    passed = []
-    if metrics["max_position_violation_rad"] > 0.0:
-        passed.append(f"position by {metrics['max_position_violation_rad']:.2g} rad")
-    if metrics["max_velocity_violation_rad_s"] > 0.0:
-        passed.append(f"speed by {metrics['max_velocity_violation_rad_s']:.2g} rad/s")
-    if metrics["max_torque_ratio"] > 1.0 + 1e-9:
-        passed.append(f"torque, {metrics['max_torque_ratio']:.3f} of its limit")
-    return "PASSED " + ", ".join(passed) if passed else "kept"
-
-
-def cells(name: str, row: dict[str, Any]) -> tuple[str, ...]:
-    """Return the cells of a row."""
-    if "refused" in row:
-        return (name, *[""] * (len(HEADS) - 2), row["refused"])
-    low, high = row["accelerations"]
-    return (
-        f"`{name}`",
-        str(row["joints"]),
-        str(row["endless"] or "-"),
-        f"{row['rate']:g}",
-        row["speeds"],
-        f"{low:g} to {high:g}",
-        "yes" if row["filter"] else "-",
-        row["reached"],
-        f"{row['seconds']:.0f}",
-        row["limits"],
-    )
-
-
-def write_page(rows: dict[str, dict[str, Any]]) -> None:
-    """Put the table between its marks in the page."""
-    text = PAGE.read_text()
-    head, rest = text.split(BEGIN)
-    _, tail = rest.split(END)
-    lines = [cells(name, rows[name]) for name in ARMS if name in rows]
-    body = table([Figure("new_robot", rows=lines)], HEADS)
-    PAGE.write_text(f"{head}{BEGIN}\n{body}\n{END}{tail}")
+    beyond = {
+        "position, rad": metrics["max_position_violation_rad"],
+        "speed, rad/s": metrics["max_velocity_violation_rad_s"],
+        "torque, of its limit": metrics["max_torque_ratio"] - 1.0 - 1e-9,
+    }
+    passed = [f"{name} by {value:.2g}" for name, value in beyond.items() if value > 0.0]
+    return "PASSED " + "; ".join(passed) if passed else "kept"
 
 
 def main() -> int:
@@ -210,14 +171,13 @@ def main() -> int:
         parser.error(f"unknown arm '{unknown[0]}'; there are: {', '.join(ARMS)}")
     assert any(path.is_dir() for path in package_directories())
     FOLDER.mkdir(parents=True, exist_ok=True)
-    kept = FOLDER / "rows.json"
-    rows = json.loads(kept.read_text()) if kept.exists() else {}
+    rows = {cells[0]: cells for cells in page_rows(PART, PAGE).values()}
     for name in names:
-        rows[name] = make(name, ARMS[name])
-        print(" | ".join(cells(name, rows[name])), flush=True)
-        kept.write_text(json.dumps(rows, indent=1) + "\n")
-        write_page(rows)
-    return 0 if all(rows[name].get("limits") == "kept" for name in names) else 1
+        cells = rows[f"`{name}`"] = play(name, ARMS[name])
+        print(*cells, sep=" | ", flush=True)
+        known = [rows[f"`{each}`"] for each in ARMS if f"`{each}`" in rows]
+        write_part(PART, table(known, HEADS), PAGE)
+    return int(any(rows[f"`{name}`"][-1] != "kept" for name in names))
 
 
 if __name__ == "__main__":

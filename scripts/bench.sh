@@ -11,12 +11,13 @@ Ratios compare programs that run in turns in one process. NAME --help lists opti
   chain       from state to command through both nodes, against empty relays; with --imperfect
               also with estimator, prediction and margins
   realtime    all nodes by the wall clock: one process, separate ones, relays, and what the
-              machine itself can do; where the time of a period goes
-  peers       limits kept beside TSID, placo and a clamp; the step beside TSID's; the QPs by solvers
-              of qpsolvers; these are installed into .venv-tsid, .venv-placo and .venv-qpsolvers
-  step        one controller step, part by part
-  bounds      acceleration bounds: one arm, and batches; with --tsid also TSID's, which is
-              installed into .venv-tsid
+              machine itself can do; with --loads limits kept while the machine is busy or programs
+              stop (20 min)
+  peers       limits kept beside TSID, placo and a clamp
+  step        one controller step, part by part; with --tsid beside TSID's
+  bounds      acceleration bounds: one arm, and batches; with --tsid beside TSID's
+
+TSID and placo are installed into .venv-tsid and .venv-placo.
 USAGE
 }
 root="$(cd "$(dirname "$0")/.." && pwd)"
@@ -30,4 +31,5 @@ fi
 shift
 # shellcheck source=scripts/environment.sh
 source "$root/scripts/environment.sh"
+export PYTHONPATH="$root/reproduction:${PYTHONPATH:-}"
 exec python "$root/benchmarks/bench_$name.py" "$@"

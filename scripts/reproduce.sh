@@ -15,11 +15,10 @@ Writes figures to results/ and tables to docs/results.md, and prints the tables.
   whole_arm          weak motors, with and without the safety filter (10 min)
   imperfect          late, coarse and noisy robots, with and without each remedy (40 min on
                      two cores)
-  imperfect panda    one of the robots; its rows replace those of before
+  imperfect panda    one of the robots
   contrast           the moving picture of README
   theory             figures and tables of the pages under docs/theory (3 min)
   soak               faults while the arm moves: restarts, wrong states, second nodes (3 min)
-  exactness          the bounds compared with brute force (30 min)
   all                the first four (default)
 USAGE
 }
@@ -36,7 +35,7 @@ if [ "$what" = all ]; then
 fi
 what="${what//-/_}"
 case "$what" in
-paper0 | paper1_integral | paper1_compliance | whole_arm | imperfect | contrast | theory | soak | exactness) ;;
+paper0 | paper1_integral | paper1_compliance | whole_arm | imperfect | contrast | theory | soak) ;;
 *)
     echo "error: unknown '$what'; --help lists what there is" >&2
     exit 2

@@ -3,13 +3,13 @@
 
 bash scripts/reproduce.sh imperfect                 the tables of docs/results.md
 bash scripts/reproduce.sh imperfect panda           those of one robot
-bash scripts/reproduce.sh imperfect page            only the page, of all rows that were played
 bash scripts/reproduce.sh imperfect --minutes 1     quicker: 1 minute each in place of 10
 
 The real nodes in one process, in lockstep, with `config/imperfect/<robot>.yaml`. Each minute has
 its own seed: goals anew each second, half of the joints at their limits, pushes, and rests in
 which joints lie on their limits. Every second minute has a posture task so stiff that the limits
-decide. Limits are checked at each physics step, against the true state.
+decide. Limits are checked at each physics step, against the true state. Rows that are not played
+stay on the page.
 """
 
 from __future__ import annotations
@@ -22,25 +22,18 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cache
 from multiprocessing import get_context
-from typing import Any
+from typing import Any, NamedTuple
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pinocchio as pin
 from chain import load_node_values, run_chain
-from imperfect_page import (
-    WITHIN_DECLARED,
-    Minute,
-    Outcome,
-    ideal_hand,
-    keep,
-    keep_outcome,
-    row,
-    write_page,
-)
+from figure import DIFFERS, Figure, Row, page_rows, table, write_part
 
 from viability_bounds_pkg.robot.description import build_model, read_urdf
 from viability_bounds_pkg.testing.ros_harness import private_domain
 
+PART = "imperfect"
 ROBOTS = ("panda", "talos_left_arm", "baxter_left_arm")
 MINUTE = 60.0  # s
 FAST = 9  # goals of a second each
@@ -49,15 +42,26 @@ SETTLED = 5.0  # s after which the torque steps of such a goal count
 ON_ITS_WAY = 0.02  # rad that a joint moves afterwards; then they do not
 RISE = 0.2  # s
 UNUSED = ("acceleration_limits", "ft_wrench")
-LEG = 6.0  # s of a goal whose time is measured
 HANDS = ("ideal", "ideal_remedies", "all")
 """Cases whose hand is looked at four times, not once."""
-NEAR = 5e-3  # rad; so near a goal is reached
 STIFF = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
 """A posture task that drives each joint to its limits, whatever the hand does."""
 
 OF_ROBOT = ("rotor_inertia", "acceleration_min", "acceleration_max")
 """What the files of imperfect robots have of robot and model: the same in all cases."""
+
+STEP_AT_REST, HAND_FACTOR, TORQUE_ROUNDING = 0.05, 3.0, 1e-9
+"""What is promised: step of torque, of its limit; hand, of the ideal one's distance; share."""
+HEADS = (
+    "what is spoilt, and what is done",
+    "minutes",
+    "position, rad",
+    "speed, rad/s",
+    "torque, of tau_max",
+    "step at rest, of tau_max",
+    "hand at rest, mm",
+    "",
+)
 
 PUSHED = {
     "panda": {"panda_hand": 10.0, "panda_link4": 20.0},
@@ -142,12 +146,13 @@ CASES = {
 }
 AT_LENGTH = ("all", "filter", "filter_weak")
 """Cases that are played for longer."""
+WITHIN_DECLARED = (*AT_LENGTH, "outage_stop")
+"""Cases in which no limit may be passed: what is spoilt is within what is declared."""
 NOT_PLAYED = {
     ("baxter_left_arm", "filter"),
     ("baxter_left_arm", "filter_weak"),
 }
 """Baxter has the filter in each case, and cannot hold itself with less torque."""
-IDEAL = ("ideal", "ideal_remedies")
 DOUBLED = (
     "encoder_resolution",
     "position_noise",
@@ -276,6 +281,21 @@ class Course:
             yield {"time": time + (share - 0.05) * RISE, "push": push}
 
 
+class Minute(NamedTuple):
+    """What a minute showed; the largest of all joints.
+
+    Attributes:
+        position, speed: how far beyond the limits, rad and rad/s.
+        torque: share of torque_max.
+        step_at_rest: largest change of torque in a period at rest, share of torque_max.
+    """
+
+    position: float
+    speed: float
+    torque: float
+    step_at_rest: float
+
+
 def play(robot: str, name: str, seed: int) -> Minute:
     """Play a minute of a case."""
     values = node_values(robot, CASES[name], seed)
@@ -290,14 +310,9 @@ def play(robot: str, name: str, seed: int) -> Minute:
         during = (run.t[1:] >= begin) & (run.t[1:] < end)
         if np.ptp(run.q[1:][during], axis=0).max() < ON_ITS_WAY:
             at_rest |= during
-    return Minute(
-        float(result.vector("position_violation_rad").max()),
-        float(result.vector("velocity_violation_rad_s").max()),
-        float(result.vector("torque_ratio").max()),
-        float(np.nanmax(steps)),
-        float(np.nanmax(steps[at_rest], initial=0.0)),
-        int(result.robot["braked_periods"]),
-    )
+    keys = ("position_violation_rad", "velocity_violation_rad_s", "torque_ratio")
+    position, speed, torque = (float(result.vector(key).max()) for key in keys)
+    return Minute(position, speed, torque, float(np.nanmax(steps[at_rest], initial=0.0)))
 
 
 def hand_at_rest(robot: str, name: str, seed: int) -> float:
@@ -306,9 +321,8 @@ def hand_at_rest(robot: str, name: str, seed: int) -> float:
     course = Course(values["controller_node"], robot, seed)
     start = np.array(values["bullet_node"]["start_positions"])
     goal = course.pose(start + np.random.default_rng(seed).uniform(-0.2, 0.2, start.size))
-    result = run_chain(
-        {}, {"duration": 8.0, "events": list(course.pose_goal(0.0, goal))}, values, UNUSED
-    )
+    scenario = {"duration": 8.0, "events": list(course.pose_goal(0.0, goal))}
+    result = run_chain({}, scenario, values, UNUSED)
     return float(np.linalg.norm(course.pose(result.q).translation - goal.translation))
 
 
@@ -324,35 +338,38 @@ def encoder_step_at_hand(robot: str) -> float:
     return float(sum(np.linalg.norm(pose.translation - here) for pose in moved))
 
 
-def times_to_goal(robot: str, name: str) -> dict[str, Any]:
-    """Return how long the joints take from the middle of their ranges to limits and back.
+def verdict(name: str, worst: Minute, hand: float, allowed: float) -> str:
+    """Return the last entry of a row, empty where nothing is promised.
 
-    Returns:
-        "times" to the upper limits, back, to the lower ones, and back, s, None where a joint stays
-        off; and what is "left" at the limits, rad.
+    Args:
+        name: of the case.
+        worst: of its minutes.
+        hand: median distance of the hand from its goals, m.
+        allowed: what it may be, m.
     """
-    values = node_values(robot, CASES[name], 0)
-    controller = values["controller_node"]
-    controller |= STIFF
-    low, high = (np.array(controller[f"position_{end}"]) for end in ("min", "max"))
-    middle = 0.5 * (low + high)
-    goals = [middle, high, middle, low, middle]
-    events = [
-        {"time": LEG * k, "posture": dict(zip(controller["joints"], goal.tolist(), strict=True))}
-        for k, goal in enumerate(goals)
-    ]
-    run = run_chain({}, {"duration": LEG * len(goals), "events": events}, values, UNUSED).run
-    times: list[float | None] = []
-    left = 0.0
-    for k, goal in enumerate(goals[1:], start=1):
-        during = (run.t >= LEG * k) & (run.t < LEG * (k + 1))
-        distance = np.abs(run.q[during] - goal).max(axis=1)
-        away = np.flatnonzero(distance > NEAR)
-        arrived = 0 if away.size == 0 else int(away[-1]) + 1
-        times.append(float(run.t[during][arrived] - LEG * k) if arrived < distance.size else None)
-        if k % 2:
-            left = max(left, float(distance[-1]))
-    return {"times": times, "left": left}
+    if name not in WITHIN_DECLARED:
+        return ""
+    passed = max(worst.position, worst.speed, worst.torque - 1.0 - TORQUE_ROUNDING) > 0.0
+    wrong = ["a limit was passed"] * passed
+    if name == "all":
+        wrong += ["step at rest"] * (worst.step_at_rest > STEP_AT_REST)
+        wrong += ["hand at rest"] * (hand > allowed)
+    return f"{DIFFERS}: {', '.join(wrong)}" if wrong else "kept"
+
+
+def row(name: str, minutes: Sequence[Minute], hands: Sequence[float], allowed: float) -> Row:
+    """Return a row of the table: the worst of the minutes, the hand, and the `verdict`."""
+    worst, median = Minute(*np.max(minutes, axis=0).tolist()), float(np.median(hands))
+    return (
+        CASES[name].title,
+        str(len(minutes)),
+        f"{worst.position:.2g}",
+        f"{worst.speed:.2g}",
+        f"{worst.torque:.3f}",
+        f"{worst.step_at_rest:.3f}",
+        f"{1e3 * median:.2f} to {1e3 * max(hands):.2f}",
+        verdict(name, worst, median, allowed),
+    )
 
 
 def _own_domain() -> None:
@@ -360,66 +377,104 @@ def _own_domain() -> None:
     os.environ["ROS_DOMAIN_ID"] = str(_held.enter_context(private_domain()))
 
 
-def seeds(name: str, minutes: int) -> range:
-    """Return the seeds of a case's minutes: one minute alone is one with a stiff posture task."""
-    return range(minutes) if name in AT_LENGTH else range(1, minutes + 1)
-
-
-def play_all(
-    robots: Sequence[str], names: Sequence[str], minutes_declared: int, minutes_others: int
-) -> bool:
-    """Play cases of robots, keep and print their rows; return whether limits were kept.
-
-    Only the cases in `WITHIN_DECLARED` count.
-    """
-    lengths = {name: minutes_declared if name in AT_LENGTH else minutes_others for name in names}
-    fine = True
+def play_all(robots: Sequence[str], names: Sequence[str], at_length: int, others: int) -> Figure:
+    """Play cases of robots for some minutes; put their rows on the page, and print them."""
+    figure = Figure("imperfect")
+    rows = {key: cells for key, cells in page_rows(PART).items() if len(cells) == len(HEADS)}
     with ProcessPoolExecutor(
-        max(1, os.cpu_count() or 1), get_context("spawn"), initializer=_own_domain
+        os.cpu_count(), get_context("spawn"), initializer=_own_domain
     ) as pool:
-        runs = {
-            (robot, name): (
-                [pool.submit(play, robot, name, seed) for seed in seeds(name, minutes)],
-                [
-                    pool.submit(hand_at_rest, robot, name, k)
-                    for k in range(4 if name in HANDS else 1)
-                ],
-                pool.submit(times_to_goal, robot, name) if name in IDEAL else None,
-            )
-            for robot in robots
-            for name, minutes in lengths.items()
-            if (robot, name) not in NOT_PLAYED
-        }
-        for (robot, name), (minutes, hands, times) in runs.items():
-            outcome = Outcome(
-                CASES[name].title,
-                [each.result() for each in minutes],
-                [each.result() for each in hands],
-                encoder_step_at_hand(robot),
-            )
-            keep_outcome(robot, name, outcome)
-            print(robot, *row(name, outcome, ideal_hand(robot)), sep=" | ", flush=True)
-            if times is not None:
-                keep(robot, "costs", name, times.result())
-                print(robot, "time to goals", times.result(), sep=" | ", flush=True)
-            fine &= name not in WITHIN_DECLARED or outcome.kept
-    return fine
+        runs = {}
+        for robot in robots:
+            for name in names:
+                if (robot, name) in NOT_PLAYED:
+                    continue
+                # One minute alone is one with a stiff posture task.
+                seeds = range(at_length) if name in AT_LENGTH else range(1, others + 1)
+                runs[robot, name] = (
+                    [pool.submit(play, robot, name, seed) for seed in seeds],
+                    [
+                        pool.submit(hand_at_rest, robot, name, k)
+                        for k in range(4 if name in HANDS else 1)
+                    ],
+                )
+        for (robot, name), futures in runs.items():
+            minutes, hands = ([each.result() for each in some] for some in futures)
+            ideal = rows.get((robot, CASES["ideal"].title))
+            # The median that the page has of the ideal robot, in mm.
+            hand = 1e-3 * float(ideal[-2].split()[0]) if ideal and name != "ideal" else np.inf
+            allowed = max(HAND_FACTOR * hand, encoder_step_at_hand(robot))
+            cells = row(name, minutes, hands, allowed)
+            figure.data |= {
+                f"{robot}_{name}": np.array(minutes),
+                f"{robot}_{name}_hand": np.array(hands),
+            }
+            figure.rows.append(cells)
+            rows[robot, CASES[name].title] = cells
+            write_page(rows)
+            print(robot, *cells, sep=" | ", flush=True)
+    figure.save(draw(rows), "imperfect")
+    return figure
+
+
+def write_page(rows: Mapping[tuple[str, str], Row]) -> None:
+    """Write a table for each robot."""
+    text = []
+    for robot in ROBOTS:
+        links = ", ".join(f"`{link}` {force:g} N" for link, force in PUSHED[robot].items())
+        known = (rows.get((robot, case.title)) for case in CASES.values())
+        body = table([cells for cells in known if cells is not None], HEADS)
+        text.append(f"### {robot}\n\nPushed: {links}.\n\n{body}")
+    write_part(PART, "\n\n".join(text))
+
+
+def color_of(name: str) -> str:
+    """Return the color of a case: grey, nothing spoilt; green, as declared; orange, beyond it."""
+    if name.startswith("ideal"):
+        return "tab:gray"
+    if name in WITHIN_DECLARED:
+        return "tab:green"
+    return "tab:orange" if name == "twice" else "tab:red"
+
+
+def draw(rows: Mapping[tuple[str, str], Row]) -> plt.Figure:
+    """Return a picture of the largest violations by robot and case."""
+    titles = [case.title for case in CASES.values()]
+    picture, axes = plt.subplots(
+        2, len(ROBOTS), figsize=(14, 7), sharey=True, sharex="row", layout="constrained"
+    )
+    for line, head in zip(axes, ("position, rad", "speed, rad/s"), strict=True):
+        values = {key: float(cells[HEADS.index(head)]) for key, cells in rows.items()}
+        some = [value for value in values.values() if value > 0.0] or [1e-3, 1.0]
+        low = 10.0 ** np.floor(np.log10(min(some)) - 1.0)
+        for axis, robot in zip(line, ROBOTS, strict=True):
+            for place, (name, case) in enumerate(CASES.items()):
+                value, color = values.get((robot, case.title)), color_of(name)
+                if value:
+                    axis.barh(place, value - low, left=low, color=color)
+                    axis.text(value, place, f" {value:.2g}", va="center", fontsize=8)
+                elif value is not None:
+                    axis.plot(1.6 * low, place, "o", mfc="none", color=color, clip_on=False)
+            axis.set(xscale="log", xlim=(low, 30.0 * max(some)))
+            axis.set(xlabel=f"{head.replace(',', ' beyond a limit,')}", title=robot)
+            axis.set_yticks(range(len(titles)), titles, fontsize=8)
+            axis.grid(axis="x", alpha=0.3)
+    axes[0, 0].invert_yaxis()
+    return picture
 
 
 def main() -> int:
-    """Play cases, print the tables, and tell whether what is declared kept all limits."""
+    """Play cases, write the tables, and tell whether what is declared kept all limits."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("robot", nargs="?", default="all", choices=("all", *ROBOTS, "page"))
+    parser.add_argument("robot", nargs="?", default="all", choices=("all", *ROBOTS))
     parser.add_argument("--case", choices=tuple(CASES), help="only this row")
     parser.add_argument("--minutes", type=int, default=10, help="of each robot, as declared")
     parser.add_argument("--others", type=int, default=1, help="minutes of the other rows")
     given = parser.parse_args()
-    robots = {"all": ROBOTS, "page": ()}.get(given.robot, (given.robot,))
+    robots = ROBOTS if given.robot == "all" else (given.robot,)
     names = (given.case,) if given.case else tuple(CASES)
-    fine = play_all(robots, names, given.minutes, given.others)
-    titles = {name: case.title for name, case in CASES.items()}
-    write_page(ROBOTS, titles, PUSHED)
-    return 0 if fine else 1
+    figure = play_all(robots, names, given.minutes, given.others)
+    return int(any("a limit was passed" in cells[-1] for cells in figure.rows))
 
 
 if __name__ == "__main__":

@@ -10,23 +10,23 @@ In turns, random postures that can be held, half of the joints next to their lim
 the hand in random postures, not all of which can be reached from where the arm is without
 planning. The next goal comes when the arm has been at rest at one, or after the time limit.
 The tasks are stiff, so that the limits decide. Robot, bounds and controller are those of the
-files, in one loop in lockstep, with exact states. The table is in docs/results.md. What is done is
-kept in results/whole_arm/ until a source file changes.
+files, in one loop in lockstep, with exact states. The table is in docs/results.md.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pinocchio as pin
-from chain import ROOT
 from direct import DirectLoop, column
-from figure import Figure, table, verdict, write_part
-from pieces import in_pieces
+from figure import DIFFERS, Figure, table, write_part
 
 from torque_safety_controller.parts.whole_arm.braking_plan import (
     RESERVE,
@@ -36,6 +36,8 @@ from torque_safety_controller.parts.whole_arm.braking_plan import (
 )
 from torque_safety_controller.parts.whole_arm.safety_filter import SafetyFilter
 
+PART = "whole-arm"
+HEADS = ("arm", "played", "position, rad", "speed, rad/s", "torque", "steps changed", "")
 POSTURE = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
 """Gains on the way to postures."""
 POSE: dict[str, Any] = {"pose_kp": 100.0, "pose_kd": 20.0, "posture_kp": 10.0, "posture_kd": -1.0}
@@ -55,17 +57,14 @@ AGAINST_FRICTION = {
 }
 """TALOS': those of its file, the joints as stiff as the hand. Its integral action alone ends in
 stick-slip, 2 mrad to and fro, and what pulls at the null space sticks and slips as well."""
-DATA_SHEET = [15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0]
-"""Panda's largest accelerations by its maker, rad/s^2."""
 SHORT = 4
 """Minutes of rows without the filter, at most."""
 CLEAR = 0.005
 """Distance of goals from position limits, rad: the bounds' margins keep Baxter 4 mrad off them."""
 KEPT_FREE = 0.05
 """Share of the torque limits that holding a goal leaves."""
-NEAR = {"posture": (0.01,), "pose": (0.01, 0.05)}
-"""Tolerances of goals: rad of each joint; m and rad of the hand. `AT` is the closer one."""
 AT = {"posture": (0.001,), "pose": (0.001, 0.005)}
+"""When an arm is at a goal: rad of each joint; m and rad of the hand."""
 STILL, REST = 0.01, 0.3
 """Speed below which an arm is at rest, rad/s, and how long it is to be before the next goal, s."""
 SHOULDER, ELBOW = 1, 3
@@ -123,135 +122,85 @@ def random_goal(loop: DirectLoop, rng: np.random.Generator, at_limits: float = 0
             return goal
 
 
-class Errors:
-    """How far an arm is off its goal.
-
-    Args:
-        loop: of the arm.
-        goals: "posture" or "pose".
-        goal: a posture; for poses, one of those with the hand where it is to go.
-    """
-
-    def __init__(self, loop: DirectLoop, goals: str, goal: np.ndarray) -> None:
-        self._loop, self._goal = loop, goal if goals == "posture" else None
-        if goals == "posture":
-            loop.controller.goals.set_posture(goal)
-        else:
-            data = loop.model.createData()
-            pin.framesForwardKinematics(loop.model, data, goal)
-            frame = loop.model.getFrameId(loop.controller.robot.frame)
-            loop.controller.goals.set_pose(data.oMf[frame].copy())
-
-    def now(self) -> np.ndarray:
-        """Return the largest of a joint, rad; or those of the hand, m and rad."""
-        loop = self._loop
-        sample = loop.samples[-1]
-        if self._goal is not None:
-            return np.abs(sample.q - self._goal).max(keepdims=True)
-        return np.linalg.norm(sample.error.reshape(2, 3), axis=1)
-
-
-def arrive(loop: DirectLoop, goals: str, goal: np.ndarray, limit: float) -> tuple[float, float]:
-    """Go to a goal; return when the arm was near and at it for good, s, NaN where it was not."""
-    errors, steps = Errors(loop, goals, goal), round(limit / loop.dt)
-    last = {"near": 0, "at": 0}  # steps in which it was not there
-    resting = 0
-    for k in range(steps):
+def visit(loop: DirectLoop, goals: str, posture: np.ndarray, limit: float) -> None:
+    """Go to a posture, or where the hand is in it, until the arm rests there or time is over."""
+    if goals == "posture":
+        loop.controller.goals.set_posture(posture)
+    else:
+        data = loop.model.createData()
+        pin.framesForwardKinematics(loop.model, data, posture)
+        frame = loop.model.getFrameId(loop.controller.robot.frame)
+        loop.controller.goals.set_pose(data.oMf[frame].copy())
+    resting, end = 0, loop.t + limit
+    while loop.t < end and resting * loop.dt < REST:
         loop.step()
-        off = errors.now()
-        for name, tolerance in (("near", NEAR[goals]), ("at", AT[goals])):
-            if not (off <= tolerance).all():
-                last[name] = k + 1
-        still = last["at"] <= k and float(np.abs(loop.samples[-1].v).max()) < STILL
+        sample = loop.samples[-1]
+        if goals == "posture":
+            off = np.abs(sample.q - posture).max(keepdims=True)
+        else:
+            off = np.linalg.norm(sample.error.reshape(2, 3), axis=1)
+        still = (off <= AT[goals]).all() and np.abs(sample.v).max() < STILL
         resting = resting + 1 if still else 0
-        if resting * loop.dt >= REST:
-            steps = k + 1
-            break
     loop.samples.clear()
-    near, at = (t * loop.dt if t < steps else float("nan") for t in last.values())
-    return near, at
 
 
 def play(name: str, seed: int, limit: float, duration: float = 60.0) -> dict[str, Any]:
-    """Play random goals for a minute; return violations, times and what the filter did."""
+    """Play random goals for a minute; return violations and what the filter did."""
     case = CASES[name]
     loop, rng = make_loop(case), np.random.default_rng(seed)
     gains = {"posture": POSTURE, "pose": POSE}
     if case.robot == "talos_left_arm":
         gains = AGAINST_FRICTION
-    times: dict[str, list[tuple[float, float]]] = {goals: [] for goals in gains}
     while loop.t < duration:
         for goals, own in gains.items():
             loop.change(**own)
-            goal = random_goal(loop, rng, 0.5 if goals == "posture" else 0.0)
-            times[goals].append(arrive(loop, goals, goal, limit))
+            visit(loop, goals, random_goal(loop, rng, 0.5 if goals == "posture" else 0.0), limit)
     monitor, keeper = loop.robot.monitor, loop.controller.find(SafetyFilter)
     return {
         "position": float(monitor.max_position_violation.max()),
         "speed": float(monitor.max_velocity_violation.max()),
         "torque": float(monitor.max_torque_ratio.max()),
         "seconds": loop.t,
-        "times": times,
         "outcomes": {} if keeper is None else dict(keeper.outcomes),
     }
 
 
-def compare(figure: Figure, minutes: int, limit: float, word: str) -> bool:
-    """Play all cases, fill in their rows; return whether the filter kept all limits."""
-    kept = True
+def compare(figure: Figure, minutes: int, limit: float, word: str) -> None:
+    """Play all cases whose names contain a word; fill in their rows, and print them."""
     names = [name for name in CASES if word in name]
-    seeds = {
-        name: range(minutes if case.filtered else min(minutes, SHORT))
-        for name, case in CASES.items()
-        if name in names
-    }
-    pieces = [(name, seed, limit) for name in names for seed in seeds[name]]
-    played: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
-    for (name, *_), minute in in_pieces("whole_arm", play, pieces):
-        played[name].append(minute)
-        if len(played[name]) == len(seeds[name]):
-            kept &= add_row(figure, name, played[name])
+    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
+        runs = {
+            name: [
+                pool.submit(play, name, seed, limit)
+                for seed in range(minutes if CASES[name].filtered else min(minutes, SHORT))
+            ]
+            for name in names
+        }
+        for name, futures in runs.items():
+            add_row(figure, name, [each.result() for each in futures])
             print(*figure.rows[-1], sep=" | ", flush=True)
-    return kept
 
 
-def add_row(figure: Figure, name: str, minutes: list[dict[str, Any]]) -> bool:
-    """Add the row of a case; return whether the filter, if it is on, kept all limits."""
+def add_row(figure: Figure, name: str, minutes: list[dict[str, Any]]) -> None:
+    """Add the row of a case, with a verdict if the filter is on."""
     position, speed, torque = (
         max(minute[key] for minute in minutes) for key in ("position", "speed", "torque")
     )
-    times = {
-        goals: np.array([each for minute in minutes for each in minute["times"][goals]])
-        for goals in NEAR
-    }
-    postures, poses = np.isfinite(times["posture"]), np.isfinite(times["pose"])
-    median = float(np.nanmedian(times["posture"][:, 0]))
     outcomes: Counter[str] = sum((Counter(minute["outcomes"]) for minute in minutes), Counter())
     fine = position == 0.0 and speed == 0.0 and torque <= 1.0 + 1e-9
     filtered = CASES[name].filtered
     share = 1.0 - outcomes["as wanted"] / max(outcomes.total(), 1)
-    figure.metrics |= {
-        f"{name}: position": position,
-        f"{name}: speed": speed,
-        f"{name}: postures": len(postures),
-        f"{name}: near": float(postures[:, 0].mean()),
-        f"{name}: at": float(postures[:, 1].mean()),
-        f"{name}: poses near": float(poses[:, 0].mean()),
-        f"{name}: poses at": float(poses[:, 1].mean()),
-        f"{name}: time": median,
-    }
-    figure.rows.append(
-        (
-            name,
-            f"{sum(minute['seconds'] for minute in minutes) / 60.0:.0f} min",
-            f"{position:.2g}",
-            f"{speed:.2g}",
-            f"{torque:.3f}",
-            f"{share:.2%}" if filtered else "-",
-            verdict(fine, "kept") if filtered else "",
-        )
+    figure.metrics |= {f"{name}: position": position, f"{name}: speed": speed}
+    figure.add(
+        name,
+        f"{sum(minute['seconds'] for minute in minutes) / 60.0:.0f} min",
+        f"{position:.2g}",
+        f"{speed:.2g}",
+        f"{torque:.3f}",
+        f"{share:.2%}" if filtered else "-",
+        holds=fine or not filtered,
+        so="kept" if filtered else "",
     )
-    return fine or not filtered
 
 
 def shoulder(axis: plt.Axes, seed: int = 4) -> None:
@@ -312,20 +261,17 @@ def main() -> int:
     parser.add_argument("--row", default="", help="rows whose names contain this alone")
     given = parser.parse_args()
     figure = Figure("whole_arm")
-    kept = compare(figure, given.minutes, given.limit, given.row)
-    heads = ("arm", "played", "position, rad", "speed, rad/s", "torque")
-    rows = table([figure], (*heads, "steps changed", ""))
-    print("\n" + rows)
+    compare(figure, given.minutes, given.limit, given.row)
+    wrong = int(any(DIFFERS in cells[-1] for cells in figure.rows))
     if given.row:
-        return 0 if kept else 1
-    write_part("whole-arm", rows)
+        return wrong
+    write_part(PART, table(figure.rows, HEADS))
     picture, axes = plt.subplots(1, 3, figsize=(12.5, 4.0), layout="constrained")
     shoulder(axes[0])
     safe_set(axes[1], 0.0)
     safe_set(axes[2], 1.5)
-    picture.savefig(ROOT / "docs" / "images" / "whole_arm.png", dpi=90)
-    figure.save(picture)
-    return 0 if kept else 1
+    figure.save(picture, "whole_arm")
+    return wrong
 
 
 if __name__ == "__main__":

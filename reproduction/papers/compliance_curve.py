@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
-from compliance_push import MODES, ROBOT
+from compliance_push import HEADS, MODES, PART, ROBOT, WITH_FILE
 from direct import (
     DirectLoop,
     Sample,
@@ -50,17 +50,21 @@ UPRIGHT = _pole("upright pole", "z", (0.40, 0.40, 0.5), 1.2)
 
 
 class Drawn(NamedTuple):
-    """A curve as it was drawn."""
+    """A curve as it was drawn.
+
+    Attributes:
+        samples: of the loop.
+        goals, places: where the hand should have been, and where it was, shape (N, 3), m.
+        forces: sum of what the poles pressed with at each step, shape (N,), N.
+        touched: links that touched a pole.
+        loop: that was played.
+    """
 
     samples: tuple[Sample, ...]
     goals: np.ndarray
-    """Where the hand should have been, shape (N, 3), m."""
     places: np.ndarray
-    """Where it was, shape (N, 3), m."""
     forces: np.ndarray
-    """Sum of what the poles pressed with at each step, shape (N,), N."""
     touched: frozenset[str]
-    """Links that touched a pole."""
     loop: DirectLoop
 
     @property
@@ -122,22 +126,13 @@ def draw(
 def judge(run: Drawn) -> dict[str, float]:
     """Return what a run amounts to."""
     place, turn = hand_errors(run.samples)
-    touching = run.forces > 0.0
-    result = {
+    return {
         "hand_m": float(place.max()),
-        "hand_rms_m": float(np.sqrt(np.mean(place**2))),
         "hand_rad": float(turn.max()),
         "force_n": float(run.forces.max()),
-        "force_mean_n": float(run.forces[touching].mean()) if touching.any() else 0.0,
         "impulse_n_s": float(run.forces.sum() * run.loop.dt),
-        "touching_s": float(touching.sum() * run.loop.dt),
         "within_limits": float(within_limits(run.loop)),
-        "torque_share": float(run.loop.robot.monitor.max_torque_ratio.max()),
     }
-    for k in range(run.turn[-1] + 1):
-        result[f"turn_{k + 1}_hand_m"] = float(place[run.turn == k].max())
-        result[f"turn_{k + 1}_force_n"] = float(run.forces[run.turn == k].max())
-    return result
 
 
 SPRING = {"posture_kp": 1.0}
@@ -152,97 +147,58 @@ def among_poles() -> dict[str, Drawn]:
 
 def figure_10() -> Figure:
     """The curve, free and among poles, without and with null-space compliance."""
-    figure = Figure("paper1-fig10")
+    figure = Figure("paper1-fig10", PART, HEADS)
     free = {name: draw(changed) for name, changed in MODES.items()}
-    poles = among_poles()
-    slack = {name: draw(changed, POLES) for name, changed in MODES.items()}
-    found = {}
-    for kind, runs in (("free", free), ("poles", poles), ("poles, kp 0", slack)):
+    poles = "the same among two rigid poles, posture kp 1 1/s²"
+    turns = f"{TURNS} turns of a circle of 40 cm in the y-z plane, without poles"
+    for what, paper, runs in (
+        (turns, "-", free),
+        (poles, "under 2 cm; only tried with", among_poles()),
+    ):
+        without, with_it = (judge(run) for run in runs.values())
+        good = with_it["hand_m"] < 0.02 and bool(with_it["within_limits"])
+        if runs is free:
+            good &= without["hand_m"] < 0.02 and bool(without["within_limits"])
+        else:
+            good &= all(with_it[key] < without[key] for key in ("force_n", "impulse_n_s"))
+        figure.add(
+            f"Fig. 10, 11: {what}",
+            paper,
+            _told(without),
+            _told(with_it),
+            holds=good,
+            so="under 2 cm" if runs is free else WITH_FILE,
+        )
         for name, run in runs.items():
-            found[kind, name] = judge(run)
-            figure.metrics |= {f"{kind}, {name}: {k}": v for k, v in found[kind, name].items()}
+            figure.metrics |= {f"{what}, {name}: {k}": v for k, v in judge(run).items()}
             figure.data |= {
-                f"{kind}, {name}: {what}": value.astype(np.float32)
-                for what, value in (
-                    ("t", run.t),
-                    ("goal", run.goals),
-                    ("place", run.places),
-                    ("force", run.forces),
-                    ("q", column(run.samples, "q")),
-                )
+                f"{what}, {name}: {key}": value.astype(np.float32)
+                for key, value in (("t", run.t), ("place", run.places), ("force", run.forces))
             }
-    figure.rows += _rows(found)
-    figure.save(_picture(free, poles))
+    figure.save(_picture(free, among_poles()))
     return figure
 
 
 def adverse() -> Figure:
     """A pole to which the null space cannot yield."""
-    figure = Figure("paper1-adverse-pole")
-    found = {name: judge(draw(changed, [UPRIGHT], 2)) for name, changed in MODES.items()}
-    for name, each in found.items():
-        figure.metrics |= {f"{name}: {key}": value for key, value in each.items()}
-    told = [
-        f"{_told(each)}, {each['force_n']:.0f} N, {each['impulse_n_s']:.0f} N s"
-        for each in found.values()
-    ]
-    kept = all(each["within_limits"] for each in found.values())
-    figure.rows.append(
-        (
-            "An upright pole at the left, where the null space has little room, 2 turns",
-            "-",
-            f"without: {told[0]}; with: {told[1]}",
-            "for comparison: the null space cannot yield to every pole" if kept else "DIFFERS",
-        )
+    figure = Figure("paper1-adverse-pole", PART, HEADS)
+    found = [judge(draw(changed, [UPRIGHT], 2)) for changed in MODES.values()]
+    figure.add(
+        "An upright pole at the left, where the null space has little room, 2 turns",
+        "-",
+        *(_told(each) for each in found),
+        holds=all(each["within_limits"] for each in found),
+        so="for comparison: the null space cannot yield to every pole",
     )
-    figure.save(None)
+    figure.save()
     return figure
 
 
 def _told(found: dict[str, float]) -> str:
-    limits = "no limit broken" if found["within_limits"] else "a limit BROKEN"
-    return f"hand within {1e3 * found['hand_m']:.1f} mm, {limits}"
-
-
-def _forces(found: dict[str, float]) -> str:
-    turns = [found[f"turn_{k + 1}_force_n"] for k in range(TURNS)]
-    return (
-        f"{', '.join(f'{each:.0f}' for each in turns)} N in turns 1 to {TURNS}, "
-        f"{found['impulse_n_s']:.0f} N s in all"
-    )
-
-
-def _rows(found: dict[tuple[str, str], dict[str, float]]) -> list[tuple[str, str, str, str]]:
-    without, with_ = MODES
-    rows = []
-    both = [found["free", name] for name in MODES]
-    good = all(each["hand_m"] < 0.02 and each["within_limits"] for each in both)
-    rows.append(
-        (
-            f"Fig. 10, 11: {TURNS} turns of a circle of 40 cm in the y-z plane, without poles",
-            "-",
-            f"without: {_told(both[0])}; with: {_told(both[1])}",
-            "under 2 cm" if good else "DIFFERS",
-        )
-    )
-    for kind, what in (
-        ("poles", "the same among two rigid poles, posture kp 1 1/s²"),
-        ("poles, kp 0", "the same, posture kp 0: the arm stays where the poles have put it"),
-    ):
-        with_it, lacking = found[kind, with_], found[kind, without]
-        kept = with_it["hand_m"] < 0.02 and with_it["within_limits"]
-        lower = with_it["force_n"] < lacking["force_n"]
-        lower &= with_it["impulse_n_s"] < lacking["impulse_n_s"]
-        rows.append(
-            (
-                f"Fig. 10, 11: {what}",
-                "under 2 cm; only tried with",
-                f"with: {_told(with_it)}, {_forces(with_it)}; without: {_told(lacking)}, "
-                f"{_forces(lacking)}",
-                "so with the file's values" if kept and lower else "DIFFERS",
-            )
-        )
-    return rows
+    """Return what a run amounts to, in words."""
+    limits = "" if found["within_limits"] else ", a limit BROKEN"
+    touching = f"; {found['force_n']:.0f} N, {found['impulse_n_s']:.0f} N s in all"
+    return f"hand {1e3 * found['hand_m']:.1f} mm{limits}" + touching * (found["force_n"] > 0.0)
 
 
 def _picture(free: Mapping[str, Drawn], poles: Mapping[str, Drawn]) -> plt.Figure:

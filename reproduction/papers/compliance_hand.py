@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import matplotlib.pyplot as plt
 import numpy as np
 import pinocchio as pin
-from compliance_push import ELBOW, HAND, RAMP, ROBOT
+from compliance_push import ELBOW, HAND, HEADS, PART, RAMP, ROBOT, WITH_FILE
 from direct import DirectLoop, within_limits
-from figure import Figure, verdict
+from figure import Figure
 
 from sim_bridge.bullet.obstacles import Obstacle
 from torque_safety_controller.parts.contact.interaction import Interaction
@@ -26,15 +26,19 @@ GAP = 0.005  # m, from the fingertips to the table
 
 
 class PressingHand(NamedTuple):
-    """A hand that points down, to press with."""
+    """A hand that points down, to press with.
+
+    Attributes:
+        robot: name of its file.
+        changed: parameters that differ from the file's.
+        axis: 1 or -1: the fingers point along the end effector's z axis, or against it.
+        reach: of the fingertips from the end effector's frame, m.
+    """
 
     robot: str
     changed: dict[str, Any]
-    """Parameters that differ from the file's."""
     axis: float
-    """1 or -1: the fingers point along the end effector's z axis, or against it."""
     reach: float
-    """Of the fingertips from the end effector's frame, m."""
 
 
 PANDA = PressingHand(
@@ -56,22 +60,26 @@ TALOS = PressingHand(
     -1.0,
     0.1816,
 )
-WITH_FILE = "so with the file's values"
 SLIDE = np.array([0.0, 0.15, 0.0])  # m
 
 
 class Led(NamedTuple):
-    """What a hand did that was pulled and let go: a row for each control step."""
+    """What a hand did that was pulled and let go: a row for each control step.
+
+    Attributes:
+        t: time, s.
+        place, turn: of the hand from where it began, m, shape (N, 3), and rad.
+        joints: shape (N, n), rad.
+        force: measured at the hand, N.
+        state: of the controller's interaction.
+        loop: that was played.
+    """
 
     t: np.ndarray
     place: np.ndarray
-    """From where it began, shape (N, 3), m."""
     turn: np.ndarray
-    """Likewise, shape (N,), rad."""
     joints: np.ndarray
-    """Shape (N, n), rad."""
     force: np.ndarray
-    """Measured at the hand, shape (N,), N."""
     state: list[str]
     loop: DirectLoop
 
@@ -126,70 +134,50 @@ def lead(
     )
 
 
-def dual(figure: Figure) -> None:
-    """Figure 9: the elbow pushed, the hand pulled, let go, and the elbow pushed once more."""
+def figure_9() -> Figure:
+    """Dual compliance: elbow pushed, hand pulled, let go, and the elbow pushed once more."""
+    figure = Figure("paper1-fig9", PART, HEADS)
     pushes = [
         (1.0, 3.0, ELBOW, ELBOW_PUSH),
         (4.0, 6.0, HAND, PULL),
         (7.5, 9.5, ELBOW, -ELBOW_PUSH),
     ]
     led = lead(pushes, 10.5)
-    distance = np.linalg.norm(led.place, axis=1)
     pulled, released = led.at(4.0), led.at(6.0)
+    stayed = float(np.linalg.norm(led.place[:pulled], axis=1).max())
+    turned = float(led.turn[:pulled].max())
+    moved = float(np.linalg.norm(led.place[released] - led.place[pulled]))
     kept = np.linalg.norm(led.place[released:] - led.place[released], axis=1)
-    null = np.abs(led.joints[led.at(1.0) : led.at(3.0)] - led.joints[led.at(1.0)]).max()
-    figure.data = {
-        "t": led.t,
-        "place_m": led.place,
-        "turn_rad": led.turn,
-        "q": led.joints,
-        "force_n": led.force,
-        "yielding": np.array([state == "yielding" for state in led.state]),
-    }
+    null = float(np.abs(led.joints[led.at(1.0) : led.at(3.0)] - led.joints[led.at(1.0)]).max())
+    calm = all(s != "yielding" for t, s in zip(led.t, led.state, strict=True) if not 4 <= t < 6.1)
+    figure.data = dict(zip(Led._fields[:5], led[:5], strict=True))
     figure.metrics = {
-        "hand_while_elbow_pushed_m": float(distance[:pulled].max()),
-        "hand_while_elbow_pushed_rad": float(led.turn[:pulled].max()),
-        "joint_moved_by_elbow_push_rad": float(null),
-        "hand_led_m": float(np.linalg.norm(led.place[released] - led.place[pulled])),
-        "kept_after_release_m": float(kept[: led.at(7.5) - released].max()),
-        "kept_while_elbow_pushed_again_m": float(kept.max()),
-        "yielded_steps_but_for_the_pull": float(
-            sum(s == "yielding" for t, s in zip(led.t, led.state, strict=True) if not 4 <= t < 6.1)
-        ),
-        "limits_kept": float(within_limits(led.loop)),
+        "hand_while_elbow_pushed_m": stayed,
+        "joint_moved_by_elbow_push_rad": null,
+        "hand_led_m": moved,
+        "kept_after_release_m": float(kept.max()),
     }
-    numbers = figure.metrics
-    figure.rows = [
-        (
-            "Fig. 9",
-            "the hand stays when the arm is pushed",
-            f"elbow pushed with {np.linalg.norm(ELBOW_PUSH):.0f} N: hand within "
-            f"{1e3 * numbers['hand_while_elbow_pushed_m']:.1f} mm, a joint moves by "
-            f"{null:.2f} rad",
-            verdict(
-                numbers["hand_while_elbow_pushed_m"] < 0.005
-                and numbers["hand_while_elbow_pushed_rad"] < np.radians(1.0)
-                and null > 0.1
-                and not numbers["yielded_steps_but_for_the_pull"],
-                WITH_FILE,
-            ),
-        ),
-        (
-            "Fig. 9",
-            "moved freely when the hand itself is; its new place is kept",
-            f"{PULL[0]:.0f} N move it by {1e3 * numbers['hand_led_m']:.0f} mm in 2 s; kept within "
-            f"{1e3 * numbers['kept_after_release_m']:.1f} mm when let go, "
-            f"{1e3 * numbers['kept_while_elbow_pushed_again_m']:.1f} mm when the elbow is pushed "
-            "again",
-            verdict(
-                numbers["hand_led_m"] > 0.02
-                and numbers["kept_while_elbow_pushed_again_m"] < 0.005
-                and bool(numbers["limits_kept"]),
-                WITH_FILE,
-            ),
-        ),
-    ]
+    figure.add(
+        "Fig. 9",
+        "the hand stays when the arm is pushed",
+        "",
+        f"elbow pushed with {np.linalg.norm(ELBOW_PUSH):.0f} N: hand within {1e3 * stayed:.1f} "
+        f"mm, a joint moves by {null:.2f} rad",
+        holds=stayed < 0.005 and turned < np.radians(1.0) and null > 0.1 and calm,
+        so=WITH_FILE,
+    )
+    figure.add(
+        "Fig. 9",
+        "moved freely when the hand itself is; its new place is kept",
+        "",
+        f"{PULL[0]:.0f} N move it by {1e3 * moved:.0f} mm in 2 s; kept within "
+        f"{1e3 * kept[: led.at(7.5) - released].max():.1f} mm when let go, "
+        f"{1e3 * kept.max():.1f} mm when the elbow is pushed again",
+        holds=moved > 0.02 and kept.max() < 0.005 and within_limits(led.loop),
+        so=WITH_FILE,
+    )
     figure.save(_draw_dual(led, pushes))
+    return figure
 
 
 def _draw_dual(led: Led, pushes: list[tuple[float, float, str, np.ndarray]]) -> plt.Figure:
@@ -222,17 +210,22 @@ def _draw_dual(led: Led, pushes: list[tuple[float, float, str, np.ndarray]]) -> 
 
 
 class Pressed(NamedTuple):
-    """What a hand did that pressed on a table: a row for each control step."""
+    """What a hand did that pressed on a table: a row for each control step.
+
+    Attributes:
+        t: time, s.
+        force: of the table on the hand, shape (N, 3), N.
+        measured: what the controller made of the sensor, along the table's normal, N.
+        place: of the hand, from where it began, shape (N, 3), m.
+        slide: begin and end of the sliding, s.
+        loop: that was played.
+    """
 
     t: np.ndarray
     force: np.ndarray
-    """Of the table on the hand, shape (N, 3), N."""
     measured: np.ndarray
-    """What the controller made of the sensor, along the table's normal, shape (N,), N."""
     place: np.ndarray
-    """Of the hand, from where it began, shape (N, 3), m."""
     slide: tuple[float, float]
-    """Begin and end of the sliding, s."""
     loop: DirectLoop
 
 
@@ -281,7 +274,6 @@ def judge_press(run: Pressed) -> dict[str, float]:
     touched = int(np.argmax(normal > 0.0))
     settled = run.t > run.t[touched] + 0.3
     sliding = (run.t >= run.slide[0]) & (run.t < run.slide[1])
-    standing = settled & ~sliding
     window = round(0.05 / run.loop.dt)
 
     def steady(part: np.ndarray) -> float:
@@ -295,46 +287,42 @@ def judge_press(run: Pressed) -> dict[str, float]:
         "least_after_contact_n": float(normal[settled].min()),
         "error_standing": steady(settled & (run.t < run.slide[0])),
         "error_sliding": steady(sliding),
-        "error_standing_after": steady(standing & (run.t > run.slide[1] + 0.3)),
         "periods_without_contact": float((normal[touched + 1 :] <= 0.0).sum()),
         "slid_m": float(np.ptp(run.place[:, 1])),
         "limits_kept": float(within_limits(run.loop)),
     }
 
 
-def _holds(numbers: Mapping[str, float]) -> bool:
-    """Return whether a press keeps within 5% and does not bounce by 2 N."""
-    return (
-        max(numbers["error_standing"], numbers["error_sliding"]) < 0.05
-        and numbers["most_n"] < FORCE + 2.0
-        and numbers["least_after_contact_n"] > FORCE - 2.0
-    )
-
-
-def pressing(figure: Figure) -> None:
+def pressing() -> Figure:
     """Hybrid control: 10 N on a table, sliding along it."""
-    runs = {"Panda": press(PANDA), "TALOS": press(TALOS)}
-    judged = {name: judge_press(run) for name, run in runs.items()}
+    figure = Figure("paper1-press", PART, HEADS)
+    runs = {
+        "Panda, without friction": press(PANDA),
+        "TALOS, its friction compensated": press(TALOS),
+    }
     for name, run in runs.items():
-        figure.metrics |= {f"{name.lower()}_{key}": v for key, v in judged[name].items()}
+        numbers = judge_press(run)
+        figure.metrics |= {f"{name}: {key}": value for key, value in numbers.items()}
         figure.data |= {
-            f"{name.lower()}_{key}": value
-            for key, value in zip(("t", "force_n", "measured_n", "place_m"), run[:4], strict=True)
+            f"{name}: {key}": value
+            for key, value in zip(Pressed._fields[:4], run[:4], strict=True)
         }
-    figure.rows = [
-        (
-            "Eq. (27)",
-            "force control, not shown",
-            f"{name}, {note}, presses with {FORCE:.0f} N: at most {numbers['most_n']:.1f} N; "
-            f"within {100 * numbers['error_standing']:.1f} % standing, "
-            f"{100 * numbers['error_sliding']:.1f} % sliding {100 * SLIDE[1]:.0f} cm",
-            "within 5 %, 2 N" if _holds(numbers) else "not held: friction",
+        standing, sliding = numbers["error_standing"], numbers["error_sliding"]
+        holds = max(standing, sliding) < 0.05
+        holds &= numbers["most_n"] < FORCE + 2.0 and numbers["least_after_contact_n"] > FORCE - 2.0
+        figure.rows.append(
+            (
+                f"Eq. (27), force control. {name}",
+                "not shown",
+                "",
+                f"presses with {FORCE:.0f} N: at most {numbers['most_n']:.1f} N; within "
+                f"{100 * standing:.1f} % standing, {100 * sliding:.1f} % sliding "
+                f"{100 * SLIDE[1]:.0f} cm",
+                "within 5 %, 2 N" if holds else "not held: friction",
+            )
         )
-        for (name, numbers), note in zip(
-            judged.items(), ("without friction", "its friction compensated"), strict=True
-        )
-    ]
     figure.save(_draw_press(runs))
+    return figure
 
 
 def _draw_press(runs: Mapping[str, Pressed]) -> plt.Figure:
@@ -346,9 +334,8 @@ def _draw_press(runs: Mapping[str, Pressed]) -> plt.Figure:
         axis.plot(run.t, run.measured, label="as the controller sees it", lw=0.8)
         axis.plot(run.t, np.hypot(*run.force[:, :2].T), label="friction", lw=0.8)
         axis.axhline(FORCE, color="0.4", ls=":")
-        axis.set_ylabel(f"{name}: force [N]")
-        axis.set_ylim(-4.0, 25.0)
-        axes[2].plot(run.t, 1e3 * run.place[:, 1], label=f"{name}, along the table")
+        axis.set(ylabel="force [N]", ylim=(-4.0, 25.0), title=name)
+        axes[2].plot(run.t, 1e3 * run.place[:, 1], label=f"{name.split(',')[0]}, along the table")
     axes[0].legend(loc="upper left")
     axes[2].set_ylabel("hand [mm]")
     axes[2].set_xlabel("time [s]")

@@ -10,11 +10,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pinocchio as pin
 from camera import Camera
-from chain import ROOT
 from compliance_curve import Drawn, among_poles
 from compliance_push import ELBOW, Pushed, runs
-from figure import RESULTS, Figure
-from PIL import Image
+from figure import Figure
 
 FLOOR = -1.07  # m, under the feet
 
@@ -87,7 +85,7 @@ def figures_7_and_8() -> Figure:
                     tail = PUSHED.pixel(elbow - 0.35 * each.force / np.linalg.norm(each.force))
                     arrow = {"arrowstyle": "-|>", "color": "red", "lw": 2.5}
                     axis.annotate("", tip, tail, arrowprops=arrow)
-    figure.save(picture)
+    figure.save(picture, "compliance")
     return figure
 
 
@@ -113,20 +111,5 @@ def figure_10_stills() -> Figure:
                 axis.plot(*path.T, color="red", lw=1)
                 axis.plot(*view.pixel(run.goals[k]), "o", color="red", ms=5)
                 axis.set(xlim=(0, view.size[0]), ylim=(view.size[1], 0))
-    figure.save(picture)
+    figure.save(picture, "poles")
     return figure
-
-
-def embed() -> None:
-    """Write the pictures that the documentation shows, few colours and small."""
-    for name, to in (
-        ("paper1-stiction", "stiction"),
-        ("paper1-fig7-8", "compliance"),
-        ("paper1-fig10-stills", "poles"),
-    ):
-        image = Image.open(RESULTS / name / "figure.png").convert("RGB")
-        width = 1100
-        small = image.resize((width, round(image.height * width / image.width)))
-        small.quantize(200, Image.Quantize.MAXCOVERAGE).save(
-            ROOT / "docs" / "images" / f"{to}.png", optimize=True
-        )

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Sequence
 
 import matplotlib.pyplot as plt
 import numpy as np
 import yaml
-from chain import ROOT, ChainResult, load_values, run_chain
-from figure import Figure, joint_axes, reproduce, table, write_part
+from chain import ROOT, load_values, run_chain
+from figure import Figure, reproduce
 from matplotlib.colors import BoundaryNorm, ListedColormap
 
 from viability_bounds_pkg import baselines, viability
@@ -24,9 +23,11 @@ from viability_bounds_pkg.acceleration_limits import estimate_acceleration_limit
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.robot.description import build_model, read_urdf
 
-sys.path.insert(0, f"{Path(__file__).resolve().parents[2]}/src/viability_bounds_pkg/test/support")
+sys.path.insert(0, f"{ROOT}/src/viability_bounds_pkg/test/support")
 
 import paper_algorithms
+
+PART = "paper0"
 
 
 def one_joint(q: float, v: float, a: float) -> JointLimits:
@@ -36,7 +37,7 @@ def one_joint(q: float, v: float, a: float) -> JointLimits:
 
 def figure_1() -> Figure:
     """State-space plot of the viability constraints of this paper, [5] and [6]."""
-    figure = Figure("paper0-fig1")
+    figure = Figure("paper0-fig1", PART)
     limits, dt = one_joint(1.0, 5.0, 15.0), 0.1
     q = np.linspace(-1.0, 1.0, 2001)
     column = q[:, None]
@@ -45,41 +46,28 @@ def figure_1() -> Figure:
         "Decré et al. [6]": baselines.decre_velocity_range(column, limits, dt),
         "Rubrecht et al. [5]": baselines.rubrecht_velocity_range(column, limits, dt),
     }
-    reach = np.sqrt(2.0 * 15.0 * (q + 1.0))
     picture, axis = plt.subplots(figsize=(8, 5), layout="constrained")
-    styles = ("tab:blue", "tab:orange", "tab:green")
-    for (name, (low, high)), color in zip(curves.items(), styles, strict=True):
-        width = 4.0 if color == styles[0] else 1.5
-        axis.plot(q, high[:, 0], color=color, linewidth=width, label=name)
-        axis.plot(q, low[:, 0], color=color, linewidth=width)
+    for k, (name, (low, high)) in enumerate(curves.items()):
+        axis.plot(q, high[:, 0], color=f"C{k}", linewidth=1.5 if k else 4.0, label=name)
+        axis.plot(q, low[:, 0], color=f"C{k}", linewidth=1.5 if k else 4.0)
         figure.data[name] = np.column_stack([q, low[:, 0], high[:, 0]])
     for sign in (-1.0, 1.0):
-        axis.axhline(sign * 5.0, color="tab:red", linestyle="--", label=None)
+        axis.axhline(sign * 5.0, color="tab:red", linestyle="--")
         axis.axvline(sign, color="tab:red", linestyle="--")
+    reach = np.sqrt(2.0 * 15.0 * (q + 1.0))
     axis.plot(q, np.minimum(reach, 9.0), "k:", label="reachable from rest at a limit")
     axis.plot(q, -np.minimum(reach[::-1], 9.0), "k:")
-    axis.set(
-        xlabel="q [rad]",
-        ylabel="velocity [rad/s]",
-        xlim=(-1.05, 1.05),
-        ylim=(-6, 6),
-        title="q limits ±1 rad, velocity 5 rad/s, acceleration 15 rad/s²; dt of [5], [6]: 0.1 s",
-    )
+    axis.set(xlabel="q [rad]", ylabel="velocity [rad/s]", xlim=(-1.05, 1.05), ylim=(-6, 6))
+    axis.set_title("q limits ±1 rad, velocity 5 rad/s, acceleration 15 rad/s²; dt 0.1 s")
     axis.legend(loc="lower left", fontsize="small")
     exact, rubrecht = (curves[name][1][:, 0] for name in list(curves)[::2])
-    conservative = bool((rubrecht <= exact + 1e-12).all())
-    figure.metrics = {
-        "widest_gap_to_rubrecht_rad_s": float((exact - rubrecht).max()),
-        "exact_velocity_at_centre_rad_s": float(exact[1000]),
-    }
-    figure.rows.append(
-        (
-            "Fig. 1: [5] against the exact kernel",
-            "inside it, conservative",
-            f"inside it everywhere: {conservative}; by up to "
-            f"{figure.metrics['widest_gap_to_rubrecht_rad_s']:.2f} rad/s",
-            "agrees" if conservative else "DIFFERS",
-        )
+    inside = bool((rubrecht <= exact + 1e-12).all())
+    gap = figure.metrics["widest_gap_to_rubrecht_rad_s"] = float((exact - rubrecht).max())
+    figure.add(
+        "Fig. 1: [5] against the exact kernel",
+        "inside it, conservative",
+        f"inside it everywhere: {inside}; by up to {gap:.2f} rad/s",
+        holds=inside,
     )
     figure.save(picture)
     return figure
@@ -87,7 +75,7 @@ def figure_1() -> Figure:
 
 def figure_3() -> Figure:
     """Regions of the state space by active acceleration bound."""
-    figure = Figure("paper0-fig3")
+    figure = Figure("paper0-fig3", PART)
     limits, dt = one_joint(0.5, 2.0, 10.0), 0.1
     q, v = np.meshgrid(np.linspace(-0.5, 0.5, 401), np.linspace(-2.0, 2.0, 401))
     states = q.reshape(-1, 1), v.reshape(-1, 1)
@@ -114,27 +102,44 @@ def figure_3() -> Figure:
     axis.set(xlabel="q [rad]", ylabel="velocity [rad/s]", title="dt = 0.1 s, as in the paper")
     share = {name: float((region == i).mean()) for i, name in enumerate(names)}
     figure.metrics = {f"share_{name}": value for name, value in share.items()}
-    present = all(share[name] > 0.0 for name in names)
-    shown = ", ".join(f"{name} {value:.1%}" for name, value in share.items())
-    figure.rows.append(
-        (
-            "Fig. 3: regions by active upper bound",
-            "six regions: unreachable, not viable, and four bounds",
-            shown,
-            "agrees: all six are present" if present else "DIFFERS: a region is missing",
-        )
+    figure.add(
+        "Fig. 3: regions by active upper bound",
+        "six regions: unreachable, not viable, and four bounds",
+        ", ".join(f"{name} {value:.1%}" for name, value in share.items()),
+        holds=min(share.values()) > 0.0,
+        so="agrees: all six are present",
     )
     figure.save(picture)
     return figure
 
 
-def joint_space_run(method: str, factor: float) -> ChainResult:
-    """Play Fig. 4: Baxter's first joint, driven 0.1 rad beyond its upper limit."""
+def draw_trajectory(
+    axes: Sequence[plt.Axes],
+    title: str,
+    curves: tuple[np.ndarray, ...],
+    q_limit: float,
+    v_max: float,
+) -> None:
+    """Draw time, position, velocity and acceleration of a joint from above to below."""
+    t, *values = curves
+    limits = ([q_limit], [-v_max, v_max], [])
+    labels = ("position [rad]", "velocity [rad/s]", "acceleration [rad/s²]")
+    for axis, value, lines, label in zip(axes, values, limits, labels, strict=True):
+        axis.plot(t[: value.size], value)
+        axis.set_ylabel(label)
+        axis.grid(alpha=0.3)
+        for line in lines:
+            axis.axhline(line, color="tab:red", linestyle="--")
+    axes[0].set_title(title)
+    axes[-1].set_xlabel("time [s]")
+
+
+def play_figure_4(figure: Figure, axes: Sequence[plt.Axes], method: str, factor: float) -> None:
+    """Drive Baxter's first joint 0.1 rad beyond its upper limit."""
     values = load_values("baxter_left_arm") | {"safety_filter": False}
-    n = len(values["joints"])
-    first = [2.0] + values["position_max"][1:]
+    n, first = len(values["joints"]), values["joints"][0]
     values |= {
-        "position_max": first,
+        "position_max": [2.0] + values["position_max"][1:],
         "velocity_max": [2.0] * n,
         "acceleration_min": [-12.0] * n,
         "acceleration_max": [12.0] * n,
@@ -151,195 +156,135 @@ def joint_space_run(method: str, factor: float) -> ChainResult:
         "posture_kp": 1000.0,
         "posture_weight": 1.0,
     }
-    goal = dict(zip(values["joints"], values["start_positions"], strict=True))
-    goal[values["joints"][0]] = 2.1
+    goal = dict(zip(values["joints"], values["start_positions"], strict=True)) | {first: 2.1}
     scenario = {"duration": 2.5, "events": [{"time": 0.0, "posture": goal}]}
     # Only here may a goal lie outside the limits.
     beyond = {"controller_node": {"position_max": [2.2] + values["position_max"][1:]}}
-    return run_chain(values, scenario, beyond)
+    result = run_chain(values, scenario, beyond)
+    t, q, v = result.run.t, result.run.q[:, 0], result.run.v[:, 0]
+    a = np.diff(v) / 0.01
+    name = f"{method}_{factor:g}dt"
+    near, past = q > 2.0 - 2e-4, np.flatnonzero(q > 2.0 + 1e-9)
+    figure.data[name] = np.column_stack([t[:-1], q[:-1], v[:-1], a])
+    figure.metrics |= {
+        f"{name}_violation_rad": float(result.vector("position_violation_rad")[0]),
+        f"{name}_impact_rad_s": float(v[past[0]]) if past.size else 0.0,
+        f"{name}_chatter_rad_s2": float(np.abs(np.diff(a))[t[:-2] > 1.5].max()),
+        f"{name}_times_at_limit": float(np.count_nonzero(near[1:] & ~near[:-1]) + near[0]),
+    }
+    draw_trajectory(axes, f"{method}, {factor:g} dt", (t, q, v, a), 2.0, 2.0)
 
 
 def figure_4() -> Figure:
     """Trajectories of the first joint under four ways to bound accelerations."""
-    figure = Figure("paper0-fig4")
-    cases = {
-        "a: naive, dt": ("naive", 1.0),
-        "b: naive, 2 dt": ("naive", 2.0),
-        "b: naive, 5 dt": ("naive", 5.0),
-        "c: exact, dt": ("exact", 1.0),
-        "d: exact, 2 dt": ("exact", 2.0),
-        "d: exact, 5 dt": ("exact", 5.0),
-    }
+    figure = Figure("paper0-fig4", PART)
+    cases = [(method, factor) for method in ("naive", "exact") for factor in (1.0, 2.0, 5.0)]
     picture, axes = plt.subplots(3, len(cases), figsize=(20, 8), sharex=True, layout="constrained")
-    for column, (name, (method, factor)) in zip(axes.T, cases.items(), strict=True):
-        result = joint_space_run(method, factor)
-        run = result.run
-        t, q, v = run.t, run.q[:, 0], run.v[:, 0]
-        a = np.append(np.diff(v) / 0.01, np.nan)
-        key = name.replace(": ", "_").replace(", ", "_").replace(" ", "")
-        figure.data[key] = np.column_stack([t, q, v, a])
-        jumps = np.abs(np.diff(a[:-1]))
-        settled = t[:-2] > 1.5
-        figure.metrics |= {
-            f"{key}_violation_rad": float(result.vector("position_violation_rad")[0]),
-            f"{key}_impact_rad_s": _impact(q, v, 2.0),
-            f"{key}_chatter_rad_s2": float(jumps[settled].max()),
-            f"{key}_times_at_limit": float(_visits(q, 2.0, 2e-4)),
-        }
-        column[0].plot(t, q)
-        column[0].axhline(2.0, color="tab:red", linestyle="--")
-        column[0].set(title=f"({name})", ylim=(0.0, 2.2))
-        column[1].plot(t, v)
-        for sign in (-1.0, 1.0):
-            column[1].axhline(sign * 2.0, color="tab:red", linestyle="--")
-            column[2].axhline(sign * 12.0, color="tab:red", linestyle="--")
-        column[2].step(t, a, where="post")
-        column[2].set(xlabel="time [s]")
-    for axis, label in zip(
-        axes[:, 0],
-        ("position [rad]", "velocity [rad/s]", "acceleration [rad/s²]"),
-        strict=True,
-    ):
-        axis.set_ylabel(label)
-    for axis in axes.flat:
-        axis.grid(alpha=0.3)
-    figure.rows = _figure_4_rows(figure.metrics)
+    for column, (method, factor) in zip(axes.T, cases, strict=True):
+        play_figure_4(figure, column, method, factor)
+    m = figure.metrics
+
+    def broken(name: str) -> str:
+        return f"by {m[f'{name}_violation_rad']:.3f} rad, at {m[f'{name}_impact_rad_s']:.2f} rad/s"
+
+    exact = max(m[f"exact_{factor}dt_violation_rad"] for factor in (1, 2, 5))
+    chatter, times = m["exact_1dt_chatter_rad_s2"], m["exact_1dt_times_at_limit"]
+    smooth = m["exact_2dt_chatter_rad_s2"]
+    figure.add(
+        "Fig. 4a: naive",
+        "upper bound violated",
+        broken("naive_1dt"),
+        holds=m["naive_1dt_violation_rad"] > 1e-3,
+    )
+    figure.add(
+        "Fig. 4b: naive, larger dt",
+        "impact velocity reduced, still violated",
+        f"2 dt {broken('naive_2dt')}; 5 dt {broken('naive_5dt')}",
+        holds=m["naive_2dt_violation_rad"] > 1e-3
+        and m["naive_5dt_impact_rad_s"] < m["naive_1dt_impact_rad_s"],
+    )
+    figure.add(
+        "Fig. 4c: exact",
+        "bounds reached many times, never violated",
+        f"largest violation {exact:.1e} rad; at the limit {times:.0f} times",
+        holds=exact < 1e-6 and times > 1,
+    )
+    figure.add(
+        "Fig. 4d: exact, larger dt",
+        "the discontinuities of acceleration disappear",
+        f"largest step of acceleration at rest {smooth:.2g} rad/s² (4c: {chatter:.2g})",
+        holds=smooth < 0.01 * chatter,
+    )
     figure.save(picture)
     return figure
 
 
-def _impact(q: np.ndarray, v: np.ndarray, limit: float) -> float:
-    """Return the velocity at which an upper limit is crossed, rad/s; 0 if it is not."""
-    beyond = np.flatnonzero(q > limit + 1e-9)
-    return float(v[beyond[0]]) if beyond.size else 0.0
-
-
-def _visits(q: np.ndarray, limit: float, near: float) -> int:
-    """Return how many times the joint comes to its limit."""
-    at = q > limit - near
-    return int(np.count_nonzero(at[1:] & ~at[:-1]) + at[0])
-
-
-def _figure_4_rows(m: dict[str, float]) -> list[tuple[str, str, str, str]]:
-    def broken(key: str) -> str:
-        return f"by {m[f'{key}_violation_rad']:.3f} rad, at {m[f'{key}_impact_rad_s']:.2f} rad/s"
-
-    def agrees(condition: bool) -> str:
-        return "agrees" if condition else "DIFFERS"
-
-    naive = [m[f"{key}_violation_rad"] > 1e-3 for key in ("a_naive_dt", "b_naive_2dt")]
-    exact = max(m[f"{key}_violation_rad"] for key in ("c_exact_dt", "d_exact_2dt", "d_exact_5dt"))
-    chatter = m["c_exact_dt_chatter_rad_s2"], m["d_exact_2dt_chatter_rad_s2"]
-    softer = m["b_naive_5dt_impact_rad_s"] < m["a_naive_dt_impact_rad_s"]
-    return [
-        ("Fig. 4a: naive", "upper bound violated", broken("a_naive_dt"), agrees(naive[0])),
-        (
-            "Fig. 4b: naive, larger dt",
-            "impact velocity reduced, still violated",
-            f"2 dt {broken('b_naive_2dt')}; 5 dt {broken('b_naive_5dt')}",
-            agrees(naive[1] and softer),
-        ),
-        (
-            "Fig. 4c: exact",
-            "bounds reached many times, never violated",
-            f"largest violation {exact:.1e} rad; at the limit "
-            f"{m['c_exact_dt_times_at_limit']:.0f} times",
-            agrees(exact < 1e-6 and m["c_exact_dt_times_at_limit"] > 1),
-        ),
-        (
-            "Fig. 4d: exact, larger dt",
-            "the discontinuities of acceleration disappear",
-            f"largest step of acceleration at rest {chatter[1]:.2g} rad/s² (4c: {chatter[0]:.2g})",
-            agrees(chatter[1] < 0.01 * chatter[0]),
-        ),
-    ]
-
-
 def figure_5() -> Figure:
     """Trajectory of the elbow in Cartesian torque control, naive and exact."""
-    figure = Figure("paper0-fig5")
-    cases = {
-        "a: naive, 2 dt": ("naive", 2.0),
-        "naive, 20 dt": ("naive", 20.0),
-        "b: exact, 2 dt": ("exact", 2.0),
-    }
+    figure = Figure("paper0-fig5", PART)
     values = load_values("baxter_left_arm") | {"safety_filter": False}
     elbow = values["joints"].index("left_e1")
-    low, dt = values["position_min"][elbow], 1.0 / values["rate_hz"]
+    low, v_max = values["position_min"][elbow], values["velocity_max"][elbow]
     path = ROOT / "config" / "scenarios" / "baxter_left_arm_demo.yaml"
-    scenario = yaml.safe_load(path.read_text())
-    scenario = {"duration": 4.0, "events": scenario["events"][:1]}
+    scenario = {"duration": 4.0, "events": yaml.safe_load(path.read_text())["events"][:1]}
     picture, axes = plt.subplots(3, 3, figsize=(14, 8), sharex=True, layout="constrained")
-    for column, (name, (method, factor)) in zip(axes.T, cases.items(), strict=True):
+    found = {}
+    cases = (("naive", 2.0), ("naive", 20.0), ("exact", 2.0))
+    for column, (method, factor) in zip(axes.T, cases, strict=True):
         own = {"method": method, "bounds_dt_factor": factor}
         result = run_chain(values | own, scenario, {})
         run = result.run
         t, q, v = run.t, run.q[:, elbow], run.v[:, elbow]
+        bounds = run.a_lower[:, elbow], run.a_upper[:, elbow]
         crossed = np.flatnonzero(q < low)
-        key = name.split(": ")[-1].replace(", ", "_").replace(" ", "")
-        figure.data[key] = np.column_stack([t, q, v, run.a_lower[:, elbow], run.a_upper[:, elbow]])
+        first = crossed[0] if crossed.size else int(np.argmin(q))
+        name = f"{method}_{factor:g}dt"
+        found[name] = float(t[first]), float(v[first]), float((q - low).min())
+        figure.data[name] = np.column_stack([t, q, v, *bounds])
         figure.metrics |= {
-            f"{key}_violation_rad": float(result.vector("position_violation_rad").max()),
-            f"{key}_impact_time_s": float(t[crossed[0]]) if crossed.size else float("nan"),
-            f"{key}_impact_rad_s": float(v[crossed[0]]) if crossed.size else 0.0,
-            f"{key}_closest_rad": float((q - low).min()),
-            f"{key}_speed_at_closest_rad_s": float(abs(v[np.argmin(q)])),
-            f"{key}_torque_ratio": float(result.vector("torque_ratio").max()),
+            f"{name}_violation_rad": float(result.vector("position_violation_rad").max()),
+            f"{name}_nearest_s": found[name][0],
+            f"{name}_nearest_rad_s": found[name][1],
+            f"{name}_torque_ratio": float(result.vector("torque_ratio").max()),
         }
-        column[0].plot(t, q)
-        column[0].axhline(low, color="tab:red", linestyle="--")
-        column[0].set(title=f"({name})", ylim=(-0.2, 0.6))
-        column[1].plot(t, v)
-        for sign in (-1.0, 1.0):
-            limit = sign * values["velocity_max"][elbow]
-            column[1].axhline(limit, color="tab:red", linestyle="--")
-        column[2].fill_between(
-            t, run.a_lower[:, elbow], run.a_upper[:, elbow], alpha=0.25, label="allowed"
-        )
-        column[2].plot(t[:-1], np.diff(v) / dt, linewidth=1.0, label="measured")
-        column[2].set(xlabel="time [s]")
-    axes[2, 0].legend(loc="upper right")
-    labels = ("elbow position [rad]", "elbow velocity [rad/s]", "elbow acceleration [rad/s²]")
-    for axis, label in zip(axes[:, 0], labels, strict=True):
-        axis.set_ylabel(label)
-    for axis in axes.flat:
-        axis.grid(alpha=0.3)
-    m = figure.metrics
-    gentler = abs(m["naive_20dt_impact_rad_s"]) < 0.5 * abs(m["naive_2dt_impact_rad_s"])
-    figure.rows = [
-        (
-            "Fig. 5a: naive, 2 dt",
-            "elbow hits its lower bound at 0.36 s at -1.4 rad/s",
-            f"at {m['naive_2dt_impact_time_s']:.2f} s at {m['naive_2dt_impact_rad_s']:.2f} rad/s",
-            "agrees qualitatively; poses and acceleration limits are not in the paper",
-        ),
-        (
-            "Fig. 5: naive, 20 dt",
-            "still hits, at 0.3 rad/s",
-            f"at {abs(m['naive_20dt_impact_rad_s']):.2f} rad/s",
-            "agrees qualitatively" if gentler and m["naive_20dt_impact_rad_s"] < 0 else "DIFFERS",
-        ),
-        (
-            "Fig. 5b: exact, 2 dt",
-            "reaches the bound with zero velocity",
-            f"{1e3 * m['exact_2dt_closest_rad']:.2f} mrad before it, at "
-            f"{m['exact_2dt_speed_at_closest_rad_s']:.1e} rad/s",
-            "agrees" if m["exact_2dt_violation_rad"] == 0.0 else "DIFFERS",
-        ),
-    ]
+        a = np.diff(v) * values["rate_hz"]
+        draw_trajectory(column, f"{method}, {factor:g} dt", (t, q, v, a), low, v_max)
+        column[2].fill_between(t, *bounds, alpha=0.25, label="allowed")
+        column[2].legend(loc="upper right")
+    time_hit, hit, _ = found["naive_2dt"]
+    gentle, (_, speed, room) = found["naive_20dt"][1], found["exact_2dt"]
+    figure.add(
+        "Fig. 5a: naive, 2 dt",
+        "elbow hits its lower bound at 0.36 s at -1.4 rad/s",
+        f"at {time_hit:.2f} s at {hit:.2f} rad/s",
+        so="agrees qualitatively; poses and acceleration limits are not in the paper",
+    )
+    figure.add(
+        "Fig. 5: naive, 20 dt",
+        "still hits, at 0.3 rad/s",
+        f"at {abs(gentle):.2f} rad/s",
+        holds=0.0 > gentle > 0.5 * hit,
+        so="agrees qualitatively",
+    )
+    figure.add(
+        "Fig. 5b: exact, 2 dt",
+        "reaches the bound with zero velocity",
+        f"{1e3 * room:.2f} mrad before it, at {abs(speed):.1e} rad/s",
+        holds=figure.metrics["exact_2dt_violation_rad"] == 0.0,
+    )
     figure.save(picture)
     return figure
 
 
 def algorithm_4() -> Figure:
     """Time Algorithm 4 with the paper's number of samples; compare it with the refined search."""
-    figure = Figure("paper0-alg4")
+    figure = Figure("paper0-alg4", PART)
     values = load_values("baxter_left_arm")
     joints = values["joints"]
     model = build_model(read_urdf(values["robot_description"]), joints)
     limits = [values[key] for key in ("position_min", "position_max", "velocity_max")]
-    picture, axes = joint_axes(joints, "evaluations N", "smallest limit found [rad/s²]")
-    found = {}
+    picture, axes = plt.subplots(1, len(joints), figsize=(20, 3), layout="constrained")
+    found, seconds = {}, {}
     for method, most in (("sampling", 6), ("refined", 4)):
         evaluations, tightest = [], []
         for samples in np.logspace(2, most, most - 1, dtype=int).tolist():
@@ -352,38 +297,38 @@ def algorithm_4() -> Figure:
                 method=method,
                 overrides={"left_s1": (-3.0, 3.0)},
             ).worst
-            figure.metrics[f"{method}_seconds"] = time.perf_counter() - start
+            seconds[method] = time.perf_counter() - start
             evaluations.append(worst.evaluations)
             tightest.append(worst.room.min(axis=0))
-        tightest = np.array(tightest)
         found[method] = tightest[-1]
         figure.data[method] = np.column_stack([evaluations, tightest])
-        for j, axis in enumerate(axes):
-            axis.semilogx(evaluations, tightest[:, j], marker=".", label=method)
+        for axis, joint, curve in zip(axes, joints, np.array(tightest).T, strict=True):
+            axis.semilogx(evaluations, curve, marker=".", label=method)
+            axis.set(xlabel="evaluations N", title=joint)
+    axes[0].set_ylabel("smallest limit found [rad/s²]")
     axes[0].legend()
-    tighter = bool((found["refined"] <= found["sampling"]).all())
-    share = float(np.delete(found["refined"] / found["sampling"], joints.index("left_s1")).min())
-    figure.metrics |= {"refined_is_tighter": tighter, "smallest_ratio": share}
-    figure.rows = [
-        (
-            "Algorithm 4, N = 1e6",
-            "about 5 minutes",
-            f"{figure.metrics['sampling_seconds']:.1f} s",
-            "faster; left_s1 has no interval: see config/baxter_left_arm.yaml",
-        ),
-        (
-            "Beyond it: refined search, N = 1e4",
-            "-",
-            f"{figure.metrics['refined_seconds']:.1f} s; limits down to {share:.0%} of those that "
-            "N = 1e6 samples found",
-            "tighter" if tighter else "DIFFERS: a limit is wider",
-        ),
-    ]
+    shares = np.delete(found["refined"] / found["sampling"], joints.index("left_s1"))
+    figure.metrics = {f"{method}_seconds": each for method, each in seconds.items()}
+    figure.metrics["smallest_ratio"] = float(shares.min())
+    figure.add(
+        "Algorithm 4, N = 1e6",
+        "about 5 minutes",
+        f"{seconds['sampling']:.1f} s",
+        so="faster; left_s1 has no interval: see config/baxter_left_arm.yaml",
+    )
+    figure.add(
+        "Beyond it: refined search, N = 1e4",
+        "-",
+        f"{seconds['refined']:.1f} s; limits down to {shares.min():.0%} of those that "
+        "N = 1e6 samples found",
+        holds=bool((found["refined"] <= found["sampling"]).all()),
+        so="tighter",
+    )
     figure.save(picture)
     return figure
 
 
-FIGURES: dict[str, Callable[[], Figure]] = {
+FIGURES = {
     "fig1": figure_1,
     "fig3": figure_3,
     "fig4": figure_4,
@@ -391,11 +336,5 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "alg4": algorithm_4,
 }
 
-
-def write_document(figures: list[Figure]) -> None:
-    """Write the table of docs/results.md."""
-    write_part("paper0", table(figures))
-
-
 if __name__ == "__main__":
-    raise SystemExit(reproduce(__doc__, FIGURES, write_document))
+    raise SystemExit(reproduce(__doc__, FIGURES))

@@ -17,11 +17,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pinocchio as pin
 from direct import DirectLoop, column, distance, hand_places
-from figure import Figure, reproduce, table, write_part
+from figure import Figure, reproduce
 
 from torque_safety_controller.parts.contact.interaction import Interaction
 
-ROBOT = "talos_left_arm"
+PART, ROBOT = "paper1-integral", "talos_left_arm"
 ELBOW = 5
 HAND = "wrist_left_ft_tool_link"
 UNLIMIT, LASTING = "without anti-windup", "without leak"
@@ -33,6 +33,8 @@ UNLIMITED = PRINTED | {UNLIMIT: True}
 PLAIN = UNLIMITED | {LASTING: True}
 # Pushes in world axes, N: to the side, and down.
 PUSHES = ((0.0, -60.0, 0.0), (0.0, 0.0, -100.0))
+PUSHED = ("pushed", "overshoot", "recovery", "share", "share_pushed", "swing")
+"""What `push` finds: m, m, s, budgets at most and when let go, N."""
 AWAY = 0.01  # m
 SENSOR_SETTLES = 0.1  # s
 
@@ -55,60 +57,53 @@ def goal(loop: DirectLoop, start: pin.SE3, offset: tuple[float, ...]) -> None:
 
 def figure_3() -> Figure:
     """From position to torque control, with the elbow loaded by friction."""
-    figure = Figure("paper1-fig3")
-    for name, changed in {"the file's values": {}, "the paper's values": PAPER}.items():
-        picture = _handover(figure, name, changed)
+    figure = Figure("paper1-fig3", PART)
+    picture, axes = plt.subplots(1, 2, figsize=(14, 4.5), layout="constrained")
+    cases = {"the file's values": {}, "the paper's values": PAPER}
+    for axis, (name, changed) in zip(axes, cases.items(), strict=True):
+        _handover(figure, axis, name, changed)
     figure.save(picture)
     return figure
 
 
-def _handover(figure: Figure, name: str, changed: dict[str, Any]) -> plt.Figure:
-    """Add a handover to the figure; return the picture."""
+def _handover(figure: Figure, axis: plt.Axes, name: str, changed: dict[str, Any]) -> None:
+    """Add a handover to the figure."""
     loop = make_loop(changed)
     q = loop.config.start_positions.copy()
     for k in range(1500):  # move, so that friction holds a part of the weight, and rest
         q[ELBOW] = loop.config.start_positions[ELBOW] + 0.1 * min(1.0, k / 1000)
         loop.move(q)
-    before = len(loop.samples)
     loop.resume(q)
     loop.run(1.5)
-    samples = tuple(loop.samples[before - 500 :])
+    samples = tuple(loop.samples[1000:])
     tau, additional = column(samples, "tau"), column(samples, "additional")
     t = column(samples, "t") - samples[501].t
-    figure.data |= {
-        f"{name}: {what}": value
-        for what, value in (("t", t), ("tau", tau), ("additional", additional))
-    }
+    figure.data |= {f"{name}: t": t, f"{name}: tau": tau, f"{name}: additional": additional}
     jumps = np.abs(np.diff(tau, axis=0)) / loop.config.torque_max
     # Sample 500 is the drives' last, 501 the first under torque control.
-    ordinary = np.delete(jumps, 500, axis=0).max()
-    excess = float(jumps[500].max() - ordinary)
-    without = np.abs(additional[501] / loop.config.torque_max)
+    step, ordinary = float(jumps[500].max()), float(np.delete(jumps, 500, axis=0).max())
+    without = float(np.abs(additional[501] / loop.config.torque_max).max())
     figure.metrics |= {
-        f"{name}: handover_step_share": float(jumps[500].max()),
-        f"{name}: ordinary_step_share": float(ordinary),
-        f"{name}: step_without_seed_share": float(without.max()),
-        f"{name}: elbow_motion_rad": float(np.ptp(column(samples, "q")[501:, ELBOW])),
+        f"{name}: handover_step_share": step,
+        f"{name}: ordinary_step_share": ordinary,
+        f"{name}: step_without_seed_share": without,
     }
-    picture, axis = plt.subplots(figsize=(8, 4.5), layout="constrained")
     model = tau[501:, ELBOW] - additional[501:, ELBOW]
     axis.plot(t[501:], model, color="tab:purple", label="computed torque")
     axis.plot(t[501:], additional[501:, ELBOW], color="tab:blue", label="integral term")
     axis.plot(t, tau[:, ELBOW], color="black", label="torque of the motor")
     axis.axvline(0.0, color="tab:red", linestyle="--", label="handover")
-    axis.set(xlabel="time [s]", ylabel="elbow torque [N m]", title="from position to torque")
+    axis.set(xlabel="time [s]", ylabel="elbow torque [N m]", title=name)
     axis.legend()
     axis.grid(alpha=0.3)
-    figure.rows.append(
-        (
-            "Fig. 3: handover at the elbow",
-            "torque continuous",
-            f"largest step {jumps[500].max():.3%} of tau_max, ordinary ones up to {ordinary:.3%}; "
-            f"it would have been {without.max():.1%}",
-            f"so with {name}" if excess < 0.01 else "DIFFERS",
-        )
+    figure.add(
+        "Fig. 3: handover at the elbow",
+        "torque continuous",
+        f"largest step {step:.3%} of tau_max, ordinary ones up to {ordinary:.3%}; it would have "
+        f"been {without:.1%}",
+        holds=step - ordinary < 0.01,
+        so=f"so with {name}",
     )
-    return picture
 
 
 def push(
@@ -155,7 +150,6 @@ def push(
         "loop": loop,
         "samples": pushed + released,
         "felt": np.array(felt),
-        "seconds": seconds,
         "pushed": float(np.linalg.norm(places[0])),
         "overshoot": max(0.0, float(-(places @ direction).min())),
         "recovery": float((far[-1] + 1) * loop.dt) if far.size else 0.0,
@@ -171,69 +165,69 @@ FIG5 = {
     "(11), whole torque": PAPER,
     "(11), whole torque, the file's values": {},
 }
+FIG5_HEADS = (
+    "Fig. 5: push, anti-windup",
+    "budgets when let go",
+    "at most",
+    "overshoot, mm",
+    "within 1 cm after, s",
+    "force swings by, N",
+    "",
+)
 
 
 def figure_5() -> Figure:
     """Push the hand for seconds, release it, with and without anti-windup."""
-    figure = Figure("paper1-fig5")
+    figure = Figure("paper1-fig5", PART, FIG5_HEADS)
     # The paper leaks in both; without leaking it is worse still, see the ablation.
     picture, axes = plt.subplots(
         len(FIG5), 2 * len(PUSHES), figsize=(20, 12), sharex=True, layout="constrained"
     )
     for k, force in enumerate(PUSHES):
-        size = float(np.linalg.norm(force))
         found = {name: push(changed, force) for name, changed in FIG5.items()}
+        told = f"{np.linalg.norm(force):.0f} N {'to the side' if force[1] else 'down'}"
         for row, (name, run) in zip(axes, found.items(), strict=True):
-            loop, samples = run["loop"], run["samples"]
+            samples, felt = run["samples"], run["felt"]
             t = column(samples, "t") - samples[0].t
             additional = column(samples, "additional")[:, ELBOW]
-            budget = loop.integral_budget[ELBOW]
-            others = (run["felt"], "measured force [N]"), (1e3 * distance(samples), "hand [mm]")
+            budget = run["loop"].integral_budget[ELBOW]
+            others = (felt, "measured force [N]"), (1e3 * distance(samples), "hand [mm]")
             for axis, (values, label) in zip(row[2 * k : 2 * k + 2], others, strict=True):
                 axis.plot(t, additional, color="tab:red", label="additional torque, elbow")
                 for sign in (-1.0, 1.0):
                     axis.axhline(sign * budget, color="tab:red", linestyle=":")
-                axis.set(ylabel="torque [N m]", title=f"{name}, {size:.0f} N")
+                axis.set(xlabel="time [s]", ylabel="torque [N m]", title=f"{name}, {told}")
                 right = axis.twinx()
                 right.plot(t, values, color="black", lw=0.8)
                 right.set_ylabel(f"{label}, black")
-            key = f"push{k}_{name}"
-            figure.data[key] = np.column_stack([t, additional, distance(samples), run["felt"]])
-            for what in ("pushed", "overshoot", "recovery", "share", "share_pushed", "swing"):
-                figure.metrics[f"{key}_{what}"] = run[what]
-        figure.rows += _rows_of_figure_5(force, found)
-    for axis in axes[-1]:
-        axis.set_xlabel("time [s]")
+            figure.data[f"{told}, {name}"] = np.column_stack(
+                [t, additional, distance(samples), felt]
+            )
+            figure.metrics |= {f"{told}, {name}: {key}": run[key] for key in PUSHED}
+            figure.rows.append(_row_of_figure_5(told, name, found))
     figure.save(picture)
     return figure
 
 
-def _rows_of_figure_5(force: tuple[float, ...], found: dict[str, dict]) -> list[tuple[str, ...]]:
-    side = "to the side" if force[1] else "down"
-    bad = found["without anti-windup"]
-    rows = []
-    for name, run in found.items():
-        here = (
-            f"{run['share_pushed']:.2f} budgets when let go, {run['share']:.2f} at most; "
-            f"overshoot {1e3 * run['overshoot']:.1f} mm; within 1 cm after {run['recovery']:.2f} "
-            f"s; force swings by {run['swing']:.1f} N"
+def _row_of_figure_5(told: str, name: str, found: dict[str, dict]) -> tuple[str, ...]:
+    run, bad, printed = (found[each] for each in (name, "without anti-windup", "(11) as printed"))
+    if run is bad:
+        holds = run["share_pushed"] > 2.0 and all(
+            run[each] > printed[each] for each in ("overshoot", "swing")
         )
-        values = "the file's values" if "file" in name else "the paper's values"
-        if run is bad:
-            paper = "grows; larger oscillation at release"
-            so = run["share_pushed"] > 2.0
-            for each in ("overshoot", "swing"):
-                so &= run[each] > found["(11) as printed"][each]
-        else:
-            paper = "saturates; no visible oscillation"
-            # C s of an arm that still moves is in it, too.
-            so = run["share_pushed"] <= 1.2 and run["overshoot"] <= bad["overshoot"] / 3.0
-            if name == "(11) as printed":
-                paper += "; C s takes it beyond at release"
-                so &= run["share"] > 1.2
-        what = f"Fig. 5: {np.linalg.norm(force):.0f} N {side}, {name}"
-        rows.append((what, paper, here, f"so with {values}" if so else f"not so with {values}"))
-    return rows
+    else:
+        # C s of an arm that still moves is in it, too; as printed it goes beyond at release.
+        holds = run["share_pushed"] <= 1.2 and run["overshoot"] <= bad["overshoot"] / 3.0
+        holds &= run is not printed or run["share"] > 1.2
+    return (
+        f"{told}, {name}",
+        f"{run['share_pushed']:.2f}",
+        f"{run['share']:.2f}",
+        f"{1e3 * run['overshoot']:.1f}",
+        f"{run['recovery']:.2f}",
+        f"{run['swing']:.1f}",
+        "so" if holds else "not so",
+    )
 
 
 OFFSETS = ((0.05, 0.1, 0.15), (0.1, -0.1, -0.05), (0.0, 0.0, 0.1), (0.0, 0.0, 0.0))
@@ -254,69 +248,62 @@ def track(changed: dict[str, Any], seconds: float = 8.0) -> tuple[DirectLoop, fl
 
 def steady() -> Figure:
     """Steady pose error with the integral action and without it."""
-    figure = Figure("paper1-steady")
-    cases = {
-        "no integral": {"integral_action": "none"},
-        "the paper's values": PAPER,
-        "those of the file": {},
-    }
+    figure = Figure("paper1-steady", PART)
+    cases = {"no": {"integral_action": "none"}, "the paper's": PAPER, "the file's": {}}
     errors = {}
     picture, axis = plt.subplots(figsize=(9, 4.5), layout="constrained")
     for name, changed in cases.items():
         loop, errors[name], _ = track(changed)
-        far = distance(tuple(loop.samples))
-        t = column(tuple(loop.samples), "t")
-        axis.semilogy(t, np.maximum(1e3 * far, 1e-3), label=name)
+        t, far = column(tuple(loop.samples), "t"), distance(tuple(loop.samples))
+        axis.semilogy(t, np.maximum(1e3 * far, 1e-3), label=f"{name} integral action")
         figure.data[name] = np.column_stack([t, far])
-        figure.metrics[f"{name}_m"] = errors[name]
+        figure.metrics[f"{name}: error_m"] = errors[name]
     axis.set(xlabel="time [s]", ylabel="hand off its goal [mm]")
     axis.legend()
     axis.grid(alpha=0.3)
-    ratio = errors["no integral"] / errors["those of the file"]
-    less = errors["no integral"] / errors["the paper's values"]
-    figure.metrics["ratio"] = ratio
-    figure.rows.append(
-        (
-            "Steady pose error, friction 10 %, mass error 10 %",
-            "-",
-            f"{1e3 * errors['no integral']:.2f} mm without integral, "
-            f"{1e3 * errors['those of the file']:.2f} mm with lambda = 100 1/s and a budget of "
-            f"20 %: {ratio:.0f} times smaller; with the paper's lambda = 2 1/s and 10 %, less "
-            f"than the stiction, {less:.1f} times",
-            "at least 10 times" if ratio >= 10.0 else "DIFFERS: less than 10 times",
-        )
+    none, paper, file = errors.values()
+    figure.add(
+        "Steady pose error, friction 10 %, mass error 10 %",
+        "-",
+        f"{1e3 * none:.2f} mm without integral, {1e3 * file:.2f} mm with the file's values: "
+        f"{none / file:.0f} times smaller; with the paper's {none / paper:.1f} times",
+        holds=none >= 10.0 * file,
+        so="at least 10 times",
     )
     figure.save(picture)
     return figure
 
 
+ABLATION = {
+    "no integral": {"integral_action": "none"},
+    "plain integral": PLAIN,
+    "leaky (12)-(14)": UNLIMITED,
+    "leaky, (10)": PAPER | {"integral_anti_windup": "scaling"},
+    "leaky, (11) as printed": PRINTED,
+    "leaky, (11), whole torque": PAPER,
+    "the same, the file's values": {},
+    "and friction compensation": {"friction_compensation": 1.0},
+}
+ABLATION_HEADS = (
+    "integral action",
+    "error at rest, mm",
+    "on the way, mm",
+    "peak torque, budgets",
+    "overshoot, mm",
+    "within 1 cm after, s",
+)
+
+
 def ablation() -> Figure:
     """Every part of the integral action left out, at the paper's gain and at the file's."""
-    figure = Figure("paper1-ablation")
-    cases = {
-        "no integral": {"integral_action": "none"},
-        "plain integral": PLAIN,
-        "leaky (12)-(14)": UNLIMITED,
-        "leaky, (10)": PAPER | {"integral_anti_windup": "scaling"},
-        "leaky, (11) as printed": PRINTED,
-        "leaky, (11), whole torque": PAPER,
-        "the same, the file's values": {},
-        "and friction compensation": {"friction_compensation": 1.0},
-    }
-    names = ("rest", "way", "share", "overshoot", "recovery")
-    values = {}
-    for name, changed in cases.items():
+    figure = Figure("paper1-ablation", PART, ABLATION_HEADS)
+    for name, changed in ABLATION.items():
         _, rest, way = track(changed)
         runs = [push(changed, force) for force in PUSHES]
-        values[name] = (
-            rest,
-            way,
-            *(max(run[what] for run in runs) for what in ("share", "overshoot", "recovery")),
+        share, overshoot, recovery = (
+            max(run[what] for run in runs) for what in ("share", "overshoot", "recovery")
         )
-        figure.metrics |= {
-            f"{name}: {what}": value for what, value in zip(names, values[name], strict=True)
-        }
-        rest, way, share, overshoot, recovery = values[name]
+        figure.data[name] = np.array([rest, way, share, overshoot, recovery])
         figure.rows.append(
             (
                 name,
@@ -327,25 +314,7 @@ def ablation() -> Figure:
                 f"{recovery:.2f}",
             )
         )
-    picture, axes = plt.subplots(1, len(names), figsize=(15, 4), layout="constrained")
-    titles = (
-        "error at rest [mm]",
-        "error on the way [mm]",
-        "peak torque [budgets]",
-        "overshoot [mm]",
-        "recovery [s]",
-    )
-    for axis, title, column_of in zip(
-        axes, titles, zip(*values.values(), strict=True), strict=True
-    ):
-        scale = 1e3 if "[mm]" in title else 1.0
-        axis.barh(list(values), scale * np.array(column_of))
-        axis.invert_yaxis()
-        axis.set_title(title)
-        if axis is not axes[0]:
-            axis.set_yticklabels([])
-    figure.data = {name: np.array(value) for name, value in values.items()}
-    figure.save(picture)
+    figure.save()
     return figure
 
 
@@ -357,6 +326,11 @@ class Disturbed:
     """
 
     LINKS = ("arm_left_2_link", "arm_left_4_link", "arm_left_7_link", HAND)
+    COUNTED = ("steps", "not_finite", "beyond", "beyond_pushed", "relaxed") + (
+        "torque_ratio",
+        "deepest",
+        "fastest",
+    )
 
     def __init__(self, changed: dict[str, Any]) -> None:
         self.loop = DirectLoop(ROBOT, changed)
@@ -427,65 +401,36 @@ class Disturbed:
 
 def endurance(minutes: float = 10.0) -> Figure:
     """Random pushes, goals and parameter changes: what stays within its limits."""
-    figure = Figure("paper1-endurance")
-    cases = {
-        f"{minutes:g} minutes of random pushes up to 150 N, goals and parameters": ({}, minutes),
-        "1 minute of it with disturbance_time 0": ({"disturbance_time": 0.0}, 1.0),
-    }
-    for k, (name, (changed, duration)) in enumerate(cases.items()):
+    figure = Figure("paper1-endurance", PART)
+    cases = (
+        (f"{minutes:g} minutes of random pushes up to 150 N, goals and parameters", {}, minutes),
+        ("1 minute of it with disturbance_time 0", {"disturbance_time": 0.0}, 1.0),
+    )
+    for name, changed, duration in cases:
         run = Disturbed(changed)
         run.run(duration)
-        figure.metrics |= {
-            f"{name}: {key}": float(getattr(run, key))
-            for key in ("steps", "not_finite", "beyond", "beyond_pushed", "relaxed")
-            + ("torque_ratio", "deepest", "fastest")
-        }
+        figure.metrics |= {f"{name}: {key}": float(getattr(run, key)) for key in Disturbed.COUNTED}
         kept = run.torque_ratio <= 1.0 and not run.not_finite
-        # In the first, limits may be passed where a push is more than the motors can hold.
-        calm = run.beyond == run.beyond_pushed or k > 0
-        figure.rows.append(
-            (
-                name,
-                "torque limits kept whatever the integral does" if k == 0 else "-",
-                run.told(),
-                ("kept, the file's values" if k == 0 else "for comparison")
-                if kept and calm
-                else "DIFFERS",
-            )
+        # Limits may be passed where a push is more than the motors can hold.
+        kept &= bool(changed) or run.beyond == run.beyond_pushed
+        figure.add(
+            name,
+            "-" if changed else "torque limits kept whatever the integral does",
+            run.told(),
+            holds=kept,
+            so="for comparison" if changed else "kept, the file's values",
         )
-    figure.save(None)
+    figure.save()
     return figure
 
 
 PARTS: dict[str, Callable[[], Figure]] = {
     "fig3": figure_3,
-    "fig5": figure_5,
     "steady": steady,
-    "ablation": ablation,
     "endurance": endurance,
+    "fig5": figure_5,
+    "ablation": ablation,
 }
-ABLATION_HEADS = (
-    "integral action",
-    "error at rest, mm",
-    "error on the way (after 1 s), mm",
-    "peak torque, budgets",
-    "overshoot at release, mm",
-    "recovery, s",
-)
-
-
-def tables(figures: list[Figure]) -> str:
-    """Return the table beside the paper, and that of the ablation."""
-    plain = [figure for figure in figures if figure.name != "paper1-ablation"]
-    parts = [table(plain)] if plain else []
-    parts += [table([figure], ABLATION_HEADS) for figure in figures if figure not in plain]
-    return "\n\n".join(parts)
-
-
-def write_document(figures: list[Figure]) -> None:
-    """Write the tables of docs/results.md."""
-    write_part("paper1-integral", tables(figures))
-
 
 if __name__ == "__main__":
-    raise SystemExit(reproduce(__doc__, PARTS, write_document, tables))
+    raise SystemExit(reproduce(__doc__, PARTS))

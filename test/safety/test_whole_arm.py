@@ -5,7 +5,6 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from direct import DirectLoop, column
-from whole_arm import CLEAR, KEPT_FREE, arrive, random_goal
 
 from torque_safety_controller.parts.whole_arm.safety_filter import SafetyFilter
 
@@ -15,18 +14,6 @@ FILTERED = {"safety_filter": True}
 SHOULDER = 1
 STRETCHED = np.array([0.0, -0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
 """Where Baxter's shoulder needs more than it has."""
-SHORT = 0.3  # rad
-
-
-def near_goal(loop, rng):
-    """Return a posture within a short move that can be held."""
-    data, q = loop.model.createData(), loop.robot.state().q
-    low, high = loop.limits.q_min + CLEAR, loop.limits.q_max - CLEAR
-    while True:
-        goal = np.clip(q + rng.uniform(-SHORT, SHORT, q.size), low, high)
-        held = np.abs(pin.computeGeneralizedGravity(loop.model, data, goal))
-        if (held <= (1.0 - KEPT_FREE) * loop.config.torque_max).all():
-            return goal
 
 
 def load_at(loop, q):
@@ -125,47 +112,3 @@ def test_before_what_cannot_be_held_the_arm_stops_short_of_its_goal():
     assert np.abs(samples[-1].q - below).max() > 0.01
     assert np.abs(samples[-1].v).max() < 0.05
     assert beyond(loop)[:2] == (0.0, 0.0)
-
-
-def test_an_arm_goes_on_to_the_next_goal_when_it_is_at_rest():
-    loop = DirectLoop("panda", STIFF)
-    start = loop.robot.state().q
-    near, at = arrive(loop, "posture", start + 0.1, 5.0)
-    assert 0.1 < near < at < loop.t - 0.29
-    assert loop.t < 3.0
-    np.testing.assert_allclose(loop.robot.state().q, start + 0.1, atol=1e-3)
-
-
-def test_a_goal_that_is_not_reached_has_no_time():
-    loop = DirectLoop("panda", STIFF)
-    times = arrive(loop, "posture", loop.robot.state().q + 0.5, 0.2)
-    assert np.isnan(times).all()
-    assert loop.t == pytest.approx(0.2)
-
-
-def test_a_pose_is_reached_where_its_posture_has_the_hand():
-    gains = {"pose_kp": 100.0, "pose_kd": 20.0}
-    loop = DirectLoop("panda", gains)
-    goal = loop.robot.state().q + 0.1
-    near, at = arrive(loop, "pose", goal, 5.0)
-    assert near < at < 3.0
-    hand = loop.pose().translation
-    loop.robot.reset(goal, np.zeros(7))
-    np.testing.assert_allclose(hand, loop.pose().translation, atol=1e-3)
-
-
-def test_random_goals_can_be_held_and_are_clear_of_limits():
-    loop = DirectLoop("baxter_left_arm", STIFF)
-    rng = np.random.default_rng(0)
-    low, high = loop.limits.q_min, loop.limits.q_max
-    at_limits = []
-    for k in range(40):
-        goal = near_goal(loop, rng) if k % 2 else random_goal(loop, rng)
-        assert (load_at(loop, goal) <= 0.95).all()
-        room = np.minimum(goal - low, high - goal)
-        assert room.min() >= CLEAR - 1e-12
-        if k % 2:
-            assert np.abs(goal - loop.robot.state().q).max() <= SHORT
-        else:
-            at_limits.append((room < CLEAR + 1e-12).mean())
-    assert 0.3 < np.mean(at_limits) < 0.7

@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What TSID and placo answer: runs in an interpreter of its own, see `other_environment.py`.
+
+``python rival_worker.py INPUT.npz OUTPUT.npz TASK NAME`` does one of the tasks below with what
+the input gives, writes what it found, and times a block for each line on standard input.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+from rollout import drive
+
+Arrays = dict[str, np.ndarray]
+Times = tuple[float, ...]
+
+
+class Tsid:
+    """Tasks and limits in TSID: of positions, speeds, accelerations and torques.
+
+    Args:
+        model: of the arm.
+        given: limits and gains; with ``frame`` a pose task besides the posture task.
+    """
+
+    def __init__(self, model: pin.Model, given: Arrays) -> None:
+        from tsid import tsid_pywrap as tsid
+
+        self._tsid, n = tsid, model.nv
+        self._robot = tsid.RobotWrapper(model, tsid.RootJointType.FIXED_BASE_SYSTEM, False)
+        self.problem = tsid.InverseDynamicsFormulationAccForce("problem", self._robot, False)
+        self.problem.computeProblemData(0.0, pin.neutral(model), np.zeros(n))
+        if "frame" in given:
+            self._pose = tsid.TaskSE3Equality("pose", self._robot, str(given["frame"]))
+            self._pose.setKp(np.full(6, given["pose_kp"]))
+            self._pose.setKd(np.full(6, given["pose_kd"]))
+            self._pose.useLocalFrame(True)
+            self.problem.addMotionTask(self._pose, 1.0, 1, 0.0)
+        self._posture = tsid.TaskJointPosture("posture", self._robot)
+        self._posture.setKp(np.full(n, given["kp"]))
+        self._posture.setKd(np.full(n, given["kd"]))
+        self.problem.addMotionTask(self._posture, float(given["posture_weight"]), 1, 0.0)
+        # The constructor doubles the step, which is the paper's way to avoid chatter.
+        self.bounds = tsid.TaskJointPosVelAccBounds(
+            "bounds", self._robot, float(given["dt"]), False
+        )
+        self.bounds.setPositionBounds(given["low"], given["high"])
+        self.bounds.setVelocityBounds(np.full(n, given["v_max"]))
+        self.bounds.setAccelerationBounds(np.full(n, given["a_max"]))
+        self.problem.addMotionTask(self.bounds, 1.0, 0, 0.0)
+        # The problem refers to its tasks without keeping them.
+        self._torques = tsid.TaskActuationBounds("torques", self._robot)
+        self._torques.setBounds(-given["tau_max"], given["tau_max"])
+        self.problem.addActuationTask(self._torques, 1.0, 0, 0.0)
+        self.solver = tsid.SolverHQuadProgFast("solver")
+        self.solver.resize(self.problem.nVar, self.problem.nEq, self.problem.nIn)
+
+    def set_goal(self, q_des: np.ndarray, pose: np.ndarray | None = None) -> None:
+        """Set the posture to reach; and the pose: rotation and translation, shape (3, 4)."""
+        goal = self._tsid.TrajectoryEuclidianConstant("goal", q_des)
+        self._posture.setReference(goal.computeNext())
+        if pose is not None:
+            place = self._tsid.TrajectorySE3Constant("goal", pin.SE3(pose[:, :3], pose[:, 3]))
+            self._pose.setReference(place.computeNext())
+
+    def torque(self, q: np.ndarray, v: np.ndarray) -> np.ndarray | None:
+        """Return the torque to apply, shape (n,), N m, or None without a solution."""
+        solution = self.solver.solve(self.problem.computeProblemData(0.0, q, v))
+        return self.problem.getActuatorForces(solution) if solution.status == 0 else None
+
+
+class Placo:
+    """Joints' task in placo, with its limits of positions, speeds and torques."""
+
+    def __init__(self, urdf: Path, given: Arrays) -> None:
+        import placo
+
+        self._robot = placo.RobotWrapper(str(urdf))
+        self._names = [str(name) for name in given["joints"]]
+        for name, low, high in zip(self._names, given["low"], given["high"], strict=True):
+            self._robot.set_joint_limits(name, float(low), float(high))
+        self._robot.set_velocity_limits(float(given["v_max"]))
+        self._solver = placo.DynamicsSolver(self._robot)
+        self._solver.mask_fbase(True)
+        self._solver.dt = float(given["dt"])
+        self._task = self._solver.add_joints_task()
+        self._task.configure("joints", "soft", 1.0)
+        self._task.kp, self._task.kd = float(given["kp"]), float(given["kd"])
+        for name, torque in zip(self._names, given["tau_max"], strict=True):
+            self._solver.set_torque_limit(name, float(torque))
+            self._solver.set_qdd_safe(name, float(given["a_max"]))
+        self._solver.enable_joint_limits(True)
+        self._solver.enable_velocity_limits(True)
+        self._solver.enable_torque_limits(True)
+        self._floating = len(self._robot.state.qd) - len(self._names)
+
+    def set_goal(self, q_des: np.ndarray) -> None:
+        """Set the posture to reach."""
+        self._task.set_joints(dict(zip(self._names, q_des.tolist(), strict=True)))
+
+    def torque(self, q: np.ndarray, v: np.ndarray) -> np.ndarray | None:
+        """Return the torque to apply, shape (n,), N m, or None without a solution."""
+        for name, position, speed in zip(self._names, q.tolist(), v.tolist(), strict=True):
+            self._robot.set_joint(name, position)
+            self._robot.set_joint_velocity(name, speed)
+        self._robot.update_kinematics()
+        try:
+            result = self._solver.solve(False)
+        except RuntimeError:
+            return None
+        return np.array(result.tau)[self._floating :] if result.success else None
+
+
+def roll_out(given: Arrays, name: str, urdf: Path) -> tuple[Arrays, None]:
+    """Drive an arm from goal to goal."""
+    model = pin.buildModelFromUrdf(str(urdf))
+    arm = Tsid(model, given) if name == "tsid" else Placo(urdf, given)
+    return drive(arm, model, given), None
+
+
+def answer(given: Arrays, _: str, urdf: Path) -> tuple[Arrays, Callable[[], Times]]:
+    """Give accelerations, torques and bounds in the given states, NaN without a solution."""
+    arm = Tsid(pin.buildModelFromUrdf(str(urdf)), given)
+    q, v, every = list(given["q"]), list(given["v"]), int(given["steps_per_goal"])
+    a, tau, lower, upper = np.full((4, *given["q"].shape), np.nan)
+    for i in range(len(q)):
+        if i % every == 0:
+            arm.set_goal(given["posture"][i], given["pose"][i])
+        solution = arm.solver.solve(arm.problem.computeProblemData(0.0, q[i], v[i]))
+        if solution.status == 0:
+            a[i] = arm.problem.getAccelerations(solution)
+            tau[i] = arm.problem.getActuatorForces(solution)
+        bounds = arm.bounds.getConstraint()
+        lower[i], upper[i] = bounds.lowerBound, bounds.upperBound
+
+    def timed() -> Times:
+        """Return microseconds of the processor of a step: problem, solution, results."""
+        parts, clock = np.zeros(3), time.thread_time
+        for i in range(len(q)):
+            if i % every == 0:
+                arm.set_goal(given["posture"][i], given["pose"][i])
+            first = clock()
+            data = arm.problem.computeProblemData(0.0, q[i], v[i])
+            second = clock()
+            solution = arm.solver.solve(data)
+            third = clock()
+            arm.problem.getAccelerations(solution), arm.problem.getActuatorForces(solution)
+            parts += second - first, third - second, clock() - third
+        return tuple(1e6 * parts / len(q))
+
+    return {"a": a, "tau": tau, "bounds": np.stack([lower, upper], axis=1)}, timed
+
+
+def bound(given: Arrays, *_: object) -> tuple[Arrays, Callable[[], Times]]:
+    """Give the bounds of equal joints in states q and v, for limits by name."""
+    from tsid import tsid_pywrap as tsid
+
+    found, tasks = {}, {}
+    for name in given["names"]:
+        q_min, q_max, v_max, a_max, dt = given[f"limits:{name}"]
+        states = given[f"states:{name}"]
+        model, parent, n = pin.Model(), 0, states.shape[2]
+        for j in range(n):
+            joint = pin.JointModelRZ()
+            parent = model.addJoint(parent, joint, pin.SE3.Identity(), f"joint_{j}")
+            model.appendBodyToJoint(parent, pin.Inertia.Random(), pin.SE3.Identity())
+        robot = tsid.RobotWrapper(model, tsid.RootJointType.FIXED_BASE_SYSTEM, False)
+        task = tsid.TaskJointPosVelAccBounds("bounds", robot, 0.5 * dt, False)
+        task.setPositionBounds(np.full(n, q_min), np.full(n, q_max))
+        task.setVelocityBounds(np.full(n, v_max))
+        task.setAccelerationBounds(np.full(n, a_max))
+        data = robot.data()
+        values = np.empty_like(states)
+        for i, (q, v) in enumerate(zip(*states, strict=True)):
+            constraint = task.compute(0.0, q, v, data)
+            values[:, i] = constraint.lowerBound, constraint.upperBound
+        found[str(name)] = values
+        tasks[str(name)] = task, data, robot, list(zip(*states, strict=True))
+
+    def timed() -> Times:
+        """Return microseconds of a call, its bounds read as arrays."""
+        task, data, _, pairs = tasks[str(given["names"][0])]
+        begin = time.thread_time()
+        for q, v in pairs:
+            constraint = task.compute(0.0, q, v, data)
+            constraint.lowerBound, constraint.upperBound  # noqa: B018
+        return (1e6 * (time.thread_time() - begin) / len(pairs),)
+
+    return found, timed
+
+
+def main() -> None:
+    """Do the task, then time for as long as asked to."""
+    source, target, task, name = sys.argv[1:]
+    with np.load(source) as content:
+        given = dict(content)
+    with tempfile.TemporaryDirectory() as directory:
+        urdf = Path(directory) / "arm.urdf"
+        urdf.write_text(str(given.get("urdf", "")))
+        work = {"rollout": roll_out, "step": answer, "bounds": bound}[task]
+        found, timed = work(given, name, urdf)
+    np.savez(target, **found)
+    print("ready", flush=True)
+    for _ in sys.stdin:
+        print(*timed(), flush=True)
+
+
+if __name__ == "__main__":
+    main()
