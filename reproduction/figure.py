@@ -91,10 +91,11 @@ def tables(figures: Sequence[Figure]) -> dict[tuple[str, str], str]:
 def page_rows(part: str, page: str = "results.md") -> dict[tuple[str, str], Row]:
     """Return the rows of a part of a page, by the heading above them and their first cell."""
     heading, rows = "", {}
-    for line in _split(part, page)[1].splitlines():
+    lines = _split(part, page)[1].splitlines()
+    for line, following in zip(lines, [*lines[1:], ""], strict=True):
         if line.startswith("### "):
             heading = line.removeprefix("### ")
-        elif line.startswith("| "):
+        elif line.startswith("| ") and not following.startswith("|---"):
             cells = tuple(cell.strip() for cell in line[1:-1].split("|"))
             rows[heading, cells[0]] = cells
     return rows

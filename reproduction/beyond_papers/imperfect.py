@@ -53,7 +53,7 @@ OF_ROBOT = ("rotor_inertia", "acceleration_min", "acceleration_max")
 STEP_AT_REST, HAND_FACTOR, TORQUE_ROUNDING = 0.05, 3.0, 1e-9
 """What is promised: step of torque, of its limit; hand, of the ideal one's distance; share."""
 HEADS = (
-    "what is spoilt, and what is done",
+    "case",
     "minutes",
     "position, rad",
     "speed, rad/s",
@@ -109,40 +109,38 @@ NOTHING_DECLARED: dict[str, Any] = {
     "bounds_dt_factor": 2.0,
 }
 CASES = {
-    "ideal": Case("nothing spoilt, nothing done", 0, ()),
+    "ideal": Case("ideal", 0, ()),
     # A delay that is declared is predicted, so that it must exist.
     "ideal_remedies": Case(
-        "nothing spoilt, all done; no delay to predict",
+        "ideal, all done but prediction",
         0,
         changed={"estimator_node": {"delay": 0, "motor_bandwidth": []}},
     ),
-    "nothing": Case("spoilt, nothing done", 1, ()),
+    "nothing": Case("nothing done", 1, ()),
     "no_margins": Case(
-        "spoilt, all but margins and horizon", 1, changed={"bounds_node": NOTHING_DECLARED}
+        "all but margins and horizon", 1, changed={"bounds_node": NOTHING_DECLARED}
     ),
     "no_prediction": Case(
-        "spoilt, all but prediction",
+        "all but prediction",
         1,
         changed={"estimator_node": {"delay": 0, "motor_bandwidth": []}},
     ),
     "no_observer": Case(
-        "spoilt, all but the observer",
+        "all but the observer",
         1,
         changed={"estimator_node": {"velocity_estimation": False}},
     ),
-    "all": Case("spoilt, all done", 1),
-    "twice": Case("spoilt twice as much as declared, all done", 2),
+    "all": Case("all done", 1),
+    "twice": Case("twice as much as declared", 2),
     "outage_brake": Case(
-        "spoilt, all done; commands fail for up to 0.2 s; brakes",
+        "commands fail for 0.2 s, brakes",
         1,
         changed={"bullet_node": {"acceleration_min": [], "acceleration_max": []}},
         outages=True,
     ),
-    "outage_stop": Case("spoilt, all done; commands fail for up to 0.2 s; stop", 1, outages=True),
-    "filter": Case("spoilt, all done; safety filter", 1, filtered=True),
-    "filter_weak": Case(
-        "spoilt, all done; safety filter, 60% of its torque", 1, filtered=True, torque=0.6
-    ),
+    "outage_stop": Case("commands fail for 0.2 s, stop", 1, outages=True),
+    "filter": Case("safety filter", 1, filtered=True),
+    "filter_weak": Case("safety filter, 60% of its torque", 1, filtered=True, torque=0.6),
 }
 AT_LENGTH = ("all", "filter", "filter_weak")
 """Cases that are played for longer."""
@@ -380,7 +378,7 @@ def _own_domain() -> None:
 def play_all(robots: Sequence[str], names: Sequence[str], at_length: int, others: int) -> Figure:
     """Play cases of robots for some minutes; put their rows on the page, and print them."""
     figure = Figure("imperfect")
-    rows = {key: cells for key, cells in page_rows(PART).items() if len(cells) == len(HEADS)}
+    rows = page_rows(PART)
     with ProcessPoolExecutor(
         os.cpu_count(), get_context("spawn"), initializer=_own_domain
     ) as pool:

@@ -37,7 +37,7 @@ from torque_safety_controller.parts.whole_arm.braking_plan import (
 from torque_safety_controller.parts.whole_arm.safety_filter import SafetyFilter
 
 PART = "whole-arm"
-HEADS = ("arm", "played", "position, rad", "speed, rad/s", "torque", "steps changed", "")
+HEADS = ("arm", "position, rad", "speed, rad/s", "torque", "steps changed", "")
 POSTURE = {"posture_kp": 100.0, "posture_kd": 20.0, "posture_weight": 1.0, "pose_weight": 0.0}
 """Gains on the way to postures."""
 POSE: dict[str, Any] = {"pose_kp": 100.0, "pose_kd": 20.0, "posture_kp": 10.0, "posture_kd": -1.0}
@@ -160,7 +160,6 @@ def play(name: str, seed: int, limit: float, duration: float = 60.0) -> dict[str
         "position": float(monitor.max_position_violation.max()),
         "speed": float(monitor.max_velocity_violation.max()),
         "torque": float(monitor.max_torque_ratio.max()),
-        "seconds": loop.t,
         "outcomes": {} if keeper is None else dict(keeper.outcomes),
     }
 
@@ -193,7 +192,6 @@ def add_row(figure: Figure, name: str, minutes: list[dict[str, Any]]) -> None:
     figure.metrics |= {f"{name}: position": position, f"{name}: speed": speed}
     figure.add(
         name,
-        f"{sum(minute['seconds'] for minute in minutes) / 60.0:.0f} min",
         f"{position:.2g}",
         f"{speed:.2g}",
         f"{torque:.3f}",
