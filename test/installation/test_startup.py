@@ -105,7 +105,7 @@ def test_a_file_that_is_not_parameters_is_refused_in_one_line(tmp_path, capfd, t
     assert "broken.yaml" in lines[0]
 
 
-# Both signals take the same way in every program; test_ros_runtime.py sends both to one, and
+# Both signals take the same way in every program; test_programs.py sends one each, and
 # test_one_process.py ends safety_stack, and simulated_stack in lockstep.
 @pytest.mark.parametrize(
     ("node", "options", "sent"),

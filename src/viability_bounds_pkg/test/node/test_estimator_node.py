@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
+"""The estimator node: joint states in, joint states as commands will meet them out."""
+
 import math
-import re
-import time
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import JointState
@@ -24,6 +23,7 @@ PERIOD = 2_000_000  # ns
 DT = 1e-9 * PERIOD
 HOME = np.array(VALUES["start_positions"])
 STILL = np.zeros(N)
+TAU = np.array([5.0, -20.0, 3.0, 30.0, 1.0, 2.0, 0.5])
 COARSE = {"position_error": [1e-4] * N, "acceleration_disturbance": [5.0] * N}
 
 
@@ -100,18 +100,20 @@ def test_answers_are_those_of_the_estimator_with_stamp_and_effort_of_the_state(r
         arm.command(k, command)
         ours.answer(k * PERIOD, command)
     assert not ours.resets
+    # A repeated state gets the same answer and is no step.
+    np.testing.assert_array_equal(arm.state(12, q, v, tau), got)
+    ros.wait_until(lambda: arm.reported("states_answered") == "12")
 
 
 def test_nothing_declared_and_velocities_reported_states_pass_exactly(ros):
     arm = EstimatorProbe(ros, velocity_estimation=False)
     rng = np.random.default_rng(1)
-    for k in range(1, 8):
+    for k in range(1, 5):
         q, v = HOME + rng.uniform(-1e-3, 1e-3, N), rng.uniform(-0.1, 0.1, N)
         np.testing.assert_array_equal(arm.state(k, q, v, np.ones(N)), [q, v])
         arm.command(k, np.ones(N))
-    ros.wait_until(lambda: arm.reported("states_answered") == "7")
-    assert arm.reported("message") == "answering"
-    assert arm.reported("resets") == "none"
+    ros.wait_until(lambda: arm.reported("states_answered") == "4")
+    assert (arm.reported("message"), arm.reported("resets")) == ("answering", "none")
 
 
 def test_joints_in_any_order_and_others_with_them(ros):
@@ -132,81 +134,33 @@ def test_joints_in_any_order_and_others_with_them(ros):
     assert answer.name == names
     assert answer.header == message.header
     assert answer.effort == message.effort
-    assert answer.position[4] == 0.04
-    assert answer.velocity[4] == -0.5
-    expected = reference(1, coarse=False)
-    state = expected.step(PERIOD, State(HOME, v), STILL + 3.0)
+    state = reference(1, coarse=False).step(PERIOD, State(HOME, v), STILL + 3.0)
     np.testing.assert_allclose(answer.position, placed(state.q, 0.04), atol=1e-12)
     np.testing.assert_allclose(answer.velocity, placed(state.v, -0.5), atol=1e-12)
 
 
-def test_commands_with_joints_in_another_order(ros):
-    answers = []
-    tau = np.array([5.0, -20.0, 3.0, 30.0, 1.0, 2.0, 0.5])
-    for order in (slice(None), [3, 0, 6, 1, 2, 5, 4]):
-        arm = EstimatorProbe(ros, delay=1, velocity_estimation=False)
-        for k in (1, 2, 3):
-            answer = arm.state(k)
-            arm.command(k, tau[order], joints=list(np.array(JOINTS)[order]))
-        answers.append(answer)
-        ros.stop(arm.node)
-    np.testing.assert_array_equal(*answers)
-    assert abs(answers[0].v).max() > 1e-3
+def last_estimate(ros, tau, joints=JOINTS) -> np.ndarray:
+    """Return the estimate after two commands for an arm at rest."""
+    arm = EstimatorProbe(ros, delay=1, velocity_estimation=False)
+    for k in (1, 2):
+        arm.state(k)
+        arm.command(k, tau, joints=joints)
+    answer = np.array(arm.state(3))
+    ros.stop(arm.node)
+    return answer
 
 
-def test_a_repeated_state_gets_the_same_answer_and_no_step(ros):
-    arm = EstimatorProbe(ros, delay=1, **COARSE)
-    tau = np.array([5.0, -20.0, 3.0, 30.0, 1.0, 2.0, 0.5])
-    arm.state(1)
-    arm.command(1, tau)
-    first = arm.state(2, HOME + 1e-4)
-    arm.command(2, 2.0 * tau)
-    for _ in range(3):
-        np.testing.assert_array_equal(arm.state(2, HOME + 1e-4), first)
-    ros.wait_until(lambda: arm.reported("states_answered") == "2")
+def test_commands_count_by_the_names_of_joints_and_up_to_the_torque_limits(ros):
+    usual = last_estimate(ros, TAU)
+    assert abs(usual[1]).max() > 1e-3
+    order = [3, 0, 6, 1, 2, 5, 4]
+    shuffled = last_estimate(ros, TAU[order], [JOINTS[i] for i in order])
+    np.testing.assert_array_equal(shuffled, usual)
+    strongest = last_estimate(ros, VALUES["torque_max"])
+    np.testing.assert_array_equal(last_estimate(ros, np.full(N, 1e6)), strongest)
 
 
-def test_a_missing_command_holds_the_last(ros):
-    tau = np.array([5.0, -20.0, 3.0, 30.0, 1.0, 2.0, 0.5])
-    answers = []
-    for missing in (False, True):
-        arm = EstimatorProbe(ros, delay=2, velocity_estimation=False)
-        for k in range(1, 6):
-            answer = arm.state(k)
-            if not (missing and k == 4):
-                arm.command(k, tau)
-        answers.append(answer)
-        ros.stop(arm.node)
-    np.testing.assert_array_equal(*answers)
-
-
-def test_position_commands_take_the_reported_torque_as_held(ros):
-    arm = EstimatorProbe(ros, delay=2, velocity_estimation=False)
-    tau = np.array([5.0, -20.0, 3.0, 30.0, 1.0, 2.0, 0.5])
-    for k in range(1, 7):
-        answer = arm.state(k, tau=tau)
-        arm.command(k, q=HOME)
-    data = model().createData()
-    expected = State(HOME, STILL)
-    for _ in range(2):
-        expected = expected.after(np.array(pin.aba(model(), data, *expected, tau)), DT)
-    np.testing.assert_allclose(answer, expected, atol=1e-3)
-    assert abs(answer.v).max() > 0.1
-
-
-def test_torques_beyond_the_limits_of_the_motors_are_those_limits(ros):
-    answers = []
-    for tau in (np.array(VALUES["torque_max"]), np.full(N, 1e6)):
-        arm = EstimatorProbe(ros, delay=1, velocity_estimation=False)
-        for k in (1, 2, 3):
-            answer = arm.state(k)
-            arm.command(k, tau)
-        answers.append(answer)
-        ros.stop(arm.node)
-    np.testing.assert_array_equal(*answers)
-
-
-def test_a_jump_and_a_gap_start_anew_and_are_told_once(ros):
+def test_a_jump_and_a_gap_start_anew_and_are_told(ros):
     arm = EstimatorProbe(ros, **COARSE)
     for k in (1, 2, 3):
         arm.state(k)
@@ -222,51 +176,27 @@ def test_a_jump_and_a_gap_start_anew_and_are_told_once(ros):
 
 def test_a_robot_that_starts_over_is_answered_after_the_time_out(ros):
     arm = EstimatorProbe(ros, **COARSE)
-    begin = time.monotonic()
     arm.state(5000)
     np.testing.assert_array_equal(arm.state(1, HOME + 0.5), [HOME + 0.5, STILL])
-    assert time.monotonic() - begin >= VALUES["state_timeout"]
+    ros.wait_until(lambda: "old stamp" in arm.reported("states_refused"), "the refusals")
 
 
-@pytest.mark.parametrize(
-    ("q", "v", "reason"),
-    [
-        ([math.nan, *HOME[1:]], STILL, "not finite"),
-        (HOME, [*STILL[1:], math.inf], "not finite"),
-        (HOME[:3], STILL, "wrong size"),
-    ],
-)
-def test_states_that_are_wrong_are_dropped_and_counted(ros, q, v, reason):
-    arm = EstimatorProbe(ros, state_timeout=30.0)
+def test_messages_that_are_wrong_are_dropped_and_counted(ros):
+    arm = EstimatorProbe(ros, delay=1, state_timeout=30.0)
     arm.state(1)
     arm.answers.clear()
+    broken = joint_state(JOINTS, 2 * PERIOD, [math.nan, *HOME[1:]], STILL)
     ros.wait_until(
-        lambda: re.search(f"{reason}: [1-9]", arm.reported("states_refused")),
-        each=lambda: arm.states.publish(joint_state(JOINTS, 2 * PERIOD, q, v)),
+        lambda: "not finite: " in arm.reported("states_refused"),
+        each=lambda: arm.states.publish(broken),
     )
     assert not arm.answers
-    assert np.isfinite(arm.state(2)).all()
-
-
-@pytest.mark.parametrize(
-    ("tau", "joints", "reason"),
-    [
-        ([math.nan] * N, JOINTS, "not finite"),
-        ([1.0] * (N - 1), JOINTS, "wrong size"),
-        ([1.0] * (N - 1), JOINTS[1:], "missing joint"),
-    ],
-)
-def test_commands_that_are_wrong_are_dropped_and_counted(ros, tau, joints, reason):
-    arm = EstimatorProbe(ros, delay=1)
-    arm.state(1)
-    arm.command(1, tau, joints=joints)
-    assert np.isfinite(arm.state(2)).all()
-    ros.wait_until(lambda: f"{reason}: " in arm.reported("commands_refused"))
-
-
-def test_an_effort_that_is_not_finite_is_none(ros):
-    arm = EstimatorProbe(ros, delay=1, **COARSE)
-    for k in (1, 2, 3):
+    arm.command(1, [math.nan] * N)
+    arm.command(1, [1.0] * (N - 1))
+    arm.command(1, [1.0] * (N - 1), joints=JOINTS[1:])
+    for reason in ("not finite", "wrong size", "missing joint"):
+        ros.wait_until(lambda why=reason: f"{why}: " in arm.reported("commands_refused"))
+    for k in (2, 3, 4):  # an effort that is not finite is none
         assert np.isfinite(arm.state(k, tau=[math.nan] * N)).all()
 
 
@@ -292,14 +222,11 @@ def test_diagnostics_tell_the_errors(ros):
 @pytest.mark.parametrize(
     ("changed", "name"),
     [
-        ({"delay": -1}, "delay"),
         ({"delay": 1.5}, "delay"),
-        ({"position_error": [1e-4]}, "position_error"),
         ({"position_error": [-1e-4] * N}, "position_error"),
         ({"acceleration_disturbance": [math.nan] * N}, "acceleration_disturbance"),
         ({"velocity_max": None, "robot_description": "topic"}, "velocity_max"),
         ({"robot_description": None}, "robot_description"),
-        ({"robot_description": "/no/such.urdf"}, "robot_description"),
         ({"joints": [*JOINTS[:-1], "elbow"]}, "joints"),
     ],
 )
