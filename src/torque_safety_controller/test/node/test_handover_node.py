@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Handover between position and torque control over real DDS."""
+"""Handover between position and torque control, as its service, states and commands show it."""
 
 from __future__ import annotations
 
@@ -14,9 +14,6 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool
 
-from torque_safety_controller import handover
-from torque_safety_controller.node.controller_node import ControllerNode
-from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.ros.runtime import GOAL_QOS
 from viability_bounds_pkg.testing.ros_harness import read_config
 
@@ -75,13 +72,15 @@ class HandoverChain(ControllerChain):
         assert response.success, response.message
 
     def take_over(self, q=Q, tau=TAU) -> np.ndarray:
-        """Enable torque control; return its first torques, which follow some positions."""
+        """Enable torque control; return its first torques."""
         self.enable(True)
-        commands = [self.answer(q, tau)]
-        while not len(commands[-1].effort):
-            commands.append(self.answer(q, tau))
-        assert len(commands) > handover.FEWEST - 1
-        return assert_torque(commands[-1])
+        return assert_torque(self.until_torque(q, tau))
+
+    def until_torque(self, q=Q, tau=TAU) -> JointState:
+        """Return the first command with torques; positions are held until then."""
+        while not len((command := self.answer(q, tau)).effort):
+            assert_position(command, command.position)
+        return command
 
     def refuses(self, torque: bool) -> str:
         response = self.call(torque)
@@ -133,20 +132,18 @@ def test_it_goes_over_to_the_torque_of_the_motors_and_back(ros):
 def test_a_state_asked_for_again_gets_what_it_got(ros):
     chain = HandoverChain(ros)
     chain.answer()
+
+    def assert_again(command):
+        chain.commands.clear()
+        stamp = chain.stamp
+        ros.wait_until(lambda: len(chain.commands) > 2, each=lambda: chain.state(stamp))
+        assert all(each == command for each in chain.commands)
+
     chain.enable(True)
-    handed_over = chain.answer()
-    chain.commands.clear()
-    stamp = chain.stamp
-    ros.wait_until(lambda: len(chain.commands) > 2, each=lambda: chain.state(stamp))
-    assert all(command == handed_over for command in chain.commands)
-    torque = chain.answer()
-    while not len(torque.effort):
-        torque = chain.answer()
+    assert_again(chain.answer())
+    torque = chain.until_torque()
     chain.enable(False)
-    chain.commands.clear()
-    stamp = chain.stamp
-    ros.wait_until(lambda: len(chain.commands) > 2, each=lambda: chain.state(stamp))
-    assert all(command == torque for command in chain.commands)
+    assert_again(torque)
 
 
 def test_a_call_between_a_state_and_its_limits_is_obeyed(ros):
@@ -156,8 +153,7 @@ def test_a_call_between_a_state_and_its_limits_is_obeyed(ros):
     chain.enable(False)
     assert_position(chain.await_command(10, lambda: chain.bound(10)))
     chain.stamp = 10
-    for _ in range(3):
-        assert_position(chain.answer())
+    assert_position(chain.answer())
     assert ros.reported(NODE, "control") == "position"
 
 
@@ -168,14 +164,6 @@ def test_a_handover_that_was_asked_for_can_be_called_off(ros):
     chain.enable(False)
     for _ in range(3):
         assert_position(chain.answer(Q + 0.01))
-
-
-def test_an_arm_in_hold_is_given_to_its_drives(ros):
-    chain = HandoverChain(ros, start_control="torque")
-    assert_torque(chain.answer())
-    chain.await_report(mode="HOLD")
-    chain.enable(False)
-    assert_position(chain.answer())
 
 
 def test_goals_from_before_the_handover_are_dropped(ros):
@@ -190,8 +178,8 @@ def test_goals_from_before_the_handover_are_dropped(ros):
     chain.answer()
     chain.await_report(goals_pending="0", mode="TRACKING")
     ros.diagnostics.clear()
-    ros.wait_until(lambda: ros.reported(NODE, "position_error_m"))
-    assert float(ros.reported(NODE, "position_error_m")) < 1e-9
+    ros.wait_until(lambda: chain.reported("position_error_m"))
+    assert float(chain.reported("position_error_m")) < 1e-9
 
 
 def test_efforts_for_ros2_control_are_silent_under_position_control(ros):
@@ -200,51 +188,21 @@ def test_efforts_for_ros2_control_are_silent_under_position_control(ros):
     efforts = ros.listen(Float64MultiArray, topic)
     ros.hears(topic)
     chain.answer()
-    chain.enable(True)
-    torque = chain.answer()
-    while not len(torque.effort):
-        ros.run_for(0.005)
-        assert not efforts
-        torque = chain.answer()
+    ros.run_for(0.1, each=lambda: chain.state(chain.stamp))
+    assert not efforts
+    torque = chain.take_over()
     ros.wait_until(lambda: efforts, "efforts", each=lambda: chain.state(chain.stamp))
-    np.testing.assert_array_equal(efforts[0].data, torque.effort)
-
-
-def test_noise_of_the_currents_is_no_step_of_the_torque(ros):
-    """Seeded from one sample, 1% of noise made a first step of 2.3% of the limits."""
-    chain, random = HandoverChain(ros), np.random.default_rng(3)
-    command = chain.answer(Q, TAU + 0.01 * TAU_MAX)
-    chain.enable(True)
-    while not len(command.effort):
-        assert_position(command)
-        command = chain.answer(Q, TAU + 0.01 * TAU_MAX * random.standard_normal(N))
-    assert chain.stamp > 20
-    assert (np.abs(assert_torque(command) - TAU) < 0.005 * TAU_MAX).all()
-
-
-def test_a_torque_that_stays_unknown_is_not_gone_on_from(ros, monkeypatch):
-    monkeypatch.setattr(handover, "PATIENCE", 0.05)
-    chain = HandoverChain(ros)
-    chain.answer()
-    chain.enable(True)
-    for sign in (-1.0, 1.0) * 15:
-        assert_position(chain.answer(Q, sign * TAU))
-    chain.await_report(mode="POSITION", reason="handover failed: after 0.05 s the torque of")
+    np.testing.assert_array_equal(efforts[0].data, torque)
 
 
 # Refused
 
 
-def test_torque_is_refused_before_the_first_state(ros):
-    chain = HandoverChain(ros)
+def test_torque_is_refused_before_the_first_state_and_while_states_are_old(ros):
+    chain = HandoverChain(ros, bounds_timeout=0.1)
     assert "no joint state" in chain.refuses(True)
     assert "position control is on already" in chain.refuses(False)
     assert_position(chain.answer())
-
-
-def test_torque_is_refused_while_states_are_old(ros):
-    chain = HandoverChain(ros, bounds_timeout=0.1)
-    chain.answer()
     ros.run_for(0.15)
     assert "no joint state, or only old ones" in chain.refuses(True)
     chain.answer()
@@ -263,38 +221,19 @@ def test_torque_is_refused_while_limits_are_old_or_of_another_run(ros, stamp):
     chain.enable(True)
 
 
-@pytest.mark.parametrize(
-    ("q", "tau", "reason"),
-    [
-        (Q + 5.0 * np.eye(N)[2], TAU, f"outside the position limits: {JOINTS[2]}"),
-        (Q, (), "no motor torque"),
-        (Q, [*TAU[:6], math.nan], "no motor torque"),
-        (Q, [*TAU[:6], 1.1 * TAU_MAX[6]], f"motor torque beyond torque_max: {JOINTS[6]}"),
-    ],
-)
-def test_torque_is_refused_where_it_cannot_begin(ros, q, tau, reason):
+def test_torque_is_refused_where_it_cannot_begin(ros):
     chain = HandoverChain(ros)
-    chain.answer(q, tau)
-    assert reason in chain.refuses(True)
-    assert_position(chain.answer(q, tau), q)
+    for tau, reason in (
+        ((), "no motor torque"),
+        ([*TAU[:6], 1.1 * TAU_MAX[6]], f"motor torque beyond torque_max: {JOINTS[6]}"),
+    ):
+        chain.answer(Q, tau)
+        assert reason in chain.refuses(True)
+        assert_position(chain.answer(Q, tau))
     chain.await_report(control="position")
-
-
-def test_what_is_on_already_is_refused(ros):
-    chain = HandoverChain(ros, start_control="torque")
-    before = assert_torque(chain.answer())
-    assert "torque control is on already" in chain.refuses(True)
-    np.testing.assert_allclose(assert_torque(chain.answer()), before, atol=1e-6)
-    chain.enable(False)
     chain.answer()
-    assert "position control is on already" in chain.refuses(False)
-
-
-def test_it_starts_with_torque_or_position_only(ros):
-    with pytest.raises(SettingError, match="'start_control' is 'velocity'; allowed: one of"):
-        ros.start(ControllerNode, VALUES | {"start_control": "velocity"})
-    HandoverChain(ros)
-    assert "read-only" in ros.refuses(NODE, start_control="torque")
+    chain.take_over()
+    assert "torque control is on already" in chain.refuses(True)
 
 
 # What goes wrong on the way
@@ -305,52 +244,21 @@ def test_a_handover_ends_where_limits_stop_coming(ros):
     chain.answer()
     chain.enable(True)
     # Repeated, as by a robot in lockstep, and not answered until then.
-    command = chain.answer(Q + 1e-3, bounds=False)
-    assert_position(command)
-    chain.await_report(
-        mode="POSITION",
-        reason="handover failed: acceleration limits are stale",
-        control="position",
-    )
-    for _ in range(3):
-        assert_position(chain.answer(bounds=False))
-    assert "no acceleration limits" not in chain.call(True).message  # 4 ms old by their stamps
+    assert_position(chain.answer(Q + 1e-3, bounds=False))
+    failed = "handover failed: acceleration limits are stale"
+    chain.await_report(mode="POSITION", reason=failed, control="position")
+    assert_position(chain.answer(bounds=False))
 
 
-@pytest.mark.parametrize(
-    ("q", "tau", "reason"),
-    [
-        (Q, (), "joint_states carry no motor torque"),
-        (Q + 5.0, TAU, "outside the position limits"),
-    ],
-)
-def test_a_handover_ends_where_torque_cannot_begin_after_all(ros, q, tau, reason):
+def test_a_handover_ends_where_torque_cannot_begin_after_all(ros):
     chain = HandoverChain(ros)
     chain.answer()
     chain.enable(True)
     chain.stamp += 100  # a gap, after which the arm may be elsewhere
-    assert_position(chain.answer(q, tau))
-    chain.await_report(mode="POSITION", reason=f"handover failed: {reason}")
-    chain.stamp += 100
-    assert_position(chain.answer())
-
-
-@pytest.mark.parametrize("start", ["torque", "position"])
-def test_a_robot_that_was_silent_is_commanded_as_at_start(ros, start):
-    chain = HandoverChain(ros, start_control=start, state_timeout=1.0, bounds_timeout=1.0)
-    chain.answer()
-    if start == "position":
-        chain.take_over()
-    assert_torque(chain.answer())
-    chain.await_report(mode="STOPPED")
-    assert "no joint state" in chain.refuses(False)
-    chain.stamp += 1100
-    again = chain.answer()
-    if start == "torque":
-        assert_torque(again)
-    else:
-        assert_position(again)
-        chain.await_report(reason="the robot was silent or started over")
+    assert_position(chain.answer(Q + 5.0))
+    chain.await_report(
+        mode="POSITION", reason="handover failed: outside the position limits", control="position"
+    )
 
 
 def test_nothing_is_sent_once_it_is_stopped(ros):
@@ -367,7 +275,7 @@ def test_nothing_is_sent_once_it_is_stopped(ros):
 
 
 def test_a_robot_that_is_put_elsewhere_is_held_there_however_near(ros):
-    """The drives would jump to where they held it before: found by fuzzing, with a reset."""
+    """The drives would jump to where they held it before."""
     chain = HandoverChain(ros)
     chain.answer()
     assert_position(chain.answer(Q + 0.06))  # pushed away

@@ -19,7 +19,6 @@ from viability_bounds_pkg.testing.ros_harness import read_config
 pytestmark = pytest.mark.long
 
 SERVICE = f"{NODE}/enable_torque"
-TAU_MAX = np.array(read_config("panda", NODE)["torque_max"])
 
 
 class HandoverArm:
@@ -69,36 +68,22 @@ class HandoverArm:
         return q, tau, np.array([len(commands[s].effort) > 0 for s in stamps])
 
 
-PUSHED = {"talos_left_arm": "arm_left_5_link", "panda": "panda_link5"}
-FORCE = {"talos_left_arm": (30.0, -40.0, 50.0), "panda": (20.0, -30.0, 40.0)}  # N
-# Panda's gears are good; here they are not.
-POOR_GEARS = {
-    "integral_action": "task",
-    "rotor_inertia": [0.3, 0.3, 0.3, 0.3, 0.1, 0.1, 0.1],
-    "friction_coulomb": (0.08 * TAU_MAX).tolist(),
-    "friction_static": (0.1 * TAU_MAX).tolist(),
-}
-
-
 @pytest.mark.parametrize(
     ("robot", "changed", "load"),
     [
-        ("talos_left_arm", {}, ""),
         ("talos_left_arm", {}, "friction"),
         ("talos_left_arm", {"integral_action": "none"}, "friction"),
         ("talos_left_arm", {}, "push"),
         ("panda", {}, ""),
-        ("panda", {}, "push"),
-        ("panda", POOR_GEARS, "friction"),
     ],
-    ids=["talos", "talos-friction", "talos-none", "talos-push", "panda", "panda-push", "poor"],
+    ids=["friction", "friction, no integral", "push", "light gears"],
 )
 def test_the_handover_is_not_felt(ros, robot, changed, load):
     arm = HandoverArm(ros, robot, **changed)
     arm.run(100)
     if load:
-        arm.push(PUSHED[robot], FORCE[robot])  # for half a second
-        arm.run(750 if load == "friction" else 180)
+        arm.push("arm_left_5_link", (30.0, -40.0, 50.0))  # N, for half a second
+        arm.run(750 if load == "friction" else 180)  # in friction the arm sticks thereafter
     arm.enable(True)
     arm.run(200)
     arm.enable(False)

@@ -9,8 +9,12 @@ from typing import Any
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
+from torque_safety_controller.controller import Controller
+from torque_safety_controller.node.assembly import make_controller
 from torque_safety_controller.node.controller_node import ControllerNode
+from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
 from torque_safety_controller.tasks.gains import Gains, critical_damping
+from viability_bounds_pkg.parameter import parameter_table, read
 from viability_bounds_pkg.ros.topics import state_topic
 from viability_bounds_pkg.testing.ros_harness import RosHarness, acceleration_limits, joint_state
 
@@ -30,6 +34,13 @@ def gains_of(values: Mapping[str, Any]) -> Gains:
         posture_weight=values["posture_weight"],
         hold_kd=values["hold_kd"],
     )
+
+
+def controller_of(values: Mapping[str, Any]) -> Controller:
+    """Return the controller that the node makes of its parameters, without the node."""
+    known = {row.name for row in parameter_table(ControllerConfiguration)}
+    own = {name: value for name, value in values.items() if name in known}
+    return make_controller(read(ControllerConfiguration, own))[0]
 
 
 class ControllerChain:
@@ -73,6 +84,10 @@ class ControllerChain:
             lambda: stamp * MS in self.commands.stamps, f"a command for {stamp}", each=each
         )
         return self.commands[self.commands.stamps.index(stamp * MS)]
+
+    def await_goals(self, count: int = 1) -> None:
+        """Wait until so many goals have come that no state has brought into effect yet."""
+        self.ros.wait_until(lambda: self.reported("goals_pending") == str(count), "the goals")
 
     def reported(self, key: str) -> str:
         """Return a value of the node's last diagnostics, or the empty string."""

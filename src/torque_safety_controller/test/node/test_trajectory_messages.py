@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trajectories over topics: read, refused, followed in the robot's time."""
+"""Trajectories from messages: read, refused, followed in the robot's time."""
 
 import math
 
@@ -7,22 +7,18 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from arms import load_arm
+from controller_chain import MS, NODE, ControllerChain, gains_of
+from controllers import make, pose_at
 from geometry_msgs.msg import Transform, Twist
-from sensor_msgs.msg import JointState
-from trajectory_msgs.msg import (
-    JointTrajectory,
-    MultiDOFJointTrajectory,
-    MultiDOFJointTrajectoryPoint,
-)
+from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
-from torque_safety_controller.node.controller_node import ControllerNode
 from torque_safety_controller.node.goal_messages import GoalRefused, trajectory_from_message
+from torque_safety_controller.qp import AccelerationRange
 from viability_bounds_pkg.pose_trajectory import PoseTrajectory, circle
 from viability_bounds_pkg.ros.runtime import GOAL_QOS, set_stamp
 from viability_bounds_pkg.state import State
-from viability_bounds_pkg.testing.ros_harness import acceleration_limits, joint_state, read_config
+from viability_bounds_pkg.testing.ros_harness import read_config
 
-MS = 1_000_000
 PLANE = [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]  # from the lowest point towards y
 BASE = pin.SE3(pin.utils.rotate("z", 0.7), np.array([0.1, 0.2, 0.3]))
 
@@ -80,10 +76,7 @@ def changed(edit):
         (lambda m: m.points[1].velocities.append(Twist()), r"points\[1\] must have"),
         (lambda m: setattr(m.points[2].velocities[0].linear, "x", math.nan), "not finite"),
         (lambda m: setattr(m.points[2].transforms[0].rotation, "w", 3.0), "norm"),
-        (
-            lambda m: setattr(m.points[2].time_from_start, "sec", 0),
-            r"points\[2\].time is",
-        ),
+        (lambda m: setattr(m.points[2].time_from_start, "sec", 0), r"points\[2\].time is"),
         (lambda m: m.points.clear(), "at least one point"),
     ],
 )
@@ -102,34 +95,29 @@ def test_velocities_may_be_left_out():
 
 def test_it_is_followed_in_the_robots_time(ros):
     arm = load_arm("panda")
-    values = read_config("panda", "controller_node") | {"state_timeout": 5.0}
-    values = {k: v for k, v in values.items() if k not in ("velocity_max", "robot_name")}
-    values = {k: v for k, v in values.items() if k != "start_positions"}
-    node = ros.start(ControllerNode, values)
-    commands = ros.listen(JointState, "joint_commands")
-    states = ros.talk(JointState, "joint_states")
-    limits = ros.talk(JointTrajectory, "acceleration_limits")
-    goals = ros.talk(MultiDOFJointTrajectory, "target_trajectory", GOAL_QOS)
-    ros.hears("joint_commands")
+    values = read_config("panda", NODE) | {
+        "state_timeout": 40.0,
+        "bounds_timeout": 20.0,
+        "disturbance_time": 0.0,
+    }
+    chain = ControllerChain(ros, values)
     q, v, wide = arm.q_start, np.zeros(arm.n), np.full(arm.n, 50.0)
-    joints = values["joints"]
-    robot = arm.robot(0.0)
-    robot.update(State(q, v), v)
-    start = robot.pose.copy()
-    points = circle(start, 0.05, PLANE, period=0.02, points_per_turn=8)
+    core = make(arm, gains=gains_of(values))
+    core.reset(q)
+    points = circle(pose_at(arm, q), 0.05, PLANE, period=0.02, points_per_turn=8)
     meant = PoseTrajectory(points)
+    goals = ros.talk(MultiDOFJointTrajectory, "target_trajectory", GOAL_QOS)
     goals.publish(message_of(points, stamp=20 * MS, frame=""))
-    ros.wait_until(lambda: ros.reported("controller_node", "goals_pending") == "1", "the goal")
-    for stamp in range(10, 60, 2):
+    chain.await_goals()
+    for stamp in range(20, 50, 2):
 
         def send(stamp=stamp):
-            limits.publish(acceleration_limits(joints, stamp * MS, -wide, wide))
-            states.publish(joint_state(joints, stamp * MS, q, v))
+            chain.send_limits(stamp, -wide, wide)
+            chain.send_state(stamp, q, v)
 
-        ros.wait_until(lambda s=stamp: s * MS in commands.stamps, "an answer", each=send)
-        if stamp >= 20:
-            pose, *_ = meant.sample(1e-3 * (stamp - 20))
-            error = pin.log6(pose.actInv(node._controller.goals.pose_des)).vector
-            assert np.abs(error).max() < 1e-6
-    resting = node._controller.goals.pose_des.translation
-    assert resting == pytest.approx(start.translation, abs=1e-9)
+        core.goals.set_pose(*meant.sample(1e-3 * (stamp - 20)))
+        wanted = core.step(State(q, v), AccelerationRange(-wide, wide)).tau
+        found = chain.await_command(stamp, send).effort
+        np.testing.assert_allclose(found, wanted, atol=1e-4, err_msg=f"at {stamp} ms")  # N m
+    # It ends where it began.
+    ros.wait_until(lambda: float(chain.reported("position_error_m") or "nan") < 1e-6)

@@ -8,19 +8,14 @@ import pinocchio as pin
 import pytest
 import yaml
 from arms import load_arm
-from controller_chain import NODE, ControllerChain
+from controller_chain import NODE, ControllerChain, controller_of
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from std_srvs.srv import Trigger
 
-from torque_safety_controller.node.assembly import make_controller
 from torque_safety_controller.node.goal_messages import numbers_of
-from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.parts.contact import interaction
 from torque_safety_controller.parts.contact.interaction import Interaction
-from torque_safety_controller.parts.contact.wrench_sensor import STRONGEST
 from viability_bounds_pkg.exceptions import SettingError
-from viability_bounds_pkg.parameter import parameter_table, read
 from viability_bounds_pkg.robot.description import inertia_beyond, read_urdf
 from viability_bounds_pkg.ros.messages import pose_message
 from viability_bounds_pkg.ros.runtime import CONTROL_QOS, GOAL_QOS, set_stamp
@@ -28,17 +23,13 @@ from viability_bounds_pkg.state import State
 from viability_bounds_pkg.testing.ros_harness import read_config
 
 ARM = load_arm("panda")
-KNOWN = {row.name for row in parameter_table(ControllerConfiguration)}
 FORCES = {
     "ft_frame": "panda_link8",
     "force_directions": [0.0, 0.0, 1.0, 0.0, 0.0, 0.0],
     "yield_threshold": [10.0, 2.0],
     "contacts": ["{frame: panda_hand, point: [0, 0, 0.1], normal: [0, 0, -1], friction: 0.5}"],
 }
-VALUES = {k: v for k, v in (read_config("panda", NODE) | FORCES).items() if k in KNOWN} | {
-    "state_timeout": 20.0,
-    "bounds_timeout": 10.0,
-}
+VALUES = read_config("panda", NODE) | FORCES | {"state_timeout": 40.0, "bounds_timeout": 20.0}
 
 
 def weight() -> np.ndarray:
@@ -69,9 +60,7 @@ class WrenchChain(ControllerChain):
 
     def __init__(self, ros, **changed) -> None:
         super().__init__(ros, VALUES | changed)
-        self.measured = None
-        if changed.get("ft_frame") != "":
-            self.measured = ros.talk(WrenchStamped, "ft_wrench", CONTROL_QOS)
+        self.measured = ros.talk(WrenchStamped, "ft_wrench", CONTROL_QOS)
         self.targets = ros.talk(WrenchStamped, "target_wrench", GOAL_QOS)
         self.poses = ros.talk(PoseStamped, "target_pose", GOAL_QOS)
         self.stamp = 0
@@ -117,18 +106,11 @@ def test_a_pull_is_yielded_to_until_the_sensor_falls_silent(ros):
     assert hand.reported("mode") == "TRACKING"
     assert hand.reported("level") == DiagnosticStatus.WARN
     assert "sensor is silent" in hand.reported("message")
-    hand.feels = wrench(force=(0.0, 1.0, 0.0))
-    hand.until("compliance", "holding")
-
-
-def test_yielding_is_switched_by_the_threshold_and_an_empty_one_is_off(ros):
-    hand = WrenchChain(ros, yield_threshold=[])
     hand.feels = wrench(force=(0.0, 30.0, 0.0))
-    hand.give_pose()
+    hand.until("compliance", "yielding")
+    # An empty threshold switches it off.
+    ros.accepts(NODE, yield_threshold=[])
     hand.until("compliance", "off")
-    for threshold, found in (([10.0, 2.0], "yielding"), ([], "off")):
-        assert ros.set_parameters(NODE, yield_threshold=threshold)[0].successful
-        hand.until("compliance", found)
 
 
 def test_measurements_that_are_none_are_dropped_counted_and_named(ros):
@@ -136,7 +118,6 @@ def test_measurements_that_are_none_are_dropped_counted_and_named(ros):
     hand.feels = wrench(force=(0.0, 30.0, math.nan), frame="panda_link8")
     hand.give_pose()
     hand.until("wrenches_refused", "not six finite numbers")
-    assert hand.reported("compliance") == "sensor silent"
     hand.feels = wrench(force=(0.0, 30.0, 0.0), frame="moon")
     hand.until("wrenches_refused", "another frame_id")
     hand.feels = wrench(force=(0.0, 1e300, 0.0))
@@ -144,44 +125,36 @@ def test_measurements_that_are_none_are_dropped_counted_and_named(ros):
     assert hand.reported("compliance") == "sensor silent"
 
 
-def test_a_target_is_exerted_and_torques_say_so(ros, monkeypatch):
+def test_targets_that_cannot_be_exerted_are_refused_and_others_are_exerted(ros):
     """In contact with what gives exactly that back, the motors carry it."""
-    monkeypatch.setattr(interaction, "WRENCH_TIME", 1e-3)
-    monkeypatch.setattr(interaction, "FORCE_STEP", 20.0)
     hand = WrenchChain(ros, yield_threshold=[])
     hand.feels = wrench()
     hand.give_pose()
     before = hand.step()
+    for k, message in enumerate(
+        (wrench(force=(0.0, 0.0, math.inf)), wrench(force=(0.0, 0.0, 1e300)), wrench(frame="moon"))
+    ):
+        hand.targets.publish(message)
+        hand.until("goals_refused", f"target_wrench: {k + 1};")
+    assert hand.reported("compliance") != "force"
     hand.targets.publish(wrench(force=(0.0, 0.0, 10.0), frame="panda_hand"))
     hand.feels = wrench(force=(0.0, 0.0, -10.0))
     hand.until("compliance", "force")
-    for _ in range(300):  # until the target is reached
-        after = hand.step()
     robot = ARM.robot(0.0)
     robot.update(State(ARM.q_start, np.zeros(ARM.n)), np.zeros(ARM.n))
     pressed = robot.J.T @ np.array([0.0, 0.0, 10.0, 0.0, 0.0, 0.0])
-    np.testing.assert_allclose(after - before, pressed, atol=0.05)
+
+    def missing():
+        return np.abs(hand.step() - before - pressed).max()
+
+    ros.wait_until(lambda: missing() < 0.05, "the torques of the target")  # N m
 
 
-@pytest.mark.parametrize(
-    ("message", "changed"),
-    [
-        (wrench(force=(0.0, 0.0, math.inf)), {}),
-        (wrench(force=(0.0, 0.0, 1e300)), {}),
-        (wrench(frame="moon"), {}),
-        (wrench(force=(0.0, 0.0, 10.0)), {"force_directions": [0.0] * 6}),
-        (
-            wrench(force=(0.0, 0.0, 10.0)),
-            {"ft_frame": "", "force_directions": [0.0] * 6, "yield_threshold": []},
-        ),
-    ],
-)
-def test_targets_that_cannot_be_exerted_are_refused(ros, message, changed):
-    hand = WrenchChain(ros, **changed)
-    if changed.get("ft_frame") != "":
-        hand.feels = wrench()
+def test_without_a_direction_that_is_controlled_no_target_is_exerted(ros):
+    hand = WrenchChain(ros, force_directions=[0.0] * 6)
+    hand.feels = wrench()
     hand.give_pose()
-    hand.targets.publish(message)
+    hand.targets.publish(wrench(force=(0.0, 0.0, 10.0)))
     hand.until("goals_refused", "target_wrench")
     assert hand.reported("compliance") != "force"
 
@@ -189,15 +162,15 @@ def test_targets_that_cannot_be_exerted_are_refused(ros, message, changed):
 def test_after_the_strongest_wrenches_that_are_taken_the_arm_goes_on(ros):
     """Sums, squares and filters of larger ones would not be finite for ever."""
     hand = WrenchChain(ros)
-    most = 0.999 * STRONGEST  # without the weight of the hand
+    most = 0.999e5  # N; without the weight of the hand
     hand.feels = wrench(force=(most, -most, most), frame="panda_link8")
     hand.give_pose()
-    hand.targets.publish(wrench(force=(STRONGEST, STRONGEST, -STRONGEST), frame="panda_hand"))
+    hand.targets.publish(wrench(force=(1e5, 1e5, -1e5), frame="panda_hand"))
     hand.until("compliance", "force")
     hand.feels = wrench()
     hand.targets.publish(wrench(force=(0.0, 0.0, 1.0), frame="panda_hand"))
     hand.until("target_wrench", "1")
-    for _ in range(1000):  # 2 s
+    for _ in range(200):  # 0.4 s
         hand.step()
     assert hand.reported("mode") == "TRACKING"
 
@@ -210,7 +183,7 @@ def test_a_tare_takes_what_is_felt_for_the_bias_but_not_from_a_hand_that_is_led(
         hand.step()
     answer = ros.call(Trigger, f"{NODE}/tare_ft_sensor", Trigger.Request())
     assert answer.success
-    np.testing.assert_allclose(hand.node._controller.find(Interaction).sensor.bias[0], 4.0)
+    hand.until("ft_bias", "4 ")
     hand.feels = wrench(force=(40.0, 0.0, 0.0))
     hand.until("compliance", "yielding")
     answer = ros.call(Trigger, f"{NODE}/tare_ft_sensor", Trigger.Request())
@@ -221,11 +194,6 @@ def test_a_tare_takes_what_is_felt_for_the_bias_but_not_from_a_hand_that_is_led(
 # Parameters
 
 
-def build(**changed):
-    given = VALUES | changed
-    return make_controller(read(ControllerConfiguration, given))[0]
-
-
 def contact(**changed):
     given = {"frame": "panda_hand", "normal": [0.0, 0.0, -1.0], "friction": 0.5} | changed
     return yaml.safe_dump(given, default_flow_style=True)
@@ -234,25 +202,17 @@ def contact(**changed):
 @pytest.mark.parametrize(
     ("changed", "named"),
     [
-        ({"ft_frame": "moon"}, "ft_frame"),
         ({"ft_frame": "panda_link3"}, "ft_frame"),
         ({"ft_frame": ""}, "force_directions"),
         ({"ft_frame": "", "force_directions": [0.0] * 6}, "yield_threshold"),
-        ({"force_directions": [1.0] * 5}, "force_directions"),
         ({"force_directions": [0.5] * 6}, "force_directions"),
         ({"admittance_kp": [-1.0, 0.1]}, "admittance_kp"),
-        ({"admittance_kp": [0.1, math.inf]}, "admittance_kp"),
-        ({"admittance_kp": []}, "admittance_kp"),
         ({"yield_threshold": [0.0, 1.0]}, "yield_threshold"),
-        ({"contacts": [contact(frame="moon")]}, "contacts[0].frame"),
         ({"contacts": [contact(), contact(frame="panda_link8")]}, "contacts"),
-        ({"contacts": [contact(frame="")]}, "contacts[0].frame"),
         ({"contacts": [contact(point=[0.0, 1.0])]}, "contacts[0].point"),
         ({"contacts": [contact(normal=[0.0, 0.0, 0.0])]}, "contacts[0].normal"),
-        ({"contacts": [contact(normal="up")]}, "contacts[0].normal"),
         ({"contacts": [contact(friction=-0.5)]}, "contacts[0].friction"),
         ({"contacts": [contact(), contact(friction=0.1)]}, "contacts[1].friction"),
-        ({"contacts": [contact(), contact(normal=[0.0, 0.0, 1.0])]}, "contacts[1].normal"),
         ({"contacts": [contact(), contact(stiffness=1.0)]}, "contacts[1]"),
         ({"contacts": ["panda_hand"]}, "contacts[0]"),
         ({"contacts": [contact(frame="panda_link4")]}, "contacts"),
@@ -260,42 +220,21 @@ def contact(**changed):
 )
 def test_a_wrong_parameter_is_named(changed, named):
     with pytest.raises(SettingError) as error:
-        build(**changed)
+        controller_of(VALUES | changed)
     assert error.value.name == named
 
 
-def test_each_parameter_reaches_the_settings():
-    interaction = build(
-        admittance_kp=[0.2, 0.03],
-        yield_threshold=[3.0, 4.0],
-    ).find(Interaction)
-    settings = interaction.settings
-    np.testing.assert_array_equal(settings.admittance_kp, [0.2, 0.03])
-    np.testing.assert_array_equal(settings.yield_threshold, [3.0, 4.0])
-    np.testing.assert_array_equal(settings.force_directions, [0, 0, 1, 0, 0, 0])
-
-
-def test_what_a_tool_weighs_is_that_of_the_urdf():
-    """At rest, a sensor that feels the weight of Panda's hand measures no wrench."""
-    controller = build()
-    robot, sensor = controller.robot, controller.find(Interaction).sensor
-    robot.update(State(ARM.q_start, np.zeros(ARM.n)), np.zeros(ARM.n))
-    sensor.receive(WEIGHT)
-    sensor.update(robot.pose.rotation, 0.002)
-    assert np.abs(WEIGHT).max() > 5.0
-    assert np.abs(sensor.wrench).max() < 1e-6
-
-
-def test_points_of_one_link_are_one_contact():
+def test_parameters_reach_the_controller():
     corners = [[x, y, 0.1] for x in (-0.02, 0.02) for y in (-0.01, 0.01)]
-    controller = build(
-        contacts=[contact(point=corner) for corner in corners],
-    )
-    hand = controller.find(Interaction).contact
-    np.testing.assert_array_equal(hand.points, corners)
-    assert hand.friction == 0.5
-
-
-def test_without_a_sensor_there_is_nothing_to_do():
-    controller = build(ft_frame="", force_directions=[0.0] * 6, yield_threshold=[])
-    assert controller.find(Interaction) is None
+    changed = {
+        "admittance_kp": [0.2, 0.03],
+        "yield_threshold": [3.0, 4.0],
+        "contacts": [contact(point=corner) for corner in corners],
+    }
+    made = controller_of(VALUES | changed).find(Interaction)
+    np.testing.assert_array_equal(made.settings.admittance_kp, [0.2, 0.03])
+    np.testing.assert_array_equal(made.settings.yield_threshold, [3.0, 4.0])
+    np.testing.assert_array_equal(made.contact.points, corners)  # points of a link are one contact
+    assert made.contact.friction == 0.5
+    off = {"ft_frame": "", "force_directions": [0.0] * 6, "yield_threshold": []}
+    assert controller_of(VALUES | off).find(Interaction) is None
