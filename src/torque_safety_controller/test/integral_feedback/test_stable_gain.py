@@ -12,22 +12,18 @@ from viability_bounds_pkg.state import State
 
 DT = 0.002
 REST = np.zeros(7)
+ARM = load_arm("panda")
 
 
-@pytest.fixture(scope="module")
-def arm():
-    return load_arm("panda")
-
-
-def at(arm, q):
-    robot = arm.robot(DT)
+def at(q):
+    robot = ARM.robot(DT)
     robot.rates = True
     robot.update(State(q, REST), REST)
     return robot
 
 
-def action(arm, gain):
-    return IntegralAction("joints", IntegralSettings(arm.tau_max, gain), 2.0 * arm.tau_max)
+def action(gain):
+    return IntegralAction("joints", IntegralSettings(ARM.tau_max, gain), 2.0 * ARM.tau_max)
 
 
 def used(made, robot):
@@ -37,44 +33,43 @@ def used(made, robot):
 
 
 def radius(gain, M):
-    """Return by how much the errors of an ideal arm's speeds grow in a period, at most."""
+    """By how much the errors of an ideal arm's speeds grow in a period, at most."""
     step = np.eye(len(M)) - gain * DT * np.linalg.solve(M, np.diag(np.diag(M)))
     return np.abs(np.linalg.eigvals(step)).max()
 
 
-def test_errors_do_not_grow_in_any_posture_and_an_asked_gain_that_is_stable_is_kept(arm):
+def test_errors_do_not_grow_in_any_posture_and_a_stable_gain_is_kept():
     rng = np.random.default_rng(1)
     grows = 0
-    for _ in range(200):
-        robot = at(arm, arm.random_state(rng)[0])
+    for _ in range(60):
+        robot = at(ARM.random_state(rng)[0])
         M = robot.M
         grows += radius(100.0, M) > 1.0
-        gain = used(action(arm, 100.0), robot)
+        gain = used(action(100.0), robot)
         assert radius(gain, M) <= 1.0 + 1e-9
         largest = np.linalg.eigvals(np.linalg.solve(M, np.diag(np.diag(M)))).real.max()
         assert coupling(M) == pytest.approx(largest, rel=1e-9)
-        least = 1.0 / (DT * largest)
-        assert gain >= min(100.0, least / np.sqrt(2.0)) * 0.999  # no lower than it must be
-    assert 50 < grows < 190  # with the gain as asked
+        # No lower than it must be.
+        assert gain >= min(100.0, 1.0 / (DT * largest) / np.sqrt(2.0)) * 0.999
+    assert 15 < grows < 57  # with the gain as asked
 
 
-def test_it_follows_an_arm_that_moves(arm):
+def test_it_follows_an_arm_that_moves():
     rng = np.random.default_rng(2)
-    made = action(arm, 1000.0)
-    q, goal = arm.random_state(rng)[0], arm.random_state(rng)[0]
+    made = action(1000.0)
+    q, goal = (ARM.random_state(rng)[0] for _ in range(2))
     gains = []
-    for k in range(1500):
-        if k in (500, 1000):
-            q, goal = goal, arm.random_state(rng)[0]
-        robot = at(arm, q + (goal - q) * (k % 500) / 500)
+    for way in np.r_[np.linspace(0.0, 1.0, 400), np.linspace(1.0, 0.0, 400)]:
+        robot = at(q + way * (goal - q))
         gains.append(used(made, robot))
         assert radius(gains[-1], robot.M) <= 1.0 + 1e-9
-        assert gains[-1] >= 0.99 * used(action(arm, 1000.0), robot) / np.sqrt(2.0)
+        assert gains[-1] >= 0.99 * used(action(1000.0), robot) / np.sqrt(2.0)
     assert 3 < np.count_nonzero(np.diff(gains)) < 40
+    # In steps of sqrt(2).
     assert len(set(np.round(np.log2(1000.0 / np.array(gains)) * 2.0, 6) % 1.0)) == 1
 
 
-def test_a_matrix_that_is_none_has_no_coupling(arm):
-    M = at(arm, np.zeros(arm.n)).M
+def test_a_matrix_that_is_none_has_no_coupling():
+    M = at(REST).M
     for bad in (np.full_like(M, np.nan), -M, np.zeros_like(M)):
         assert np.isnan(coupling(bad))

@@ -3,42 +3,41 @@
 
 import numpy as np
 
-from torque_safety_controller.anti_windup import nearest_with_leak
 from torque_safety_controller.integral_feedback import (
     ArmTerms,
     IntegralFeedback,
+    IntegralSettings,
 )
 
 N = 5
-DT = 1e-3
 SHARP = 1e-12  # relative; rounding and nothing else
 ROUGH = 1e-9
 
 
-def random_dynamics(rng, n=N, speed=1.0):
-    """A mass matrix and any C: what is said below does not need it to be a robot's."""
-    A = rng.normal(size=(n, n))
-    return A @ A.T + 0.3 * np.eye(n), speed * rng.normal(size=(n, n))
+def random_dynamics(rng, speed=1.0):
+    """A mass matrix and any C: what is shown with them does not need it to be a robot's."""
+    A = rng.normal(size=(N, N))
+    return A @ A.T + 0.3 * np.eye(N), speed * rng.normal(size=(N, N))
 
 
 def arm_terms(M, C, v=None) -> ArmTerms:
-    """Terms of an arm without a task."""
-    n = len(M)
-    no_task = np.zeros((0, n))
-    return ArmTerms(M, C, no_task, no_task, np.zeros(n) if v is None else v)
+    """Terms of an arm without a task; at rest without `v`."""
+    v = np.zeros(len(M)) if v is None else v
+    no_task = np.zeros((0, len(M)))
+    return ArmTerms(np.ascontiguousarray(M), np.ascontiguousarray(C), no_task, no_task, v)
 
 
-def begun(law, v=None) -> IntegralFeedback:
+def begun(settings: IntegralSettings, v=None) -> IntegralFeedback:
     """An integral action at the beginning, at this velocity."""
-    feedback = IntegralFeedback(law)
-    zero = np.zeros((len(law.budget),) * 2)
+    feedback = IntegralFeedback(settings)
+    zero = np.zeros((len(settings.budget),) * 2)
     feedback.reset(arm_terms(zero, zero, v))
     return feedback
 
 
-def at_state(law, fast, slow=None) -> IntegralFeedback:
+def at_state(settings: IntegralSettings, fast, slow=None) -> IntegralFeedback:
     """An integral action with these integrators."""
-    feedback = begun(law)
+    feedback = begun(settings)
     feedback.memory.fast[:] = fast
     feedback.memory.slow[:] = fast if slow is None else slow
     return feedback
@@ -47,23 +46,3 @@ def at_state(law, fast, slow=None) -> IntegralFeedback:
 def torque_now(feedback, M, C):
     """The torque of a step that takes no time."""
     return feedback.torque(arm_terms(M, C), np.zeros(len(M)), 0.0)
-
-
-def uncorrected(law, s, M, C):
-    """Torque and leak of (11*) for this s, before the integrators are corrected."""
-    limit = law.budget
-    Ks = law.gain * np.diag(M) * s
-    w = C @ s + np.clip(Ks, -limit, limit)
-    return nearest_with_leak(M, s, C @ s + Ks, limit, w)
-
-
-def moving(feedback, rng, steps=50):
-    """Some steps of a slow motion; the terms after them and the torques."""
-    M, C = np.diag(rng.uniform(0.5, 2.0, N)), 0.2 * rng.normal(size=(N, N))
-    v, torques = np.zeros(N), []
-    feedback.reset(arm_terms(M, C))
-    for k in range(steps):
-        v = v + DT * rng.normal(size=N)
-        a_ref = 3.0 * np.cos(0.05 * k + np.arange(N))
-        torques.append(feedback.torque(arm_terms(M, C, v), a_ref, DT))
-    return arm_terms(M, C, v), np.array(torques)
