@@ -1,21 +1,82 @@
 # SPDX-License-Identifier: Apache-2.0
 """Null-space compliance of simulated arms: what it is for, its limits, and what it refuses."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from compliance_run import DT, ComplianceRun, energy, hand_errors, started, unlimited
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from task_arm import TaskArm
+from task_arm import TaskArm, arm_terms
 
 from torque_safety_controller.integral_feedback import (
+    ArmTerms,
     IntegralFeedback,
+    IntegralSettings,
 )
 from torque_safety_controller.integral_feedback.nullspace import (
     NullspaceCompliance,
     TaskShapeError,
+    fast_weight,
 )
 from torque_safety_controller.integral_feedback.nullspace_step import THRESHOLD, torque_matrix
+
+DT = 2e-3
+
+
+def unlimited(n, **changes) -> IntegralSettings:
+    return IntegralSettings(np.full(n, np.inf), **changes)
+
+
+def energy(compliance, M) -> float:
+    """What the memory stores, J."""
+    a, x = compliance.memory.a, compliance.memory.root / np.sqrt(np.diag(M))
+    weight = fast_weight(compliance.settings)
+    return 0.5 * (a @ M @ a + weight * x @ (np.diag(M) * x))
+
+
+class ComplianceRun:
+    """An arm with friction and heavy rotors that holds its hand still."""
+
+    def __init__(self, robot="talos", rows=6, q=None, stiffness=0.0):
+        self.arm, self.stiffness = TaskArm(robot, rows, armature=0.15), stiffness
+        self.q = self.arm.posture.copy() if q is None else np.array(q, dtype=float)
+        self.v, self.a_ref = np.zeros((2, self.arm.n))
+        self.hand = self.arm.hand(self.q)
+        self.terms = self.arm.terms(self.q, self.v)
+        self.errors, self.torques = [], []
+
+    @property
+    def now(self) -> ArmTerms:
+        return arm_terms(self.terms, self.v)
+
+    def started(self, settings, kind=NullspaceCompliance):
+        """An integral action without any memory."""
+        action = kind(settings, self.arm.rows) if kind is NullspaceCompliance else kind(settings)
+        action.reset(self.now)
+        return action
+
+    def move(self, added, disturbance=0.0, push=None, a_ref=None):
+        """Hold the model's and the added torque for a control period; `push` is on the elbow."""
+        t, error = self.terms, np.zeros(6)
+        if a_ref is None:
+            a_ref, error = self.arm.reference(
+                self.q, self.v, t, self.hand, stiffness=self.stiffness
+            )
+        self.a_ref = a_ref
+        tau = t.M @ a_ref + t.h + added + disturbance
+        if push is not None:
+            tau = tau + self.arm.push(self.q, np.array(push))
+        self.q, self.v = self.arm.move(self.q, self.v, tau, DT, friction=2.0)
+        self.terms = self.arm.terms(self.q, self.v)
+        self.errors.append(np.linalg.norm(error[:3]))
+        self.torques.append(added)
+
+    def go(self, action, duration, **others):
+        for _ in range(round(duration / DT)):
+            self.move(action.torque(self.now, self.a_ref, DT), **others)
+        return self
+
 
 # What it is for
 
@@ -25,55 +86,39 @@ def test_elbow_moves_further_and_the_hand_no_further():
     moved, errors = {}, {}
     for kind in (IntegralFeedback, NullspaceCompliance):
         run = ComplianceRun()
-        action = kind(unlimited(9)) if kind is IntegralFeedback else kind(unlimited(9), 6)
-        action.reset(run.now)
+        action = run.started(unlimited(9), kind)
         run.go(action, 0.1).go(action, 2.0, push=[0.0, 40.0, 0.0])
-        moved[kind], errors[kind] = np.abs(run.q - run.arm.posture).max(), hand_errors(run).max()
+        moved[kind], errors[kind] = np.abs(run.q - run.arm.posture).max(), max(run.errors)
     assert moved[NullspaceCompliance] > 2.5 * moved[IntegralFeedback] > 0.1
     assert errors[NullspaceCompliance] < 0.005
     assert errors[NullspaceCompliance] < 1.1 * errors[IntegralFeedback]
 
 
-def test_a_constant_disturbance_is_integrated_away_while_the_null_space_is_free():
+@pytest.mark.parametrize("slow", [0.0, 0.1])
+def test_a_constant_disturbance_is_integrated_away(slow):
     """Wrong masses. Without forgetting the hand's error goes to zero, else to what theory says."""
-    arm = TaskArm("panda")
-    weight = -0.1 * arm.terms(arm.posture, np.zeros(7)).h
-    assert np.abs(weight).max() > 2.0
-
-    def steady(kind=NullspaceCompliance, **changes):
-        run = ComplianceRun("panda", stiffness=20.0)
-        law = unlimited(7, gain=6.0, **changes)
-        action = kind(law) if kind is IntegralFeedback else kind(law, 6)
-        action.reset(run.now)
-        run.go(action, 6.0, disturbance=weight)
-        return run, np.linalg.norm(run.errors[-1]), np.abs(run.q - arm.posture).max()
-
-    alone = ComplianceRun("panda", stiffness=20.0)
-    for _ in range(500):
-        alone.move(0.0, disturbance=weight)
-    without = np.linalg.norm(alone.errors[-1])
-    assert without > 4e-3
-    _, error, moved = steady(slow_leak_rate=0.0)
-    assert error < 1e-3 * without
-    _, _, moved_stiff = steady(IntegralFeedback, slow_leak_rate=0.0)
-    assert moved > 3.0 * moved_stiff
-    run, error, _ = steady(slow_leak_rate=0.1)
-    # At rest s' = 0.1 a + 99.9 N a and a_fast = 0.001 a.
+    run = ComplianceRun("panda", stiffness=20.0)
+    weight = -0.1 * run.terms.h
+    run.go(run.started(unlimited(7, gain=6.0, slow_leak_rate=slow)), 5.0, disturbance=weight)
+    # At rest s' = slow a + (100 - slow) N a and a_fast = 0.01 s'.
     M, J = run.terms.M, run.terms.J
     K = 6.0 * np.diag(np.diag(M))
     P = np.linalg.solve(M, J.T) @ np.linalg.inv(J @ np.linalg.solve(M, J.T)) @ J
-    leak = 0.1 * np.eye(7) + 99.9 * (np.eye(7) - P)
-    a = np.linalg.solve(M @ leak + 0.5 * P.T @ K @ P + 0.5 * K * 1e-3, -weight)
-    assert error == pytest.approx(np.linalg.norm(0.1 * J @ a / 400.0), rel=0.03)
+    leak = slow * np.eye(7) + (100.0 - slow) * (np.eye(7) - P)
+    a = np.linalg.solve(M @ leak + 0.5 * P.T @ K @ P + 0.5 * K * slow / 100.0, -weight)
+    expected = np.linalg.norm(slow * (J @ a)[:3] / 400.0)
+    assert run.errors[-1] == pytest.approx(expected, rel=0.03, abs=4e-6)
+    without = np.linalg.norm((J @ np.linalg.solve(M, weight))[:3] / 400.0)
+    assert expected < 0.2 * without > 4e-4
 
 
 def test_a_push_that_lasts_does_not_make_it_grow():
     """An arm held off its posture; the law as printed would double its memory."""
     run = ComplianceRun(stiffness=20.0)
-    compliance = started(run, unlimited(9))
+    compliance = run.started(unlimited(9))
     half = []
     for _ in range(2):
-        run.go(compliance, 2.5, push=[0.0, 30.0, 0.0])
+        run.go(compliance, 1.5, push=[0.0, 30.0, 0.0])
         half.append(np.linalg.norm(compliance.memory.a))
     assert half[1] < 1.1 * half[0]
 
@@ -82,62 +127,164 @@ def test_singular_start():
     """From a stretched-out arm to where the hand is free to move, then holding it there."""
     run = ComplianceRun("panda", q=np.zeros(7))
     assert np.linalg.svd(run.terms.J)[1][-1] < 1e-15
-    compliance = started(run, unlimited(7))
+    compliance = run.started(unlimited(7))
     for _ in range(round(1.5 / DT)):
-        added = compliance.torque(*run.arguments())
+        added = compliance.torque(run.now, run.a_ref, DT)
         run.move(added, a_ref=20.0 * (run.arm.posture - run.q) - 9.0 * run.v)
     assert np.linalg.svd(run.terms.J)[1][-1] > THRESHOLD
     run.hand = run.arm.hand(run.q)
     run.go(compliance, 1.0)
     assert np.abs(run.torques).max() < 15.0
-    assert hand_errors(run)[-1] < 0.002
+    assert run.errors[-1] < 0.002
 
 
 # The gains
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(1, 6), st.floats(0.0, 1.0))
-@settings(max_examples=100, deadline=None, derandomize=True)
-def test_gain_matrix_is_positive(seed, m, mu):
-    """Semidefinite always; definite with a fast memory."""
-    rng = np.random.default_rng(seed)
+@given(st.integers(0, 2**32 - 1).map(np.random.default_rng), st.integers(1, 6), st.floats(0, 1))
+@settings(max_examples=60, deadline=None, derandomize=True)
+def test_torque_is_that_of_the_paper_with_a_positive_gain(rng, m, mu):
+    """(21) with (26); semidefinite always, definite with a fast memory."""
     n = 7
-    J, J_plus = rng.normal(size=(m, n)), rng.normal(size=(n, m))
-    M = np.diag(rng.uniform(0.01, 3.0, n))
-    K = 2.0 * np.diag(M)
-    # At rest: neither C nor J'.
-    H = torque_matrix(J, 0.0 * J, M, 0.0 * M, 2.0, mu, J_plus, 0.0 * J_plus)
-    np.testing.assert_allclose(H, H.T, atol=1e-12 * np.abs(H).max())
-    P = J_plus @ J
-    expected = (1.0 - mu) * P.T @ np.diag(K) @ P + mu * np.diag(K)
-    # And in motion it is (21) with (26).
-    C, J_dot = rng.normal(size=(n, n)), rng.normal(size=(m, n))
-    rates, a = rng.normal(size=(n, m)), rng.normal(size=n)
+    J, J_dot, J_plus, rates = rng.normal(size=(4, m, n))
+    J_plus, rates = np.ascontiguousarray(J_plus.T), np.ascontiguousarray(rates.T)
+    M, C, a = np.diag(rng.uniform(0.01, 3.0, n)), rng.normal(size=(n, n)), rng.normal(size=n)
+    K, P = 2.0 * M, J_plus @ J
+    expected = (1.0 - mu) * P.T @ K @ P + mu * K
+    at_rest = torque_matrix(J, 0.0 * J, M, 0.0 * M, 2.0, mu, J_plus, 0.0 * J_plus)
+    np.testing.assert_allclose(at_rest, expected, atol=1e-12 * np.abs(expected).max())
     found = torque_matrix(J, J_dot, M, C, 2.0, mu, J_plus, rates) @ a
     s, integral = a - P @ a, -J @ a
     torque = C @ a - M @ (J_plus @ J_dot @ s + rates @ integral) + expected @ a
     np.testing.assert_allclose(found, torque, atol=1e-11 * np.abs(torque).max())
-    np.testing.assert_allclose(H, expected, atol=1e-12 * H.max())
-    smallest = np.linalg.eigvalsh(H)[0]
-    assert smallest >= -1e-12 * H.max()
-    if mu > 0.1:
-        assert smallest > 0.9 * mu * K.min()
+    smallest = np.linalg.eigvalsh(at_rest)[0]
+    assert smallest >= -1e-12 * at_rest.max()
+    assert smallest > 0.9 * mu * np.diag(K).min() or mu < 0.1
+
+
+# Limits
+
+
+@given(
+    st.integers(0, 2**32 - 1).map(np.random.default_rng),
+    st.integers(1, 6),
+    st.sampled_from([0.0, 0.01, 1.0, 100.0, np.inf]),
+)
+@settings(max_examples=80, deadline=None, derandomize=True)
+def test_always_finite_and_within_the_budget(rng, m, budget):
+    """Any motion, rank and size of J, however sudden: nothing is promised of it but that."""
+    n = 7
+    budgets = budget * rng.uniform(0.5, 1.0, n) if 0.0 < budget < np.inf else np.full(n, budget)
+    law = IntegralSettings(
+        budgets,
+        mu=rng.choice([0.0, 0.5, 1.0]),
+        slow_leak_rate=rng.choice([0.0, 0.1, 3.0]),
+        fast_leak_rate=rng.choice([3.0, 100.0]),
+    )
+    compliance = NullspaceCompliance(law, m)
+    for _ in range(20):
+        rank = rng.integers(0, m + 1)
+        J, J_dot = rng.normal(size=(2, m, n)) * 10.0 ** rng.uniform(-6.0, 1.0, (2, 1, 1))
+        J[rank:] = 0.0
+        A, C = rng.normal(size=(2, n, n))
+        M = A @ A.T + 10.0 ** rng.uniform(-3.0, 0.0) * np.eye(n)
+        v, a_ref = rng.normal(size=(2, n)) * 10.0 ** rng.uniform(-3.0, 3.0, (2, 1))
+        tau = compliance.torque(ArmTerms(M, C, J, J_dot, v), a_ref, rng.choice([0.0, 1e-3, 1.0]))
+        assert np.isfinite(tau).all()
+        assert (np.abs(tau) <= budgets).all()
+        assert np.isfinite(energy(compliance, M))
+
+
+def with_memory(seed):
+    """A moving arm, and twice a memory from a random torque."""
+    run, rng = ComplianceRun("talos"), np.random.default_rng(seed)
+    run.v = 0.5 * rng.normal(size=9)
+    run.terms = run.arm.terms(run.q, run.v)
+    run.a_ref = run.v.copy()
+    torque = np.diag(run.terms.M) * rng.normal(size=9)
+    twins = [NullspaceCompliance(unlimited(9), 6) for _ in range(2)]
+    for each in twins:
+        each.initialise(torque, run.now)
+    return run, *twins
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_limiting_takes_energy_away_and_never_adds_any(seed):
+    """The memory after limiting gives just the limited torque, and stores no more."""
+    run, wide, tight = with_memory(seed)
+    free = wide.torque(run.now, run.a_ref, DT)
+    budgets = np.abs(free) * np.random.default_rng(seed).uniform(0.3, 2.0, 9)
+    tight.settings = replace(tight.settings, budget=budgets)
+    got = tight.torque(run.now, run.a_ref, DT)
+    assert tight.saturated.any() and not wide.saturated.any()
+    assert (np.abs(got) <= budgets).all()
+    M = run.terms.M
+    assert energy(tight, M) <= energy(wide, M) * (1.0 + 1e-12)
+    # Without more error it goes on from there.
+    after = tight.torque(run.now, run.a_ref, 0.0)
+    np.testing.assert_allclose(after, got, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_one_limited_joint_does_not_weaken_the_others(seed):
+    """By (10) all torques would fall to nine tenths; here only the limited joint's does."""
+    run, wide, tight = with_memory(seed)
+    free = wide.torque(run.now, run.a_ref, DT)
+    j = int(np.argmax(np.abs(free)))
+    others = np.arange(9) != j
+    budget = np.where(others, np.inf, 0.9 * np.abs(free))
+    tight.settings = replace(tight.settings, budget=budget)
+    got = tight.torque(run.now, run.a_ref, DT)
+    assert abs(got[j]) == pytest.approx(0.9 * abs(free[j]), rel=1e-9)
+    np.testing.assert_allclose(got[others], free[others], atol=0.02 * np.abs(free).max())
+    assert tight.saturated[j] and not tight.saturated[others].any()
+
+
+def test_it_leaves_its_limits_at_once():
+    """A hand that was held off for seconds returns without the swing of an integral wound up."""
+    swings = []
+    for budget in (np.inf, 3.0):
+        run = ComplianceRun("panda")
+        compliance = run.started(IntegralSettings(np.full(7, budget)))
+        for k in range(round(3.0 / DT)):
+            force = run.terms.J[:3].T @ np.array([0.0, 60.0, 0.0]) if k * DT < 2.0 else 0.0
+            run.move(compliance.torque(run.now, run.a_ref, DT), disturbance=force)
+        assert np.abs(run.torques).max() <= budget
+        swings.append(max(run.errors[round(2.3 / DT) :]))
+    assert swings[1] < 0.4 * swings[0]
 
 
 # What can go wrong
 
 
+def test_of_an_initial_torque_the_task_keeps_what_it_feels():
+    run = ComplianceRun("talos")
+    compliance = NullspaceCompliance(unlimited(9), 6)
+    torque = 5.0 * np.cos(np.arange(9))
+    J, M = run.terms.J, run.terms.M
+    felt = J @ np.linalg.solve(M, torque)
+    first = compliance.initialise(torque, run.now)
+    np.testing.assert_allclose(J @ np.linalg.solve(M, first), felt, atol=1e-9)
+    for _ in range(round(2.0 / DT)):  # nothing moves, nothing is asked for
+        later = compliance.torque(run.now, run.a_ref, DT)
+    left = np.exp(-0.1 * 2.0)  # the slow memory leaks
+    np.testing.assert_allclose(J @ np.linalg.solve(M, later), left * felt, rtol=0.01, atol=0.01)
+    task = J.T @ np.linalg.solve(J @ np.linalg.solve(M, J.T), felt)
+    np.testing.assert_allclose(later, left * task, atol=0.02)
+    assert np.abs(torque - task).max() > 1.0
+
+
 def test_starts_from_zero_and_a_pause_is_no_kick():
     run = ComplianceRun()
     run.v = np.ones(9)
-    compliance = started(run, unlimited(9))
-    np.testing.assert_array_equal(compliance.torque(*run.arguments()), 0.0)
+    compliance = run.started(unlimited(9))
+    np.testing.assert_array_equal(compliance.torque(run.now, run.a_ref, DT), 0.0)
     run.v = np.zeros(9)
     run.go(compliance, 0.3, push=[0.0, 30.0, 0.0])
     before, stored = run.torques[-1], energy(compliance, run.terms.M)
     run.v = run.v + 1.0  # who knows why
     compliance.skip(run.now, 0.2)
-    assert energy(compliance, run.terms.M) < stored
+    assert energy(compliance, run.terms.M) == pytest.approx(np.exp(-2 * 0.1 * 0.2) * stored)
     after = compliance.torque(run.now, run.a_ref, 0.0)
     assert np.abs(after - before).max() < 0.6 * np.abs(before).max()
     compliance.reset(run.now)
@@ -145,11 +292,10 @@ def test_starts_from_zero_and_a_pause_is_no_kick():
 
 
 def test_bad_input_changes_nothing():
-    run, twin = ComplianceRun(), ComplianceRun()
-    compliances = [started(each, unlimited(9)) for each in (run, twin)]
-    for each, compliance in zip((run, twin), compliances, strict=True):
-        each.go(compliance, 0.1, push=[0.0, 30.0, 0.0])
-    compliance, now = compliances[0], run.now
+    run = ComplianceRun()
+    compliance = run.started(unlimited(9))
+    run.go(compliance, 0.1, push=[0.0, 30.0, 0.0])
+    now, before = run.now, [x.copy() for x in compliance.memory]
     for name in now._fields:
         bad = getattr(now, name).copy()
         bad.flat[0] = np.nan
@@ -157,30 +303,26 @@ def test_bad_input_changes_nothing():
             compliance.torque(now._replace(**{name: bad}), run.a_ref, DT)
     with pytest.raises(ValueError, match="finite"):
         compliance.torque(now, np.full(9, np.nan), DT)
-    negative = now._replace(M=-now.M)
-    for M in (negative, now._replace(M=0.0 * now.M)):
+    for M in (-now.M, 0.0 * now.M):
         with pytest.raises(ValueError, match="positive definite"):
-            compliance.torque(M, run.a_ref, DT)
+            compliance.torque(now._replace(M=M), run.a_ref, DT)
         with pytest.raises(ValueError, match="positive definite"):
-            compliance.initialise(np.ones(9), M)
+            compliance.initialise(np.ones(9), now._replace(M=M))
     with pytest.raises(ValueError, match="finite"):
         compliance.initialise(np.full(9, np.nan), now)
     with pytest.raises(ValueError, match="v must be"):
         compliance.skip(now._replace(v=np.full(9, np.inf)), DT)
-    expected = compliances[1].torque(*twin.arguments())
-    np.testing.assert_array_equal(compliance.torque(*run.arguments()), expected)
+    for x, y in zip(compliance.memory, before, strict=True):
+        np.testing.assert_array_equal(x, y)
 
 
-@pytest.mark.parametrize("m", [0, 7, 8])
-def test_a_task_without_null_space_is_refused(m):
-    with pytest.raises(TaskShapeError, match=f"a task of {m} rows for 7 joints; .* 1 to 6 rows"):
-        NullspaceCompliance(unlimited(7), m)
-
-
-@pytest.mark.parametrize("m", range(1, 7))
-def test_any_task_with_a_null_space_is_served(m):
-    run = ComplianceRun("panda", rows=m)
-    compliance = started(run, unlimited(7), m)
-    run.go(compliance, 0.1, push=[0.0, 30.0, 0.0])
-    assert np.abs(run.terms.J @ compliance.memory.a).max() > 1e-4
-    assert np.isfinite(run.torques).all()
+def test_only_a_task_with_a_null_space_is_served():
+    for m in (0, 7, 8):
+        message = f"a task of {m} rows for 7 joints; .* 1 to 6 rows"
+        with pytest.raises(TaskShapeError, match=message):
+            NullspaceCompliance(unlimited(7), m)
+    for m in (1, 6):
+        run = ComplianceRun("panda", rows=m)
+        compliance = run.started(unlimited(7))
+        run.go(compliance, 0.1, push=[0.0, 30.0, 0.0])
+        assert np.abs(run.terms.J @ compliance.memory.a).max() > 1e-4

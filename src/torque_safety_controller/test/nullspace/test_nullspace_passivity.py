@@ -7,7 +7,7 @@ from task_arm import TaskArm, arm_terms
 
 from torque_safety_controller.integral_feedback import IntegralSettings
 from torque_safety_controller.integral_feedback.leaky_integrator import leak_factors
-from torque_safety_controller.integral_feedback.nullspace import NullspaceCompliance, fast_weight
+from torque_safety_controller.integral_feedback.nullspace import NullspaceCompliance
 from torque_safety_controller.integral_feedback.nullspace_step import (
     THRESHOLD,
     dynamically_consistent_inverse,
@@ -17,7 +17,7 @@ NEVER_FORGETS = dict(slow_leak_rate=0.0, fast_leak_rate=0.0)
 """(23) to the letter: a alone decides, and does not leak."""
 TWO_RATES = dict(slow_leak_rate=0.3, fast_leak_rate=20.0)
 # The Panda's elbow nearly stretched: the hand loses a direction.
-STRETCHED = 0.25 * np.array([0.3, 0.4, 0.2, -1.6, 0.1, 2.0, 0.5])
+STRETCHED = dict(posture=0.25 * TaskArm("panda").posture, speed=0.02)
 
 
 class PassivityLoop:
@@ -35,21 +35,22 @@ class PassivityLoop:
         self.disturbance = disturbance * weights * np.sin(1.0 + np.arange(n))
         torque = weights * np.cos(2.0 * np.arange(n))
         self.torque = self.compliance.initialise(torque, arm_terms(self.terms, self.v))
-        self.act()
         self.step()
 
-    def act(self):
-        n = self.arm.n
+    def step(self):
+        """Play a control period."""
+        n, t = self.arm.n, self.terms
         self.a_ref = 40.0 * (self.posture - self.q) - 10.0 * self.v
         self.a_ref += 3.0 * np.sin(3.0 * self.t + np.arange(n))
-        t = self.terms
         tau = t.M @ self.a_ref + t.h + self.torque + self.disturbance
         self.q, self.v = self.arm.move(self.q, self.v, tau, self.dt)
         self.t += self.dt
+        self.terms = self.arm.terms(self.q, self.v)
+        self.torque = self.compliance.torque(arm_terms(self.terms, self.v), self.a_ref, self.dt)
 
-    def step(self):
-        self.terms = t = self.arm.terms(self.q, self.v)
-        self.torque = self.compliance.torque(arm_terms(t, self.v), self.a_ref, self.dt)
+    @property
+    def a(self):
+        return self.compliance.memory.a
 
     def inverse(self):
         t = self.terms
@@ -58,124 +59,91 @@ class PassivityLoop:
     def near_singular(self):
         return np.linalg.svd(self.terms.J)[1][-1] < THRESHOLD
 
-    def forgotten(self):
-        """x = a - a_fast."""
-        return self.compliance.memory.root / np.sqrt(np.diag(self.terms.M))
-
-    def energy(self):
-        """W of the documentation."""
-        a, x = self.compliance.memory.a, self.forgotten()
-        M = self.terms.M
-        return 0.5 * (a @ M @ a + fast_weight(self.settings) * x @ (np.diag(M) * x))
-
-    def power(self):
-        """What the energy should change by, W: the terms of the proof in the documentation."""
-        g, t = self.settings, self.terms
-        P = self.inverse() @ t.J
-        a, x = self.compliance.memory.a, self.forgotten()
-        fast, slow = a - x, P @ a
-        K, slow_rate, fast_rate = g.gain * np.diag(t.M), g.slow_leak_rate, g.fast_leak_rate
+    def energy_and_power(self):
+        """W of docs/theory/nullspace.md, and what it should change by: the terms of the proof."""
+        g, M, a = self.settings, self.terms.M, self.a
+        P, K = self.inverse() @ self.terms.J, g.gain * np.diag(M)
+        x = self.compliance.memory.root / np.sqrt(np.diag(M))  # a - a_fast
+        fast, slow, rates = a - x, P @ a, g.fast_leak_rate - g.slow_leak_rate
+        energy = 0.5 * a @ M @ a
         power = -(1.0 - g.mu) * slow @ (K * slow) - g.mu * fast @ (K * fast)
-        power -= slow_rate * a @ t.M @ a
-        power -= (fast_rate - slow_rate) * a @ t.M @ (a - P @ a)
-        if fast_rate > slow_rate:
-            power -= slow_rate * g.mu * x @ (K * x) / (fast_rate - slow_rate)
-        return power - a @ self.disturbance
+        power -= g.slow_leak_rate * a @ M @ a + rates * a @ M @ (a - P @ a)
+        if rates > 0.0:
+            energy += 0.5 * g.mu / rates * x @ (K * x)
+            power -= g.slow_leak_rate * g.mu / rates * x @ (K * x)
+        return energy, power - a @ self.disturbance
 
 
 def energy_balance(loop, duration):
-    """Energies and the largest difference from what the integrated power makes of the first."""
-    energies, expected = [loop.energy()], loop.energy()
-    power, off = loop.power(), 0.0
+    """Energies, and the largest difference from what the powers make of the first, relative."""
+    W, power = loop.energy_and_power()
+    energies, expected, off = [W], W, 0.0
     for _ in range(round(duration / loop.dt)):
-        loop.act()
         loop.step()
-        now = loop.power()
-        expected += 0.5 * loop.dt * (power + now)
-        power = now
-        energies.append(loop.energy())
-        off = max(off, abs(energies[-1] - expected))
+        last, (W, power) = power, loop.energy_and_power()
+        expected += 0.5 * loop.dt * (last + power)
+        energies.append(W)
+        off = max(off, abs(W - expected) / energies[0])
     return np.array(energies), off
 
 
-@pytest.mark.parametrize("robot, rows", [("panda", 6), ("panda", 3), ("talos", 6), ("talos", 8)])
-def test_energy_falls_at_the_rate_of_the_theory(robot, rows):
-    """V = a'Ma/2 falls by what the gains take; what is off halves with the period."""
+@pytest.mark.parametrize(
+    ("robot", "rows", "others"),
+    [
+        ("panda", 3, NEVER_FORGETS),
+        ("talos", 8, NEVER_FORGETS),
+        ("panda", 6, TWO_RATES | STRETCHED),
+    ],
+)
+def test_energy_falls_at_the_rate_of_the_theory(robot, rows, others):
+    """Also near a singularity; what is off halves with the period, or more."""
     offs = []
     for dt in (1e-3, 5e-4):
-        energies, off = energy_balance(PassivityLoop(robot, rows, dt, **NEVER_FORGETS), 0.25)
+        loop = PassivityLoop(robot, rows, dt, **others)
+        assert loop.near_singular() == ("posture" in others)
+        energies, off = energy_balance(loop, 0.2)
         assert (np.diff(energies) < 0.0).all()
-        assert off < 0.005 * energies[0]
         offs.append(off)
-    # Less than half is as good: then first-order parts of different sign met.
+    assert offs[0] < 0.005 or "posture" in others
     assert offs[1] < 0.6 * offs[0]
 
 
-@pytest.mark.parametrize("robot, rows", [("panda", 6), ("talos", 3)])
-def test_energy_of_the_two_rate_law_with_a_disturbance(robot, rows):
+def test_energy_with_two_rates_and_a_disturbance():
     """The storage function of the documentation, with all its terms, a changing M included."""
     offs = []
     for dt in (1e-3, 5e-4):
-        loop = PassivityLoop(robot, rows, dt, disturbance=1.0, **TWO_RATES)
-        energies, off = energy_balance(loop, 0.25)
-        assert off < 0.01 * energies[0]
-        offs.append(off)
+        loop = PassivityLoop("panda", 6, dt, disturbance=1.0, **TWO_RATES)
+        offs.append(energy_balance(loop, 0.25)[1])
+    assert offs[0] < 0.01
     assert 0.4 * offs[0] < offs[1] < 0.6 * offs[0]
 
 
-def test_energy_falls_near_a_singularity_too():
-    """With a direction damped (23) still holds, and with it passivity."""
-    offs = []
-    for dt in (1e-3, 5e-4):
-        loop = PassivityLoop("panda", 6, dt, posture=STRETCHED, speed=0.02, **TWO_RATES)
-        near = loop.near_singular()
-        energies, off = energy_balance(loop, 0.1)
-        assert near
-        assert (np.diff(energies) < 0.0).all()
-        offs.append(off)
-    assert offs[1] < 0.6 * offs[0]
-
-
-@pytest.mark.parametrize("slow", [0.0, 2.0])
-@pytest.mark.parametrize("robot, rows", [("panda", 6), ("talos", 3), ("talos", 8)])
+@pytest.mark.parametrize(("robot", "rows", "slow"), [("panda", 6, 0.0), ("talos", 8, 2.0)])
 def test_integral_of_the_task_error_is_exact(robot, rows, slow):
-    """J a is the sum of J s' in the middle of the steps, leaking slowly: to rounding."""
+    """(25): J a is the sum of J s' in the middle of the steps, leaking slowly: to rounding."""
     dt = 1e-3
     loop = PassivityLoop(robot, rows, dt, disturbance=1.0, slow_leak_rate=slow)
     decay, gain = leak_factors(slow, dt, False)
-    expected = loop.terms.J @ loop.compliance.memory.a
-    largest = 0.0
-    for _ in range(300):
+    expected, largest = loop.terms.J @ loop.a, 0.0
+    for _ in range(200):
         J, v = loop.terms.J, loop.v
-        loop.act()
         loop.step()
         error = loop.a_ref * dt - (loop.v - v)
         expected = decay * expected + gain * 0.5 * (J + loop.terms.J) @ error
         largest = max(largest, np.abs(expected).max())
-        assert not loop.near_singular()
-        found = loop.terms.J @ loop.compliance.memory.a
-        np.testing.assert_allclose(found, expected, atol=1e-12)
+        np.testing.assert_allclose(loop.terms.J @ loop.a, expected, atol=1e-12)
     assert largest > 0.1
 
 
 def test_integral_of_the_task_error_near_a_singularity():
     """What is lost there, step by step: the relation of the documentation, to rounding."""
     dt, theta = 1e-3, 2.0
-    loop = PassivityLoop(
-        "panda",
-        6,
-        dt,
-        disturbance=0.1,
-        posture=STRETCHED,
-        speed=0.02,
-        slow_leak_rate=theta,
-        fast_leak_rate=theta,
-    )
+    leaks = dict(slow_leak_rate=theta, fast_leak_rate=theta)
+    loop = PassivityLoop("panda", 6, dt, disturbance=0.1, **STRETCHED, **leaks)
     decay, gain = leak_factors(theta, dt, False)
     lost_most, near = 0.0, 0
     for _ in range(100):
-        J, v, a, J_plus = loop.terms.J, loop.v, loop.compliance.memory.a.copy(), loop.inverse()
-        loop.act()
+        J, v, a, J_plus = loop.terms.J, loop.v, loop.a.copy(), loop.inverse()
         loop.step()
         near += loop.near_singular()
         error = loop.a_ref * dt - (loop.v - v)
@@ -186,12 +154,11 @@ def test_integral_of_the_task_error_near_a_singularity():
         integral = -decay * J @ a + (J_new - J) @ middle
         lost = R_new @ integral + decay * R @ J @ a
         expected = decay * J @ a + gain * 0.5 * (J + J_new) @ error + lost
-        found = J_new @ loop.compliance.memory.a
-        np.testing.assert_allclose(found, expected, atol=1e-11)
+        np.testing.assert_allclose(J_new @ loop.a, expected, atol=1e-11)
         lost_most = max(lost_most, np.abs(lost).max())
         # Nothing is lost in directions that are damped neither now nor before.
         U, singular, _ = np.linalg.svd(np.hstack([R, R_new]))
-        np.testing.assert_allclose(U[:, singular < 1e-9].T @ lost, 0.0, atol=1e-9)
         assert (singular < 1e-9).any()
+        np.testing.assert_allclose(U[:, singular < 1e-9].T @ lost, 0.0, atol=1e-9)
     assert near > 10
     assert lost_most > 1e-6

@@ -5,11 +5,8 @@ Nothing of the controller is used for what is expected: inverses and rates by Nu
 differences along the motion, (11) by ProxQP.
 """
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from compliance_run import DT, ComplianceRun, unlimited
 from general_solver import nearest
 from printed_law import FAST, LAMBDA, MU, SLOW, STEP, PrintedLaw
 from task_arm import TaskArm, arm_terms
@@ -17,69 +14,52 @@ from task_arm import TaskArm, arm_terms
 from torque_safety_controller.integral_feedback import IntegralSettings
 from torque_safety_controller.integral_feedback.printed import PrintedCompliance
 
-SMALL = 1e-5  # s; of differences
-
 
 class Motion(PrintedLaw):
     """A real arm on a motion, and how its torque is limited."""
 
-    def __init__(self, robot, rows, limit, limit_torque):
+    def __init__(self, robot, rows, method):
         self.arm = TaskArm(robot, rows, armature=0.1)
-        super().__init__(self.arm.model, self.arm.posture, rows, 0.3, 2.0, SMALL)
-        self.limit, self.limit_torque = limit, limit_torque
-        self.binding = 0
+        super().__init__(self.arm.model, self.arm.posture, rows, 0.3, 2.0, small=1e-5)
+        self.limit = np.where(np.arange(self.n) % 3 == 0, 0.02, 1.0)
+        self.method, self.binding = method, 0
+
+    def terms(self, t):
+        return self.arm.terms(self.q(t), self.v(t))
 
     def J(self, t):
-        return self.arm.terms(self.q(t), self.v(t)).J
+        return self.terms(t).J
 
     def limited(self, u):
-        return self.limit_torque(self, u)
+        """(10), or (11) with a for s: what u takes energy out of."""
+        limit = self.limit
+        factor = min(1.0, (limit / np.abs(u)).min())
+        if self.method == "scaling":
+            return factor * u
+        x = nearest(u, -limit, limit, self.a, factor * self.a @ u)
+        self.binding += np.abs(x - np.clip(u, -limit, limit)).max() > 1e-3
+        return x
 
 
-def factor(u, limit):
-    """(10)."""
-    return min(1.0, (limit / np.abs(u)).min())
-
-
-def scaled(motion, u):
-    return factor(u, motion.limit) * u
-
-
-def solved(motion, u):
-    """(11), with a for s: what u takes energy out of."""
-    limit = motion.limit
-    x = nearest(u, -limit, limit, motion.a, factor(u, limit) * motion.a @ u)
-    motion.binding += np.abs(x - np.clip(u, -limit, limit)).max() > 1e-3
-    return x
-
-
-LIMITED = {"scaling": scaled, "paper": solved}
-
-
-@pytest.mark.parametrize("method", LIMITED)
-@pytest.mark.parametrize(("robot", "rows"), [("panda", 6), ("panda", 3), ("talos", 6)])
-def test_it_is_what_the_paper_prints(method, robot, rows):
+@pytest.mark.parametrize(
+    ("robot", "rows", "method"), [("panda", 3, "paper"), ("talos", 6, "scaling")]
+)
+def test_it_is_what_the_paper_prints(robot, rows, method):
     """What differs is J' in the middle of a step: less than 1e-4 of the torque."""
-    n = TaskArm(robot, rows).n
-    limit = np.where(np.arange(n) % 3 == 0, 0.02, 1.0)
-    motion = Motion(robot, rows, limit, LIMITED[method])
-    compliance = PrintedCompliance(IntegralSettings(limit, LAMBDA, SLOW, FAST, MU, method), rows)
-
-    def terms(t):
-        return arm_terms(motion.arm.terms(motion.q(t), motion.v(t)), motion.v(t))
-
-    compliance.reset(terms(0.0))
+    motion = Motion(robot, rows, method)
+    settings = IntegralSettings(motion.limit, LAMBDA, SLOW, FAST, MU, method)
+    compliance = PrintedCompliance(settings, rows)
+    compliance.reset(arm_terms(motion.terms(0.0), motion.v(0.0)))
     limited = 0
-    for k in range(1, 300):
+    for k in range(1, 150):
         t = k * STEP
+        now = arm_terms(motion.terms(t), motion.v(t))
+        found = compliance.torque(now, motion.a_ref(t - STEP), STEP)
         expected = motion.expected(t)
-        found = compliance.torque(terms(t), motion.a_ref(t - STEP), STEP)
         np.testing.assert_allclose(found, expected, atol=1e-4 * max(1.0, np.abs(expected).max()))
         limited += compliance.saturated.any()
-    assert limited > 100
-    # Its second condition is rarely felt; here it is throughout.
-    if method == "paper":
-        assert (motion.binding > 200) == ((robot, rows) == ("panda", 3))
+    assert limited > 50
+    assert motion.binding > 70 or method == "scaling"
 
 
 def test_energy_falls_at_the_rate_of_the_paper_s_proof():
@@ -87,7 +67,9 @@ def test_energy_falls_at_the_rate_of_the_paper_s_proof():
     offs = []
     for dt in (1e-3, 5e-4):
         arm = TaskArm("panda", 6)
-        law = unlimited(7, slow_leak_rate=0.0, fast_leak_rate=0.0, anti_windup="paper")
+        law = IntegralSettings(
+            np.full(7, np.inf), slow_leak_rate=0.0, fast_leak_rate=0.0, anti_windup="paper"
+        )
         compliance = PrintedCompliance(law, 6)
         q, v = arm.posture.copy(), 0.5 * np.cos(np.arange(7))
         now = arm.terms(q, v)
@@ -114,12 +96,27 @@ def test_energy_falls_at_the_rate_of_the_paper_s_proof():
     assert offs[1] < 0.6 * offs[0]
 
 
-@pytest.mark.parametrize("method", LIMITED)
+@pytest.mark.parametrize("method", ["paper", "scaling"])
 def test_a_torque_is_taken_over_as_far_as_the_task_feels_it(method):
     """And one within the range of the task's inverse goes on."""
-    run = ComplianceRun("panda")
-    compliance = PrintedCompliance(replace(unlimited(7), anti_windup=method), 6)
-    torque = run.terms.J.T @ np.array([3.0, -2.0, 4.0, 0.3, 0.1, -0.2])
-    np.testing.assert_allclose(compliance.initialise(torque, run.now), torque, rtol=1e-9)
-    after = compliance.torque(run.now, np.zeros(7), DT)
-    np.testing.assert_allclose(after, torque, rtol=0.01)
+    arm, rest = TaskArm("panda"), np.zeros(7)
+    terms = arm.terms(arm.posture, rest)
+    compliance = PrintedCompliance(IntegralSettings(np.full(7, np.inf), anti_windup=method), 6)
+    torque = terms.J.T @ np.array([3.0, -2.0, 4.0, 0.3, 0.1, -0.2])
+    now = arm_terms(terms, rest)
+    np.testing.assert_allclose(compliance.initialise(torque, now), torque, rtol=1e-9)
+    after = compliance.torque(now, rest, 2e-3)
+    np.testing.assert_allclose(after, np.exp(-0.1 * 2e-3) * torque, rtol=1e-9)
+
+
+def test_numbers_that_are_not_finite_are_refused_and_change_nothing():
+    arm, rest = TaskArm("panda"), np.zeros(7)
+    now = arm_terms(arm.terms(arm.posture, rest), rest)
+    compliance = PrintedCompliance(IntegralSettings(np.ones(7), anti_windup="paper"), 6)
+    compliance.initialise(np.ones(7), now)
+    before = [x.copy() for x in compliance.memory]
+    for bad, a_last in ((now._replace(C=np.nan * now.C), rest), (now, 1e308 * np.ones(7))):
+        with pytest.raises(ValueError, match="finite"), np.errstate(all="ignore"):
+            compliance.torque(bad, a_last, 1e3)
+    for x, y in zip(compliance.memory, before, strict=True):
+        np.testing.assert_array_equal(x, y)
