@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+"""DAQP as it is used here: optimal, certain of infeasibility, and not misled by its past."""
+
 from itertools import product
 
 import numpy as np
@@ -33,10 +35,6 @@ def rows(problem):
     return np.vstack([np.eye(len(problem.g)), problem.C])
 
 
-def violation(problem, x) -> float:
-    return problem.violations(x).max()
-
-
 def solve(problem, solver=None):
     result = (solver or DaqpSolver()).solve(problem)
     return result.status, result.x
@@ -44,7 +42,7 @@ def solve(problem, solver=None):
 
 def assert_optimal(problem, x):
     """Karush-Kuhn-Tucker: limits kept, and multipliers of the right sign balance the slope."""
-    assert violation(problem, x) < 1e-7
+    assert problem.violations(x).max() < 1e-7
     value, N = rows(problem) @ x, rows(problem)
     at_lower, at_upper = (np.abs(value - each) < 1e-7 for each in (problem.lower, problem.upper))
     slope = problem.H @ x + problem.g
@@ -55,8 +53,7 @@ def assert_optimal(problem, x):
 
 def has_a_point(problem) -> bool:
     N = rows(problem)
-    A = np.vstack([N, -N])
-    b = np.r_[problem.upper, -problem.lower]
+    A, b = np.vstack([N, -N]), np.r_[problem.upper, -problem.lower]
     finite = np.isfinite(b)
     found = linprog(np.zeros(N.shape[1]), A[finite], b[finite], bounds=(None, None))
     return found.status == 0
@@ -76,7 +73,8 @@ def every_active_set(problem):
             continue
         zero = np.zeros((len(on), len(on)))
         x = np.linalg.solve(np.block([[problem.H, A.T], [A, zero]]), np.r_[-problem.g, b])[:n]
-        if violation(problem, x) < 1e-9 and (best is None or problem.cost(x) < problem.cost(best)):
+        kept = problem.violations(x).max() < 1e-9
+        if kept and (best is None or problem.cost(x) < problem.cost(best)):
             best = x
     return best
 
@@ -86,31 +84,24 @@ def by_proxqp(problem):
     n, N = len(problem.g), rows(problem)
     equal = problem.lower == problem.upper
     qp = proxqp.sparse.QP(n, int(equal.sum()), int((~equal).sum()))
-    qp.settings.eps_abs = 1e-9
-    qp.settings.eps_rel = 0.0
+    qp.settings.eps_abs, qp.settings.eps_rel = 1e-9, 0.0
     qp.settings.check_duality_gap = True
     qp.settings.eps_duality_gap_abs = 1e-7
     qp.settings.max_iter = 200
-    qp.init(
-        sparse.csc_matrix(problem.H),
-        problem.g,
-        sparse.csc_matrix(N[equal]),
-        problem.lower[equal],
-        sparse.csc_matrix(N[~equal]),
-        problem.lower[~equal],
-        problem.upper[~equal],
-    )
+    H, A, C = (sparse.csc_matrix(each) for each in (problem.H, N[equal], N[~equal]))
+    lower, upper = problem.lower[~equal], problem.upper[~equal]
+    qp.init(H, problem.g, A, problem.lower[equal], C, lower, upper)
     qp.solve()
     solved = qp.results.info.status == proxqp.QPSolverOutput.PROXQP_SOLVED
     return np.array(qp.results.x) if solved else None
 
 
-@pytest.mark.parametrize(("n", "m"), [(2, 1), (2, 3), (3, 2)])
+@pytest.mark.parametrize(("n", "m"), [(2, 2), (3, 2)])
 def test_agrees_with_trying_every_active_set(n, m):
     rng = np.random.default_rng(1)
     none = limited = 0
-    for k in range(60):
-        problem = random_problem(rng, n, m, tight=0.5, inside=k % 2 == 0)
+    for k in range(24):
+        problem = random_problem(rng, n, m, tight=0.5, inside=k % 3 > 0)
         best = every_active_set(problem)
         status, x = solve(problem)
         if best is None:
@@ -120,17 +111,17 @@ def test_agrees_with_trying_every_active_set(n, m):
         assert status is Status.SOLVED
         limited += np.abs(problem.H @ x + problem.g).max() > 1e-3
         np.testing.assert_allclose(x, best, atol=SAME)
-    assert limited > 20
-    assert none > 3
+    assert limited > 8
+    assert none > 1
 
 
-@pytest.mark.parametrize(("n", "m"), [(7, 7), (9, 19), (25, 40)])
-@pytest.mark.parametrize("flat", [1.0, 1e-3, 1e-6])
+@pytest.mark.parametrize(("n", "m"), [(1, 0), (1, 1), (9, 19), (25, 40)])
+@pytest.mark.parametrize("flat", [1e-3, 1e-6, 1e-9])
 def test_is_optimal_and_agrees_with_another_solver(n, m, flat):
     rng = np.random.default_rng(2)
     solver = DaqpSolver()  # one, as in a control loop: each begins with what was active last
     compared = 0
-    for _ in range(20):
+    for _ in range(10):
         problem = random_problem(rng, n, m, flat=flat)
         status, x = solve(problem, solver)
         assert status is Status.SOLVED
@@ -140,17 +131,16 @@ def test_is_optimal_and_agrees_with_another_solver(n, m, flat):
             compared += 1
             assert problem.cost(x) <= problem.cost(other) + 1e-5
             np.testing.assert_allclose(x, other, atol=1e-3)
-    assert compared > 10 or flat == 1e-6
+    assert compared > 5 or flat <= 1e-6
 
 
-@pytest.mark.parametrize("tight", [0.03, 0.3, 1.0])
-def test_knows_whether_there_is_a_solution(tight):
+def test_knows_whether_there_is_a_solution():
     rng = np.random.default_rng(3)
     solver = DaqpSolver()
     known = {True: 0, False: 0}
-    for _ in range(80):
+    for _ in range(60):
         n, m = rng.integers(2, 10), rng.integers(1, 15)
-        problem = random_problem(rng, n, m, tight * rng.uniform(0.3, 3.0), inside=False)
+        problem = random_problem(rng, n, m, rng.uniform(0.1, 2.0), inside=False)
         exists = has_a_point(problem)
         known[exists] += 1
         for status, x in (solve(problem), solve(problem, solver)):
@@ -160,41 +150,30 @@ def test_knows_whether_there_is_a_solution(tight):
     assert min(known.values()) > 5
 
 
-def test_what_was_solved_before_changes_nothing():
+def test_what_was_solved_before_changes_nothing_and_the_same_again_takes_one_iteration():
     """Limits that were equal or infinite in the last program, rows that were zero."""
     rng = np.random.default_rng(4)
     solver = DaqpSolver()
-    for _ in range(200):
+    for _ in range(60):
         problem = random_problem(rng, 9, 15)
-        C = problem.C.copy()
-        lower, upper = problem.lower.copy(), problem.upper.copy()
         if rng.random() < 0.3:
             row = rng.integers(4, 15)
-            C[row] = 0.0
-            lower[9 + row], upper[9 + row] = -1.0, 1.0
-        problem = problem._replace(C=C, lower=lower, upper=upper)
+            problem.C[row] = 0.0
+            problem.lower[9 + row], problem.upper[9 + row] = -1.0, 1.0
         status, x = solve(problem, solver)
         expected, fresh = solve(problem)
         assert status is expected is Status.SOLVED
         np.testing.assert_allclose(x, fresh, atol=SAME)
         assert_optimal(problem, x)
+        assert solver.solve(problem).iterations == 1
         if rng.random() < 0.2:  # something that cannot be solved, in between
-            assert solve(problem._replace(lower=upper + 1.0), solver)[0] is Status.FAILED
-
-
-def test_the_same_again_takes_one_iteration():
-    rng = np.random.default_rng(10)
-    for _ in range(40):
-        problem = random_problem(rng, 9, 15)
-        solver = DaqpSolver()
-        first, again = solver.solve(problem), solver.solve(problem)
-        assert again.iterations == 1
-        np.testing.assert_allclose(again.x, first.x, atol=1e-9)
+            crossed = problem._replace(lower=problem.upper + 1.0)
+            assert solve(crossed, solver)[0] is Status.FAILED
 
 
 def test_rows_that_say_the_same_do_no_harm():
     rng = np.random.default_rng(5)
-    for _ in range(40):
+    for _ in range(10):
         problem = random_problem(rng, 7, 8)
         C = np.vstack([problem.C, problem.C[::-1], np.eye(7), np.zeros((2, 7))])
         lower, upper = (
@@ -211,45 +190,34 @@ def test_rows_that_say_the_same_do_no_harm():
 def test_rows_that_contradict_each_other_through_others_have_no_solution():
     """One row is a combination of the others but for rounding, and its limit is not."""
     rng = np.random.default_rng(9)
-    for _ in range(100):
+    for _ in range(30):
         n, m = 12, 4
         problem = random_problem(rng, n, 0)
         C, b = rng.normal(size=(m, n)), rng.normal(size=m)
         share = rng.uniform(0.1, 1.0, m)
         C, b = np.vstack([C, share @ C / 3.0]), np.r_[b, share @ b / 3.0 - 1e-3]
-        no = np.full(n, np.inf)
-        status, _ = solve(
-            problem._replace(
-                C=C, lower=np.r_[-no, b[:m], -np.inf], upper=np.r_[no, np.full(m, np.inf), b[m]]
-            )
-        )
-        assert status is Status.INFEASIBLE
+        no, some = np.full(n, np.inf), np.full(m, np.inf)
+        lower, upper = np.r_[-no, b[:m], -np.inf], np.r_[no, some, b[m]]
+        assert solve(problem._replace(C=C, lower=lower, upper=upper))[0] is Status.INFEASIBLE
+    zero = np.zeros((1, 12))
+    lower, upper = np.r_[np.full(12, -9.0), 1.0], np.full(13, 9.0)
+    assert solve(problem._replace(C=zero, lower=lower, upper=upper))[0] is Status.INFEASIBLE
 
 
-def test_a_row_of_zeros_that_excludes_zero_has_no_solution():
-    problem = random_problem(np.random.default_rng(6), 4, 1)
-    no = QuadraticProgram(
-        problem.H, problem.g, np.zeros((1, 4)), np.r_[np.full(4, -9.0), 1.0], np.full(5, 9.0)
-    )
-    assert solve(no)[0] is Status.INFEASIBLE
-
-
-@pytest.mark.parametrize("warm", [False, True])
 @pytest.mark.parametrize("field", ["H", "g", "C", "lower", "upper"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_what_is_not_finite_fails_or_is_no_limit(field, value, warm):
+def test_what_is_not_finite_fails_or_is_no_limit(field, value):
     problem = random_problem(np.random.default_rng(7), 5, 3)
-    solver = DaqpSolver()
-    if warm:
-        solve(problem, solver)
+    allowed = (field, value) in {("lower", -np.inf), ("upper", np.inf)}
     for place in (0, -1):
-        poisoned = getattr(problem, field).copy()
-        poisoned.flat[place] = value
-        allowed = (field, value) in {("lower", -np.inf), ("upper", np.inf)}
-        status, x = solve(problem._replace(**{field: poisoned}), solver)
-        assert (status is Status.SOLVED) == allowed
-        assert allowed or status is Status.FAILED
-        assert not allowed or np.isfinite(x).all()
+        bad = getattr(problem, field).copy()
+        bad.flat[place] = value
+        warm = DaqpSolver()
+        solve(problem, warm)
+        for solver in (DaqpSolver(), warm):
+            status, x = solve(problem._replace(**{field: bad}), solver)
+            assert status is (Status.SOLVED if allowed else Status.FAILED)
+            assert not allowed or np.isfinite(x).all()
 
 
 def test_crossed_limits_and_costs_without_a_minimum_fail():
@@ -257,25 +225,6 @@ def test_crossed_limits_and_costs_without_a_minimum_fail():
     assert solve(problem._replace(lower=problem.upper + 1.0))[0] is Status.FAILED
     assert solve(problem._replace(H=-problem.H))[0] is Status.FAILED
     assert solve(problem._replace(H=0.0 * problem.H))[0] is Status.FAILED
-
-
-@pytest.mark.parametrize("size", [(1, 0), (7, 0), (1, 1)])
-def test_no_rows_at_all(size):
-    problem = random_problem(np.random.default_rng(11), *size)
-    status, x = solve(problem)
-    assert status is Status.SOLVED
-    assert_optimal(problem, x)
-
-
-@pytest.mark.parametrize("flat", [1e-7, 1e-9])
-def test_costs_that_are_nearly_flat(flat):
-    rng = np.random.default_rng(12)
-    solver = DaqpSolver()
-    for _ in range(40):
-        problem = random_problem(rng, 7, 7, flat=flat)
-        status, x = solve(problem, solver)
-        assert status is Status.SOLVED
-        assert_optimal(problem, x)
 
 
 def test_cost_and_violations_of_a_solution():

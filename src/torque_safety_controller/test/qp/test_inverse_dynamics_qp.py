@@ -1,111 +1,136 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The inverse-dynamics QP finds the least cost within its limits."""
+"""The inverse-dynamics QP finds the least cost, and relaxes least where limits contradict."""
 
 import numpy as np
 import pytest
 from qp_problems import (
-    ACCELERATION_TOLERANCE,
     GAMMA,
-    LITTLE_ROOM,
-    NEAR,
+    KEPT,
     N,
-    assert_cost_is_least,
-    assert_torques_kept,
-    built,
-    excess,
+    assert_tasks_served_best,
+    assert_torques_and_forces_kept,
+    by_proxqp,
+    least_relaxation,
     random_problem,
-    reference,
     solution_of,
 )
 
-from torque_safety_controller.qp import InverseDynamicsQP
+from torque_safety_controller.qp import InverseDynamicsQP, LinearConstraints
 
 
-@pytest.mark.parametrize(("room", "scale"), [(1.0, 0.1), (1.0, 1.0), (1.0, 100.0), (0.6, 1.0)])
-def test_agrees_with_an_independent_solver(room, scale):
-    rng = np.random.default_rng(3)
+@pytest.mark.parametrize(
+    ("k", "r", "scale"), [(0, 0, 1.0), (0, 0, 100.0), (10, 8, 1.0), (20, 24, 1.0)]
+)
+def test_agrees_with_another_solver_on_another_form(k, r, scale):
+    rng = np.random.default_rng(1)
     qp = InverseDynamicsQP(N, GAMMA)  # one solver, as in the loop: each starts from the last
-    solved = limited = 0
-    for _ in range(150):
-        problem = random_problem(rng, room, scale)
-        best = reference(problem)
-        if best is None or reference(problem, -1e-4) is None:
-            continue  # no solution, or one by a hair
-        solved += 1
+    solved = limited = pushed = 0
+    for _ in range(40):
+        problem = random_problem(rng, k, r, scale=scale)
         solution = solution_of(qp, problem)
-        a, relaxation = solution.a, solution.relaxation
-        assert relaxation is None
-        np.testing.assert_array_less(excess(problem, a), ACCELERATION_TOLERANCE)
-        assert_torques_kept(problem, a)
-        assert_cost_is_least(problem, a, best)
-        np.testing.assert_allclose(a, best, rtol=1e-3, atol=NEAR)
-        limited += np.isclose(a, problem.a_lower, atol=1e-3).any()
-    assert solved > 40
-    assert limited > 0.3 * solved or scale < 1.0, "the limits are hardly felt"
+        assert solution.exact
+        assert problem.excess(solution.a).max() < KEPT
+        assert_torques_and_forces_kept(problem, solution)
+        assert_tasks_served_best(problem, solution)
+        S, lower, upper = problem.soft()
+        limited += (np.minimum(S @ solution.a - lower, upper - S @ solution.a) < KEPT).any()
+        pushed += (solution.rho > 1e-3).any()
+        other = by_proxqp(problem)
+        if other is not None:
+            solved += 1
+            x = np.r_[solution.a, solution.rho]
+            np.testing.assert_allclose(x, other, atol=2e-2 if r else 1e-3)
+    assert solved > 20
+    assert limited > 12
+    assert pushed > 12 or r == 0
 
 
-def test_without_limits_it_is_least_squares():
-    rng = np.random.default_rng(4)
-    problem = random_problem(rng)
-    no = np.full(N, np.inf)
-    unlimited = problem._replace(a_lower=-no, a_upper=no, tau_lower=-no, tau_upper=no)
-    solution = solution_of(InverseDynamicsQP(N, GAMMA), unlimited)
-    H, g = problem.cost()
-    assert solution.relaxation is None
-    np.testing.assert_allclose(solution.a, np.linalg.solve(H, -g), atol=1e-3)
-
-
-def test_a_step_like_the_last_needs_one_iteration():
-    rng = np.random.default_rng(12)
+@pytest.mark.parametrize(
+    ("k", "r", "room", "scale", "masses"),
+    [(0, 0, 0.3, 100.0, 1.0), (0, 0, 0.05, 1.0, 1e3), (10, 4, 0.3, 1.0, 1.0), (10, 4, 0.05, 1, 1)],
+)
+def test_torques_win_and_bounds_and_rows_give_way_by_the_least(k, r, room, scale, masses):
+    rng = np.random.default_rng(2)
     qp = InverseDynamicsQP(N, GAMMA)
-    no = np.full(N, np.inf)
-    spared = limited = 0
+    relaxed = rows_relaxed = 0
+    for _ in range(40):
+        problem = random_problem(rng, k, r, room, scale, masses)
+        needed = least_relaxation(problem)
+        if needed.max() < 1e-2:
+            continue
+        relaxed += 1
+        solution = solution_of(qp, problem)
+        assert_torques_and_forces_kept(problem, solution)
+        relaxation = np.r_[solution.relaxation, solution.constraint_relaxation]
+        np.testing.assert_allclose(relaxation, problem.excess(solution.a), atol=1e-9)
+        np.testing.assert_allclose(relaxation, needed, atol=1e-4)
+        rows_relaxed += solution.constraint_relaxation.max(initial=0.0) > 1e-2
+        # What freedom is left serves the tasks.
+        assert_tasks_served_best(problem, solution)
+    assert relaxed > 15
+    assert rows_relaxed > 10 or k == 0
+
+
+def test_a_dearer_row_gives_way_less():
+    problem = random_problem(np.random.default_rng(3))
+    wide, G = np.full(N, 1e6), np.zeros((1, N))
+    G[0, 2] = 1.0
+    upper = np.ones(N)
+    for factor, expected in ((1.0, [0.5, 0.5]), (10.0, [100.0 / 101.0, 1.0 / 101.0])):
+        row = LinearConstraints(factor * G, factor * np.array([2.0]), np.array([np.inf]))
+        solution = solution_of(
+            InverseDynamicsQP(N),
+            problem._replace(
+                rows=row, a_lower=-wide, a_upper=upper, tau_lower=-wide, tau_upper=wide
+            ),
+        )
+        found = solution.relaxation[2], solution.constraint_relaxation[0] / factor
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("factor", [1e-4, 1e4])
+def test_rows_of_any_usual_length_have_a_solution(factor):
+    rng = np.random.default_rng(10)
     for _ in range(20):
-        problem = random_problem(rng)._replace(tau_lower=-no, tau_upper=no)
-        first = solution_of(qp, problem)
-        again = solution_of(qp, problem)
-        np.testing.assert_allclose(again.a, first.a, rtol=1e-5, atol=ACCELERATION_TOLERANCE)
-        spared += again.iterations == 1
-        limited += (excess(problem, 1.001 * first.a) > 0.0).any()
-    assert limited == 20, "no bound is active"
-    assert spared > 15
+        problem = random_problem(rng, 8, 4, 0.3)
+        problem = problem._replace(rows=problem.rows._replace(G=factor * problem.rows.G))
+        assert_torques_and_forces_kept(problem, solution_of(InverseDynamicsQP(N, GAMMA), problem))
 
 
-def test_little_room_is_not_taken_for_none():
-    solution = solution_of(InverseDynamicsQP(N, GAMMA), LITTLE_ROOM)
-    a, relaxation = solution.a, solution.relaxation
-    assert relaxation is None
-    np.testing.assert_allclose(a, reference(LITTLE_ROOM), atol=NEAR)
-
-
-def test_a_joint_without_freedom():
-    """Bounds that leave one acceleration, as for a joint that must brake with all it has."""
-    problem = random_problem(np.random.default_rng(7))
-    a_upper = problem.a_upper.copy()
-    a_upper[2] = problem.a_lower[2]
-    solution = solution_of(InverseDynamicsQP(N, GAMMA), problem._replace(a_upper=a_upper))
-    a, relaxation = solution.a, solution.relaxation
-    assert relaxation is None
-    assert a[2] == pytest.approx(problem.a_lower[2], abs=ACCELERATION_TOLERANCE)
-
-
-def test_only_the_ratio_of_weights_counts():
-    problem = random_problem(np.random.default_rng(8))
-    heavier = [task._replace(weight=1e5 * task.weight) for task in problem.tasks]
-    a = solution_of(InverseDynamicsQP(N, GAMMA), problem).a
-    b = solution_of(InverseDynamicsQP(N, GAMMA), problem._replace(tasks=heavier)).a
-    np.testing.assert_allclose(a, b, atol=ACCELERATION_TOLERANCE)
-    lighter = [problem.tasks[0], problem.tasks[1]._replace(weight=3.0)]
-    c = solution_of(InverseDynamicsQP(N, GAMMA), problem._replace(tasks=lighter)).a
-    assert np.abs(a - c).max() > 0.1
-
-
-def test_the_program_is_what_was_asked_for():
+def test_no_problem_leaves_a_trace_and_the_same_again_takes_one_iteration():
+    """Sizes change from step to step, and some problems have no solution without relaxation."""
+    rng = np.random.default_rng(4)
     qp = InverseDynamicsQP(N, GAMMA)
-    problem = random_problem(np.random.default_rng(35))
-    program = built(qp, problem._replace(a_lower=np.full(N, 1.0), a_upper=np.full(N, 1.5)))
-    np.testing.assert_array_equal(program.C, problem.M)
-    np.testing.assert_array_equal(program.lower, np.r_[np.ones(N), problem.tau_lower])
-    H, g = problem.cost()
-    np.testing.assert_allclose(program.H, H, atol=1e-12)
-    np.testing.assert_allclose(program.g, g, atol=1e-12)
+    exact = 0
+    for _ in range(40):
+        k, r = int(rng.integers(0, 12)), int(rng.integers(0, 3)) * 4
+        problem = random_problem(rng, k, r, rng.choice([0.3, 1.0]))
+        if rng.random() < 0.3:
+            problem = problem._replace(rows=None)
+        if rng.random() < 0.3:
+            problem = problem._replace(contacts=None)
+        used, fresh = solution_of(qp, problem), solution_of(InverseDynamicsQP(N, GAMMA), problem)
+        np.testing.assert_allclose(used.a, fresh.a, atol=1e-5)
+        np.testing.assert_allclose(used.rho, fresh.rho, atol=1e-4)
+        assert used.exact == fresh.exact
+        if used.exact:
+            exact += 1
+            assert solution_of(qp, problem).iterations == 1
+    assert 10 < exact < 35
+
+
+def test_wrong_shapes_are_refused():
+    problem = random_problem(np.random.default_rng(7), 10, 8)
+    rows, contacts = problem.rows, problem.contacts
+    task = contacts.tasks[1]
+    for bad in (
+        {"rows": rows._replace(G=rows.G[:, 1:])},
+        {"rows": rows._replace(lower=rows.lower[1:])},
+        {"rows": rows._replace(upper=rows.upper[1:])},
+        {"contacts": contacts._replace(B=contacts.B[1:])},
+        {"contacts": contacts._replace(rho_max=contacts.rho_max[1:])},
+        {"contacts": contacts._replace(tasks=[task._replace(W=task.W[:, 1:])])},
+        {"contacts": contacts._replace(tasks=[task._replace(F_des=np.zeros(6))])},
+    ):
+        with pytest.raises(ValueError, match="joints with|wrench task of"):
+            solution_of(InverseDynamicsQP(N, GAMMA), problem._replace(**bad))

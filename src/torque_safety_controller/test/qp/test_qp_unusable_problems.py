@@ -1,24 +1,68 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers that are no problem, or hardly one: soon refused, and without a trace."""
-
-import time
+"""Numbers that are no problem, or hardly one: refused without a trace; and solvers that fail."""
 
 import numpy as np
 import pytest
 from qp_problems import (
-    ACCELERATION_TOLERANCE,
     GAMMA,
-    LONG,
     N,
-    assert_torques_kept,
+    assert_torques_and_forces_kept,
+    built,
     random_problem,
     solution_of,
 )
 
 from torque_safety_controller.qp import (
+    SOLVERS,
     InverseDynamicsQP,
     NoSolutionFound,
+    SolverResult,
+    Status,
 )
+
+
+def poisoned(problem, field):
+    """The problem with one NaN in this array, wherever it is."""
+
+    def spoil(part):
+        array = getattr(part, field).copy()
+        array.flat[1] = np.nan
+        return part._replace(**{field: array})
+
+    if field in ("A", "b"):
+        return problem._replace(tasks=[spoil(problem.tasks[0]), problem.tasks[1]])
+    if field in ("G", "lower", "upper"):
+        return problem._replace(rows=spoil(problem.rows))
+    if field in ("B", "rho_max"):
+        return problem._replace(contacts=spoil(problem.contacts))
+    if field in ("W", "F_des"):
+        first, second = problem.contacts.tasks
+        return problem._replace(contacts=problem.contacts._replace(tasks=[spoil(first), second]))
+    return spoil(problem)
+
+
+def test_a_nan_raises_and_leaves_no_trace():
+    problem = random_problem(np.random.default_rng(8), 10, 8)
+    qp = InverseDynamicsQP(N, GAMMA)
+    expected = solution_of(qp, problem).a
+    for fields in ("A b a_lower a_upper M tau_lower tau_upper", "G lower upper B rho_max W F_des"):
+        for field in fields.split():
+            with pytest.raises(NoSolutionFound):
+                solution_of(qp, poisoned(problem, field))
+            np.testing.assert_allclose(solution_of(qp, problem).a, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_crossed_limits_raise(solver):
+    problem = random_problem(np.random.default_rng(9), 10)
+    rows = problem.rows._replace(lower=np.full(10, 1.0), upper=np.zeros(10))
+    for crossed in (
+        {"a_lower": problem.a_upper + 1.0},
+        {"tau_lower": problem.tau_upper + 1.0},
+        {"rows": rows},
+    ):
+        with pytest.raises(NoSolutionFound):
+            solution_of(InverseDynamicsQP(N, GAMMA, solver), problem._replace(**crossed))
 
 
 def test_without_a_weight_there_is_no_solution():
@@ -29,64 +73,64 @@ def test_without_a_weight_there_is_no_solution():
             solution_of(InverseDynamicsQP(N, GAMMA), problem._replace(tasks=tasks))
 
 
-@pytest.mark.parametrize("field", ["A", "b", "a_lower", "a_upper", "M", "tau_lower", "tau_upper"])
-@pytest.mark.parametrize("warm", [False, True])
-def test_a_nan_raises_soon_and_leaves_no_trace(field, warm):
-    problem = random_problem(np.random.default_rng(9))
-    expected = solution_of(InverseDynamicsQP(N, GAMMA), problem).a
-    qp = InverseDynamicsQP(N, GAMMA)
-    if warm:
-        solution_of(qp, problem)
-    if field in ("A", "b"):
-        poisoned = getattr(problem.tasks[0], field).copy()
-        bad = problem._replace(
-            tasks=[problem.tasks[0]._replace(**{field: poisoned}), problem.tasks[1]]
-        )
-    else:
-        poisoned = getattr(problem, field).copy()
-        bad = problem._replace(**{field: poisoned})
-    poisoned.flat[3] = np.nan
-    begin = time.monotonic()
-    with pytest.raises(NoSolutionFound):
-        solution_of(qp, bad)
-    assert time.monotonic() - begin < LONG
-    solution = solution_of(qp, problem)
-    assert solution.relaxation is None
-    np.testing.assert_allclose(solution.a, expected, atol=ACCELERATION_TOLERANCE)
-
-
-@pytest.mark.parametrize(("low", "high"), [("a_lower", "a_upper"), ("tau_lower", "tau_upper")])
-def test_crossed_limits_raise_soon(low, high):
-    problem = random_problem(np.random.default_rng(10))
-    crossed = problem._replace(**{low: getattr(problem, high) + 1.0})
-    begin = time.monotonic()
-    with pytest.raises(NoSolutionFound):
-        solution_of(InverseDynamicsQP(N, GAMMA), crossed)
-    assert time.monotonic() - begin < LONG
-
-
-@pytest.mark.parametrize("scale", [1e6, 1e12, 1e30, 1e100, 1e200, 1e307])
-def test_absurd_numbers_cost_neither_time_nor_limits(scale):
+@pytest.mark.parametrize("scale", [1e12, 1e100, 1e306])
+def test_absurd_numbers_break_no_torque_limits(scale):
     rng = np.random.default_rng(11)
     qp = InverseDynamicsQP(N, GAMMA)
     for room in (1.0, 0.3, 0.05):
-        problem = random_problem(rng, room, scale)
-        begin = time.monotonic()
+        problem = random_problem(rng, room=room, scale=scale)
         try:
-            a = solution_of(qp, problem).a
+            solution = solution_of(qp, problem)
         except NoSolutionFound:
-            pass
-        else:
-            assert np.isfinite(a).all()
-            assert_torques_kept(problem, a)
-        assert time.monotonic() - begin < LONG
+            continue
+        assert np.isfinite(solution.a).all()
+        assert_torques_and_forces_kept(problem, solution)
 
 
-def test_a_mass_matrix_that_is_nearly_singular():
+def test_a_mass_matrix_that_is_nearly_singular_or_none():
     rng = np.random.default_rng(37)
     qp = InverseDynamicsQP(N, GAMMA)
-    for k in range(60):
-        problem = random_problem(rng, (1.0, 0.3)[k % 2])
+    for k in range(20):
+        problem = random_problem(rng, room=(1.0, 0.3)[k % 2])
         u = rng.normal(size=(N, 1))
         problem = problem._replace(M=u @ u.T + 10.0 ** rng.uniform(-6, -2) * np.eye(N))
-        assert_torques_kept(problem, solution_of(qp, problem).a)
+        assert_torques_and_forces_kept(problem, solution_of(qp, problem))
+    problem = random_problem(rng, room=0.05)
+    assert not solution_of(qp, problem).exact
+    M = problem.M - 2.0 * np.linalg.eigvalsh(problem.M)[-1] * np.eye(N)
+    with pytest.raises(NoSolutionFound, match="not positive definite"):
+        solution_of(qp, problem._replace(M=M))
+
+
+# Solvers
+
+
+def test_proxqp_gives_the_same_accelerations():
+    rng = np.random.default_rng(30)
+    mine, other = InverseDynamicsQP(N, GAMMA), InverseDynamicsQP(N, GAMMA, "proxqp")
+    for k in range(20):
+        problem = random_problem(rng, 4, 4, room=(1.0, 0.3)[k % 2])
+        expected, found = solution_of(mine, problem), solution_of(other, problem)
+        assert expected.exact == found.exact
+        np.testing.assert_allclose(found.a, expected.a, atol=1e-4)
+
+
+class Failing:
+    """A solver that never solves anything."""
+
+    def solve(self, program):
+        return SolverResult(Status.FAILED, np.full(len(program.g), np.nan), 0)
+
+
+def test_proxqp_is_asked_where_daqp_fails_and_if_all_fail_the_error_has_the_program(monkeypatch):
+    problem = random_problem(np.random.default_rng(31))
+    expected = solution_of(InverseDynamicsQP(N, GAMMA), problem)
+    monkeypatch.setitem(SOLVERS, "daqp", Failing)
+    found = solution_of(InverseDynamicsQP(N, GAMMA), problem)
+    np.testing.assert_allclose(found.a, expected.a, atol=1e-4)
+    monkeypatch.setitem(SOLVERS, "proxqp", Failing)
+    qp = InverseDynamicsQP(N, GAMMA)
+    program = built(qp, problem)
+    with pytest.raises(NoSolutionFound) as caught:
+        qp.solve(program)
+    assert caught.value.program is program

@@ -4,7 +4,8 @@
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
+import scipy.sparse as sparse
+from proxsuite import proxqp
 from scipy.optimize import lsq_linear, nnls
 
 from torque_safety_controller.qp import (
@@ -12,14 +13,12 @@ from torque_safety_controller.qp import (
     ContactForces,
     LinearConstraints,
     TaskTerm,
+    WrenchTerm,
 )
 
 N = 7
-GAMMA = 1e-6
-ACCELERATION_TOLERANCE = 1e-6  # rad/s^2
-TORQUE_TOLERANCE = 1e-6  # N m
-NEAR = 1e-3  # rad/s^2; a cost counts as the least if moving so far could have lowered it so
-LONG = 1.0  # s; the solver gives up after a hundredth of it
+GAMMA = 1e-4
+KEPT = 1e-6  # rad/s^2, N m and N
 
 
 class Problem(NamedTuple):
@@ -29,18 +28,43 @@ class Problem(NamedTuple):
     M: np.ndarray
     tau_lower: np.ndarray
     tau_upper: np.ndarray
-    rows: LinearConstraints | None = None
-    contacts: ContactForces | None = None
+    rows: LinearConstraints
+    contacts: ContactForces
+
+    @property
+    def r(self) -> int:
+        """Number of forces."""
+        return len(self.contacts.rho_max)
 
     def cost(self) -> tuple[np.ndarray, np.ndarray]:
-        """H and g of the cost, the largest weight made 1."""
-        scale = 1.0 / max(task.weight for task in self.tasks)
-        H, g = GAMMA * np.eye(N), np.zeros(N)
-        for A, b, weight in self.tasks:
-            A = np.eye(N) if A is None else A
-            H += scale * weight * A.T @ A
-            g -= scale * weight * A.T @ b
+        """H and g of the cost in (a, rho), the largest weight made 1."""
+        scale = max(t.weight for t in [*self.tasks, *self.contacts.tasks])
+        H, g = GAMMA * np.eye(N + self.r), np.zeros(N + self.r)
+        terms = [(np.eye(N) if A is None else A, b, weight, 0) for A, b, weight in self.tasks]
+        terms += [(W, F, weight, N) for W, F, weight in self.contacts.tasks]
+        for A, b, weight, first in terms:
+            part = np.zeros((len(b), N + self.r))
+            part[:, first : first + A.shape[1]] = A
+            H += weight / scale * part.T @ part
+            g -= weight / scale * part.T @ b
         return H, g
+
+    def soft(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What may be relaxed: S, lower and upper of lower <= S a <= upper."""
+        rows = self.rows
+        lower, upper = np.r_[self.a_lower, rows.lower], np.r_[self.a_upper, rows.upper]
+        return np.vstack([np.eye(N), rows.G]), lower, upper
+
+    def hard(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Torques and forces: C, lower and upper of lower <= C (a, rho) <= upper."""
+        C = np.block([[self.M, -self.contacts.B], [np.zeros((self.r, N)), np.eye(self.r)]])
+        lower = np.r_[self.tau_lower, np.zeros(self.r)]
+        return C, lower, np.r_[self.tau_upper, self.contacts.rho_max]
+
+    def excess(self, a: np.ndarray) -> np.ndarray:
+        """How far a is outside of bounds and rows, shape (n + k,)."""
+        S, lower, upper = self.soft()
+        return np.maximum(np.maximum(lower - S @ a, S @ a - upper), 0.0)
 
 
 def built(qp, problem: Problem):
@@ -52,113 +76,105 @@ def solution_of(qp, problem: Problem):
     return qp.solve(built(qp, problem))
 
 
-def random_problem(rng, room=1.0, scale=1.0) -> Problem:
-    """An arm's problem; with little room many have no solution without relaxation."""
+def random_problem(rng, k=0, r=0, room=1.0, scale=1.0, masses=1.0) -> Problem:
+    """An arm's problem with k rows and r forces; with little room limits contradict each other.
+
+    Of the bounds some leave no acceleration but 0, or hardly another, and some are infinite.
+    """
     L = 0.5 * rng.normal(size=(N, N))
-    J = rng.normal(size=(6, N))
-    middle = (1.0 - room) * 20.0 * rng.normal(size=N)
-    half = room * rng.uniform(2.0, 50.0, N)
+    middle, half = (1.0 - room) * 20.0 * rng.normal(size=N), room * rng.uniform(2.0, 50.0, N)
+    a_lower, a_upper = -rng.uniform(1.0, 5.0, N), rng.uniform(1.0, 5.0, N)
+    kind = rng.random(N)
+    a_lower[kind < 0.1] = a_upper[kind < 0.1] = 0.0
+    a_lower[(kind > 0.1) & (kind < 0.2)] = -1e-3
+    a_upper[(kind > 0.15) & (kind < 0.25)] = np.inf
+    shift = (1.0 - room) * 5.0 * rng.normal(size=k)
+    lower = shift - room * rng.uniform(0.5, 5.0, k)
+    upper = shift + room * rng.uniform(0.5, 5.0, k)
+    one_sided = rng.random(k)
+    lower[one_sided < 0.3] = -np.inf
+    upper[one_sided > 0.7] = np.inf
+    wrenches = [
+        WrenchTerm(rng.normal(size=(6, r)), 10.0 * rng.normal(size=6), 0.5),
+        WrenchTerm(rng.normal(size=(3, r)), 10.0 * rng.normal(size=3), 2.0),
+    ]
     return Problem(
         [
-            TaskTerm(J, 10.0 * scale * rng.normal(size=6), 3.0),
-            TaskTerm(None, scale * rng.normal(size=N), 3e-3),
+            TaskTerm(rng.normal(size=(6, N)), 10.0 * scale * rng.normal(size=6), 3.0),
+            TaskTerm(None, scale * rng.normal(size=N), 3e-2),
         ],
-        -rng.uniform(1.0, 5.0, N),
-        rng.uniform(1.0, 5.0, N),
-        L @ L.T + 0.05 * np.eye(N),
-        middle - half,
-        middle + half,
+        a_lower,
+        a_upper,
+        masses * (L @ L.T + 0.05 * np.eye(N)),
+        masses * (middle - half),
+        masses * (middle + half),
+        LinearConstraints(rng.normal(size=(k, N)), lower, upper),
+        ContactForces(
+            rng.normal(size=(N, r)),
+            np.where(rng.random(r) < 0.2, 0.0, np.inf),
+            wrenches if r else [],
+        ),
     )
 
 
-def least_distance(H, g, C, d) -> np.ndarray | None:
-    """Minimise x'Hx/2 + g'x subject to C x <= d by Lawson and Hanson's reduction to NNLS.
+def by_proxqp(problem: Problem) -> np.ndarray | None:
+    """Solve it in another form by another method; None where that does not converge.
 
-    None without a solution. It shares nothing with the solver under test.
+    The torque is a variable of its own, with the dynamics as an equation.
     """
-    R = cholesky(H)
-    shift = solve_triangular(R, g, trans=1)
-    G = -solve_triangular(R, C.T, trans=1).T
-    h = -(d + solve_triangular(R, C.T, trans=1).T @ shift)
-    E = np.vstack([G.T, h])
-    f = np.zeros(len(E))
-    f[-1] = 1.0
-    u, distance = nnls(E, f, maxiter=1000)
-    r = E @ u - f
-    if distance < 1e-7:
-        return None
-    return solve_triangular(R, -r[:-1] / r[-1] - shift)
-
-
-def reference(problem: Problem, widen=0.0) -> np.ndarray | None:
+    r, rows = problem.r, problem.rows
     H, g = problem.cost()
-    eye = np.eye(N)
-    C = np.vstack([eye, -eye, problem.M, -problem.M])
-    d = np.concatenate([problem.a_upper, -problem.a_lower, problem.tau_upper, -problem.tau_lower])
-    finite = np.isfinite(d)
-    return least_distance(H, g, C[finite], d[finite] + widen)
+    H = np.block([[H, np.zeros((N + r, N))], [np.zeros((N, N + r)), np.zeros((N, N))]])
+    dynamics = np.hstack([problem.M, -problem.contacts.B, -np.eye(N)])
+    C = np.vstack([np.eye(N + r + N), np.hstack([rows.G, np.zeros((len(rows.G), r + N))])])
+    lower = np.r_[problem.a_lower, np.zeros(r), problem.tau_lower, rows.lower]
+    upper = np.r_[problem.a_upper, problem.contacts.rho_max, problem.tau_upper, rows.upper]
+    qp = proxqp.sparse.QP(N + r + N, N, len(lower))
+    qp.settings.eps_abs, qp.settings.eps_rel = 1e-9, 0.0
+    qp.settings.max_iter = 300
+    qp.settings.eps_primal_inf = 1e-10
+    H, dynamics, C = (sparse.csc_matrix(each) for each in (H, dynamics, C))
+    qp.init(H, np.r_[g, np.zeros(N)], dynamics, np.zeros(N), C, lower, upper)
+    qp.solve()
+    solved = qp.results.info.status == proxqp.QPSolverOutput.PROXQP_SOLVED
+    return np.array(qp.results.x)[: N + r] if solved else None
 
 
 def least_relaxation(problem: Problem) -> np.ndarray:
-    """How far the nearest accelerations that the motors can give are outside the bounds.
+    """How far bounds and rows have to give way at least, shape (n + k,).
 
-    A least-squares problem in boxes: the torques M a, and the point of the bounds next to a.
+    A least-squares problem in boxes: the torques, the forces, and the nearest values within the
+    limits.
     """
-    A = np.hstack([np.linalg.inv(problem.M), -np.eye(N)])
-    lower = np.concatenate([problem.tau_lower, problem.a_lower])
-    upper = np.concatenate([problem.tau_upper, problem.a_upper])
-    found = lsq_linear(A, np.zeros(N), (lower, upper), method="bvls", tol=1e-14, max_iter=1000)
-    return A @ found.x
+    S, lower, upper = problem.soft()
+    _, hard_lower, hard_upper = problem.hard()
+    inverse = np.linalg.inv(problem.M)
+    A = np.hstack([S @ inverse, S @ inverse @ problem.contacts.B, -np.eye(len(S))])
+    lower, upper = np.r_[hard_lower, lower], np.r_[hard_upper, upper]
+    fixed = lower == upper
+    at_fixed = A[:, fixed] @ lower[fixed]
+    box = lower[~fixed], upper[~fixed]
+    found = lsq_linear(A[:, ~fixed], -at_fixed, box, method="bvls", tol=1e-14, max_iter=1000)
+    return np.abs(A[:, ~fixed] @ found.x + at_fixed)
 
 
-def excess(problem: Problem, a: np.ndarray) -> np.ndarray:
-    return np.maximum(np.maximum(problem.a_lower - a, a - problem.a_upper), 0.0)
+def assert_torques_and_forces_kept(problem: Problem, solution) -> None:
+    C, lower, upper = problem.hard()
+    value = C @ np.r_[solution.a, solution.rho]
+    assert (value >= lower - KEPT).all()
+    assert (value <= upper + KEPT).all()
 
 
-def assert_torques_kept(problem: Problem, a: np.ndarray) -> None:
-    tau = problem.M @ a
-    assert (tau >= problem.tau_lower - TORQUE_TOLERANCE).all()
-    assert (tau <= problem.tau_upper + TORQUE_TOLERANCE).all()
-
-
-def assert_cost_is_least(problem: Problem, a: np.ndarray, best: np.ndarray) -> None:
+def assert_tasks_served_best(problem: Problem, solution) -> None:
+    """Karush-Kuhn-Tucker, with bounds and rows where they have been moved to."""
+    x = np.r_[solution.a, solution.rho]
+    S, soft_lower, soft_upper = problem.soft()
+    hard, hard_lower, hard_upper = problem.hard()
+    C = np.vstack([np.hstack([S, np.zeros((len(S), problem.r))]), hard])
+    at_lower = C @ x < np.r_[soft_lower, hard_lower] + KEPT
+    at_upper = C @ x > np.r_[soft_upper, hard_upper] - KEPT
     H, g = problem.cost()
-    excess_cost = 0.5 * (a @ H @ a - best @ H @ best) + g @ (a - best)
-    assert excess_cost < NEAR * np.linalg.norm(H @ best + g) + NEAR**2 * np.trace(H)
-
-
-# From Baxter in the middle of a run, three joints at their limits, pulled hard.
-LITTLE_ROOM = Problem(
-    [
-        TaskTerm(
-            np.array(
-                [
-                    [-0.8437, -0.5147, 0.2832, 0.2894, 0.06856, -0.1188, 0.0],
-                    [-0.4136, 0.9839, 0.1117, -0.6929, 0.02211, 0.3685, 0.0],
-                    [0.02297, -0.1776, -0.002851, 0.08876, 0.0, 0.0, 0.0],
-                    [0.3696, -0.8888, -0.1465, 0.9234, -0.06502, -0.9517, 0.0],
-                    [-0.7819, -0.4551, 0.3947, 0.3834, 0.2016, -0.3069, 0.0],
-                    [-0.5021, 0.05447, 0.9071, -0.01767, 0.9773, 0.0, 1.0],
-                ]
-            ),
-            np.array([952.7, -635.0, -543.0, 82.82, 761.2, 17.73]),
-            1.0,
-        ),
-        TaskTerm(None, np.array([9.167, 3.895, -0.7992, -9.537, 0.7991, -4.948, 24.58]), 1e-3),
-    ],
-    np.array([4.357e-03, -3.0, -10.9, -15.0, -15.0, -15.0, -0.9936]),
-    np.array([5.0, 3.0, -7.932e-04, 3.705e-03, -2.695e-02, 15.0, 15.0]),
-    np.array(
-        [
-            [2.509, 0.05143, -0.5865, 0.0799, -0.05236, -0.03626, -0.02088],
-            [0.05143, 3.505, -0.07796, -1.478, -0.01562, 0.2931, 0.004666],
-            [-0.5865, -0.07796, 0.2063, 0.008431, 0.05344, 0.00501, 0.03691],
-            [0.0799, -1.478, 0.008431, 0.8111, 0.007311, -0.1949, -0.00223],
-            [-0.05236, -0.01562, 0.05344, 0.007311, 0.04943, -0.0002561, 0.03969],
-            [-0.03626, 0.2931, 0.00501, -0.1949, -0.0002561, 0.09254, 0.0005197],
-            [-0.02088, 0.004666, 0.03691, -0.00223, 0.03969, 0.0005197, 0.04058],
-        ]
-    ),
-    np.array([-43.01, -15.06, -52.18, -61.39, -15.17, -13.17, -14.91]),
-    np.array([56.99, 84.94, 47.82, 38.61, 14.83, 16.83, 15.09]),
-)
+    normals = np.vstack([C[at_lower], -C[at_upper]]).T
+    slope = H @ x + g
+    left = nnls(normals, slope)[1] if normals.size else np.linalg.norm(slope)
+    assert left < 1e-5 * (1.0 + np.linalg.norm(g))
