@@ -8,6 +8,4 @@ from viability_bounds_pkg.testing.fixtures import graph_of_its_own, ros, shared_
 
 sys.path.insert(0, str(Path(__file__).resolve().parent / "support"))
 
-from talos_joints import talos_model
-
-__all__ = ["graph_of_its_own", "ros", "shared_ros", "talos_model"]
+__all__ = ["graph_of_its_own", "ros", "shared_ros"]

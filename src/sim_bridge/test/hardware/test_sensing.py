@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+"""What drives report of a motion: encoders, noise, filter, delay."""
+
 import math
 from dataclasses import replace
 
@@ -6,13 +8,11 @@ import numpy as np
 import pytest
 
 from sim_bridge.hardware import Imperfections, Sensing
-from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import parameter_table
 
 N = 3
 DT = 2e-3
 TORQUE_MAX = np.array([80.0, 40.0, 10.0])
-ZERO = np.zeros(N)
 
 
 def imperfections(**given):
@@ -27,10 +27,9 @@ def sensing(**given):
     return Sensing(imperfections(**given), TORQUE_MAX, DT)
 
 
-def path(count, seed=0):
+def path(count):
     """Return a motion: positions and velocities, shape (count, N) each."""
-    t = DT * np.arange(count)[:, None]
-    rate = np.array([3.0, 7.0, 11.0]) + seed
+    t, rate = DT * np.arange(count)[:, None], np.array([3.0, 7.0, 11.0])
     return np.sin(rate * t), rate * np.cos(rate * t)
 
 
@@ -42,35 +41,17 @@ def readings(sensors, q, v, effort=None):
     return (np.array(each) for each in zip(first, *rest, strict=True))
 
 
-def test_without_imperfections_readings_are_the_truth():
-    q, v = path(50)
-    tau = v.copy()
-    for read, true in zip(readings(sensing(), q, v, tau), (q, v, tau), strict=True):
-        np.testing.assert_array_equal(read, true)
-
-
 def test_encoders_report_whole_steps_at_most_half_a_step_off():
     resolution = np.array([1e-3, 0.0, 3e-4])
-    given = replace(imperfections(), encoder_resolution=resolution)
-    encoders = Sensing(given, TORQUE_MAX, DT)
-    q = np.random.default_rng(0).uniform(-3.0, 3.0, (5000, N))
-    read = np.array([encoders.encoders(each) for each in q])
+    sensors = Sensing(replace(imperfections(), encoder_resolution=resolution), TORQUE_MAX, DT)
+    q = np.random.default_rng(0).uniform(-3.0, 3.0, (3000, N))
+    read, *_ = readings(sensors, q, q)
     np.testing.assert_array_equal(read[:, 1], q[:, 1])
     for j in (0, 2):
         steps = read[:, j] / resolution[j]
         np.testing.assert_allclose(steps, np.rint(steps), atol=1e-9)
-        error = np.abs(read[:, j] - q[:, j])
-        assert error.max() <= 0.5 * resolution[j] * (1.0 + 1e-9)
-        assert error.max() > 0.49 * resolution[j]
-
-
-def test_noise_comes_before_rounding():
-    q, v = np.full((2000, N), 0.3), np.zeros((2000, N))
-    read, *_ = readings(sensing(encoder_resolution=1e-3, position_noise=6e-4), q, v)
-    steps = read / 1e-3
-    np.testing.assert_allclose(steps, np.rint(steps), atol=1e-9)
-    assert set(np.rint(steps[:, 0] - 300.0)) == {-2.0, -1.0, 0.0, 1.0, 2.0}
-    assert np.abs(read - q).max() <= 0.5e-3 + 3.0 * 6e-4
+        error = np.abs(read[:, j] - q[:, j]).max()
+        assert 0.49 * resolution[j] < error <= 0.5 * resolution[j] * (1.0 + 1e-9)
 
 
 def test_velocity_from_encoders_is_the_difference_over_a_period():
@@ -80,9 +61,6 @@ def test_velocity_from_encoders_is_the_difference_over_a_period():
     np.testing.assert_allclose(read, rounded, atol=1e-12)
     np.testing.assert_allclose(velocity[1:], np.diff(rounded, axis=0) / DT, atol=1e-9)
     np.testing.assert_array_equal(velocity[0], v[0])
-    # One step more or less, and the velocity half a period ago.
-    middle = np.diff(q, axis=0) / DT
-    assert np.abs(velocity[1:] - middle).max() <= 1e-3 / DT + 1e-9
 
 
 def test_the_drive_filters_velocities_and_nothing_else():
@@ -96,23 +74,30 @@ def test_the_drive_filters_velocities_and_nothing_else():
     np.testing.assert_array_equal(effort, v)
 
 
-@pytest.mark.parametrize("delay", [1, 2, 5])
+@pytest.mark.parametrize("delay", [0, 1, 5])
 def test_a_delayed_state_is_that_of_so_many_periods_ago(delay):
     q, v = path(30)
     tau = 2.0 * q
-    exact = readings(sensing(state_delay=delay), q, v, tau)
-    for read, true in zip(exact, (q, v, tau), strict=True):
-        np.testing.assert_array_equal(read[delay:], true[:-delay])
+    reported = readings(sensing(state_delay=delay), q, v, tau)
+    for read, true in zip(reported, (q, v, tau), strict=True):
+        np.testing.assert_array_equal(read[delay:], true[: 30 - delay])
         np.testing.assert_array_equal(read[:delay], np.tile(true[0], (delay, 1)))
 
 
-def test_noise_of_velocity_and_effort_is_added_to_what_is_reported():
-    q, v = path(4000)
-    _, velocity, effort = readings(sensing(velocity_noise=0.05, current_noise=0.01), q, v, v)
-    assert np.abs(velocity - v).max() <= 0.15 + 1e-12
-    np.testing.assert_allclose((velocity - v).std(axis=0), 0.05, rtol=0.05)
-    assert (np.abs(effort - v) <= 0.03 * TORQUE_MAX + 1e-12).all()
-    np.testing.assert_allclose((effort - v).std(axis=0), 0.01 * TORQUE_MAX, rtol=0.05)
+def test_noise_is_white_normal_clipped_at_three_deviations_and_apart_for_each_reading():
+    q = np.zeros((8000, N))
+    given = {"position_noise": 1.0, "velocity_noise": 0.05, "current_noise": 0.01}
+    noises = np.hstack(list(readings(sensing(**given), q, q, q)))
+    unit = noises / np.hstack([np.ones(N), np.full(N, 0.05), 0.01 * TORQUE_MAX])
+    # The deviation of a normal distribution clipped at 3.
+    inside, density = math.erf(3.0 / math.sqrt(2.0)), math.exp(-4.5) / math.sqrt(2.0 * math.pi)
+    clipped = math.sqrt(inside - 6.0 * density + 9.0 * (1.0 - inside))
+    np.testing.assert_allclose(unit.std(axis=0), clipped, rtol=0.03)
+    np.testing.assert_allclose(np.abs(unit).max(axis=0), 3.0, rtol=1e-12)
+    assert np.abs(unit.mean(axis=0)).max() < 0.05
+    # Neither joints, kinds nor times have to do with each other.
+    both = np.corrcoef(np.hstack([unit[1:], unit[:-1]]), rowvar=False)
+    assert np.abs(both - np.eye(len(both))).max() < 0.05
 
 
 def test_a_reset_and_the_seed_repeat_everything():
@@ -127,26 +112,7 @@ def test_a_reset_and_the_seed_repeat_everything():
     }
     q, v = path(50)
     sensors = sensing(**given)
-    once = list(readings(sensors, q, v, v))
-    readings_of_others = list(readings(sensing(**given, imperfection_seed=1), q, v, v))
-    for read, again, other in zip(
-        once, readings(sensors, q, v, v), readings_of_others, strict=True
-    ):
-        np.testing.assert_array_equal(read, again)
-        assert (read != other).any()
-
-
-def test_what_is_on_is_told_by_name():
-    assert imperfections().names == ()
-    assert not imperfections(missed_in_row=9, imperfection_seed=4).names
-    some = imperfections(velocity_source="encoder", state_delay=1, torque_constant_error=-0.02)
-    assert some.names == ("velocity_source", "state_delay", "torque_constant_error")
-    assert some.of_motors
-    assert not imperfections(command_delay=1, encoder_resolution=1e-4).of_motors
-
-
-@pytest.mark.parametrize("cutoff", [50.0, 60.0])
-def test_a_filter_above_half_the_rate_is_refused(cutoff):
-    imperfections(velocity_filter_hz=cutoff).check_rate(1000.0)
-    with pytest.raises(SettingError, match=rf"velocity_filter_hz' is {cutoff:g};.*rate_hz, 50;"):
-        imperfections(velocity_filter_hz=cutoff).check_rate(100.0)
+    once, again = list(readings(sensors, q, v, v)), list(readings(sensors, q, v, v))
+    others = list(readings(sensing(**given, imperfection_seed=1), q, v, v))
+    np.testing.assert_array_equal(once, again)
+    assert all((one != other).any() for one, other in zip(once, others, strict=True))

@@ -5,135 +5,105 @@ import math
 
 import numpy as np
 import pinocchio as pin
-import pytest
 from geometry_msgs.msg import WrenchStamped
-from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from robot_probe import JOINTS, PERIOD, VALUES, Q, RobotProbe
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
 from sim_bridge.node.bullet_node import BulletNode
+from sim_bridge.node.bullet_parameters import BulletConfiguration, make_robot
+from viability_bounds_pkg.parameter import read
 from viability_bounds_pkg.robot.description import inertia_beyond, read_urdf
-from viability_bounds_pkg.ros.runtime import (
-    LATCHED_QOS,
-    stamp_to_ns,
-)
+from viability_bounds_pkg.ros.runtime import LATCHED_QOS, stamp_to_ns
 from viability_bounds_pkg.testing.ros_harness import read_config
 
+ORDER = [3, 1, 6, 0, 2, 5, 4]
+SHUFFLED = [*(JOINTS[i] for i in ORDER), "other"]
 
-def test_each_command_with_the_right_stamp_moves_time_by_one_period(ros):
-    robot = RobotProbe(ros)
-    first = robot.stamp
-    assert first == PERIOD
+
+def test_each_command_moves_time_by_one_period(ros):
+    clocks = ros.listen(Clock, "/clock")
+    robot = RobotProbe(ros, publish_clock=True)
+    assert robot.stamp == PERIOD
     robot.step(times=5)
-    assert robot.stamp == first + 5 * PERIOD
+    assert robot.stamp == 6 * PERIOD
+    ros.wait_until(lambda: clocks and stamp_to_ns(clocks[-1].clock) == robot.stamp)
     assert robot.states[-1].name[:7] == JOINTS
     np.testing.assert_allclose(robot.q, Q, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("reason", "send"),
-    [
-        ("not finite", lambda r: r.send(r.stamp, [math.nan] * 7)),
-        ("not finite", lambda r: r.send(r.stamp, [math.inf] + [0.0] * 6)),
-        ("wrong size", lambda r: r.send(r.stamp, [1.0] * 3)),
-        ("missing joint", lambda r: r.send(r.stamp, [1.0] * 6, JOINTS[1:])),
-        ("wrong size", lambda r: r.send(r.stamp)),
-        ("wrong size", lambda r: r.send(r.stamp, q=Q[:3])),
-        ("wrong size", lambda r: r.send(r.stamp, q=Q, v=[0.0])),
-        ("wrong size", lambda r: r.send(r.stamp, [1.0] * 3, q=Q)),
-        ("not finite", lambda r: r.send(r.stamp, q=[math.nan] * 7)),
-        ("not finite", lambda r: r.send(r.stamp, q=Q, v=[0.0] * 6 + [math.inf])),
-        ("not finite", lambda r: r.send(r.stamp, [math.nan] * 7, q=Q)),
-        ("missing joint", lambda r: r.send(r.stamp, q=Q[1:], joints=JOINTS[1:])),
-        ("not for this period", lambda r: r.send(r.stamp - PERIOD, q=Q)),
-        ("not for this period", lambda r: r.send(r.stamp - PERIOD, [1.0] * 7)),
-        ("not for this period", lambda r: r.send(r.stamp + PERIOD, [1.0] * 7)),
-    ],
-)
-def test_commands_that_cannot_be_obeyed_are_dropped_and_counted(ros, reason, send):
+def test_commands_that_cannot_be_obeyed_are_dropped_and_counted(ros):
     robot = RobotProbe(ros)
     robot.step(times=3)
-    stamp = robot.stamp
-    send(robot)
-    ros.wait_until(lambda: f"{reason}: 1;" in robot.reported("commands_refused"))
+    stamp, counts = robot.stamp, {}
+    for reason, command in (
+        ("not finite", {"tau": [math.nan] * 7}),
+        ("not finite", {"tau": [math.inf] + [0.0] * 6}),
+        ("not finite", {"q": [math.nan] * 7}),
+        ("not finite", {"q": Q, "v": [0.0] * 6 + [math.inf]}),
+        ("not finite", {"tau": [math.nan] * 7, "q": Q}),
+        ("wrong size", {}),
+        ("wrong size", {"tau": [1.0] * 3}),
+        ("wrong size", {"tau": [1.0] * 3, "q": Q}),
+        ("wrong size", {"q": Q[:3]}),
+        ("wrong size", {"q": Q, "v": [0.0]}),
+        ("missing joint", {"tau": [1.0] * 6, "joints": JOINTS[1:]}),
+        ("missing joint", {"q": Q[1:], "joints": JOINTS[1:]}),
+        ("not for this period", {"tau": [1.0] * 7, "stamp": stamp - PERIOD}),
+        ("not for this period", {"tau": [1.0] * 7, "stamp": stamp + PERIOD}),
+        ("not for this period", {"q": Q, "stamp": stamp - PERIOD}),
+    ):
+        robot.send(**{"stamp": stamp} | command)
+        counts[reason] = counts.get(reason, 0) + 1
+        expected = {f"{each}: {count}" for each, count in counts.items()}
+        ros.wait_until(
+            lambda e=expected: all(f"{each};" in robot.reported("commands_refused") for each in e),
+            f"{expected} after {command}",
+        )
     assert robot.stamp == stamp
     robot.step()  # and it goes on
 
 
-def test_names_may_come_in_any_order(ros):
+def test_joints_are_found_by_their_names(ros):
     robot = RobotProbe(ros)
-    order = [3, 1, 6, 0, 2, 5, 4]
-    for _ in range(20):
-        stamp, tau = robot.stamp, robot.gravity()
-        robot.send(stamp, tau[order], [JOINTS[i] for i in order])
-        ros.wait_until(lambda s=stamp: robot.stamp > s)
-    np.testing.assert_allclose(robot.q, Q, atol=1e-6)
+    tau = robot.gravity() + np.linspace(0.1, 0.7, 7)
+    robot.step(tau=[*tau[ORDER], math.nan], joints=SHUFFLED)
+    np.testing.assert_allclose(robot.tau, tau, rtol=1e-12)
 
 
 def test_torque_beyond_the_limits_is_clipped_and_reported(ros):
     robot = RobotProbe(ros)
     robot.step(3.0 * np.array(VALUES["torque_max"]))
-    robot.step()
-    ros.wait_until(lambda: float(robot.reported("commanded_torque_ratio_max") or 0.0) > 2.9)
-    applied = np.array([float(x) for x in robot.reported("torque_ratio").split()])
-    assert applied.max() <= 1.0 + 1e-9
+    np.testing.assert_array_equal(robot.tau, VALUES["torque_max"])
+    assert float(robot.reported_now("commanded_torque_ratio_max")) > 2.9
+    assert max(map(float, robot.reported("torque_ratio").split())) <= 1.0 + 1e-9
 
 
-def test_effort_is_the_torque_that_the_motors_gave(ros):
+def test_positions_are_held_and_followed_by_the_drives(ros):
     robot = RobotProbe(ros)
-    tau = robot.gravity() + 0.5
-    robot.step(tau)
-    np.testing.assert_allclose(robot.tau, tau, rtol=1e-12)
-
-
-def test_other_joints_in_a_command_are_ignored(ros):
-    robot = RobotProbe(ros)
-    stamp, tau = robot.stamp, robot.gravity()
-    robot.send(stamp, [math.nan, *tau], ["other", *JOINTS])
-    ros.wait_until(lambda: robot.stamp > stamp, "the next state")
-    np.testing.assert_allclose(robot.tau, tau, rtol=1e-12)
-
-
-def test_positions_are_held_by_the_drives(ros):
-    robot = RobotProbe(ros)
-    robot.move(Q, times=30)
+    robot.step(q=Q, times=20)
     np.testing.assert_allclose(robot.q, Q, rtol=0.0, atol=1e-3)
     np.testing.assert_allclose(robot.tau, robot.gravity(), atol=0.05)
-    robot.await_reported("control", "position")
-    goal = Q + np.linspace(-0.1, 0.1, 7)
-    robot.move(goal, times=400)
-    np.testing.assert_allclose(robot.q, goal, rtol=0.0, atol=1e-3)
-    assert robot.reported("commands_refused") == "none"
-    assert max(float(x) for x in robot.reported("torque_ratio").split()) <= 1.0
-
-
-def test_positions_may_come_in_any_order_and_with_velocities(ros):
-    robot = RobotProbe(ros)
-    order = [3, 1, 6, 0, 2, 5, 4]
     speed = np.linspace(0.05, 0.1, 7)
     for k in range(100):
-        stamp, path = robot.stamp, Q + speed * (k + 1) * PERIOD * 1e-9
-        names = [*(JOINTS[i] for i in order), "other"]
-        robot.send(stamp, joints=names, q=[*path[order], 9.0], v=[*speed[order], 9.0])
-        ros.wait_until(lambda s=stamp: robot.stamp > s)
+        path = Q + speed * (k + 1) * PERIOD * 1e-9
+        robot.step(joints=SHUFFLED, q=[*path[ORDER], 9.0], v=[*speed[ORDER], 9.0])
     np.testing.assert_allclose(robot.q, path, rtol=0.0, atol=1e-3)
     np.testing.assert_allclose(robot.v, speed, atol=0.01)
+    robot.await_reported("control", "position")
+    assert robot.reported("commands_refused") == "none"
 
 
 def test_control_changes_at_any_time_without_a_jump(ros):
     robot = RobotProbe(ros)
     robot.step(times=5)
-    tau = robot.tau
-    q, v = robot.q, robot.v
-    robot.move(q + v * PERIOD * 1e-9, v)
+    q, v, tau = robot.q, robot.v, robot.tau
+    robot.step(q=q + v * PERIOD * 1e-9, v=v)
     assert (np.abs(robot.tau - tau) < 1e-3 * np.abs(tau).max()).all()
-    robot.move(q, times=20)
-    robot.send(robot.stamp, robot.gravity(), q=Q + 1.0)  # efforts win
+    robot.step(q=q, times=20)
+    robot.step(tau=robot.gravity(), joints=JOINTS, q=Q + 1.0)  # efforts win
     robot.await_reported("control", "torque")
-    robot.step(times=20)
     np.testing.assert_allclose(robot.q, Q, atol=1e-3)
 
 
@@ -144,24 +114,17 @@ def test_the_sensor_is_published_for_each_state_with_bias_and_seeded_noise(ros):
 
     def course():
         """Let 40 periods pass after a reset; return what was felt, shape (40, 6)."""
-        begin = robot.stamp
-        assert ros.call(Trigger, "bullet_node/reset", Trigger.Request()).success
-        ros.wait_until(lambda: robot.stamp > begin)
+        robot.reset()
         robot.step(times=40)
         ros.wait_until(lambda: felt and felt.stamps[-1] == robot.stamp)
         of = {stamp_to_ns(message.header.stamp): message.wrench for message in felt}
         wrenches = [of[stamp] for stamp in sorted(of)[-40:]]
-        assert felt[-1].header.frame_id == VALUES["ft_frame"]
-        return np.array(
-            [
-                [w.force.x, w.force.y, w.force.z, w.torque.x, w.torque.y, w.torque.z]
-                for w in wrenches
-            ]
-        )
+        forces = [[w.force.x, w.force.y, w.force.z] for w in wrenches]
+        return np.hstack([forces, [[w.torque.x, w.torque.y, w.torque.z] for w in wrenches]])
 
     one, other = course(), course()
-    assert one.shape == (40, 6)
     np.testing.assert_array_equal(one, other)
+    assert felt[-1].header.frame_id == VALUES["ft_frame"]
     noise, bias = np.array(VALUES["ft_noise"]), np.array(VALUES["ft_bias"])
     assert (0.5 * noise < one.std(axis=0)).all() and (one.std(axis=0) < 2.0 * noise).all()
     tool = inertia_beyond(read_urdf(VALUES["robot_description"]), VALUES["ft_frame"])
@@ -169,40 +132,30 @@ def test_the_sensor_is_published_for_each_state_with_bias_and_seeded_noise(ros):
     np.testing.assert_allclose(weight, [0.0, 0.0, 9.81 * tool.mass], atol=0.08)
 
 
-@pytest.mark.parametrize("robot", ["panda", "talos_left_arm"])
-def test_robot_state_publisher_can_place_every_link(ros, robot):
+def test_robot_state_publisher_can_place_every_link(ros):
     """It reads the description, and the joints by name: those that are locked, too."""
-    node = ros.start(BulletNode, read_config(robot, "bullet_node") | {"clock": "lockstep"})
-    states = ros.listen(JointState, "joint_states", qos_profile_sensor_data)
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    descriptions = ros.listen(String, "robot_description", latched)
+    values = read_config("talos_left_arm", "bullet_node") | {"clock": "lockstep"}
+    states = ros.listen(JointState, "joint_states")
+    descriptions = ros.listen(String, "robot_description", LATCHED_QOS)
+    ros.start(BulletNode, values)
     ros.wait_until(lambda: states and descriptions)
     state, model = states[-1], pin.buildModelFromXML(descriptions[0].data)
     assert set(state.name) == set(model.names) - {"universe"}
-    q, data = pin.neutral(model), model.createData()
-    for name, position in zip(state.name, state.position, strict=True):
-        joint = model.joints[model.getJointId(name)]
-        angle = [math.cos(position), math.sin(position)]  # of a continuous joint
-        q[joint.idx_q : joint.idx_q + joint.nq] = [position] if joint.nq == 1 else angle
-    pin.framesForwardKinematics(model, data, q)
-    links = [f.name for f in model.frames if f.type == pin.FrameType.BODY and f.name != "universe"]
-    for link in links:
-        placed = data.oMf[model.getFrameId(link, pin.FrameType.BODY)]
-        simulated = node._robot.link_pose(link)
-        np.testing.assert_allclose(placed.homogeneous, simulated.homogeneous, atol=1e-6)
-    others = slice(len(node._config.joints), None)
-    assert not any(state.velocity[others]) and not any(state.effort[others])
     assert len(state.velocity) == len(state.effort) == len(state.name)
 
-
-def test_robot_description_and_clock_are_published(ros):
-    clocks = ros.listen(Clock, "/clock")
-    robot = RobotProbe(ros, publish_clock=True)
-    late = ros.listen(String, "robot_description", LATCHED_QOS)
-    ros.wait_until(lambda: late)
-    assert "<robot" in late[0].data
-    robot.step()
-    ros.wait_until(lambda: clocks and stamp_to_ns(clocks[-1].clock) == robot.stamp)
+    q, data = pin.neutral(model), model.createData()
+    for name, position in zip(state.name, state.position, strict=True):
+        q[model.joints[model.getJointId(name)].idx_q] = position
+    pin.framesForwardKinematics(model, data, q)
+    config = read(BulletConfiguration, values)
+    simulated = make_robot(config)
+    simulated.reset(config.start_positions, np.zeros(len(config.joints)))
+    for frame in model.frames:
+        if frame.type == pin.FrameType.BODY and frame.name != "universe":
+            placed = data.oMf[model.getFrameId(frame.name, pin.FrameType.BODY)]
+            expected = simulated.link_pose(frame.name)
+            np.testing.assert_allclose(placed.homogeneous, expected.homogeneous, atol=1e-6)
+    simulated.close()
 
 
 def test_a_broken_limit_is_an_error_in_diagnostics(ros):
@@ -211,7 +164,7 @@ def test_a_broken_limit_is_an_error_in_diagnostics(ros):
         robot.step(robot.gravity() + np.array([0.0] * 6 + [6.0]))
         if np.abs(robot.v[6]) > VALUES["velocity_max"][6] + 0.1:
             break
-    ros.wait_until(lambda: robot.reported("message") == "a limit was broken")
+    robot.await_reported("message", "a limit was broken")
     violation = [float(x) for x in robot.reported("velocity_violation_rad_s").split()]
     assert violation[6] > 0.1
     assert max(violation[:5]) < 0.1

@@ -15,15 +15,9 @@ from websockets.sync.client import connect
 
 NAMES = "chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
 _FLAGS = (
-    "--headless=new",
-    "--no-sandbox",
-    "--no-first-run",
-    "--hide-scrollbars",
-    # Draws without a graphics card.
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--remote-debugging-port=0",
-    "about:blank",
+    *("--headless=new", "--no-sandbox", "--no-first-run", "--hide-scrollbars"),
+    *("--use-angle=swiftshader", "--enable-unsafe-swiftshader"),  # without a graphics card
+    *("--remote-debugging-port=0", "about:blank"),
 )
 
 
@@ -33,51 +27,40 @@ def find_browser():
 
 
 class Browser:
-    """One page in a browser; `close` ends it.
+    """One page in a browser, a context manager.
 
     Args:
         size: of the page, pixels.
     """
 
     def __init__(self, size=(1280, 800)):
+        width, height = size
         self._profile = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+        where = f"--user-data-dir={self._profile.name}", f"--window-size={width},{height}"
         self._process = subprocess.Popen(
-            [
-                find_browser(),
-                f"--user-data-dir={self._profile.name}",
-                f"--window-size={size[0]},{size[1]}",
-                *_FLAGS,
-            ],
+            [find_browser(), *where, *_FLAGS],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,
         )
-        for line in self._process.stderr:
-            if found := re.search(r"ws://\S+", line):
-                break
-        else:
-            raise RuntimeError("the browser did not start")
+        found = None
+        while not found:
+            line = self._process.stderr.readline()
+            if not line:
+                raise RuntimeError("the browser did not start")
+            found = re.search(r"ws://\S+", line)
         self._socket = connect(found[0], max_size=None, ping_interval=None)
-        self._number = 0
-        self._session = None
+        self._number, self._session = 0, {}
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         attached = self.call("Target.attachToTarget", targetId=target, flatten=True)
-        self._session = attached["sessionId"]
-        self.call(
-            "Emulation.setDeviceMetricsOverride",
-            width=size[0],
-            height=size[1],
-            deviceScaleFactor=1,
-            mobile=False,
-        )
+        self._session = {"sessionId": attached["sessionId"]}
+        metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self.call("Emulation.setDeviceMetricsOverride", **metrics)
 
     def __enter__(self):
         return self
 
     def __exit__(self, *_):
-        self.close()
-
-    def close(self):
         self._socket.close()
         self._process.terminate()
         self._process.wait(10)
@@ -97,18 +80,15 @@ class Browser:
     def _send(self, method, parameters):
         self._number += 1
         message = {"id": self._number, "method": method, "params": parameters}
-        if self._session:
-            message["sessionId"] = self._session
-        self._socket.send(json.dumps(message))
+        self._socket.send(json.dumps(message | self._session))
 
     def open(self, address):
         self.call("Page.navigate", url=address)
 
     def value(self, script):
         """Return what an expression of JavaScript gives."""
-        return self.call("Runtime.evaluate", expression=script, returnByValue=True)["result"].get(
-            "value"
-        )
+        answer = self.call("Runtime.evaluate", expression=script, returnByValue=True)
+        return answer["result"].get("value")
 
     def wait(self, script, timeout=60.0):
         """Return the value of an expression as soon as it is true."""
@@ -119,30 +99,26 @@ class Browser:
             time.sleep(0.1)
         raise TimeoutError(f"after {timeout:g} s not true: {script}")
 
-    def mouse(self, kind, x, y, held=False):
-        # Without waiting for the answer, which may come only with the next picture of the page.
-        event = {
-            "type": f"mouse{kind}",
-            "x": float(x),
-            "y": float(y),
-            "button": "left" if kind != "Moved" or held else "none",
-            "buttons": 1 if held else 0,
-            "clickCount": 0 if kind == "Moved" else 1,
-        }
-        self._send("Input.dispatchMouseEvent", event)
-
     def drag(self, start, end, meanwhile, steps=10):
         """Press at `start`, move to `end`, let go; call `meanwhile` between the events."""
         way = [np.add(start, k / steps * np.subtract(end, start)) for k in range(steps + 1)]
         events = [("Moved", start, False)] * 2 + [("Pressed", start, True)]
         events += [("Moved", at, True) for at in way] + [("Released", end, False)]
-        for kind, at, held in events:
-            self.mouse(kind, *at, held=held)
+        for kind, (x, y), held in events:
+            event = {
+                "type": f"mouse{kind}",
+                "x": float(x),
+                "y": float(y),
+                "button": "left" if kind != "Moved" or held else "none",
+                "buttons": int(held),
+                "clickCount": int(kind != "Moved"),
+            }
+            # Without waiting for the answer, which may come only with the next picture.
+            self._send("Input.dispatchMouseEvent", event)
             meanwhile()
 
-    def screenshot(self, path=None):
-        """Return the page as PNG; write it to `path`, too, if that is given."""
+    def screenshot(self, path):
+        """Write the page as PNG, and return it."""
         picture = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
-        if path is not None:
-            Path(path).write_bytes(picture)
+        Path(path).write_bytes(picture)
         return picture

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A robot node in lockstep, and what a controller sees and sends."""
+"""A robot node, and what a controller sees and sends."""
 
 import numpy as np
 import pinocchio as pin
 from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool, Trigger
 
 from sim_bridge.node.bullet_node import BulletNode
 from viability_bounds_pkg.robot.description import build_model, read_urdf
@@ -21,7 +22,7 @@ BRAKES = {"acceleration_min": [], "acceleration_max": []}
 
 
 class RobotProbe:
-    """The node, and what a controller sees and sends."""
+    """A Panda, by default in lockstep."""
 
     def __init__(self, ros, **changes):
         self.ros = ros
@@ -49,27 +50,26 @@ class RobotProbe:
     def gravity(self):
         return pin.computeGeneralizedGravity(MODEL, MODEL.createData(), self.q)
 
-    def step(self, tau=None, times=1):
-        """Answer states, by default with gravity compensation, and await the next ones."""
+    def send(self, stamp, tau=(), joints=JOINTS, *, q=(), v=()):
+        self.commands.publish(joint_state(joints, stamp, q, v, tau))
+
+    def step(self, tau=None, times=1, **command):
+        """Answer states, by default with gravity compensation, and await the next ones.
+
+        Best effort may lose a command under load: it is sent again.
+        """
         for _ in range(times):
-            stamp, torque = self.stamp, self.gravity() if tau is None else tau
-            self._answer(stamp, lambda s=stamp, t=torque: self.send(s, t))
-
-    def _answer(self, stamp, send):
-        """Send until the next state has come: best effort may lose a command under load."""
-        self.ros.wait_until(lambda: self.stamp > stamp, "the next state", each=send, period=0.5)
-
-    def send(self, stamp, tau=None, joints=JOINTS, *, q=None, v=None):
-        message = joint_state(joints, stamp, tau=[] if tau is None else tau)
-        message.position = [] if q is None else list(map(float, q))
-        message.velocity = [] if v is None else list(map(float, v))
-        self.commands.publish(message)
-
-    def move(self, q, v=None, times=1):
-        """Answer states with positions, and await the next ones."""
-        for _ in range(times):
-            stamp = self.stamp
-            self._answer(stamp, lambda s=stamp: self.send(s, q=q, v=v))
+            stamp, sent = self.stamp, dict(command)
+            if tau is not None:
+                sent["tau"] = tau
+            elif "q" not in command:
+                sent["tau"] = self.gravity()
+            self.ros.wait_until(
+                lambda s=stamp: self.stamp > s,
+                "the next state",
+                each=lambda s=stamp, c=sent: self.send(s, **c),
+                period=0.5,
+            )
 
     def push(self, link, force, stamp=0):
         """Push along y and wait until the robot knows."""
@@ -78,13 +78,26 @@ class RobotProbe:
         message.header.frame_id = link
         message.wrench.force.y = force
         set_stamp(message.header.stamp, stamp)
-        before = len(self.node._world)
+        before = int(self.reported_now("world_changes_pending"))
         pushes.publish(message)
-        self.ros.wait_until(lambda: len(self.node._world) > before, "the push")
-        self.ros.probe.destroy_publisher(pushes)
+        self.await_reported("world_changes_pending", str(before + 1))
+
+    def reset(self):
+        """Reset the robot and await its next state."""
+        before = self.stamp
+        assert self.ros.call(Trigger, "bullet_node/reset", Trigger.Request()).success
+        self.ros.wait_until(lambda: self.stamp > before, "a state after the reset")
+
+    def pause(self, paused):
+        assert self.ros.call(SetBool, "bullet_node/pause", SetBool.Request(data=paused)).success
 
     def reported(self, key):
         return self.ros.reported("bullet_node", key)
+
+    def reported_now(self, key):
+        """Return a value of diagnostics that are yet to come."""
+        self.ros.diagnostics.clear()
+        return self.ros.wait_until(lambda: self.reported(key), key)
 
     def await_reported(self, key, value):
         self.ros.wait_until(lambda: self.reported(key) == value, f"{key} {value}")
