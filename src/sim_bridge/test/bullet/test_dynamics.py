@@ -116,7 +116,7 @@ def test_heavier_links_move_as_if_the_urdf_said_so():
                 for key, value in element.attrib.items():
                     element.set(key, repr(scale * float(value)))
         urdf = ElementTree.tostring(root, encoding="unicode")
-        _, joints, locked = pair.robot.description[:1], *pair.robot.description[1:]
+        _, joints, locked = pair.robot.description
         heavy = build_model(urdf, joints, locked, pair.model.armature)
         for q, v, tau in random_states(pair, 5, seed=5):
             expected = pin.aba(heavy, heavy.createData(), q, v, tau)

@@ -99,22 +99,43 @@ def test_a_command_that_comes_late_acts_at_its_time_unless_that_is_over():
     assert path.absent
 
 
-def test_the_stamp_of_a_message_tells_how_late_it_is():
-    now, refused = 100 * PERIOD, Counter()
+NOW = 100 * PERIOD
+
+
+def accepts(stream, stamp):
+    message = joint_state(JOINTS, stamp, tau=[1.0] * 7)
+    return stream.accept(message, NOW, 0.0, ended=False, paused=False)
+
+
+@pytest.fixture
+def refused():
+    return Counter()
+
+
+@pytest.fixture
+def stream(refused):
     config = read(BulletConfiguration, VALUES | {"command_delay": 2})
-    stream = CommandStream(config, refused, lambda _: None)
+    made = CommandStream(config, refused, lambda _: None)
+    made.proceed()
+    return made
 
-    def accepts(stamp):
-        message = joint_state(JOINTS, stamp, tau=[1.0] * 7)
-        return stream.accept(message, now, 0.0, ended=False, paused=False)
 
-    stream.proceed()
-    assert not accepts(now - PERIOD)  # it is kept, and does not end the period
+def test_the_stamp_of_a_message_tells_how_late_it_is(stream, refused):
+    assert not accepts(stream, NOW - PERIOD)  # it is kept, and does not end the period
     assert not refused
-    assert not accepts(now - PERIOD)  # for the second time
-    assert not accepts(now - 3 * PERIOD)
+    assert not accepts(stream, NOW - PERIOD)  # for the second time
+    assert not accepts(stream, NOW - 3 * PERIOD)
     assert refused == {"not for this period": 2}
     stream.proceed()
     assert stream.acting is None
     stream.proceed()
     assert stream.acting.tau.tolist() == [1.0] * 7
+
+
+def test_one_for_a_state_of_a_pause_does_not_act_after_it(stream):
+    """With a delay it would be in time for the first period."""
+    stream.resume(NOW - PERIOD)
+    accepts(stream, NOW - PERIOD)
+    for _ in range(3):
+        stream.proceed()
+        assert stream.acting is None
