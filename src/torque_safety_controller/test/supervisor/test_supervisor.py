@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Events in; mode, reason and share of the goals out."""
+"""Events in; mode, reason and share of the goals out. And commands that do not act."""
+
+import math
 
 import numpy as np
 import pytest
@@ -7,13 +9,14 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from torque_safety_controller.command_check import TRUSTED_AFTER, CommandCheck
+from torque_safety_controller.command_check import CommandCheck
 from torque_safety_controller.modes import CAUSES, CHANGES, Control, Goals, Mode
-from torque_safety_controller.ramp import FALL_TIME, RISE_TIME
-from torque_safety_controller.supervisor import REST_PATIENCE, Supervisor
+from torque_safety_controller.supervisor import Supervisor
 
 DT, COVERED, PAUSE = 0.01, 1, 0.2
-REST, MOVES, TAU = np.zeros(2), np.array([0.0, 0.5]), np.ones(2)
+REST, MOVES, TAU = np.zeros(2), np.array([0.0, 0.5]), np.array([5.0, -3.0])
+TRUSTED = 100
+"""States that agree with their commands before one that does not counts."""
 
 
 class Chain:
@@ -49,13 +52,11 @@ class Chain:
 
 def test_it_is_stopped_until_the_first_state():
     chain = Chain()
-    assert chain.now == (Mode.STOPPED, "no joint state yet")
     chain.supervisor.silent("no joint state")
     assert chain.now == (Mode.STOPPED, "no joint state yet")
     chain.supervisor.robot_returned("")
     assert chain.answer(None).share == 1.0
-    assert chain.now == (Mode.TRACKING, "goal")
-    assert chain.told == [(Mode.TRACKING, "goal")]
+    assert chain.told == [(Mode.TRACKING, "goal")] == [chain.now]
 
 
 # Each row of CAUSES: how it begins, and how it ends.
@@ -88,29 +89,22 @@ ROWS = {
 }
 
 
-def test_what_must_not_change_by_accident():
-    """Nothing is sent without a usable state; without limits or a solution goals do not count."""
+def test_without_usable_states_nothing_is_sent_and_without_a_solution_goals_do_not_count():
     stops = {name for name, cause in CAUSES.items() if cause.mode is Mode.STOPPED}
     slows = {name for name, cause in CAUSES.items() if cause.goals is Goals.SLOWED}
-    serves = {name for name, cause in CAUSES.items() if cause.goals is Goals.KEPT}
     assert stops == {"silent", "refused"}
     assert slows == {"refused", "failed", "stale", "rival", "moves"}
-    assert serves == {"silent", "drives", "no plan"}
-    assert list(CAUSES)[:3] == ["silent", "refused", "drives"]
     into_torque = {before for before, after in CHANGES.items() if after is Control.TORQUE}
-    assert into_torque == {
-        (Control.TAKING_OVER, "torque known"),
-        (Control.GIVING_BACK, "enable"),
-    }
+    assert into_torque == {(Control.TAKING_OVER, "torque known"), (Control.GIVING_BACK, "enable")}
 
 
 @pytest.mark.parametrize("name", CAUSES)
 def test_each_cause_gives_its_mode_and_its_share_and_ends(name):
     begins, ends = ROWS[name]
-    cause, chain = CAUSES[name], Chain(commands=CommandCheck(0.1 * TAU, 1))
+    cause, chain = CAUSES[name], Chain(commands=CommandCheck(0.1 * np.abs(TAU), 1))
     chain.supervisor.robot_returned("")
     chain.answer(None)
-    chain.run(TRUSTED_AFTER)
+    chain.run(TRUSTED)
     begins(chain)
     mode, reason = chain.now
     assert mode is (cause.mode or Mode.TRACKING)
@@ -123,12 +117,12 @@ def test_each_cause_gives_its_mode_and_its_share_and_ends(name):
     if cause.goals is Goals.SLOWED:
         assert chain.now[0] is Mode.HOLD and chain.now[1].startswith("comes to rest: ")
     chain.v = REST
-    shares = chain.run(round((RISE_TIME + 2 * FALL_TIME) / DT) + 2)
+    shares = chain.run(80)  # longer than it takes to get the goals back
     assert chain.now == (Mode.TRACKING, "goal")
     assert shares[-1] == 1.0
 
 
-def test_the_first_cause_counts():
+def test_the_first_cause_counts_and_a_repeated_state_takes_back_that_the_robot_was_silent():
     chain = Chain()
     chain.answer(None, goal="no goal")
     assert chain.now == (Mode.HOLD, "no goal")
@@ -143,15 +137,7 @@ def test_the_first_cause_counts():
     assert not chain.supervisor.stale
 
 
-def test_a_repeated_state_of_a_robot_that_was_late_restores_the_mode():
-    chain = Chain()
-    chain.answer(None)
-    chain.supervisor.silent("no joint state")
-    chain.supervisor.repeated()
-    assert chain.now == (Mode.TRACKING, "goal")
-
-
-def test_rows_are_counted_told_once_and_forgotten():
+def test_rows_of_missed_states_are_counted_and_told_once():
     chain = Chain()
     chain.answer(None)
     assert not chain.answer((COVERED + 1) * DT).forget_disturbance
@@ -159,16 +145,16 @@ def test_rows_are_counted_told_once_and_forgotten():
     assert order.forget_disturbance and not order.forget_integral
     assert order.share < 1.0
     chain.answer(4 * DT)
-    assert chain.warned == [
-        "2 states in a row without an answer, the bounds cover 1: the arm is slowed"
-    ]
     assert chain.now == (Mode.TRACKING, "goal")
     values = chain.supervisor.values()
     assert (values["missed_rows_too_long"], values["missed_row_longest"]) == (2, 3)
     assert "slowed to" in chain.supervisor.trouble
     chain.run(100)
-    assert chain.warned[-1] == "the arm goes on"
     assert not chain.supervisor.trouble
+    assert chain.warned == [
+        "2 states in a row without an answer, the bounds cover 1: the arm is slowed",
+        "the arm goes on",
+    ]
 
 
 def test_a_pause_in_which_the_robot_stops_itself_holds_the_arm_until_it_rests():
@@ -182,22 +168,9 @@ def test_a_pause_in_which_the_robot_stops_itself_holds_the_arm_until_it_rests():
     assert chain.now == (Mode.TRACKING, "goal")
 
 
-def test_nothing_is_learned_and_the_integral_fades_while_commands_do_not_act():
-    chain = Chain(commands=CommandCheck(0.1 * TAU, 1))
-    chain.answer(None)
-    chain.run(TRUSTED_AFTER)
-    orders = [chain.answer(tau=-TAU) for _ in range(60)]
-    assert not any(order.obeyed for order in orders)
-    assert [order.forget_disturbance for order in orders[:4]] == [False, False, True, True]
-    assert not orders[40].forget_integral and orders[55].forget_integral
-    assert orders[1].share == 1.0 and orders[10].share == 0.0
-    assert chain.answer(tau=None).obeyed, "it is not known"
-
-
 def test_the_share_waits_for_a_goal():
     chain = Chain()
     chain.supervisor.robot_returned("the motors held the arm before")
-    assert chain.answer(None, goal="no goal").share == 0.0
     assert not any(chain.run(100, goal="no goal"))
     assert 0.0 < chain.answer().share < 0.01
 
@@ -205,16 +178,31 @@ def test_the_share_waits_for_a_goal():
 # Control
 
 
+def reach(start, control) -> Chain:
+    """Return a chain that has come to a control by events."""
+    chain = Chain(start)
+    supervisor = chain.supervisor
+    if start == "position":
+        supervisor.enable(True)
+        supervisor.change("torque known", "here")
+    if control is not Control.TORQUE:
+        supervisor.enable(False)
+    if control in (Control.POSITION, Control.TAKING_OVER):
+        supervisor.change("at rest", "here")
+    if control is Control.TAKING_OVER:
+        supervisor.enable(True)
+    assert supervisor.control is control
+    return chain
+
+
 @pytest.mark.parametrize("control", Control)
-@pytest.mark.parametrize("event", sorted({event for _, event in CHANGES}))
-def test_control_changes_by_its_table_and_not_else(control, event):
-    chain = Chain()
-    chain.supervisor._set_control(control, "here")
-    chain.supervisor.change(event, "there")
-    assert chain.supervisor.control is CHANGES.get((control, event), control)
-    assert chain.supervisor.by_drives == ("position" in chain.supervisor.control.value) or (
-        chain.supervisor.control is Control.TAKING_OVER
-    )
+def test_control_changes_by_its_table_and_not_else(control):
+    for event in {event for _, event in CHANGES}:
+        supervisor = reach("torque", control).supervisor
+        supervisor.change(event, "there")
+        assert supervisor.control is CHANGES.get((control, event), control)
+        drives = supervisor.control in (Control.POSITION, Control.TAKING_OVER)
+        assert supervisor.by_drives == drives
 
 
 @pytest.mark.parametrize(
@@ -228,13 +216,12 @@ def test_control_changes_by_its_table_and_not_else(control, event):
     ],
 )
 def test_a_robot_that_was_away_does_not_get_torque_unasked(start, control, after):
-    chain = Chain(start)
-    chain.supervisor._set_control(control, "")
+    chain = reach(start, control)
     chain.supervisor.robot_returned("")
     assert chain.supervisor.control is after
 
 
-def test_an_arm_in_motion_comes_to_rest_before_its_drives_get_it():
+def test_an_arm_comes_to_rest_before_its_drives_get_it_but_is_not_waited_for_for_ever():
     chain = Chain()
     chain.answer(None)
     chain.supervisor.enable(False)
@@ -242,15 +229,10 @@ def test_an_arm_in_motion_comes_to_rest_before_its_drives_get_it():
     assert chain.now == (Mode.HOLD, "on the way to position control")
     chain.answer()
     assert chain.now == (Mode.POSITION, "enable_torque")
-
-
-def test_an_arm_that_does_not_come_to_rest_is_not_waited_for_for_ever():
-    chain = Chain()
-    chain.answer(None)
-    chain.supervisor.enable(False)
-    chain.run(round(REST_PATIENCE / DT) - 1, v=MOVES)
+    chain = reach("torque", Control.GIVING_BACK)
+    chain.run(round(1.9 / DT), v=MOVES)
     assert chain.supervisor.control is Control.GIVING_BACK
-    chain.run(2, v=MOVES)
+    chain.run(round(0.2 / DT), v=MOVES)
     assert chain.supervisor.control is Control.POSITION
 
 
@@ -263,8 +245,59 @@ def test_a_handover_ends_where_limits_stop_coming():
     assert chain.supervisor.control is Control.TAKING_OVER
     chain.answer(limits=False)
     assert chain.now == (Mode.POSITION, "handover failed: acceleration limits are stale")
-    chain.answer(limits=False)
-    assert not chain.supervisor.stale
+
+
+# Commands that do not act
+
+
+def test_commands_count_as_ignored_from_the_third_state_in_a_row_on_that_disagrees():
+    check = trusted()
+    for in_row in (1, 2, 3, 4):
+        assert not check.agrees(TAU + [0.0, 2.1])
+        assert check.ignored == (in_row >= 3)
+        check.sent(TAU)
+    assert check.agrees(TAU + [0.9, -1.9])
+    assert not check.ignored
+    assert not check.agrees(np.array([math.nan, -3.0]))
+
+
+def trusted() -> CommandCheck:
+    """Return a check after enough states that agree."""
+    check = CommandCheck(np.array([1.0, 2.0]), reach=3)
+    for _ in range(TRUSTED):
+        check.sent(TAU)
+        assert check.agrees(TAU)
+    return check
+
+
+def test_the_torque_of_any_of_the_last_commands_agrees():
+    check = trusted()
+    for tau in (TAU + 4.0, TAU, TAU):
+        check.sent(tau)
+    assert check.agrees(TAU + 4.5)
+    check.sent(TAU)
+    assert not check.agrees(TAU + 4.5)
+
+
+def test_torques_that_have_not_agreed_yet_are_of_another_kind():
+    check = trusted()
+    check.reset()
+    for _ in range(3 * TRUSTED):
+        check.sent(TAU)
+        assert check.agrees(np.zeros(2))
+    assert not check.ignored
+
+
+def test_nothing_is_learned_and_the_integral_fades_while_commands_do_not_act():
+    chain = Chain(commands=CommandCheck(0.1 * np.abs(TAU), 1))
+    chain.answer(None)
+    chain.run(TRUSTED)
+    orders = [chain.answer(tau=-TAU) for _ in range(60)]
+    assert not any(order.obeyed for order in orders)
+    assert [order.forget_disturbance for order in orders[:4]] == [False, False, True, True]
+    assert not orders[40].forget_integral and orders[55].forget_integral
+    assert orders[1].share == 1.0 and orders[10].share == 0.0
+    assert chain.answer(tau=None).obeyed, "it is not known"
 
 
 # Whatever comes
@@ -275,7 +308,7 @@ class Events(RuleBasedStateMachine):
 
     def __init__(self):
         super().__init__()
-        self.chain = Chain("torque", CommandCheck(0.1 * TAU, 2))
+        self.chain = Chain("torque", CommandCheck(0.1 * np.abs(TAU), 2))
         self.supervisor, self.share = self.chain.supervisor, 1.0
         self.answered = False
 
@@ -297,8 +330,8 @@ class Events(RuleBasedStateMachine):
             by_drives = supervisor.by_drives
             assert 0.0 <= order.share <= 1.0
             if not by_drives:
-                # The ramp is in the root of the share.
-                assert np.sqrt(order.share) <= np.sqrt(self.share) + DT / RISE_TIME + 1e-9
+                # It rises by the square of a ramp of half a second.
+                assert np.sqrt(order.share) <= np.sqrt(self.share) + DT / 0.5 + 1e-9
                 self.share = order.share
             supervisor.answered(None if by_drives else TAU, failure * (not by_drives), planned)
             mode = supervisor.mode
@@ -343,12 +376,11 @@ class Events(RuleBasedStateMachine):
 
     @invariant()
     def mode_has_a_reason(self):
-        """Each change is told, with a reason; the number of changes agrees."""
-        assert isinstance(self.supervisor.mode, Mode) and self.supervisor.reason
-        assert len(self.chain.told) == self.supervisor.changes
+        """Each change is told, with a reason."""
+        assert self.supervisor.reason
         if self.chain.told:
             assert self.chain.told[-1] == self.chain.now
 
 
 TestEvents = Events.TestCase
-TestEvents.settings = settings(max_examples=100, stateful_step_count=30, deadline=None)
+TestEvents.settings = settings(max_examples=40, stateful_step_count=25, deadline=None)
