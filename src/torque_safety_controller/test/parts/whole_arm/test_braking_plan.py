@@ -6,8 +6,6 @@ import pinocchio as pin
 import pytest
 
 from torque_safety_controller.parts.whole_arm.braking_plan import (
-    AT_REST,
-    UNIFORM,
     PlanLimits,
     PlanTorques,
     braking_periods,
@@ -45,90 +43,57 @@ def played(q, v, periods):
     return states
 
 
-def random_state(rng, share=1.0):
+def random_state(rng):
     """A state from which no joint has to brake harder than it can within a step."""
     q = rng.uniform(LOW, HIGH)
     room = np.where(rng.random(N) < 0.5, HIGH - q, LOW - q)
-    hardest = share * np.sqrt(2.0 * BRAKING * np.abs(room))
+    hardest = np.sqrt(2.0 * BRAKING * np.abs(room))
     return q, np.sign(room) * rng.uniform(0.0, 1.0, N) * np.minimum(hardest, 2.0)
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_samples_are_states_of_the_plan(seed):
+@pytest.mark.parametrize("seed", range(4))
+def test_a_plan_ends_within_the_limits_and_its_samples_are_its_states(seed):
     rng = np.random.default_rng(seed)
     q, v = random_state(rng)
     periods = periods_of(q, v, rng.uniform(DT, 1.0))
-    clock, positions, velocities, accelerations, _ = sampled(q, v, periods)
+    clock, positions, velocities, accelerations, beyond = sampled(q, v, periods)
     states = played(q, v, periods)
-    assert (clock[:UNIFORM] == periods.max() * np.arange(UNIFORM) / UNIFORM).all()
     assert {*periods, *(periods - 1.0)} <= {*clock}
     for k, time in enumerate(clock):
-        now = states[int(time)]
+        q_now, v_now, a_now = states[int(time)]
         t = DT * (time - int(time))  # within a period
         moved = np.minimum(t, np.maximum(DT * (periods - int(time)), 0.0))
-        np.testing.assert_allclose(
-            positions[k], now[0] + moved * (now[1] + 0.5 * moved * now[2]), atol=1e-10
-        )
-        np.testing.assert_allclose(velocities[k], now[1] + moved * now[2], atol=1e-10)
-        np.testing.assert_allclose(accelerations[k], now[2], atol=ROUNDING)
-    np.testing.assert_array_equal(velocities[AT_REST], 0.0)
-    np.testing.assert_array_equal(accelerations[AT_REST], 0.0)
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_a_plan_ends_within_the_limits(seed):
-    rng = np.random.default_rng(seed)
-    q, v = random_state(rng)
-    _, positions, velocities, _, beyond = sampled(q, v, periods_of(q, v, rng.uniform(DT, 1.0)))
+        place = q_now + moved * (v_now + 0.5 * moved * a_now)
+        np.testing.assert_allclose(positions[k], place, atol=1e-10)
+        np.testing.assert_allclose(velocities[k], v_now + moved * a_now, atol=1e-10)
+        np.testing.assert_allclose(accelerations[k], a_now, atol=ROUNDING)
+    assert not velocities[-1].any()
     assert beyond == 0.0
     assert (positions >= LOW - TOLERANCE - 1e-12).all()
     assert (positions <= HIGH + TOLERANCE + 1e-12).all()
     assert (np.abs(velocities) <= np.abs(v) + 1e-12).all()
 
 
-A = BRAKING[3]
-
-
 @pytest.mark.parametrize(
-    ("place", "speed", "T", "expected"),
+    ("place", "speed", "expected", "beyond"),
     [
-        (0.0, 0.1, 0.3, 30),  # the time of the plan
-        (0.0, 0.1, 0.305, 31),  # rounded up
-        (0.0, 1.0, 0.05, np.ceil(1.0 / A / DT)),  # no harder than A
-        (1.1, 1.0, 0.3, 20),  # stands at the limit
-        (1.1, -1.0, 0.3, 30),  # which is not ahead
-        (-0.9, -1.0, 0.3, 20),  # the lower one
-        (1.2 - 0.0595, 1.0, 0.3, 12),  # with A, though it stands 0.5 mrad beyond
-        (1.2 - 0.02, 1.0, 0.3, 4),  # harder than A, as nothing else helps
-        (1.2, 0.0, 0.3, 30),  # at rest at the limit
-        (1.3, 0.0, 0.3, 30),  # and beyond
-        (1.3, 0.1, 0.3, 1),  # at once
+        (0.0, 0.1, 30, 0.0),  # the time that is asked for
+        (1.1, 1.0, 20, 0.0),  # stands at the limit
+        (1.1, -1.0, 30, 0.0),  # which is not ahead
+        (1.2 - 0.02, 1.0, 4, 0.0),  # harder than usual, as nothing else helps
+        (1.3, 0.1, 1, 0.1 + 0.5 * 0.1 * DT - 1e-3),  # beyond: at once
+        (-1.02, 0.5, 30, 0.02 - 1e-3),  # on its way back
     ],
 )
-def test_what_decides_how_long_a_joint_takes(place, speed, T, expected):
-    assert A == 9.0
+def test_how_long_a_joint_takes_and_by_how_far_it_passes_its_limit(place, speed, expected, beyond):
     q, v = np.zeros(N), np.zeros(N)
     q[3], v[3] = place, speed
-    assert periods_of(q, v, T)[3] == expected
+    periods = periods_of(q, v, 0.3)
+    assert periods[3] == expected
+    assert sampled(q, v, periods)[-1] == pytest.approx(beyond)
 
 
-@pytest.mark.parametrize(
-    ("place", "speed", "beyond"),
-    [
-        (1.2, 0.1, 0.0),
-        (1.2, 1.0, 0.5 * 1.0 * DT - 1e-3),
-        (1.21, 0.0, 0.01 - 1e-3),
-        (-1.02, -0.5, 0.02 + 0.5 * 0.5 * DT - 1e-3),
-        (-1.02, 0.5, 0.02 - 1e-3),
-    ],
-)
-def test_a_limit_that_cannot_be_kept_is_told(place, speed, beyond):
-    q, v = np.zeros(N), np.zeros(N)
-    q[3], v[3] = place, speed
-    assert sampled(q, v, periods_of(q, v, 0.3))[-1] == pytest.approx(beyond)
-
-
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_the_rest_of_a_plan_is_a_plan(seed):
     """What makes one plan, once found, enough for ever: period by period until it stands."""
     rng = np.random.default_rng(seed)
@@ -136,8 +101,7 @@ def test_the_rest_of_a_plan_is_a_plan(seed):
     periods = periods_of(q, v, rng.uniform(3.0 * DT, 0.8))
     states, beyond = played(q, v, periods), sampled(q, v, periods)[-1]
     for k in range(1, len(states)):
-        rest = np.maximum(periods - k, 1.0)
-        left = sampled(*states[k][:2], rest)
+        left = sampled(*states[k][:2], np.maximum(periods - k, 1.0))
         assert left[-1] <= beyond + 1e-12
         for mine, other in zip(left[1:4], states[k], strict=True):
             np.testing.assert_allclose(mine[0], other, atol=1e-8)
@@ -149,7 +113,7 @@ def passes(place, speed, A, limit):
     return max(place, place + 0.5 * DT * speed * needed) > limit + ROUNDING
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(5))
 def test_bounds_are_narrowed_to_the_last_acceleration_from_which_a_joint_can_stop(seed):
     """Against the definition: at each end, and just outside."""
     q, v = random_state(np.random.default_rng(seed))
@@ -164,25 +128,6 @@ def test_bounds_are_narrowed_to_the_last_acceleration_from_which_a_joint_can_sto
                 assert passes(place, speed, BRAKING[j], limit[j]) == expected
 
 
-def test_the_plan_is_within_the_bounds_and_from_outside_only_the_way_back_is():
-    q, v, plan = HIGH + 0.1, np.full(N, 0.5), np.full(N, -20.0)
-    low, high = narrow(q, v, plan, -BRAKING, BRAKING, LOW, HIGH, BRAKING, DT)
-    np.testing.assert_array_equal(high, plan)
-    np.testing.assert_array_equal(low, plan)
-    low, high = narrow(HIGH, v, plan, -BRAKING, BRAKING, LOW, HIGH, BRAKING, DT)
-    assert (low <= high).all()
-    np.testing.assert_array_less(high, 0.0)
-
-
-def test_joints_without_limits_are_free():
-    free, v = np.full(N, np.inf), np.full(N, 0.5)
-    low, high = narrow(np.zeros(N), v, 0.0 * v, -BRAKING, BRAKING, -free, free, BRAKING, DT)
-    np.testing.assert_array_equal(low, -BRAKING)
-    np.testing.assert_array_equal(high, BRAKING)
-    periods = braking_periods(np.zeros(N), v, np.array([0.3]), -free, free, *LIMITS[2:])
-    assert (periods >= 30).all()
-
-
 def sample_model():
     """A manipulator of seven joints."""
     model = pin.buildSampleModelManipulator()
@@ -192,9 +137,8 @@ def sample_model():
     return model
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_torques_of_plans_are_those_of_inverse_dynamics_with_what_is_given_besides(seed):
-    rng, model = np.random.default_rng(seed), sample_model()
+def test_torques_of_plans_are_those_of_inverse_dynamics_with_what_is_given_besides():
+    rng, model = np.random.default_rng(0), sample_model()
     data, usable, extra = model.createData(), rng.uniform(5.0, 50.0, N), rng.normal(size=N)
     q, v = random_state(rng)
     periods = braking_periods(q, v, np.array([0.1, 0.4]), *LIMITS)
@@ -207,7 +151,7 @@ def test_torques_of_plans_are_those_of_inverse_dynamics_with_what_is_given_besid
         assert plans.slack[i] == pytest.approx(1.0 - (np.abs(plans.tau[i]) / usable).max())
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_torques_change_as_the_derivatives_say(seed):
     """Against the torques of plans from states a little apart, at each kind of sample."""
     rng, model = np.random.default_rng(seed), sample_model()
@@ -228,9 +172,7 @@ def test_torques_change_as_the_derivatives_say(seed):
         M = np.triu(M) + np.triu(M, 1).T
         change = torque_change(float(clock), periods, by_q, by_v, M, DT)
         for j in np.flatnonzero(periods > 1):
-            da = np.zeros(N)
-            da[j] = step
-            high, low = (torque(begin + s * da, clock - 1) for s in (1.0, -1.0))
-            measured = (high - low) / (2.0 * step)
+            da = step * np.eye(N)[j]
+            measured = (torque(begin + da, clock - 1) - torque(begin - da, clock - 1)) / (2 * step)
             scale = max(np.abs(measured).max(), 1e-6)
             np.testing.assert_allclose(change[:, j], measured, atol=1e-4 * scale)

@@ -1,14 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The filter on Baxter, whose shoulder cannot hold the stretched arm, against an adversary."""
 
-from functools import cache
-
 import numpy as np
 import pinocchio as pin
 import pytest
 
-from torque_safety_controller.parts.whole_arm.braking_plan import RESERVE, braking_periods
-from torque_safety_controller.parts.whole_arm.safety_filter import KEPT, SafetyFilter
+from torque_safety_controller.parts.whole_arm.safety_filter import SafetyFilter
 from viability_bounds_pkg.cli.limits_file import read_robot
 from viability_bounds_pkg.joint_limits import JointLimits
 from viability_bounds_pkg.testing.ros_harness import config_folder, read_config
@@ -16,6 +13,8 @@ from viability_bounds_pkg.viability import BoundsSolver
 
 ROUNDING = 1e-9
 SHOULDER, ELBOW = 1, 3
+RESERVE = 0.03
+"""Share of the torque limits that plans leave."""
 
 
 class Arm:
@@ -120,18 +119,6 @@ def heavier(arm):
     return wanted
 
 
-@cache
-def at_random(arm, seed):
-    """What `Arm.play` returns of 4 s to and fro."""
-    return arm.play(bang_bang(arm, seed), 4.0)
-
-
-@cache
-def to_the_worst(arm):
-    """What `Arm.play` returns of 2.5 s towards the worst posture."""
-    return arm.play(heavier(arm), 2.5)
-
-
 ARMS = [("baxter_left_arm", 1.0), ("panda", 0.6), ("talos_left_arm", 0.6)]
 
 
@@ -140,84 +127,51 @@ def arm(request):
     return Arm(*request.param)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_no_limit_is_passed_whatever_is_wanted(arm, seed):
-    worst, _, keeper = at_random(arm, seed)
-    assert worst[0] <= ROUNDING
-    assert worst[1] <= ROUNDING
-    assert worst[2] <= 1.0 + ROUNDING
-    assert keeper.outcomes["outside"] == 0
-    assert keeper.outcomes["as wanted"] > 0
-
-
-def test_no_limit_is_passed_where_the_worst_posture_is_wanted(arm):
-    worst, states, keeper = to_the_worst(arm)
-    assert worst[0] <= ROUNDING
-    assert worst[1] <= ROUNDING
-    assert worst[2] <= 1.0 + ROUNDING
-    q, v = states[-1]
-    if arm.tau_max[SHOULDER] == 50.0:  # Baxter's: pressed against what it can hold
-        load = arm.torque(q, np.zeros(arm.n), np.zeros(arm.n))[SHOULDER] / arm.tau_max[SHOULDER]
-        assert 1.0 - RESERVE - 3.0 * KEPT <= abs(load) <= 1.0 - RESERVE + ROUNDING
-
-
-def test_without_the_filter_baxter_passes_its_limits():
-    arm = Arm("baxter_left_arm")
-    worst = max(arm.play(bang_bang(arm, seed), 6.0, False)[0][2] for seed in range(3))
-    assert worst > 1.0
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_the_plan_in_hand_ends_at_rest_and_can_be_held(arm, seed):
-    """Nothing is wanted any more: the plans alone, from wherever the adversary had got to."""
-    adversary, stop = bang_bang(arm, seed), 1.5 + 0.37 * seed
+def test_no_limit_is_passed_whatever_is_wanted_and_then_the_arm_comes_to_rest(arm):
+    """In the end nothing is wanted: the plans alone, from wherever the adversary had got to."""
+    adversary, stop = bang_bang(arm, 0), 2.0
 
     def wanted(t, q, v):
         return adversary(t, q, v) if t < stop else -v / arm.dt
 
-    worst, states, _ = arm.play(wanted, stop + 2.0)
+    worst, states, keeper = arm.play(wanted, stop + 1.5)
     assert (worst <= [ROUNDING, ROUNDING, 1.0 + ROUNDING]).all()
+    assert keeper.outcomes["outside"] == 0
+    assert keeper.outcomes["as wanted"] > 0
     q, v = states[-1]
     assert np.abs(v).max() < 1e-6
     held = np.abs(arm.torque(q, np.zeros(arm.n), np.zeros(arm.n)))
     assert (held <= arm.tau_max).all()
 
 
-def test_between_its_samples_a_plan_needs_no_more_than_the_reserve(arm):
-    """The torques of accepted plans on a fine grid: what `RESERVE` has to cover."""
-    rng = np.random.default_rng(5)
-    _, states, _ = at_random(arm, 0)
-    keeper = arm.filter()
-    most, seen = 0.0, 0
-    for index in rng.choice(len(states), 60, replace=False):
-        q, v = states[index]
-        periods = braking_periods(q, v, np.array([0.3]), *keeper._limits)
-        if keeper._plans.evaluate(q, v, periods, np.zeros(arm.n)).slack[0] < 0.0:
-            continue
-        times, seen = arm.dt * periods[0], seen + 1
-        a = -v / times
-        for t in np.linspace(0.0, times.max(), 300):
-            moved = np.minimum(t, times)
-            tau = arm.torque(
-                q + (v + 0.5 * a * moved) * moved, v + a * moved, np.where(t < times, a, 0.0)
-            )
-            most = max(most, (np.abs(tau) / arm.tau_max).max())
-    assert seen > 0
-    assert most <= 1.0
+def test_no_limit_is_passed_where_the_worst_posture_is_wanted():
+    arm = Arm("baxter_left_arm")
+    worst, states, _ = arm.play(heavier(arm), 2.5)
+    assert (worst <= [ROUNDING, ROUNDING, 1.0 + ROUNDING]).all()
+    # Pressed against what its shoulder can hold.
+    q, zero = states[-1][0], np.zeros(arm.n)
+    load = arm.torque(q, zero, zero)[SHOULDER] / arm.tau_max[SHOULDER]
+    assert 0.94 <= abs(load) <= 1.0 - RESERVE + ROUNDING
 
 
-def test_constraints_leave_the_plan_as_it_is(arm):
+def test_without_the_filter_baxter_passes_its_limits():
+    arm = Arm("baxter_left_arm")
+    worst = max(arm.play(bang_bang(arm, seed), 3.0, False)[0][2] for seed in range(3))
+    assert worst > 1.0
+
+
+def test_constraints_leave_the_plan_as_it_is():
     """They allow its acceleration, so that a QP with them, bounds and torques has a solution."""
-    states = at_random(arm, 1)[1] + to_the_worst(arm)[1]
+    arm = Arm("baxter_left_arm")
+    _, states, _ = arm.play(bang_bang(arm, 1), 1.5)
     keeper, zero, seen = arm.filter(), np.zeros(arm.n), 0
-    for q, v in states[::7]:
+    for q, v in states[::5]:
         lower, upper, _ = arm.solver.bounds(q, v)
         keeper.forget_plan()
         rows = keeper.update(q, v, zero, lower, upper)
-        if rows is None or keeper.slack < KEPT:
+        if rows is None or keeper.slack < 0.01:
             continue
         seen += 1
-        np.testing.assert_allclose(np.linalg.norm(rows.G, axis=1), 1.0)
         assert (rows.G @ keeper.plan <= rows.upper + ROUNDING).all()
     assert seen > 0
 
