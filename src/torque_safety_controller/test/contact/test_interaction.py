@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torque_safety_controller.controller import Controller
-from torque_safety_controller.parts.contact import interaction
 from torque_safety_controller.parts.contact.contacts import FrictionContact
 from torque_safety_controller.parts.contact.interaction import (
     Compliance,
@@ -23,16 +22,19 @@ from torque_safety_controller.parts.contact.wrench_sensor import WrenchSensor
 from torque_safety_controller.parts.goals import Goals
 from torque_safety_controller.parts.joint_bounds import JointBounds
 from torque_safety_controller.qp import AccelerationRange
-from torque_safety_controller.tasks.admittance import KV, AdmittanceTask, admittance
+from torque_safety_controller.tasks.admittance import AdmittanceTask, admittance
 from viability_bounds_pkg.state import State
 
 GAINS = replace(PLAIN, posture_weight=1e-6)  # so little that the hand does what its tasks want
-WIDE = np.full(7, 1e3)  # rad/s^2; bounds that no one feels
 DT = 1e-3
 Z = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 ARM = load_arm("panda")
 Q, REST = ARM.q_start, np.zeros(7)
-PAPER_KP = 5e-3
+ELSEWHERE = Q + 0.05
+STRONG = np.full(7, 1e3)  # N m
+KP, KV = 5e-3, 1e-7  # of Table I, defaults
+FORCE_STEP = 0.5  # N; by what is counted on may exceed what is felt
+DUAL = {"yield_threshold": np.array([10.0, 2.0])}
 NORMAL = np.array([0.0, 0.0, -1.0])
 """A table below a hand that points down pushes against the hand's z axis."""
 
@@ -40,39 +42,43 @@ NORMAL = np.array([0.0, 0.0, -1.0])
 class SimulatedHand:
     """A controller of Panda, and what its sensor feels."""
 
-    def __init__(self, contact=False, tau_max=ARM.tau_max, gains=GAINS, **settings) -> None:
-        sensor = WrenchSensor(
-            pin.SE3.Identity(),
-            pin.Inertia.Zero(),
-            np.zeros(3),
-            filter_hz=1e9,
-            timeout=0.005,
-        )
-        touching = FrictionContact(ARM.frame, np.zeros((1, 3)), NORMAL, 0.5) if contact else None
-        robot = ARM.robot(DT)
-        goals = Goals(robot.n, gains)
+    def __init__(self, contact=False, tau_max=ARM.tau_max, **settings) -> None:
+        zero = pin.Inertia.Zero()
+        sensor = WrenchSensor(pin.SE3.Identity(), zero, np.zeros(3), filter_hz=1e9, timeout=0.005)
+        self.contact = FrictionContact(ARM.frame, np.zeros((1, 3)), NORMAL, 0.5)
+        self.goals = Goals(7, GAINS)
         self.interaction = Interaction(
-            goals, sensor, touching, settings=InteractionSettings(**settings)
+            self.goals,
+            sensor,
+            self.contact if contact else None,
+            settings=InteractionSettings(**settings),
         )
-        parts = [self.interaction, goals, JointBounds()]
-        self.controller = Controller(robot, parts, tau_max, hold_kd=gains.hold_kd)
-        self.controller.warm_up()
+        parts = [self.interaction, self.goals, JointBounds()]
+        self.controller = Controller(ARM.robot(DT), parts, tau_max, hold_kd=GAINS.hold_kd)
         self.controller.reset(Q)
-        self.pose = ARM.robot(0.0)
-        self.pose.update(State(Q, REST), REST)
-        self.controller.goals.set_pose(self.pose.pose.copy())
+        robot = ARM.robot(0.0)
+        robot.update(State(Q, REST), REST)
+        self.start = robot.pose.copy()
+        self.goals.set_pose(self.start)
 
-    def step(self, wrench=None, q=Q, v=REST, bounds=WIDE):
-        if wrench is not None:
-            self.interaction.sensor.receive(wrench)
-        return self.controller.step(State(q, v), AccelerationRange(-bounds, bounds))
+    def step(self, wrench=None, q=Q, count=1, bound=1e3):
+        for _ in range(count):
+            if wrench is not None:
+                self.interaction.sensor.receive(wrench)
+            bounds = AccelerationRange(np.full(7, -bound), np.full(7, bound))
+            step = self.controller.step(State(q, REST), bounds)
+        return step
+
+    def accelerates(self, step) -> np.ndarray:
+        return self.controller.robot.J @ step.a + self.controller.robot.drift
 
     @property
     def state(self) -> Compliance:
         return self.interaction.state
 
-    def hand_acceleration(self, step, v=REST) -> np.ndarray:
-        return self.controller.robot.J @ step.a + self.controller.robot.drift
+    @property
+    def holds_where_it_is(self) -> bool:
+        return self.goals.pose_des.isApprox(self.controller.robot.pose)
 
 
 def force(x=0.0, y=0.0, z=0.0) -> np.ndarray:
@@ -82,28 +88,22 @@ def force(x=0.0, y=0.0, z=0.0) -> np.ndarray:
 # (27)
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=50)
 @given(st.integers(0, 2**32 - 1))
 def test_the_task_asks_for_what_equation_27_says(seed):
     rng = np.random.default_rng(seed)
     robot = ARM.robot(0.0)
-    q, v = ARM.random_state(rng)
-    robot.update(State(q, v), REST)
+    robot.update(State(*ARM.random_state(rng)), REST)
     F_ref, F, F_ref_rate, F_rate = rng.normal(size=(4, 6)) * 10.0
-    kp, any_speed = rng.uniform(0.0, 1.0, size=2), (np.inf, np.inf)
-    Kp = np.diag(np.repeat(kp, 3))
-    expected = -Kp @ (F_ref - F) - KV * (F_ref_rate - F_rate)
-    g = admittance(F_ref - F, F_ref_rate - F_rate, kp, any_speed, 50.0)
+    kp = rng.uniform(0.0, 1.0, size=2)
+    expected = -np.repeat(kp, 3) * (F_ref - F) - KV * (F_ref_rate - F_rate)
+    g = admittance(F_ref - F, F_ref_rate - F_rate, kp, (np.inf, np.inf), 50.0)
     task = AdmittanceTask(g, 2.0, np.arange(6)).term(robot)
     a = np.linalg.lstsq(task.A, task.b, rcond=None)[0]
     np.testing.assert_allclose(robot.J @ a + robot.drift, expected, atol=1e-6)
-    some = np.array([1, 2, 5])
-    part = AdmittanceTask(g, 2.0, some).term(robot)
-    np.testing.assert_array_equal(part.A, task.A[some])
-    np.testing.assert_array_equal(part.b, task.b[some])
 
 
-@pytest.mark.parametrize("push", [0.1, 3.0, 100.0])
+@pytest.mark.parametrize("push", [0.1, 100.0])
 def test_the_hand_does_not_rush(push):
     """It settles at the speed of (27) against the damping, or at the limit."""
     direction = np.array([2.0, -1.0, 2.0]) / 3.0
@@ -113,44 +113,37 @@ def test_the_hand_does_not_rush(push):
     np.testing.assert_allclose(g[3:] / 50.0, min(0.2 * push / 50.0, 0.1) * direction)
 
 
-def test_a_hand_that_feels_too_little_moves_on_and_too_much_back(monkeypatch):
+def test_a_hand_that_feels_too_little_moves_on_and_too_much_back():
     """The paper's weights: the mean of what the two tasks want, in the direction of force only."""
-    monkeypatch.setattr(interaction, "PRESS_SPEED_MAX", (10.0, 10.0))
     hand = SimulatedHand(force_directions=Z)
-    hand.interaction.set_target(-force(z=-10.0))  # press along z: the table pushes with -10
-    for _ in range(3000):
-        free = hand.step(force())
+    hand.interaction.set_target(-force(z=-3.0))  # press along z: the table pushes with -3
+    free = hand.step(force(), count=1500)
     assert hand.state is Compliance.FORCE
-    wanted = 0.5 * PAPER_KP * 10.0
-    assert hand.hand_acceleration(free)[2] == pytest.approx(wanted, rel=1e-3)
-    np.testing.assert_allclose(np.delete(hand.hand_acceleration(free), 2), 0.0, atol=1e-4)
-    hand.step(force(z=-30.0))  # in which the derivative acts, too
-    too_much = hand.step(force(z=-30.0))
-    assert hand.hand_acceleration(too_much)[2] == pytest.approx(-2.0 * wanted, rel=1e-3)
-    hand.step(force(z=-10.0))
-    enough = hand.step(force(z=-10.0))
-    np.testing.assert_allclose(hand.hand_acceleration(enough), 0.0, atol=1e-4)
+    wanted = 0.5 * KP * 3.0
+    assert hand.accelerates(free)[2] == pytest.approx(wanted, rel=1e-3)
+    np.testing.assert_allclose(np.delete(hand.accelerates(free), 2), 0.0, atol=1e-4)
+    too_much = hand.step(force(z=-9.0), count=2)
+    assert hand.accelerates(too_much)[2] == pytest.approx(-2.0 * wanted, rel=1e-3)
+    enough = hand.step(force(z=-3.0), count=2)
+    np.testing.assert_allclose(hand.accelerates(enough), 0.0, atol=1e-4)
 
 
 def test_no_stiffness_is_left_where_force_is_controlled():
     hand = SimulatedHand(force_directions=Z)
-    goal = hand.pose.pose * pin.SE3(np.eye(3), np.array([0.01, 0.0, 0.02]))
-    hand.controller.goals.set_pose(goal)
+    hand.goals.set_pose(hand.start * pin.SE3(np.eye(3), np.array([0.01, 0.0, 0.02])))
     hand.interaction.set_target(np.zeros(6))
-    a = hand.hand_acceleration(hand.step(force()))
+    a = hand.accelerates(hand.step(force()))
     assert a[0] == pytest.approx(GAINS.pose_kp * 0.01, rel=1e-2)
     assert a[2] == pytest.approx(0.0, abs=1e-4)
 
 
 def test_a_target_in_the_base_frame_turns_with_the_hand():
     hand = SimulatedHand(force_directions=np.ones(6))
-    R = hand.pose.pose.rotation
     pressed = np.array([1.0, 2.0, -3.0, 0.1, 0.2, 0.3])
     hand.interaction.set_target(pressed, np.eye(3))
-    for _ in range(3000):
-        hand.step(np.zeros(6))
-    expected = -np.concatenate([R.T @ pressed[:3], R.T @ pressed[3:]])
-    np.testing.assert_allclose(hand.interaction.reference, expected, atol=1e-6)
+    hand.step(np.zeros(6), count=1500)
+    expected = -(pressed.reshape(2, 3) @ hand.start.rotation).ravel()
+    np.testing.assert_allclose(hand.interaction.reference, expected, atol=1e-5)
 
 
 # Contact
@@ -158,47 +151,46 @@ def test_a_target_in_the_base_frame_turns_with_the_hand():
 
 def test_the_motors_give_what_the_contact_takes():
     """Against inverse dynamics with the force as Pinocchio's external one; and only in contact."""
-    hand = SimulatedHand(contact=True, force_directions=Z, tau_max=np.full(7, 1e3))
-    free = hand.step(force())
+    hand = SimulatedHand(contact=True, force_directions=Z, tau_max=STRONG)
+    assert hand.step(force()).forces is None
     hand.interaction.set_target(-force(z=-10.0))
-    exact = ARM.robot(DT)
-    exact.update(State(Q, REST), REST)
-    np.testing.assert_allclose(free.tau, exact.torque(free.a), atol=1e-9)
-    for _ in range(2000):
-        pressing = hand.step(force(z=-10.0))
-    assert pressing.forces is not None
+    pressing = hand.step(force(z=-10.0), count=1000)
     # The wrench task has a hundred thousandth of the others' weight, and gamma acts on it, too.
     np.testing.assert_allclose(hand.interaction.reference, force(z=-10.0), atol=2.5)
-    model, data = ARM.model, ARM.model.createData()
-    frame = model.frames[model.getFrameId(ARM.frame)]
-    fext = [pin.Force.Zero() for _ in range(model.njoints)]
+    frame = ARM.model.frames[ARM.model.getFrameId(ARM.frame)]
+    fext = [pin.Force.Zero() for _ in range(ARM.model.njoints)]
     fext[frame.parentJoint] = frame.placement.act(pin.Force(hand.interaction.reference))
     # With rest before and after, the middle of the step is Q to first order.
-    expected = pin.rnea(model, data, Q, REST, pressing.a, fext)
+    expected = pin.rnea(ARM.model, ARM.model.createData(), Q, REST, pressing.a, fext)
     np.testing.assert_allclose(pressing.tau, expected, atol=1e-2)
 
 
-def test_torque_limits_hold_with_the_contact_counted_in(monkeypatch):
-    monkeypatch.setattr(interaction, "WRENCH_WEIGHT", 1e6)
-    monkeypatch.setattr(interaction, "WRENCH_TIME", 1e-3)
+def test_torque_limits_hold_with_the_contact_counted_in():
     hand = SimulatedHand(contact=True, force_directions=Z)
     hand.interaction.set_target(-force(z=-2000.0))
-    steps = [hand.step(force(z=-2000.0), bounds=np.full(7, 0.5)) for _ in range(50)]
-    assert all((np.abs(step.tau) <= ARM.tau_max).all() for step in steps)
-    # They bind: what is counted on is less than was asked for, and that is what (27) goes by.
+    at_limit = False
+    for _ in range(500):
+        tau = np.abs(hand.step(force(z=-2000.0), bound=0.5).tau)
+        assert (tau <= ARM.tau_max).all()
+        at_limit |= (tau > 0.999 * ARM.tau_max).any()
+    assert at_limit
+    # What is counted on is less than was asked for, and that is what (27) goes by.
     assert -1500.0 < hand.interaction.reference[2] < -50.0
-    assert (np.abs(steps[-1].tau) > 0.999 * ARM.tau_max).any()
 
 
-def test_what_is_counted_on_exceeds_what_is_felt_by_a_step_at_most(monkeypatch):
-    monkeypatch.setattr(interaction, "FORCE_STEP", 2.0)
-    monkeypatch.setattr(interaction, "WRENCH_TIME", 1e-6)
+def counted_on(hand, felt) -> np.ndarray:
+    (task,) = hand.step(force(z=-felt)).forces.tasks
+    return task.F_des
+
+
+def test_what_is_counted_on_exceeds_what_is_felt_by_half_a_newton_at_most():
     hand = SimulatedHand(contact=True, force_directions=Z)
     hand.interaction.set_target(-force(x=5.0, z=-10.0))
-    for measured, counted in ((0.0, 2.0), (3.0, 5.0), (-7.0, 2.0), (9.0, 10.0), (40.0, 10.0)):
-        (task,) = hand.step(force(z=-measured)).forces.tasks
+    hand.step(force(), count=1000)
+    for felt, counted in ((0.0, 0.5), (3.0, 3.5), (-7.0, 0.5), (9.8, 10.0), (40.0, 10.0)):
         # Smaller, and in the same direction.
-        np.testing.assert_allclose(task.F_des, [0.5 * counted, 0.0, -counted], rtol=1e-9)
+        found = counted_on(hand, felt)
+        np.testing.assert_allclose(found[:3], [0.5 * counted, 0.0, -counted], rtol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -211,70 +203,45 @@ def test_what_is_counted_on_exceeds_what_is_felt_by_a_step_at_most(monkeypatch):
     ],
     ids=["across", "across only", "a pull", "a moment"],
 )
-def test_what_a_contact_cannot_give_is_not_counted_on(goal, monkeypatch):
-    monkeypatch.setattr(interaction, "WRENCH_TIME", 1e-6)
+def test_what_a_contact_cannot_give_is_not_counted_on(goal):
     hand = SimulatedHand(contact=True, force_directions=Z)
     hand.interaction.set_target(-goal)
-    contact = hand.interaction.contact
-    (task,) = hand.step(force()).forces.tasks
-    pressing = contact.normal @ task.F_des[:3]
-    assert 0.0 <= pressing <= interaction.FORCE_STEP + 1e-9
-    across = task.F_des[:3] - pressing * contact.normal
-    assert np.linalg.norm(across) <= contact.friction * pressing + 1e-9
-    assert np.linalg.norm(task.F_des[3:]) < 1.0
+    hand.step(force(), count=100)
+    counted = counted_on(hand, 0.0)
+    pressing = NORMAL @ counted[:3]
+    assert 0.0 <= pressing <= FORCE_STEP + 1e-9
+    across = counted[:3] - pressing * NORMAL
+    assert np.linalg.norm(across) <= hand.contact.friction * pressing + 1e-9
+    assert np.linalg.norm(counted[3:]) < 1.0
 
 
 # Dual compliance
 
 
-def test_yielding_has_hysteresis():
-    hand = SimulatedHand(yield_threshold=np.array([10.0, 1.0]))
-    before = False
+def test_the_hand_is_led_above_the_threshold_and_held_below_half_of_it():
+    hand, before = SimulatedHand(**DUAL), False
     for value in np.random.default_rng(0).uniform(-20.0, 20.0, 200):
         hand.step(force(y=value))
         after = hand.state is Compliance.YIELDING
-        if abs(value) > 10.0:
-            assert after
-        elif abs(value) <= 10.0 * interaction.YIELD_RELEASE:
-            assert not after
-        else:
-            assert after == before
+        assert after == (abs(value) > (5.0 if before else 10.0))
         before = after
-
-
-def test_a_moment_is_yielded_to_as_well():
-    hand = SimulatedHand(yield_threshold=np.array([10.0, 2.0]))
+    led = hand.accelerates(hand.step(force(x=12.0)))
+    assert led[0] > 0.1  # m/s^2
+    held = hand.accelerates(hand.step(force(x=4.0)))
+    np.testing.assert_allclose(held, 0.0, atol=1e-4)
     hand.step(np.array([0, 0, 0, 0, 2.1, 0.0]))
-    assert hand.state is Compliance.YIELDING
-    hand.step(np.array([0, 0, 0, 0, 0.9, 0.0]))
-    assert hand.state is Compliance.HOLDING
-
-
-def test_the_hand_is_held_below_the_threshold_and_led_above():
-    settings = {"yield_threshold": np.array([10.0, 2.0])}
-    hand = SimulatedHand(**settings)
-    held = hand.step(force(x=9.0))
-    assert hand.state is Compliance.HOLDING
-    np.testing.assert_allclose(hand.hand_acceleration(held), 0.0, atol=1e-4)
-    led = hand.step(force(x=12.0))
-    assert hand.state is Compliance.YIELDING
-    gain = interaction.YIELD_KP[0]
-    assert hand.hand_acceleration(led)[0] == pytest.approx(0.5 * gain * 12.0, rel=1e-2)
+    assert hand.state is Compliance.YIELDING, "to a moment"
 
 
 def test_where_the_hand_is_let_go_is_its_new_goal():
-    hand = SimulatedHand(yield_threshold=np.array([10.0, 2.0]))
+    hand = SimulatedHand(**DUAL)
     hand.step(force(x=20.0))
-    elsewhere = Q + 0.05
-    hand.step(force(x=20.0), elsewhere)
-    taken = hand.controller.goals.held
+    hand.step(force(x=20.0), ELSEWHERE)
     there = hand.controller.robot.pose.copy()
-    hand.step(force(x=1.0), elsewhere + 1e-3)
-    assert hand.state is Compliance.HOLDING
-    assert hand.controller.goals.pose_des.isApprox(there)
-    assert hand.controller.goals.held == taken
-    hand.step(force(x=1.0), Q)
-    assert hand.controller.goals.pose_des.isApprox(there)
+    for q in (ELSEWHERE + 1e-3, Q):
+        hand.step(force(x=1.0), q)
+        assert hand.state is Compliance.HOLDING
+        assert hand.goals.pose_des.isApprox(there)
 
 
 # What goes wrong
@@ -282,61 +249,38 @@ def test_where_the_hand_is_let_go_is_its_new_goal():
 
 @pytest.mark.parametrize("pressing", [False, True])
 def test_a_sensor_that_falls_silent_ends_it_where_the_hand_is(pressing):
-    hand = SimulatedHand(contact=True, force_directions=Z, yield_threshold=np.array([10.0, 2.0]))
+    hand = SimulatedHand(contact=True, force_directions=Z, **DUAL)
     if pressing:
         hand.interaction.set_target(-force(z=-10.0))
     hand.step(force(z=-20.0))
     assert hand.state is (Compliance.FORCE if pressing else Compliance.YIELDING)
-    elsewhere = Q + 0.05
-    for _ in range(10):
-        step = hand.step(None, elsewhere)
+    step = hand.step(None, ELSEWHERE, count=10)
     assert hand.state is Compliance.SILENT
-    assert hand.controller.goals.pose_des.isApprox(hand.controller.robot.pose)
+    assert hand.holds_where_it_is
     assert step.forces is None
-    np.testing.assert_allclose(hand.hand_acceleration(step), 0.0, atol=1e-4)
-    assert not hand.interaction.report()["target_wrench"].any()
+    np.testing.assert_allclose(hand.accelerates(step), 0.0, atol=1e-4)
     # Back again, nothing is pressed unasked.
-    step = hand.step(force(z=-5.0), elsewhere)
+    step = hand.step(force(z=-5.0), ELSEWHERE)
     assert hand.state is Compliance.HOLDING
-    np.testing.assert_allclose(hand.hand_acceleration(step), 0.0, atol=1e-4)
+    np.testing.assert_allclose(hand.accelerates(step), 0.0, atol=1e-4)
 
 
-def test_directions_taken_back_end_the_pressing_where_the_hand_is():
-    hand = SimulatedHand(force_directions=Z)
-    hand.interaction.set_target(force(z=10.0))
-    hand.step(force())
-    elsewhere = Q + 0.05
-    hand.interaction.settings = replace(hand.interaction.settings, force_directions=np.zeros(6))
-    hand.step(force(), elsewhere)
-    assert hand.state is Compliance.OFF
-    assert hand.controller.goals.pose_des.isApprox(hand.controller.robot.pose)
-
-
-def test_directions_exchanged_while_pressing_hold_the_hand_where_it_is():
+@pytest.mark.parametrize(
+    ("directions", "state"),
+    [(np.zeros(6), Compliance.OFF), (np.roll(Z, -1), Compliance.FORCE)],
+    ids=["taken back", "exchanged"],
+)
+def test_directions_that_change_while_pressing_hold_the_hand_where_it_is(directions, state):
     """Else what was pressed along would spring back to a goal that the hand has left."""
     hand = SimulatedHand(force_directions=Z)
     hand.interaction.set_target(force(z=10.0))
     hand.step(force())
-    elsewhere = Q + 0.05
-    hand.step(force(), elsewhere)
-    assert hand.controller.goals.pose_des.isApprox(hand.pose.pose)
-    hand.interaction.settings = replace(hand.interaction.settings, force_directions=np.roll(Z, -1))
-    hand.step(force(), elsewhere)
-    assert hand.state is Compliance.FORCE
-    assert hand.controller.goals.pose_des.isApprox(hand.controller.robot.pose)
-    taken = hand.controller.goals.held
-    hand.step(force(), elsewhere)
-    assert hand.controller.goals.held == taken
-
-
-def test_settings_that_change_do_not_let_go_of_a_hand_that_is_led():
-    hand = SimulatedHand(yield_threshold=np.array([10.0, 2.0]))
-    hand.step(force(x=20.0))
-    hand.interaction.settings = replace(
-        hand.interaction.settings, yield_threshold=np.array([11.0, 2.0])
-    )
-    hand.step(force(x=8.0))
-    assert hand.state is Compliance.YIELDING
+    hand.step(force(), ELSEWHERE)
+    assert hand.goals.pose_des.isApprox(hand.start)
+    hand.interaction.settings = replace(hand.interaction.settings, force_directions=directions)
+    hand.step(force(), ELSEWHERE)
+    assert hand.state is state
+    assert hand.holds_where_it_is
 
 
 def test_starting_anew_presses_nothing():
