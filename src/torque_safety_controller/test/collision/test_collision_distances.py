@@ -11,7 +11,6 @@ from collision_arm import (
     box,
     everything,
     half_space,
-    panda,
     random_states,
     sphere,
     two_links,
@@ -26,14 +25,11 @@ from viability_bounds_pkg.testing.ros_harness import read_config
 NODE = "controller_node"
 
 
-def names_of(avoidance, rows):
-    return [avoidance.model.names[k] for k in rows.pair]
-
-
 def test_distances_are_coals():
     """Every pair of capsules, box and half space, by another implementation."""
-    avoidance, data = everything(), panda()[0].model.createData()
+    avoidance = everything()
     arm, names = avoidance.model.arm, avoidance.model.names
+    data = arm.createData()
     shapes = {shape.name: (shape, arm.frames[0]) for shape in SURROUNDINGS}
     for shape in read(ControllerConfiguration, read_config("panda", NODE)).collision.capsules:
         shapes[shape.name] = (shape, arm.frames[arm.getFrameId(shape.name)])
@@ -46,7 +42,7 @@ def test_distances_are_coals():
         geometry.addCollisionPair(pin.CollisionPair(*(index[each] for each in name.split(" - "))))
     found = geometry.createData()
     compared = 0
-    for q, v in random_states(60, seed=1):
+    for q, v in random_states(30, seed=1):
         wide_rows(avoidance, q, v)
         pin.computeDistances(arm, data, geometry, found, q)
         for name, d, result in zip(names, avoidance.distances, found.distanceResults, strict=True):
@@ -62,7 +58,7 @@ def test_distances_are_coals():
                 tolerance = 2e-6 if other.is_box else 1e-9
                 assert d == pytest.approx(result.min_distance, abs=tolerance)
             compared += 1
-    assert compared > 2000
+    assert compared > 1000
 
 
 def test_rate_and_acceleration_by_finite_differences():
@@ -72,7 +68,7 @@ def test_rate_and_acceleration_by_finite_differences():
     found = avoidance.distances
     compared, off = 0, 0
     rng = np.random.default_rng(2)
-    for q, v in random_states(60, seed=3):
+    for q, v in random_states(30, seed=3):
         a = rng.uniform(-3.0, 3.0, len(q))
         nearby = []
         for t in (-h, 0.0, h):
@@ -89,46 +85,35 @@ def test_rate_and_acceleration_by_finite_differences():
             if abs(rows.rate[k] - rate[p]) > 1e-4 or error > 1e-2 * (1.0 + abs(acceleration[p])):
                 off += 1
     # Where the closest points come to an end or an edge in between, the difference is not d''.
-    assert compared > 2000
+    assert compared > 1000
     assert off <= compared // 500
 
 
-@pytest.mark.parametrize("kind, axis", [("revolute", "0 0 1"), ("prismatic", "1 0 0")])
-def test_a_ball_before_a_wall_by_hand(kind, axis):
+def test_a_ball_before_a_wall_by_hand():
     """The wall is x = 1; for the planar arm, x of the hand and its derivatives are known."""
     wall = half_space("wall", [1.0, 0.0, 0.0], [-1.0, 0.0, 0.0])
-    avoidance, _ = two_links(BALL, 0.4, [wall], kind, axis, influence=5.0)
+    avoidance, _ = two_links(BALL, 0.4, [wall], influence=5.0)
     q, v, a = np.array([0.3, 0.4]), np.array([0.7, -0.5]), np.array([1.1, 0.6])
     rows = wide_rows(avoidance, q, v)
-    if kind == "revolute":
-        both, speed = q.sum(), v.sum()
-        x = 0.5 * np.cos(q[0]) + 0.4 * np.cos(both)
-        x_dot = -0.5 * np.sin(q[0]) * v[0] - 0.4 * np.sin(both) * speed
-        x_bias = -0.5 * np.cos(q[0]) * v[0] ** 2 - 0.4 * np.cos(both) * speed**2
-        J = -np.array([0.5 * np.sin(q[0]) + 0.4 * np.sin(both), 0.4 * np.sin(both)])
-    else:
-        length = 0.9 + q[1]
-        x = length * np.cos(q[0])
-        x_dot = -length * np.sin(q[0]) * v[0] + np.cos(q[0]) * v[1]
-        x_bias = -length * np.cos(q[0]) * v[0] ** 2 - 2.0 * np.sin(q[0]) * v[0] * v[1]
-        J = np.array([-length * np.sin(q[0]), np.cos(q[0])])
-    assert names_of(avoidance, rows) == ["fore - wall"]
+    both, speed = q.sum(), v.sum()
+    x = 0.5 * np.cos(q[0]) + 0.4 * np.cos(both)
+    x_dot = -0.5 * np.sin(q[0]) * v[0] - 0.4 * np.sin(both) * speed
+    x_bias = -0.5 * np.cos(q[0]) * v[0] ** 2 - 0.4 * np.cos(both) * speed**2
+    J = -np.array([0.5 * np.sin(q[0]) + 0.4 * np.sin(both), 0.4 * np.sin(both)])
     assert rows.distance[0] == pytest.approx(1.0 - x - 0.05)
     assert rows.rate[0] == pytest.approx(-x_dot)
     assert rows.G[0] @ a + rows.bias[0] == pytest.approx(-(J @ a + x_bias))
 
 
 def test_a_ball_around_a_ball_by_hand():
-    """On a circle about the other ball nothing changes; past it, on a line, d'' = v^2 / d."""
-    about = sphere("ball", [0.0, 0.0, 0.0], 0.1)
-    avoidance, _ = two_links(BALL, 0.4, [about], influence=5.0)
-    rows = wide_rows(avoidance, np.array([0.3, 0.5]), np.array([2.0, 0.0]))
+    """Nothing changes on a circle about the other ball; on a line past it, d'' = v^2 / d."""
+    circle, _ = two_links(BALL, 0.4, [sphere("ball", [0.0, 0.0, 0.0], 0.1)], influence=5.0)
+    rows = wide_rows(circle, np.array([0.3, 0.5]), np.array([2.0, 0.0]))
     assert rows.rate[0] == pytest.approx(0.0, abs=1e-12)
     assert rows.bias[0] == pytest.approx(0.0, abs=1e-12)
-    slider, _ = two_links(
-        BALL, 0.4, [sphere("ball", [0.9, 0.5, 0.0], 0.1)], "prismatic", "1 0 0", influence=5.0
-    )
-    rows = wide_rows(slider, np.zeros(2), np.array([0.0, 0.8]))
+    aside = sphere("ball", [0.9, 0.5, 0.0], 0.1)
+    line, _ = two_links(BALL, 0.4, [aside], "prismatic", "1 0 0", influence=5.0)
+    rows = wide_rows(line, np.zeros(2), np.array([0.0, 0.8]))
     assert rows.bias[0] == pytest.approx(0.8**2 / 0.5)
 
 
@@ -148,21 +133,20 @@ def test_ends_have_rows_before_the_closest_point_jumps_there():
 @pytest.mark.parametrize(
     "obstacle",
     [
-        lambda o: capsule("it", [0.3, -0.2 + o, 0.0], [0.3, 0.2 + o, 0.0], 0.01),  # crossing
-        lambda o: capsule("it", [0.5, o, 0.0], [0.9, o, 0.0], 0.01),  # one in the other
-        lambda o: capsule("it", [0.5, 0.2 + o, 0.0], [0.9, 0.2 + o, 0.0], 0.01),  # parallel
-        lambda o: sphere("it", [0.7, o, 0.0], 0.01),  # on the axis
-        lambda o: box("it", [0.7, o, 0.0], [0.2, 0.2, 0.2]),  # pierced
-        lambda o: box("it", [0.7, 0.2 + o, 0.0], [0.1, 0.1, 0.1]),  # parallel to faces and edges
-        lambda o: half_space("it", [0.0, o, 0.0], [0.0, 1.0, 0.0]),  # half of it inside
+        lambda o: capsule("crossing", [0.3, -0.2 + o, 0.0], [0.3, 0.2 + o, 0.0], 0.01),
+        lambda o: capsule("inside", [0.5, o, 0.0], [0.9, o, 0.0], 0.01),
+        lambda o: capsule("parallel", [0.5, 0.2 + o, 0.0], [0.9, 0.2 + o, 0.0], 0.01),
+        lambda o: sphere("on the axis", [0.7, o, 0.0], 0.01),
+        lambda o: box("pierced", [0.7, o, 0.0], [0.2, 0.2, 0.2]),
+        lambda o: box("parallel faces", [0.7, 0.2 + o, 0.0], [0.1, 0.1, 0.1]),
+        lambda o: half_space("half inside", [0.0, o, 0.0], [0.0, 1.0, 0.0]),
     ],
+    ids=lambda make: make(0.0).name,
 )
 def test_degenerate_places_give_finite_rows(obstacle, offset):
     avoidance, _ = two_links(ROD, 0.2, [obstacle(offset)])
     limit = np.full(2, 20.0)
     for v in (np.zeros(2), np.array([1.0, -2.0])):
         rows = avoidance.rows(np.zeros(2), v, -limit, limit)
-        assert np.isfinite(rows.G).all()
-        assert np.isfinite(rows.lower).all()
-        assert np.isfinite(rows.bias).all()
+        assert all(np.isfinite(each).all() for each in (rows.G, rows.lower, rows.bias))
         assert not np.isnan(avoidance.closest()[0])

@@ -5,16 +5,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import yaml
-from collision_arm import box, half_space, panda, sphere
 
 from torque_safety_controller.new_robot.capsules import fitted_capsule, link_capsules
+from torque_safety_controller.node.assembly import make_collision
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.parts.collision.model import build_collision_model
-from torque_safety_controller.parts.collision.shapes import capsule
-from torque_safety_controller.tools.fit_capsules import main, with_capsules
+from torque_safety_controller.tools.fit_capsules import main
 from viability_bounds_pkg.exceptions import SettingError
 from viability_bounds_pkg.parameter import read
-from viability_bounds_pkg.parameter_files import ParameterFileError
 from viability_bounds_pkg.robot.configuration import load_model
 from viability_bounds_pkg.robot.description import (
     RobotDescriptionError,
@@ -63,28 +60,29 @@ def test_the_capsules_of_a_robots_file_hold_the_meshes_of_its_links(name):
     assert held > 1
 
 
-def test_the_tool_writes_capsules_into_a_parameter_file(tmp_path):
+def test_the_tool_writes_capsules_into_a_parameter_file(tmp_path, capsys):
     shipped = (config_folder() / "panda.yaml").read_text()
     path = tmp_path / "panda.yaml"
-    entries = yaml.safe_load(shipped)["/**/controller_node"]["ros__parameters"].pop(
-        "collision_capsules"
-    )
-    lines = "".join(f'      - "{entry}"\n' for entry in entries)
+    entries = yaml.safe_load(shipped)["/**/controller_node"]["ros__parameters"]
+    lines = "".join(f'      - "{entry}"\n' for entry in entries["collision_capsules"])
     without = shipped.replace(f"    collision_capsules:\n{lines}", "")
     assert "capsules" not in without
-    for text in (without, shipped):
-        path.write_text(text)
-        assert main([str(path)]) == 0
-        assert path.read_text() == shipped
-    with pytest.raises(ParameterFileError, match="no section"):
-        with_capsules("bounds_node:\n", entries)
+    path.write_text(without)
+    assert main([str(path)]) == 0
+    assert path.read_text() == shipped
+    path.write_text(without.replace("/**/controller_node:", "/**/controller_node:  # its own"))
+    assert main([str(path)]) == 1
+    assert "no section '/**/controller_node:'" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 50])
-def test_few_points_and_points_of_a_capsule_are_held_tightly(count):
-    rng = np.random.default_rng(count)
-    points = rng.normal(size=(count, 3))
+@pytest.mark.parametrize("count", [1, 2, 50])
+def test_points_are_held(count):
+    points = np.random.default_rng(count).normal(size=(count, 3))
     assert inside(points, *fitted_capsule(points))
+
+
+def test_points_of_a_capsule_are_held_tightly():
+    rng = np.random.default_rng(0)
     directions = rng.normal(size=(3000, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     along = rng.uniform(size=(3000, 1)) * np.array([0.3, 0.2, -0.1])
@@ -110,18 +108,17 @@ def test_shapes_of_a_urdf_are_held(geometry, radius):
     np.testing.assert_allclose(0.5 * (found.start + found.end), [0.3, 0.0, 0.0], atol=0.02)
 
 
-def test_a_shape_that_the_parser_drops_is_an_error():
-    urdf = SHAPES.format('<capsule radius="0.05" length="0.3"/>')
-    model = build_model(urdf, ["turn"])
-    with pytest.raises(RobotDescriptionError, match="'arm': only 0 of 1"):
-        load_geometry(urdf, model)
-
-
-def test_a_mesh_that_is_missing_is_an_error():
-    urdf = SHAPES.format('<mesh filename="package://nowhere/arm.stl"/>')
-    model = build_model(urdf, ["turn"])
-    with pytest.raises(RobotDescriptionError, match="package://nowhere/arm.stl: no package"):
-        load_geometry(urdf, model)
+@pytest.mark.parametrize(
+    ("geometry", "message"),
+    [
+        ('<capsule radius="0.05" length="0.3"/>', "'arm': only 0 of 1"),
+        ('<mesh filename="package://nowhere/a.stl"/>', "package://nowhere/a.stl: no package"),
+    ],
+)
+def test_a_shape_that_would_be_missing_is_an_error(geometry, message):
+    urdf = SHAPES.format(geometry)
+    with pytest.raises(RobotDescriptionError, match=message):
+        load_geometry(urdf, build_model(urdf, ["turn"]))
 
 
 def test_links_of_locked_joints_are_where_these_are_locked():
@@ -132,53 +129,109 @@ def test_links_of_locked_joints_are_where_these_are_locked():
     frame = model.frames[model.getFrameId("gripper_right_base_link")]
     assert frame.parentJoint == model.getJointId("torso_2_joint")
     full = pin.buildModelFromXML(urdf)
-    q = pin.neutral(full)
+    q, data = pin.neutral(full), full.createData()
     for name, position in config.locked.items():
         q[full.joints[full.getJointId(name)].idx_q] = position
-    data = full.createData()
     pin.framesForwardKinematics(full, data, q)
     hand = data.oMf[full.getFrameId("gripper_right_base_link")]
     torso = data.oMi[full.getJointId("torso_2_joint")]
     np.testing.assert_allclose(frame.placement, torso.actInv(hand), atol=1e-9)
 
 
-def test_neighbours_are_left_out_and_what_is_always_near():
-    _, _, collision = panda()
-    assert "panda_hand - panda_link2" in collision.names
-    assert "panda_hand - table" in collision.names
-    for name in ("panda_link2 - panda_link1", "panda_hand - panda_link7", "panda_link0 - table"):
-        assert name not in collision.names
-    assert collision.left_out["collision_posture"] == ["panda_link7 - panda_link5"]
+# Parameters
 
 
-def build(**changes):
-    arm, capsules = panda()[0], read(ControllerConfiguration, PANDA).collision.capsules
-    given = {"capsules": capsules, "q_start": arm.q_start, **changes}
-    return build_collision_model(given.pop("model", arm.model), **given)
+def configuration(**changes) -> ControllerConfiguration:
+    return read(ControllerConfiguration, PANDA | {"collision_avoidance": True} | changes)
 
 
-def test_obstacles_are_in_the_base_frame():
-    model = panda()[0].model.copy()
-    place = pin.SE3(pin.rpy.rpyToMatrix(0.1, -0.2, 0.3), np.array([0.5, 0.1, 0.2]))
-    model.addFrame(pin.Frame("table_frame", 0, 0, place, pin.FrameType.OP_FRAME))
-    things = [
-        sphere("ball", [0.1, 0.2, 0.3], 0.1),
-        box("block", [0.3, 0.0, 0.1], [0.1, 0.2, 0.3]),
-        half_space("floor", [0.0, 0.0, -0.1], [0.0, 0.0, 2.0]),
-    ]
-    segments = build(model=model, obstacles=things, base_frame="table_frame").segments
-    ball = segments.ends[10 + 1]
-    np.testing.assert_allclose(ball, [place.act(np.array([0.1, 0.2, 0.3]))] * 2)
-    block, floor = segments.boxes
-    np.testing.assert_allclose(block[0], place.act(np.array([0.3, 0.0, 0.1])))
-    np.testing.assert_allclose(block[1], [0.05, 0.1, 0.15])
-    np.testing.assert_allclose(block[2:], place.rotation.T, atol=1e-12)
-    normal = place.rotation[:, 2]
-    np.testing.assert_allclose(floor[4], normal, atol=1e-12)
-    surface = floor[0] + floor[1, 2] * normal
-    assert normal @ surface == pytest.approx(normal @ place.act(np.array([0.0, 0.0, -0.1])))
+def load(**changes):
+    config = configuration(**changes)
+    return make_collision(config, load_model(config, config.read_urdf()))
 
 
-def test_capsules_of_an_unknown_link_are_refused():
-    with pytest.raises(SettingError, match="did you mean"):
-        build(capsules=[capsule("panda_hnd", [0.0] * 3, [0.1] * 3, 0.1)])
+THINGS = [
+    "{name: table, shape: box, size: [0.4, 1, 5e-2], position: [0.7, 0, 0.2], rpy: [0, 0, 0.8]}",
+    "{name: ball, shape: sphere, size: [0.2, 0.2, 0.2], position: [0.5, 0.3, 0.5]}",
+    "{name: pole, shape: cylinder, size: [0.06, 0.06, 1.0], position: [0.4, -0.4, 0.5]}",
+    "{name: floor, shape: half_space, position: [0.0, 0.0, -0.1]}",
+]
+
+
+def test_off_nothing_is_loaded():
+    assert load(collision_avoidance=None) is None
+
+
+def test_obstacles_become_shapes_in_the_base_frame():
+    segments = load(obstacles=THINGS).model.segments
+    table, ball, pole, floor = range(11, 15)
+    np.testing.assert_allclose(segments.radius[[table, ball, pole, floor]], [0.0, 0.1, 0.03, 0.0])
+    np.testing.assert_allclose(segments.ends[ball], [[0.5, 0.3, 0.5]] * 2)
+    np.testing.assert_allclose(segments.ends[pole], [[0.4, -0.4, 0.0], [0.4, -0.4, 1.0]])
+    table, floor = segments.boxes
+    np.testing.assert_allclose(table[:2], [[0.7, 0.0, 0.2], [0.2, 0.5, 0.025]])
+    np.testing.assert_allclose(table[2:], pin.utils.rotate("z", 0.8).T, atol=1e-12)
+    assert floor[0, 2] + floor[1, 2] == pytest.approx(-0.1)
+
+
+def test_neighbours_are_left_out_and_what_is_near_in_the_given_posture_or_always():
+    top = "{name: top, shape: box, size: [1.0, 1.0, 0.1], position: [0.2, 0.0, 0.15]}"
+    model = load(obstacles=[top]).model
+    assert {"panda_hand - panda_link2", "panda_hand - top"} <= set(model.names)
+    for name in ("panda_link2 - panda_link1", "panda_hand - panda_link7", "panda_link0 - top"):
+        assert name not in model.names
+    assert model.left_out["collision_posture"] == ["panda_link7 - panda_link5"]
+    assert "panda_link1 - top" in model.left_out["all postures"]
+    # In the middle of the limits, the default, the hand is bent back to the forearm.
+    middle = load(collision_posture=None).model
+    assert "panda_hand - panda_link5" in middle.left_out["collision_posture"]
+
+
+BOX = {"name": "box", "shape": "box", "size": [1, 1, 1], "position": [0, 0, 1], "rpy": [0, 0, 0]}
+
+
+def obstacle(**changes):
+    given = {key: value for key, value in (BOX | changes).items() if value is not None}
+    return {"obstacles": [*THINGS, yaml.safe_dump(given, default_flow_style=True)]}
+
+
+@pytest.mark.parametrize(
+    ("changes", "name", "allowed"),
+    [
+        (obstacle(name=None), "obstacles[4].name", "a string"),
+        (obstacle(name="ball"), "obstacles[4].name", "a name that no other obstacle has"),
+        (obstacle(name="panda_hand"), "obstacles[4].name", ""),
+        (obstacle(shape="cone"), "obstacles[4].shape", "box, sphere, cylinder, half_space"),
+        (obstacle(size=[1.0, 1.0]), "obstacles[4].size", "3 finite numbers"),
+        (obstacle(size=[0.4, 1.0, 0.0]), "obstacles[4].size", "3 finite numbers > 0"),
+        (obstacle(shape="sphere", size=[1.0, 2.0, 1.0]), "obstacles[4].size", "the same diameter"),
+        (obstacle(position=[0.0, True, 0.0]), "obstacles[4].position", "3 finite numbers"),
+        (obstacle(rpy=["a", "b", "c"]), "obstacles[4].rpy", "3 finite numbers"),
+        ({"obstacles": ["{name: a"]}, "obstacles[0]", "a YAML mapping with the fields name, "),
+        (
+            {"obstacles": ["{colour: red}"]},
+            "obstacles[0]",
+            "a YAML mapping with the fields name, ",
+        ),
+        ({"collision_posture": [0.0] * 6}, "collision_posture", ""),
+        ({"collision_posture": [9.0] * 7}, "collision_posture", "within the position limits"),
+        ({"acceleration_min": None}, "acceleration_min", ""),
+        ({"acceleration_max": [-1.0] * 7}, "acceleration_max", ""),
+        ({"collision_capsules": None}, "collision_capsules", "fit_capsules"),
+        (
+            {"collision_capsules": ["{link: panda_hnd, radius: 0.1, start: [0, 0, 0]}"]},
+            "collision_capsules[0].end",
+            "",
+        ),
+    ],
+)
+def test_what_cannot_be_is_refused_by_the_name_of_the_parameter(changes, name, allowed):
+    with pytest.raises(SettingError) as error:
+        load(**changes)
+    assert error.value.name == name
+    assert allowed in error.value.allowed
+
+
+def test_the_parameters_are_checked_even_while_it_is_off():
+    with pytest.raises(SettingError, match="shape"):
+        configuration(collision_avoidance=False, obstacles=["{name: table}"])
