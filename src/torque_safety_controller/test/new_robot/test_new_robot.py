@@ -10,9 +10,10 @@ import pytest
 import yaml
 
 from torque_safety_controller.new_robot.chain import NewRobotError, find_chain
-from torque_safety_controller.new_robot.estimates import CAP, LEAST, SHARE, USEFUL, estimate
+from torque_safety_controller.new_robot.estimates import estimate
 from torque_safety_controller.new_robot.postures import SelfCollisions, find_postures
 from torque_safety_controller.tools.new_robot import main
+from viability_bounds_pkg.cli.limits_file import read_robot
 from viability_bounds_pkg.robot.description import load_geometry, read_urdf
 
 ROBOTS = "package://example-robot-data/robots/"
@@ -60,43 +61,38 @@ def room(chain, estimates, rng, count):
 
 
 @pytest.mark.parametrize("name", ["ur5", pytest.param("panda", marks=pytest.mark.long)])
-def test_limits_are_available_in_every_state_tried(name):
+def test_limits_are_available_in_every_state_tried_and_no_smaller_than_need_be(name):
     chain, estimates = chain_of(name), estimates_of(name)
     assert not estimates.filtered.any()
-    up, down = room(chain, estimates, np.random.default_rng(1), 6000)
+    up, down = room(chain, estimates, np.random.default_rng(1), 3000)
     assert (up >= estimates.a_max).all()
     assert (down >= -estimates.a_min).all()
     assert (estimates.v_max <= chain.v_max).all()
-    assert min(estimates.a_max.min(), -estimates.a_min.max()) >= LEAST
+    if name == "ur5":
+        assert estimates.speed_scale == 1.0
+        assert (estimates.a_max == 15.0).all()  # more is of little use
+    else:
+        # At the URDF's speeds Panda's second joint has none; config/panda.yaml has 3 rad/s^2.
+        assert 0.7 < estimates.speed_scale < 0.8
+        assert 2.7 < estimates.a_max[1] < 4.5
 
 
-def test_limits_are_no_smaller_than_need_be():
-    ur5, panda = estimates_of("ur5"), estimates_of("panda")
-    assert (ur5.a_max == CAP).all()
-    assert ur5.speed_scale == 1.0
-    # At the URDF's speeds Panda's second joint has none; config/panda.yaml has 3 rad/s^2.
-    assert 0.7 < panda.speed_scale < 0.8
-    assert 0.9 * USEFUL < panda.a_max[1] < 1.5 * USEFUL
-
-
+@pytest.mark.long
 def test_a_weak_motor_gets_the_safety_filter_and_limits_of_most_states():
     chain, estimates = chain_of("baxter"), estimates_of("baxter")
     assert [n for n, f in zip(chain.joints, estimates.filtered, strict=True) if f] == ["left_s1"]
     up, down = room(chain, estimates, np.random.default_rng(1), 4000)
     random = slice(0, None, 2)  # those that are no corners
     available = np.minimum(up, down)[random, 1] >= estimates.a_max[1]
-    assert SHARE - 0.05 < available.mean() < 1.0
+    assert 0.75 < available.mean() < 1.0
     assert "left_s1" in estimates.why
 
 
-def test_joints_without_end_have_no_position_limits():
+def test_joints_without_end_have_no_position_limits_and_two_arms_are_one_chain():
     chain = chain_of("kinova")
     assert chain.continuous.sum() == 3
     assert np.isinf(chain.q_max[chain.continuous]).all()
     assert np.isfinite(chain.q_max[~chain.continuous]).all()
-
-
-def test_two_arms_are_one_chain():
     chain = find_chain(read_urdf(BAXTER), ["left_gripper", "right_gripper"])
     assert len(chain.joints) == 14
     assert chain.tips[0] == "left_gripper"
@@ -117,8 +113,6 @@ def test_start_and_goals_are_free_of_collisions_and_can_be_held():
 
 
 def test_missing_limits_come_from_the_urdf(tmp_path):
-    from viability_bounds_pkg.cli.limits_file import read_robot
-
     path = tmp_path / "robot.yaml"
     joints = ", ".join(chain_of("panda").joints)
     text = f"/**: {{ros__parameters: {{robot_description: {PANDA}, joints: [{joints}]}}}}"
@@ -192,62 +186,59 @@ def test_a_motor_that_is_too_weak_is_named():
         estimate(chain)
 
 
+# The tool
+
+
+def run(folder, text, *arguments, name="arm.urdf"):
+    """Write a URDF and run the tool."""
+    path = folder / name
+    path.write_text(text)
+    return main([str(path), *arguments, "--out", str(folder)])
+
+
 def test_the_tool_refuses_in_one_line(tmp_path, capsys):
-    path = tmp_path / "arm.urdf"
-    path.write_text(urdf())
-    out = tmp_path / "config"
-    assert main([str(path), "no_link", "--out", str(out)]) == 1
-    assert main([str(tmp_path / "none.urdf"), "hand", "--out", str(out)]) == 1
-    (tmp_path / "arm.xacro").write_text('<robot xmlns:xacro="x"><xacro:arm/></robot>')
-    assert main([str(tmp_path / "arm.xacro"), "hand", "--out", str(out)]) == 1
+    assert run(tmp_path, urdf(), "no_link") == 1
+    assert main([str(tmp_path / "none.urdf"), "hand", "--out", str(tmp_path)]) == 1
+    xacro = '<robot xmlns:xacro="x"><xacro:arm/></robot>'
+    assert run(tmp_path, xacro, "hand", name="arm.xacro") == 1
     errors = capsys.readouterr().err.splitlines()
     assert [line.startswith("new_robot: ") for line in errors] == [True, True, True]
     assert "no_link" in errors[0]
     assert "none.urdf" in errors[1]
     assert errors[2].endswith("fails: unknown macro name: xacro:arm; give it what it asks for")
-    assert not list(out.rglob("*.yaml"))
+    assert not list(tmp_path.rglob("*.yaml"))
     with pytest.raises(SystemExit):
-        main([str(path), "hand", "--topic"])
+        main([str(tmp_path / "arm.urdf"), "hand", "--topic"])
     assert "either a URDF or --topic" in capsys.readouterr().err
 
 
 def test_a_file_for_xacro_is_expanded(tmp_path, monkeypatch, capsys):
-    text = urdf().replace("<robot ", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" ')
     mass = '<mass value="2.0"'
-    assert mass in text
+    text = urdf().replace("<robot ", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" ')
     begin = text.index(">", text.index("<robot")) + 1
-    text = text.replace(mass, '<mass value="${m / 2}"')
     text = f'{text[:begin]}<xacro:property name="m" value="4"/>{text[begin:]}'
-    path = tmp_path / "arm.urdf.xacro"
-    path.write_text(text)
-    assert main([str(path), "hand", "--name", "arm", "--out", str(tmp_path)]) == 0
+    text = text.replace(mass, '<mass value="${m / 2}"')
+    assert run(tmp_path, text, "hand", "--name", "arm", name="arm.urdf.xacro") == 0
     assert mass in (tmp_path / "arm.urdf").read_text()
     monkeypatch.setitem(sys.modules, "xacro", None)  # as if it was not there
-    assert main([str(path), "hand", "--name", "b", "--out", str(tmp_path)]) == 1
+    assert run(tmp_path, text, "hand", "--name", "b", name="arm.urdf.xacro") == 1
     assert "pip install xacro, or apt install ros-jazzy-xacro" in capsys.readouterr().err
 
 
-def test_xacro_in_a_comment_is_none(tmp_path):
-    path = tmp_path / "arm.urdf"
-    path.write_text(urdf().replace("</robot>", "<!-- <xacro:if>\n--></robot>"))
-    assert main([str(path), "hand", "--out", str(tmp_path)]) == 0
-
-
 def test_files_are_not_replaced_unasked_and_say_where_numbers_come_from(tmp_path, capsys):
-    path = tmp_path / "arm.urdf"
-    path.write_text(urdf(more=BALL))
-    assert main([str(path), "hand", "--out", str(tmp_path)]) == 0
-    assert main([str(path), "hand", "--out", str(tmp_path)]) == 1
+    text = urdf(more=BALL).replace("</robot>", "<!-- <xacro:if> in a comment is none\n--></robot>")
+    assert run(tmp_path, text, "hand") == 0
+    assert run(tmp_path, text, "hand") == 1
     assert "exists; --force replaces it" in capsys.readouterr().err
-    text = (tmp_path / "an_arm.yaml").read_text()
-    values = yaml.safe_load(text)["/**"]["ros__parameters"]
+    written = (tmp_path / "an_arm.yaml").read_text()
+    values = yaml.safe_load(written)["/**"]["ros__parameters"]
     assert values["joints"] == ["shoulder", "wrist"]
     assert "torque_max" not in values  # the URDF has it
-    links = yaml.safe_load(text)["/**/controller_node"]["ros__parameters"]["collision_capsules"]
-    assert any(entry.startswith("{link: ball, ") for entry in links)
-    lines = text.splitlines()
+    own = yaml.safe_load(written)["/**/controller_node"]["ros__parameters"]
+    assert any(entry.startswith("{link: ball, ") for entry in own["collision_capsules"])
+    lines = [line.strip() for line in written.splitlines()]
     for name in ("rate_hz", "start_positions", "acceleration_min", "acceleration_drift"):
-        index = next(i for i, line in enumerate(lines) if line.strip().startswith(f"{name}:"))
-        assert lines[index - 1].strip().startswith("#"), name
-    (file,) = (tmp_path / "scenarios").iterdir()
-    assert yaml.safe_load(file.read_text())
+        index = next(i for i, line in enumerate(lines) if line.startswith(f"{name}:"))
+        assert lines[index - 1].startswith("#"), name
+    (scenario,) = (tmp_path / "scenarios").iterdir()
+    assert yaml.safe_load(scenario.read_text())

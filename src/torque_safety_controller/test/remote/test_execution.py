@@ -10,66 +10,62 @@ from torque_safety_controller.driving.trajectory import JointPoint, JointTraject
 from torque_safety_controller.remote.execution import Execution, Progress, Tolerances
 from viability_bounds_pkg.state import State
 
-ANY = Tolerances(np.full(2, math.inf), np.full(2, math.inf))
-NEAR = Tolerances(np.array([0.01, 0.02]), np.full(2, math.inf))
+FREE = np.full(2, math.inf)
+ANY = Tolerances(FREE, FREE)
+NEAR = Tolerances(np.array([0.01, 0.02]), FREE)
 START, END = np.array([0.1, -0.2]), np.array([0.5, 0.6])
+MIDDLE, FASTEST = (START + END) / 2, 1.5 * (END - START) / 2.0  # of the cubic in two seconds
 BEGIN = 7_000_000_000
 
 
-def execution(path=ANY, goal=NEAR, begin=0):
+def execution(path=ANY, begin=0):
     trajectory = JointTrajectory([JointPoint(2.0, END)])
-    made = Execution(["a", "b"], trajectory, path, goal, patience=1.0, begin=begin)
+    made = Execution(["a", "b"], trajectory, path, NEAR, patience=1.0, begin=begin)
     made.start(State(START, np.zeros(2)), BEGIN)
     return made
 
 
-def look(made, t, q, v=(0.0, 0.0)):
+def judged(made, t, q, v=(0.0, 0.0)):
     return made.judge(State(np.asarray(q), np.array(v)), BEGIN + round(1e9 * t))
 
 
 def test_it_begins_where_the_arm_is():
     made = execution()
-    assert look(made, 0.0, START) is Progress.MOVING
-    np.testing.assert_allclose(made.desired[0], START)
-    assert look(made, 1.0, START, (0.1, 0.0)) is Progress.MOVING
-    # The cubic from rest to rest, half way.
-    middle, fastest = (START + END) / 2, 1.5 * (END - START) / 2.0
-    np.testing.assert_allclose(made.off, [middle - START, fastest - [0.1, 0.0]], atol=1e-12)
+    assert judged(made, 1.0, START, (0.1, 0.0)) is Progress.MOVING
+    np.testing.assert_allclose(made.off, [MIDDLE - START, FASTEST - [0.1, 0.0]], atol=1e-12)
 
 
 def test_it_is_reached_when_its_time_is_over_and_the_arm_near():
     made = execution()
-    assert look(made, 1.999, END) is Progress.MOVING
-    assert look(made, 2.0, END + [0.0, 0.021]) is Progress.MOVING
+    assert judged(made, 1.999, END) is Progress.MOVING
+    assert judged(made, 2.0, END + [0.0, 0.021]) is Progress.MOVING
     assert made.why == "b is -0.021 rad off; allowed: 0.02"
-    assert look(made, 2.5, END + [0.009, 0.019]) is Progress.REACHED
+    assert judged(made, 2.5, END + [0.009, 0.019]) is Progress.REACHED
     assert not made.why
 
 
 def test_it_is_not_reached_when_patience_ends():
     made = execution()
-    assert look(made, 2.999, END + 0.1) is Progress.MOVING
-    assert look(made, 3.0, END + 0.1) is Progress.NOT_REACHED
+    assert judged(made, 2.999, END + 0.1) is Progress.MOVING
+    assert judged(made, 3.0, END + 0.1) is Progress.NOT_REACHED
     assert made.why == "a is -0.1 rad off; allowed: 0.01"
 
 
-@pytest.mark.parametrize("part", ["position", "velocity"])
+@pytest.mark.parametrize("part", [0, 1], ids=["position", "velocity"])
 def test_it_leaves_its_path(part):
-    allowed = {"position": np.full(2, math.inf), "velocity": np.full(2, math.inf)}
+    allowed = [FREE.copy(), FREE.copy()]
     allowed[part][1] = 0.3
-    made = execution(path=Tolerances(**allowed))
-    q, v = (START + END) / 2, 1.5 * (END - START) / 2.0
-    off = {"position": np.zeros(2), "velocity": np.zeros(2)}
-    off[part][:] = 5.0, 0.29
-    assert look(made, 1.0, q + off["position"], v + off["velocity"]) is Progress.MOVING
-    off[part][1] = 0.31
-    assert look(made, 1.0, q + off["position"], v + off["velocity"]) is Progress.OFF_PATH
+    made = execution(Tolerances(*allowed))
+    for off, progress in ((0.29, Progress.MOVING), (0.31, Progress.OFF_PATH)):
+        state = [MIDDLE, FASTEST]
+        state[part] = state[part] + [5.0, off]
+        assert judged(made, 1.0, *state) is progress
     assert made.why.startswith("b is -0.31 rad")
 
 
 def test_one_with_a_time_of_its_own_waits():
-    made = execution(path=NEAR, begin=BEGIN + 1_000_000_000)
-    assert look(made, 0.5, START + 1.0) is Progress.MOVING
-    assert look(made, 1.5, START + 1.0) is Progress.OFF_PATH
-    assert look(made, 2.9, END + 0.1) is Progress.OFF_PATH
-    assert look(made, 3.0, END) is Progress.REACHED
+    made = execution(NEAR, begin=BEGIN + 1_000_000_000)
+    assert judged(made, 0.5, START + 1.0) is Progress.MOVING
+    assert judged(made, 1.5, START + 1.0) is Progress.OFF_PATH
+    assert judged(made, 2.9, END + 0.1) is Progress.OFF_PATH
+    assert judged(made, 3.0, END) is Progress.REACHED

@@ -12,10 +12,7 @@ from proxsuite import proxqp
 
 from torque_safety_controller.new_robot.capsules import link_capsules
 from torque_safety_controller.parameters.controller_parameters import ControllerConfiguration
-from torque_safety_controller.parts.collision.avoidance import (
-    Collision,
-    CollisionRows,
-)
+from torque_safety_controller.parts.collision.avoidance import Collision, CollisionRows
 from torque_safety_controller.parts.collision.model import CollisionModel, build_collision_model
 from torque_safety_controller.parts.collision.shapes import Shape, capsule, make_obstacle
 from viability_bounds_pkg.joint_limits import JointLimits
